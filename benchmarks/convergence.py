@@ -22,17 +22,17 @@ from pathlib import Path
 import torch
 
 from physgraph_usd.lab.chart.reference import Reference
+from physgraph_usd.lab.methods import METHODS
+from physgraph_usd.lab.methods.first_order import Adam, GradientDescent
+from physgraph_usd.lab.methods.lbfgs import Lbfgs
 from physgraph_usd.lab.train.patches import PatchConfig, make_patches
 from physgraph_usd.shot.solve import prepare_device
 from physgraph_usd.solver.frame.group import Group
 from physgraph_usd.solver.frame.settings import SolveSettings
-from physgraph_usd.solver.integrate import METHODS
 from physgraph_usd.solver.integrate.base import Integrator, System
-from physgraph_usd.solver.integrate.first_order import Adam, GradientDescent
-from physgraph_usd.solver.integrate.learned import integrator_of
 from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton
 from physgraph_usd.solver.integrate.solve import Budget, solve_level
-from physgraph_usd.solver.integrate.weights import FOLDER, load_network
+from physgraph_usd.solver.integrate.weights import KINDS, integrator_of, load_network
 from physgraph_usd.solver.level import refine_garments
 
 from .rows import Found, Row, run_alone, say, table
@@ -53,8 +53,8 @@ CONFIG = PatchConfig(count=3, levels=(2, 2), elastic=True, most_vertices=4000, r
 def main(arguments: Sequence[str] | None = None) -> None:
     """Print the table and draw the picture."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--weights", type=Path, default=FOLDER / "physgraph-paper.safetensors")
-    parser.add_argument("--physgraph", type=Path, default=FOLDER / "physgraph.safetensors")
+    parser.add_argument("--weights", type=Path, default=KINDS["physgraph-paper"].file)
+    parser.add_argument("--physgraph", type=Path, default=KINDS["physgraph"].file)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--out", type=Path, default=None)
     parser.add_argument("--shots", default="", help="garments of benchmarks.unseen in place of patches")
@@ -99,7 +99,7 @@ def rows(short: bool) -> Found:
     patches = list(trained_like("cpu", config))
     found, lines, below = [], [], 0
     for number, patch in enumerate(patches):
-        gaps = curves(patch, FOLDER / "physgraph-paper.safetensors", FOLDER / "physgraph.safetensors", device="cpu")
+        gaps = curves(patch, KINDS["physgraph-paper"].file, KINDS["physgraph"].file, device="cpu")
         lost = overtaken(gaps)
         below += not lost
         best = min(gaps[name][PAPER_STEPS] for name in gaps if name.startswith(("Adam", "gradient")))
@@ -134,7 +134,7 @@ def curves(patch: Problem, paper: Path, own: Path, *, device: str) -> dict[str, 
     found |= {f"gradient descent {rate:g}": flat(patch, GradientDescent(rate)) for rate in GRADIENT_RATES}
     rates = (*GRADIENT_RATES, *GRADIENT_SWEEP)
     found |= best("gradient descent", {rate: flat(patch, GradientDescent(rate)) for rate in rates})
-    found["L-BFGS"] = flat(patch, QuasiNewton(use_metric=False))
+    found["L-BFGS"] = flat(patch, Lbfgs())
     found["quasi-Newton, finest level"] = flat(patch, QuasiNewton())
     found["quasi-Newton, nested"] = nested(patch, QuasiNewton())
     if paper.exists():

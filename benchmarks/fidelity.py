@@ -141,8 +141,8 @@ def simulated(
     level = level_at(garment_of(stage, subdivisions), subdivisions)
     pressed = Pressed(level, stage.bodies)
     terms = (
-        *elastic_terms(level, [fabric], potential="continuum"),
-        *body_terms(level, [fabric], gravity=GRAVITY, potential="continuum"),
+        *elastic_terms(level, [fabric]),
+        *body_terms(level, [fabric], gravity=GRAVITY),
     )
     h = 1.0 / (RATE * INCREMENTS)
     begun = level.from_coarse @ stage.rest

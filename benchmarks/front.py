@@ -30,8 +30,8 @@ from benchmarks.shots import opened
 from physgraph_usd.lab.chart.problem import COLD, Problem, Solved, plain_detail
 from physgraph_usd.lab.chart.reference import Reference, find_reference
 from physgraph_usd.lab.chart.table import TOLERANCE, quickest
+from physgraph_usd.lab.methods import METHODS
 from physgraph_usd.shot.solve import prepare_device
-from physgraph_usd.solver.integrate import METHODS
 from physgraph_usd.solver.scene import Frame
 from physgraph_usd.usd.read.reader import Shot, open_shot
 

@@ -22,11 +22,11 @@ import torch
 
 from benchmarks.rows import say, table
 from benchmarks.unseen import opened_garment, plain_group
+from physgraph_usd.lab.methods.lbfgs import Lbfgs
 from physgraph_usd.shot.solve import prepare_device
 from physgraph_usd.solver.integrate.base import Carry, Integrator, System
-from physgraph_usd.solver.integrate.learned import integrator_of
 from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton
-from physgraph_usd.solver.integrate.weights import FOLDER, load_network
+from physgraph_usd.solver.integrate.weights import FOLDER, integrator_of, load_network
 
 NOISE = 1e-9
 """Of the starts, in edge lengths."""
@@ -35,7 +35,7 @@ SHOTS = ("sleeve", "flag", "swatch", "skirt", "tshirt")
 LEVEL = 1
 MAKERS: dict[str, Callable[[], Integrator]] = {
     "quasi-newton": QuasiNewton,
-    "lbfgs": lambda: QuasiNewton(use_metric=False),
+    "lbfgs": Lbfgs,
 }
 
 

@@ -22,13 +22,13 @@ from typing import Any
 
 from benchmarks.rows import say
 from physgraph_usd.lab.chart.reference import Reference
+from physgraph_usd.lab.methods import PAPER
 from physgraph_usd.shot.solve import prepare_device
 from physgraph_usd.solver.integrate.base import Integrator
 from physgraph_usd.solver.integrate.guard import Guard
-from physgraph_usd.solver.integrate.learned import integrator_of
 from physgraph_usd.solver.integrate.network import PhysgraphConfig
 from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton
-from physgraph_usd.solver.integrate.weights import FOLDER, Network, load_network
+from physgraph_usd.solver.integrate.weights import KINDS, integrator_of, load_network
 
 from .unseen import FABRICS, SHOTS, Case, cases, descend
 
@@ -47,7 +47,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Print the tables."""
     given = parsed(arguments)
     prepare_device(given.device)
-    files = given.weights or sorted(FOLDER.glob("physgraph*.safetensors"))
+    files = given.weights or [kind.file for kind in KINDS.values()]
     candidates = {file: load(file, given.device) for file in files}
     results: dict[Path, list[dict[str, float]]] = {file: [] for file in files}
     names = [f"{file.stem}" for file in files]
@@ -84,11 +84,11 @@ def parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
     return parser.parse_args(arguments)
 
 
-def load(file: Path, device: str) -> tuple[Network, dict[str, Any]]:
+def load(file: Path, device: str) -> tuple[Any, dict[str, Any]]:
     """Weights and their card."""
     card = file.with_suffix(".json")
     about = json.loads(card.read_text(encoding="utf-8")) if card.exists() else {}
-    kind = about.get("kind") or ("physgraph-paper" if "paper" in file.stem else "physgraph")
+    kind = about.get("kind") or (PAPER if "paper" in file.stem else "physgraph")
     return load_network(file, kind=kind, device=device), about
 
 
@@ -158,9 +158,7 @@ def compared(ours: dict[str, float], theirs: dict[str, float]) -> dict[str, floa
     return ours | ratios | {"reach ratio": ours["reached"] / theirs["reached"]}
 
 
-def summary(
-    candidates: dict[Path, tuple[Network, dict[str, Any]]], results: dict[Path, list[dict[str, float]]]
-) -> None:
+def summary(candidates: dict[Path, tuple[Any, dict[str, Any]]], results: dict[Path, list[dict[str, float]]]) -> None:
     """Print one row a candidate."""
     head = ["weights", "hash", "network", "seed", "minutes", "patches"]
     head += [f"gap ratio {s}" for s in SCHEDULES] + [f"ms ratio {s}" for s in SCHEDULES] + ["ms to 3%, ratio"]
@@ -183,7 +181,7 @@ def summary(
     say(f"\nmedians over {max(map(len, results.values()), default=0)} shots and fabrics")
 
 
-def in_words(network: Network) -> str:
+def in_words(network: Any) -> str:
     """Vectors and size."""
     config = network.config
     if isinstance(config, PhysgraphConfig):

@@ -25,11 +25,13 @@ from benchmarks.rows import Found, Row, run_alone, table, under
 from benchmarks.shots import distances, frames_of, opened, problem_of
 from physgraph_usd.lab.chart.problem import Problem, with_garments
 from physgraph_usd.lab.chart.reference import Reference, find_reference
+from physgraph_usd.lab.methods import METHODS
 from physgraph_usd.solver.fabric import PRESETS
+from physgraph_usd.solver.forces import body_terms, elastic_terms
 from physgraph_usd.solver.frame.settings import SolveSettings
-from physgraph_usd.solver.integrate import METHODS, Method
-from physgraph_usd.solver.integrate.learned import integrator_of
-from physgraph_usd.solver.integrate.weights import shipped_network
+from physgraph_usd.solver.integrate import Method
+from physgraph_usd.solver.integrate.weights import integrator_of, shipped_network
+from physgraph_usd.solver.level import Level, hinge_geometry
 from physgraph_usd.solver.scene import Frame
 
 POSES = {
@@ -39,6 +41,8 @@ POSES = {
 }
 """Garments, all when empty, and time codes of each sample."""
 LEVEL = 2
+PAPER_SPRING, PAPER_HINGE = 2.598, 3.46
+"""The paper's k_s over Y and k_b over D on an equilateral lattice (docs/fabrics.md)."""
 ERG = 1e7
 """Ergs in a joule."""
 MARGIN = 0.002
@@ -187,13 +191,35 @@ def solved(problem: Problem, frame: Frame, method: Method, steps: int) -> tuple[
 
 
 def in_paper_form(problem: Problem, frame: Frame, points: Sequence[np.ndarray]) -> dict[str, float]:
-    """Energy of springs, hinges and weight in the paper's potential [J]."""
-    refiner, found = problem.refiner, dict.fromkeys(TERMS, 0.0)
-    refiner.use(SolveSettings(METHODS["quasi-newton"], temporal="off", potential="paper"))
-    for part in refiner.parts_of(frame):
-        energies = refiner.group_of(part).energies([frame.garments[i] for i in part], [points[i] for i in part])
-        found = {name: value + energies[name] for name, value in found.items()}
+    """Energy of springs, hinges and weight in the paper's potential [J].
+
+    The paper weighs springs by k_s a_e / A, hinges by k_b a_h / A and vertices by density a_v^2 / A, with A the
+    garment's rest area and a_h a third of the two triangles' areas. Energies of our terms are rescaled to those.
+    """
+    found = dict.fromkeys(TERMS, 0.0)
+    for part in problem.refiner.parts_of(frame):
+        group, frames = problem.refiner.group_of(part), [frame.garments[index] for index in part]
+        level, fabrics = group.forces_for(frames)[-1].level, [each.fabric for each in frames]
+        x = group.tensor(np.concatenate([points[index] for index in part]) - group.cage(frames).origin)
+        terms = (*elastic_terms(level, fabrics), *body_terms(level, fabrics, gravity=group.gravity))
+        area = torch.zeros(len(level.spans), dtype=level.dtype)
+        area.index_add_(0, level.vertex_garment.long(), level.vertex_area)
+        weights = {
+            "stretch": PAPER_SPRING / 3.0 * level.spring_length**2,
+            "bending": PAPER_HINGE * hinge_areas(level) / level.hinge_shape,
+            "gravity": level.vertex_area,
+        }
+        for term in terms:
+            term.add_force(x, torch.zeros_like(x))
+            energy, owner = term.split(x)  # pyright: ignore[reportAttributeAccessIssue]
+            found[term.name] += float((energy * weights[term.name] / area[owner.long()]).sum())
     return found
+
+
+def hinge_areas(level: Level) -> torch.Tensor:
+    """A third of the areas of each hinge's two triangles [m^2], shape (H,)."""
+    _, first, second, _ = hinge_geometry(level.rest.numpy(), level.hinges.numpy())
+    return torch.as_tensor((first + second) / 3.0)
 
 
 if __name__ == "__main__":

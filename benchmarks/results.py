@@ -40,7 +40,7 @@ from benchmarks import (
 from benchmarks.rows import HEAD, Found, Part, code_of
 from physgraph_usd import __version__
 from physgraph_usd.shot.solve import prepare_device
-from physgraph_usd.solver.integrate.weights import FOLDER
+from physgraph_usd.solver.integrate.weights import KINDS
 
 PAGE = Path("docs/notes/results.md")
 CACHE = Path("build")
@@ -160,7 +160,7 @@ def about(part: Part) -> Iterator[str]:
 
 def hashes() -> Iterator[str]:
     """Names and the first digits of the hashes of the weights that ship."""
-    for file in sorted(FOLDER.glob("*.safetensors")):
+    for file in sorted(kind.file for kind in KINDS.values()):
         yield f"`{file.stem}` {hashlib.sha256(file.read_bytes()).hexdigest()[:12]}"
 
 

@@ -22,17 +22,16 @@ import numpy as np
 import torch
 
 from benchmarks.rows import say
+from physgraph_usd.lab.methods.paper_network import PaperConfig
 from physgraph_usd.shot.solve import prepare_device
 from physgraph_usd.solver.fabric import PRESETS
 from physgraph_usd.solver.frame.group import Group
 from physgraph_usd.solver.frame.settings import SolveSettings
 from physgraph_usd.solver.integrate import METHODS
 from physgraph_usd.solver.integrate.base import Integrator, System
-from physgraph_usd.solver.integrate.learned import integrator_of
 from physgraph_usd.solver.integrate.network import PhysgraphConfig
-from physgraph_usd.solver.integrate.paper_network import PaperConfig
 from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton
-from physgraph_usd.solver.integrate.weights import random_network, shipped_network
+from physgraph_usd.solver.integrate.weights import integrator_of, random_network, shipped_network
 from physgraph_usd.solver.mesh.topology import PolygonMesh
 from physgraph_usd.solver.scene import Garment, GarmentFrame
 

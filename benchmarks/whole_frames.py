@@ -39,11 +39,11 @@ from benchmarks.rows import say, table
 from benchmarks.shots import opened
 from benchmarks.temporal import detail_of
 from physgraph_usd.lab.chart.problem import DEFAULT, judge, plain_detail
+from physgraph_usd.lab.methods import METHODS
 from physgraph_usd.shot.settled import unsettled
 from physgraph_usd.shot.solve import prepare_device
 from physgraph_usd.solver.frame.refiner import Refiner
 from physgraph_usd.solver.frame.settings import SolveSettings
-from physgraph_usd.solver.integrate import METHODS
 from physgraph_usd.solver.scene import Frame
 from physgraph_usd.usd.read.reader import Shot, open_shot
 

@@ -11,11 +11,11 @@ import torch
 from meshes import grid
 from sheets import garment_of
 
+from physgraph_usd.lab.methods import METHODS
 from physgraph_usd.solver.fabric import Fabric
 from physgraph_usd.solver.frame.group import Group
 from physgraph_usd.solver.frame.refiner import Refiner
 from physgraph_usd.solver.frame.settings import SolveSettings
-from physgraph_usd.solver.integrate import method_named
 from physgraph_usd.solver.integrate.base import Carry, Integrator, System
 from physgraph_usd.solver.level import refine_garments
 from physgraph_usd.solver.mesh.topology import PolygonMesh
@@ -34,7 +34,7 @@ def sheet(columns: int, rows: int, edge: float = 0.05, *, kind: str = "triangles
 
 def settings_of(*, integrator: str = "quasi-newton", **options: Any) -> SolveSettings:
     """Settings with a method by its name."""
-    return SolveSettings(method_named(integrator), **options)
+    return SolveSettings(METHODS[integrator], **options)
 
 
 class Answer(NamedTuple):

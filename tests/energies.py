@@ -33,14 +33,14 @@ def sides(triangles: np.ndarray) -> dict[tuple[int, int], list[int]]:
     return found
 
 
-def stretch_energy(rest: Tensor, triangles: np.ndarray, youngs: float, *, paper: bool = False) -> Energy:
+def stretch_energy(rest: Tensor, triangles: np.ndarray, youngs: float) -> Energy:
     """Springs along the sides."""
     areas = area(rest, triangles)
     found = sides(triangles)
     ends = torch.tensor(list(found))
     share = torch.stack([areas[numbers].sum() / 3 for numbers in found.values()])
     l0 = (rest[ends[:, 1]] - rest[ends[:, 0]]).norm(dim=1)
-    k = 2.598 * youngs * share / areas.sum() if paper else 3 * youngs * share / l0**2
+    k = 3 * youngs * share / l0**2
     return lambda x: (0.5 * k * ((x[ends[:, 1]] - x[ends[:, 0]]).norm(dim=1) - l0) ** 2).sum()
 
 
@@ -68,15 +68,13 @@ def hinge_list(triangles: np.ndarray) -> tuple[Tensor, Tensor]:
     return torch.tensor(corners, dtype=torch.long).reshape(-1, 4), torch.tensor(pairs, dtype=torch.long).reshape(-1, 2)
 
 
-def bending_energy(
-    rest: Tensor, triangles: np.ndarray, rigidity: float, *, paper: bool = False, bent: bool = False
-) -> Energy:
+def bending_energy(rest: Tensor, triangles: np.ndarray, rigidity: float, *, bent: bool = False) -> Energy:
     """Hinges at the sides."""
     areas = area(rest, triangles)
     hinges, pairs = hinge_list(triangles)
     both = areas[pairs].sum(dim=1)
     l0 = (rest[hinges[:, 1]] - rest[hinges[:, 0]]).norm(dim=1)
-    w = 3.46 * rigidity * both / 3 / areas.sum() if paper else rigidity * (l0**2 / both).clamp_max(HINGE_CAP)
+    w = rigidity * (l0**2 / both).clamp_max(HINGE_CAP)
     theta0 = fold(rest, hinges) if bent else torch.zeros(len(hinges), dtype=rest.dtype)
 
     def energy(x: Tensor) -> Tensor:
@@ -87,7 +85,7 @@ def bending_energy(
     return energy
 
 
-def membrane_energy(rest: Tensor, triangles: np.ndarray, youngs: float, shear: float, *, paper: bool = False) -> Energy:
+def membrane_energy(rest: Tensor, triangles: np.ndarray, youngs: float, shear: float) -> Energy:
     """Triangles that stretch along two axes and shear by the angle between them; axes by projection."""
     areas = area(rest, triangles)
     a, b, c = (rest[triangles[:, n]] for n in range(3))
@@ -103,7 +101,7 @@ def membrane_energy(rest: Tensor, triangles: np.ndarray, youngs: float, shear: f
     c11 = youngs / (1 - 1 / 9)
     longest = torch.stack([(a - b).norm(dim=1), (b - c).norm(dim=1), (c - a).norm(dim=1)]).amax(dim=0)
     sound = (4 * areas / longest**2).clamp_max(1.0)
-    weight = areas * sound * (2 * areas / areas.sum() if paper else 1.0)
+    weight = areas * sound
 
     def energy(x: Tensor) -> Tensor:
         p, q, r = (x[triangles[:, n]] for n in range(3))

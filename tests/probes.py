@@ -16,6 +16,7 @@ from scipy.integrate import solve_bvp
 from scipy.optimize import brentq
 from sheets import level_of_kind
 
+from physgraph_usd.lab.methods.newton import Newton
 from physgraph_usd.solver.fabric import Fabric
 from physgraph_usd.solver.forces import elastic_terms
 from physgraph_usd.solver.forces.base import Force, ForceModule
@@ -23,7 +24,6 @@ from physgraph_usd.solver.forces.bending import Bending
 from physgraph_usd.solver.forces.gravity import Gravity
 from physgraph_usd.solver.integrate.base import System
 from physgraph_usd.solver.integrate.metric import Metric
-from physgraph_usd.solver.integrate.newton import Newton
 from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton
 from physgraph_usd.solver.integrate.solve import Budget, solve_level
 from physgraph_usd.solver.level import Level
@@ -215,7 +215,7 @@ def relax(level: Level, forces: Sequence[Force], x: torch.Tensor, *, steps: int 
 def hang(level: Level, start: np.ndarray, fabric: Fabric) -> np.ndarray:
     """Rest positions of a pinned sheet under its own weight, z up."""
     weight = Gravity(level, torch.tensor([fabric.density]), np.array([0.0, 0.0, -G]))
-    forces = (*elastic_terms(level, [fabric], potential="continuum"), weight)
+    forces = (*elastic_terms(level, [fabric]), weight)
     return relax(level, forces, torch.as_tensor(start)).numpy()
 
 

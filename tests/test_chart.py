@@ -45,7 +45,8 @@ from physgraph_usd.lab.chart.reference import Solutions
 from physgraph_usd.lab.chart.run import chart_shot
 from physgraph_usd.lab.chart.table import Chart, Point, collate, typical
 from physgraph_usd.lab.chart.words import advice, settings
-from physgraph_usd.solver.integrate import METHODS, Method
+from physgraph_usd.lab.methods import METHODS
+from physgraph_usd.solver.integrate import Method
 from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton
 from physgraph_usd.solver.scene import Frame
 
@@ -239,9 +240,11 @@ def test_the_front_is_what_nothing_is_below_sooner():
 
 
 def test_a_sentence_says_which_method_to_take():
-    points = point("a", 1, 10.0, 0.4), point("a", 4, 40.0, 0.1)
-    assert advice(chart_of(*points, point(DEFAULT, 12, 19.0, 0.2))).startswith("Take refine's default")
-    assert advice(chart_of(*points, point(DEFAULT, 12, 60.0, 0.2))).startswith("Take a (--integrator a)")
+    """With the option that asks for it, where `refine` knows the method."""
+    for name, said in (("physgraph", "Take physgraph (--integrator physgraph) for"), ("gd", "Take gd for")):
+        points = point(name, 1, 10.0, 0.4), point(name, 4, 40.0, 0.1)
+        assert advice(chart_of(*points, point(DEFAULT, 12, 19.0, 0.2))).startswith("Take refine's default")
+        assert advice(chart_of(*points, point(DEFAULT, 12, 60.0, 0.2))).startswith(said)
 
 
 def test_the_bar_goes_on_where_a_part_takes_longer(monkeypatch: pytest.MonkeyPatch):

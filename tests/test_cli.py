@@ -191,9 +191,9 @@ class TestRefine:
         said = run("refine", "--help").output
         headings = ["Files:", "Scene:", "Solver:", "Layer:", "Several shots, and", "Messages:", "Options:"]
         assert [said.index(heading) for heading in headings] == sorted(said.index(heading) for heading in headings)
-        assert tuple(METHODS) == INTEGRATORS
+        assert tuple(METHODS)[: len(INTEGRATORS)] == INTEGRATORS  # The lab registers more.
         letters = "".join(said.split())
-        assert ",".join(METHODS) + ".[default:auto]" in letters
+        assert ",".join(INTEGRATORS) + ".[default:auto]" in letters
         assert "Moststepsatthefinestlevel.[default:12;x>=0]" in letters
         assert "denim" in run("tag", "--help").output
 

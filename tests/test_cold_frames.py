@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from cloth import frame_of, refiner_of, sheet
 from sheets import garment_of
 
 from benchmarks.cold_frames import folds_on_cage
+from physgraph_usd.lab.methods import METHODS
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.solver.frame.refiner import Refiner
 from physgraph_usd.solver.scene import Scene
@@ -26,7 +28,7 @@ def test_the_cage_does_not_show(kind: str, integrator: str):
     angle = rest[:, 0] / 0.1
     bent = np.stack([0.1 * np.sin(angle), rest[:, 1], 0.1 * np.cos(angle)], axis=1)
     garment = garment_of(mesh, rest)
-    settings = RefineOptions(integrator=integrator).solve_settings()
+    settings = replace(RefineOptions().solve_settings(), method=METHODS[integrator])
     refiner = Refiner(Scene((garment,), np.zeros(3), ()), settings, levels=[2])
     points = refiner.solve(frame_of(bent)).points[0]
     assert points is not None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import gc
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +17,8 @@ from pxr import Usd
 from sheets import garment_of
 
 from physgraph_usd.cli import main
+from physgraph_usd.lab.methods.paper_network import PaperConfig, has_triton
+from physgraph_usd.lab.methods.paper_steps import LearnedPaper
 from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.solver.colliders.mesh import MeshBody
 from physgraph_usd.solver.colliders.pose import MeshPose
@@ -24,10 +26,9 @@ from physgraph_usd.solver.frame.group import Group
 from physgraph_usd.solver.frame.solve import solve_frame
 from physgraph_usd.solver.frame.values import FrameInput
 from physgraph_usd.solver.integrate.fused import fused_physgraph
-from physgraph_usd.solver.integrate.learned import LearnedMetric, LearnedPaper
+from physgraph_usd.solver.integrate.learned import LearnedMetric
 from physgraph_usd.solver.integrate.metric import Metric
 from physgraph_usd.solver.integrate.network import VECTORS, Physgraph, PhysgraphConfig
-from physgraph_usd.solver.integrate.paper_network import PaperConfig, PaperNetwork, has_triton
 from physgraph_usd.solver.integrate.weights import random_network, shipped_network
 from physgraph_usd.solver.level import refine_garments
 from physgraph_usd.solver.mesh.topology import PolygonMesh
@@ -108,12 +109,12 @@ def test_the_papers_step_is_the_same_by_its_kernel(latent: int, monkeypatch: pyt
     one, frames = cloth("cuda", torch.float32)
     systems, coarse = one.systems(frames)
     system, x = systems[-1], one.levels[-1].base.apply(coarse)
-    paper = LearnedPaper(cast(PaperNetwork, shipped_network("physgraph-paper")))
+    paper = LearnedPaper(shipped_network("physgraph-paper"))
     if latent != PaperConfig().latent:
-        paper = LearnedPaper(cast(PaperNetwork, random_network(PaperConfig(latent), seed=3, scale=0.3)))
+        paper = LearnedPaper(random_network(PaperConfig(latent), seed=3, scale=0.3))
     carry = paper.start(system, x)
     fused, again = paper.propose(system, carry), paper.propose(system, carry)
-    monkeypatch.setattr("physgraph_usd.solver.integrate.paper_network.has_triton", lambda: False)
+    monkeypatch.setattr("physgraph_usd.lab.methods.paper_network.has_triton", lambda: False)
     plain = paper.propose(system, carry)
     assert torch.equal(fused, again)
     assert 0.0 < float((fused - plain).norm()) < 3e-3 * float(plain.norm())

@@ -32,7 +32,6 @@ from physgraph_usd.solver.forces.tether import Tether
 from physgraph_usd.solver.level import Level
 
 DOWN = np.array([0.0, 0.0, -9.81])
-POTENTIALS = ("continuum", "paper")
 INTERNAL = ("stretch", "membrane", "bending")
 ELASTIC = (*INTERNAL, "gravity")
 
@@ -55,17 +54,17 @@ class Case:
         return crumple(self.rest, self.noise, self.seed)
 
 
-def force_of(name: str, level: Level, *, potential: str = "continuum", scale: float = 1.0) -> Force:
+def force_of(name: str, level: Level, *, scale: float = 1.0) -> Force:
     """A term with constants of everyday size; `scale` multiplies its stiffness or weight."""
 
     def of(value: float) -> Tensor:
         return torch.full((len(level.spans),), scale * value, dtype=torch.float64)
 
     makers: dict[str, Callable[[], Force]] = {
-        "stretch": lambda: Stretch(level, of(30.0), potential=potential),
-        "membrane": lambda: Membrane(level, of(30.0), of(7.0), potential=potential),
-        "bending": lambda: Bending(level, of(0.05), potential=potential),
-        "gravity": lambda: Gravity(level, of(0.2), DOWN, potential=potential),
+        "stretch": lambda: Stretch(level, of(30.0)),
+        "membrane": lambda: Membrane(level, of(30.0), of(7.0)),
+        "bending": lambda: Bending(level, of(0.05)),
+        "gravity": lambda: Gravity(level, of(0.2), DOWN),
         "guide": lambda: guide_of(level, scale),
         "tether": lambda: Tether(level, of(0.2), 400.0, level.rest * 1.1),
     }
@@ -97,31 +96,31 @@ def cases(draw: st.DrawFn) -> Case:
 
 
 @settings(max_examples=60)
-@given(case=cases(), paper=st.booleans())
-def test_forces_match_autograd_of_an_independent_energy(case: Case, paper: bool):
+@given(case=cases())
+def test_forces_match_autograd_of_an_independent_energy(case: Case):
     level, x, bent = case.build(), case.x, case.bent
     rest, triangles = level.rest, case.triangles
     energies = {
-        "stretch": stretch_energy(rest, triangles, 30.0, paper=paper),
-        "membrane": membrane_energy(rest, triangles, 30.0, 7.0, paper=paper),
-        "bending": bending_energy(rest, triangles, 0.05, paper=paper, bent=bent),
+        "stretch": stretch_energy(rest, triangles, 30.0),
+        "membrane": membrane_energy(rest, triangles, 30.0, 7.0),
+        "bending": bending_energy(rest, triangles, 0.05, bent=bent),
     }
     for name, energy in energies.items():
         if name == "bending" and not len(level.hinges):
             continue
-        found, f = evaluate(force_of(name, level, potential=POTENTIALS[paper]), x)
+        found, f = evaluate(force_of(name, level), x)
         expected, g = autograd_force(energy, x)
         assert found == pytest.approx(expected, rel=1e-9)
         assert apart(f, g) < 1e-8, name
 
 
 @settings(max_examples=25)
-@given(case=cases(), potential=st.sampled_from(POTENTIALS), seed=st.integers(0, 99))
-def test_internal_forces_balance_and_turn_with_the_mesh(case: Case, potential: str, seed: int):
+@given(case=cases(), seed=st.integers(0, 99))
+def test_internal_forces_balance_and_turn_with_the_mesh(case: Case, seed: int):
     level, x = case.build(), case.x
     turn, shift = torch.as_tensor(rotation(seed)), torch.tensor([0.3, -2.0, 1.0])
     for name in INTERNAL:
-        force = force_of(name, level, potential=potential)
+        force = force_of(name, level)
         energy, f = evaluate(force, x)
         size = f.abs().sum() + 1e-30
         assert f.sum(dim=0).abs().max() < 1e-12 * size
@@ -131,17 +130,16 @@ def test_internal_forces_balance_and_turn_with_the_mesh(case: Case, potential: s
         assert (turned - f @ turn.T).abs().max() < 1e-9 * size
 
 
-@pytest.mark.parametrize("potential", POTENTIALS)
 @settings(max_examples=10)
 @given(case=cases())
-def test_scaling_lengths_and_stiffness(potential: str, case: Case):
+def test_scaling_lengths_and_stiffness(case: Case):
     """Energies scale as Y length^2, D, density length^3, guide length^4 and tether density length^4."""
     level, x = case.build(), case.x
     larger = case.build(scale=7.0)
     powers = {"stretch": 2, "membrane": 2, "bending": 0, "gravity": 3, "guide": 4, "tether": 4}
     for name, power in powers.items():
-        energy, f = evaluate(force_of(name, level, potential=potential), x)
-        scaled, g = evaluate(force_of(name, larger, potential=potential, scale=3.0), 7.0 * x)
+        energy, f = evaluate(force_of(name, level), x)
+        scaled, g = evaluate(force_of(name, larger, scale=3.0), 7.0 * x)
         assert scaled == pytest.approx(3.0 * 7.0**power * energy, rel=1e-9, abs=1e-15)
         assert apart(g, 3.0 * 7.0 ** (power - 1) * f) < 1e-9 or not bool(f.any())
 

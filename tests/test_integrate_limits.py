@@ -8,7 +8,8 @@ import scipy.sparse as sp
 import torch
 from cloth import Watched
 
-from physgraph_usd.solver.integrate.base import System
+from physgraph_usd.lab.methods.lbfgs import Lbfgs
+from physgraph_usd.solver.integrate.base import Integrator, System
 from physgraph_usd.solver.integrate.metric import Metric
 from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton
 from physgraph_usd.solver.integrate.solve import Budget, solve_level
@@ -36,9 +37,9 @@ def near_the_saddle() -> torch.Tensor:
     return torch.as_tensor(np.random.default_rng(0).uniform(0.05, 0.2, (COUNT, 3)))
 
 
-@pytest.mark.parametrize("use_metric", [True, False])
-def test_secants_of_negative_curvature_are_not_kept(use_metric: bool):
-    problem, method = system(), QuasiNewton(use_metric=use_metric)
+@pytest.mark.parametrize("method", [QuasiNewton(), Lbfgs()], ids=["quasi-newton", "lbfgs"])
+def test_secants_of_negative_curvature_are_not_kept(method: Integrator):
+    problem = system()
     carry = method.start(problem, near_the_saddle())
     after = method.step(problem, carry)
     moved, yielded = after.x - carry.x, carry.force - after.force

@@ -19,17 +19,24 @@ from sheets import rotation
 
 from physgraph_usd.cli import main
 from physgraph_usd.errors import WeightsError
+from physgraph_usd.lab.methods import METHODS, paper_network
+from physgraph_usd.lab.methods.paper_network import PaperConfig
 from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.solver.fabric import Fabric
 from physgraph_usd.solver.frame.group import Group
-from physgraph_usd.solver.integrate import METHODS, paper_network
 from physgraph_usd.solver.integrate.base import Carry, Integrator, System
 from physgraph_usd.solver.integrate.fused import seeing
-from physgraph_usd.solver.integrate.learned import LONGEST, LearnedMetric, integrator_of, limited
+from physgraph_usd.solver.integrate.learned import LONGEST, LearnedMetric, limited
 from physgraph_usd.solver.integrate.network import VECTORS, Physgraph, PhysgraphConfig, pairs_of
-from physgraph_usd.solver.integrate.paper_network import PaperConfig
 from physgraph_usd.solver.integrate.solve import Budget, solve_level
-from physgraph_usd.solver.integrate.weights import FOLDER, load_network, make_network, random_network, save_network
+from physgraph_usd.solver.integrate.weights import (
+    KINDS,
+    integrator_of,
+    load_network,
+    make_network,
+    random_network,
+    save_network,
+)
 from physgraph_usd.solver.level import refine_garments
 from physgraph_usd.solver.scene import GarmentFrame
 
@@ -315,9 +322,7 @@ def test_s37_weights_of_the_other_kind_are_refused(tmp_path: Path):
 
 @pytest.mark.parametrize("kind", ["physgraph", "physgraph-paper"])
 def test_shipped_weights_solve_and_have_a_card(kind: str):
-    file = FOLDER / f"{kind}.safetensors"
-    if not file.exists():
-        pytest.skip(f"no weights of {kind} ship")
+    file = KINDS[kind].file
     card = json.loads(file.with_suffix(".json").read_text())
     with safe_open(str(file), framework="pt") as opened:
         assert opened.metadata()["sha256"] == card["sha256"]
@@ -351,8 +356,8 @@ def test_a_user_brings_weights_of_their_own(tmp_path: Path):
         assert points["own"]
         assert points["own"] != points["shipped"]
     for options, word in (
-        (["--integrator", "newton", "--weights", str(own)], "has no weights"),
-        (["--integrator", "physgraph-paper", "--weights", str(own)], "not of 'physgraph-paper'"),
+        (["--integrator", "quasi-newton", "--weights", str(own)], "has no weights"),
+        (["--integrator", "physgraph", "--weights", str(KINDS["physgraph-paper"].file)], "not of 'physgraph'"),
         (["--integrator", "physgraph", "--weights", str(tmp_path / "none")], "no weights at"),
     ):
         result = CliRunner().invoke(main, ["refine", str(stage), "-o", str(tmp_path / "x.usda"), *options])

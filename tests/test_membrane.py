@@ -36,7 +36,6 @@ def pair() -> Level:
     return build_levels(garments, refine_garments(garments, [1, 1]), dtype=torch.float64)[-1]
 
 
-@pytest.mark.parametrize("potential", ["continuum", "paper"])
 @pytest.mark.parametrize(
     ("fabrics", "kinds"),
     [
@@ -47,16 +46,14 @@ def pair() -> Level:
         ((Fabric(30.0, shear=0.0), SPRINGS), (Stretch, Membrane)),
     ],
 )
-def test_each_garment_has_the_term_its_fabric_asks_for(
-    fabrics: tuple[Fabric, Fabric], kinds: tuple[type, ...], potential: str
-):
+def test_each_garment_has_the_term_its_fabric_asks_for(fabrics: tuple[Fabric, Fabric], kinds: tuple[type, ...]):
     level = pair()
     x = crumple(level.rest.numpy(), 0.005, 1)
-    terms = in_plane_terms(level, fabrics, potential=potential)
+    terms = in_plane_terms(level, fabrics)
     assert tuple(type(term) for term in terms) == kinds
     found = sum((evaluate(term, x)[1] for term in terms), torch.zeros_like(x))
     for span, fabric in zip(level.spans, fabrics, strict=True):
-        alone = in_plane_terms(level, (fabric, fabric), potential=potential)
+        alone = in_plane_terms(level, (fabric, fabric))
         assert len(alone) == 1
         assert torch.allclose(found[span], evaluate(alone[0], x)[1][span], rtol=1e-12, atol=1e-15)
 

@@ -36,7 +36,7 @@ ALLOWED = {
     # Functions of topology or of materials.
     "contact/cloth.py ClothContact.mesh: _meshes": "of a level and what is sewn there",
     "contact/measure.py _Cloth.of: _known": "of a level's triangles",
-    "frame/group.py Group.forces_for: _forces": "of the potential and the materials; of the last ones alone",
+    "frame/group.py Group.forces_for: _forces": "of the materials; of the last ones alone",
     "frame/group.py Group._built: _integrators": "of the method",
     "frame/scene_frame.py SceneCloth.group: _groups": "one a set of garments solved together",
     "frame/level_forces.py LevelForces.lasting_system: _lasting": "of the materials, and aimed anew in each frame",

@@ -16,7 +16,7 @@ from benchmarks.convergence import from_least
 from benchmarks.learned import FRONT, SCHEDULES, Runs, measured
 from physgraph_usd.lab.chart.problem import ALONE, Problem
 from physgraph_usd.lab.chart.reference import Reference, find_reference
-from physgraph_usd.solver.integrate import METHODS
+from physgraph_usd.lab.methods import METHODS
 from physgraph_usd.solver.scene import Frame, Scene
 
 

@@ -14,10 +14,9 @@ from physgraph_usd.lab.train.loop import TrainConfig, Trainer
 from physgraph_usd.lab.train.patches import PatchConfig
 from physgraph_usd.lab.train.rounds import Round, RoundConfig, make_rounds, system_of
 from physgraph_usd.solver.contact.metric import HeldMetric
-from physgraph_usd.solver.integrate.learned import integrator_of
 from physgraph_usd.solver.integrate.network import PhysgraphConfig
 from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton
-from physgraph_usd.solver.integrate.weights import random_network, shipped_network
+from physgraph_usd.solver.integrate.weights import integrator_of, random_network, shipped_network
 
 FEW = RoundConfig(scenes=3, reference_steps=15, most_vertices=1)
 

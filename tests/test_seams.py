@@ -126,7 +126,7 @@ class TestSeam:
 class TestForces:
     def sewn(self) -> tuple[SewnForces, ForceModule, Seam, torch.Tensor]:
         level, seam, base = two_halves()
-        apart = ForceModule(elastic_terms(level, [SOFT], potential="continuum"))
+        apart = ForceModule(elastic_terms(level, [SOFT]))
         return SewnForces(apart, seam), apart, seam, base + 2e-3 * noise(base)
 
     def test_the_force_is_minus_the_gradient(self):

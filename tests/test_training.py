@@ -14,6 +14,7 @@ from click.testing import CliRunner, Result
 
 from physgraph_usd.cli import main
 from physgraph_usd.errors import UsageError
+from physgraph_usd.lab.methods.paper_network import PaperConfig
 from physgraph_usd.lab.train import loop, record
 from physgraph_usd.lab.train.bundle import Bundle, JointSystem, Twin, deal, detached, unrolled
 from physgraph_usd.lab.train.held_out import nested_gap
@@ -22,10 +23,8 @@ from physgraph_usd.lab.train.patches import Patch, PatchConfig, describe, make_p
 from physgraph_usd.solver.forces.base import ForceModule
 from physgraph_usd.solver.forces.contact import Contact
 from physgraph_usd.solver.integrate.base import Carry, System
-from physgraph_usd.solver.integrate.learned import integrator_of
 from physgraph_usd.solver.integrate.network import PhysgraphConfig
-from physgraph_usd.solver.integrate.paper_network import PaperConfig
-from physgraph_usd.solver.integrate.weights import load_network, random_network
+from physgraph_usd.solver.integrate.weights import integrator_of, load_network, random_network
 
 FEW = PatchConfig(count=3, levels=(1, 1), edges=(5, 6), reference_steps=20)
 TINY = """

@@ -89,10 +89,9 @@ def _say_who_integrated(report: RefineReport, entries: Sequence[dict[str, Any]])
         for level in entry.get("levels", ()):
             movers.update(level["movers"])
     asked = str(report.options["integrator"])
-    name = next((each for each in LEARNED if movers[each]), None)
-    if name:
-        part = movers[name] / movers.total()
-        report.modelled["network"] = f"{name} made {part:.0%} of the steps (--integrator {asked})"
+    if movers[LEARNED]:
+        part = movers[LEARNED] / movers.total()
+        report.modelled["network"] = f"{LEARNED} made {part:.0%} of the steps (--integrator {asked})"
     else:
         report.left_out["network"] = f"--integrator {asked}"
 

@@ -22,10 +22,8 @@ if TYPE_CHECKING:
 
 AUTO = "auto"
 """The integrator of the shipped network; always known."""
-INTEGRATORS = (
-    AUTO, "quasi-newton", "quasi-newton-flat", "lbfgs", "adam", "gd", "newton", "physgraph", "physgraph-paper",
-)  # fmt: skip
-"""Names of `integrate.METHODS`, which imports torch."""
+INTEGRATORS = (AUTO, "quasi-newton", "physgraph")
+"""Names of the solver's own methods in `integrate.METHODS`, which imports torch."""
 REPORT_NAME, PAGE_NAME = "report.json", "report.html"
 """Names of the report and its page in a folder of their own."""
 LIST = "; repeatable"
@@ -109,7 +107,6 @@ class RefineOptions:
     )
     mode: str = _layer("over", "Refine in place, or beside the coarse mesh.", choices=("over", "sibling"))
     temporal: str = _solver("tether", "How a frame uses the last one.", choices=("tether", "warm", "off"))
-    potential: str = _solver("continuum", "Which form of the energy.", choices=("continuum", "paper"))
     contact: str = _solver("quadratic", "How bodies push the cloth.", choices=("quadratic", "off"))
     self_contact: str = _solver("auto", "How cloth pushes cloth.", choices=("auto", "off"))
     workers: int = _solver(
@@ -204,7 +201,6 @@ class RefineOptions:
             budget_ms=self.budget_ms,
             frame_limit=self.frame_limit,
             temporal=self.temporal,
-            potential=self.potential,
             contact=self.contact_settings(),
         )
 

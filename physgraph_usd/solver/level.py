@@ -65,7 +65,6 @@ class Level:
             shape (M, 4); zero where a triangle has no area.
         hinges: Edge i-j and the corners opposite to it: k and k' of one face, l and l' of the other, shape (H, 6).
         hinge_shape: Bending stiffness of a hinge over the fabric's, as `rest_shape` gives it, shape (H,).
-        hinge_area: A third of the two triangles' areas [m^2], shape (H,).
         rest_angle: [rad], shape (H,).
         vertex_area: A third of the areas of the incident elastic triangles [m^2], shape (V,).
         spacing: Mean rest length of the incident springs [m], shape (V,).
@@ -96,7 +95,6 @@ class Level:
     membrane_inverse: Float[Tensor, "membrane 4"]
     hinges: Int[Tensor, "hinges 6"]
     hinge_shape: Float[Tensor, " hinges"]
-    hinge_area: Float[Tensor, " hinges"]
     rest_angle: Float[Tensor, " hinges"]
     vertex_area: Float[Tensor, " vertices"]
     spacing: Float[Tensor, " vertices"]
@@ -481,7 +479,7 @@ def rest_shape(
         size: Lengths of the cloth over those of the rest positions, shape (V,).
 
     Returns:
-        spring_length, spring_area, membrane_area, hinge_shape, hinge_area, rest_angle, vertex_area, spacing.
+        spring_length, spring_area, membrane_area, hinge_shape, rest_angle, vertex_area, spacing.
     """
     count = len(rest)
     area = share * triangle_areas(rest, membrane) * size[membrane].mean(axis=1) ** 2
@@ -501,7 +499,6 @@ def rest_shape(
         "spring_area": spring_area,
         "membrane_area": area,
         "hinge_shape": np.nan_to_num(hinge_shape, nan=0.0),
-        "hinge_area": (first + second) / 3.0,
         "rest_angle": np.where(bent, angle, 0.0),
         "vertex_area": np.bincount(membrane.ravel(), np.repeat(area, 3) / 3.0, count),
         "spacing": np.where(spacing > 0, spacing, fallback),

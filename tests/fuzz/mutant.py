@@ -128,5 +128,5 @@ def _options(draft: Draft) -> dict[str, Any]:
     if draft.chance(0.1):
         options["temporal"] = draft.pick(["warm", "off"])
     if draft.chance(0.1):
-        options["integrator"] = draft.pick(["adam", "lbfgs", "gd", "quasi-newton-flat"])
+        options["integrator"] = draft.pick(["quasi-newton", "physgraph"])
     return options

@@ -29,7 +29,7 @@ from report_solver import Result
 import physgraph_usd
 from benchmarks.rows import code_of
 from physgraph_usd.errors import PhysGraphError
-from physgraph_usd.solver.integrate import METHODS
+from physgraph_usd.lab.methods import METHODS
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "notes" / "stability.md"
 

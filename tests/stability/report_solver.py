@@ -17,10 +17,10 @@ from test_meshes import ALMOST_NOTHING, CORNERS, FAULTS, faulty, hung
 from test_starts import ball, squeezed
 
 from physgraph_usd.errors import SolveError
+from physgraph_usd.lab.methods import METHODS
 from physgraph_usd.solver.fabric import Fabric
 from physgraph_usd.solver.frame.solve import solve_frame
 from physgraph_usd.solver.frame.values import FrameInput
-from physgraph_usd.solver.integrate import method_named
 from physgraph_usd.solver.integrate.base import Carry
 from physgraph_usd.solver.integrate.guard import Guard
 from physgraph_usd.solver.integrate.solve import Budget, solve_level
@@ -84,7 +84,7 @@ def s3_needles(method: str) -> Result:
         [GarmentFrame(points * [0.95, 1.0, 1.0] + 0.01 * np.sin(20 * points), FABRIC, GUIDE)]
     )
     seen: list[Carry] = []
-    solve_level(systems[-1], Watched(method_named(method).build(), seen.append), coarse, level=0, budget=Budget(30))
+    solve_level(systems[-1], Watched(METHODS[method].build(), seen.append), coarse, level=0, budget=Budget(30))
     moves = [float((b.x - a.x).norm(dim=1).max()) for a, b in pairwise(seen)]
     finite = all(bool(carry.x.isfinite().all()) for carry in seen)
     return under(max(moves, default=0.0) / 0.1 if finite else math.nan, 1.0, " edges")
@@ -209,7 +209,7 @@ def s13_saddle(method: str) -> Result:
 def s15_crumpled(method: str) -> Result:
     """How many times the energy of a crumpled ball has fallen after 200 steps."""
     system, x = ball()
-    _, report = solve_level(system, Guard(method_named(method).build()), x, level=0, budget=Budget(200))
+    _, report = solve_level(system, Guard(METHODS[method].build()), x, level=0, budget=Budget(200))
     factor = report.energy_before / report.energy_after
     return Result(factor >= 10.0, f"/ {factor:.3g}")
 
@@ -290,7 +290,7 @@ def s37_guard(method: str) -> Result:
     )
     seen: list[Carry] = []
     base = group_of(mesh, rest, level=1, dtype=torch.float32).levels[-1].base.apply(coarse)
-    guarded = Guard(method_named(method).build())
+    guarded = Guard(METHODS[method].build())
     solve_level(systems[-1], Watched(guarded, seen.append), base, level=0, budget=Budget(25))
     rises = sum(after.energy > before.energy for before, after in pairwise(seen))
     return Result(rises == 0, f"{rises} rises")

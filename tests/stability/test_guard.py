@@ -119,7 +119,7 @@ def test_s37_a_good_direction_that_overshoots_is_halved_or_quartered():
 
 def test_s37_at_the_minimum_it_stays():
     system, x = problem()
-    from physgraph_usd.solver.integrate.newton import Newton
+    from physgraph_usd.lab.methods.newton import Newton
 
     x, _ = solve_level(system, Newton(), x, level=0, budget=Budget(60, 1e-10))
     carries = descent(system, x, PROPOSALS["random"], steps=5)

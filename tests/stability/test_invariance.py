@@ -11,8 +11,8 @@ from cloth import DOWN, FABRIC, base_of, frame_of, refiner_of, rms, sheet, solve
 from meshes import grid, mesh_of
 from sheets import garment_of, rotation
 
+from physgraph_usd.lab.methods import METHODS
 from physgraph_usd.solver.fabric import Fabric
-from physgraph_usd.solver.integrate import METHODS
 from physgraph_usd.solver.mesh.topology import PolygonMesh
 
 EDGE = 0.05

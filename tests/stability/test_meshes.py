@@ -10,7 +10,7 @@ from meshes import mesh_of
 from sheets import garment_of
 
 from physgraph_usd.errors import GarmentError
-from physgraph_usd.solver.integrate import METHODS
+from physgraph_usd.lab.methods import METHODS
 from physgraph_usd.solver.mesh.defects import defects
 from physgraph_usd.solver.mesh.topology import PolygonMesh
 

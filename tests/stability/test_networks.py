@@ -9,15 +9,14 @@ import pytest
 import torch
 from cloth import FABRIC, GUIDE, Watched, finest_system, group_of, sheet, wave
 
+from physgraph_usd.lab.methods.paper_network import PaperConfig
 from physgraph_usd.solver.fabric import Fabric
 from physgraph_usd.solver.integrate.base import Carry, System
 from physgraph_usd.solver.integrate.guard import Guard
-from physgraph_usd.solver.integrate.learned import integrator_of
 from physgraph_usd.solver.integrate.network import VECTORS, PhysgraphConfig
-from physgraph_usd.solver.integrate.paper_network import PaperConfig
 from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton
 from physgraph_usd.solver.integrate.solve import Budget, solve_level
-from physgraph_usd.solver.integrate.weights import FOLDER, load_network, random_network
+from physgraph_usd.solver.integrate.weights import KINDS, integrator_of, random_network, shipped_network
 from physgraph_usd.solver.scene import GarmentFrame
 
 RANDOM = {
@@ -26,11 +25,7 @@ RANDOM = {
     "physgraph-paper": PaperConfig(latent=16, rounds=3),
     "raw features": PaperConfig(latent=16, rounds=2, features="paper"),
 }
-SHIPPED = [
-    pytest.param(name, marks=pytest.mark.slow) if name == "physgraph-paper" else name
-    for name in ("physgraph", "physgraph-paper")
-    if (FOLDER / f"{name}.safetensors").exists()
-]
+SHIPPED = [pytest.param(name, marks=pytest.mark.slow) if name == "physgraph-paper" else name for name in KINDS]
 
 
 def problem(
@@ -68,7 +63,7 @@ def test_s37_random_weights_never_end_worse_than_the_input(name: str, scale: flo
 
 
 def shipped(name: str) -> Guard:
-    return Guard(integrator_of(load_network(FOLDER / f"{name}.safetensors", kind=name)))
+    return Guard(integrator_of(shipped_network(name)))
 
 
 def polished_gap(integrator: Guard, system: System, x: torch.Tensor, *, steps: int = 15, polish: int = 25) -> float:
@@ -111,7 +106,7 @@ def test_s33_rounding_does_not_decide_what_a_step_is(size: tuple[int, int]):
 
     Quasi-Newton's differ 3 to 300 times as much then; where features jumped it was some hundred thousand times.
     """
-    integrator = Guard(integrator_of(load_network(FOLDER / "physgraph.safetensors", kind="physgraph")))
+    integrator = Guard(integrator_of(shipped_network("physgraph")))
     mesh, rest = sheet(*size)
     system, x = finest_system(group_of(mesh, rest, level=2), wave(rest))
     noise = 1e-9 * float(system.spacing.mean()) * torch.randn(x.shape, generator=torch.Generator().manual_seed(0))

@@ -11,8 +11,8 @@ import torch
 from cloth import Answer, Watched, finest_system, frame_of, group_of, refiner_of, sheet, solved, total, wave
 from sheets import garment_of, rotation
 
+from physgraph_usd.lab.methods import METHODS
 from physgraph_usd.solver.fabric import Fabric
-from physgraph_usd.solver.integrate import method_named
 from physgraph_usd.solver.integrate.base import Carry
 from physgraph_usd.solver.integrate.guard import Guard
 from physgraph_usd.solver.integrate.solve import Budget, solve_level
@@ -93,7 +93,7 @@ def ball(level: int = 1, dtype: torch.dtype = torch.float64):
 def test_s15_a_crumpled_ball_uncrumples(name: str, steps: int, dtype: torch.dtype):
     system, x = ball(dtype=dtype)
     seen: list[Carry] = []
-    integrator = Guard(method_named(name).build())
+    integrator = Guard(METHODS[name].build())
     solve_level(system, Watched(integrator, seen.append), x, level=0, budget=Budget(steps))
     assert all(bool(carry.x.isfinite().all()) for carry in seen)
     assert all(after.energy <= before.energy for before, after in pairwise(seen))
@@ -103,7 +103,7 @@ def test_s15_a_crumpled_ball_uncrumples(name: str, steps: int, dtype: torch.dtyp
 @pytest.mark.parametrize("name", ["adam", "gd", "quasi-newton-flat"])
 def test_s15_no_method_is_thrown(name: str):
     system, x = ball(dtype=torch.float32)
-    out, report = solve_level(system, Guard(method_named(name).build()), x, level=0, budget=Budget(200))
+    out, report = solve_level(system, Guard(METHODS[name].build()), x, level=0, budget=Budget(200))
     assert bool(out.isfinite().all())
     assert report.energy_after < report.energy_before
 

@@ -10,8 +10,8 @@ import numpy as np
 from PIL import Image
 
 from ...shot.page.drawing import Surface, draw, fit_view
-from ...solver.integrate import METHODS
 from ...solver.scene import Frame
+from ..methods import METHODS
 from .measure import find_curves
 from .problem import COLD, Problem
 from .table import GAPS, Chart, Point

@@ -15,8 +15,9 @@ from typing import Any
 import numpy as np
 
 from ...errors import SolveError, UsageError, counted
-from ...solver.integrate import METHODS, Method
+from ...solver.integrate import Method
 from ...solver.scene import Frame
+from ..methods import METHODS
 from .journal import Journal
 from .options import Clock, Plan
 from .problem import COLD, Problem

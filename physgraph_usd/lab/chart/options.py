@@ -9,14 +9,14 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from ...errors import UsageError
-from ...solver.integrate import METHODS
+from ..methods import METHODS, PAPER
 
 SHORT_MINUTES = 3.5
 """Time that the short form plans with: on a busy machine a plan takes a third longer, and pictures are drawn."""
 LONGEST_SHORT = 15.0
 """Minutes up to which a chart has the short form's size."""
 CLOCKS = ("wall", "cpu")
-SLOW = ("physgraph-paper",)
+SLOW = (PAPER,)
 """Integrators of which one step takes longer on the CPU than a frame of any other: 4 s at 26,000 vertices."""
 FOR_REFERENCE, FOR_CURVES, FOR_WARM, FOR_TERMS = 0.25, 0.5, 0.1, 0.15
 """Fractions of the time."""
@@ -79,7 +79,7 @@ class ChartOptions:
         rest_frame: Time code whose points are the rest shape, "auto" for one fitted to the shot, or None.
         device: "cpu" or "cuda".
         clock: "wall", or "cpu" to count one core's own time, which other programs do not change.
-        methods: Names of `integrate.METHODS` to measure; empty takes all, on the CPU's short form but `SLOW`.
+        methods: Names of `METHODS` to measure; empty takes all, on the CPU's short form but `SLOW`.
         peers: "NAME=PYTHON" for each solver outside to measure; see `peers.run.PEERS`.
         count: Frames to measure, or None for the size's own number.
         short: Take the short size.

@@ -20,8 +20,8 @@ import numpy as np
 from ...errors import counted
 from ...solver.frame.settings import SolveSettings
 from ...solver.frame.values import State
-from ...solver.integrate import METHODS
 from ...solver.scene import Frame
+from ..methods import METHODS
 from .problem import COLD, Problem
 
 STARTS = (

@@ -11,8 +11,8 @@ from dataclasses import asdict, replace
 from typing import Any
 
 from ...errors import SolveError, counted
-from ...solver.integrate import METHODS
 from ...solver.scene import Frame
+from ..methods import METHODS
 from .journal import Journal
 from .measure import DEFAULT as AUTO
 from .options import Clock

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ...errors import counted
+from ...shot.options import INTEGRATORS
 from .measure import DEFAULT, SMOOTH, UPSAMPLED
 from .table import TOLERANCE, Chart, Point
 
@@ -107,7 +108,7 @@ def advice(chart: Chart) -> str:
     if place["on_front"]:
         return f"Take refine's default, which you have without asking: it comes to {left}; nothing gets as low sooner."
     known = {point.method: point for point in chart.points}[place["fastest"]]
-    asked = f" (--integrator {known.integrator})" if known.method == known.integrator else ""
+    asked = f" (--integrator {known.integrator})" if known.method == known.integrator in INTEGRATORS else ""
     return (
         f"Take {label(chart, place['fastest'])}{asked} for single frames like these: refine's default comes to {left}, "
         f"{place['ratio']:.1f} times the {place['fastest_ms']:.0f} ms in which that gets as low."

@@ -18,10 +18,9 @@ from torch import Tensor
 
 from ...errors import UsageError
 from ...shot.plain_json import to_json
-from ...solver.integrate.learned import integrator_of
 from ...solver.integrate.network import Physgraph, PhysgraphConfig
-from ...solver.integrate.paper_network import PaperConfig, PaperNetwork
-from ...solver.integrate.weights import FOLDER, load_network, make_network
+from ...solver.integrate.weights import KINDS, integrator_of, load_network, make_network
+from ..methods.paper_network import PaperConfig, PaperNetwork
 from .bundle import Bundle, RoundBundle, Twin, deal, deal_rounds, detached, unrolled
 from .held_out import HeldOut
 from .patches import Patch, PatchConfig, make_patches
@@ -292,7 +291,7 @@ def _begun(config: TrainConfig) -> Physgraph | PaperNetwork:
     network = make_network(config.network)
     if not config.start:
         return network
-    file = FOLDER / f"{config.kind}.safetensors" if config.start == "shipped" else Path(config.start)
+    file = KINDS[config.kind].file if config.start == "shipped" else Path(config.start)
     known, own = load_network(file, kind=config.kind).state_dict(), network.state_dict()
     for name, value in known.items():
         if name.removesuffix(".weight").removesuffix(".bias").split(".")[0] in ("hidden", "decode", "messages"):

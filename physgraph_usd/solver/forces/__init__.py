@@ -22,36 +22,34 @@ from .membrane import in_plane_terms
 
 
 def elastic_terms(
-    level: Level, fabrics: Sequence[Fabric], *, potential: str, raised: Sequence[bool] | None = None
+    level: Level, fabrics: Sequence[Fabric], *, raised: Sequence[bool] | None = None
 ) -> tuple[Force, ...]:
     """The terms of the cloth itself.
 
     Args:
         level: The level.
         fabrics: Fabric of each garment.
-        potential: "continuum" or "paper".
         raised: For each garment, whether its bending stiffness is raised where edges are too long for its folds; none
             is when None.
     """
     weft = None
     if any(fabric.weft_bend is not None for fabric in fabrics):
         weft = [fabric.bend if fabric.weft_bend is None else fabric.weft_bend for fabric in fabrics]
-    least = None if raised is None or potential == "paper" else _carried(level, fabrics, raised)
+    least = None if raised is None else _carried(level, fabrics, raised)
     bends = _each(level, [fabric.bend for fabric in fabrics])
-    bending = Bending(level, bends, weft=weft, least=least, potential=potential)
-    return (*in_plane_terms(level, fabrics, potential=potential), bending)
+    bending = Bending(level, bends, weft=weft, least=least)
+    return (*in_plane_terms(level, fabrics), bending)
 
 
-def body_terms(level: Level, fabrics: Sequence[Fabric], *, gravity: np.ndarray, potential: str) -> tuple[Force, ...]:
+def body_terms(level: Level, fabrics: Sequence[Fabric], *, gravity: np.ndarray) -> tuple[Force, ...]:
     """The terms that act on the cloth's mass.
 
     Args:
         level: The level.
         fabrics: Fabric of each garment.
         gravity: [m/s^2], shape (3,).
-        potential: "continuum" or "paper".
     """
-    return (Gravity(level, _each(level, [fabric.density for fabric in fabrics]), gravity, potential=potential),)
+    return (Gravity(level, _each(level, [fabric.density for fabric in fabrics]), gravity),)
 
 
 def _carried(level: Level, fabrics: Sequence[Fabric], raised: Sequence[bool]) -> Tensor:

@@ -1,7 +1,6 @@
 """Bending: dihedral angles at the edges.
 
-    E = 1/2 sum_h w_h (theta_h - theta0_h)^2,   w_h = D s_h         (potential="continuum")
-                                                w_h = k_b a_h / A   (potential="paper")
+    E = 1/2 sum_h w_h (theta_h - theta0_h)^2,   w_h = D s_h
 
 | symbol | here | meaning |
 |---|---|---|
@@ -9,7 +8,6 @@
 | theta | atan2(n1 x n2 . e, n1 . n2) | signed angle between the triangles' normals [rad] |
 | s_h | ``level.hinge_shape`` | l0^2 / (A1 + A2) at edges, 2 A / l0^2 at a quad's diagonal (`level.rest_shape`) |
 | | `grain.bending_factor` | where warp and weft differ: D by the direction in which a hinge bends |
-| k_b | 3.46 D | the paper's constant [N m] for the same D on an equilateral lattice (docs/fabrics.md) |
 
 At an edge of a quad the normal is that of the triangle from the edge to the middle of the opposite side, the mean over
 both splits of the quad. theta - theta0 is taken modulo a full turn into [-pi, pi], so the energy is continuous wherever
@@ -38,12 +36,9 @@ from ..mesh.kernels import FUSED
 from ..mesh.stencil import add_at
 from ..mesh.threads import argument
 from .base import Elements, element_overloads
-from .stretch import garment_area
 
 wp.set_module_options(FUSED)
 
-PAPER_HINGE = 3.46
-"""The paper's k_b over D: both in N m."""
 TURN = 2.0 * math.pi
 """A full turn [rad]."""
 PER_TURN = 1.0 / TURN
@@ -197,7 +192,6 @@ class Bending:
         *,
         weft: Sequence[float] | None = None,
         least: Float[Tensor, " hinges"] | None = None,
-        potential: str = "continuum",
     ) -> None:
         """Weigh the hinges of a level.
 
@@ -206,7 +200,6 @@ class Bending:
             rigidity: Bending stiffness D of each garment [N m]; along the warp where the weft's differs.
             weft: Bending stiffness along the weft [N m]; None where it is the warp's, or no grain is known.
             least: Bending stiffness that a hinge has at least [N m]; None where that is its own.
-            potential: "continuum" or "paper".
         """
         owner = level.hinge_garment.long()
         scaled = rigidity.to(level.rest)[owner] * level.bend_scale
@@ -214,10 +207,7 @@ class Bending:
             scaled = scaled * bending_factor(level.grain.hinge, rigidity.tolist(), weft, owner)
         if least is not None:
             scaled = torch.maximum(scaled, least)
-        if potential == "paper":
-            self.weight = PAPER_HINGE * scaled * level.hinge_area / garment_area(level)[owner]
-        else:
-            self.weight = scaled * level.hinge_shape
+        self.weight = scaled * level.hinge_shape
         self._level, self.rest_angle = level, level.rest_angle
         narrow = (level.hinges[:, 2] == level.hinges[:, 3]) & (level.hinges[:, 4] == level.hinges[:, 5])
         self._kinds = [

@@ -1,7 +1,6 @@
 """Gravity.
 
-    E = - sum_v m_v g . x_v,   m_v = density a_v         (potential="continuum")
-                               m_v = density a_v^2 / A   (potential="paper")
+    E = - sum_v m_v g . x_v,   m_v = density a_v
 
 The solver recentres each frame on the mean of its coarse positions, so the energy is relative to the input's mean
 height.
@@ -16,7 +15,6 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..level import Level
-from .stretch import garment_area
 
 
 class Gravity:
@@ -34,8 +32,6 @@ class Gravity:
         level: Level,
         density: Float[Tensor, " garments"],
         gravity: np.ndarray,
-        *,
-        potential: str = "continuum",
     ) -> None:
         """Weigh the vertices of a level.
 
@@ -43,14 +39,11 @@ class Gravity:
             level: The level.
             density: Areal density of each garment [kg/m^2].
             gravity: Acceleration [m/s^2], shape (3,).
-            potential: "continuum" or "paper".
         """
         self._owner = level.vertex_garment
         owner = self._owner.long()
         self.density = density.to(level.rest)
         mass = self.density[owner] * level.vertex_area
-        if potential == "paper":
-            mass = mass * level.vertex_area / garment_area(level)[owner]
         self.weight = mass.unsqueeze(1) * torch.as_tensor(gravity, dtype=level.dtype, device=level.device)
 
     def add_force(self, x: Float[Tensor, "vertices 3"], force: Float[Tensor, "vertices 3"]) -> Float[Tensor, ""]:

@@ -68,8 +68,6 @@ class Guide:
         level: Level,
         guide_map: GuideMap,
         stiffness: Float[Tensor, " coarse"],
-        *,
-        relative_weight: float = 1.0,
     ) -> None:
         """Weigh the ties of a level; `retarget` gives them coarse positions.
 
@@ -77,10 +75,9 @@ class Guide:
             level: The level.
             guide_map: Its averaging operator.
             stiffness: k_g s_c at each coarse vertex [N/m^3].
-            relative_weight: Multiplier of the whole term (the paper's potential is weighted by area twice).
         """
         self._map, self._level = guide_map, level
-        per_area = relative_weight * stiffness.double().cpu().numpy()
+        per_area = stiffness.double().cpu().numpy()
         pin = level.pin.double().cpu().numpy()
         soft = np.where((pin > 0) & (pin < 1.0 - PIN_MARGIN), SOFT_PIN * pin / np.maximum(1.0 - pin, PIN_MARGIN), 0.0)
         self._coarse_weight = per_area * guide_map.coarse_area

@@ -21,8 +21,7 @@ triangles that are stretched threefold: there the cloth would be stiffer than it
 
 With G = 0.375 Y the sheet is isotropic and equals the edge springs of an equilateral mesh for small strains. Otherwise
 the material's axes matter: `grain.axes` defines them for a triangle. Painted stretch scales multiply all
-constants. The paper has no membrane: with potential="paper" each triangle is weighted by 2 A_t / A, which is what the
-paper's springs are to the continuum's on an equilateral mesh.
+constants.
 
 There is no barrier against inversion: cloth buckles long before it matters.
 """
@@ -44,7 +43,7 @@ from ..level import Level
 from ..mesh.kernels import FUSED
 from ..mesh.stencil import add_at
 from .base import Elements, Force, element_overloads
-from .stretch import Stretch, garment_area
+from .stretch import Stretch
 
 wp.set_module_options(FUSED)
 
@@ -142,7 +141,6 @@ class Membrane:
         *,
         weft: Float[Tensor, " garments"] | None = None,
         limit: Float[Tensor, " garments"] | None = None,
-        potential: str = "continuum",
     ) -> None:
         """Weigh the triangles of a level.
 
@@ -152,12 +150,9 @@ class Membrane:
             shear: Shear stiffness of each garment [N/m]; zero for garments of edge springs.
             weft: 2D Young's modulus of each garment along the weft [N/m]; None where it is the warp's.
             limit: Strain from which each garment's cloth stiffens; None where none does.
-            potential: "continuum" or "paper".
         """
         owner = level.membrane_garment.long()
         weight = level.membrane_scale * level.membrane_area
-        if potential == "paper":
-            weight = weight * 2.0 * level.membrane_area / garment_area(level)[owner]
         # A triangle without area has no rest shape to strain from; a sliver is strained by the mesh, not by the cloth.
         weight = weight * level.membrane_inverse.any(dim=1) * sliver_weight(level)
         self.warp_stiffness, self.weft_stiffness = (
@@ -243,13 +238,12 @@ def shape_gradients(level: Level) -> Float[Tensor, "triangles 3 2"]:
     return torch.cat([-others.sum(dim=1, keepdim=True), others], dim=1)
 
 
-def in_plane_terms(level: Level, fabrics: Sequence[Fabric], *, potential: str = "continuum") -> tuple[Force, ...]:
+def in_plane_terms(level: Level, fabrics: Sequence[Fabric]) -> tuple[Force, ...]:
     """Edge springs for the garments whose fabric these can stand for, the membrane for the others.
 
     Args:
         level: The level.
         fabrics: Fabric of each garment.
-        potential: "continuum" or "paper".
 
     Returns:
         The terms that some garment needs; each is zero on the other's garments.
@@ -262,13 +256,13 @@ def in_plane_terms(level: Level, fabrics: Sequence[Fabric], *, potential: str = 
     youngs = each([fabric.stretch for fabric in fabrics])
     terms: list[Force] = []
     if not bool(woven.all()) or not fabrics:
-        terms.append(Stretch(level, torch.where(woven, 0.0, youngs), potential=potential))
+        terms.append(Stretch(level, torch.where(woven, 0.0, youngs)))
     if bool(woven.any()):
         weft = each([fabric.stretch if f is None else f for fabric in fabrics for f in (fabric.weft_stretch,)])
         shear = each([shear_stiffness(fabric) for fabric in fabrics])
         limit = each([NO_LIMIT if f.stretch_limit is None else f.stretch_limit for f in fabrics])
         youngs, weft, shear = (torch.where(woven, value, 0.0) for value in (youngs, weft, shear))
-        terms.append(Membrane(level, youngs, shear, weft=weft, limit=limit, potential=potential))
+        terms.append(Membrane(level, youngs, shear, weft=weft, limit=limit))
     return tuple(terms)
 
 

@@ -1,15 +1,12 @@
 """Stretch: springs along the edges of faces and both diagonals of quads.
 
-    E = 1/2 sum_e k_e (l_e - l0_e)^2,   k_e = 3 Y a_e / l0_e^2  (potential="continuum")
-                                        k_e = k_s a_e / A       (potential="paper")
+    E = 1/2 sum_e k_e (l_e - l0_e)^2,   k_e = 3 Y a_e / l0_e^2
 
 | symbol | here | meaning |
 |---|---|---|
 | Y | ``youngs`` | 2D Young's modulus [N/m] |
 | a_e | ``level.spring_area`` | a third of the adjacent triangles' areas [m^2], weighted so that quads are isotropic |
 | l0 | ``level.spring_length`` | rest length [m] |
-| k_s | 2.598 Y | the paper's spring constant [N/m] for the same Y on an equilateral lattice (docs/fabrics.md) |
-| A | total rest area of the garment [m^2] |
 
 Springs cannot express shear on its own: an isotropic sheet of them has nu = 1/3 and G = 0.375 Y.
 """
@@ -31,9 +28,6 @@ from ..mesh.stencil import add_at
 from .base import Elements, element_overloads
 
 wp.set_module_options(KERNELS)
-
-PAPER_SPRING = 2.598
-"""The paper's k_s over Y: both in N/m."""
 
 
 @wp.kernel
@@ -70,20 +64,15 @@ class Stretch:
 
     name = "stretch"
 
-    def __init__(self, level: Level, youngs: Float[Tensor, " garments"], *, potential: str = "continuum") -> None:
+    def __init__(self, level: Level, youngs: Float[Tensor, " garments"]) -> None:
         """Weigh the springs of a level.
 
         Args:
             level: The level.
             youngs: 2D Young's modulus of each garment [N/m].
-            potential: "continuum" or "paper".
         """
         modulus = youngs.to(level.rest)[level.spring_garment.long()] * level.spring_scale
-        if potential == "paper":
-            area = garment_area(level)[level.spring_garment.long()]
-            self.stiffness = PAPER_SPRING * modulus * level.spring_area / area
-        else:
-            self.stiffness = 3.0 * modulus * level.spring_area / level.spring_length**2
+        self.stiffness = 3.0 * modulus * level.spring_area / level.spring_length**2
         self._level = level
         self._elements = Elements(_KERNELS, level.springs, [self.stiffness, level.spring_length], level=level)
 
@@ -111,9 +100,3 @@ class Stretch:
         columns = np.concatenate([ends[:, 0], ends[:, 1], ends[:, 1], ends[:, 0]])
         count = self._level.vertex_count
         return sp.csr_matrix((np.concatenate([k, k, -k, -k]), (rows, columns)), shape=(count, count))
-
-
-def garment_area(level: Level) -> Float[Tensor, " garments"]:
-    """Rest area of each garment [m^2]."""
-    total = torch.zeros(len(level.spans), dtype=level.dtype, device=level.device)
-    return add_at(total, level.vertex_garment.long(), level.vertex_area)

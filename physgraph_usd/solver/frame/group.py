@@ -55,7 +55,7 @@ class Group:
     followers: Followers
     cloth: ClothContact
     seams: list[Seam | None]
-    # The lasting terms by potential and materials, of the last ones alone; and integrators with what they recorded.
+    # The lasting terms by materials, of the last ones alone; and integrators with what they recorded.
     _forces: dict[tuple[object, ...], list[LevelForces]] = field(default_factory=dict)
     _integrators: dict[Callable[[], Integrator], Integrator] = field(default_factory=dict)
 
@@ -108,10 +108,9 @@ class Group:
 
     def forces_for(self, frames: Sequence[GarmentFrame]) -> list[LevelForces]:
         """The lasting terms of each level, rebuilt with their metrics when a material changes."""
-        potential = self.settings.potential
-        key = (potential, *((frame.fabric, frame.guide) for frame in frames))
+        key = tuple((frame.fabric, frame.guide) for frame in frames)
         if key not in self._forces:
-            weights = {"frames": frames, "gravity": self.gravity, "potential": potential}
+            weights = {"frames": frames, "gravity": self.gravity}
             pairs = zip(self.levels, self.guide_maps, strict=True)
             made = [build_forces(level, guide_map, self.garments, **weights) for level, guide_map in pairs]
             self._forces.clear()

@@ -17,7 +17,6 @@ from ..forces import body_terms, elastic_terms
 from ..forces.base import Force, ForceModule
 from ..forces.bending import Bending
 from ..forces.guide import Guide, GuideMap
-from ..forces.stretch import PAPER_SPRING, garment_area
 from ..forces.tether import Tether
 from ..integrate.base import ForceField, Preconditioner, System
 from ..integrate.facets import facets
@@ -131,7 +130,6 @@ def build_forces(
     *,
     frames: Sequence[GarmentFrame],
     gravity: np.ndarray,
-    potential: str,
 ) -> LevelForces:
     """Weigh the terms of a level by the materials of a frame.
 
@@ -141,24 +139,20 @@ def build_forces(
         garments: The garments.
         frames: Their values at one time code.
         gravity: [m/s^2], shape (3,).
-        potential: "continuum" or "paper".
     """
     fabrics = [frame.fabric for frame in frames]
     level = level.eased(fabrics)
     stiffness = np.concatenate([frame.guide * g.guide_scale for frame, g in zip(frames, garments, strict=True)])
-    relative = 1.0
-    if potential == "paper":
-        relative = PAPER_SPRING / 3.0 * float(level.rest_length.square().mean() / garment_area(level).mean())
     terms = (
-        *elastic_terms(level, fabrics, potential=potential, raised=[each.raises_bending for each in garments]),
-        *body_terms(level, fabrics, gravity=gravity, potential=potential),
+        *elastic_terms(level, fabrics, raised=[each.raises_bending for each in garments]),
+        *body_terms(level, fabrics, gravity=gravity),
     )
-    guide = Guide(level, guide_map, torch.as_tensor(stiffness), relative_weight=relative)
+    guide = Guide(level, guide_map, torch.as_tensor(stiffness))
     matrix = on_edges(ForceModule((*terms, guide)).rest_matrix(), level.springs.cpu().numpy())
     metric = Metric(matrix, free=level.free, dtype=level.dtype)
     density = torch.tensor([fabric.density for fabric in fabrics], dtype=level.dtype, device=level.device)
     bends = any(fabric.bend > 0 for fabric in fabrics)
-    unresolved = potential != "paper" and _is_unresolved(level, garments, fabrics)
+    unresolved = _is_unresolved(level, garments, fabrics)
     return LevelForces(level, terms, guide, metric, density, bends, unresolved)
 
 

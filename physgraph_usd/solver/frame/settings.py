@@ -45,7 +45,6 @@ class SolveSettings:
         frame_limit: Seconds after which a frame stops where it stands; None for a multiple of what frames take.
         temporal: "tether", "warm" or "off".
         tether: Tether stiffness [1/s^2].
-        potential: "continuum" or "paper".
         reset: When a frame starts cold.
         contact: How contact is solved.
         cancelled: Asked before each step: whether nobody waits for the result any more; or None.
@@ -58,7 +57,6 @@ class SolveSettings:
     frame_limit: float | None = None
     temporal: str = "tether"
     tether: float = 2000.0
-    potential: str = "continuum"
     reset: Reset = field(default_factory=Reset)
     contact: ContactSettings = field(default_factory=ContactSettings)
     cancelled: Callable[[], bool] | None = None

@@ -1,6 +1,7 @@
 """Integrators: forces in, displacements out.
 
-A new integrator is one file and one line in `METHODS`.
+A new integrator is one file and one line in `METHODS`. Methods that are only compared stand in `lab.methods`, which
+registers them when it is imported.
 """
 
 from __future__ import annotations
@@ -8,13 +9,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import cast
 
 from ...errors import UsageError
 from .base import Integrator
-from .first_order import Adam, GradientDescent
 from .guard import Guard
-from .learned import guarded
-from .newton import Newton
+from .learned import LearnedMetric
+from .network import Physgraph
 from .quasi_newton import QuasiNewton
 from .weights import load_network, shipped_network
 
@@ -34,23 +35,27 @@ class Method:
 
 def _shipped() -> Integrator:
     """The integrator of the network that ships."""
-    return guarded(shipped_network("physgraph"))
+    return _guarded(shipped_network(LEARNED))
 
 
+def _guarded(network: Physgraph) -> Integrator:
+    """The integrator of a network, with quasi-Newton to spare."""
+    return Guard(LearnedMetric(network), spare=QuasiNewton())
+
+
+LEARNED = "physgraph"
+"""Name of the method whose every step is the network's, and of the kind of its weights."""
 METHODS: dict[str, Method] = {
     "auto": Method(_shipped, nested=True),
     "quasi-newton": Method(QuasiNewton, nested=True),
-    "quasi-newton-flat": Method(QuasiNewton, nested=False),
-    "lbfgs": Method(lambda: QuasiNewton(use_metric=False), nested=False),
-    "adam": Method(lambda: Guard(Adam()), nested=False),
-    "gd": Method(lambda: Guard(GradientDescent()), nested=False),
-    "newton": Method(Newton, nested=True),
-    "physgraph": Method(_shipped, nested=True),
-    "physgraph-paper": Method(lambda: guarded(shipped_network("physgraph-paper")), nested=False),
+    LEARNED: Method(_shipped, nested=True),
 }
-"""Every method by its name on the command line."""
-LEARNED = ("auto", "physgraph", "physgraph-paper")
-"""Those that have weights."""
+"""Every method by its name: those of the command line, and what `register` adds."""
+
+
+def register(name: str, method: Method) -> None:
+    """Add a method to `METHODS`."""
+    METHODS[name] = method
 
 
 def method_named(name: str, weights: Path | None = None) -> Method:
@@ -69,11 +74,11 @@ def method_named(name: str, weights: Path | None = None) -> Method:
     method = METHODS[name]
     if weights is None:
         return method
-    if name not in LEARNED:
-        raise UsageError(f"integrator '{name}' has no weights; name one that has: {', '.join(LEARNED)}")
-    network = load_network(weights, kind="physgraph" if name == "auto" else name)
+    if name not in ("auto", LEARNED):
+        raise UsageError(f"integrator '{name}' has no weights; name one that has: auto, {LEARNED}")
+    network = cast(Physgraph, load_network(weights, kind=LEARNED))
 
     def own() -> Integrator:
-        return guarded(network)
+        return _guarded(network)
 
     return replace(method, build=own)

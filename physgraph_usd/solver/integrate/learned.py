@@ -1,4 +1,4 @@
-"""The learned integrators: one force evaluation a step, no line search; the guard around them keeps them safe.
+"""The learned integrator: one force evaluation a step, no line search; the guard around it keeps it safe.
 
 | symbol | here | meaning |
 |---|---|---|
@@ -7,37 +7,30 @@
 | c_i | ``coefficients`` | what the network answers |
 | D | ``move`` | sum_i c_i v_i, no longer than `LONGEST` edges at any vertex |
 
-Both see a `System` and nothing else. Weights are read from safetensors files that carry their kind, their configuration
-and a hash of the numbers.
+The network sees a `System` and nothing else.
 """
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from functools import cache, partial
 from typing import TypeVar
-from weakref import WeakKeyDictionary
 
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 
 from ...errors import SolveError
 from ..level import Level
 from .base import Carry, System
 from .fused import FusedPhysgraph, fused_physgraph
-from .guard import Guard
 from .network import Physgraph
-from .paper_network import DirectedEdges, PaperNetwork
-from .quasi_newton import QuasiNewton
 from .recorded import MOST_GARMENTS, Memory, Recording, Recordings, pays
 from .secants import Dot, dot, secant_direction
 from .vertex_frame import VertexFrame
 
-NetworkT = TypeVar("NetworkT", Physgraph, PaperNetwork)
+NetworkT = TypeVar("NetworkT", bound=nn.Module)
 
 LONGEST = 5.0
 """Most edge lengths that a vertex moves in a step."""
@@ -113,7 +106,7 @@ class LearnedMetric:
     ) -> Tensor:
         """The network's combination of vectors [m]; a recording gives the L-BFGS direction by itself."""
         names, step = self._network.config.vectors, carry.memory.step
-        frame = cache(lambda: VertexFrame(_level(system), carry.x))
+        frame = cache(lambda: VertexFrame(level_of(system), carry.x))
         whole = partial(_vector, system=system, carry=carry, secant=secant or _secant_direction)
         if fused is not None:
             return fused(vectors_of(fused.bases, whole, frame=frame), system.spacing, system.reach, step, frame=frame)
@@ -165,79 +158,11 @@ def _vector(name: str, *, system: System, carry: Carry, secant: Callable[[Carry]
     return memory.secants[-age].move if age <= len(memory.secants) else torch.zeros_like(carry.x)
 
 
-@dataclass(frozen=True, eq=False)
-class _History:
-    """Stiffness at the start [N/m], past forces [N] and past displacements [m], newest first."""
-
-    stiffness: Tensor
-    forces: tuple[Tensor, ...]
-    moves: tuple[Tensor, ...] = ()
-
-
-class LearnedPaper:
-    """`physgraph-paper`: the paper's network, fed past displacements and forces along the edges of the mesh."""
-
-    name = "physgraph-paper"
-
-    def __init__(self, network: PaperNetwork) -> None:
-        """Keep the network."""
-        self._network = network
-
-    def start(self, system: System, x: Float[Tensor, "vertices 3"]) -> Carry:
-        """Evaluate x with an empty history."""
-        self._network = placed(self._network, system, torch.float32)
-        energy, force = system.energy_and_force(x)
-        # A third of the trace of the Hessian's blocks, at the start: what the force is measured in.
-        stiffness = system.diagonal(x).unsqueeze(1)
-        return Carry(x, energy, force, None, self.name, _History(stiffness, (force,)))
-
-    def step(self, system: System, carry: Carry) -> Carry:
-        """One step of the network."""
-        memory: _History = carry.memory
-        move = self.propose(system, carry)
-        x = carry.x + move
-        energy, force = system.energy_and_force(x)
-        length = self._network.config.history
-        forces, moves = (force, *memory.forces)[:length], (move, *memory.moves)[:length]
-        return Carry(x, energy, force, None, self.name, _History(memory.stiffness, forces, moves))
-
-    def propose(self, system: System, carry: Carry) -> Float[Tensor, "vertices 3"]:
-        """The displacement of the next step [m]."""
-        memory: _History = carry.memory
-        config, level = self._network.config, _level(system)
-        edges = directed_edges(level)
-        scaled = config.features == "scaled"
-        length = system.spacing.unsqueeze(1)  # V 1
-        unit, force_unit = (length, memory.stiffness * length) if scaled else (1.0, 1.0)
-        none = [torch.zeros_like(carry.x)] * config.history
-        moves = [-move / unit for move in (*memory.moves, *none)[: config.history]]
-        forces = [force / force_unit for force in (*memory.forces, *none)[: config.history]]
-        vertex = torch.cat([*moves, *forces], dim=1)  # V 6H
-        sender, receiver = edges.sender, edges.receiver
-        size = 0.5 * (length[sender] + length[receiver]) if scaled else 1.0
-        spans = [(x[receiver] - x[sender]) / size for x in (carry.x, level.rest)]
-        edge = torch.cat([part for s in spans for part in (s, s.norm(dim=1, keepdim=True))], dim=1)  # 2E 8
-        fixed = (~system.free).to(torch.float32)
-        with fast_products(carry.x.is_cuda and not self._network.training):
-            out = self._network(vertex.float(), edge.float(), fixed, edges=edges)
-        return limited(out.to(carry.x) * length, system.spacing) * system.free
-
-
 def placed(network: NetworkT, system: System, dtype: torch.dtype) -> NetworkT:
     """The network on the system's device and of a scalar type: itself, or a copy."""
     parameter, device = next(network.parameters()), system.spacing.device
     fits = (parameter.device, parameter.dtype) == (device, dtype)
     return network if fits else copy.deepcopy(network).to(device=device, dtype=dtype)
-
-
-def integrator_of(network: Physgraph | PaperNetwork) -> LearnedMetric | LearnedPaper:
-    """The integrator that uses a network."""
-    return LearnedMetric(network) if isinstance(network, Physgraph) else LearnedPaper(network)
-
-
-def guarded(network: Physgraph | PaperNetwork) -> Guard:
-    """The integrator as it is used: guarded, our own with quasi-Newton to spare."""
-    return Guard(integrator_of(network), spare=QuasiNewton() if isinstance(network, Physgraph) else None)
 
 
 def limited(move: Float[Tensor, "vertices 3"], spacing: Float[Tensor, " vertices"]) -> Float[Tensor, "vertices 3"]:
@@ -276,28 +201,12 @@ def garment_dot(level: Level | None, a: Tensor, b: Tensor) -> Tensor:
     return each.new_zeros(len(level.spans), 1).index_add_(0, owner, each)[owner]
 
 
-_EDGES: WeakKeyDictionary[Level, DirectedEdges] = WeakKeyDictionary()
+def level_of(system: System) -> Level:
+    """The level of a system.
 
-
-def directed_edges(level: Level) -> DirectedEdges:
-    """The edges of a level in both directions, found once."""
-    if level not in _EDGES:
-        _EDGES[level] = DirectedEdges.of(level.edges, len(level.rest))
-    return _EDGES[level]
-
-
-@contextmanager
-def fast_products(wanted: bool) -> Iterator[None]:
-    """Let float32 products of matrices on CUDA use tensor cores, whose factors have 10 bits: enough for a proposal."""
-    before = torch.backends.cuda.matmul.allow_tf32
-    torch.backends.cuda.matmul.allow_tf32 = wanted or before
-    try:
-        yield
-    finally:
-        torch.backends.cuda.matmul.allow_tf32 = before
-
-
-def _level(system: System) -> Level:
+    Raises:
+        SolveError: It has none.
+    """
     if system.level is None:
         raise SolveError("this network needs a mesh, and the system has none")
     return system.level

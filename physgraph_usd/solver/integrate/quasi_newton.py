@@ -61,35 +61,30 @@ def truncated(
 
 
 class QuasiNewton:
-    """L-BFGS on a metric or, for comparison, on the diagonal.
+    """L-BFGS on a metric."""
 
-    Attributes:
-        name: "quasi-newton" or "lbfgs".
-    """
+    name = "quasi-newton"
 
-    def __init__(self, *, history: int = SECANTS, use_metric: bool = True, record: bool = True) -> None:
-        """Choose the memory and the first guess.
+    def __init__(self, *, history: int = SECANTS, record: bool = True) -> None:
+        """Choose the memory.
 
         Args:
             history: Number of secants kept.
-            use_metric: False scales by the Hessian's diagonal at the start instead of H0.
             record: On CUDA, record a step on H0 and replay it.
         """
-        self.name = "quasi-newton" if use_metric else "lbfgs"
-        self._history, self._use_metric = history, use_metric
-        self._record, self._recordings = record and use_metric and history == SECANTS, Recordings[_Trial]()
+        self._history = history
+        self._record, self._recordings = record and history == SECANTS, Recordings[_Trial]()
 
     def start(self, system: System, x: Float[Tensor, "vertices 3"]) -> Carry:
         """Evaluate x with an empty memory."""
         energy, force = system.energy_and_force(x)
-        inverse = None if self._use_metric else self._present(system, x)
-        return self._begin(system, x, energy, force, inverse=inverse)
+        return self._begin(system, x, energy, force, inverse=None)
 
     def resume(self, system: System, carry: Carry) -> Carry:
         """Evaluate x anew under forces that changed a little; the secants are kept."""
         memory: _Memory = carry.memory
         energy, force = system.energy_and_force(carry.x)
-        memory = replace(memory, image=self._image(system, memory.inverse, force))
+        memory = replace(memory, image=system.apply_metric_inverse(force, memory.inverse))
         return self._carry(carry.x, energy, force, memory)
 
     def step(self, system: System, carry: Carry) -> Carry:
@@ -113,10 +108,10 @@ class QuasiNewton:
         move = x - carry.x
         if dot(move, move) < SHORTENED**2 * dot(direction, direction):
             again = memory.shortened and not memory.stiff
-            inverse = self._present(system, x) if again or not self._use_metric else None
+            inverse = self._present(system, x) if again else None
             begun = self._begin(system, x, energy, force, inverse=inverse)
             return replace(begun, memory=replace(begun.memory, shortened=True))
-        image = self._image(system, memory.inverse, force)
+        image = system.apply_metric_inverse(force, memory.inverse)
         secants, newest = memory.secants, Secant(move, carry.force - force, memory.image - image)
         if newest.curvature < math.inf:
             secants = (*secants, newest)[-self._history :]
@@ -138,8 +133,8 @@ class QuasiNewton:
         return replace(after, mover=self.name, memory=_Memory(secants, None, after.preconditioned))
 
     def _begin(self, system: System, x: Tensor, energy: float, force: Tensor, *, inverse: Solver | None) -> Carry:
-        stiff = int(inverse is not None and self._use_metric)
-        return self._carry(x, energy, force, _Memory((), inverse, self._image(system, inverse, force), stiff))
+        image = system.apply_metric_inverse(force, inverse)
+        return self._carry(x, energy, force, _Memory((), inverse, image, int(inverse is not None)))
 
     def _softened(self, system: System, carry: Carry) -> _Memory:
         """The memory of a carry with the metric at rest in place of one that was stiffened."""
@@ -148,15 +143,11 @@ class QuasiNewton:
         return _Memory(secants, None, system.apply_metric_inverse(carry.force))
 
     def _carry(self, x: Tensor, energy: float, force: Tensor, memory: _Memory) -> Carry:
-        return Carry(x, energy, force, memory.image if self._use_metric else None, self.name, memory)
+        return Carry(x, energy, force, memory.image, self.name, memory)
 
     def _present(self, system: System, x: Tensor) -> Solver:
         """A guess of the inverse Hessian by the present state's stiffness."""
-        stiffness = system.diagonal(x)
-        return system.metric.stiffened(stiffness) if self._use_metric else (1.0 / stiffness.unsqueeze(1)).mul
-
-    def _image(self, system: System, inverse: Solver | None, force: Tensor) -> Tensor:
-        return system.apply_metric_inverse(force, inverse) if inverse is None or self._use_metric else inverse(force)
+        return system.metric.stiffened(system.diagonal(x))
 
     def _forget(self, system: System, carry: Carry) -> Carry:
         """No secant step lowers the energy: drop the secants; without any, try one step on the diagonal, then stay."""

@@ -8,43 +8,79 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import asdict
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, fields
 from functools import cache
 from pathlib import Path
-from typing import Any, overload
+from typing import Any, Protocol, cast
 
 import torch
+from jaxtyping import Float
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
-from torch import Tensor
+from torch import Tensor, nn
 
 from ...errors import WeightsError
+from .base import Carry, Integrator, System
+from .learned import LearnedMetric
 from .network import VECTORS, Physgraph, PhysgraphConfig
-from .paper_network import PaperConfig, PaperNetwork
 
 VERSION = "2"
 """Format of the file and meaning of the features; other versions are refused."""
 FOLDER = Path(__file__).resolve().parents[2] / "weights"
-"""The weights that ship."""
-
-Network = Physgraph | PaperNetwork
+"""The weights that ship with the solver."""
 
 
-def kind_of(network: Network) -> str:
-    """The integrator that a network belongs to."""
-    return "physgraph" if isinstance(network, Physgraph) else "physgraph-paper"
+class Learned(Integrator, Protocol):
+    """An integrator whose steps a network proposes."""
+
+    def propose(self, system: System, carry: Carry) -> Float[Tensor, "vertices 3"]:
+        """The displacement of the next step [m]."""
+        ...
 
 
-@overload
-def make_network(config: PhysgraphConfig) -> Physgraph: ...
-@overload
-def make_network(config: PaperConfig) -> PaperNetwork: ...
-def make_network(config: PhysgraphConfig | PaperConfig) -> Network:
-    """An untrained network."""
-    return Physgraph(config) if isinstance(config, PhysgraphConfig) else PaperNetwork(config)
+@dataclass(frozen=True)
+class Kind:
+    """A kind of network.
+
+    Attributes:
+        config: Class of its configuration, a dataclass.
+        network: Class of the network, made from a configuration, which it keeps as ``config``.
+        integrator: Makes the unguarded integrator of a network.
+        file: The .safetensors that ships.
+    """
+
+    config: type[Any]
+    network: type[nn.Module]
+    integrator: Callable[[Any], Learned]
+    file: Path
 
 
-def save_network(network: Network, file: Path) -> str:
+KINDS = {"physgraph": Kind(PhysgraphConfig, Physgraph, LearnedMetric, FOLDER / "physgraph.safetensors")}
+"""Every kind of network by its name in files of weights; `register_kind` adds to it."""
+
+
+def register_kind(name: str, kind: Kind) -> None:
+    """Add a kind of network to `KINDS`."""
+    KINDS[name] = kind
+
+
+def kind_of(network: nn.Module) -> str:
+    """The name of a network's kind."""
+    return next(name for name, kind in KINDS.items() if isinstance(network, kind.network))
+
+
+def integrator_of(network: nn.Module) -> Learned:
+    """The unguarded integrator that uses a network."""
+    return KINDS[kind_of(network)].integrator(network)
+
+
+def make_network(config: Any) -> Any:
+    """An untrained network of the kind that a configuration is of."""
+    return next(kind.network for kind in KINDS.values() if isinstance(config, kind.config))(config)
+
+
+def save_network(network: nn.Module, file: Path) -> str:
     """Write weights and what they are.
 
     Args:
@@ -58,19 +94,19 @@ def save_network(network: Network, file: Path) -> str:
     about = {
         "kind": kind_of(network),
         "version": VERSION,
-        "config": json.dumps(asdict(network.config)),
+        "config": json.dumps(asdict(cast(Any, network).config)),
         "sha256": hash_of(tensors),
     }
     save_file(tensors, file, metadata=about)
     return about["sha256"]
 
 
-def load_network(file: Path, *, kind: str, device: str = "cpu") -> Network:
+def load_network(file: Path, *, kind: str, device: str = "cpu") -> nn.Module:
     """Read weights.
 
     Args:
         file: A file that `save_network` wrote.
-        kind: "physgraph" or "physgraph-paper".
+        kind: A name out of `KINDS`.
         device: Where to put them.
 
     Returns:
@@ -99,13 +135,13 @@ def load_network(file: Path, *, kind: str, device: str = "cpu") -> Network:
 
 
 @cache
-def shipped_network(kind: str) -> Network:
-    """The weights that ship with the package.
+def shipped_network(kind: str) -> Any:
+    """The network of a kind with the weights that ship.
 
     Raises:
         WeightsError: They are not there.
     """
-    return load_network(FOLDER / f"{kind}.safetensors", kind=kind)
+    return load_network(KINDS[kind].file, kind=kind)
 
 
 def weights_hash(file: Path) -> str:
@@ -134,18 +170,19 @@ def _read(file: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
         raise WeightsError(f"{file} cannot be read: {error}") from error
 
 
-def _config(kind: str, values: dict[str, Any]) -> PhysgraphConfig | PaperConfig:
-    if kind == "physgraph-paper":
-        return PaperConfig(**values)
-    converted: dict[str, Any] = values | {"vectors": tuple(values["vectors"])}
-    config = PhysgraphConfig(**converted)
-    unknown = [name for name in config.vectors if name not in VECTORS]
+def _config(kind: str, values: dict[str, Any]) -> Any:
+    """A configuration out of a file, which names every field; a list there is a tuple."""
+    config = KINDS[kind].config
+    for each in fields(config):
+        _ = values[each.name]
+    made = config(**{name: tuple(value) if isinstance(value, list) else value for name, value in values.items()})
+    unknown = [name for name in getattr(made, "vectors", ()) if name not in VECTORS]
     if unknown:
         raise ValueError(f"unknown vectors {unknown}")
-    return config
+    return made
 
 
-def random_network(config: PhysgraphConfig | PaperConfig, *, seed: int, scale: float = 1.0) -> Network:
+def random_network(config: Any, *, seed: int, scale: float = 1.0) -> Any:
     """A network with random weights, the last layer's too: what the guard must withstand."""
     generator = torch.Generator().manual_seed(seed)
     network = make_network(config)

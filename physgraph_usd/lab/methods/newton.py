@@ -13,8 +13,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from .base import Carry, System
-from .quasi_newton import backtrack
+from ...solver.integrate.base import Carry, System
+from ...solver.integrate.quasi_newton import backtrack
 
 
 class Newton:

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from .base import Carry, System
+from ...solver.integrate.base import Carry, System
 
 
 class GradientDescent:
