@@ -14,21 +14,21 @@ from __future__ import annotations
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import click
 import numpy as np
-from pxr import Sdf
 
 from benchmarks.contact_shots import REAL
 from benchmarks.rows import say
 from physgraph_usd.lab.samples import write_sample
+from physgraph_usd.shot.frames import Finished
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.refine import refine_shot
+from physgraph_usd.shot.run import fine_meshes
+from physgraph_usd.solver.level import refine_garments
 from physgraph_usd.usd.read.reader import open_shot
-from physgraph_usd.usd.write.chunk import mean_edge, points_at, read_chunk
 
 CASES: tuple[tuple[str, int, dict[str, Any]], ...] = (("sleeve", 1, {}), ("swatch", 1, {}), ("flag", 1, {}))
 MORE = (
@@ -71,47 +71,45 @@ def main(folder: Path | None, shots: Sequence[str], prerolls: Sequence[int], *, 
 def rows(shot: Path, level: int, options: dict[str, Any], folder: Path, prerolls: Sequence[int]) -> Iterator[str]:
     """One case, a row for each pre-roll."""
     named = {name: options.get(name, ()) for name in ("garments", "colliders")}
-    times = open_shot(str(shot), **named).scene.times
+    scene = open_shot(str(shot), **named).scene
+    (mesh, *_) = fine_meshes(scene.garments, refine_garments(scene.garments, [level] * len(scene.garments)))
+    edges, times = mesh.half_edges.edges, scene.times
     first = len(times) // 2
-    own = times[first : first + FRAMES]
-    whole, path = _refine(shot, folder / "whole.usdc", level=level, **options)
-    moves = np.mean([_apart(whole, whole, path, a, b)[0] for a, b in pairwise(times)])
+    last = min(first + FRAMES, len(times)) - 1
+    whole = _refine(shot, folder / "whole", level=level, preroll=0, **options)
+    moves = np.mean([_apart(_points(whole, k), _points(whole, k + 1), edges)[0] for k in range(len(times) - 1)])
     alone = 0.0
     for preroll in (0, *(each for each in prerolls if 0 < each < first)):
         began = time.process_time()
-        span = {"frames": (own[0], own[-1]), "preroll": preroll}
-        chunk, _ = _refine(shot, folder / f"{preroll}.usdc", level=level, **options | span)
+        span = {"frames": (times[first], times[last]), "preroll": preroll}
+        chunk = _refine(shot, folder / str(preroll), level=level, **options | span)
         spent = time.process_time() - began
         alone = spent if preroll == 0 else alone
-        adds = _adds(whole, chunk, path)
-        ends = "  ".join("{:5.3f}/{:5.2f}".format(*_apart(whole, chunk, path, t, t)) for t in (own[0], own[-1]))
+        before = range(first - preroll, first) if options.get("temporal") != "off" else ()
+        found = [_apart(_points(whole, k), _points(chunk, k, seam=first), edges) for k in before]
+        adds = "{:5.3f}/{:5.2f}".format(*(np.max(found, axis=0) / (len(found) + 1))) if found else "jumps"
+        both = [_apart(_points(whole, k), _points(chunk, k), edges) for k in (first, last)]
+        ends = "  ".join("{:5.3f}/{:5.2f}".format(*each) for each in both)
         yield f"{moves:6.2f}{preroll:7}   {ends}  {adds:11}  {spent - alone:5.1f}"
 
 
-def _refine(shot: Path, out: Path, **options: Any) -> tuple[Sdf.Layer, str]:
+def _refine(shot: Path, out: Path, **options: Any) -> Finished:
     refine_shot(shot, out, RefineOptions(**options))
-    layer = Sdf.Layer.FindOrOpen(str(out))
-    return layer, str(layer.customLayerData["physgraph"]["garments"][0])
+    return Finished(out)
 
 
-def _adds(whole: Sdf.Layer, chunk: Sdf.Layer, path: str) -> str:
-    """What a joined seam adds to a frame's move, RMS and at most over its frames, in mean fine edges."""
-    told = read_chunk(chunk)
-    found = []
-    for at, points in told.preroll.items() if told else ():
-        there = points_at(whole, path, at)
-        assert there is not None
-        distances = np.linalg.norm(there.astype(np.float64) - points[path], axis=1) / mean_edge(whole, path, there)
-        found.append((np.sqrt((distances**2).mean()), distances.max()))
-    return "{:5.3f}/{:5.2f}".format(*(np.max(found, axis=0) / (len(found) + 1))) if found else "jumps"
+def _points(frames: Finished, index: int, *, seam: int | None = None) -> np.ndarray:
+    """World positions [m] of the first garment in a frame by number, shape (V, 3)."""
+    outcome = frames.read(index, None, seam=seam)
+    assert outcome is not None
+    assert outcome.points[0] is not None
+    return outcome.points[0].astype(np.float64)
 
 
-def _apart(one: Sdf.Layer, other: Sdf.Layer, path: str, time: float, later: float) -> tuple[float, float]:
+def _apart(one: np.ndarray, other: np.ndarray, edges: np.ndarray) -> tuple[float, float]:
     """Distance between two frames in mean fine edges, RMS and at most."""
-    a, b = points_at(one, path, time), points_at(other, path, later)
-    assert a is not None
-    assert b is not None
-    distances = np.linalg.norm(a.astype(np.float64) - b, axis=1) / mean_edge(one, path, a)
+    edge = np.linalg.norm(one[edges[:, 0]] - one[edges[:, 1]], axis=1).mean()
+    distances = np.linalg.norm(one - other, axis=1) / edge
     return float(np.sqrt((distances**2).mean())), float(distances.max())
 
 

@@ -31,7 +31,7 @@ def commands(folder: Path) -> dict[str, list[str]]:
     sleeve, chunks = shot.stdout.strip(), folder / "chunks"
     chunks.mkdir()
     for frames in ("1:3", "4:6"):
-        part = ["--preroll", "2", "--frames", frames, "-o", chunks / f"{frames[0]}.usdc"]
+        part = ["--preroll", "2", "--frames", frames, "-o", chunks / frames[0]]
         subprocess.run([*COMMAND, "refine", sleeve, *part], capture_output=True, check=True)
     copy = folder / "copy.usda"
     copy.write_text(f"#usda 1.0\n(\n subLayers = [@{sleeve}@]\n)\n", encoding="utf-8")

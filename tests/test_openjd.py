@@ -52,7 +52,7 @@ def test_its_reader_finds_progress_and_status_of_a_chunk(tmp_path: Path):
     shot = cloth_shot(tmp_path / "shot.usdc", times=TIMES[:4])
     empty = [word for option in ("--garment", "--collider", "--level") for word in (option, "")]
     line = ["--frames", "1-2", "--preroll", "1", *empty, "--openjd", "--steps", "1"]
-    done = run("refine", shot, "-o", tmp_path / "c.usdc", *line)
+    done = run("refine", shot, "-o", tmp_path / "c", *line)
     assert done.exit_code == 0, done.stderr
     for text in done.stderr.splitlines():
         record = logging.makeLogRecord({"msg": text, "levelno": logging.INFO, "session_id": "s"})
@@ -71,10 +71,10 @@ def test_a_job_makes_one_layer_and_a_second_run_of_it_solves_nothing_again(tmp_p
     asked = parameters(tmp_path, Garment=CLOTH, Level="1")
     runs = [openjd("run", TEMPLATE, "--step", "Stitch", "--run-dependencies", *asked) for _ in range(2)]
     assert [done.returncode for done in runs] == [0, 0], runs
-    assert [done.stdout.count("is taken as done") for done in runs] == [0, 2]
+    assert [done.stdout.count("4 of 4 frames are those of a run") for done in runs] == [0, 2]
     assert "openjd_progress: 100.0" in runs[0].stdout
     assert "openjd_status: seam at 5: " in runs[0].stdout
-    assert sorted(file.name for file in (tmp_path / "c").iterdir()) == ["chunk.1-4.usdc", "chunk.5-8.usdc"]
+    assert sorted(file.name for file in (tmp_path / "c").iterdir()) == ["chunk.1-4", "chunk.5-8"]
     layer = tmp_path / "out" / "fine.usdc"
     assert faults(layer, shot) == []
     assert sample_times(layer) == TIMES
@@ -82,7 +82,7 @@ def test_a_job_makes_one_layer_and_a_second_run_of_it_solves_nothing_again(tmp_p
 
 @pytest.mark.slow
 def test_a_job_fails_where_a_chunk_is_missing(tmp_path: Path):
-    refine(cloth_shot(tmp_path / "shot.usdc", times=TIMES), tmp_path / "chunk.usdc", frames=(1.0, 4.0), preroll=6)
-    done = openjd("run", TEMPLATE, "--step", "Stitch", *parameters(tmp_path, Chunks=str(tmp_path / "chunk.usdc")))
+    refine(cloth_shot(tmp_path / "shot.usdc", times=TIMES), tmp_path / "chunk", frames=(1.0, 4.0), preroll=6)
+    done = openjd("run", TEMPLATE, "--step", "Stitch", *parameters(tmp_path, Chunks=str(tmp_path / "chunk")))
     assert done.returncode != 0
     assert "frames 5:8 are in no chunk" in done.stdout

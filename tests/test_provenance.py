@@ -84,7 +84,7 @@ def test_a_refined_garment_is_refined_again_from_its_coarse_mesh(dressed: Path, 
 @pytest.mark.parametrize("entry", [1, "x", {"a": 1}, float("nan")])
 def test_a_record_that_somebody_else_wrote_is_no_reason_to_fail(dressed: Path, entry: object) -> None:
     layer = Sdf.Layer.FindOrOpen(str(dressed))
-    layer.customLayerData = {"physgraph": dict.fromkeys(["garments", "variants", "chunk", "left_out"], entry)}
+    layer.customLayerData = {"physgraph": dict.fromkeys(["garments", "variants", "left_out"], entry)}
     layer.Save()
     assert refined_layers(Usd.Stage.Open(layer)) == []
     assert open_shot(str(dressed), level=1).scene.garments

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,11 +19,13 @@ from stages import add_sheet, new_stage, save, vec3
 
 from physgraph_usd.cli import main
 from physgraph_usd.errors import AbsentError, LayerError, PhysGraphError, UsageError
+from physgraph_usd.shot.frames import Finished, kept_for
+from physgraph_usd.shot.options import RefineOptions
+from physgraph_usd.shot.refine import refine_shot
 from physgraph_usd.shot.stitch import SEAM_BOUND, check_seams, stitch
 from physgraph_usd.usd.check.validate import validate_layer
 from physgraph_usd.usd.provenance import read_record
 from physgraph_usd.usd.stage import paths_in
-from physgraph_usd.usd.write.chunk import Chunk, read_chunk
 
 TIMES = tuple(float(time) for time in range(1, 25))
 SPANS = ((1.0, 8.0), (9.0, 16.0), (17.0, 24.0))
@@ -34,7 +37,7 @@ def refine_chunks(
     shot: Path, folder: Path, spans: Sequence[tuple[float, float]] = SPANS, *, preroll: int = 6, **options: Any
 ) -> list[Path]:
     """Refine parts of a shot, each by itself."""
-    chunks = [folder / f"chunk{first:g}.usdc" for first, _ in spans]
+    chunks = [folder / f"chunk{first:g}" for first, _ in spans]
     for span, chunk in zip(spans, chunks, strict=True):
         assert refine(shot, chunk, frames=span, preroll=preroll, **options).exit_code == 0
     return chunks
@@ -44,14 +47,16 @@ def record_of(file: Path) -> dict[str, Any]:
     return read_record(Sdf.Layer.FindOrOpen(str(file))) or {}
 
 
-def chunk_in(file: Path) -> Chunk:
-    chunk = read_chunk(Sdf.Layer.FindOrOpen(str(file)))
-    assert chunk is not None
-    return chunk
-
-
 def points(layer: Path, time: float) -> np.ndarray:
     return np.asarray(Sdf.Layer.FindOrOpen(str(layer)).QueryTimeSample(f"{CLOTH}.points", time))
+
+
+def solved(chunk: Path, time: float) -> np.ndarray:
+    """World positions [m] of the sheet in a chunk."""
+    outcome = Finished(chunk).read(TIMES.index(time), time)
+    assert outcome is not None
+    assert outcome.points[0] is not None
+    return outcome.points[0]
 
 
 def points_in(stage: Usd.Stage, path: str, time: float) -> Any:
@@ -88,10 +93,10 @@ class TestOneLayer:
         assert sample_times(runs.joined) == TIMES
         for span, chunk in zip(SPANS, runs.chunks, strict=True):
             own = [time for time in TIMES if span[0] <= time <= span[1]]
-            assert sample_times(chunk) == tuple(own)
             for time in own:
-                joined = points(runs.joined, time)
-                assert np.array_equal(points(chunk, time), joined) == (time + 6 <= span[1] or time > 16), time
+                held = solved(chunk, time)
+                same = np.allclose(held, fine(runs.shot, runs.joined, time), rtol=0, atol=1e-7)
+                assert same == (time + 6 <= span[1] or time > 16), time
 
     @pytest.mark.slow
     def test_holds_the_positions_of_as_many_workers(self, runs: Runs, tmp_path: Path):
@@ -107,11 +112,6 @@ class TestOneLayer:
         assert record["options"].pop("preroll") == 6
         assert record == one
 
-    def test_a_chunk_by_itself_is_valid_and_said_to_be_one(self, runs: Runs):
-        (problem,) = validate_layer(runs.chunks[1])
-        assert problem.severity == "warning"
-        assert "is a chunk, with 8 of the shot's 24 frames" in problem.message
-
     def test_the_command_says_how_far_seams_move(self, runs: Runs, tmp_path: Path):
         done = run("stitch", *runs.chunks, "-o", tmp_path / "joined.usdc")
         assert done.exit_code == 0, done.stderr
@@ -119,43 +119,47 @@ class TestOneLayer:
         assert [line.partition(":")[0] for line in done.stderr.splitlines()] == ["seam at 9", "seam at 17"]
         assert faults(tmp_path / "joined.usdc", runs.shot) == []
 
+    def test_one_report_tells_of_all_frames(self, runs: Runs, tmp_path: Path):
+        report, seams = stitch(runs.chunks, tmp_path / "joined.usdc", report_to=tmp_path / "report.json")
+        assert [frame["time"] for frame in report.frames] == list(TIMES)
+        assert {seam.after for seam in seams} == {9.0, 17.0}
+        assert report.out == tmp_path / "joined.usdc"
+        told = json.loads((tmp_path / "report.json").read_text())
+        assert len(told["frames"]) == len(TIMES)
+
     @pytest.mark.parametrize("time", [12.0, 16.0])
-    def test_a_value_that_is_not_finite_is_refused_by_frame(self, runs: Runs, tmp_path: Path, time: float):
-        """In the middle of a chunk, and where two are joined with the body."""
-        copies = [Path(shutil.copy(chunk, tmp_path)) for chunk in runs.chunks]
-        broken = points(copies[1], time).copy()
-        broken[7, 1] = np.nan
-        layer = Sdf.Layer.FindOrOpen(str(copies[1]))
-        layer.SetTimeSample(f"{CLOTH}.points", time, vec3(broken))
-        layer.Save()
-        with pytest.raises(
-            LayerError, match=rf"{copies[1]}: <{CLOTH}> at time code {time:g}: points: value 7 is \[.*nan"
-        ):
-            stitch(copies, tmp_path / "joined.usdc")
-        assert not (tmp_path / "joined.usdc").exists()
+    def test_a_damaged_frame_is_refused_by_name_and_no_chunk_is_touched(self, runs: Runs, tmp_path: Path, time: float):
+        """In the middle of a chunk, and where two are joined."""
+        copies = copied(runs, tmp_path / "c")
+        file = copies[1] / f"{TIMES.index(time)}.npz"
+        broken = dict(np.load(file))
+        broken["points0"][7, 1] = np.nan
+        np.savez(file, **broken)
+        there = sorted(tmp_path.rglob("*"))
+        with pytest.raises(LayerError, match=rf"{file} is damaged .*remove it and --resume"):
+            stitch(copies, tmp_path / "joined.usdc", shot=runs.shot)
+        assert sorted(tmp_path.rglob("*")) == there
 
-    def test_a_chunk_that_was_changed_is_refused(self, runs: Runs, tmp_path: Path):
-        copies = [Path(shutil.copy(chunk, tmp_path)) for chunk in runs.chunks]
-        layer = Sdf.Layer.FindOrOpen(str(copies[1]))
-        layer.EraseTimeSample(f"{CLOTH}.points", 12.0)
-        layer.Save()
-        with pytest.raises(LayerError, match=rf"{copies[1]} was changed after refine wrote it"):
+    def test_chunks_that_were_moved_are_told_where_the_shot_is(self, runs: Runs, tmp_path: Path):
+        copies = copied(runs, tmp_path / "a" / "b" / "c")
+        with pytest.raises(PhysGraphError, match=r"shot\.usdc"):
             stitch(copies, tmp_path / "joined.usdc")
-
-    def test_without_the_shot_it_is_made_too(self, runs: Runs, tmp_path: Path):
-        """Chunks that were copied elsewhere: what they hold is enough."""
-        copies = [Path(shutil.copy(chunk, tmp_path)) for chunk in runs.chunks]
-        stitch(copies, tmp_path / "joined.usdc")
+        done = run("stitch", copies[0].parent, "-o", tmp_path / "joined.usdc", "--shot", runs.shot)
+        assert done.exit_code == 0, done.stderr
         assert faults(tmp_path / "joined.usdc", runs.shot) == []
-        for time in TIMES:
-            assert np.allclose(points(tmp_path / "joined.usdc", time), points(runs.joined, time), rtol=0, atol=1e-6)
+        assert all(np.array_equal(points(tmp_path / "joined.usdc", t), points(runs.joined, t)) for t in TIMES)
+
+
+def copied(runs: Runs, folder: Path) -> list[Path]:
+    """The chunks, copied into a folder."""
+    return [Path(shutil.copytree(chunk, folder / chunk.name)) for chunk in runs.chunks]
 
 
 def test_the_old_name_of_the_option_works_and_no_help_shows_it(tmp_path: Path):
-    shot, out = cloth_shot(tmp_path / "shot.usdc"), tmp_path / "chunk.usdc"
+    shot, out = cloth_shot(tmp_path / "shot.usdc"), tmp_path / "chunk"
     line = ["refine", shot, "-o", out, "--frames", "3:4", "--run-up=1", "--steps", "1", "--level", "0"]
     assert CliRunner().invoke(main, [str(word) for word in line]).exit_code == 0
-    assert [*chunk_in(out).preroll] == [2.0]
+    assert {file.name for file in out.iterdir()} == {"run.json", "1.before2.npz", "2.npz", "3.npz"}
     shown = CliRunner().invoke(main, ["refine", "--help"]).output
     assert "--preroll" in shown
     assert "run-up" not in shown
@@ -200,17 +204,37 @@ class TestRefused:
         with pytest.raises(UsageError, match="were made with other files of the shot"):
             stitch(chunks, tmp_path / "joined.usdc")
 
-    def test_a_layer_that_is_no_chunk(self, runs: Runs, tmp_path: Path):
-        with pytest.raises(LayerError, match=r"one\.usdc is no chunk of a shot; refine with --preroll"):
-            stitch([runs.one], tmp_path / "joined.usdc")
+    def test_another_version_of_the_shot(self, tmp_path: Path):
+        shot = cloth_shot(tmp_path / "shot.usdc")
+        chunks = refine_chunks(shot, tmp_path, [(1.0, 3.0), (4.0, 6.0)])
+        stage = Usd.Stage.Open(str(shot))
+        mesh = UsdGeom.Mesh(stage.GetPrimAtPath(CLOTH))
+        mesh.GetPointsAttr().Set(mesh.GetPointsAttr().Get(2.0), 3.0)
+        stage.Save()
+        with pytest.raises(UsageError, match=r"the shot has changed since .*chunk1 was .*; refine the chunks anew"):
+            stitch(chunks, tmp_path / "joined.usdc")
 
-    def test_to_write_over_a_chunk_or_a_file_unasked(self, runs: Runs):
-        before = runs.chunks[2].read_bytes()
-        with pytest.raises(UsageError, match="is part of the shot"):
-            stitch(runs.chunks, runs.chunks[2], overwrite=True)
-        assert runs.chunks[2].read_bytes() == before
+    def test_what_is_no_chunk(self, runs: Runs, tmp_path: Path):
+        for place in (runs.one, tmp_path):
+            with pytest.raises(
+                UsageError, match=r"is no chunk of a shot, nor a folder of chunks; refine with --preroll"
+            ):
+                stitch([place], tmp_path / "joined.usdc")
+        with pytest.raises(UsageError, match="is a layer's name, and a chunk is a folder"):
+            refine_shot(runs.shot, tmp_path / "chunk.usdc", RefineOptions(preroll=2))
+
+    def test_to_write_over_a_file_or_finished_frames_unasked(self, runs: Runs):
+        before = runs.joined.read_bytes()
         with pytest.raises(UsageError, match="exists"):
             stitch(runs.chunks, runs.joined)
+        assert runs.joined.read_bytes() == before
+        there = sorted(runs.chunks[0].iterdir())
+        with pytest.raises(UsageError, match="holds 8 finished frames; go on by --resume, or drop them by --overwrite"):
+            refine_chunks(runs.shot, runs.chunks[0].parent, SPANS[:1])
+        assert sorted(runs.chunks[0].iterdir()) == there
+        with pytest.raises(UsageError, match="with other steps; refine as then"):
+            refine_chunks(runs.shot, runs.chunks[0].parent, SPANS[:1], steps=5, resume=True)
+        assert sorted(runs.chunks[0].iterdir()) == there
 
     def test_a_seam_that_moves_too_far(self, runs: Runs, tmp_path: Path):
         with pytest.raises(LayerError, match=rf"seam at \d+: <{CLOTH}> moves .* fine edges RMS.*--seam-bound"):
@@ -222,7 +246,7 @@ class TestRefused:
         chunks = refine_chunks(shot, tmp_path, [(1.0, 3.0), (4.0, 6.0)], preroll=0)
         with pytest.raises(LayerError, match="nothing tells how far the seam at 4 moves"):
             stitch(chunks, tmp_path / "joined.usdc")
-        assert stitch(chunks, tmp_path / "joined.usdc", seam_bound=float("inf")) == []
+        assert stitch(chunks, tmp_path / "joined.usdc", seam_bound=float("inf"))[1] == []
         assert faults(tmp_path / "joined.usdc", shot) == []
 
     def test_a_range_without_a_frame(self, tmp_path: Path):
@@ -235,19 +259,21 @@ class TestRefused:
 
 def test_frames_that_failed_are_named_and_leave_their_seam_unknown(tmp_path: Path):
     shot = cloth_shot(tmp_path / "shot.usdc", broken={3.0: float("nan")})
-    chunks = [tmp_path / "c1.usdc", tmp_path / "c2.usdc"]
+    chunks = [tmp_path / "c1", tmp_path / "c2"]
     spans = ((1.0, 3.0), (4.0, 6.0))
     done = [refine(shot, chunk, frames=span, preroll=2) for chunk, span in zip(chunks, spans, strict=True)]
     assert [report.exit_code for report in done] == [3, 0]
     with pytest.raises(LayerError, match="nothing tells how far the seam at 4 moves"):
         stitch(chunks, tmp_path / "joined.usdc")
-    stitch(chunks, tmp_path / "joined.usdc", seam_bound=float("inf"))
+    assert not (tmp_path / "joined.usdc").exists()
+    report, _ = stitch(chunks, tmp_path / "joined.usdc", seam_bound=float("inf"))
+    assert (report.exit_code, list(report.failed)) == (3, ["3"])
     assert sample_times(tmp_path / "joined.usdc") == (1.0, 2.0, 4.0, 5.0, 6.0)
     assert list(record_of(tmp_path / "joined.usdc")["failed"]) == ["3"]
 
 
 def test_part_of_a_shot_is_stitched_where_it_is_asked_for(runs: Runs, tmp_path: Path):
-    with pytest.raises(UsageError, match=r"chunk17\.usdc holds the frames 17:24, of which some lie outside --frames"):
+    with pytest.raises(UsageError, match=r"chunk17 holds the frames 17:24, of which some lie outside --frames"):
         stitch(runs.chunks, tmp_path / "joined.usdc", frames=(1.0, 16.0))
     stitch(runs.chunks[:2], tmp_path / "joined.usdc", frames=(1.0, 16.0))
     (warning,) = validate_layer(tmp_path / "joined.usdc")
@@ -255,11 +281,11 @@ def test_part_of_a_shot_is_stitched_where_it_is_asked_for(runs: Runs, tmp_path: 
     assert sample_times(tmp_path / "joined.usdc") == TIMES[:16]
 
 
-def test_an_interrupted_chunk_goes_on_with_the_preroll_that_it_had(tmp_path: Path):
-    shot, out, whole = (tmp_path / f"{name}.usdc" for name in ("shot", "chunk", "whole"))
-    cloth_shot(shot)
-    options: dict[str, Any] = {"frames": (4.0, 6.0), "preroll": 2}
-    refine(shot, whole, **options)
+def test_an_interrupted_chunk_is_named_as_missing_and_goes_on(tmp_path: Path):
+    """What it had finished is kept, its pre-roll too."""
+    shot = cloth_shot(tmp_path / "shot.usdc")
+    (first,) = refine_chunks(shot, tmp_path, [(1.0, 3.0)], preroll=2)
+    out, options = tmp_path / "second", {"frames": (4.0, 6.0), "preroll": 2}
 
     def interrupt(done: int, _: int) -> None:
         if done == 2:
@@ -267,10 +293,16 @@ def test_an_interrupted_chunk_goes_on_with_the_preroll_that_it_had(tmp_path: Pat
 
     with pytest.raises(KeyboardInterrupt):
         refine(shot, out, progress=interrupt, **options)
+    kept = {file.name: file.read_bytes() for file in out.iterdir() if file.suffix == ".npz"}
+    assert {"1.before3.npz", "2.before3.npz", "3.npz", "4.npz"} <= kept.keys()
+    with pytest.raises(UsageError, match=r"frames 6:6 are in no chunk; .*second .4:5.*go on by --resume"):
+        stitch([first, out], tmp_path / "joined.usdc")
+    assert "2 of 3 frames are kept in" in str(kept_for(out))
     refine(shot, out, resume=True, **options)
-    ended, asked = chunk_in(out).preroll, chunk_in(whole).preroll
-    assert [*ended] == [*asked] == [2.0, 3.0]
-    assert all(np.array_equal(ended[time][CLOTH], points[CLOTH]) for time, points in asked.items())
+    assert kept_for(out) is None
+    assert all((out / name).read_bytes() == data for name, data in kept.items())
+    stitch([first, out], tmp_path / "joined.usdc", seam_bound=1.0)
+    assert faults(tmp_path / "joined.usdc", shot) == []
 
 
 @pytest.fixture
@@ -322,7 +354,8 @@ def test_every_attribute_is_that_of_one_run_where_frames_stand_alone(
     """Defaults, runs of equal frames, velocities at seams, boxes, heat maps; of garments in some chunks only, too."""
     options = ALONE | {"velocities": velocities, "heat_map": True}
     refine(odd_shot, tmp_path / "one.usdc", **options)
-    assert stitch(refine_chunks(odd_shot, tmp_path, ODD_SPANS, **options), tmp_path / "joined.usdc") == []
+    _, seams = stitch(refine_chunks(odd_shot, tmp_path, ODD_SPANS, **options), tmp_path / "joined.usdc")
+    assert seams == []
     assert faults(tmp_path / "joined.usdc", odd_shot) == []
     one, joined = (authored(tmp_path / name) for name in ("one.usdc", "joined.usdc"))
     assert len(one) > 40
@@ -331,61 +364,15 @@ def test_every_attribute_is_that_of_one_run_where_frames_stand_alone(
     assert garments[0] == garments[1]
 
 
-class TestClips:
-    @pytest.mark.parametrize("name", ["clips.usda", "clips.usdc"])
-    def test_show_the_same_as_one_layer(self, runs: Runs, tmp_path: Path, name: str):
-        root = tmp_path / "root.usda"
-        stitch(runs.chunks, tmp_path / name, clips=True, root=root)
-        made = {"clips.manifest.usda", "clips.topology.usdc", name, "root.usda"}
-        assert {file.name for file in tmp_path.iterdir()} == made
-        joined, clips = open_over(runs.shot, runs.joined), Usd.Stage.Open(str(root))
-        compared = 0
-        for attribute in joined.GetPrimAtPath(CLOTH).GetAuthoredAttributes():
-            other = clips.GetAttributeAtPath(attribute.GetPath())
-            for code in [Usd.TimeCode.Default(), *map(Usd.TimeCode, np.arange(1.0, 24.5, 0.5))]:
-                assert attribute.Get(code) == other.Get(code), (attribute, code)
-            compared += 1
-        assert compared > 8
-        assert clips.GetAttributeAtPath(f"{CLOTH}.points").GetTimeSamples() == list(TIMES)
-
-    def test_a_root_shows_one_layer_over_the_shot_too_and_replaces_no_file(self, runs: Runs, tmp_path: Path):
-        (tmp_path / "root.usda").write_text("mine")
-        out: dict[str, Any] = {"out": tmp_path / "joined.usdc", "root": tmp_path / "root.usda"}
-        with pytest.raises(UsageError, match=r"root\.usda exists"):
-            stitch(runs.chunks, **out)
-        assert [(file.name, file.read_text()) for file in tmp_path.iterdir()] == [("root.usda", "mine")]
-        stitch(runs.chunks, **out, overwrite=True)
-        shown, asked = Usd.Stage.Open(str(tmp_path / "root.usda")), open_over(runs.shot, runs.joined)
-        assert points_in(shown, CLOTH, TIMES[-1]) == points_in(asked, CLOTH, TIMES[-1])
-
-    def test_validate_checks_what_the_clips_play(self, runs: Runs, tmp_path: Path):
-        copies = [Path(shutil.copy(chunk, tmp_path)) for chunk in runs.chunks]
-        stitch(copies, tmp_path / "clips.usda", clips=True)
-        assert faults(tmp_path / "clips.usda", runs.shot) == []
-        broken = Sdf.Layer.FindOrOpen(str(copies[2]))
-        points = broken.QueryTimeSample(f"{CLOTH}.points", 20.0)
-        broken.SetTimeSample(f"{CLOTH}.points", 20.0, list(points)[:-1])
-        broken.Save()
-        found = validate_layer(tmp_path / "clips.usda", runs.shot)
-        assert {(each.rule, each.time) for each in found if each.severity == "error"} >= {("points", 20.0)}
-
-    def test_of_garments_that_not_every_chunk_has(self, odd_shot: Path, tmp_path: Path):
-        chunks = refine_chunks(odd_shot, tmp_path, ODD_SPANS, **ALONE)
-        stitch(chunks, tmp_path / "joined.usdc")
-        stitch(chunks, tmp_path / "clips.usda", clips=True)
-        joined, clips = (open_over(odd_shot, tmp_path / name) for name in ("joined.usdc", "clips.usda"))
-        for path in ("/World/moves", "/World/halts", "/World/seldom", "/World/never"):
-            for time in range(1, 9):
-                one, other = (points_in(stage, path, time) for stage in (joined, clips))
-                gone = (path, time) in (("/World/moves", 4), ("/World/halts", 5))
-                assert (one is None, other is None) == (gone, gone), (path, time)
-                assert gone or np.allclose(one, other, rtol=0.0, atol=1e-6), (path, time)
-
-    def test_refuse_what_a_layer_refuses_and_leave_nothing(self, runs: Runs, tmp_path: Path):
-        for chunks, bound in ((runs.chunks[:2], 1.0), (runs.chunks, 1e-4)):
-            with pytest.raises(PhysGraphError):
-                stitch(chunks, tmp_path / "clips.usda", clips=True, seam_bound=bound)
-        assert not list(tmp_path.iterdir())
+def test_a_root_shows_one_layer_over_the_shot_too_and_replaces_no_file(runs: Runs, tmp_path: Path):
+    (tmp_path / "root.usda").write_text("mine")
+    out: dict[str, Any] = {"out": tmp_path / "joined.usdc", "root": tmp_path / "root.usda"}
+    with pytest.raises(UsageError, match=r"root\.usda exists"):
+        stitch(runs.chunks, **out)
+    assert [(file.name, file.read_text()) for file in tmp_path.iterdir()] == [("root.usda", "mine")]
+    stitch(runs.chunks, **out, overwrite=True)
+    shown, asked = Usd.Stage.Open(str(tmp_path / "root.usda")), open_over(runs.shot, runs.joined)
+    assert points_in(shown, CLOTH, TIMES[-1]) == points_in(asked, CLOTH, TIMES[-1])
 
 
 class TestSeamsBeforeAllIsThere:
@@ -394,7 +381,7 @@ class TestSeamsBeforeAllIsThere:
     def test_a_pair_is_measured_and_nothing_is_written(self, runs: Runs, tmp_path: Path):
         there = sorted(runs.chunks[0].parent.iterdir())
         (seam,) = check_seams(runs.chunks[:2])
-        (whole, *_) = stitch(runs.chunks, tmp_path / "joined.usdc")
+        _, (whole, *_) = stitch(runs.chunks, tmp_path / "joined.usdc")
         assert seam == whole
         line = ["stitch", *runs.chunks[:2], "--check-seams", "--seam-bound", 0.2 * seam.rms]
         done = CliRunner().invoke(main, [str(word) for word in line])
@@ -402,15 +389,19 @@ class TestSeamsBeforeAllIsThere:
         assert sorted(runs.chunks[0].parent.iterdir()) == there
 
     def test_a_chunk_is_measured_beside_those_of_its_folder(self, runs: Runs, tmp_path: Path):
-        (tmp_path / "other.usda").write_text("#usda 1.0\n")
-        first, second, third = (tmp_path / name.name for name in runs.chunks)
-        shutil.copy(runs.chunks[0], first)
-        assert check_seams([tmp_path], of=first) == []
-        shutil.copy(runs.chunks[2], third)
-        assert check_seams([tmp_path], of=third) == []
-        shutil.copy(runs.chunks[1], second)
-        assert [seam.after for seam in check_seams([tmp_path], of=third)] == [17.0]
-        assert [seam.after for seam in check_seams([tmp_path], of=second)] == [9.0, 17.0]
+        """What is no chunk, or not whole yet, is left out."""
+        (tmp_path / "c").mkdir()
+        (tmp_path / "c" / "other.usda").write_text("#usda 1.0\n")
+        first, second, third = copied(runs, tmp_path / "all")
+        of = {"shot": runs.shot}
+        shutil.copytree(first, tmp_path / "c" / "first")
+        assert check_seams([tmp_path / "c"], of=tmp_path / "c" / "first", **of) == []
+        shutil.copytree(third, tmp_path / "c" / "third")
+        assert check_seams([tmp_path / "c"], of=tmp_path / "c" / "third", **of) == []
+        shutil.copytree(second, tmp_path / "c" / "second")
+        assert [each.after for each in check_seams([tmp_path / "c"], of=tmp_path / "c" / "third", **of)] == [17.0]
+        (tmp_path / "c" / "third" / "20.npz").unlink()
+        assert [each.after for each in check_seams([tmp_path / "c"], of=tmp_path / "c" / "second", **of)] == [9.0]
 
 
 def test_warnings_of_usd_itself_stay_off_the_terminal(tmp_path: Path, capfd: pytest.CaptureFixture[str]):
@@ -420,5 +411,4 @@ def test_warnings_of_usd_itself_stay_off_the_terminal(tmp_path: Path, capfd: pyt
     layer.Save()
     chunks = refine_chunks(shot, tmp_path, ((1.0, 2.0), (3.0, 4.0)), preroll=2)
     stitch(chunks, tmp_path / "joined.usdc")
-    stitch(chunks, tmp_path / "clips.usda", clips=True)
     assert "_ReportErrors" not in capfd.readouterr().err

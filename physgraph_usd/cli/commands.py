@@ -45,27 +45,36 @@ PRIMS = "Prim path, glob or collection; repeatable."
     default=0.05,
     help="Most that a seam may move, RMS, in mean fine edge lengths.",
 )
-@click.option("--clips", is_flag=True, help="Play the chunks as value clips instead of copying them into one file.")
+@click.option("--shot", type=click.Path(dir_okay=False), help="The shot where it is not where the chunks say.")
+@click.option(
+    "--report",
+    "report_to",
+    type=click.Path(path_type=Path),
+    metavar="FILE.json|DIR",
+    help="Write one report of all frames.",
+)
 @click.option("--root", type=click.Path(path_type=Path), help="Also write a .usda with the layer over the shot.")
 @overwrite_option
 def stitch(chunks: tuple[Path, ...], out: Path | None, *, check_seams: bool, seam_bound: float, **options: Any) -> None:
-    """Join each CHUNK of a shot, as refine --preroll writes them, into one layer and print its path.
+    """Join each CHUNK of a shot, a folder as refine --preroll leaves it, into one layer and print its path.
 
-    A folder stands for all layers in it. How far each seam moves goes to stderr.
+    A folder of chunks stands for all in it. How far each seam moves goes to stderr. Exits with 3 where a frame failed.
     """
     with signals_noted():
         with imports_uncollected():
             from ..shot import stitch as chunk
 
         if check_seams:
-            for seam in chunk.check_seams(chunks, seam_bound=seam_bound):
+            for seam in chunk.check_seams(chunks, seam_bound=seam_bound, shot=options["shot"]):
                 click.echo(seam, err=True)
             return
         if out is None:
             raise UsageError("give a layer to write by -o, or --check-seams")
-        for seam in chunk.stitch(chunks, out, seam_bound=seam_bound, **options):
+        report, seams = chunk.stitch(chunks, out, seam_bound=seam_bound, **options)
+        for seam in seams:
             click.echo(seam, err=True)
     click.echo(out)
+    sys.exit(report.exit_code)
 
 
 @click.command()

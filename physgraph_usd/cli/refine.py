@@ -80,7 +80,10 @@ def _jobs(ctx: click.Context, shots: tuple[str, ...], out: Path) -> list[Job]:
     """Shots with layers and options, from the command line and the show's file."""
     from ..shot.options import OPTIONS, RefineOptions
 
-    layers = _one_each(shots, out, "-o", suffix=".refined.usdc", accepts=USD_SUFFIXES)
+    if ctx.params["preroll"] is None:
+        layers = _one_each(shots, out, "-o", suffix=".refined.usdc", accepts=USD_SUFFIXES)
+    else:
+        layers = [out] if len(shots) == 1 else [out / Path(shot).stem for shot in shots]
     reports = _each_or_none(shots, ctx.params["report"], "--report", suffix="", accepts=(".json",))
     roots = _each_or_none(shots, ctx.params["root"], "--root", suffix=".usda", accepts=USD_SUFFIXES)
     jobs = []

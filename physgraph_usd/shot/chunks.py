@@ -16,9 +16,9 @@ from typing import Any, NoReturn, Protocol
 
 import numpy as np
 
-from ..errors import SolveError
+from ..errors import LayerError, SolveError
 from ..interrupts import leave_if_asked
-from .frames import FrameFolder, Lead, Outcome
+from .frames import Finished, Folders, FrameFolder, Lead, Outcome
 from .processes import POLL_SECONDS, Call, memory_is_named
 
 PREROLL = 6
@@ -67,7 +67,9 @@ def _ranges(numbers: Sequence[int]) -> list[range]:
     return [range(numbers[a], numbers[b - 1] + 1) for a, b in pairwise([*starts, len(numbers)])]
 
 
-def seams_of(chunks: Sequence[Sequence[range]], frames: FrameFolder, *, preroll: int) -> dict[int, tuple[int, float]]:
+def seams_of(
+    chunks: Sequence[Sequence[range]], frames: Finished | Folders, *, preroll: int
+) -> dict[int, tuple[int, float]]:
     """The frames that are solved on both sides of a seam.
 
     Args:
@@ -97,16 +99,18 @@ def solve_in_chunks(
     frames: FrameFolder,
     *,
     workers: int,
+    only: range | None = None,
     preroll: int = PREROLL,
     start: Callable[..., Work] | None = None,
 ) -> Generator[Outcome, None, None]:
-    """Solve all time codes but those that are kept, in this process or in several, and yield all in order.
+    """Solve time codes but those that are kept, in this process or in several, and yield all in order.
 
     Args:
         solver: Solves time codes in order.
         times: The time codes.
         frames: Where results go; frames in its ``kept`` are taken from there.
         workers: Number of processes; 1 solves in this one.
+        only: Numbers of the time codes to solve; None for all.
         preroll: Frames solved before each chunk but the first of the shot; they are yielded as the ``lead`` of the same
             frames of the chunk before.
         start: Starts a function in a process of its own, with its arguments, in place of `Call`; then one chunk is not
@@ -116,7 +120,8 @@ def solve_in_chunks(
         SolveError: A process died.
         LayerError: A result cannot be written.
     """
-    chunks = chunks_of([k for k in range(len(times)) if k not in frames.kept], workers)
+    wanted = range(len(times)) if only is None else only
+    chunks = chunks_of([k for k in wanted if k not in frames.kept], workers)
     seams = seams_of(chunks, frames, preroll=preroll)
     solved: Iterator[int] = iter(())
     calls: list[Work] = []
@@ -126,7 +131,8 @@ def solve_in_chunks(
         calls = [(start or Call)(_work, solver, list(times), chunk, frames, preroll) for chunk in chunks]
     owners = {k: call for chunk, call in zip(chunks, calls, strict=False) for part in chunk for k in part}
     try:
-        for index, time in enumerate(times):
+        for index in wanted:
+            time = times[index]
             outcome = _collect(frames, index, time, owner=owners.get(index), solved=solved)
             if index in seams:
                 seam, weight = seams[index]
@@ -140,6 +146,30 @@ def solve_in_chunks(
             call.ask_to_end()
         for call in calls:
             call.end()
+
+
+def finished_frames(
+    frames: Folders, times: Sequence[float | None], numbers: Sequence[int], *, preroll: int
+) -> Generator[Outcome, None, None]:
+    """Yield frames that chunks hold, in order; where two chunks have a frame, the later one's is the ``lead``.
+
+    Args:
+        frames: The frames of the chunks.
+        times: Time codes of the shot.
+        numbers: Numbers of the frames to yield.
+        preroll: Frames solved before each chunk.
+    """
+    starts, seams = frames.seams(), seams_of([], frames, preroll=preroll)
+    for index in numbers:
+        leave_if_asked()
+        outcome = frames.read(index, times[index])
+        if outcome is None:
+            raise LayerError(f"the result of time code {times[index]} is gone; refine it anew by --resume")
+        if index in starts:  # It may equal the last frame of the pre-roll, which is not the one before it here.
+            outcome = replace(outcome, reused=(False,) * len(outcome.reused))
+        seam, weight = seams.get(index, (None, 0.0))
+        lead = None if seam is None else frames.read(index, times[index], seam=seam)
+        yield outcome if lead is None or seam is None else replace(outcome, lead=Lead(lead, seam, weight))
 
 
 def _solve(

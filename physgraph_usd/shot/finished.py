@@ -10,7 +10,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..errors import PhysGraphError
+from ..errors import PhysGraphError, UsageError
 from ..usd.files import LAYER_SUFFIXES, Target, check_suffix, check_targets, files_of
 from ..usd.provenance import asset_path, file_hashes, is_result_of, mute_refined, unsaved_layers
 from ..usd.stage import open_stage
@@ -108,8 +108,10 @@ def check_jobs(jobs: Sequence[Job], *, also: Sequence[Target] = ()) -> None:
     for shot, out, options in jobs:
         options.check()
         for what, path in (("the layer", out), ("the root", options.root)):
-            if path is not None:
+            if path is not None and (options.preroll is None or path is not out):
                 check_suffix(what, Path(path), LAYER_SUFFIXES)
+        if options.preroll is not None and out.suffix in LAYER_SUFFIXES:
+            raise UsageError(f"{out} is a layer's name, and a chunk is a folder of finished frames; name one by -o")
         targets += options.targets(out)
         left = options.skip_existing and out.is_file()  # and not opened: nothing that is there is replaced
         inputs |= ({Path(shot)} if left else files_of(shot)) | {Path(file) for file in (options.weights,) if file}

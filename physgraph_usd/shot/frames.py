@@ -1,7 +1,7 @@
-"""Finished frames of a run in a folder beside its layer: they outlive the run when it is interrupted.
+"""Finished frames of a run in a folder: they outlive the run when it is interrupted, and are what `stitch` joins.
 
-One file a frame, whole or not there, and `RUN`, a record of everything that decides the frames. The folder goes when
-the layer is whole under its name and for no other reason; until then one run locks it.
+One file a frame, whole or not there, and `RUN`, a record of everything that decides the frames. The folder beside a
+layer goes when the layer is whole under its name and for no other reason; a chunk's folder stays. One run locks it.
 """
 
 from __future__ import annotations
@@ -25,6 +25,8 @@ from .lock import LOCK, FolderLock
 
 RUN = "run.json"
 """A record of everything that decides the frames."""
+CHUNK = "chunk"
+"""Entry of the record of a chunk: number of its first frame, and of the frame after its last."""
 _DONE, _FAILED = ".npz", ".failed.npz"
 _FRAMES = ".frames"
 _BEFORE = ".before"
@@ -96,136 +98,58 @@ class Kept:
         return f"{frames} {are} kept in {self.folder}; --resume goes on from {them}"
 
 
-def kept_for(layer: Path) -> Kept | None:
-    """Finished frames that lie beside a layer, or None where there are none."""
-    folder = frames_folder(layer)
+def kept_for(out: Path) -> Kept | None:
+    """Finished frames beside a layer, or in a chunk's folder that lacks some; None where there are none."""
+    folder = out if out.is_dir() else frames_folder(out)
+    run = record_in(folder)
+    first, stop = run.get(CHUNK) or (0, len(run.get("times", ())))
+    count = len(whole_frames(folder))
+    return Kept(folder, count, stop - first) if count and not (CHUNK in run and count == stop - first) else None
+
+
+def record_in(folder: Path) -> dict[str, Any]:
+    """The record of the run that a folder's frames are of; empty where there is none."""
     try:
-        times = json.loads((folder / RUN).read_text(encoding="utf-8"))["times"]
-    except (OSError, ValueError, KeyError):
-        return None
-    count = len(_whole_frames(folder))
-    return Kept(folder, count, len(times)) if count else None
+        found = json.loads((folder / RUN).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return found if isinstance(found, dict) else {}
 
 
-def _whole_frames(folder: Path) -> list[int]:
-    """Numbers of the frames in a folder that are whole."""
+def whole_frames(folder: Path) -> list[int]:
+    """Numbers of the frames in a folder that are whole and did not fail."""
     names = [file.name for file in folder.glob("*")]
     numbers = [int(stem) for name in names if (stem := name.removesuffix(_DONE)).isdecimal()]
     return [number for number in numbers if zipfile.is_zipfile(folder / f"{number}{_DONE}")]
 
 
-class FrameFolder:
-    """The folder; a context manager that leaves finished frames inside unless the layer came to stand whole.
+class Finished:
+    """Finished frames in a folder, to read.
 
     Attributes:
-        kept: Numbers of the frames that an interrupted run had finished and that are used.
-        dropped: How many of the same run were there and are solved anew.
+        folder: The folder.
+        kept: Numbers of the frames that are there whole.
     """
 
-    def __init__(
-        self,
-        folder: Path,
-        run: Mapping[str, Any],
-        *,
-        counts: Sequence[int] = (),
-        resume: bool = False,
-        drop: bool = False,
-        keep: bool = True,
-    ) -> None:
-        """Take a folder for a run, empty or with the frames of one that was interrupted.
-
-        Args:
-            folder: Where; made where it is not there.
-            run: Everything that decides the frames, ready for JSON.
-            counts: Number of fine vertices of each garment; a frame with other ones is damaged.
-            resume: Use finished frames that are there.
-            drop: Remove finished frames that are there, whatever run they are of.
-            keep: Leave finished frames there when the run is interrupted.
-
-        Raises:
-            UsageError: The folder holds finished frames of another run, or is not ours.
-            LayerError: The folder cannot be made, or another run is at work in it.
-        """
-        self.folder, self._keep, self._counts = folder, keep, tuple(counts)
-        try:
-            self._check_ours()
-            self._lock = FolderLock(folder, layer=folder.with_name(folder.name.removesuffix(_FRAMES)))
-            with ExitStack() as unless_taken:
-                unless_taken.callback(self._lock.release)
-                self._take(json.loads(json.dumps(run)), resume=resume, drop=drop)
-                unless_taken.pop_all()
-        except OSError as error:
-            raise LayerError(f"cannot write {folder}: {error.strerror}") from error
-
-    def _take(self, wanted: dict[str, Any], *, resume: bool, drop: bool) -> None:
-        """Use or drop what is there; frames that failed are tried again."""
-        found = _whole_frames(self.folder)
-        different = self._differences(wanted) if found else []
-        if different and (resume or not drop):
-            holds = f"{self.folder} holds {counted(len(found), 'finished frame')} of a run"
-            remedy = "refine as then, or drop them by --overwrite without --resume"
-            raise UsageError(f"{holds} with other {', '.join(different[:3])}; {remedy}")
-        self.kept = frozenset(found if resume else ())
-        self.dropped = 0 if resume or different else len(found)
-        for file in self.folder.glob(f"*{_FAILED}"):
-            file.unlink()
-        if not self.kept:
-            self._clear()
-        self._run = json.dumps(wanted, indent=2) + "\n"
-        write_text(self.folder / RUN, self._run)
-
-    def _check_ours(self) -> None:
-        """Refuse a folder with files that are not ours: it is emptied once the layer is whole."""
-        names = {file.name for file in self.folder.glob("*")}
-        others = sorted(name for name in names if name not in (RUN, LOCK) and not _OURS.fullmatch(name))
-        if others or (names and not names & {RUN, LOCK}):
-            other = f"; {others[0]} is not a file of ours" if others else ""
-            raise UsageError(f"{self.folder} is no folder of finished frames{other}; choose another name for the layer")
-
-    def _differences(self, wanted: dict[str, Any]) -> list[str]:
-        """Names of the entries in which the record there differs."""
-        try:
-            there = json.loads((self.folder / RUN).read_text(encoding="utf-8"))
-        except ValueError:
-            there = {}
-        return sorted(_different(there, wanted))
+    def __init__(self, folder: Path, *, counts: Sequence[int] = ()) -> None:
+        """Look which frames are there; ``counts`` as `FrameFolder` takes them."""
+        self.folder, self._counts = folder, tuple(counts)
+        self.kept = frozenset(whole_frames(folder))
 
     def _file(self, index: int, suffix: str = _DONE, *, seam: int | None = None) -> Path:
         return self.folder / (f"{index}" + ("" if seam is None else f"{_BEFORE}{seam}") + suffix)
+
+    @property
+    def failed(self) -> set[int]:
+        """Numbers of the frames that failed."""
+        stems = [file.name.removesuffix(_FAILED) for file in self.folder.glob(f"*{_FAILED}")]
+        return {int(stem) for stem in stems if stem.isdecimal()}
 
     def seams(self) -> set[int]:
         """Numbers of the frames before which finished frames of two processes meet."""
         names = [file.name.removesuffix(_DONE) for file in self.folder.glob(f"*{_BEFORE}*{_DONE}")]
         found = {int(seam) for name in names if (seam := name.partition(_BEFORE)[2]).isdecimal()}
         return found & self.kept
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Name the folder for processes that may be at work elsewhere."""
-        return self.__dict__ | {"folder": self.folder.absolute()}
-
-    def write(self, index: int, outcome: Outcome, *, seam: int | None = None) -> None:
-        """Write a frame's result; ``seam`` where it serves for the pre-roll of the frame of that number.
-
-        Raises:
-            LayerError: The disk is full, or the folder is gone or another run's: a task on another machine may outlast
-                the run that it is of.
-        """
-        arrays: dict[str, Any] = {f"points{k}": p for k, p in enumerate(outcome.points) if p is not None}
-        maps = [(k, name, values) for k, heat in enumerate(outcome.heat) for name, values in (heat or {}).items()]
-        arrays |= {f"heat{k}.{name}": values for k, name, values in maps} | {"heated": np.array(len(outcome.heat))}
-        arrays |= {"record": json.dumps(outcome.record), "reused": np.array(outcome.reused, dtype=bool)}
-        file = self._file(index, _DONE if outcome.points else _FAILED, seam=seam)
-        temporary = temporary_path(file, suffix="")
-        try:
-            if (self.folder / RUN).read_text(encoding="utf-8") != self._run:
-                raise LayerError(f"{self.folder} is another run's by now")
-            with make_file(temporary) as stream:
-                np.savez(stream, **arrays)
-            temporary.replace(file)
-        except OSError as error:
-            raise LayerError(f"cannot write {file}: {error.strerror}") from error
-        finally:
-            temporary.unlink(missing_ok=True)
 
     def read(self, index: int, time: float | None, *, seam: int | None = None) -> Outcome | None:
         """A frame's result, or None where it is not there yet; ``seam`` as `write` takes it.
@@ -257,6 +181,113 @@ class FrameFolder:
             if each is not None and (each.shape != (count, 3) or each.dtype.kind != "f" or not np.isfinite(each).all()):
                 raise ValueError(f"points of shape {each.shape}, not {count} finite positions")
 
+
+class FrameFolder(Finished):
+    """A run's folder; a context manager that leaves frames inside if the run fails, or if they are a chunk.
+
+    Attributes:
+        kept: Numbers of the frames that an interrupted run had finished and that are used.
+        dropped: How many of the same run were there and are solved anew.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        run: Mapping[str, Any],
+        *,
+        counts: Sequence[int] = (),
+        resume: bool = False,
+        drop: bool = False,
+        keep: bool = True,
+        stays: bool = False,
+    ) -> None:
+        """Take a folder for a run, empty or with the frames of one that was interrupted.
+
+        Args:
+            folder: Where; made where it is not there.
+            run: Everything that decides the frames, ready for JSON.
+            counts: Number of fine vertices of each garment; a frame with other ones is damaged.
+            resume: Use finished frames that are there.
+            drop: Remove finished frames that are there, whatever run they are of.
+            keep: Leave finished frames there when the run is interrupted.
+            stays: Leave them there at the end too, and drop none unasked: the folder is a chunk for `stitch`.
+
+        Raises:
+            UsageError: The folder holds finished frames of another run, or is not ours.
+            LayerError: The folder cannot be made, or another run is at work in it.
+        """
+        super().__init__(folder, counts=counts)
+        self._keep, self._stays = keep, stays
+        try:
+            self._check_ours()
+            self._lock = FolderLock(folder, layer=folder.with_name(folder.name.removesuffix(_FRAMES)))
+            with ExitStack() as unless_taken:
+                unless_taken.callback(self._lock.release)
+                self._take(json.loads(json.dumps(run)), resume=resume, drop=drop)
+                unless_taken.pop_all()
+        except OSError as error:
+            raise LayerError(f"cannot write {folder}: {error.strerror}") from error
+
+    def _take(self, wanted: dict[str, Any], *, resume: bool, drop: bool) -> None:
+        """Use or drop what is there; frames that failed are tried again."""
+        found = whole_frames(self.folder)
+        different = self._differences(wanted) if found else []
+        if different and (resume or not drop):
+            holds = f"{self.folder} holds {counted(len(found), 'finished frame')} of a run"
+            remedy = "refine as then, or drop them by --overwrite without --resume"
+            raise UsageError(f"{holds} with other {', '.join(different[:3])}; {remedy}")
+        if found and self._stays and not (resume or drop):
+            there = f"{self.folder} holds {counted(len(found), 'finished frame')}"
+            raise UsageError(f"{there}; go on by --resume, or drop them by --overwrite")
+        self.kept = frozenset(found if resume else ())
+        self.dropped = 0 if resume or different else len(found)
+        for file in self.folder.glob(f"*{_FAILED}"):
+            file.unlink()
+        if not self.kept:
+            self._clear()
+        self._run = json.dumps(wanted, indent=2) + "\n"
+        write_text(self.folder / RUN, self._run)
+
+    def _check_ours(self) -> None:
+        """Refuse a folder with files that are not ours: it is emptied once the layer is whole."""
+        names = {file.name for file in self.folder.glob("*")}
+        others = sorted(name for name in names if name not in (RUN, LOCK) and not _OURS.fullmatch(name))
+        if others or (names and not names & {RUN, LOCK}):
+            other = f"; {others[0]} is not a file of ours" if others else ""
+            raise UsageError(f"{self.folder} is no folder of finished frames{other}; choose another name for the layer")
+
+    def _differences(self, wanted: dict[str, Any]) -> list[str]:
+        """Names of the entries in which the record there differs."""
+        return sorted(differences(record_in(self.folder), wanted))
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Name the folder for processes that may be at work elsewhere."""
+        return self.__dict__ | {"folder": self.folder.absolute()}
+
+    def write(self, index: int, outcome: Outcome, *, seam: int | None = None) -> None:
+        """Write a frame's result; ``seam`` where it serves for the pre-roll of the frame of that number.
+
+        Raises:
+            LayerError: The disk is full, or the folder is gone or another run's: a task on another machine may outlast
+                the run that it is of.
+        """
+        arrays: dict[str, Any] = {f"points{k}": p for k, p in enumerate(outcome.points) if p is not None}
+        maps = [(k, name, values) for k, heat in enumerate(outcome.heat) for name, values in (heat or {}).items()]
+        arrays |= {f"heat{k}.{name}": values for k, name, values in maps} | {"heated": np.array(len(outcome.heat))}
+        arrays |= {"record": json.dumps(outcome.record), "reused": np.array(outcome.reused, dtype=bool)}
+        file = self._file(index, _DONE if outcome.points else _FAILED, seam=seam)
+        temporary = temporary_path(file, suffix="")
+        try:
+            if (self.folder / RUN).read_text(encoding="utf-8") != self._run:
+                raise LayerError(f"{self.folder} is another run's by now")
+            with make_file(temporary) as stream:
+                np.savez(stream, **arrays)
+            temporary.replace(file)
+        except OSError as error:
+            raise LayerError(f"cannot write {file}: {error.strerror}") from error
+        finally:
+            temporary.unlink(missing_ok=True)
+
     def _clear(self) -> None:
         """Remove our files but the locked one."""
         for file in self.folder.glob("*"):
@@ -272,7 +303,8 @@ class FrameFolder:
     ) -> None:
         """Keep the frames, however the run failed, unless that was not wanted; let go of the folder."""
         try:
-            if kind is None or not (self._keep or self.kept) or not _whole_frames(self.folder):
+            done = kind is None and not self._stays
+            if done or (kind and not (self._keep or self.kept)) or not whole_frames(self.folder):
                 self._clear()
         finally:
             self._lock.release()
@@ -284,8 +316,28 @@ def _heat_of(data: Mapping[str, np.ndarray], index: int) -> dict[str, np.ndarray
     return {name.removeprefix(prefix): data[name] for name in data if name.startswith(prefix)}
 
 
-def _different(there: Any, wanted: Any, name: str = "") -> list[str]:
+def differences(there: Any, wanted: Any, name: str = "") -> list[str]:
     """Names of the entries in which two records differ."""
     if isinstance(there, dict) and isinstance(wanted, dict):
-        return [each for key in {*there, *wanted} for each in _different(there.get(key), wanted.get(key), key)]
+        return [each for key in {*there, *wanted} for each in differences(there.get(key), wanted.get(key), key)]
     return [] if there == wanted else [name]
+
+
+class Folders:
+    """Frames of several chunks as if they lay in one folder.
+
+    Attributes:
+        kept: Numbers of the frames that are there, failed ones among them.
+    """
+
+    def __init__(self, owners: Mapping[int, Finished]) -> None:
+        """Take the folder of each frame, by number."""
+        self._owners, self.kept = owners, frozenset(owners)
+
+    def seams(self) -> set[int]:
+        """Numbers of the frames before which chunks meet, or what two processes solved of one."""
+        return set().union(*(folder.seams() for folder in {*self._owners.values()})) & self.kept
+
+    def read(self, index: int, time: float | None, *, seam: int | None = None) -> Outcome | None:
+        """Read a frame as `Finished.read` does; the pre-roll of a seam lies in the folder of the frame after it."""
+        return self._owners[index if seam is None else seam].read(index, time, seam=seam)

@@ -26,6 +26,8 @@ from ..usd.read.reader import Shot
 from .frames import Lead, Outcome
 from .options import RefineOptions
 
+Both = Sequence[tuple[Outcome, Lead]]
+"""The frames before a seam, each with its solution by the process behind the seam."""
 Positions = Sequence[np.ndarray | None]
 """Points of each garment, shape (V, 3), None where it has no sample."""
 Mover = Callable[[float | None, Positions, Positions, Positions], tuple[Positions, str]]
@@ -46,7 +48,7 @@ class Joint:
     why: str
 
 
-def join(both: Sequence[tuple[Outcome, Lead]], move: Mover) -> Joint:
+def join(both: Both, move: Mover) -> Joint:
     """Join the frames of one seam.
 
     Args:
@@ -73,19 +75,26 @@ def _between(before: np.ndarray, after: np.ndarray, weight: float) -> np.ndarray
     return start + weight * (after.astype(np.float64) - start)
 
 
-def joined(outcomes: Iterable[Outcome], move: Mover, warn: Callable[[str], object]) -> Iterator[Outcome]:
+def joined(
+    outcomes: Iterable[Outcome],
+    move: Mover,
+    warn: Callable[[str], object],
+    *,
+    seen: Callable[[Both, Joint], object] | None = None,
+) -> Iterator[Outcome]:
     """Frames in order, joined where two processes solved them.
 
     Args:
         outcomes: The frames, those that two solved with the other one's as ``lead``.
         move: Moves cloth safely.
         warn: Called with a warning for each seam left as a jump.
+        seen: Called with the frames of each seam, before and after they are joined.
     """
     both: list[tuple[Outcome, Lead]] = []
     for outcome in outcomes:
         ends = bool(both) and (outcome.lead is None or outcome.lead.seam != both[0][1].seam)
         if ends:
-            yield from _joined_or_warned(both, move, warn)
+            yield from _and_warn(both, join(both, move), warn, seen)
             both = []
         # It may equal the last frame of the pre-roll, which is not the one that was written.
         first = replace(outcome, reused=(False,) * len(outcome.reused)) if ends else outcome
@@ -93,13 +102,14 @@ def joined(outcomes: Iterable[Outcome], move: Mover, warn: Callable[[str], objec
             yield first
         else:
             both.append((first, outcome.lead))
-    yield from _joined_or_warned(both, move, warn)
+    yield from _and_warn(both, join(both, move), warn, seen)
 
 
-def _joined_or_warned(
-    both: Sequence[tuple[Outcome, Lead]], move: Mover, warn: Callable[[str], object]
+def _and_warn(
+    both: Both, joint: Joint, warn: Callable[[str], object], seen: Callable[[Both, Joint], object] | None
 ) -> tuple[Outcome, ...]:
-    joint = join(both, move)
+    if both and seen is not None:
+        seen(both, joint)
     if joint.why:
         after = f"after time code {both[-1][0].time:g}"
         warn(f"the cloth jumps {after}, where the work of two processes meets: {joint.why}")

@@ -118,7 +118,7 @@ class RefineOptions:
     )
     preroll: int | None = _farm(
         None,
-        "Write --frames as a chunk for stitch, which joins it to the one before over the N frames before it.",
+        "Leave --frames in folder OUT, a chunk for stitch, which joins it to the one before over the N frames before.",
         metavar="N",
         least=0,
     )
@@ -218,12 +218,16 @@ class RefineOptions:
             _check(name.replace("_", " "), getattr(self, name), option)
         if self.skip_existing and self.overwrite:
             raise UsageError("skip existing leaves layers that are there, overwrite replaces them; choose one")
+        if self.preroll is not None and (self.skip_existing or self.root is not None):
+            raise UsageError(
+                "root and skip existing are for layers, preroll makes a chunk: give stitch the root, or resume"
+            )
         if self.device != "cpu" and not self.device.startswith("cuda"):
             raise UsageError(f"unknown device '{self.device}'; known: cpu, cuda")
 
     def targets(self, layer: Path) -> list[tuple[str, Path]]:
         """Every file that a run writes, in words and where."""
-        files = [("the layer", layer)]
+        files = [("the layer" if self.preroll is None else "the chunk", layer)]
         if self.root is not None:
             files.append(("the root", Path(self.root)))
         if self.report is not None:

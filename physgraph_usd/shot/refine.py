@@ -26,7 +26,7 @@ from .options import RefineOptions, json_of
 from .page.report import write_folder
 from .processes import call_each, memory_is_named
 from .report import RefineReport, is_of_failure
-from .run import Run
+from .run import Joins, Run
 from .solve import open_for, time_frames
 from .warnings import WARNINGS
 
@@ -55,20 +55,41 @@ def refine_shot(shot: str | Path, out: str | Path, options: RefineOptions = DEFA
     if there := skipped(shot, out, options):
         return there
     if not options.dry_run:
-        _check_places(out, options)
-    with _run(str(shot), options, out=out) as (opened, report):
+        if not out.resolve().parent.is_dir():
+            raise UsageError(f"the folder {out.resolve().parent} does not exist")
+        check_places(out, options)
+    with running(str(shot), options, out=out) as (opened, report):
         if options.dry_run:
             return report
         if may_be_done(out, options) and is_result_of(out, made_from(opened, out, options), settled=options.strict):
             return taken_as_done(report, out)
         _check_new(out, options)
-        Run(opened, out, options, report).refine()
-        if options.root is not None:
-            files = {"layer": out, "shot": Path(shot), "absolute": options.asset_paths == "absolute"}
-            write_root(Path(options.root), **files, overwrite=options.overwrite)
-        if options.report is not None:
-            _write_report(report, Path(options.report), opened)
+        write_all(opened, out, options, report)
     return report
+
+
+def write_all(
+    opened: Shot, out: Path, options: RefineOptions, report: RefineReport, *, joins: Joins | None = None
+) -> None:
+    """Write a run's layer, or its chunk, and the root and report that were asked for.
+
+    Args:
+        opened: The shot.
+        out: The layer, or the chunk's folder.
+        options: What to do and how.
+        report: The report.
+        joins: Chunks to join, in place of solving; None to solve.
+
+    Raises:
+        SolveError: No frame could be solved.
+        LayerError: A file cannot be written, or seams are refused.
+    """
+    Run(opened, out, options, report, joins).refine()
+    if options.root is not None:
+        files = {"layer": out, "shot": Path(opened.path), "absolute": options.asset_paths == "absolute"}
+        write_root(Path(options.root), **files, overwrite=options.overwrite)
+    if options.report is not None:
+        _write_report(report, Path(options.report), opened)
 
 
 def refine_stage(
@@ -100,7 +121,7 @@ def refine_stage(
         LayerError: The layer is invalid, or the report cannot be written.
     """
     _check_of_stage(stage, options)
-    with _run(stage, options, on_report=on_report) as (opened, report):
+    with running(stage, options, on_report=on_report) as (opened, report):
         layer = Run(opened, None, options, report).refine()
         if options.report is not None:
             _write_report(report, Path(options.report), opened)
@@ -109,7 +130,7 @@ def refine_stage(
 
 
 @contextmanager
-def _run(
+def running(
     shot: str | Stage,
     options: RefineOptions,
     *,
@@ -171,14 +192,13 @@ def refine_shots(
     return in_order(found, call_each(refine, alone, workers=at_once))
 
 
-def _check_places(out: Path, options: RefineOptions) -> None:
+def check_places(out: Path, options: RefineOptions) -> None:
     """Refuse before the work, not after an hour of frames, what could not be written then."""
-    if not out.resolve().parent.is_dir():
-        raise UsageError(f"the folder {out.resolve().parent} does not exist")
     if not options.resume:
         _check_new(out, options)
     for _, path in options.targets(out):
-        check_place(path)
+        if path != out or options.preroll is None:  # A chunk is a folder.
+            check_place(path)
 
 
 def _check_new(out: Path, options: RefineOptions) -> None:

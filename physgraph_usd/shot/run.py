@@ -5,26 +5,31 @@ from __future__ import annotations
 import dataclasses
 import sys
 import time as clock
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, closing, nullcontext
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any, Protocol
 
-from ..errors import NOTICE, SolveError, counted
+from ..errors import NOTICE, AbsentError, SolveError, counted
 from ..solver.level import refine_garments
 from ..solver.mesh.kernels import kernels_are_compiled
+from ..solver.mesh.subdivide import Refinement
+from ..solver.mesh.topology import PolygonMesh
+from ..solver.scene import Garment
 from ..usd.provenance import CROSSED, FAILED, UNSETTLED, UNSOLVED
 from ..usd.read.reader import Shot
+from ..usd.times import within
 from ..usd.view import Layer
-from ..usd.write.chunk import Chunk, chunk_of
 from ..usd.write.writer import LayerWriter
-from .chunks import PREROLL, solve_in_chunks
+from .chunks import PREROLL, finished_frames, solve_in_chunks
 from .cuts import Cuts
 from .describe import say_what_was
 from .farm import connected
 from .finished import made_from
-from .frames import FrameFolder, Outcome, frames_folder
-from .joined import SafeMover, joined
+from .frames import CHUNK, Folders, FrameFolder, Outcome, frames_folder
+from .joined import Both, Joint, SafeMover, joined
 from .notes import of_energy, of_folds, of_rest
 from .options import RefineOptions
 from .report import LOG, RefineReport
@@ -41,6 +46,36 @@ TIMED_FRAMES, LONG_RUN = 3, 60.0
 """Frames after which a run says when it will end, where that is so far away [s]."""
 
 
+class Joins(Protocol):
+    """Chunks to join.
+
+    Attributes:
+        numbers: Numbers of the frames to write, in order.
+        record: Entries of the layer's record.
+    """
+
+    numbers: range
+    record: Mapping[str, Any]
+
+    @property
+    def frames(self) -> Folders:
+        """The frames."""
+        ...
+
+    @property
+    def preroll(self) -> int:
+        """Most frames solved before each chunk."""
+        ...
+
+    def seen(self, both: Both, joint: Joint) -> None:
+        """Take note of a seam."""
+        ...
+
+    def check(self) -> None:
+        """Refuse (LayerError) the seams, once all frames are written and before the layer has its name."""
+        ...
+
+
 @dataclass(frozen=True, eq=False)
 class Run:
     """A run.
@@ -50,12 +85,14 @@ class Run:
         out: The layer to write, or None for one in memory.
         options: What to do and how.
         report: Its report, in which the garments are.
+        joins: Chunks to join into the layer, in place of solving; None to solve.
     """
 
     shot: Shot
     out: Path | None
     options: RefineOptions
     report: RefineReport
+    joins: Joins | None = None
 
     def refine(self) -> Layer | None:
         """Solve and write all frames; returns the layer where it is in memory.
@@ -74,39 +111,61 @@ class Run:
         return layer
 
     def _write_layer(self) -> Layer | None:
-        """Solve and write all frames; returns the layer where it is in memory."""
+        """Solve all frames and write them, or leave them as a chunk; returns the layer where it is in memory."""
         began, options = clock.perf_counter(), self.options
-        chunk = None if options.preroll is None else chunk_of(self.shot.scene.times, options.frames)
-        times, leads = self._times(chunk)
-        provenance = made_from(self.shot, self.out, options)
+        provenance = made_from(self.shot, self.out, options) | dict(self.joins.record if self.joins else {})
         known = len(self.shot.warnings)  # What is said of the shot itself has been.
-        made = {"mode": options.mode, "velocities": options.velocities, "overwrite": options.overwrite, "chunk": chunk}
-        refinements = refine_garments(self.shot.scene.garments, self._solver.levels)
+        part = [time for time in (self._times[k] for k in self._numbers) if time is not None]
+        made = {"mode": options.mode, "velocities": options.velocities, "overwrite": options.overwrite}
+        made["times"] = part if len(part) < len(self.shot.scene.times) else None
+        refinements = refine_garments(self.shot.scene.garments, self.solver.levels)
         with ExitStack() as stack:
-            frames = None
-            if self.out is not None:
-                decides = {"levels": self._solver.levels, "times": times, "report": options.report is not None}
-                settings = {"resume": options.resume, "drop": options.overwrite, "keep": options.keep_frames}
-                meshes = zip(self.shot.scene.garments, refinements, strict=True)
-                counts = [[cage, *steps][-1].mesh.vertex_count for cage, steps in meshes]
-                frames = stack.enter_context(
-                    FrameFolder(frames_folder(self.out), provenance | decides, counts=counts, **settings)
-                )
-            writer = stack.enter_context(LayerWriter(self.shot, refinements, self.out, provenance=provenance, **made))
-            solved = stack.enter_context(closing(self._solved(times, frames)))
-            for _ in range(leads):
-                outcome = next(solved)
-                if outcome.points and outcome.time is not None:
-                    writer.begin_after(outcome.time, outcome.points)
-            self._write_frames(writer, solved, len(times) - leads)
-            layer = writer.layer if self.out is None else None
+            frames = writer = None
+            if self.out is not None and self.joins is None:
+                frames = stack.enter_context(self._folder(self.out, provenance, refinements))
+            if not self._is_chunk:
+                how = {"provenance": provenance, **made}
+                writer = stack.enter_context(LayerWriter(self.shot, refinements, self.out, **how))
+            solved = stack.enter_context(closing(self._solved(frames)))
+            self._write_frames(writer, solved, len(self._numbers))
+            layer = writer.layer if writer is not None and self.out is None else None
         self.report.strict = options.strict
         self.report.seconds["frames"] = clock.perf_counter() - began
         self.report.warn(*map(str, self.shot.warnings[known:]))
         return layer
 
+    def _folder(
+        self, out: Path, provenance: dict[str, Any], refinements: Sequence[Sequence[Refinement]]
+    ) -> FrameFolder:
+        """The folder of finished frames: a chunk's own, or the one beside a layer until the layer is done."""
+        options, chunk = self.options, self._is_chunk
+        decides = {"levels": self.solver.levels, "times": self._times, "report": options.report is not None}
+        if chunk:
+            decides[CHUNK] = [self._numbers.start, self._numbers.stop]
+        meshes = fine_meshes(self.shot.scene.garments, refinements)
+        counts = [mesh.vertex_count for mesh in meshes]
+        settings = {"resume": options.resume, "drop": options.overwrite, "keep": options.keep_frames, "stays": chunk}
+        return FrameFolder(out if chunk else frames_folder(out), provenance | decides, counts=counts, **settings)
+
+    @property
+    def _is_chunk(self) -> bool:
+        """Whether the finished frames are what is wanted, for `stitch`."""
+        return self.options.preroll is not None
+
     @cached_property
-    def _solver(self) -> ShotSolver:
+    def _times(self) -> list[float | None]:
+        """Time codes of the open shot."""
+        return list(self.shot.scene.times) or [None]
+
+    @cached_property
+    def _numbers(self) -> range:
+        """Numbers of the time codes wanted: all that are open, or of a whole shot those in the range of frames."""
+        if self.joins is not None:
+            return self.joins.numbers
+        return numbers_in(self.shot.scene.times, self.options.frames if self._is_chunk else None)
+
+    @cached_property
+    def solver(self) -> ShotSolver:
         """Solves the shot's frames, here and in other processes, which find the same colliders."""
         options = self.options
         if AUTO in options.colliders:
@@ -125,26 +184,23 @@ class Run:
         asked = PREROLL if self.options.preroll is None else self.options.preroll
         return 0 if self.options.temporal == "off" else asked
 
-    def _times(self, chunk: Chunk | None) -> tuple[list[float | None], int]:
-        """Time codes to solve, in order, and how many of the first are the pre-roll of a chunk."""
-        every: list[float | None] = list(self.shot.scene.times) or [None]
-        if chunk is None or not chunk.times:
-            return every, 0
-        first = every.index(chunk.times[0])
-        lead = min(first, self._preroll)
-        return every[first - lead : first + len(chunk.times)], lead
-
-    def _solved(self, times: list[float | None], frames: FrameFolder | None) -> Outcomes:
+    def _solved(self, frames: FrameFolder | None) -> Outcomes:
         """Frames in order, those of an interrupted run among them, joined where several processes solved them."""
-        if frames is None:
-            yield from self._solver(times)
+        times, numbers, options, joins = self._times, self._numbers, self.options, self.joins
+        mover = SafeMover(self.shot, options, self.solver.levels)
+        if joins is not None:
+            solved = finished_frames(joins.frames, times, numbers, preroll=joins.preroll)
+            yield from joined(solved, mover, self.report.warn, seen=joins.seen)
+            joins.check()
             return
-        self._warn_of_finished(frames, len(times))
-        mover, options = SafeMover(self.shot, self.options, self._solver.levels), self.options
+        if frames is None:
+            yield from self.solver(times)
+            return
+        self._warn_of_finished(frames, len(numbers))
         with connected(options.scheduler) if options.scheduler else nullcontext() as farm:
-            chunks = {"workers": options.workers, "preroll": self._preroll, "start": farm}
-            with closing(solve_in_chunks(self._solver, times, frames, **chunks)) as solved:
-                yield from joined(solved, mover, self.report.warn)
+            chunks = {"workers": options.workers, "only": numbers, "preroll": self._preroll, "start": farm}
+            with closing(solve_in_chunks(self.solver, times, frames, **chunks)) as solved:
+                yield from solved if self._is_chunk else joined(solved, mover, self.report.warn)
 
     def _warn_of_finished(self, frames: FrameFolder, count: int) -> None:
         """Warn where frames of an earlier run are used, or could have been."""
@@ -157,8 +213,8 @@ class Run:
             kept = f"{len(frames.kept)} of {counted(count, 'frame')}"
             self.report.warn(WARNINGS["resumed"](kept=kept, again=again))
 
-    def _write_frames(self, writer: LayerWriter, solved: Outcomes, count: int) -> None:
-        """Write each frame as it comes, then close the layer."""
+    def _write_frames(self, writer: LayerWriter | None, solved: Outcomes, count: int) -> None:
+        """Write each frame as it comes, then close the layer; a chunk's frames are in its folder."""
         report, options = self.report, self.options
         written, shot, began = 0.0, {"shot": report.shot}, clock.perf_counter()
         for done, outcome in enumerate(solved, start=1):
@@ -181,21 +237,25 @@ class Run:
             UNSETTLED: len(report.unsettled) or None,
             CROSSED: report.crossings if report.leaves_crossings else None,
         }
-        writer.close(lacking=lacking)
+        if writer is not None:
+            writer.close(lacking=lacking)
+            report.warn(*map(str, writer.notices))
         report.seconds["close"] = clock.perf_counter() - start
         report.seconds["write"] = written
-        report.warn(*map(str, writer.notices), *of_frames(report))
+        report.warn(*of_frames(report))
         report.note(*of_folds(report.garments, report.frames), *of_energy(report.garments, report.frames))
         (report.warn if options.strict else report.note)(*of_rest(report.unsettled, len(report.frames)))
         say_what_was(report)
 
-    def _write_frame(self, writer: LayerWriter, outcome: Outcome) -> float:
+    def _write_frame(self, writer: LayerWriter | None, outcome: Outcome) -> float:
         """Write one time code's result and record it; returns the seconds that writing took."""
         self.report.frames.append(outcome.record)
         if not outcome.points:
             name, error = _name_of(outcome.time), str(outcome.record["error"])
             self.report.failed[name] = error
             self.report.warn(WARNINGS["failed"](name=name, error=error))
+            return 0.0
+        if writer is None:
             return 0.0
         start, records = clock.perf_counter(), self.report.frames
         how = {
@@ -205,6 +265,31 @@ class Run:
         }
         writer.write(outcome.time, outcome.points, **how)
         return clock.perf_counter() - start
+
+
+def numbers_in(every: Sequence[float], frames: tuple[float, float] | None) -> range:
+    """Numbers of the time codes of a shot in a range; a shot without samples has one frame.
+
+    Args:
+        every: Time codes of the whole shot, in order.
+        frames: First and last time code; None for all.
+
+    Raises:
+        AbsentError: No time code lies there.
+    """
+    if frames is None:
+        return range(max(len(every), 1))
+    times = within(every, frames)
+    if not times:
+        message = "no sample of the shot lies in frames {:g}:{:g}".format(*frames)
+        ends = f"; its {len(every)} samples run from {every[0]:g} to {every[-1]:g}" if every else ""
+        raise AbsentError(message + ends)
+    return range(every.index(times[0]), every.index(times[-1]) + 1)
+
+
+def fine_meshes(garments: Sequence[Garment], refinements: Sequence[Sequence[Refinement]]) -> list[PolygonMesh]:
+    """The finest mesh of each garment."""
+    return [[cage, *steps][-1].mesh for cage, steps in zip(garments, refinements, strict=True)]
 
 
 def _name_of(time: float | None) -> str:

@@ -36,7 +36,6 @@ _TYPES: dict[str, Any] = {
     "variants": _LIST,
     "shot": str,
     "left_out": Mapping,
-    "chunk": Mapping,
 }
 METADATA = ("upAxis", "metersPerUnit", "kilogramsPerUnit", "defaultPrim", "startTimeCode", "endTimeCode")
 """Stage metadata that a refined layer has in common with its shot."""

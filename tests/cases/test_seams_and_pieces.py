@@ -156,9 +156,9 @@ class TestWelded:
         """Both frames before the seam in time are solved twice, and moved safely."""
         halves = together(panel(-0.12, 0.12, 4), panel(0.0, 0.12, 4))
         shot = shot_of(tmp_path, sheet=halves)
-        refine(shot, tmp_path / "a.usdc", frames=(1.0, 3.0), preroll=2)
-        refine(shot, tmp_path / "b.usdc", frames=(4.0, 5.0), preroll=2)
-        stitch([tmp_path / "a.usdc", tmp_path / "b.usdc"], tmp_path / "fine.usdc")
+        refine(shot, tmp_path / "a", frames=(1.0, 3.0), preroll=2)
+        refine(shot, tmp_path / "b", frames=(4.0, 5.0), preroll=2)
+        stitch([tmp_path / "a", tmp_path / "b"], tmp_path / "fine.usdc")
         assert widest_gap(shot, tmp_path / "fine.usdc", {"sheet": halves}) == 0.0
         assert not faults(tmp_path / "fine.usdc", shot)
 

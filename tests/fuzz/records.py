@@ -14,7 +14,7 @@ from .damage import NAN, ODD_INTS, WORDS
 from .files import ALL
 from .mutant import Draft, Kind
 
-_ENTRIES = ("garments", "shot", "variants", "left_out", "failed", "chunk", "chunks", "contents", "options", "inputs")
+_ENTRIES = ("garments", "shot", "variants", "left_out", "failed", "chunks", "contents", "options", "inputs")
 
 
 def _values(draft: Draft) -> Any:

@@ -20,7 +20,6 @@ from ..read.skinning import skel_root
 from ..stage import at_time, paths_in, root_metadata, timecode
 from ..times import SAME_TIME, garment_times
 from ..view import StageView
-from ..write.chunk import read_chunk, samples_and_blocks
 from ..write.normals import VertexNormals
 from ..write.overs import EMPTIED
 from ..write.primvars import STALE
@@ -348,12 +347,12 @@ def whole_range(layer: Sdf.Layer) -> Iterator[Problem]:
     """All samples of the shot were refined: outside those that were, the cloth stands still."""
     for path, message in (read_record(layer) or {}).get("left_out", {}).items():
         yield Problem("warning", path, None, f"was refined without {message}, where it stands still (--frames)")
-    chunk = read_chunk(layer)
-    if chunk is not None and chunk.times != chunk.every:
-        message = (
-            f"is a chunk, with {len(chunk.times)} of the shot's {len(chunk.every)} frames; stitch it to the others"
-        )
-        yield Problem("warning", "/", None, message)
+
+
+def times_with_values(layer: Sdf.Layer, name: str) -> list[float]:
+    """Time codes at which a layer has a value of an attribute, and no block."""
+    every = layer.ListTimeSamplesForPath(name)
+    return [time for time in every if not isinstance(layer.QueryTimeSample(name, time), Sdf.ValueBlock)]
 
 
 def self_contained(layer: Sdf.Layer) -> Iterator[Problem]:
@@ -394,7 +393,7 @@ def is_mesh(path: str, composed: Usd.Stage) -> str:
 def against_shot(layer: Sdf.Layer, coarse: Usd.Prim, target: Sdf.Path) -> Iterator[Problem]:
     """Samples lie at the shot's own times, and the fine mesh is about where and as large as the coarse one."""
     name = str(target.AppendProperty("points"))
-    written, _ = samples_and_blocks(layer, name)
+    written = times_with_values(layer, name)
     for time in written:
         if reason := absence(coarse, time):
             yield _error(f"is a sample at a time at which the garment is not there: {reason}", name, time)

@@ -8,14 +8,24 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pxr import Sdf, Usd, UsdUtils
+from pxr import Sdf, Usd
 
 from ...errors import LayerError
 from ..provenance import read_record, recorded_shot
 from ..stage import USD_ERRORS, bad_rate, is_there, open_layer, paths_in, pxr_errors, quiet
 from ..view import StageView
-from ..write.chunk import samples_and_blocks
-from .rules import LAYER_RULES, RULES, Fine, Problem, against_shot, is_mesh, same_metadata, same_variants, subsets
+from .rules import (
+    LAYER_RULES,
+    RULES,
+    Fine,
+    Problem,
+    against_shot,
+    is_mesh,
+    same_metadata,
+    same_variants,
+    subsets,
+    times_with_values,
+)
 from .validators import PLUGIN
 
 __all__ = ["Problem", "check_layer", "validate_layer"]
@@ -48,7 +58,6 @@ def validate_layer(layer: str | Path | Sdf.Layer, shot: str | Path | Usd.Stage |
         stages = [Usd.Stage.OpenMasked(opened, nothing)] + ([] if view is None else [view.open(mask=nothing)])
         if fault := next(filter(None, map(bad_rate, stages)), ""):
             return [Problem("error", "/", None, fault, "time_scale")]
-        opened = _played(opened)
         problems = check_layer(opened, view)
         if lost:
             message = f"the shot that its record names is not at {below}; give it with --shot, or bring the layer back"
@@ -90,7 +99,7 @@ def check_layer(layer: Sdf.Layer, shot: StageView | None, *, samples: int | None
 
 def _check_garment(prim: Usd.Prim, layer: Sdf.Layer, samples: int | None, *, coarse: Usd.Prim) -> Iterator[Problem]:
     """Run the rules for one garment; for subsets that break a rule in the shot already there is a warning."""
-    written, _ = samples_and_blocks(layer, str(prim.GetPath().AppendProperty("points")))
+    written = times_with_values(layer, str(prim.GetPath().AppendProperty("points")))
     if samples is not None and len(written) > samples:
         written = [written[i] for i in np.linspace(0, len(written) - 1, samples).astype(int)]
     fine = Fine(prim, layer, (None, *written))
@@ -121,21 +130,6 @@ def _coarse_path(layer: Sdf.Layer, path: str) -> str:
     spec = layer.GetPrimAtPath(path)
     references = list(spec.referenceList.prependedItems) if spec else []
     return str(references[0].primPath) if references else path
-
-
-def _played(layer: Sdf.Layer) -> Sdf.Layer:
-    """A layer that `stitch --clips` wrote, with the samples that its clips play; any other as it is."""
-    stage = Usd.Stage.Open(layer) if "chunks" in (read_record(layer) or {}) and layer.subLayerPaths else None
-    moving = [prim for prim in stage.TraverseAll() if prim.HasAuthoredMetadata("clips")] if stage else []
-    if stage is None or not moving:
-        return layer
-    whole = UsdUtils.FlattenLayerStack(stage)
-    for prim in moving:
-        whole.GetPrimAtPath(prim.GetPath()).ClearInfo("clips")
-        for attribute in prim.GetAuthoredAttributes():
-            for time in attribute.GetTimeSamples():
-                whole.SetTimeSample(attribute.GetPath(), time, attribute.Get(time))
-    return whole
 
 
 def _own_validators(layer: Sdf.Layer, shot: StageView) -> list[Problem]:

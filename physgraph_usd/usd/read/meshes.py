@@ -249,7 +249,7 @@ class RefinedLayer:
         self.targets = tuple(str(each) for each in record.get("garments", ()))
 
     def target(self, shot: Shot, index: int) -> str | None:
-        """Path of a garment's fine mesh by number; None in a chunk without a sample of it."""
+        """Path of a garment's fine mesh by number; None in a layer without a sample of it."""
         coarse = str(shot.sources[index].path)
         return next((each for each in self.targets if each in (coarse, f"{coarse}_refined")), None)
 

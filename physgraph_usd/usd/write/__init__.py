@@ -1,1 +1,1 @@
-"""Writing: layers, primvars, chunks and samples; a file is complete or not there."""
+"""Writing: layers, primvars, samples; a file is complete or not there."""

@@ -67,7 +67,6 @@ class PointTrack:
 
     Attributes:
         box: Extent of the last sample.
-        cuts: Time codes of the samples to which the cloth jumps from the one before, where there are velocities.
         unknown: Time codes of the samples whose velocities are blocked.
     """
 
@@ -102,7 +101,6 @@ class PointTrack:
         stream.attribute(self._paths["extent"], TYPES["extent"])
         self._rest, self._still, self._rate, self._own = rest, still, rate, own
         self._absent = list(absent)
-        self.cuts: list[float] = []
         self.unknown: list[float] = []
         self._has_default = False
         self._last: _Sample | None = None
@@ -115,7 +113,7 @@ class PointTrack:
         self,
         time: float | None,
         points: np.ndarray,
-        to_metres: np.ndarray | None,
+        to_metres: np.ndarray,
         *,
         changed: bool = True,
         cut: bool = False,
@@ -125,8 +123,7 @@ class PointTrack:
         Args:
             time: Time code, or None for the default of a shot without samples.
             points: Fine points [m], world space, shape (V, 3).
-            to_metres: Local space to world metres, shape (4, 4), for column vectors; None where the points are local
-                ones, float32.
+            to_metres: Local space to world metres, shape (4, 4), for column vectors.
             changed: False when the world points are known to equal the last ones.
             cut: Whether the cloth jumps here from the sample before.
 
@@ -137,14 +134,12 @@ class PointTrack:
             self._block_until(time)
         if cut and self._rate is not None and time is not None:
             self._end_stretch()
-            self.cuts.append(time)
-        same_matrix = self._matrix is not None and to_metres is not None and np.array_equal(self._matrix, to_metres)
+        same_matrix = self._matrix is not None and np.array_equal(self._matrix, to_metres)
         if not changed and same_matrix and self._last is not None and time is not None:
             self._take(_Sample(time, self._last.points), moved=False)
             return
         self._matrix = to_metres
-        if to_metres is not None:
-            points = to_local(points, to_metres, str(self._paths["points"].GetPrimPath()), time)
+        points = to_local(points, to_metres, str(self._paths["points"].GetPrimPath()), time)
         if not self._has_default:
             self._author(None, points if self._rest is None else self._rest)
             self._has_default, self._rest = True, None
@@ -190,9 +185,9 @@ class PointTrack:
             self._author_velocity(self._queue[-2], self._queue[0], sample)
             del self._queue[:-2]
 
-    def finish(self, *, hold: bool = False) -> None:
-        """Author the last velocity, and with ``hold`` the end of a run of equal samples that others are to follow."""
-        if hold or self._absent:
+    def finish(self) -> None:
+        """Author the last velocity, and the blocks after the last sample."""
+        if self._absent:
             self._end_run()
         self._end_stretch()
         self._block_until(np.inf)
@@ -318,12 +313,6 @@ class HeatTrack:
                 self._set(name, end, last)
             self._set(name, time, values)
             self._runs[name] = values, None
-
-    def finish(self, *, hold: bool = False) -> None:
-        """Author the ends of runs of equal samples where further samples are to follow them (``hold``)."""
-        for name, (last, end) in self._runs.items() if hold else ():
-            if end is not None and not self._still:
-                self._set(name, end, last)
 
     def _path(self, name: str) -> Sdf.Path:
         return self._target.AppendProperty(PREFIX + name)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import TracebackType
@@ -27,12 +26,11 @@ from ..read.reader import Shot
 from ..stage import Notice, at_time, first_value, pxr_errors, value_at
 from ..times import within
 from . import overs
-from .chunk import CHUNK, Chunk
 from .normals import VertexNormals
 from .overs import author_used_values
 from .primvars import FineMap, carry_primvars, carry_subsets
 from .stream import LayerStream
-from .track import HeatTrack, ModelHints, PointTrack, extent_of, to_local
+from .track import HeatTrack, ModelHints, PointTrack
 
 MODES = ("over", "sibling")
 
@@ -54,7 +52,7 @@ class LayerWriter:
         velocities: bool = False,
         provenance: Mapping[str, Any] | None = None,
         overwrite: bool = False,
-        chunk: Chunk | None = None,
+        times: Sequence[float] | None = None,
     ) -> None:
         """Start the layer and author everything that does not move.
 
@@ -66,8 +64,8 @@ class LayerWriter:
             velocities: Whether to author velocities, by finite differences, where the shot has none too.
             provenance: Further entries of the record in ``customLayerData["physgraph"]``.
             overwrite: Whether an existing file may be replaced.
-            chunk: Frames of the shot that the layer is for; garments without a sample there are not in it. None for
-                all.
+            times: Time codes that will be written where they are not all of the shot; garments without a sample there
+                are not in the layer.
 
         Raises:
             UsageError: The mode is unknown, or the file exists or is one that the shot is made of.
@@ -82,7 +80,7 @@ class LayerWriter:
         self._shot, self._mode, self._time = shot, mode, -np.inf
         self._velocities, self._open = velocities, True
         self._record = {"mode": mode} | dict(provenance or {})
-        self._chunk, self._meshes = chunk, dict[int, _RefinedMesh]()
+        self._times, self._meshes = times, dict[int, _RefinedMesh]()
         self.notices: list[Notice] = []
         with ExitStack() as stack:
             self._stream = stack.enter_context(LayerStream(out, overwrite=overwrite))
@@ -96,9 +94,9 @@ class LayerWriter:
         provenance.copy_stage_metadata(self._shot.stage, self._stream.layer, span=span)
         options = {"sibling": self._mode == "sibling", "velocities": self._velocities}
         with pxr_errors(f"cannot read {self._shot.path}"):
-            for index in _garments_in(self._shot, self._chunk):
+            for index in _garments_in(self._shot, self._times):
                 absent = self._shot.sources[index].absent
-                absent = absent if self._chunk is None else self._chunk.holds(absent)
+                absent = absent if self._times is None else within(absent, (self._times[0], self._times[-1]))
                 mesh = _RefinedMesh(self._stream, self._shot, index, steps=refinements[index], absent=absent, **options)
                 self.notices += mesh.notices
                 self._meshes[index] = mesh
@@ -142,24 +140,6 @@ class LayerWriter:
                 mesh.write(time, array, (heat[index] if heat else None) or {}, **how)
         self._time = np.inf if time is None else time
 
-    def begin_after(self, time: float, points: Sequence[np.ndarray | None]) -> None:
-        """Take a frame of a chunk's pre-roll into the chunk's record.
-
-        Args:
-            time: Its time code.
-            points: As `write` takes them.
-
-        Raises:
-            LayerError: A point is not finite.
-        """
-        assert self._chunk is not None, "only a chunk has a pre-roll"
-        found = {
-            str(mesh.target): mesh.before(time, array)
-            for index, mesh in self._meshes.items()
-            if (array := points[index]) is not None
-        }
-        self._chunk = replace(self._chunk, preroll={**self._chunk.preroll, time: found})
-
     @property
     def targets(self) -> list[Sdf.Path]:
         """Path of each garment's fine mesh."""
@@ -177,12 +157,13 @@ class LayerWriter:
         if self._time == -np.inf:
             raise LayerError(f"no time code was written to {self._stream.target}")
         for mesh in self._meshes.values():
-            mesh.finish(hold=self._chunk is not None)
+            mesh.finish()
             self.notices += mesh.unknown_velocities()
-        if self._chunk is not None:
-            self._chunk = replace(self._chunk, cuts={str(mesh.target): mesh.cuts for mesh in self._meshes.values()})
         facts = _facts(self._shot, self.targets, self._stream.target)
-        facts |= {CHUNK: self._chunk.record()} if self._chunk is not None else {}
+        if self._times is not None:
+            count = len(self._shot.scene.times)
+            left = f"{count - len(self._times)} of the shot's {count} frames"
+            facts["left_out"] = {str(path): left for path in self.targets}
         provenance.author_record(self._stream.layer, facts | self._record | dict(lacking or {}))
         self._stream.flush()
         self._check_written()
@@ -276,12 +257,6 @@ class _RefinedMesh:
         self._hints.write(time, self._track.box)
         self._heat.write(time, {name: self._weld.split(values) for name, values in heat.items()})
 
-    def before(self, time: float, points: np.ndarray) -> np.ndarray:
-        """Local points of a frame of the pre-roll, float32; the hints hold them, since `stitch` shows part of it."""
-        local = to_local(self._weld.split(points), self._shot.to_metres(self._index, time), str(self.target), time)
-        self._hints.write(time, extent_of(local))
-        return local
-
     def check(self, points: np.ndarray | None, heat: Mapping[str, np.ndarray], time: float | None) -> None:
         """Refuse points and heat maps that do not fit."""
         count = self._weld.mesh.vertex_count
@@ -290,15 +265,9 @@ class _RefinedMesh:
             raise LayerError(f"{place}: points have shape {points.shape}; the fine mesh has {count} vertices")
         self._heat.check(heat, time)
 
-    def finish(self, *, hold: bool) -> None:
-        """Author what waited for a next sample; ``hold`` as `PointTrack.finish` takes it."""
-        self._track.finish(hold=hold)
-        self._heat.finish(hold=hold)
-
-    @property
-    def cuts(self) -> tuple[float, ...]:
-        """Time codes of samples to which the cloth jumps, where there are velocities."""
-        return tuple(self._track.cuts)
+    def finish(self) -> None:
+        """Author what waited for a next sample."""
+        self._track.finish()
 
     def unknown_velocities(self) -> list[Notice]:
         """A notice of samples alone between cuts, at which the shot has no velocities either."""
@@ -336,13 +305,13 @@ def _facts(shot: Shot, targets: Sequence[Sdf.Path], out: Path | None) -> dict[st
     }
 
 
-def _garments_in(shot: Shot, chunk: Chunk | None) -> list[int]:
-    """Numbers of the garments that have a sample in a chunk; one without samples is in that of the first frame."""
+def _garments_in(shot: Shot, times: Sequence[float] | None) -> list[int]:
+    """Numbers of the garments with a sample at one of the time codes; one without samples has the shot's first."""
     every = range(len(shot.sources))
-    if chunk is None or not chunk.times:
+    if times is None:
         return [*every]
     first = shot.scene.times[0]
-    return [index for index in every if not {*(shot.sources[index].times or (first,))}.isdisjoint(chunk.times)]
+    return [index for index in every if not {*(shot.sources[index].times or (first,))}.isdisjoint(times)]
 
 
 def _own_velocities(prim: Usd.Prim, fine: FineMap, time: float | None) -> np.ndarray | None:
