@@ -23,6 +23,7 @@ from physgraph_usd.solver.frame.group import Group
 from physgraph_usd.solver.frame.settings import SolveSettings
 from physgraph_usd.solver.integrate import method_named
 from physgraph_usd.solver.integrate.base import Integrator, System
+from physgraph_usd.solver.integrate.saddle import leave_saddle
 from physgraph_usd.solver.level import refine_garments
 from physgraph_usd.solver.scene import Frame, Garment, GarmentFrame, Scene
 from physgraph_usd.usd.read.reader import open_shot
@@ -136,13 +137,17 @@ class Descent:
 def descend(
     group: Group, systems: Sequence[System], coarse: torch.Tensor, integrator: Integrator, *, steps: Sequence[int]
 ) -> Descent:
-    """Walk the levels with so many force evaluations at each, the one at its start not counted."""
+    """Walk the levels with so many force evaluations at each, the one at its start not counted.
+
+    The upsampled cage is taken off its saddle first, as the solver does it; that is not counted either.
+    """
     x = group.levels[-len(steps)].base.apply(coarse)
     energy, spent, evaluations = math.inf, 0.0, 0
     movers: dict[str, int] = {}
     clock = time.perf_counter if x.is_cuda else time.process_time
     for level, system, count in zip(group.levels[-len(steps) :], systems[-len(steps) :], steps, strict=True):
         x = x if level.from_below is None or x.shape[0] == level.vertex_count else level.from_below.apply(x)
+        x = leave_saddle(system, level, x)
         before, began = system.evaluations, clock()
         carry = integrator.start(system, x)
         while system.evaluations - before <= count and carry.mover != "stayed":

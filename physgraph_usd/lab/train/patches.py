@@ -33,6 +33,7 @@ from ...solver.integrate import METHODS
 from ...solver.integrate.base import System
 from ...solver.integrate.metric import Metric
 from ...solver.integrate.quasi_newton import QuasiNewton
+from ...solver.integrate.saddle import leave_saddle
 from ...solver.integrate.solve import Budget, solve_level
 from ...solver.integrate.vertex_frame import VertexFrame
 from ...solver.level import Level, refine_garments
@@ -142,8 +143,8 @@ class Patch:
         gravity: [m/s^2], shape (3,).
         words: Its shape, mesh, border and levels.
         body: The body that it rests on, or None.
-        raw: Upsampled cage at each level [m], float32.
-        start: Its energy [J].
+        raw: Upsampled cage at each level [m], float32, off the saddle where it is flat.
+        start: Its energy without leaving the saddle [J].
         least: Least energy known at each level [J].
         solved: Positions after some steps of nested quasi-Newton at each level [m], float32.
     """
@@ -170,7 +171,7 @@ class Patch:
         return with_bodies(systems, self.group.levels, coarse, [self.body])
 
     def begin(self, index: int) -> Tensor:
-        """The upsampled cage at a level [m]."""
+        """The upsampled cage at a level [m], off the saddle where it is flat."""
         return torch.as_tensor(self.raw[index])
 
     def __getstate__(self) -> dict[str, Any]:
@@ -197,12 +198,13 @@ def measure(patch: Patch, steps: int, *, presolve: int) -> None:
     coarse = patch.group.systems([patch.frame])[1]
     x = short = coarse
     for index, (level, system) in enumerate(zip(patch.group.levels, patch.systems, strict=True)):
-        raw = level.base.apply(coarse)
+        upsampled = level.base.apply(coarse)
+        raw = leave_saddle(system, level, upsampled)
         x, short = (raw, raw) if level.from_below is None else map(level.from_below.apply, (x, short))
         x, report = solve_level(system, QuasiNewton(), x, level=index, budget=Budget(steps))
         short, _ = solve_level(system, QuasiNewton(), short, level=index, budget=Budget(presolve))
         patch.raw.append(raw.numpy())
-        patch.start.append(system.energy_and_force(raw)[0])
+        patch.start.append(system.energy_and_force(upsampled)[0])
         patch.least.append(report.energy_after)
         patch.solved.append(short.numpy())
 
@@ -237,7 +239,7 @@ def patch_of(config: PatchConfig, rng: np.random.Generator) -> Patch:
     levels = int(rng.integers(config.levels[0], config.levels[1] + 1))
     while levels > 1 and len(rest) * 4**levels > config.most_vertices:
         levels -= 1
-    garment = Garment("/Patch", mesh, rest, levels, bool(rng.random() < 0.3), one, one, one, one, pin)
+    garment = Garment("/Patch", mesh, rest, levels, False, bool(rng.random() < 0.3), one, one, one, one, pin)
     points = posed(rest, rng, config)
     if rng.random() < 0.5 and pin.any():
         points = _draped(_group(garment, gravity, 0), points, fabric, guide=guide, rng=rng)

@@ -19,8 +19,8 @@ from ..forces.bending import Bending
 from ..forces.guide import Guide, GuideMap
 from ..forces.tether import Tether
 from ..integrate.base import ForceField, Preconditioner, System
-from ..integrate.facets import facets
 from ..integrate.metric import Metric, on_edges
+from ..integrate.saddle import facets
 from ..level import Level
 from ..mesh.stencil import Stencil
 from ..scene import Garment, GarmentFrame
