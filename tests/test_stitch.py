@@ -393,7 +393,7 @@ class TestSeamsBeforeAllIsThere:
         (tmp_path / "c").mkdir()
         (tmp_path / "c" / "other.usda").write_text("#usda 1.0\n")
         first, second, third = copied(runs, tmp_path / "all")
-        of = {"shot": runs.shot}
+        of: dict[str, Any] = {"shot": runs.shot}
         shutil.copytree(first, tmp_path / "c" / "first")
         assert check_seams([tmp_path / "c"], of=tmp_path / "c" / "first", **of) == []
         shutil.copytree(third, tmp_path / "c" / "third")

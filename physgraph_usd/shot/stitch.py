@@ -129,11 +129,11 @@ class _Joins:
     meshes: Sequence[PolygonMesh]
     paths: Sequence[str]
     bound: float
-    numbers: range | Sequence[int] = ()
+    numbers: range = range(0)
     record: Mapping[str, Any] = field(default_factory=dict)
     seams: list[Seam] = field(default_factory=list)
 
-    @cached_property
+    @property
     def frames(self) -> Folders:
         """The frames of all chunks; points that do not fit a mesh are damaged."""
         counts = [mesh.vertex_count for mesh in self.meshes]
