@@ -147,7 +147,7 @@ def descend(
     clock = time.perf_counter if x.is_cuda else time.process_time
     for level, system, count in zip(group.levels[-len(steps) :], systems[-len(steps) :], steps, strict=True):
         x = x if level.from_below is None or x.shape[0] == level.vertex_count else level.from_below.apply(x)
-        x = leave_saddle(system, level, x)
+        x = leave_saddle(system, level, x, outward=torch.ones(1, device=x.device))
         before, began = system.evaluations, clock()
         carry = integrator.start(system, x)
         while system.evaluations - before <= count and carry.mover != "stayed":

@@ -98,6 +98,7 @@ def test_topology_controls_that_usd_does_not_know_are_told(stage: Usd.Stage) -> 
     assert "orientation is 'upsideDown'" in notices
     assert "subdivisionScheme is 'doSabin'" in notices
     assert "subdivisionScheme has time samples" in notices
+    assert not open_shot(save(stage)).scene.garments[0].flipped
 
 
 def test_isolated_points_stay(stage: Usd.Stage) -> None:

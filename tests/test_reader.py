@@ -80,6 +80,8 @@ def test_s6_transforms_and_handedness_equal_the_baked_cloth(tmp_path: Path, plac
     for time in shot.scene.times:
         expected = sheet_points(time) @ total[:3, :3].T + total[:3, 3]
         np.testing.assert_allclose(world(shot, time), expected, atol=1e-6)
+    mirrored = np.linalg.det(total) < 0
+    assert shot.scene.garments[0].flipped == ((orientation == "leftHanded") != mirrored)
     np.testing.assert_allclose(shot.to_metres(0, 1.0), total, atol=1e-12)
 
 
@@ -92,6 +94,7 @@ def test_animated_and_mirrored_parents_are_followed_at_each_time(tmp_path: Path)
     add_sheet(stage, "/World/rig/cloth", times=(1.0, 2.0))
     shot = open_shot(save(stage))
     assert shot.scene.times == (1.0, 2.0, 2.5, 4.0)
+    assert shot.scene.garments[0].flipped
     for time, matrix in matrices.items():
         held = sheet_points(min(time, 2.0))
         np.testing.assert_allclose(world(shot, time), 0.01 * (held @ matrix[:3, :3].T + matrix[:3, 3]), atol=1e-6)

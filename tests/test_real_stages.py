@@ -46,6 +46,7 @@ def test_the_variants_are_one_animation_under_many_conventions(real_data: Path, 
         if name.endswith("c_zup_cm.usdc"):
             points = points @ np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])
         np.testing.assert_allclose(points, expected, atol=2e-6)
+    assert shot.scene.garments[0].flipped == ("lefthanded" in name)
 
 
 def test_sub_frame_and_sparse_times_are_the_authored_ones(real_data: Path) -> None:

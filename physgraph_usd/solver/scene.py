@@ -73,6 +73,7 @@ class Garment:
         closed: Whether each vertex belongs to a closed piece, whose sharp edges stay sharp, shape (V,); None without
             such pieces.
         rigid: Number of the rigid part that each vertex belongs to, -1 for cloth, shape (V,); None without parts.
+        flipped: Whether the authored winding is clockwise seen from outside: flat compressed cloth buckles to one side.
     """
 
     path: str
@@ -93,6 +94,7 @@ class Garment:
     sewn_at: np.ndarray | None = None
     closed: np.ndarray | None = None
     rigid: np.ndarray | None = None
+    flipped: bool = False
 
     @staticmethod
     def of(

@@ -199,7 +199,7 @@ def measure(patch: Patch, steps: int, *, presolve: int) -> None:
     x = short = coarse
     for index, (level, system) in enumerate(zip(patch.group.levels, patch.systems, strict=True)):
         upsampled = level.base.apply(coarse)
-        raw = leave_saddle(system, level, upsampled)
+        raw = leave_saddle(system, level, upsampled, outward=torch.ones(1))
         x, short = (raw, raw) if level.from_below is None else map(level.from_below.apply, (x, short))
         x, report = solve_level(system, QuasiNewton(), x, level=index, budget=Budget(steps))
         short, _ = solve_level(system, QuasiNewton(), short, level=index, budget=Budget(presolve))

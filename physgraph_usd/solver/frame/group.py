@@ -96,6 +96,11 @@ class Group:
             seams=level_seams(levels, garments),
         )
 
+    @property
+    def outward(self) -> Float[Tensor, " garments"]:
+        """Sign of each garment's normals: 1 for outward, -1 for inward."""
+        return torch.tensor([-1.0 if each.flipped else 1.0 for each in self.garments], device=self.levels[0].device)
+
     def tensor(self, array: np.ndarray) -> Tensor:
         """An array in the type and on the device of the solve."""
         return torch.as_tensor(array, dtype=self.levels[0].dtype, device=self.levels[0].device)

@@ -41,6 +41,7 @@ class LevelProblem:
         untangler: What makes those that draw apart what crosses.
         budget: When to stop.
         near: Remaining move [tolerances] under which a frame in contact is done after a part of its steps; 0 for never.
+        outward: As `leave_saddle` takes it.
     """
 
     lasting: LevelForces
@@ -51,6 +52,7 @@ class LevelProblem:
     untangler: Integrator
     budget: Budget
     near: float
+    outward: Float[Tensor, " garments"]
 
     @property
     def level(self) -> Level:
@@ -168,7 +170,7 @@ class Problem:
         # With creases the stopping measure sees less of what is left than there is.
         near = NEAR if self.warm and self.creases is None else 0.0
         who = (self.group.integrator, self.group.untangler)
-        return LevelProblem(lasting, module, alone, self.view(index), *who, budget, near)
+        return LevelProblem(lasting, module, alone, self.view(index), *who, budget, near, self.group.outward)
 
     def begun(
         self, index: int, below: Float[Tensor, "below 3"] | None

@@ -94,14 +94,14 @@ def solve_one_level(
     """
     level, view, budget = problem.level, problem.view, problem.budget
     if view is None:
-        x = x if smoothing is None else leave_saddle(problem.alone, level, x + smoothing)
+        x = x if smoothing is None else leave_saddle(problem.alone, level, x + smoothing, outward=problem.outward)
         x, report = solve_level(problem.alone, problem.integrator, x, level=level.index, budget=budget)
         return unhindered(x), [report], problem.module
     x, reports = _untangle(problem, view, view.begun(x))
     if smoothing is not None:
         x = view.moved(x, x + smoothing) if level.index else x
         view, terms = view.terms(x)
-        x = view.moved(x, leave_saddle(problem.system(view, terms, x), level, x))
+        x = view.moved(x, leave_saddle(problem.system(view, terms, x), level, x, outward=problem.outward))
     carry, last, terms, made, touched, integrator = None, None, (), 0, False, problem.integrator
     while not made or made < _most_steps(problem.budget, reports[-1], touched=touched):
         view, terms = view.terms(x)

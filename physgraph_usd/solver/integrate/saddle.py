@@ -49,13 +49,16 @@ def facets(
     return ((smooth(coarse) - x) * normal).sum(dim=1, keepdim=True) * normal * level.free
 
 
-def leave_saddle(system: System, level: Level, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
+def leave_saddle(
+    system: System, level: Level, x: Float[Tensor, "vertices 3"], *, outward: Float[Tensor, " garments"]
+) -> Float[Tensor, "vertices 3"]:
     """Positions from which compressed cloth can buckle.
 
     Args:
         system: The level in this frame.
         level: The same level's topology and rest shape.
         x: Start positions [m].
+        outward: 1 for garments whose winding is counter-clockwise seen from outside, else -1.
 
     Returns:
         Positions [m] of no more energy than x; x itself where nothing is compressed and flat.
@@ -63,9 +66,8 @@ def leave_saddle(system: System, level: Level, x: Float[Tensor, "vertices 3"]) -
     missing, normal = _missing_slope(level, x)
     if not bool((missing > 0).any()):
         return x
-    offset = (
-        (AMPLITUDE * level.spacing * missing * _pattern(level.vertex_count).to(x)).unsqueeze(1) * normal * level.free
-    )
+    sign = _pattern(level.vertex_count).to(x) * outward.to(x)[level.vertex_garment.long()]
+    offset = (AMPLITUDE * level.spacing * missing * sign).unsqueeze(1) * normal * level.free
     energy = system.energy_and_force(x)[0]
     for halving in range(TRIES):
         trial = x + 0.5**halving * offset

@@ -24,7 +24,7 @@ from .absence import Samples, absence
 from .cage import PointReader, read_cage
 from .grain import read_grain
 from .materials import Values, find_values
-from .placement import check_matrix, check_placement, place, to_metres
+from .placement import check_matrix, check_placement, is_flipped, place, to_metres
 from .rest import Animation, Rest, read_rest, rests_bent
 from .skinning import Bake
 
@@ -151,6 +151,7 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], samples: Samples, re
         str(prim.GetPath()),
         weld.mesh,
         weld.joined(rest.points),
+        flipped=is_flipped(prim, matrix),
         bent_rest=bent,
         grain=grain,
         **constants | pieces | painted,
