@@ -88,7 +88,7 @@ class Row:
 @click.option("--count", default=12, show_default=True, help="Frames of each shot.")
 @click.option("--level", default=2, show_default=True)
 @click.option("--steps", default=12, show_default=True)
-@click.option("--integrator", default="auto", show_default=True)
+@click.option("--integrator", default="physgraph", show_default=True)
 @click.option("--shot", "shots", multiple=True, help="Only these.")
 @click.option("--whole", is_flag=True, help="A row a frame.")
 @click.option("--linear", is_flag=True, help="Levels start with the facets of the level below.")

@@ -66,7 +66,7 @@ def measure(name: str, level: int, folder: Path | None, files: Sequence[Path]) -
     frames = [plain_detail(shot.frame(each)) for each in times[first : first + 1 + more]]
     bench.run("", 0, DEFAULT, frames[:1])  # Loads the kernels and factors the metrics.
     for file in files:
-        settings = replace(DEFAULT, method=method_named("auto", file))
+        settings = replace(DEFAULT, method=method_named("physgraph", file))
         bench.run(str(file), DEFAULT.steps, settings, frames)
 
 

@@ -177,7 +177,7 @@ def ways(device: str) -> Iterator[tuple[str, int, SolveSettings]]:
     more = LONGER[device.partition(":")[0]]
     for steps in STEPS:
         if steps == DEFAULT.steps:
-            yield "auto", steps, DEFAULT
+            yield "physgraph", steps, DEFAULT
         for name in ("quasi-newton", "physgraph"):
             method = METHODS[name]
             yield name, steps, replace(DEFAULT, method=method, steps=steps)
@@ -266,7 +266,7 @@ def report(rows: Sequence[dict[str, Any]]) -> None:
     for row in rows:
         case = found.setdefault((row["shot"], row["level"], "warm" if row["number"] else "cold"), {})
         case.setdefault((row["method"], row["steps"]), []).append(row)
-    names = ("auto", *dict.fromkeys(row["method"] for row in rows if row["method"] != "auto"))
+    names = ("physgraph", *dict.fromkeys(row["method"] for row in rows if row["method"] != "physgraph"))
     lines, ratios = [], defaultdict(list)
     for (shot, level, kind), runs in sorted(found.items(), key=lambda each: (each[0][2], each[0][1])):
         whole = {key: run for key, run in runs.items() if len(run) == max(map(len, runs.values()))}
@@ -289,7 +289,7 @@ def report(rows: Sequence[dict[str, Any]]) -> None:
 def ratio_of(run: Sequence[dict[str, Any]], runs: Mapping[tuple[str, int], Sequence[dict[str, Any]]]) -> float:
     """A run's time over the least of any named method to its energy; 1 where none gets there."""
     times = [milliseconds(run)]
-    for name in {method for method, _ in runs} - {"auto"}:
+    for name in {method for method, _ in runs} - {"physgraph"}:
         points = [(milliseconds(own), energy(own)) for (method, _), own in runs.items() if method == name]
         times += [time] if (time := time_to(points, energy(run))) is not None else []
     return milliseconds(run) / min(times) if min(times) > 0.0 else 1.0

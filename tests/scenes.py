@@ -78,7 +78,7 @@ def fold() -> Shot:
 def layers() -> Shot:
     """Three sheets over one another, from the inside out, on a ball that rises into them."""
     cloth = square(6)
-    garments = [named(cloth, name, layer=number) for number, name in enumerate("ABC")]
+    garments = [named(cloth, name) for name in "ABC"]
     cages = [[cloth[1] + [0.003 * number, 0.15 + 0.004 * number, 0.0] for number in range(3)]] * 3
     return shot(garments, cages, [ball(0.14, at=(0.0, lift, 0.0)) for lift in (0.0, 0.01, 0.02)])
 

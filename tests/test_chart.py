@@ -299,8 +299,7 @@ def test_a_busy_machine_is_told():
 def test_every_integrator_is_found_when_the_chart_is_made(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(METHODS, "newcomer", Method(lambda: QuasiNewton(history=2), nested=True))
     curves = {curve.name: curve.method.nested for curve in find_curves()}
-    assert set(METHODS) - {"auto"} <= set(curves)
-    assert "auto" not in curves
+    assert set(METHODS) <= set(curves)
     assert curves["newcomer, flat"] is False
     assert curves["gd, nested"] is True
     assert "quasi-newton, flat" not in curves

@@ -310,7 +310,7 @@ class TestErrors:
         assert (result.exit_code, result.stdout) == (2, "")
         assert "rror: " in result.stderr
 
-    @pytest.mark.parametrize("command", ["refine", "stitch", "inspect", "tag", "validate", "preview", "chart"])
+    @pytest.mark.parametrize("command", ["refine", "inspect", "tag", "validate", "preview", "chart"])
     def test_missing_file_is_2(self, command: str, tmp_path: Path) -> None:
         out = {"inspect": (), "validate": (), "preview": ("-o", tmp_path / "x.png")}.get(
             command, ("-o", tmp_path / "x.usdc")

@@ -289,12 +289,12 @@ def test_a_move_of_few_that_leaves_its_paths_is_asked_as_any(monkeypatch: pytest
     for few in (detecting.FEW, 0.0):
         monkeypatch.setattr(detecting, "FEW", few)
         detector, other = Detector(cloth.parts), np.random.default_rng(10)
-        detector.impacts(x, x + 0.1 * EDGE, share=0.2, floor=0.0, asked=torch.ones(len(x), dtype=torch.bool))
+        detector.impacts(x, x + 0.1 * EDGE, floor=0.0, asked=torch.ones(len(x), dtype=torch.bool))
         found = detector._found
         for _ in range(6):
             near = (x - x[other.integers(len(x))]).norm(dim=1) < 2.0 * EDGE
             end = x + torch.where(near.unsqueeze(1), 4.0 * EDGE * torch.as_tensor(other.normal(size=3)), 0.0)
-            pairs = detector.impacts(x, end, share=0.2, floor=0.0, asked=near)
+            pairs = detector.impacts(x, end, floor=0.0, asked=near)
             met.append({tuple(each) for each in pairs.corners.tolist()})
         assert (detector._found is found) == (few > 0.0)
     assert met[:6] == met[6:]

@@ -229,7 +229,6 @@ class TestOptions:
         [
             ("integrator", "strech"),
             ("temporal", "sometimes"),
-            ("potential", "kinetic"),
             ("mode", "under"),
             ("device", "tpu"),
             ("workers", 0),

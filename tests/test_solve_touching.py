@@ -79,6 +79,7 @@ class Fold:
             untangler=QuasiNewton(),
             budget=Budget(steps, tolerance=1e-6),
             near=0.0,
+            outward=torch.ones(1),
         )
         smoothing = None if warm else torch.zeros_like(x)
         return solve_one_level(cast(LevelProblem, problem), x, smoothing)[:2]

@@ -84,7 +84,7 @@ def test_the_guard_keeps_the_rest_of_a_step_that_turns_a_triangle():
 
 @pytest.mark.real_data
 @pytest.mark.parametrize("steps", [12, pytest.param(24, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("integrator", ["auto", pytest.param("quasi-newton", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("integrator", ["physgraph", pytest.param("quasi-newton", marks=pytest.mark.slow)])
 def test_a_squeezed_waistband_does_not_hold_up_the_skirt(real_data: Path, integrator: str, steps: int):
     """Triangles of it shrink to 0.0005 of their area: all line searches of the finest level failed at 3.6 mJ."""
     file = real_data / "shots" / "10_style3d_skirt_twist.usdc"

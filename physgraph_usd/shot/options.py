@@ -20,9 +20,7 @@ if TYPE_CHECKING:
     from ..solver.contact.settings import ContactSettings
     from ..solver.frame.settings import SolveSettings
 
-AUTO = "auto"
-"""The integrator of the shipped network; always known."""
-INTEGRATORS = (AUTO, "quasi-newton", "physgraph")
+INTEGRATORS = ("physgraph", "quasi-newton")
 """Names of the solver's own methods in `integrate.METHODS`, which imports torch."""
 REPORT_NAME, PAGE_NAME = "report.json", "report.html"
 """Names of the report and its page in a folder of their own."""
@@ -84,7 +82,9 @@ class RefineOptions:
         "Subdivisions; each makes four faces of one; auto (in Python -1) chooses.  [default: each garment's own]",
         metavar="N|auto",
     )
-    integrator: str = _solver(AUTO, f"How forces become displacements: {', '.join(INTEGRATORS)}.", metavar="NAME")
+    integrator: str = _solver(
+        INTEGRATORS[0], f"How forces become displacements: {', '.join(INTEGRATORS)}.", metavar="NAME"
+    )
     weights: Path | None = _solver(None, "Weights for the learned integrator.", metavar="FILE")
     steps: int = _solver(12, "Most steps at the finest level.", metavar="N", least=0)
     tolerance: float = _solver(
@@ -210,7 +210,7 @@ class RefineOptions:
         Raises:
             UsageError: An option is wrong.
         """
-        if self.integrator != AUTO or self.weights is not None:
+        if self.integrator != INTEGRATORS[0] or self.weights is not None:
             from ..solver.integrate import method_named
 
             method_named(self.integrator, self.weights)

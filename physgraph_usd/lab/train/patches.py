@@ -239,7 +239,7 @@ def patch_of(config: PatchConfig, rng: np.random.Generator) -> Patch:
     levels = int(rng.integers(config.levels[0], config.levels[1] + 1))
     while levels > 1 and len(rest) * 4**levels > config.most_vertices:
         levels -= 1
-    garment = Garment("/Patch", mesh, rest, levels, False, bool(rng.random() < 0.3), one, one, one, one, pin)
+    garment = Garment("/Patch", mesh, rest, levels, bool(rng.random() < 0.3), one, one, one, one, pin)
     points = posed(rest, rng, config)
     if rng.random() < 0.5 and pin.any():
         points = _draped(_group(garment, gravity, 0), points, fabric, guide=guide, rng=rng)

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from ..contact.settings import ContactSettings
-from ..integrate import METHODS, Method
+from ..integrate import LEARNED, METHODS, Method
 from ..integrate.solve import Budget
 
 COARSE_STEPS, COARSE_TOLERANCE = 4, 0.1
@@ -50,7 +50,7 @@ class SolveSettings:
         cancelled: Asked before each step: whether nobody waits for the result any more; or None.
     """
 
-    method: Method = METHODS["auto"]
+    method: Method = METHODS[LEARNED]
     steps: int = 12
     tolerance: float = 2e-3
     budget_ms: float | None = None

@@ -46,7 +46,6 @@ def _guarded(network: Physgraph) -> Integrator:
 LEARNED = "physgraph"
 """Name of the method whose every step is the network's, and of the kind of its weights."""
 METHODS: dict[str, Method] = {
-    "auto": Method(_shipped, nested=True),
     "quasi-newton": Method(QuasiNewton, nested=True),
     LEARNED: Method(_shipped, nested=True),
 }
@@ -74,8 +73,8 @@ def method_named(name: str, weights: Path | None = None) -> Method:
     method = METHODS[name]
     if weights is None:
         return method
-    if name not in ("auto", LEARNED):
-        raise UsageError(f"integrator '{name}' has no weights; name one that has: auto, {LEARNED}")
+    if name != LEARNED:
+        raise UsageError(f"integrator '{name}' has no weights; name one that has: {LEARNED}")
     network = cast(Physgraph, load_network(weights, kind=LEARNED))
 
     def own() -> Integrator:
