@@ -46,8 +46,8 @@ def _guarded(network: Physgraph) -> Integrator:
 LEARNED = "physgraph"
 """Name of the method whose every step is the network's, and of the kind of its weights."""
 METHODS: dict[str, Method] = {
-    "quasi-newton": Method(QuasiNewton, nested=True),
     LEARNED: Method(_shipped, nested=True),
+    "quasi-newton": Method(QuasiNewton, nested=True),
 }
 """Every method by its name: those of the command line, and what `register` adds."""
 
