@@ -1,6 +1,6 @@
 """Whether cold frames settle, and whether the cage's triangles show in them.
 
-    python -m benchmarks.cold_frames [--count 12] [--level 2] [--steps 12] [--integrator auto] [--shot NAME]
+    python -m benchmarks.cold_frames [--count 12] [--level 2] [--steps 12] [--integrator physgraph] [--shot NAME]
         [--linear] [--whole] [FOLDER]
 
 Solves frames spread over each sample and, where FOLDER holds real shots, over those, each by itself. Prints a row a

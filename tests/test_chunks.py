@@ -65,7 +65,7 @@ def test_chunks_cover_what_is_missing_once_evenly(missing: set[int], workers: in
     ("count", "workers", "times"), [(24, 2, 1.33), (24, 4, 2.0), (240, 2, 1.9), (240, 4, 3.6), (24, 24, 24 / 7)]
 )
 def test_the_longest_process_says_how_much_quicker_a_shot_can_be(count: int, workers: int, times: float):
-    """The figures of docs/frames.md, by N / (N / W + R)."""
+    """How many times as fast N frames are in W processes: N / (N / W + R), as docs/solver.md has it."""
     parts = [part for share in chunks_of(range(count), workers) for part in share]
     longest = max(part.stop - max(0, part.start - PREROLL) for part in parts)
     assert longest == count / workers + PREROLL

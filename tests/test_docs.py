@@ -25,7 +25,7 @@ FOR_USERS = (
     "index", "api", "attributes", "batch", "contact", "fabrics", "farm", "gallery", "hooks", "layers", "symptoms",
     "trouble", "tune",
 )  # fmt: skip
-FOR_RESEARCHERS = ("chart", "collisions", "frames", "learned", "solver")
+FOR_RESEARCHERS = ("chart", "learned", "solver")
 PAGES = [ROOT / "README.md", *(ROOT / "docs" / f"{name}.md" for name in (*FOR_USERS, *FOR_RESEARCHERS))]
 MOST_WORDS, MOST_WORDS_OF_NOTES = 14_000, 8_000
 MOST_WORDS_OF_README, MOST_WORDS_OF_A_PAGE = 1_200, 2_000

@@ -50,7 +50,7 @@ def test_importing_works_without_usd() -> None:
 
 
 def test_the_solver_solves_its_pages_example_without_usd() -> None:
-    page = (ROOT / "docs" / "solver.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
     code = page.partition("```python\n")[2].partition("```")[0].replace("range(1, 25)", "range(1, 3)")
     assert "range(1, 3)" in code
     check = "assert fine.shape == (2401, 3) and 0.2 < np.linalg.norm(fine, axis=1).min() < 0.21"

@@ -3,8 +3,8 @@
     refiner = Refiner(Scene((Garment.of("/Sheet", faces, rest),), gravity), SolveSettings())
     fine = refiner.solve(Frame(1.0, (GarmentFrame(points, PRESETS["jersey"]),))).points[0]
 
-Names are looked up when they are first used, so importing this package imports neither torch nor Warp. docs/solver.md
-has a whole example.
+Names are looked up when they are first used, so importing this package imports neither torch nor Warp. docs/api.md has
+a whole example.
 """
 
 from __future__ import annotations
