@@ -27,6 +27,10 @@ from ..level import Placed
 ROUNDS = 4
 """How often vertices that would come too near go less far; after that they stay where they start, so that it ends."""
 
+STRAINS, LEAST = 0.5, 0.01
+"""Part of its length that an edge changes by at most where vertices beside one another are cut, and a change of that
+which counts for nothing. Without it shot 02 needs twice the rounds (53 for 24 in frame 18) and keeps crossings."""
+
 
 @dataclass(frozen=True, eq=False)
 class Moved:
@@ -93,10 +97,26 @@ def safe_move(
         least.scatter_reduce_(0, corner, more.value.repeat_interleave(4), "amin")
         shorter = share * least if attempt < ROUNDS else torch.where(least < 1.0, 0.0, share)
         # Once time is over all stays where it is.
-        known, share = share, torch.zeros_like(share) if is_over() else shorter
+        known, share = share, torch.zeros_like(share) if is_over() else _spread(shorter, way, parts)
         asked = share < known
         x = torch.where((share < 1.0).unsqueeze(1), (at + share.unsqueeze(1) * way).to(wanted), wanted)
     return Moved(Placed(x), share, met)
+
+
+def _spread(share: Tensor, way: Tensor, parts: Parts) -> Float[Tensor, " vertices"]:
+    """Smaller shares round vertices that are cut short, so that no edge is strained by more than `STRAINS`."""
+    length = way.norm(dim=1)
+    late = length * (1.0 - share)
+    first, second = parts.links.T
+    within = STRAINS * parts.lengths
+    least = LEAST * within.mean()
+    while True:
+        new = late.scatter_reduce(0, second, late[first] - within, "amax")
+        new = new.scatter_reduce(0, first, new[second] - within, "amax")
+        if is_over() or not bool((new > late + least).any()):
+            break
+        late = new
+    return torch.minimum(share, (1.0 - late / length.clamp_min(1e-300)).clamp_min(0.0))
 
 
 def in_the_way(
