@@ -41,8 +41,7 @@ MOST_FRAMES = 10
 LIES_ALONG = 2.0
 """Distance within which a mesh lies along cloth, relative to the cloth's offset plus thickness. The outer skin of a
 thick
-export, or a button on the cloth, is about twice as far as the cloth keeps from a body.
-"""
+export, or a button on the cloth, is about twice as far as the cloth keeps from a body."""
 MOST_OF = 0.95
 """Least fraction of a mesh's points lying along cloth and moving with the cloth."""
 

@@ -17,8 +17,7 @@ from .untagged import Candidate
 TWICE = 2.0
 """Least ratio for a body to stand and for a garment to go round. Points of people standing, walking or dancing spread
 2.4
-to 8 times as far upwards as forwards; a four-legged animal is at most half as long again as high.
-"""
+to 8 times as far upwards as forwards; a four-legged animal is at most half as long again as high."""
 
 
 def across_gravity(scene: Scene, frames: Sequence[Frame], beside: Sequence[Candidate]) -> tuple[str, str, str] | None:

@@ -27,8 +27,7 @@ CONTENTS = "contents"
 """Entry of the record: a digest of the layer's contents, to detect a record copied into a different layer."""
 FAILED, UNSOLVED, UNSETTLED, CROSSED = "failed", "unsolved", "unsettled", "crossed"
 """Entries of the record: time codes without a sample; unsolved frames of garments, following their cage; frames written
-but not settled; edges left through faces, if over a tenth of the input's.
-"""
+but not settled; edges left through faces, if over a tenth of the input's."""
 LACKING = (FAILED, UNSOLVED, UNSETTLED, CROSSED)
 """Defects of a layer: with the first two, any run counts as done in part; with the rest, a strict run."""
 _LIST = (Vt.StringArray, list)

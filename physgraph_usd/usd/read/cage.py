@@ -31,8 +31,7 @@ MOST_CORNERS, MOST_TWICE = 1000, 64
 """Most corners of a face, and of each of two faces with equal corners. Subdivision joins all corners at a single
 vertex,
 and the number of contact pairs there grows with the square: 1,000 corners take seconds, 2,000 on a body a minute, two
-equal faces of 500 half a minute.
-"""
+equal faces of 500 half a minute."""
 MOST_BROKEN = 0.1
 """Largest fraction of points replaced by repair."""
 

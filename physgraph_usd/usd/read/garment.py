@@ -36,8 +36,7 @@ _WORD = re.compile("[A-Z]?[a-z]+|[A-Z]+(?![a-z])")
 _THICK = 10.0
 """Inverse of the largest contact distance relative to the cloth's size. Beyond, all vertices are near all vertices,
 with
-V^2 pairs, and cloth pushed out by more than its size loses the shot's shape.
-"""
+V^2 pairs, and cloth pushed out by more than its size loses the shot's shape."""
 _PER_VERTEX = {UsdGeom.Tokens.vertex, UsdGeom.Tokens.varying}
 
 

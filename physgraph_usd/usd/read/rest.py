@@ -33,12 +33,10 @@ FITTED = "fitted to the shot"
 MOST_FITTED = 50
 """Most time codes used to fit a rest shape, spread over the shot. On five real shots, medians of 25 time codes are
 within
-0.2 to 1.3% of the medians of all 24 to 60, medians of 9 within 0.6 to 4.3%.
-"""
+0.2 to 1.3% of the medians of all 24 to 60, medians of 9 within 0.6 to 4.3%."""
 STEPS = 100
 """Steps of a fit. On five real shots lengths are then within 0.1 to 0.6% of their medians (root mean square), as after
-400 to 1,500 steps without momentum.
-"""
+400 to 1,500 steps without momentum."""
 HOLD = 1e-6
 """Stiffness holding a fitted shape in place, in mean stiffnesses: makes the matrix regular, keeps lengths."""
 SHORTEST = 1e-3
