@@ -112,11 +112,9 @@ def solve_in_chunks(
         workers: Number of processes; 1 solves in this process.
         only: Numbers of the time codes to solve; None for all.
         preroll: Frames solved before each chunk except the shot's first; yielded as the ``lead`` of the same frames of
-            the
-            previous chunk.
+            the previous chunk.
         start: Replacement for `Call`: starts a function with its arguments in a new process. If given, a single chunk
-            also
-            runs in a new process.
+            also runs in a new process.
 
     Raises:
         SolveError: A process died.
@@ -201,9 +199,7 @@ def _collect(
     solved: Iterator[int],
     seam: int | None = None,
 ) -> Outcome:
-    """Read a frame once its owner, or ``solved`` if no owner is given, has stored the file; ``seam`` as in
-    `FrameFolder.read`.
-    """
+    """Read a frame once its owner, or ``solved`` without an owner, has stored it; ``seam`` as in `FrameFolder.read`."""
     ended: float | None = None
     while True:
         leave_if_asked()

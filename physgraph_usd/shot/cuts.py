@@ -15,8 +15,7 @@ from ..usd.read.reader import Shot
 
 JUMP = Reset().move
 """Least deviation of a step from its neighbouring steps to count as a jump, RMS over a garment's points, in mean cage
-edges.
-The solver treats cloth as a new pose from the same distance."""
+edges. The solver treats cloth as a new pose from the same distance."""
 _STARTED_ANEW = "cold: "
 """Prefix, in a frame's telemetry, of the reason for not continuing from the previous frame."""
 

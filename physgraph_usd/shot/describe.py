@@ -1,6 +1,4 @@
-"""Describes a shot before the first frame: garments, values, sources, and active terms. Completes the report after the
-run.
-"""
+"""Describes a shot before the first frame: garments, values, sources, active terms. Completes the report at the end."""
 
 from __future__ import annotations
 

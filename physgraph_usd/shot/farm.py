@@ -31,8 +31,7 @@ class FarmCall:
 
     Attributes:
         lag: Longest time for the call's files to appear on this machine after the call has ended [s]: network file
-            systems
-            cache missing files.
+            systems cache missing files.
     """
 
     lag = 60.0

@@ -44,8 +44,7 @@ def finished(shot: str | Path, out: Path, options: RefineOptions) -> RefineRepor
         shot: Input file.
         out: Its layer.
         options: With ``skip_existing``, an existing layer is kept. With ``resume``, the layer is kept if all outputs
-            exist
-            and the layer's record names the same inputs.
+            exist and the layer's record names the same inputs.
     """
     if there := skipped(shot, out, options):
         return there
@@ -82,9 +81,7 @@ def taken_as_done(report: RefineReport, out: Path) -> RefineReport:
 
 
 def made_from(opened: Shot | _Opened, out: Path | None, options: RefineOptions) -> dict[str, Any]:
-    """Everything the layer depends on, for the layer's record: version, code, options, the shot and hashes of its
-    files.
-    """
+    """Everything the layer depends on, for its record: version, code, options, the shot and hashes of its files."""
     folder, absolute = out and out.resolve().parent, options.asset_paths == "absolute"
     return {
         "version": __version__,

@@ -175,9 +175,7 @@ class Finished:
         return Outcome(time, points, reused, record, heat)
 
     def _check_points(self, points: Sequence[np.ndarray | None]) -> None:
-        """Refuse (ValueError) points of the wrong shape: kernels index points by face corners and would read out of
-        bounds.
-        """
+        """Refuse (ValueError) points of the wrong shape: kernels index points by face corners, without checks."""
         if points and self._counts and len(points) != len(self._counts):
             raise ValueError(f"points of {len(points)} garments, not of {len(self._counts)}")
         for each, count in zip(points, self._counts, strict=False):
@@ -272,8 +270,7 @@ class FrameFolder(Finished):
 
         Raises:
             LayerError: The disk is full, or the folder is gone or taken by a new run: a task on a remote machine may
-                outlast
-                its run.
+                outlast its run.
         """
         arrays: dict[str, Any] = {f"points{k}": p for k, p in enumerate(outcome.points) if p is not None}
         maps = [(k, name, values) for k, heat in enumerate(outcome.heat) for name, values in (heat or {}).items()]

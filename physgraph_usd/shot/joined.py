@@ -33,8 +33,7 @@ Positions = Sequence[np.ndarray | None]
 """Points of each garment, shape (V, 3), None for a garment without a sample."""
 Mover = Callable[[float | None, Positions, Positions, Positions], tuple[Positions, str]]
 """Moves cloth safely at a time code from the nearer solution towards wanted positions; the farther solution is the
-third
-argument. Also returns a description of new intersections, "" for none."""
+third argument. Also returns a description of new intersections, "" for none."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -101,8 +101,7 @@ def of_energy(garments: Sequence[Mapping[str, Any]], frames: Sequence[Mapping[st
 
 
 def of_folds(garments: Sequence[Mapping[str, Any]], frames: Sequence[Mapping[str, Any]]) -> list[str]:
-    """A note of cloth folded so sharply as to show the mesh, for the garment with most sharp folds: the level is too
-    coarse.
+    """A note of the garment with most sharp folds, if cloth folds so sharply as to show the mesh: too coarse a level.
 
     Args:
         garments: A report's garments.

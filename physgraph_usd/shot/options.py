@@ -254,7 +254,5 @@ def _check(name: str, value: Any, option: Option) -> None:
 
 
 def json_of(report: Path) -> Path:
-    """The JSON file of a report: the path itself if named ``.json``, else `REPORT_NAME` in the folder of the given
-    name.
-    """
+    """The JSON file of a report: the path itself if named ``.json``, else `REPORT_NAME` in a folder at the path."""
     return report if report.suffix == ".json" and not report.is_dir() else report / REPORT_NAME

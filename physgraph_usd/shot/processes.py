@@ -166,9 +166,7 @@ def _answer(there: Connection, function: Callable[..., Any], args: tuple[Any, ..
 
 
 class _Sent:
-    """Sends errors raised inside the block; an unforeseen error is sent as a `PhysGraphError`, with the traceback on
-    stderr.
-    """
+    """Sends errors raised inside the block; unforeseen errors as a `PhysGraphError`, with the traceback on stderr."""
 
     def __init__(self, there: Connection) -> None:
         self._there = there

@@ -111,8 +111,7 @@ def refine_stage(
 
     Returns:
         An anonymous layer, to be sublayered over the stage or exported; keep a reference as long as a stage uses the
-        layer.
-        Failed frames have no sample in the layer: they are in the report's ``failed`` and the layer's
+        layer. Failed frames have no sample in the layer: they are in the report's ``failed`` and the layer's
         ``customLayerData["physgraph"]["failed"]``.
 
     Raises:
@@ -267,9 +266,7 @@ def _write_report(report: RefineReport, path: Path, opened: Shot) -> None:
 
 
 def _write_failure(report: RefineReport, options: RefineOptions) -> None:
-    """Write the JSON of a failed run, unless over a protected file; errors of this write are dropped in favour of the
-    run's.
-    """
+    """Write the JSON of a failed run, unless over a protected file; errors here give way to the run's error."""
     if options.report is not None and not options.dry_run:
         file = json_of(Path(options.report))
         with suppress(LayerError):

@@ -16,7 +16,7 @@ from ..version import __version__
 from .plain_json import to_json
 
 FORMAT = 1
-"""Version of the JSON format; raised when a reader of the previous version could fail. See report.schema.json."""
+"""Version of the JSON format; increased when a reader of the previous version could fail. See report.schema.json."""
 SCHEMA = Path(__file__).with_name("report.schema.json")
 DONE, FAILED, IN_PART = 0, 1, 3
 LEFT = 0.1
@@ -109,8 +109,7 @@ class RefineReport:
         """0 done, 1 failed, 3 done in part, 128 plus the signal's number if the run was interrupted.
 
         A run is done in part if some frames failed or some garment was not solved in a frame. A strict run is also done
-        in part
-        if some frames did not settle, or more than a tenth of the input's crossings remain.
+        in part if some frames did not settle, or more than a tenth of the input's crossings remain.
         """
         if self.signal is not None:
             return SIGNALLED + self.signal

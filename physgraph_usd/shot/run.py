@@ -159,9 +159,7 @@ class Run:
 
     @cached_property
     def _numbers(self) -> range:
-        """Numbers of the time codes to solve: all open time codes, or for a chunk the range ``frames`` of the whole
-        shot.
-        """
+        """Numbers of the time codes to solve: all open time codes, or for a chunk those of the shot in ``frames``."""
         if self.joins is not None:
             return self.joins.numbers
         return numbers_in(self.shot.scene.times, self.options.frames if self._is_chunk else None)

@@ -48,8 +48,7 @@ def unsettled(entry: Mapping[str, Any], tolerance: float) -> Unsettled | None:
     """The unsettled state of a garment's frame, or None if settled.
 
     A frame is unsettled if a level's last descent ended because no step lowered the energy although the level was not
-    at
-    rest, or if the finest level's remaining move exceeds `FAR` tolerances. A collapsed cage is not solved at all.
+    at rest, or if the finest level's remaining move exceeds `FAR` tolerances. A collapsed cage is not solved at all.
 
     Args:
         entry: The garment's telemetry in the frame.

@@ -74,9 +74,7 @@ class ShotSolver:
         return self.__dict__ | {"_opened": None, "_shot": os.path.abspath(self._shot), "_options": options}
 
     def __call__(self, times: Sequence[float | None]) -> Outcomes:
-        """Solve time codes in order; a failed time code yields its error, and the next starts from the last solved
-        frame.
-        """
+        """Solve time codes in order; a failed one yields its error, the next starts from the last solved frame."""
         device = self._options.device
         prepare_device(device)
         shot = self._opened = self._opened or open_for(self._shot, self._options)
@@ -113,8 +111,7 @@ def sampled_at(shot: Shot, time: float | None) -> list[bool]:
 
 
 def time_frames(shot: Shot, options: RefineOptions, levels: list[int]) -> dict[str, float]:
-    """Measure the wall time of a cold frame and the mean of warm frames, and estimate the whole shot [s], on this
-    machine.
+    """Measure the wall time of a cold frame and the mean of warm frames, and estimate the whole shot's [s].
 
     Args:
         shot: The shot; up to three frames in the middle are solved: one cold, then two warm.

@@ -32,8 +32,7 @@ from .run import fine_meshes, numbers_in
 from .solve import open_for
 
 SEAM_BOUND = 0.05
-"""Largest increase of a frame's move by a seam, RMS over a garment, in mean fine edges. See `docs/farm.md` for
-measurements."""
+"""Largest increase of a frame's move by a seam, RMS over a garment, in mean fine edges; figures in `docs/farm.md`."""
 _OF_ONE_CHUNK = ("frames",)
 """Options allowed to differ between chunks of one shot."""
 
@@ -204,8 +203,7 @@ def stitch(
 
     Raises:
         UsageError: A frame is missing or doubled; chunks differ in shot, version or options, or the shot has changed
-            since;
-            or a file exists.
+            since; or a file exists.
         StageError: The shot cannot be read.
         LayerError: A frame is damaged, a seam moves too far, or the layer cannot be written or is invalid.
     """

@@ -26,8 +26,7 @@ class Row:
         shot: Input file.
         layer: Output layer.
         state: "done", "in part", "failed", "skipped" (the layer existed), "interrupted" (with frames kept) or "not
-            done"
-            (the batch was interrupted before a frame of the shot).
+            done" (the batch was interrupted before a frame of the shot).
         exit_code: Exit code of the shot, or None if not done.
         frames: Number of requested time codes.
         failed_frames: Time codes without a sample.

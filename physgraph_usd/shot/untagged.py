@@ -40,8 +40,7 @@ MOST_FRAMES = 10
 """Most frames, spread over the shot, searched for contact."""
 LIES_ALONG = 2.0
 """Distance within which a mesh lies along cloth, relative to the cloth's offset plus thickness. The outer skin of a
-thick
-export, or a button on the cloth, is about twice as far as the cloth keeps from a body."""
+thick export, or a button on the cloth, is about twice as far as the cloth keeps from a body."""
 MOST_OF = 0.95
 """Least fraction of a mesh's points lying along cloth and moving with the cloth."""
 
@@ -54,8 +53,7 @@ class Candidate:
         path: The mesh.
         reason: Why `AUTO` takes or leaves the mesh.
         shares: For each touching garment, the fraction of its vertices inside or near the mesh, in the first examined
-            frame
-            with contact; empty for a mesh left out.
+            frame with contact; empty for a mesh left out.
         pose: Pose of the mesh in the first frame with contact, or None.
     """
 
@@ -161,7 +159,7 @@ def open_with_colliders(shot: str | os.PathLike[str] | Stage, *, colliders: Sequ
     Args:
         shot: As in `open_shot`.
         colliders: As in `open_shot`, or `AUTO` among the paths.
-        options: Further options of `open_shot`.
+        options: Other options of `open_shot`.
 
     Raises:
         UsageError: When an option cannot be used.

@@ -16,16 +16,14 @@ from .untagged import Candidate
 
 TWICE = 2.0
 """Least ratio for a body to stand and for a garment to go round. Points of people standing, walking or dancing spread
-2.4
-to 8 times as far upwards as forwards; a four-legged animal is at most half as long again as high."""
+2.4 to 8 times as far upwards as forwards; a four-legged animal is at most half as long again as high."""
 
 
 def across_gravity(scene: Scene, frames: Sequence[Frame], beside: Sequence[Candidate]) -> tuple[str, str, str] | None:
     """A garment, a body inside the garment, and their common axis, "Y" or "Z", if gravity pulls across the axis.
 
     A garment goes round an axis if `TWICE` as much area faces both ways along gravity as both ways along the axis, in
-    the
-    frames and in the rest shape: the rest shape of a lying person stands.
+    the frames and in the rest shape: the rest shape of a lying person stands.
 
     Args:
         scene: The scene.

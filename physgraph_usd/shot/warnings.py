@@ -54,7 +54,7 @@ class Kind:
 
         Args:
             path: The garment, or "".
-            times: The time code of the figures, then further affected time codes.
+            times: The time code of the figures, then other affected time codes.
             figures: Values for the sentence and the remedy.
         """
         first, *others = times or (None,)
@@ -240,7 +240,7 @@ def _of_unsolved(found: Sequence[Mapping[str, Any]]) -> Iterator[str]:
 
 
 def _also(times: Sequence[float | None]) -> str:
-    """Text listing further time codes of a warning; "" without any."""
+    """Text listing the other time codes of a warning; "" without any."""
     if len(times) > MOST_NAMED:
         return f"also in {counted(len(times), 'other frame')}"
     names = ["default" if time is None else f"{time:g}" for time in times]

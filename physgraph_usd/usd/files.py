@@ -27,8 +27,7 @@ def files_of(shot: str | Path | Usd.Stage) -> set[Path]:
 
     The files are sublayers, references, payloads, value clips and assets such as textures, through all layers. Refined
     layers and their dependencies are left out: results are not read and may be overwritten. If USD cannot open the
-    shot's
-    file, the file itself is the only entry.
+    shot's file, the file itself is the only entry.
 
     Raises:
         StageError: A file is a pipe; USD would wait for ever.

@@ -65,7 +65,7 @@ def author_record(layer: Sdf.Layer, record: Mapping[str, Any]) -> None:
 
 
 def _contents(layer: Sdf.Layer) -> str:
-    """Digest of a layer's specs and sample times, without values; includes further layer data."""
+    """Digest of a layer's specs and sample times, without values; includes the other layer data."""
     digest = hashlib.sha256()
     others = sorted(set(layer.customLayerData) - {RECORD})
     digest.update(repr((str(layer.subLayerPaths), others)).encode())
@@ -236,8 +236,7 @@ def write_root(path: Path, *, layer: Path, shot: Path, absolute: bool = False, o
     """Write a small root layer with a refined layer over its shot, and return the root's path.
 
     The root copies the shot's stage metadata, including expression variables: USD reads these from a root layer only.
-    Both
-    files are named relative to the root's folder, or by absolute paths.
+    Both files are named relative to the root's folder, or by absolute paths.
 
     Raises:
         UsageError: The root exists and may not be replaced.

@@ -35,7 +35,7 @@ SIDES = ("auto", "winding", "start", "front", "back")
 outside; "front" or "back" for a floor or a wall with the cloth on one side; else the side of the coarse cloth around
 each vertex.
 "winding": outside of pieces closed or with openings of at most half their own area, by the generalised winding number;
-for all further pieces the side of the coarse cloth.
+for other pieces the side of the coarse cloth.
 "start": the side of the coarse cloth, for every piece, closed or not.
 "front", "back": the named side of the authored faces of open pieces; outside of closed pieces.
 """

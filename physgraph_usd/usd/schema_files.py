@@ -67,9 +67,7 @@ def _range(row: Property, name: str, low: float | None, high: float | None) -> s
 
 
 def _property(row: Property) -> str:
-    """One property in usda, without a fallback: an editor would show the fallback although the value comes from
-    elsewhere.
-    """
+    """One property in usda, without a fallback: an editor would show it although the value comes from elsewhere."""
     otherwise = f" Where nothing gives it: {_otherwise(row)}." if _otherwise(row) else ""
     doc = f'        doc = "{row.doc}{f" [{row.unit}]" if row.unit else ""}{otherwise}"\n'
     shown = f'        displayGroup = "{row.group}"\n        displayName = "{row.label}"\n'

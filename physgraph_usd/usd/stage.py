@@ -382,8 +382,7 @@ def open_stage(shot: str | Usd.Stage) -> tuple[Usd.Stage, list[Notice]]:
 
 
 def composition_problems(stage: Usd.Stage, warnings: Sequence[str]) -> list[tuple[Notice, bool]]:
-    """Arcs not followed by USD, each with a flag: True for a missing file or prim, False for a circle or a damaged
-    file.
+    """Arcs not followed by USD, each with a flag: True for a missing file or prim, False for a circle or damage.
 
     Args:
         stage: The stage.

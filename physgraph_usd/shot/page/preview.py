@@ -59,8 +59,7 @@ def preview(
 
     Raises:
         UsageError: When the suffix is unknown, a PNG is asked for several times, or the picture exists, is a link or is
-            a
-            file of the shot.
+            a file of the shot.
         LayerError: When the picture cannot be written.
         StageError: When a stage cannot be opened or shows no mesh.
     """

@@ -30,8 +30,7 @@ def elastic_terms(
         level: The level.
         fabrics: Fabric of each garment.
         raised: For each garment, whether bending stiffness is raised at edges too long for the garment's folds; None
-            for no
-            garment.
+            for no garment.
     """
     weft = None
     if any(fabric.weft_bend is not None for fabric in fabrics):

@@ -79,9 +79,7 @@ class ForceModule:
         self._lasting, self._last = self.forces, _Last() if remembers else None
 
     def joined_by(self, more: Sequence[Force]) -> ForceModule:
-        """This module's terms and more; a remembered result for this module's terms is still used at the same
-        positions.
-        """
+        """This module's terms and more; this module's remembered result is still used at the same positions."""
         joined = ForceModule((*self.forces, *more))
         joined._lasting, joined._last = self._lasting, self._last
         return joined

@@ -12,8 +12,7 @@
 At an edge of a quad the normal is the normal of the triangle from the edge to the midpoint of the opposite side, the
 mean over both splits of the quad. theta - theta0 is taken modulo a full turn into [-pi, pi], so the energy is
 continuous for every rotation of a hinge: a hem pressed to theta0 = 3 may pass pi. The force changes sign half a turn
-from theta0.
-Gradient after Bridson, Marino, Fedkiw, "Simulation of Clothing with Folds and Wrinkles", 2003.
+from theta0. Gradient after Bridson, Marino, Fedkiw, "Simulation of Clothing with Folds and Wrinkles", 2003.
 """
 
 from __future__ import annotations
@@ -260,8 +259,7 @@ class Bending:
         """The Hessian of the rest shape's pattern, each hinge unfolded flat [N/m]: w row^T row (Bergou et al. 2006).
 
         A row is the derivative of the angle by the corners' heights above the flat hinge. Constants are in the null
-        space, and
-        on a flat rest shape every linear function is too.
+        space, and on a flat rest shape every linear function is too.
         """
         count, rest = self._level.vertex_count, self._level.rest.double().cpu().numpy()
         total = sp.csr_matrix((count, count))

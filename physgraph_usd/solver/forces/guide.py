@@ -136,7 +136,6 @@ class Guide:
         """The lumped guide [N/m]: the row sums of R^T W R on the diagonal.
 
         The exact product couples every pair of fine vertices around a coarse vertex, which would fill the factor.
-        Lumping is
-        accurate for long waves; for short waves stretch and bending outweigh the guide.
+        Lumping is accurate for long waves; for short waves stretch and bending outweigh the guide.
         """
         return sp.csr_matrix(sp.diags(self._map.spread_matrix @ self._coarse_weight + self._pin_weight))

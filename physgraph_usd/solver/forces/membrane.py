@@ -20,8 +20,7 @@ strains the model is linear elasticity. For large strains Green's strain would g
 cages have triangles stretched threefold: there the cloth would be too stiff by as much.
 
 With G = 0.375 Y the sheet is isotropic and equals the edge springs of an equilateral mesh for small strains. Otherwise
-the material's axes matter: `grain.axes` defines them for a triangle. Painted stretch scales multiply all
-constants.
+the material's axes matter: `grain.axes` defines them for a triangle. Painted stretch scales multiply all constants.
 
 There is no barrier against inversion: cloth buckles long before inversion matters.
 """
@@ -223,8 +222,7 @@ class Membrane:
 
 
 def sliver_weight(level: Level) -> Float[Tensor, " triangles"]:
-    """1 for sound triangles; for a sliver, the factor limiting its stiffness to the stiffest sound triangle's, shape
-    (T,).
+    """1 for sound triangles; for slivers, the factor limiting stiffness to the stiffest sound triangle's, shape (T,).
 
     A corner's move strains a triangle by the gradient g of its shape function, with a stiffness proportional to A
     |g|^2:
@@ -241,7 +239,7 @@ def shape_gradients(level: Level) -> Float[Tensor, "triangles 3 2"]:
 
 
 def in_plane_terms(level: Level, fabrics: Sequence[Fabric]) -> tuple[Force, ...]:
-    """Edge springs for the garments with a suitable fabric, the membrane for all further garments.
+    """Edge springs for the garments with a suitable fabric, the membrane for the others.
 
     Args:
         level: The level.

@@ -31,8 +31,7 @@ class Seam:
 
     Attributes:
         pairs: Vertices treated as one, possibly repeated, shape (N, 2): coincident vertices, and each vertex following
-            an
-            edge with the nearer end of the edge.
+            an edge with the nearer end of the edge.
         label: A number for each vertex, equal for vertices treated as one, shape (V,).
     """
 

@@ -1,8 +1,8 @@
 """Refines the attributes of a mesh: values on vertices, faces and corners, and subsets.
 
-Floating-point values are interpolated linearly, in float64, and returned in their own type. For any further type
-(integers, booleans, strings) a fine element copies the value of its nearest parent: the parent of largest weight, then
-of lowest number.
+Floating-point values are interpolated linearly, in float64, and returned in their own type. For other types (integers,
+booleans, strings) a fine element copies the value of its nearest parent: the parent of largest weight, then of lowest
+number.
 """
 
 from __future__ import annotations
@@ -91,8 +91,7 @@ def corner_values(
     """Refine indexed values on corners (interpolation "faceVarying"), such as texture coordinates.
 
     The values have their own topology, with seams preserved; the topology is split by the same rule, so faces and
-    corners
-    are in the order of the refined mesh.
+    corners are in the order of the refined mesh.
 
     Args:
         refinements: Refinements of the mesh, coarse to fine; if empty, indices and values are returned.

@@ -34,9 +34,8 @@ def defects(mesh: PolygonMesh, points: np.ndarray | None = None) -> list[Defect]
     """Find all defects of a mesh.
 
     Args:
-        mesh: Any mesh; faces with an index out of range are reported and left out of all further checks, so edges are
-            then
-            numbered without such faces.
+        mesh: Any mesh; faces with an index out of range are reported and left out of the other checks, so edges are
+            then numbered without such faces.
         points: Positions, shape (V, 3); without positions no areas are checked.
 
     Returns:

@@ -19,8 +19,7 @@ from .topology import PolygonMesh, find_edges
 
 MOST_VERTICES = 25_000
 """Most vertices after subdivision, about as many as the cloth on top. Frames of a shirt of 22,000 vertices over a body
-of
-53,000 take half as long again as over a body of 13,000: the body's hierarchy is refitted in each frame."""
+of 53,000 take half as long again as over a body of 13,000: the body's hierarchy is refitted in each frame."""
 NEAR_PART = 0.95
 """Fraction of the surface required to be near enough: nostrils and fingertips would ask for more everywhere."""
 _SHARP = 0.5
@@ -103,7 +102,7 @@ def drawn_surface(
         cage: The authored faces.
         points: Authored points of any pose, shape (V, 3), to choose the number of subdivisions.
         holes: Numbers of the authored hole faces.
-        scheme: "catmullClark", "loop", or any further word for flat faces.
+        scheme: "catmullClark", "loop", or another word for flat faces.
         within: Allowed distance from the limit surface, in the points' unit.
     """
     kept = ~np.isin(np.arange(cage.mesh.face_count), holes)
@@ -123,8 +122,7 @@ def drawn_surface(
 
 
 def flatness(cage: ControlMesh, points: np.ndarray) -> float:
-    """Distance between the limit surface and flat faces with vertices on the limit surface, over `NEAR_PART` of the
-    surface.
+    """Distance of flat faces, with vertices on the limit surface, from the limit surface, over `NEAR_PART` of its area.
 
     The distance is estimated from the vertices added by a subdivision: their distance from the flat faces of the old
     vertices after smoothing.

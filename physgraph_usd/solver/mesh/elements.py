@@ -46,8 +46,7 @@ def elastic_elements(mesh: PolygonMesh, split: TriangleSplit, rest: np.ndarray) 
     """The elements of a mesh.
 
     A quad not convex at rest, or with an edge or a corner without extent, and any larger polygon count as the triangles
-    of
-    their split.
+    of their split.
 
     Args:
         mesh: The mesh.
@@ -88,8 +87,8 @@ def _convex_quads(mesh: PolygonMesh, split: TriangleSplit, rest: np.ndarray) -> 
 def hinges_of(triangles: np.ndarray, quads: np.ndarray | None = None) -> np.ndarray:
     """Find the pairs of faces sharing a manifold edge.
 
-    The sign of the angle does not depend on the winding when the normals are taken as
-    ``n1 = (xj - xi) x (xk - xi)`` and ``n2 = (xl - xi) x (xj - xi)``: flat is zero even if windings disagree.
+    The sign of the angle does not depend on the winding when the normals are taken as ``n1 = (xj - xi) x (xk - xi)``
+    and ``n2 = (xl - xi) x (xj - xi)``: flat is zero even if windings disagree.
 
     Args:
         triangles: Vertices, shape (T, 3). Triangles with a repeated vertex are skipped.

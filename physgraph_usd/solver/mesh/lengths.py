@@ -59,9 +59,7 @@ def _angles(
 
 LENGTHS, NORMALS = overloads(_lengths, wp.vec2i, VECTOR, SCALAR), overloads(_normals, wp.vec3i, VECTOR, VECTOR)
 ANGLES = overloads(_angles, _SIX, VECTOR, SCALAR)
-"""Kernels for `ElementValues`: lengths of edges [m], normals of triangles of twice the area's length [m^2], and angles
-of
-hinges [rad]."""
+"""Kernels for `ElementValues`: edge lengths [m], normals of twice the triangle's area [m^2], hinge angles [rad]."""
 
 
 class ElementValues:

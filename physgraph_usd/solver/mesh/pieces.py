@@ -12,8 +12,7 @@ from .topology import PolygonMesh, area_vectors, joined_by
 SMALL = 0.25
 """Size, relative to the largest piece, below which a closed piece may be a rigid part."""
 LIGHT = 0.01
-"""Area, relative to the largest piece, below which a piece may be a rigid part: either bound alone would include
-pockets."""
+"""Area, relative to the largest piece, below which a piece may be rigid: either bound alone would include pockets."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,8 +36,7 @@ def sort_pieces(
     """Find the pieces.
 
     A piece is rigid if closed and small compared with the largest piece, if smaller than an edge of the largest piece,
-    or
-    if all its faces are marked.
+    or if all its faces are marked.
 
     Args:
         mesh: The mesh, welded.

@@ -29,8 +29,7 @@ def turns_left(x: wp.array(dtype=wp.vec3f), e: wp.vec2i, p: wp.int32, q: wp.int3
 
 @wp.func
 def passes_through(x: wp.array(dtype=wp.vec3f), e: wp.vec2i, t: wp.vec3i):
-    """Whether an edge passes through a triangle; an end in the plane does not count, a side belongs to exactly one
-    face.
+    """Whether an edge passes through a triangle; an end in the plane does not count, a side belongs to one face.
 
     An end at a corner does not count: sewn cloth touches there, and rounding would decide the side.
     """

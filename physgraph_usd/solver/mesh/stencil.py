@@ -127,8 +127,7 @@ def incidence(
 
     Returns:
         Start of each vertex's row, shape (V + 1,), int32; and element * K + corner of each entry, ascending within a
-        row,
-        shape (N K,), int32.
+        row, shape (N K,), int32.
     """
     flat = elements.reshape(-1)
     starts = torch.zeros(vertex_count + 1, dtype=torch.int32, device=elements.device)

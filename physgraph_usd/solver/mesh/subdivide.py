@@ -22,8 +22,7 @@ class Refinement:
 
     Attributes:
         mesh: The child. Its vertices are the parent's vertices, then one per parent edge, then one per parent polygon
-            of
-            four or more corners, in face order. The children of a face are consecutive, in the parent's face order.
+            of four or more corners, in face order. The children of a face are consecutive, in the parent's face order.
         linear: Placement at vertices, midpoints and centroids, shape (V_child, V_parent), float64; rows sum to 1.
         parent_face: Parent of each child face, shape (F_child,), int32.
         edges: Parent edges (lo, hi), shape (E, 2), int32; child vertex ``V_parent + e`` is the midpoint of edge e.
@@ -214,14 +213,11 @@ def smooth(
     """Build the smooth placement of the same child vertices.
 
     Triangles use Loop's weights, ``beta = (5/8 - (3/8 + cos(2 pi / n) / 4)^2) / n``, and polygons the weights of
-    Catmull
-    and Clark, both as in OpenSubdiv. An edge between a triangle and a polygon uses half of either rule. A vertex
-    between
-    both weights each rule by the fraction of a full turn of a regular corner, a sixth or a fourth: with s the sum of
-    the
-    fractions, the rules are evaluated at valence 6 s and 4 s, and each corner adds its part. The result is the scheme
-    of
-    Stam and Loop (Quad/Triangle Subdivision, 2003) for s = 1, and the pure rule for a single kind of faces.
+    Catmull and Clark, both as in OpenSubdiv. An edge between a triangle and a polygon uses half of either rule. A
+    vertex between both weights each rule by the fraction of a full turn of a regular corner, a sixth or a fourth: with
+    s the sum of the fractions, the rules are evaluated at valence 6 s and 4 s, and each corner adds its part. The
+    result is the scheme of Stam and Loop (Quad/Triangle Subdivision, 2003) for s = 1, and the pure rule for a single
+    kind of faces.
 
     Boundaries and creases are cubic B-splines. Fixed are: vertices with one face, with three or more edges on
     boundaries and creases, on non-manifold edges or between several fans, isolated vertices, and corners.

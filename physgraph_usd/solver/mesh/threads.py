@@ -23,8 +23,7 @@ LEAST_QUERIES = 250
 """Items per thread, as above, for items that query a hierarchy or represent many elements."""
 SLICES, LEAST_SLICE = 8, 32
 """Slices per thread for such items, and their least average size: some items cost a hundred times as much as average,
-so
-free threads take the next slice, and slices shrink to shorten the wait for the last."""
+so free threads take the next slice, and slices shrink to shorten the wait for the last."""
 
 WORKERS = 16
 """Threads sharing an item of many elements on CUDA, because few items leave most of the device idle."""

@@ -15,8 +15,7 @@ from scipy.sparse import csgraph
 
 TIE = 1e-5
 """Relative difference below which two splits of a face count as equal. The lowest vertex number then decides,
-independent
-of rounding, the rotation of the cloth, the winding and the face's first corner."""
+independent of rounding, the rotation of the cloth, the winding and the face's first corner."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,8 +70,7 @@ class PolygonMesh:
         indices: Vertex of each corner, faces one after another, shape (C,), int32.
         vertex_count: Number of vertices V, including unused vertices.
         least_polygon: Fewest corners of a face split by subdivision into quads round its centre: 3 for Catmull and
-            Clark's
-            scheme, 4 if triangles are split into four.
+            Clark's scheme, 4 if triangles are split into four.
 
     Raises:
         ValueError: The counts are negative or do not sum to the number of indices.
@@ -185,13 +183,11 @@ class PolygonMesh:
         """Split the faces into fans of triangles.
 
         Without points a fan starts at the first corner. On quads made by :func:`.subdivide.subdivide` these diagonals
-        run from
-        a parent's corner to its face point, and thus alternate in direction. Faces under three corners vanish.
+        run from a parent's corner to its face point, and thus alternate in direction. Faces under three corners vanish.
 
         Args:
             points: Positions, shape (V, 3); when given, quads are split along the shorter diagonal (the inner diagonal
-                for
-                concave quads) and larger polygons fan from the corner with the fattest fan.
+                for concave quads) and larger polygons fan from the corner with the fattest fan.
 
         Returns:
             The triangles and the face of each.

@@ -87,9 +87,7 @@ class Weld:
 
     @property
     def sides(self) -> Int[np.ndarray, " vertices"]:
-        """A number for each vertex, equal for vertices with a common normal. The two sides of a doubled sheet have two
-        numbers.
-        """
+        """A number for each vertex, equal for vertices with a common normal; a doubled sheet has one per side."""
         shown = np.zeros(len(self.number), bool)
         shown[self.apart.indices[np.isin(self.apart.corner_face, self.faces)]] = True
         return np.unique(2 * self.number + ~shown, return_inverse=True)[1].reshape(-1)

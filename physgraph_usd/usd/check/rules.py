@@ -418,8 +418,7 @@ def against_shot(layer: Sdf.Layer, coarse: Usd.Prim, target: Sdf.Path) -> Iterat
 
 
 def _compare(clouds: Sequence[tuple[np.ndarray, np.ndarray, float | None]], name: str) -> Iterator[Problem]:
-    """Compare fine and coarse clouds by size and position, at some times; the clouds are in world axes, without
-    translation.
+    """Compare fine and coarse clouds by size and position, at some times; in world axes, without translation.
 
     Local space is not used: a sheared transform distorts local lengths, and cloth sags along the world's axis.
 

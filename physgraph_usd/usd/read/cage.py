@@ -29,9 +29,8 @@ _CONTROLS = {
 _SPLIT = "export the garment with one topology, or split the shot where it changes and use --frames"
 MOST_CORNERS, MOST_TWICE = 1000, 64
 """Most corners of a face, and of each of two faces with equal corners. Subdivision joins all corners at a single
-vertex,
-and the number of contact pairs there grows with the square: 1,000 corners take seconds, 2,000 on a body a minute, two
-equal faces of 500 half a minute."""
+vertex, and the number of contact pairs there grows with the square: 1,000 corners take seconds, 2,000 on a body a
+minute, two equal faces of 500 half a minute."""
 MOST_BROKEN = 0.1
 """Largest fraction of points replaced by repair."""
 
@@ -243,7 +242,7 @@ class PointReader:
 
 
 def as_points(value: object, path: str, name: str, *, time: float | None = None) -> np.ndarray:
-    """Convert a USD array of three-vectors to positions, shape (V, 3), float64; GarmentError for any further type."""
+    """Convert a USD array of three-vectors to positions, shape (V, 3), float64; GarmentError for other types."""
     if value is None:
         raise GarmentError(path, f"has no {name}", time=time, remedy="author point3f[] points, or leave the prim out")
     array = np.asarray(value)

@@ -35,8 +35,7 @@ _WORD = re.compile("[A-Z]?[a-z]+|[A-Z]+(?![a-z])")
 """A word of a name such as "LeatherBelt_geo1"."""
 _THICK = 10.0
 """Inverse of the largest contact distance relative to the cloth's size. Beyond, all vertices are near all vertices,
-with
-V^2 pairs, and cloth pushed out by more than its size loses the shot's shape."""
+with V^2 pairs, and cloth pushed out by more than its size loses the shot's shape."""
 _PER_VERTEX = {UsdGeom.Tokens.vertex, UsdGeom.Tokens.varying}
 
 
@@ -88,7 +87,7 @@ class GarmentReader:
     def frame(self, prim: Usd.Prim, metres: float, time: float | None) -> tuple[GarmentFrame, tuple[Notice, ...]]:
         """The garment at a time code, and notices of repairs.
 
-        All points of an absent garment are at one place, without contact: further garments may still have a frame.
+        All points of an absent garment are at one place, without contact: other garments may still have a frame.
 
         Args:
             prim: The garment's mesh prim.

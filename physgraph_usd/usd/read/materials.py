@@ -11,8 +11,8 @@ from Young's modulus E, Poisson's ratio nu and the thickness h of the mesh:
 The proposal writes stretch = E h / (1 - nu^2), for a strip with fixed width; ours is for a free strip.
 
 Stiffnesses are derived if the material authors E or nu, or has ``PhysicsSurfaceDeformableMaterialAPI``; missing values
-are then the proposal's fallbacks: 1e6 Pa, 0.3, 1 mm, 1000 kg/m^3. -inf means a missing value, and so does a density
-of 0.
+are then the proposal's fallbacks: 1e6 Pa, 0.3, 1 mm, 1000 kg/m^3. -inf means a missing value, and so does a density of
+0.
 
 All are in stage units. With m = metersPerUnit and M = kilogramsPerUnit, SI values are: stretch and shear
 M v [N/m], bending M m^2 v [N m], E M/m v [Pa], volumetric density M/m^3 v [kg/m^3], thickness m v [m].

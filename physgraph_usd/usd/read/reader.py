@@ -167,7 +167,7 @@ class Shot:
         return frame
 
     def with_values(self, overrides: Sequence[str]) -> Shot:
-        """A copy of the shot with different ``--set`` values in its frames; values read only on opening are kept.
+        """A copy of the shot with other ``--set`` values in its frames; values read only on opening are kept.
 
         Raises:
             UsageError: When a text is invalid, or has no matching garment.
@@ -217,8 +217,7 @@ def open_shot(
         level: Number of subdivisions, -1 for auto; None: each garment's own.
         overrides: ``</prim>.attribute=value`` texts; without a prim, for every garment.
         rest_frame: Time code whose points are the rest shape of every garment, or "auto" for a shape fitted to the
-            whole
-            shot; both override authored rest shapes. None: the authored shape, or else a fitted shape.
+            whole shot; both override authored rest shapes. None: the authored shape, or else a fitted shape.
         gravity: Axis of the stage along which gravity pulls, one of `AXES`; None: the stage's gravity.
         skip_invisible: Leave out garments invisible at all their time codes.
 

@@ -32,8 +32,7 @@ FITTED = "fitted to the shot"
 """First words of the source of a fitted rest shape."""
 MOST_FITTED = 50
 """Most time codes used to fit a rest shape, spread over the shot. On five real shots, medians of 25 time codes are
-within
-0.2 to 1.3% of the medians of all 24 to 60, medians of 9 within 0.6 to 4.3%."""
+within 0.2 to 1.3% of the medians of all 24 to 60, medians of 9 within 0.6 to 4.3%."""
 STEPS = 100
 """Steps of a fit. On five real shots lengths are then within 0.1 to 0.6% of their medians (root mean square), as after
 400 to 1,500 steps without momentum."""
@@ -194,9 +193,7 @@ def _checked(prim: Usd.Prim, edges: np.ndarray, rest: Rest, *, first: np.ndarray
 
 
 def rests_bent(prim: Usd.Prim) -> tuple[bool, list[Notice]]:
-    """Whether hinges rest at the rest shape's angles (``physics:restBendAnglesDefault``); a notice of an outdated
-    token.
-    """
+    """Whether hinges rest at the rest shape's angles (``physics:restBendAnglesDefault``); a notice of an old token."""
     attribute = nearest(prim, "physics:restBendAnglesDefault")
     if attribute is None:
         return False, []
@@ -264,8 +261,7 @@ def _default_points(prim: Usd.Prim, baked: Sdf.Layer) -> np.ndarray | None:
 
 def _braced(mesh: PolygonMesh) -> np.ndarray:
     """Pairs of vertices, shape (E, 2), whose distances make a mesh's metric: the edges, and in faces with more than
-    three
-    corners each corner with the next but one.
+    three corners each corner with the next but one.
     """
     corner, after = np.arange(len(mesh.indices)), mesh.next_corner[mesh.next_corner]
     diagonal = mesh.next_corner[after] != corner
@@ -277,10 +273,9 @@ def median_shape(edges: np.ndarray, poses: Sequence[np.ndarray]) -> tuple[np.nda
     """Fit a shape to the median length of each edge: minimise the sum of (l - m)^2 / m over the edges by majorization.
 
     A single pose has its own stretch; median lengths may fit no exact shape, yet cloth comes near them almost
-    everywhere.
-    Collapsed poses are left out, because garments are hidden by scaling to nothing.
-    The method is SMACOF (de Leeuw 1977): each step solves a Laplace equation with the current edge directions, with the
-    momentum of Nesterov (1983), restarted whenever the sum grows (O'Donoghue and Candes 2015).
+    everywhere. Collapsed poses are left out, because garments are hidden by scaling to nothing. The method is SMACOF
+    (de Leeuw 1977): each step solves a Laplace equation with the current edge directions, with the momentum of Nesterov
+    (1983), restarted whenever the sum grows (O'Donoghue and Candes 2015).
 
     Args:
         edges: End vertices, shape (E, 2).

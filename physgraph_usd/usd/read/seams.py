@@ -29,8 +29,7 @@ def sewn_garments(
     """Garments with the positions of their sewn vertices, and notices of adjacent unsewn borders.
 
     Vertices of different garments are sewn if coincident in every pose; vertices of the same garment must also coincide
-    in
-    the rest shape.
+    in the rest shape.
 
     Args:
         garments: The garments, welded.
@@ -88,9 +87,7 @@ class _Cloth:
         return shortest[vertices]
 
     def look(self, points: np.ndarray) -> tuple[np.ndarray, OnEdge, OnEdge]:
-        """Pairs of coincident vertices, border vertices on an edge of a different border, and border vertices beside an
-        edge.
-        """
+        """Pairs of coincident vertices, border vertices on an edge of another border, and those beside an edge."""
         pairs = pairs_within([points], self._used, float(self._reach.max(initial=0.0)))
         together = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1) <= self.reach(*pairs.T)
         pairs = pairs[together & self._rest_together(pairs)]
@@ -127,7 +124,7 @@ class _Cloth:
         return [replace(each, sewn_at=at) if np.isfinite(at).any() else each for each, at in pieces]
 
     def notices(self, points: np.ndarray, beside: OnEdge) -> list[Notice]:
-        """A notice of each garment with a border adjacent to a further border and not sewn."""
+        """A notice of each garment with a border adjacent to another border and not sewn."""
         found = []
         known = np.zeros(len(points), bool)
         known[beside.vertex] = True

@@ -60,8 +60,7 @@ class Bake:
     def add(
         self, garments: Sequence[Sdf.Path], frames: tuple[float, float] | None, *, bodies: Sequence[Sdf.Path] = ()
     ) -> list[Notice]:
-        """Bake the skinned prims, bodies also at the garments' times; returns notices of prims with unused joint
-        influences.
+        """Bake the skinned prims, bodies also at the garments' times; notices of prims with unused joint influences.
 
         Args:
             garments: Mesh prims; prims inside instances become editable in the anonymous layer.

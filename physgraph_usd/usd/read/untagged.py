@@ -34,8 +34,7 @@ def unnamed_meshes(
 
     Yields:
         The path of each mesh, in stage order; the reason for no contact, or ""; and the numbers and poses of the frames
-        in
-        which its bounds meet a garment's: to be consumed before the next path.
+        in which its bounds meet a garment's: to be consumed before the next path.
 
     Raises:
         StageError: USD can no longer read the files.

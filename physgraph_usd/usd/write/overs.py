@@ -66,7 +66,7 @@ def speed_notices(prim: Usd.Prim, *, written: bool) -> list[Notice]:
 
 
 def author_rest_points(stream: LayerStream, target: Sdf.Path, prim: Usd.Prim, fine: FineMap) -> list[Notice]:
-    """Refine the rest shape of the deformable-body schema; notices of further arrays unfit for the fine mesh."""
+    """Refine the rest shape of the deformable-body schema; notices of other arrays unfit for the fine mesh."""
     notices = []
     sizes = {fine.count(kind): kind for kind in ("faceVarying", "uniform", "vertex")}
     for attribute in prim.GetAuthoredAttributes():
@@ -161,9 +161,7 @@ def make_sibling(stream: LayerStream, prim: Usd.Prim) -> Sdf.Path:
 
 
 def _copy_collection_binding(stream: LayerStream, target: Sdf.Path, prim: Usd.Prim) -> None:
-    """Bind directly a material bound to the mesh through a collection, because the collection does not hold the
-    sibling.
-    """
+    """Bind directly a material bound to the mesh by a collection, which does not hold the sibling."""
     for purpose in (UsdShade.Tokens.allPurpose, UsdShade.Tokens.preview, UsdShade.Tokens.full):
         material, relationship = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial(purpose)
         if not material or "material:binding:collection" not in relationship.GetName():

@@ -27,10 +27,8 @@ class LayerStream:
     """A new layer, written atomically and in pieces, or in memory.
 
     Values go to a temporary binary layer beside the target; `commit` moves the layer to the final name, converting to
-    text
-    for a ``.usda`` target. Leaving the ``with`` block without `commit` removes the temporary file. A layer without a
-    target
-    is anonymous, stays in memory and touches no disk.
+    text for a ``.usda`` target. Leaving the ``with`` block without `commit` removes the temporary file. A layer without
+    a target is anonymous, stays in memory and touches no disk.
     """
 
     def __init__(self, target: Path | None, *, overwrite: bool = False) -> None:
@@ -123,8 +121,7 @@ class LayerStream:
         self._pending = 0
 
     def commit(self) -> Path | None:
-        """Move the layer to its final path, and return the path; None for an in-memory layer, still available as
-        ``layer``.
+        """Move the layer to its final path, and return the path; None for an in-memory layer, still in ``layer``.
 
         Raises:
             LayerError: The disk is full, or the target is held open by another program.

@@ -118,9 +118,7 @@ def _applied(layer: Sdf.Layer, prim: Usd.Prim, schema: str) -> Sdf.PrimSpec:
 
 
 def _author_over(spec: Sdf.PrimSpec, prim: Usd.Prim, row: Property, value: float | None) -> None:
-    """Author an attribute's default over a prim's opinions; None hides the opinions, such as a value of an earlier
-    preset.
-    """
+    """Author an attribute's default over a prim's opinions; None hides opinions, such as an earlier preset's value."""
     if value is not None:
         _author(spec, row, round(value) if row.type == "int" else value)
         if prim.GetAttribute(row.name).HasAuthoredConnections():  # Connections are stronger than the value.

@@ -65,8 +65,7 @@ class LayerWriter:
             provenance: Further entries of the record in ``customLayerData["physgraph"]``.
             overwrite: Whether an existing file may be replaced.
             times: Time codes to be written, if not all of the shot; garments without a sample at any of the time codes
-                are
-                left out of the layer.
+                are left out of the layer.
 
         Raises:
             UsageError: The mode is unknown, or the file exists or belongs to the shot.
@@ -116,8 +115,7 @@ class LayerWriter:
         Args:
             time: The stage's own time code, later than the last; None once, for a shot without samples.
             points: Per garment, fine points [m], world space, shape (V_fine, 3), or None for a garment without a sample
-                at this
-                time.
+                at this time.
             changed: Per garment, False when the points are known to equal the previous sample's.
             cuts: Per garment, whether the cloth jumps here from the previous sample; () for none.
             heat: Per garment, heat maps by name, each of shape (V_fine,), or None; () for no heat maps.
@@ -308,9 +306,7 @@ def _facts(shot: Shot, targets: Sequence[Sdf.Path], out: Path | None) -> dict[st
 
 
 def _garments_in(shot: Shot, times: Sequence[float] | None) -> list[int]:
-    """Numbers of the garments with a sample at a given time code; a garment without samples counts for the shot's
-    first.
-    """
+    """Numbers of the garments with a sample at a given time code; a garment without samples has the shot's first."""
     every = range(len(shot.sources))
     if times is None:
         return [*every]
