@@ -1,1 +1,1 @@
-"""A shot, from stage to layer: where reading, solving and writing meet."""
+"""A shot from stage to layer: reading, solving and writing combined."""

@@ -1,9 +1,9 @@
-"""Solves a shot's time codes, in this process or in several, and hands the states back in order.
+"""Solves a shot's time codes, in this process or in several, and returns the results in frame order.
 
-Each process opens the shot for itself and begins a few frames before its chunk (the pre-roll), so that warm starts have
-settled when the chunk begins; over these frames, which two processes solve, `joined` goes from one result to the
-other. Results go through files, so memory does not grow with the frames and what is finished outlives an interruption;
-frames that an earlier run finished are not solved again.
+Each process opens the shot itself and starts a few frames before its chunk (the pre-roll), to settle its warm starts by
+the first frame of the chunk. Two processes solve the frames of a pre-roll; `joined` blends the two solutions. Results
+are stored in files: memory does not grow with the frame count, finished frames survive an interruption, and a later run
+does not solve finished frames again.
 """
 
 from __future__ import annotations
@@ -22,37 +22,37 @@ from .frames import Finished, Folders, FrameFolder, Lead, Outcome
 from .processes import POLL_SECONDS, Call, memory_is_named
 
 PREROLL = 6
-"""Frames solved before a chunk, when frames depend on one another."""
+"""Frames solved before a chunk if frames depend on their predecessors."""
 
 Solver = Callable[[Sequence[float | None]], Iterator[Outcome]]
 """Solves time codes in order; must be picklable to run in several processes."""
 
 
 class Work(Protocol):
-    """A function at work in another process, as `Call` is."""
+    """A running function call in another process, such as `Call`."""
 
     lag: float
 
     @property
     def ready(self) -> bool:
-        """Whether it has returned, failed or died."""
+        """Whether the call has returned, failed or died."""
         ...
 
     def result(self) -> Any:
-        """The function's result; raises what ended it."""
+        """The function's result; raises the error if the call failed."""
         ...
 
     def ask_to_end(self) -> None:
-        """Ask it to end, and do not wait."""
+        """Ask the call to end; do not wait."""
         ...
 
     def end(self) -> None:
-        """End it, if it is still at work."""
+        """End the call if still running."""
         ...
 
 
 def chunks_of(missing: Sequence[int], workers: int) -> list[list[range]]:
-    """The frames of each worker, nearly equally many, as ranges without gaps; at most one entry per worker.
+    """Split frames nearly evenly among workers, as ranges without gaps; at most one entry per worker.
 
     Args:
         missing: Numbers of the frames to solve, in order.
@@ -70,19 +70,19 @@ def _ranges(numbers: Sequence[int]) -> list[range]:
 def seams_of(
     chunks: Sequence[Sequence[range]], frames: Finished | Folders, *, preroll: int
 ) -> dict[int, tuple[int, float]]:
-    """The frames that are solved on both sides of a seam.
+    """Find the frames solved on both sides of a seam.
 
     Args:
         chunks: The frames of each worker.
-        frames: Where results are; frames of an earlier run in it have seams of their own.
+        frames: Stored results; frames of an earlier run have their own seams.
         preroll: Frames solved before each range.
 
     Returns:
-        By the frame's number: that of the first frame after the seam, and its `Lead.weight`.
+        By frame number: the number of the first frame after the seam, and the `Lead.weight`.
     """
     starts = frames.seams()
     parts = [part for chunk in chunks for part in chunk if part.start]
-    # Where the frame after a range is an earlier run's, what goes on there is not what the range began.
+    # If an earlier run solved the frame after a range, the motion continues from the earlier run, not from the range.
     starts |= {part.start for part in parts if part.stop not in frames.kept or part.stop in starts}
     found: dict[int, tuple[int, float]] = {}
     before = 0
@@ -103,18 +103,18 @@ def solve_in_chunks(
     preroll: int = PREROLL,
     start: Callable[..., Work] | None = None,
 ) -> Generator[Outcome, None, None]:
-    """Solve time codes but those that are kept, in this process or in several, and yield all in order.
+    """Solve all time codes except the kept ones, in this process or in several, and yield all in order.
 
     Args:
         solver: Solves time codes in order.
         times: The time codes.
-        frames: Where results go; frames in its ``kept`` are taken from there.
-        workers: Number of processes; 1 solves in this one.
+        frames: Folder of the results; frames in ``frames.kept`` are read from the folder.
+        workers: Number of processes; 1 solves in this process.
         only: Numbers of the time codes to solve; None for all.
-        preroll: Frames solved before each chunk but the first of the shot; they are yielded as the ``lead`` of the same
-            frames of the chunk before.
-        start: Starts a function in a process of its own, with its arguments, in place of `Call`; then one chunk is not
-            solved in this process either.
+        preroll: Frames solved before each chunk except the shot's first; yielded as the ``lead`` of the same frames of
+            the previous chunk.
+        start: Replacement for `Call`: starts a function with its arguments in a new process. If given, a single chunk
+            also runs in a new process.
 
     Raises:
         SolveError: A process died.
@@ -151,7 +151,7 @@ def solve_in_chunks(
 def finished_frames(
     frames: Folders, times: Sequence[float | None], numbers: Sequence[int], *, preroll: int
 ) -> Generator[Outcome, None, None]:
-    """Yield frames that chunks hold, in order; where two chunks have a frame, the later one's is the ``lead``.
+    """Yield the frames of chunks in order; if two chunks hold a frame, the later chunk's result is the ``lead``.
 
     Args:
         frames: The frames of the chunks.
@@ -165,7 +165,7 @@ def finished_frames(
         outcome = frames.read(index, times[index])
         if outcome is None:
             raise LayerError(f"the result of time code {times[index]} is gone; refine it anew by --resume")
-        if index in starts:  # It may equal the last frame of the pre-roll, which is not the one before it here.
+        if index in starts:  # "Reused" refers to the last pre-roll frame, not to the previous frame here.
             outcome = replace(outcome, reused=(False,) * len(outcome.reused))
         seam, weight = seams.get(index, (None, 0.0))
         lead = None if seam is None else frames.read(index, times[index], seam=seam)
@@ -175,7 +175,7 @@ def finished_frames(
 def _solve(
     solver: Solver, times: Sequence[float | None], chunk: Sequence[range], frames: FrameFolder, preroll: int
 ) -> Iterator[int]:
-    """Solve ranges of frames, each after its pre-roll, and file them; yields the number of each when it is there."""
+    """Solve ranges of frames, each after its pre-roll, and store them; yields each frame's number once stored."""
     for part in chunk:
         first = max(0, part.start - preroll)
         with memory_is_named():
@@ -199,7 +199,7 @@ def _collect(
     solved: Iterator[int],
     seam: int | None = None,
 ) -> Outcome:
-    """Read a frame's file once its owner, or without one ``solved``, has made it; ``seam`` as `FrameFolder.read`."""
+    """Read a frame once its owner, or ``solved`` without an owner, has stored it; ``seam`` as in `FrameFolder.read`."""
     ended: float | None = None
     while True:
         leave_if_asked()

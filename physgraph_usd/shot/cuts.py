@@ -1,4 +1,4 @@
-"""Frames to which cloth jumps from the sample before: no velocity is taken across a jump."""
+"""Finds frames to which cloth jumps from the previous sample: no velocity is computed across a jump."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from ..solver.frame.settings import Reset
 from ..usd.read.reader import Shot
 
 JUMP = Reset().move
-"""RMS over a garment's points by which a step departs from the steps beside it, in mean cage edges, to be a jump: the
-solver, too, takes cloth that moves so far for another pose."""
+"""Least deviation of a step from its neighbouring steps to count as a jump, RMS over a garment's points, in mean cage
+edges. The solver treats cloth as a new pose from the same distance."""
 _STARTED_ANEW = "cold: "
-"""In the start of a frame of the telemetry, before the reason why cloth was not carried from the last one."""
+"""Prefix, in a frame's telemetry, of the reason for not continuing from the previous frame."""
 
 
 class Cuts:
-    """Jumps of a shot's garments, of those with velocities."""
+    """Jumps of all garments with velocities."""
 
     def __init__(self, opened: Shot, *, velocities: bool) -> None:
-        """Look for the cages' jumps; ``velocities``: whether garments have them where the shot has none, too."""
+        """Find the cages' jumps; ``velocities``: whether garments without authored velocities count too."""
         self._jumps = [
             jumps(opened, index) if velocities or source.velocities else frozenset[float]()
             for index, source in enumerate(opened.sources)
         ]
 
     def __call__(self, records: Sequence[Mapping[str, Any]]) -> list[bool]:
-        """For each garment, whether its cloth jumps to the last frame of some telemetry, or is solved anew there."""
+        """For each garment, whether the cloth jumps to the last telemetry record, or was solved anew there."""
         before, now = (list(record.get("garments", ())) for record in ({}, *records)[-2:])
         return [
             records[-1]["time"] in jumps
@@ -45,8 +45,8 @@ class Cuts:
 def jumps(opened: Shot, index: int) -> frozenset[float]:
     """Time codes to which a garment's cage, by number, jumps in its own space.
 
-    A cage that moves on evenly does not jump, however fast it is: a step is compared with those before and after it. Of
-    two steps that have none other beside them, the larger is the jump.
+    A step is compared with the previous and next step, so even motion is no jump at any speed. If a shot has only two
+    steps, the larger step is the jump.
     """
     ends, lasted, lengths, away = _steps(_samples(opened, index))
     if len(ends) < 2:
@@ -70,7 +70,7 @@ def _samples(opened: Shot, index: int) -> Iterator[tuple[float, np.ndarray]]:
 
 
 def _steps(samples: Iterable[tuple[float, np.ndarray]]) -> tuple[list[float], list[float], list[float], list[float]]:
-    """Where steps between samples end, how long they last, their speeds, and by how much each next one's differs.
+    """End times of the steps between samples, durations, speeds, and differences between consecutive speeds.
 
     Speeds are RMS over the points, per time code; there is one difference fewer.
     """
@@ -87,7 +87,7 @@ def _steps(samples: Iterable[tuple[float, np.ndarray]]) -> tuple[list[float], li
 
 
 def _mean_edge(opened: Shot, index: int) -> float:
-    """Mean edge of a cage in its own units at its first sample that can be read."""
+    """Mean edge of a cage in its own units at the first readable sample."""
     edges = opened.scene.garments[index].mesh.half_edges.edges
     _, first = next(_samples(opened, index))
     return float(np.linalg.norm(first[edges[:, 0]] - first[edges[:, 1]], axis=1).mean())

@@ -1,4 +1,4 @@
-"""Facts of a shot before its first frame: garments, values and sources, terms on and off; and what was."""
+"""Describes a shot before the first frame: garments, values, sources, active terms. Completes the report at the end."""
 
 from __future__ import annotations
 
@@ -33,15 +33,15 @@ from .warnings import of_gravity, of_strain, of_unfelt
 
 
 def begin_report(report: RefineReport, opened: Shot, options: RefineOptions) -> list[str]:
-    """Fill in a report before the first frame: choose the levels, and look for what a few frames give away.
+    """Fill in a report before the first frame: choose the levels and check a few sample frames.
 
     Args:
-        report: An empty one.
+        report: An empty report.
         opened: The shot.
         options: The run's options.
 
     Returns:
-        What the user should know.
+        Warnings for the user.
     """
     first, frames = _first_frame(opened), sample_frames(opened.every_time, opened.frame)
     choices = choose_levels(opened.scene, frames)
@@ -68,12 +68,12 @@ def begin_report(report: RefineReport, opened: Shot, options: RefineOptions) -> 
     report.modelled = _modelled(opened, report, options)
     report.left_out = _left_out(opened, report)
     report.variants = list(opened.selections)
-    refined = {None, *opened.scene.times}  # Frames that are looked at alone may be broken.
+    refined = {None, *opened.scene.times}  # Frames outside the run may be broken.
     return [str(notice) for notice in opened.warnings if notice.time in refined] + known
 
 
 def say_what_was(report: RefineReport) -> None:
-    """Say who made the steps, and move contact of cloth with cloth to what is left out where no frame needed it."""
+    """Report who made the steps, and list self contact as left out if no frame needed it."""
     entries = [entry for frame in report.frames for entry in frame.get("garments", ())]
     _say_who_integrated(report, entries)
     if any(entry.get("contact", {}).get("cloth", {}).get("near") for entry in entries):
@@ -83,7 +83,7 @@ def say_what_was(report: RefineReport) -> None:
 
 
 def _say_who_integrated(report: RefineReport, entries: Sequence[dict[str, Any]]) -> None:
-    """The learned integrator's part of the steps as something modelled, or why it had none."""
+    """Report the learned integrator's share of the steps as modelled, or the reason for its absence."""
     movers: Counter[str] = Counter()
     for entry in entries:
         for level in entry.get("levels", ()):
@@ -97,12 +97,12 @@ def _say_who_integrated(report: RefineReport, entries: Sequence[dict[str, Any]])
 
 
 def too_large(opened: Shot, report: RefineReport, options: RefineOptions) -> GarmentError | None:
-    """The error that names what this machine's memory cannot hold, or None."""
+    """The error naming a run too large for this machine's memory, or None."""
     return cannot_fit(opened.scene.garments, **_run(opened, report, options))
 
 
 def _run(opened: Shot, report: RefineReport, options: RefineOptions) -> dict[str, Any]:
-    """Sizes of a run beside its garments'."""
+    """Levels, frame count and worker count of a run."""
     levels = [garment["level"] for garment in report.garments]
     times = opened.scene.times if options.preroll is None else within(opened.scene.times, options.frames)
     return {"levels": levels, "frames": max(len(times), 1), "workers": options.workers}
@@ -133,7 +133,7 @@ def describe(opened: Shot, options: RefineOptions) -> dict[str, Any]:
 
 
 def _command(opened: Shot, report: RefineReport, options: RefineOptions) -> dict[str, str]:
-    """The command with what the garments touch and do not feel, and the rest shape that they need, where they do."""
+    """The command with touched but unnamed colliders added, and the rest shape option if the garments need one."""
     unfelt = dict.fromkeys(path for garment in report.garments for path in garment.get("unfelt", ()))
     strained = [(g["sources"]["rest"], [StrainedPart(**part) for part in g["strained"]]) for g in report.garments]
     rest = rest_options(strained)
@@ -144,7 +144,7 @@ def _command(opened: Shot, report: RefineReport, options: RefineOptions) -> dict
 
 
 def describe_meshes(shot: str | Stage, problem: str, options: RefineOptions) -> dict[str, Any]:
-    """A stage that could not be opened for refining: its meshes, why, and a command that may do.
+    """Describe a stage not ready for refining: its meshes, the problem, and a command to try.
 
     Raises:
         StageError: The file cannot be opened at all.
@@ -177,7 +177,7 @@ def describe_meshes(shot: str | Stage, problem: str, options: RefineOptions) -> 
 
 
 def _first_frame(opened: Shot) -> Frame:
-    """The first frame that can be read.
+    """The first readable frame.
 
     Raises:
         StageError: No frame can be read.
@@ -218,21 +218,21 @@ def _garment(garment: Garment, source: GarmentSource, frame: GarmentFrame, choic
 
 
 def _unfelt(report: RefineReport, beside: Sequence[Candidate]) -> list[str]:
-    """Add to the report the meshes that garments touch and do not feel; returns a warning of them."""
+    """Add to the report the meshes touched by garments but not used as colliders; returns a warning."""
     for garment in report.garments:
         garment["unfelt"] = [each.path for each in beside if garment["path"] in each.shares]
     return of_unfelt(beside)
 
 
 def _across(opened: Shot, frames: Sequence[Frame], beside: Sequence[Candidate]) -> list[str]:
-    """A warning where bodies and garments stand across gravity that nobody chose."""
+    """A warning if bodies and garments stand across gravity and nobody chose the gravity axis."""
     chosen = opened.gravity_source == GRAVITY_OPTION or opened.gravity_source.endswith(GARMENT["gravity"].name)
     found = None if chosen else across_gravity(opened.scene, frames, beside)
     return [] if found is None else [of_gravity(*found, pull=_pull(opened.scene.gravity), source=opened.gravity_source)]
 
 
 def _strained(opened: Shot, report: RefineReport, frames: Sequence[Frame]) -> list[str]:
-    """Add to the report the parts of garments that are not of their rest shape's size; returns a warning of them."""
+    """Add to the report the garment parts not sized like their rest shape; returns a warning."""
     found, up = {}, -opened.scene.gravity
     for index, (garment, source) in enumerate(zip(opened.scene.garments, opened.sources, strict=True)):
         parts = strained_parts(garment, [frame.garments[index].points for frame in frames], source.subsets, up=up)
@@ -263,14 +263,14 @@ def _modelled(opened: Shot, report: RefineReport, options: RefineOptions) -> dic
 
 
 def _creased(report: RefineReport) -> dict[str, str]:
-    """Which garments remember their folds, and for how long."""
+    """Garments with crease memory, and the time constants."""
     times = {garment["path"]: garment["fabric"]["crease_time"] for garment in report.garments}
     worn = [f"{time:g} s for {path}" for path, time in times.items() if time]
     return {"crease memory": f"folds set and fade in {', '.join(worn)}"} if worn else {}
 
 
 def _pull(gravity: np.ndarray) -> str:
-    """Strength and direction of gravity [m/s^2], shape (3,), by axis where it follows one."""
+    """Strength and direction of gravity [m/s^2], shape (3,), naming the axis if gravity follows one."""
     strength = float(np.linalg.norm(gravity))
     if not strength:
         return "0 m/s^2"
@@ -282,7 +282,7 @@ def _pull(gravity: np.ndarray) -> str:
 
 
 def _in_plane(report: RefineReport) -> dict[str, str]:
-    """Which garments are sheets of edge springs, which of triangles, and whose cloth is longer than its rest shape."""
+    """Garments modelled by edge springs, garments modelled by triangles, and garments with ease."""
     known = {each.name for each in dataclasses.fields(Fabric)}
     woven = {g["path"]: Fabric(**{k: v for k, v in g["fabric"].items() if k in known}) for g in report.garments}
     springs = [path for path, fabric in woven.items() if not fabric.has_membrane]
@@ -298,7 +298,7 @@ def _in_plane(report: RefineReport) -> dict[str, str]:
 
 
 def _touching(opened: Shot) -> list[str]:
-    """Paths of the colliders that some garment feels, each with its side where that was chosen."""
+    """Paths of the colliders felt by some garment, each with the chosen side, if any."""
     felt = {path for garment in opened.scene.garments for path in _felt(opened, garment)}
     return [
         collider.path + ("" if collider.side == "auto" else f" (side: {collider.side})")
@@ -308,7 +308,7 @@ def _touching(opened: Shot) -> list[str]:
 
 
 def _felt(opened: Shot, garment: Garment) -> list[str]:
-    """Paths of the colliders that a garment feels."""
+    """Paths of the colliders felt by a garment."""
     return [opened.scene.colliders[index].path for index in garment.colliders]
 
 

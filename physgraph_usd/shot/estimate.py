@@ -1,4 +1,4 @@
-"""A shot's size, from its cages alone: fine vertices, memory and the layer's size.
+"""Estimates a shot's cost from the cages alone: fine vertices, memory and layer size.
 
 ``python -m benchmarks.estimate`` measures the constants. Memory and size are within a factor of 2.
 """
@@ -14,11 +14,11 @@ from ..solver.mesh.subdivide import fine_count
 from ..solver.scene import Garment
 
 PROCESS = 5.2e8
-"""Memory of a process that has done nothing yet but import [bytes]: torch, Warp and its kernels, USD."""
+"""Memory of a process after importing torch, Warp with its kernels, and USD [bytes]."""
 PER_VERTEX = 6.5e3
-"""Memory for each fine vertex, coarser levels, forces, metric and hierarchies included [bytes]."""
+"""Memory per fine vertex, including coarser levels, forces, metric and hierarchies [bytes]."""
 LAYER_ONCE, LAYER_FRAME = 60.0, 24.0
-"""Data of each fine vertex in a layer: faces, UVs and the default once; points and normals per sample [bytes]."""
+"""Data per fine vertex in a layer: faces, UVs and the default once; points and normals per sample [bytes]."""
 
 
 @dataclass(frozen=True)
@@ -67,14 +67,14 @@ def cannot_fit(
     workers: int = 1,
     memory: float | None = None,
 ) -> GarmentError | None:
-    """The error that names what this machine's memory cannot hold, and the level that it can; or None.
+    """The error naming a run too large for memory and the largest level to fit, or None if the run fits.
 
     Args:
         garments: The garments.
         levels: Number of subdivisions of each.
         frames: Number of time codes.
         workers: Processes that share the frames.
-        memory: What the machine has [bytes]; asked of it when None.
+        memory: Memory of the machine [bytes]; measured if None.
     """
     there = memory_there() if memory is None else memory
     whole = estimate(garments, levels, frames=frames, workers=workers)
@@ -98,7 +98,7 @@ def cannot_fit(
 
 
 def memory_there() -> float:
-    """Memory of this machine [bytes]; infinite where it does not say."""
+    """Memory of this machine [bytes]; infinite if unknown."""
     try:
         return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
     except (AttributeError, OSError, ValueError):  # Windows has no sysconf.

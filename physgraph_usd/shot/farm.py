@@ -1,7 +1,7 @@
-"""Calls on the workers of a Dask scheduler, as `processes` makes them on this machine.
+"""Calls on the workers of a Dask scheduler, like `processes` on this machine.
 
-A task solves a chunk and files its frames in the folder beside the layer, which every worker sees under the same path.
-A worker that dies, dies alone: the scheduler gives its task to another one, which writes the same files again.
+A task solves a chunk and stores the frames in the folder beside the layer; every worker must see the folder under the
+same path. If a worker dies, the scheduler restarts its task on a new worker and the same files are written again.
 """
 
 from __future__ import annotations
@@ -18,39 +18,39 @@ from ..interrupts import leave_if_asked
 from ..version import __version__, code_digest
 
 RETRIES = 2
-"""How often a task is begun again after an error that nobody foresaw, such as a disk that was not there."""
+"""Restarts of a task after an unforeseen error, such as a disk not yet mounted."""
 CONNECT_SECONDS = 10.0
-"""How long to wait for the scheduler, and for its first worker."""
+"""Longest wait for the scheduler, and for its first worker."""
 
 Start = Callable[..., "FarmCall"]
-"""Starts a function on a worker, with its arguments; they must be picklable."""
+"""Starts a function on a worker; function and arguments must be picklable."""
 
 
 class FarmCall:
-    """A function at work on a worker of a Dask scheduler.
+    """A running function call on a worker of a Dask scheduler.
 
     Attributes:
-        lag: How long after its end the files that it wrote may be hidden from this machine [s]: a network's file system
-            remembers what was not there.
+        lag: Longest time for the call's files to appear on this machine after the call has ended [s]: network file
+            systems cache missing files.
     """
 
     lag = 60.0
 
     def __init__(self, future: Any) -> None:
-        """Follow a task that was submitted."""
+        """Follow a submitted task."""
         self._future = future
 
     @property
     def ready(self) -> bool:
-        """Whether it has returned or failed."""
+        """Whether the call has returned or failed."""
         return self._future.done()
 
     def result(self) -> Any:
-        """The function's result; waits for it.
+        """Wait for the function's result.
 
         Raises:
-            PhysGraphError: What it raised.
-            SolveError: Its workers died, the scheduler is gone, or something failed that nobody foresaw.
+            PhysGraphError: Raised by the function.
+            SolveError: The workers died, the scheduler is gone, or an unforeseen error occurred.
         """
         dask = _distributed()
         try:
@@ -67,23 +67,23 @@ class FarmCall:
         return value
 
     def ask_to_end(self) -> None:
-        """End it where it has not begun; a frame that a worker is solving is finished first."""
+        """Cancel the call if not yet begun; a worker finishes its current frame first."""
         self._future.cancel()
 
     def end(self) -> None:
-        """Cancel it, as `ask_to_end` does: nothing here waits for a worker."""
+        """Cancel the call like `ask_to_end`, without waiting for the worker."""
         self.ask_to_end()
 
 
 @contextmanager
 def connected(address: str) -> Iterator[Start]:
-    """Connect to a scheduler, for as long as the block lasts.
+    """Connect to a scheduler for the duration of the block.
 
     Args:
-        address: As ``dask scheduler`` prints it, such as ``tcp://farm:8786``.
+        address: Address printed by ``dask scheduler``, such as ``tcp://farm:8786``.
 
     Raises:
-        UsageError: Dask is not installed, or nothing answers there.
+        UsageError: Dask is not installed, or no scheduler answers at the address.
     """
     with _client(address) as client:
 
@@ -94,10 +94,10 @@ def connected(address: str) -> Iterator[Start]:
 
 
 def shots_at_once(address: str, chunks: int) -> int:
-    """How many shots of so many chunks keep all workers of a scheduler busy.
+    """Number of shots, each of ``chunks`` chunks, needed to keep all workers of a scheduler busy.
 
     Raises:
-        UsageError: As `connected` does.
+        UsageError: As in `connected`.
     """
     with _client(address) as client:
         return math.ceil(len(client.nthreads()) / chunks)
@@ -105,7 +105,7 @@ def shots_at_once(address: str, chunks: int) -> int:
 
 @contextmanager
 def _client(address: str) -> Iterator[Any]:
-    """A connection to a scheduler that has workers."""
+    """A connection to a scheduler with at least one worker."""
     try:
         client = _distributed().Client(address, timeout=CONNECT_SECONDS)
     except (OSError, ValueError, TypeError) as error:
@@ -121,7 +121,7 @@ def _client(address: str) -> Iterator[Any]:
 
 
 def _distributed() -> Any:
-    """Dask's package, which is an extra."""
+    """The Dask package, an optional extra."""
     try:
         return import_module("distributed")
     except ModuleNotFoundError as error:
@@ -129,12 +129,12 @@ def _distributed() -> Any:
 
 
 def _code() -> str:
-    """The version of the package here, and its code."""
+    """Version and code digest of the local package."""
     return f"{__version__} (code {code_digest()[:12]})"
 
 
 def _call(code: str, function: Callable[..., Any], args: tuple[Any, ...]) -> tuple[Any, PhysGraphError | None]:
-    """Call a function on a worker; what is wrong with the shot would be wrong on any other, and is not tried again."""
+    """Call a function on a worker. Errors of the shot are returned, not raised: a retry would fail the same way."""
     worker = _distributed().get_worker()
     if worker.state.nthreads != 1:
         message = f"the worker {worker.name} has {worker.state.nthreads} threads; start each with --nthreads 1"

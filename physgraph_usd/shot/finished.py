@@ -1,6 +1,6 @@
-"""Runs that need not be done: the layer is there and is to be left, or the same files, options and version made it.
+"""Detects runs with nothing to do: the layer exists and is kept, or was made from the same files, options and version.
 
-It is decided without the solver, whose libraries take seconds to import.
+The check works without the solver, whose libraries take seconds to import.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ class _Opened:
 
 
 def finished(shot: str | Path, out: Path, options: RefineOptions) -> RefineReport | None:
-    """The report of a shot that need not be refined, or None.
+    """The report of a shot with nothing left to refine, or None.
 
     Args:
         shot: Input file.
         out: Its layer.
-        options: With ``skip_existing`` the layer is left where it is there, with ``resume`` where all that is to be
-            written is there and the layer's record says that it was made from the same.
+        options: With ``skip_existing``, an existing layer is kept. With ``resume``, the layer is kept if all outputs
+            exist and the layer's record names the same inputs.
     """
     if there := skipped(shot, out, options):
         return there
@@ -52,7 +52,7 @@ def finished(shot: str | Path, out: Path, options: RefineOptions) -> RefineRepor
         return None
     try:
         wanted = made_from(_Opened(str(shot)), out, options)
-    except PhysGraphError:  # which the run itself will tell
+    except PhysGraphError:  # The run itself will raise the error.
         return None
     if not is_result_of(out, wanted, settled=options.strict):
         return None
@@ -60,7 +60,7 @@ def finished(shot: str | Path, out: Path, options: RefineOptions) -> RefineRepor
 
 
 def skipped(shot: str | Path, out: Path, options: RefineOptions) -> RefineReport | None:
-    """The report of a shot whose layer is there already and is to be left, or None."""
+    """The report of a shot whose existing layer is kept, or None."""
     if not options.skip_existing or not out.is_file():
         return None
     LOG.info("skipped: %s is there", out, extra={"shot": str(shot)})
@@ -68,20 +68,20 @@ def skipped(shot: str | Path, out: Path, options: RefineOptions) -> RefineReport
 
 
 def may_be_done(out: Path, options: RefineOptions) -> bool:
-    """Whether a run to go on with left everything that there is to make, and no frames."""
+    """Whether a resumed run left all outputs and no unfinished frames."""
     made = options.resume and all(path.is_file() for _, path in options.targets(out))
     return made and not frames_folder(out).exists()
 
 
 def taken_as_done(report: RefineReport, out: Path) -> RefineReport:
-    """The report of a run whose layer is there."""
+    """The report of a run whose layer exists."""
     report.warn(f"{out} is taken as done: the same files, options and version made it")
     report.out = out
     return report
 
 
 def made_from(opened: Shot | _Opened, out: Path | None, options: RefineOptions) -> dict[str, Any]:
-    """Everything that decides a layer, for its record: version, code, options, the shot and hashes of its files."""
+    """Everything the layer depends on, for its record: version, code, options, the shot and hashes of its files."""
     folder, absolute = out and out.resolve().parent, options.asset_paths == "absolute"
     return {
         "version": __version__,
@@ -94,14 +94,14 @@ def made_from(opened: Shot | _Opened, out: Path | None, options: RefineOptions) 
 
 
 def check_jobs(jobs: Sequence[Job], *, also: Sequence[Target] = ()) -> None:
-    """Refuse options that no shot could be refined with, and to write over a file that any of the jobs reads or writes.
+    """Refuse invalid options, and outputs over files read or written by any job.
 
     Args:
         jobs: Shot, layer to write and options of each.
         also: Further files to be written.
 
     Raises:
-        UsageError: With the value, and the file.
+        UsageError: Names the value, or the file.
     """
     targets = [*also]
     inputs: set[Path] = set()
@@ -113,7 +113,7 @@ def check_jobs(jobs: Sequence[Job], *, also: Sequence[Target] = ()) -> None:
         if options.preroll is not None and out.suffix in LAYER_SUFFIXES:
             raise UsageError(f"{out} is a layer's name, and a chunk is a folder of finished frames; name one by -o")
         targets += options.targets(out)
-        left = options.skip_existing and out.is_file()  # and not opened: nothing that is there is replaced
+        left = options.skip_existing and out.is_file()  # Skipped: no file is opened or replaced.
         inputs |= ({Path(shot)} if left else files_of(shot)) | {Path(file) for file in (options.weights,) if file}
     check_targets(targets, inputs)
 
@@ -121,7 +121,7 @@ def check_jobs(jobs: Sequence[Job], *, also: Sequence[Target] = ()) -> None:
 def in_order(
     found: Sequence[RefineReport | None], done: Generator[RefineReport | PhysGraphError, None, None]
 ) -> Iterator[RefineReport | PhysGraphError]:
-    """Results of jobs in order: the report of one that was finished before, else the next that is done."""
+    """Results of jobs in order: the report of a job finished before, else the next result of ``done``."""
     with closing(done):
         for there in found:
             yield next(done) if there is None else there

@@ -1,7 +1,8 @@
-"""Finished frames of a run in a folder: they outlive the run when it is interrupted, and are what `stitch` joins.
+"""Stores the finished frames of a run in a folder: the frames survive an interruption, and `stitch` joins them.
 
-One file a frame, whole or not there, and `RUN`, a record of everything that decides the frames. The folder beside a
-layer goes when the layer is whole under its name and for no other reason; a chunk's folder stays. One run locks it.
+The folder holds one file per frame, complete or absent, and `RUN`, a record of everything the frames depend on. The
+folder beside a layer is removed only once the layer is complete under its name; a chunk's folder stays. One run locks
+the folder.
 """
 
 from __future__ import annotations
@@ -24,26 +25,26 @@ from ..usd.write.atomic import make_file, temporary_path, write_text
 from .lock import LOCK, FolderLock
 
 RUN = "run.json"
-"""A record of everything that decides the frames."""
+"""File with a record of everything the frames depend on."""
 CHUNK = "chunk"
-"""Entry of the record of a chunk: number of its first frame, and of the frame after its last."""
+"""Entry in a chunk's record: number of the first frame, and of the frame after the last."""
 _DONE, _FAILED = ".npz", ".failed.npz"
 _FRAMES = ".frames"
 _BEFORE = ".before"
 _DAMAGED = (OSError, ValueError, KeyError, TypeError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error)
-"""Errors of numpy and zipfile over a file that is not what `FrameFolder.write` left."""
+"""Errors of numpy and zipfile when reading a file not written by `FrameFolder.write`."""
 _OURS = re.compile(r"(\d+(\.before\d+)?(\.failed)?\.npz|run\.json)(\.[\w-]+\.\d+\.tmp)?")
-"""Names of finished frames and of the record, also while they are written."""
+"""File names of finished frames and of the record, including temporary names while writing."""
 
 
 @dataclass(frozen=True, eq=False)
 class Lead:
-    """A time code as it was solved by the process that goes on after a seam.
+    """A time code as solved by the process after a seam.
 
     Attributes:
-        outcome: Its result there.
-        seam: Number of the first frame that is that process's alone.
-        weight: Part of its positions in the joined frame: k / (L + 1) in the k-th of the L frames that both solved.
+        outcome: Result of the process after the seam.
+        seam: Number of the first frame solved by the process after the seam alone.
+        weight: Weight of ``outcome`` in the joined frame: k / (L + 1) in the k-th of the L frames solved twice.
     """
 
     outcome: Outcome
@@ -57,11 +58,11 @@ class Outcome:
 
     Attributes:
         time: The time code; None for a shot without samples.
-        points: Fine world positions [m] of each garment, None where it has no sample; () when the solve failed.
-        reused: For each garment, True when it kept the previous frame's points.
+        points: Fine world positions [m] of each garment, None for a garment without a sample; () if the solve failed.
+        reused: For each garment, True if the previous frame's points were kept.
         record: Telemetry, or {"error": message}, ready for JSON.
-        heat: Heat maps of each garment by name, None where it has no sample; () when none was asked for.
-        lead: The same frame from behind the next seam, or None.
+        heat: Heat maps of each garment by name, None for a garment without a sample; () if not requested.
+        lead: The same frame as solved behind the next seam, or None.
     """
 
     time: float | None
@@ -79,12 +80,12 @@ def frames_folder(layer: Path) -> Path:
 
 @dataclass(frozen=True)
 class Kept:
-    """Finished frames of a run that did not come to its end.
+    """Finished frames of an incomplete run.
 
     Attributes:
-        folder: Where they are.
-        frames: How many.
-        of: Frames of the run.
+        folder: Folder of the frames.
+        frames: Number of finished frames.
+        of: Number of frames of the run.
     """
 
     folder: Path
@@ -99,7 +100,7 @@ class Kept:
 
 
 def kept_for(out: Path) -> Kept | None:
-    """Finished frames beside a layer, or in a chunk's folder that lacks some; None where there are none."""
+    """Finished frames beside a layer, or in an incomplete chunk's folder; None if no frame is finished."""
     folder = out if out.is_dir() else frames_folder(out)
     run = record_in(folder)
     first, stop = run.get(CHUNK) or (0, len(run.get("times", ())))
@@ -108,7 +109,7 @@ def kept_for(out: Path) -> Kept | None:
 
 
 def record_in(folder: Path) -> dict[str, Any]:
-    """The record of the run that a folder's frames are of; empty where there is none."""
+    """The record of the run that wrote a folder; empty if missing."""
     try:
         found = json.loads((folder / RUN).read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -117,22 +118,22 @@ def record_in(folder: Path) -> dict[str, Any]:
 
 
 def whole_frames(folder: Path) -> list[int]:
-    """Numbers of the frames in a folder that are whole and did not fail."""
+    """Numbers of the complete, successful frames in a folder."""
     names = [file.name for file in folder.glob("*")]
     numbers = [int(stem) for name in names if (stem := name.removesuffix(_DONE)).isdecimal()]
     return [number for number in numbers if zipfile.is_zipfile(folder / f"{number}{_DONE}")]
 
 
 class Finished:
-    """Finished frames in a folder, to read.
+    """Finished frames in a folder, read-only.
 
     Attributes:
         folder: The folder.
-        kept: Numbers of the frames that are there whole.
+        kept: Numbers of the complete frames.
     """
 
     def __init__(self, folder: Path, *, counts: Sequence[int] = ()) -> None:
-        """Look which frames are there; ``counts`` as `FrameFolder` takes them."""
+        """List the finished frames; ``counts`` as in `FrameFolder`."""
         self.folder, self._counts = folder, tuple(counts)
         self.kept = frozenset(whole_frames(folder))
 
@@ -152,7 +153,7 @@ class Finished:
         return found & self.kept
 
     def read(self, index: int, time: float | None, *, seam: int | None = None) -> Outcome | None:
-        """A frame's result, or None where it is not there yet; ``seam`` as `write` takes it.
+        """A frame's result, or None if not finished; ``seam`` as in `write`.
 
         Raises:
             LayerError: The file is damaged.
@@ -174,7 +175,7 @@ class Finished:
         return Outcome(time, points, reused, record, heat)
 
     def _check_points(self, points: Sequence[np.ndarray | None]) -> None:
-        """Refuse (ValueError) points that no kernel may see: these read where a face's corner says."""
+        """Refuse (ValueError) points of the wrong shape: kernels index points by face corners, without checks."""
         if points and self._counts and len(points) != len(self._counts):
             raise ValueError(f"points of {len(points)} garments, not of {len(self._counts)}")
         for each, count in zip(points, self._counts, strict=False):
@@ -183,11 +184,11 @@ class Finished:
 
 
 class FrameFolder(Finished):
-    """A run's folder; a context manager that leaves frames inside if the run fails, or if they are a chunk.
+    """A run's folder; a context manager that keeps frames if the run fails or the folder is a chunk.
 
     Attributes:
-        kept: Numbers of the frames that an interrupted run had finished and that are used.
-        dropped: How many of the same run were there and are solved anew.
+        kept: Numbers of the frames reused from an interrupted run.
+        dropped: Number of finished frames of the same run solved anew.
     """
 
     def __init__(
@@ -201,20 +202,20 @@ class FrameFolder(Finished):
         keep: bool = True,
         stays: bool = False,
     ) -> None:
-        """Take a folder for a run, empty or with the frames of one that was interrupted.
+        """Take a folder for a run, empty or with the frames of an interrupted run.
 
         Args:
-            folder: Where; made where it is not there.
-            run: Everything that decides the frames, ready for JSON.
-            counts: Number of fine vertices of each garment; a frame with other ones is damaged.
-            resume: Use finished frames that are there.
-            drop: Remove finished frames that are there, whatever run they are of.
-            keep: Leave finished frames there when the run is interrupted.
-            stays: Leave them there at the end too, and drop none unasked: the folder is a chunk for `stitch`.
+            folder: The folder; created if missing.
+            run: Everything the frames depend on, ready for JSON.
+            counts: Number of fine vertices of each garment; a frame with a different count is damaged.
+            resume: Use existing finished frames.
+            drop: Remove existing finished frames of any run.
+            keep: Keep finished frames when the run is interrupted.
+            stays: Keep finished frames after the run too, and drop none unasked: the folder is a chunk for `stitch`.
 
         Raises:
-            UsageError: The folder holds finished frames of another run, or is not ours.
-            LayerError: The folder cannot be made, or another run is at work in it.
+            UsageError: The folder holds finished frames of a different run, or foreign files.
+            LayerError: The folder cannot be created, or is locked by a running process.
         """
         super().__init__(folder, counts=counts)
         self._keep, self._stays = keep, stays
@@ -229,7 +230,7 @@ class FrameFolder(Finished):
             raise LayerError(f"cannot write {folder}: {error.strerror}") from error
 
     def _take(self, wanted: dict[str, Any], *, resume: bool, drop: bool) -> None:
-        """Use or drop what is there; frames that failed are tried again."""
+        """Use or drop existing frames; failed frames are solved again."""
         found = whole_frames(self.folder)
         different = self._differences(wanted) if found else []
         if different and (resume or not drop):
@@ -249,7 +250,7 @@ class FrameFolder(Finished):
         write_text(self.folder / RUN, self._run)
 
     def _check_ours(self) -> None:
-        """Refuse a folder with files that are not ours: it is emptied once the layer is whole."""
+        """Refuse a folder with foreign files, because the folder is emptied once the layer is complete."""
         names = {file.name for file in self.folder.glob("*")}
         others = sorted(name for name in names if name not in (RUN, LOCK) and not _OURS.fullmatch(name))
         if others or (names and not names & {RUN, LOCK}):
@@ -257,19 +258,19 @@ class FrameFolder(Finished):
             raise UsageError(f"{self.folder} is no folder of finished frames{other}; choose another name for the layer")
 
     def _differences(self, wanted: dict[str, Any]) -> list[str]:
-        """Names of the entries in which the record there differs."""
+        """Names of the entries that differ from the folder's record."""
         return sorted(differences(record_in(self.folder), wanted))
 
     def __getstate__(self) -> dict[str, Any]:
-        """Name the folder for processes that may be at work elsewhere."""
+        """Store the absolute path, for processes with a different working directory."""
         return self.__dict__ | {"folder": self.folder.absolute()}
 
     def write(self, index: int, outcome: Outcome, *, seam: int | None = None) -> None:
-        """Write a frame's result; ``seam`` where it serves for the pre-roll of the frame of that number.
+        """Write a frame's result; ``seam``: number of the frame whose pre-roll the result belongs to, or None.
 
         Raises:
-            LayerError: The disk is full, or the folder is gone or another run's: a task on another machine may outlast
-                the run that it is of.
+            LayerError: The disk is full, or the folder is gone or taken by a new run: a task on a remote machine may
+                outlast its run.
         """
         arrays: dict[str, Any] = {f"points{k}": p for k, p in enumerate(outcome.points) if p is not None}
         maps = [(k, name, values) for k, heat in enumerate(outcome.heat) for name, values in (heat or {}).items()]
@@ -289,7 +290,7 @@ class FrameFolder(Finished):
             temporary.unlink(missing_ok=True)
 
     def _clear(self) -> None:
-        """Remove our files but the locked one."""
+        """Remove our files except the lock file."""
         for file in self.folder.glob("*"):
             if file.name == RUN or _OURS.fullmatch(file.name):
                 file.unlink(missing_ok=True)
@@ -301,7 +302,7 @@ class FrameFolder(Finished):
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Keep the frames, however the run failed, unless that was not wanted; let go of the folder."""
+        """Keep the frames of a failed run unless ``keep`` is False; release the folder."""
         try:
             done = kind is None and not self._stays
             if done or (kind and not (self._keep or self.kept)) or not whole_frames(self.folder):
@@ -324,10 +325,10 @@ def differences(there: Any, wanted: Any, name: str = "") -> list[str]:
 
 
 class Folders:
-    """Frames of several chunks as if they lay in one folder.
+    """Frames of several chunks, presented as one folder.
 
     Attributes:
-        kept: Numbers of the frames that are there, failed ones among them.
+        kept: Numbers of the stored frames, including failed frames.
     """
 
     def __init__(self, owners: Mapping[int, Finished]) -> None:
@@ -335,9 +336,9 @@ class Folders:
         self._owners, self.kept = owners, frozenset(owners)
 
     def seams(self) -> set[int]:
-        """Numbers of the frames before which chunks meet, or what two processes solved of one."""
+        """Numbers of the frames before which chunks, or two processes of one chunk, meet."""
         return set().union(*(folder.seams() for folder in {*self._owners.values()})) & self.kept
 
     def read(self, index: int, time: float | None, *, seam: int | None = None) -> Outcome | None:
-        """Read a frame as `Finished.read` does; the pre-roll of a seam lies in the folder of the frame after it."""
+        """Read a frame like `Finished.read`; a seam's pre-roll is in the folder of the first frame after the seam."""
         return self._owners[index if seam is None else seam].read(index, time, seam=seam)

@@ -1,13 +1,14 @@
-"""The rule for seams: two solutions of the same frames, by two processes, become one motion.
+"""Blends two solutions of the same frames, by two processes, into one motion.
 
-Cloth that can lie in several ways lies in another one after each history. Over the L frames that both processes solved
-the positions go from one solution to the other in equal parts,
+Cloth with several possible folds settles differently after each history. Over the L frames solved by both processes,
+the positions move from one solution to the other in equal parts,
 
     x_k = (1 - s_k) a_k + s_k b_k,   s_k = k / (L + 1),   k = 1 .. L,
 
-so that the seam adds |b - a| / (L + 1) to a frame's move in place of |b - a| at once. From the nearer of the two the
-cloth moves there as far as nothing newly crosses, and out of bodies. Where the input itself crosses, that promises
-less: if more crosses than in both, or is in bodies, nothing is joined and the cloth jumps.
+and the seam adds |b - a| / (L + 1) to a frame's move instead of |b - a| at once. The cloth moves from the nearer
+solution towards the blend as far as no new intersection appears, and is pushed out of bodies. If the input itself
+intersects, the safe move guarantees less: if the blend has more crossings, or more vertices in bodies, than both
+solutions, nothing is joined and the cloth jumps.
 """
 
 from __future__ import annotations
@@ -27,12 +28,12 @@ from .frames import Lead, Outcome
 from .options import RefineOptions
 
 Both = Sequence[tuple[Outcome, Lead]]
-"""The frames before a seam, each with its solution by the process behind the seam."""
+"""The frames before a seam, each with the solution of the process behind the seam."""
 Positions = Sequence[np.ndarray | None]
-"""Points of each garment, shape (V, 3), None where it has no sample."""
+"""Points of each garment, shape (V, 3), None for a garment without a sample."""
 Mover = Callable[[float | None, Positions, Positions, Positions], tuple[Positions, str]]
-"""Moves cloth safely, of a time code, from the nearer solution towards wanted positions; also given the farther one, it
-says what newly crosses, "" where nothing does."""
+"""Moves cloth safely at a time code from the nearer solution towards wanted positions; the farther solution is the
+third argument. Also returns a description of new intersections, "" for none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,8 +41,8 @@ class Joint:
     """The frames of one seam.
 
     Attributes:
-        frames: Joined; those before the seam as they were where cloth jumps.
-        why: Why it jumps, or "".
+        frames: The joined frames; the frames before the seam unchanged if the cloth jumps.
+        why: Reason for a jump, or "".
     """
 
     frames: tuple[Outcome, ...]
@@ -52,7 +53,7 @@ def join(both: Both, move: Mover) -> Joint:
     """Join the frames of one seam.
 
     Args:
-        both: The frames before the seam, each with its solution by the process behind it.
+        both: The frames before the seam, each with the solution of the process behind the seam.
         move: Moves cloth safely.
     """
     frames, why = [], ""
@@ -64,13 +65,13 @@ def join(both: Both, move: Mover) -> Joint:
         wanted = [a if a is None or b is None else _between(a, b, lead.weight) for a, b in pairs]
         near, far = [a for a, _ in pairs], [b for _, b in pairs]
         points, why = move(outcome.time, *((near, far) if lead.weight < 0.5 else (far, near)), wanted)
-        leave_if_asked()  # before a move is taken that a signal broke off
+        leave_if_asked()  # A signal may have cut the move short.
         frames.append(replace(outcome, points=tuple(points), reused=(False,) * len(points)))
     return Joint(tuple(replace(each, lead=None) for each in ([own for own, _ in both] if why else frames)), why)
 
 
 def _between(before: np.ndarray, after: np.ndarray, weight: float) -> np.ndarray:
-    """Points between two solutions, float64; equal ones stay to the bit."""
+    """Points between two solutions, float64; equal points are unchanged to the bit."""
     start = before.astype(np.float64)
     return start + weight * (after.astype(np.float64) - start)
 
@@ -82,13 +83,13 @@ def joined(
     *,
     seen: Callable[[Both, Joint], object] | None = None,
 ) -> Iterator[Outcome]:
-    """Frames in order, joined where two processes solved them.
+    """Frames in order, joined if two processes solved them.
 
     Args:
-        outcomes: The frames, those that two solved with the other one's as ``lead``.
+        outcomes: The frames; a frame solved twice has the second solution as ``lead``.
         move: Moves cloth safely.
         warn: Called with a warning for each seam left as a jump.
-        seen: Called with the frames of each seam, before and after they are joined.
+        seen: Called with the frames of each seam, before and after joining.
     """
     both: list[tuple[Outcome, Lead]] = []
     for outcome in outcomes:
@@ -96,7 +97,7 @@ def joined(
         if ends:
             yield from _and_warn(both, join(both, move), warn, seen)
             both = []
-        # It may equal the last frame of the pre-roll, which is not the one that was written.
+        # "Reused" refers to the last pre-roll frame, which was not written.
         first = replace(outcome, reused=(False,) * len(outcome.reused)) if ends else outcome
         if outcome.lead is None:
             yield first
@@ -117,14 +118,14 @@ def _and_warn(
 
 
 class SafeMover:
-    """Moves cloth of a shot so that nothing newly crosses or is in bodies; its solver is built when needed."""
+    """Moves the cloth of a shot without new intersections or vertices in bodies; the solver is built on first use."""
 
     def __init__(self, opened: Shot, options: RefineOptions, levels: Sequence[int]) -> None:
         """Take a shot.
 
         Args:
             opened: The shot.
-            options: How it was refined.
+            options: Options of the refinement.
             levels: Subdivisions of each garment.
         """
         self._opened, self._options, self._levels = opened, options, list(levels)
@@ -133,7 +134,7 @@ class SafeMover:
     def __call__(
         self, time: float | None, near: Positions, far: Positions, wanted: Positions
     ) -> tuple[list[np.ndarray | None], str]:
-        """Move cloth, as `Mover` does, in world positions [m]."""
+        """Move cloth as `Mover` requires, in world positions [m]."""
         if self._refiner is None:
             start_warp()
             how = {"levels": self._levels, "device": self._options.device, "threads": os.cpu_count() or 1}
@@ -150,7 +151,7 @@ class SafeMover:
 
 
 def _worse(contact: Mapping[str, Any], others: Sequence[Mapping[str, Any]]) -> str:
-    """The first count of contact that is larger than in all other solutions, in words."""
+    """The first contact count larger than in all compared solutions, in words."""
     before = [_counts(each) for each in others]
     for name, count in _counts(contact).items():
         if count > max(each.get(name, 0) for each in before):
@@ -159,6 +160,6 @@ def _worse(contact: Mapping[str, Any], others: Sequence[Mapping[str, Any]]) -> s
 
 
 def _counts(contact: Mapping[str, Any]) -> dict[str, int]:
-    """Numbers of crossing edges and of vertices in bodies, of telemetry of contact."""
+    """Numbers of crossing edges and of vertices in bodies, from contact telemetry."""
     bodies = {f"vertices inside <{path}>": each["after"]["inside"] for path, each in contact.get("bodies", {}).items()}
     return {"edges through cloth": contact.get("cloth", {}).get("after", {}).get("crossings", 0)} | bodies

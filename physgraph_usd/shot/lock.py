@@ -1,4 +1,4 @@
-"""A folder that one process at a time works in; a process that dies, however it dies, lets go of it."""
+"""Locks a folder for one process at a time; the system releases the lock if the process dies."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from ..errors import LayerError
 from ..usd.write.atomic import HOST, NO_LINK, check_no_link
 
 LOCK = "run.lock"
-"""The locked file; it names the process that holds it."""
+"""The lock file; contains the name of the process that holds the lock."""
 try:
     import fcntl
 except ImportError:  # Windows has another module.
@@ -26,19 +26,19 @@ else:
 
 
 class FolderLock:
-    """A process's hold on a folder."""
+    """A process's lock on a folder."""
 
     def __init__(self, folder: Path, *, layer: Path) -> None:
-        """Lock a folder, which is made where it is not there.
+        """Lock a folder; created if missing.
 
         Args:
             folder: The folder.
-            layer: The layer that is made with it, for the message.
+            layer: The layer made in the folder, for the message.
 
         Raises:
-            LayerError: Another run holds it.
-            UsageError: The locked file is a link.
-            OSError: The folder cannot be made or written.
+            LayerError: A running process holds the lock.
+            UsageError: The lock file is a link.
+            OSError: The folder cannot be created or written.
         """
         self._file = folder / LOCK
         while True:
@@ -51,13 +51,13 @@ class FolderLock:
                 raise LayerError(f"{layer} is being made by {who}; wait for it, end it, or name another layer")
             if _is_at(self._file, self._handle):
                 break
-            os.close(self._handle)  # its holder has removed it since
+            os.close(self._handle)  # The previous holder has removed the file.
         os.ftruncate(self._handle, 0)
         os.write(self._handle, f"process {os.getpid()} on {HOST}".encode())
 
     def release(self) -> None:
-        """Let go; the folder goes where nothing else is in it."""
-        if os.name == "nt":  # where no file that is open can be removed, by anybody
+        """Release the lock; remove the folder if empty."""
+        if os.name == "nt":  # Windows cannot remove an open file.
             os.close(self._handle)
         for remove in (self._file.unlink, self._file.parent.rmdir):
             with suppress(OSError):
@@ -67,7 +67,7 @@ class FolderLock:
 
 
 def is_held(folder: Path) -> bool:
-    """Whether a run is at work in a folder."""
+    """Whether a running process holds a folder's lock."""
     try:
         handle = os.open(folder / LOCK, os.O_RDWR | NO_LINK)
     except OSError:
@@ -79,7 +79,7 @@ def is_held(folder: Path) -> bool:
 
 
 def _held(handle: int) -> bool:
-    """Take hold of an open file, unless another does; a disk that knows no locks lets everybody."""
+    """Lock an open file unless already locked; on a file system without locks, always succeeds."""
     try:
         _hold(handle)
     except (BlockingIOError, PermissionError):
@@ -90,7 +90,7 @@ def _held(handle: int) -> bool:
 
 
 def _is_at(file: Path, handle: int) -> bool:
-    """Whether an open file is still the one of that name."""
+    """Whether an open file is still the file at a path."""
     try:
         return os.path.samestat(os.fstat(handle), file.stat())
     except FileNotFoundError:

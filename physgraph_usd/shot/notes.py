@@ -1,4 +1,4 @@
-"""Lines for the report and `inspect` that are no warnings: nothing is wrong, but cloth could look otherwise."""
+"""Notes for the report and `inspect`, beside warnings: nothing is wrong, but the cloth could look different."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from .settled import COLLAPSED, LIMITED, UNSOLVED, in_words
 from .untagged import options_of
 
 EASE = 4
-"""Percent of weft ease that the note on slack proposes: of those in docs/fabrics.md, the one that folds every cage."""
+"""Weft ease proposed by the note on slack [percent]: of the values in docs/fabrics.md, the one to fold every cage."""
 ENERGY_ROUNDING = 1e-3
-"""Part of an energy that counts for nothing: sums are in single precision."""
+"""Relative energy increase below which an energy counts as unchanged: sums are in single precision."""
 MATERIALS = "stretchStiffness", "bendStiffness", "density"
-"""Values of a fabric that every preset has."""
+"""Fabric values set by every preset."""
 
 
 def of_slack(garments: Sequence[str], choices: Sequence[LevelChoice]) -> list[str]:
     """A note of the garments whose cages have no slack.
 
     Args:
-        garments: Their paths.
-        choices: Their levels.
+        garments: Prim paths.
+        choices: The level chosen for each garment.
     """
     tight = [f"<{path}>" for path, choice in zip(garments, choices, strict=True) if choice.is_tight]
     if not tight:
@@ -40,7 +40,7 @@ def of_slack(garments: Sequence[str], choices: Sequence[LevelChoice]) -> list[st
 
 
 def of_fabrics(shot: Shot) -> list[str]:
-    """A note for each preset that garments without a fabric of their own are named after.
+    """A note for each preset whose name appears in garments without authored fabric values.
 
     Args:
         shot: An open shot.
@@ -60,10 +60,10 @@ def of_fabrics(shot: Shot) -> list[str]:
 
 
 def of_rest(unsettled: Sequence[Mapping[str, Any]], frames: int) -> list[str]:
-    """A note of the frames that ended before they were at rest, with the one farthest from it.
+    """A note of the frames not at rest when the solver stopped, with the worst frame.
 
     Args:
-        unsettled: A report's frames that did not settle.
+        unsettled: A report's unsettled frames.
         frames: Number of frames.
     """
     moving = [entry for entry in unsettled if entry["stopped"] not in (LIMITED, COLLAPSED, UNSOLVED)]
@@ -76,10 +76,10 @@ def of_rest(unsettled: Sequence[Mapping[str, Any]], frames: int) -> list[str]:
 
 
 def of_energy(garments: Sequence[Mapping[str, Any]], frames: Sequence[Mapping[str, Any]]) -> list[str]:
-    """A note of the frames that ended with more energy than their upsampled cage has, with the one that has most more.
+    """A note of the frames whose energy exceeds the upsampled cage's, with the frame of the largest excess.
 
-    No descent ends above its start, but frames start from the last one's detail, and what is pushed out of bodies or
-    untangled pays for it.
+    A descent never raises the energy, but a frame starts from the previous frame's detail, and push-out and untangling
+    cost energy.
 
     Args:
         garments: A report's garments.
@@ -101,7 +101,7 @@ def of_energy(garments: Sequence[Mapping[str, Any]], frames: Sequence[Mapping[st
 
 
 def of_folds(garments: Sequence[Mapping[str, Any]], frames: Sequence[Mapping[str, Any]]) -> list[str]:
-    """A note where cloth folds as sharply as only a mesh too coarse for its fabric does, of the garment that does most.
+    """A note of the garment with most sharp folds, if cloth folds so sharply as to show the mesh: too coarse a level.
 
     Args:
         garments: A report's garments.

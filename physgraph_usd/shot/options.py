@@ -1,6 +1,6 @@
-"""The options of a refine, each said once: `RefineOptions` is also what the command line and a show's file are made of.
+"""The options of a refine, each declared once: the command line and a show's file are made from `RefineOptions`.
 
-The solver is imported where it is needed: what a batch has finished before is passed over without it.
+The solver is imported on demand, so a batch skips finished shots without loading the solver.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from ..solver.frame.settings import SolveSettings
 
 INTEGRATORS = ("physgraph", "quasi-newton")
-"""Names of the solver's own methods in `integrate.METHODS`, which imports torch."""
+"""Names of the solver's own methods in `integrate.METHODS`; repeated here because `integrate` imports torch."""
 REPORT_NAME, PAGE_NAME = "report.json", "report.html"
-"""Names of the report and its page in a folder of their own."""
+"""File names of the report and its page in a report folder."""
 LIST = "; repeatable"
 
 
@@ -32,14 +32,14 @@ class Option:
     """One option, beside its name, type and default.
 
     Attributes:
-        heading: Under which the command line's help shows it; "" for one that Python alone has.
-        help: What it does; for the help and for `RefineOptions`.
-        flag: Its name on the command line where that is not the field's.
-        metavar: What the help shows for its value.
-        choices: All values that it may have; empty for any.
-        least: Its least value, or None.
-        above: What it must be above, or None.
-        result: Whether the layer depends on it.
+        heading: Section of the command line's help; "" for an option of the Python interface only.
+        help: Description, for the help and for `RefineOptions`.
+        flag: Name on the command line if different from the field's name.
+        metavar: Placeholder for the value in the help.
+        choices: All allowed values; empty for any.
+        least: Least allowed value, or None.
+        above: Exclusive lower bound, or None.
+        result: Whether the layer depends on the option.
     """
 
     heading: str
@@ -65,7 +65,7 @@ _farm = partial(_option, "Many machines")
 
 @dataclass(frozen=True)
 class RefineOptions:
-    """Everything that `refine_shot` can be told."""
+    """Options of `refine_shot`."""
 
     frames: tuple[float, float] | None = _scene(None, "First and last time code to refine.  [default: all of the shot]")
     garments: Sequence[str] = _scene(
@@ -162,9 +162,9 @@ class RefineOptions:
     )
 
     def plain(self) -> dict[str, Any]:
-        """The options that decide the result, ready for JSON."""
+        """The options the result depends on, ready for JSON."""
         names = {name for name, option in OPTIONS.items() if option.result}
-        # A layer without these is as it was before there were any.
+        # Unset, newer options leave the record as in older versions.
         later = ("heat_map", "weights", "preroll", "gravity")
         names -= {name for name in later if getattr(self, name) is None or getattr(self, name) is False}
         values = {name: getattr(self, name) for name in OPTIONS if name in names}
@@ -175,7 +175,7 @@ class RefineOptions:
         return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
 
     def value_sources(self) -> dict[str, str]:
-        """Where each option that decides the result is from: "command line", a file, "default", or "given" (Python)."""
+        """Origin of each option in `plain`: "command line", a file, "default", or "given" (Python)."""
         fields = {f.name: f for f in dataclasses.fields(self)}
         return {
             name: self.sources.get(name, "default" if getattr(self, name) == fields[name].default else "given")
@@ -183,14 +183,14 @@ class RefineOptions:
         }
 
     def contact_settings(self) -> ContactSettings:
-        """The part that concerns contact."""
+        """Settings of contact."""
         from ..solver.contact.settings import ContactSettings
 
         cloth = "off" if self.self_contact == "off" else "pairs"
         return ContactSettings(self.contact, cloth=cloth, measured=self.report is not None)
 
     def solve_settings(self) -> SolveSettings:
-        """The part that concerns the solver."""
+        """Settings of the solver."""
         from ..solver.frame.settings import SolveSettings
         from ..solver.integrate import method_named
 
@@ -205,7 +205,7 @@ class RefineOptions:
         )
 
     def check(self) -> None:
-        """Refuse what no shot could be refined with.
+        """Refuse options invalid for every shot.
 
         Raises:
             UsageError: An option is wrong.
@@ -226,7 +226,7 @@ class RefineOptions:
             raise UsageError(f"unknown device '{self.device}'; known: cpu, cuda")
 
     def targets(self, layer: Path) -> list[tuple[str, Path]]:
-        """Every file that a run writes, in words and where."""
+        """Description and path of every file written by a run."""
         files = [("the layer" if self.preroll is None else "the chunk", layer)]
         if self.root is not None:
             files.append(("the root", Path(self.root)))
@@ -254,5 +254,5 @@ def _check(name: str, value: Any, option: Option) -> None:
 
 
 def json_of(report: Path) -> Path:
-    """The JSON file of a report: the path itself when it is named so, else in the folder of that name."""
+    """The JSON file of a report: the path itself if named ``.json``, else `REPORT_NAME` in a folder at the path."""
     return report if report.suffix == ".json" and not report.is_dir() else report / REPORT_NAME

@@ -1,4 +1,4 @@
-"""JSON that every parser reads: a number that is not finite is null, for JSON has no word for it."""
+"""Writes strict JSON for any parser: a non-finite number becomes null."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ def to_json(value: Any, *, indent: int | None = 2, default: Callable[[Any], Any]
 
     Args:
         value: Records, lists, texts and numbers.
-        indent: Spaces a level; None for one line.
-        default: Makes a plain value of any other.
+        indent: Spaces per level; None for a single line.
+        default: Converts any value of another type to a plain value.
 
     Raises:
-        TypeError: Something is no plain value and there is no ``default``.
+        TypeError: A value is not plain and ``default`` is None.
     """
     return json.dumps(_finite(value), indent=indent, default=default, allow_nan=False)
 

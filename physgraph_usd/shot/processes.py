@@ -1,4 +1,4 @@
-"""Calls in processes of their own: a process that dies is an error that names the cause."""
+"""Runs calls in separate processes; a dead process becomes an error naming the cause."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ from ..interrupts import leave_if_asked, signals_noted
 LOG = logging.getLogger("physgraph_usd")
 POLL_SECONDS = 0.02
 PATIENCE_SECONDS = 10.0
-"""How long a process that was asked to end may clear up, and one that is stopped may pause before a warning."""
+"""Time for a process to clean up after being asked to end, and for a stopped process before a warning [s]."""
 _MEMORY = re.compile(r"out of memory|n.t allocate|to allocate|bad_alloc", re.IGNORECASE)
 
 
 class Call:
-    """A function at work in a process of its own; it must be picklable, and its arguments and result too.
+    """A function running in a separate process; function, arguments and result must be picklable.
 
     Attributes:
-        lag: How long after its end the files that it wrote may be hidden [s].
+        lag: Longest time for the call's files to appear after the call has ended [s].
     """
 
     lag = 0.0
 
     def __init__(self, function: Callable[..., Any], *args: Any) -> None:
-        """Start it."""
+        """Start the process."""
         context = multiprocessing.get_context("spawn")
         self._here, there = context.Pipe(duplex=False)
         self._process = context.Process(target=_answer, args=(there, function, args), daemon=True)
@@ -48,14 +48,14 @@ class Call:
 
     @property
     def ready(self) -> bool:
-        """Whether it has returned, failed or died; of one that is stopped a warning tells."""
+        """Whether the call has returned, failed or died; warns if the process is stopped."""
         if self._answer is not None or self._here.poll():
             return True
         self._warn_if_stopped()
         return False
 
     def _warn_if_stopped(self) -> None:
-        """Warn once of a process that somebody stopped for so long that it is no pause of the whole run."""
+        """Warn once about a process stopped too long for a pause of the whole run."""
         pid = self._process.pid
         if self._has_warned or not self._is_stopped():
             self._stopped_since = None
@@ -71,14 +71,14 @@ class Call:
             return False
         try:  # WNOWAIT leaves the process's end to multiprocessing.
             return os.waitid(os.P_PID, self._process.pid, os.WSTOPPED | os.WNOHANG | os.WNOWAIT) is not None
-        except ChildProcessError:  # It has ended.
+        except ChildProcessError:  # The process has ended.
             return False
 
     def result(self) -> Any:
-        """The function's result; waits for it.
+        """Wait for the function's result.
 
         Raises:
-            PhysGraphError: The function's; an unforeseen one is named, and its traceback is on stderr.
+            PhysGraphError: Raised by the function; an unforeseen error is converted, with the traceback on stderr.
             SolveError: The process died.
         """
         if self._answer is None:
@@ -94,13 +94,13 @@ class Call:
         return value
 
     def ask_to_end(self) -> None:
-        """Ask it to clear up and end, and do not wait."""
+        """Ask the process to clean up and end; do not wait."""
         self._process.terminate()
         if self._is_stopped() and self._process.pid is not None:
             os.kill(self._process.pid, signal.SIGCONT)
 
     def end(self) -> None:
-        """End it, with time to clear up."""
+        """End the process, with time to clean up."""
         self.ask_to_end()
         self._process.join(PATIENCE_SECONDS)
         self._process.kill()
@@ -110,7 +110,7 @@ class Call:
 def call_each(
     function: Callable[..., Any], jobs: Sequence[tuple[Any, ...]], *, workers: int
 ) -> Generator[Any, None, None]:
-    """Call a function once a job, each call in a process of its own, and yield results in order.
+    """Call a function once per job, each call in a new process, and yield results in order.
 
     Args:
         function: The function; picklable.
@@ -118,7 +118,7 @@ def call_each(
         workers: Most calls at a time.
 
     Returns:
-        Per job its result, or the `PhysGraphError` that it ended with.
+        Per job the result, or the `PhysGraphError` raised.
     """
     calls: list[Call] = []
     try:
@@ -142,7 +142,7 @@ def call_each(
 
 @contextlib.contextmanager
 def memory_is_named() -> Iterator[None]:
-    """Turn errors that libraries raise when memory runs out into one of ours.
+    """Convert libraries' out-of-memory errors to a `SolveError`.
 
     Raises:
         SolveError: Memory ran out.
@@ -158,7 +158,7 @@ def memory_is_named() -> Iterator[None]:
 
 
 def _answer(there: Connection, function: Callable[..., Any], args: tuple[Any, ...]) -> None:
-    """Call the function and send its result; Ctrl-C is the business of the process that started this one."""
+    """Call the function and send the result; Ctrl-C is ignored here and handled by the parent process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_outlast_parent, daemon=True).start()
     with signals_noted(), _Sent(there), memory_is_named():
@@ -166,7 +166,7 @@ def _answer(there: Connection, function: Callable[..., Any], args: tuple[Any, ..
 
 
 class _Sent:
-    """Sends errors that are raised inside, unforeseen ones as one of ours with the traceback on stderr."""
+    """Sends errors raised inside the block; unforeseen errors as a `PhysGraphError`, with the traceback on stderr."""
 
     def __init__(self, there: Connection) -> None:
         self._there = there
@@ -186,7 +186,7 @@ class _Sent:
 
 
 def _outlast_parent() -> None:
-    """End this process when the one that started it is gone, even if it was killed."""
+    """End this process when the parent process is gone, even if killed."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()

@@ -1,4 +1,4 @@
-"""Functions that a user calls: a shot is opened, described, solved frame by frame, written, and reported."""
+"""Public functions: open a shot, describe, solve frame by frame, write, and report."""
 
 from __future__ import annotations
 
@@ -39,14 +39,14 @@ def refine_shot(shot: str | Path, out: str | Path, options: RefineOptions = DEFA
     Args:
         shot: The stage to read; never edited.
         out: The layer to write.
-        options: What to do and how.
+        options: Options of the run.
 
     Returns:
-        The report. Frames that could not be solved are in ``failed`` and have no sample in the layer.
+        The report. Failed frames are in ``failed`` and have no sample in the layer.
 
     Raises:
         UsageError: An option is wrong or the output exists.
-        StageError: The stage cannot be read as asked, or what it makes does not fit in memory.
+        StageError: The stage cannot be read with the options, or the result does not fit in memory.
         SolveError: No frame could be solved.
         LayerError: The layer cannot be written.
     """
@@ -71,14 +71,14 @@ def refine_shot(shot: str | Path, out: str | Path, options: RefineOptions = DEFA
 def write_all(
     opened: Shot, out: Path, options: RefineOptions, report: RefineReport, *, joins: Joins | None = None
 ) -> None:
-    """Write a run's layer, or its chunk, and the root and report that were asked for.
+    """Write a run's layer or chunk, and the root and report if requested.
 
     Args:
         opened: The shot.
         out: The layer, or the chunk's folder.
-        options: What to do and how.
+        options: Options of the run.
         report: The report.
-        joins: Chunks to join, in place of solving; None to solve.
+        joins: Chunks to join instead of solving; None to solve.
 
     Raises:
         SolveError: No frame could be solved.
@@ -100,23 +100,23 @@ def refine_stage(
         layer = pg.refine_stage(stage)
         stage.GetSessionLayer().subLayerPaths.insert(0, layer.identifier)
 
-    The stage is read as it stands: session layer, edits that are not saved, muted layers, variant selections, payloads
-    and population. Neither it nor any of its layers is changed.
+    The stage is read in its current state: session layer, unsaved edits, muted layers, variant selections, payloads and
+    population. The stage and its layers are not changed.
 
     Args:
         stage: The open stage.
-        options: What to do and how. An open stage lives in one process and its result in memory, so ``workers``,
+        options: Options of the run. An open stage lives in one process and the result in memory, so ``workers``,
             ``resume``, ``dry_run``, ``root`` and a folder for the report are refused; a report's JSON file is written.
-        on_report: Called with the report, also of a run that failed.
+        on_report: Called with the report, also of a failed run.
 
     Returns:
-        An anonymous layer, to be laid over the stage or exported; keep it alive as long as a stage names it. Frames
-        that could not be solved have no sample in it: they are in the report's ``failed`` and the layer's
+        An anonymous layer, to be sublayered over the stage or exported; keep a reference as long as a stage uses the
+        layer. Failed frames have no sample in the layer: they are in the report's ``failed`` and the layer's
         ``customLayerData["physgraph"]["failed"]``.
 
     Raises:
-        UsageError: An option is wrong, or of no use here.
-        StageError: The stage cannot be read as asked, or what it makes does not fit in memory.
+        UsageError: An option is wrong, or not applicable to an open stage.
+        StageError: The stage cannot be read with the options, or the result does not fit in memory.
         SolveError: No frame could be solved.
         LayerError: The layer is invalid, or the report cannot be written.
     """
@@ -137,7 +137,7 @@ def running(
     out: Path | None = None,
     on_report: Callable[[RefineReport], None] | None = None,
 ) -> Iterator[tuple[Shot, RefineReport]]:
-    """Open a shot and begin its report; a run that fails or is interrupted writes it where it was asked for."""
+    """Open a shot and begin its report; a failed or interrupted run writes the report if requested."""
     report = RefineReport(shot_name(shot), None, options.plain(), options.value_sources())
     began = clock.perf_counter()
     try:
@@ -167,18 +167,18 @@ def running(
 def refine_shots(
     jobs: Sequence[Job], *, workers: int, refine: Callable[..., RefineReport] = refine_shot
 ) -> Iterator[RefineReport | PhysGraphError]:
-    """Refine several shots, each in a process of its own: one that fails, or dies, leaves the others alone.
+    """Refine several shots, each in a separate process: a failed or dead process does not affect the rest.
 
     Args:
         jobs: Shot, layer to write and options of each.
         workers: Shots at a time; with a scheduler, chunks of each shot, and as many shots as keep its workers busy.
-        refine: What refines one of them; it must be picklable.
+        refine: Refines one shot; must be picklable.
 
     Returns:
-        Per job, in order, its report or the error that ended it.
+        Per job, in order, the report or the error.
 
     Raises:
-        UsageError: No job was begun: an option is wrong, or a file to write is one that another job reads or writes.
+        UsageError: No job was begun: an option is wrong, or an output of a job is read or written by another job.
     """
     check_jobs(jobs)
     scheduler = jobs[0][2].scheduler if jobs else None
@@ -193,7 +193,7 @@ def refine_shots(
 
 
 def check_places(out: Path, options: RefineOptions) -> None:
-    """Refuse before the work, not after an hour of frames, what could not be written then."""
+    """Refuse unwritable outputs before the work, not after an hour of frames."""
     if not options.resume:
         _check_new(out, options)
     for _, path in options.targets(out):
@@ -212,7 +212,7 @@ def _check_none(path: Path, options: RefineOptions) -> None:
 
 
 def _check_of_stage(stage: Stage, options: RefineOptions) -> None:
-    """Refuse what an open stage cannot be refined with, and to write the report over a file that it is made of."""
+    """Refuse options not applicable to an open stage, and a report over a file of the stage."""
     options.check()
     if options.workers > 1:
         raise UsageError(f"workers is {options.workers}: an open stage lives in one process; save it, or take 1")
@@ -233,12 +233,12 @@ def inspect_shot(shot: str | Path | Stage, *, timed: bool = False, **given: Any)
 
     Args:
         shot: The stage to read, a file or open.
-        timed: Whether to solve three frames in the middle of the shot, for the time that a run takes on this machine.
-        given: Options of `RefineOptions` that concern reading.
+        timed: Whether to solve three frames in the middle of the shot, to measure the time of a run on this machine.
+        given: Options of `RefineOptions` for reading.
 
     Returns:
-        Plain values. Where the shot cannot be refined as asked, ``problem`` says why, ``meshes`` lists what is there,
-        and ``exit_code`` is 2 where a garment or collider that was named is not there, else 1.
+        Plain values. If the shot cannot be refined as asked, ``problem`` gives the reason, ``meshes`` lists the stage's
+        meshes, and ``exit_code`` is 2 if a named garment or collider is missing, else 1.
 
     Raises:
         StageError: The file cannot be opened at all.
@@ -246,7 +246,7 @@ def inspect_shot(shot: str | Path | Stage, *, timed: bool = False, **given: Any)
     """
     options = RefineOptions(**given)
     source = str(shot) if isinstance(shot, Path) else shot
-    files_of(source)  # A pipe among them is an error here, and a wait for ever when opened.
+    files_of(source)  # Raises an error for a pipe; opening a pipe would wait for ever.
     try:
         with closing(open_for(source, options)) as opened:
             found = describe(opened, options)
@@ -266,7 +266,7 @@ def _write_report(report: RefineReport, path: Path, opened: Shot) -> None:
 
 
 def _write_failure(report: RefineReport, options: RefineOptions) -> None:
-    """Write the JSON of a run that failed over no file that may not be replaced; that error is the one told."""
+    """Write the JSON of a failed run, unless over a protected file; errors here give way to the run's error."""
     if options.report is not None and not options.dry_run:
         file = json_of(Path(options.report))
         with suppress(LayerError):

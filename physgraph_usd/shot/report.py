@@ -1,4 +1,4 @@
-"""The report of a run: what was modelled, what was left out and why, and how far each frame got."""
+"""The report of a run: terms modelled, terms left out with the reason, and the outcome of each frame."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from ..version import __version__
 from .plain_json import to_json
 
 FORMAT = 1
-"""Version of the JSON's format; another one where a reader of the last one could fail. See report.schema.json."""
+"""Version of the JSON format; increased when a reader of the previous version could fail. See report.schema.json."""
 SCHEMA = Path(__file__).with_name("report.schema.json")
 DONE, FAILED, IN_PART = 0, 1, 3
 LEFT = 0.1
-"""Part of what crosses in the input that a strict run may leave."""
+"""Fraction of the input's crossings allowed to remain in a strict run."""
 LOG = logging.getLogger("physgraph_usd")
-"""Where warnings and progress go, for the whole package."""
+"""Logger of the whole package, for warnings and progress."""
 MOST_NAMED = 3
-"""Most prims that a warning about several of them names."""
+"""Most prims named by a warning about several prims."""
 _OF_PRIM = re.compile(r"<([^>]+)>(?=[: ])")
 _ALSO, _DIFFERS = re.compile(r"; also (?:at|in) .*$"), re.compile(r"<[^>]*>|[-+]?\d[\d,]*(?:\.\d+)?(?:e[-+]?\d+)?")
 _FRAME: dict[str, Any] = {"time": None, "read_ms": None, "garments": [], "error": ""}
@@ -38,12 +38,12 @@ _CONTACT: dict[str, Any] = dict.fromkeys(("bodies", "cloth", "repaired", "projec
 
 
 def is_first(path: str, entry: Mapping[str, Any]) -> bool:
-    """Whether a garment is the first of those solved together in a frame: all have one energy and one contact."""
+    """Whether a garment is the first of a group solved together in a frame: the group shares energy and contact."""
     return entry.get("together", [path])[0] == path
 
 
 def is_of_failure(path: Path) -> bool:
-    """Whether a file is the report of a run that failed, which the next run may replace."""
+    """Whether a file is the report of a failed run, replaceable by the next run."""
     try:
         plain = json.loads(path.read_text(encoding="utf-8")) if path.suffix == ".json" else None
     except (OSError, ValueError):
@@ -60,25 +60,25 @@ class RefineReport:
         shot: Input file.
         out: Layer written, or None after a dry run.
         options: The options used.
-        option_sources: Where each option's value is from: "command line", a file, "default", or "given" from Python.
-        estimate: What it was expected to cost, as `Estimate.plain` gives it.
-        garments: Per garment: path, counts, level and why, material values and their sources.
-        modelled: Terms of the potential that were on, with the reason.
-        left_out: What was left out, with the reason.
-        frames: Telemetry, one entry a time code.
-        failed: Time codes that have no sample in the layer, with the error.
-        unsettled: Frames that were written though the solver left them unsettled: path, time and in what way.
+        option_sources: Origin of each option's value: "command line", a file, "default", or "given" from Python.
+        estimate: Expected cost, from `Estimate.plain`.
+        garments: Per garment: path, counts, level and reason, material values and their sources.
+        modelled: Active terms of the potential, with the reason.
+        left_out: Omitted terms, with the reason.
+        frames: Telemetry, an entry per time code.
+        failed: Time codes without a sample in the layer, with the error.
+        unsettled: Frames written but not settled: path, time and reason.
         strict: Whether a run with unsettled frames counts as done in part.
         candidates: Why ``--collider auto`` takes or leaves meshes that are neither garments nor colliders, by path.
-        variants: Variant selections in force on what the garments depend on, as paths ``/World/coat{fit=loose}``.
-        warnings: What the user should know; what is so of several prims is one of them, which names a few.
-        notes: What could look otherwise, though nothing is wrong: slack of the cages, fabrics by name, the level.
-        warned: All prims that such a warning is about.
+        variants: Active variant selections the garments depend on, as paths ``/World/coat{fit=loose}``.
+        warnings: Warnings for the user; equal warnings about several prims are merged, naming a few prims.
+        notes: Notes for the user without a fault: slack of the cages, fabrics by name, the level.
+        warned: All prims of each merged warning.
         seconds: Wall time of each stage [s].
-        peak_memory_mb: Peak resident memory of this process [MB]; None where the system does not tell.
-        error: What ended the run; "" for one that came to its end.
+        peak_memory_mb: Peak resident memory of this process [MB]; None if the system does not tell.
+        error: Error that ended the run; "" for a complete run.
         signal: Number of the signal that interrupted the run; None for none.
-        skipped: Whether the layer was there already and was left as it is.
+        skipped: Whether an existing layer was kept unchanged.
     """
 
     shot: str
@@ -106,10 +106,10 @@ class RefineReport:
 
     @property
     def exit_code(self) -> int:
-        """0 done, 1 it failed, 3 done in part, 128 and the signal's number where the run was interrupted.
+        """0 done, 1 failed, 3 done in part, 128 plus the signal's number if the run was interrupted.
 
-        In part is a run of which some frames failed or some garment was not solved in one; where that is strict also
-        one in which some did not settle, or that leaves more than a tenth of what crossed.
+        A run is done in part if some frames failed or some garment was not solved in a frame. A strict run is also done
+        in part if some frames did not settle, or more than a tenth of the input's crossings remain.
         """
         if self.signal is not None:
             return SIGNALLED + self.signal
@@ -122,13 +122,13 @@ class RefineReport:
 
     @property
     def crossings(self) -> int | None:
-        """Edges through faces that are left, of cloth and of bodies, in all frames; None where none were looked for."""
+        """Edges through faces in the result, of cloth and of bodies, in all frames; None if not measured."""
         found = self._crossed("after")
         return sum(found) if found else None
 
     @property
     def leaves_crossings(self) -> bool:
-        """Whether more than a tenth of the edges that pass through faces in the upsampled input are left."""
+        """Whether more than a tenth of the upsampled input's edges through faces remain."""
         return sum(self._crossed("after")) > LEFT * sum(self._crossed("before"))
 
     def _crossed(self, side: str) -> list[int]:
@@ -138,14 +138,14 @@ class RefineReport:
         return [each[side]["crossings"] for each in measured if each]
 
     def measured(self, frame: Mapping[str, Any]) -> list[dict[str, Any]]:
-        """Measurements of contact in a frame: garments that are solved together have one."""
+        """Measurements of contact in a frame: one per garment or group of garments solved together."""
         paths = [garment["path"] for garment in self.garments]
         entries = list(zip(paths, frame.get("garments", ()), strict=False))
         alone = [entry for path, entry in entries if is_first(path, entry)]
         return [entry["contact"] for entry in alone if entry.get("contact")]
 
     def warn(self, *warnings: str) -> None:
-        """Take warnings that are not there yet, those of a kind about many prims as one, and log them."""
+        """Add new warnings, merge warnings of a kind about several prims, and log them."""
         for warning, paths in of_a_kind(warnings).items():
             if warning not in self.warnings:
                 self.warnings.append(warning)
@@ -153,13 +153,13 @@ class RefineReport:
                 LOG.warning(warning, extra={"shot": self.shot})
 
     def note(self, *notes: str) -> None:
-        """Take notes, and log them as information."""
+        """Add notes, and log the notes as information."""
         for note in notes:
             self.notes.append(note)
             LOG.info("%s", note, extra={"shot": self.shot})
 
     def to_dict(self) -> dict[str, Any]:
-        """The report as plain values, every frame and every garment in it with the same names."""
+        """The report as plain values; every frame and garment entry has the same keys."""
         plain = {name: value for name, value in vars(self).items() if name != "out"}
         return {
             "format": FORMAT,
@@ -178,21 +178,21 @@ class RefineReport:
         """Write the report as JSON, whole or not at all.
 
         Raises:
-            LayerError: It cannot be written.
+            LayerError: The file cannot be written.
         """
         write_text(path, self.to_json() + "\n")
 
 
 def of_a_kind(warnings: Iterable[str]) -> dict[str, list[str]]:
-    """Warnings without those that are there twice, and one for all that tell the same of several prims, in order.
+    """Remove duplicate warnings and merge warnings of a kind about several prims, in order.
 
-    Warnings are of a kind where they say so, or where only their prims and figures differ.
+    Warnings are of a kind if marked with the same kind, or if only prims and figures differ.
 
     Args:
-        warnings: What is to be told; those of prims begin with the prim's path in angle brackets.
+        warnings: Warnings; a warning about a prim begins with the prim's path in angle brackets.
 
     Returns:
-        Each with the paths of the prims that it is about; none where it is as it was given.
+        Each warning with the paths of its prims if merged; an empty list if unchanged.
     """
     kinds: dict[str, list[str]] = {}
     for warning in dict.fromkeys(warnings):
@@ -206,7 +206,7 @@ def of_a_kind(warnings: Iterable[str]) -> dict[str, list[str]]:
 
 
 def _for_all(alike: Sequence[str], paths: Sequence[str]) -> str:
-    """One warning for several of a kind; its figures are those of the first."""
+    """One warning for several of a kind, with the figures of the first."""
     texts = [warning.partition(">")[2] for warning in alike]
     figures = "" if len(set(texts)) == 1 else " (the figures are those of the first)"
     named, more = ", ".join(f"<{path}>" for path in paths[:MOST_NAMED]), len(paths) - MOST_NAMED
@@ -214,7 +214,7 @@ def _for_all(alike: Sequence[str], paths: Sequence[str]) -> str:
 
 
 def _whole_frame(frame: Mapping[str, Any]) -> dict[str, Any]:
-    """A frame's entry with a value for every name."""
+    """A frame's entry with a value for every key."""
     return {**_FRAME, **frame, "garments": [_whole_garment(entry) for entry in frame.get("garments", ())]}
 
 

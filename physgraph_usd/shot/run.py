@@ -1,4 +1,4 @@
-"""One run over an open shot: each frame is solved and written as it comes, and recorded in the report."""
+"""A run over an open shot: solves each frame, writes the frame at once, and records the frame in the report."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ try:
 except ImportError:  # Windows has none.
     resource = None
 TIMED_FRAMES, LONG_RUN = 3, 60.0
-"""Frames after which a run says when it will end, where that is so far away [s]."""
+"""Frames after which a run announces its end, and least remaining time for an announcement [s]."""
 
 
 class Joins(Protocol):
@@ -59,7 +59,7 @@ class Joins(Protocol):
 
     @property
     def frames(self) -> Folders:
-        """The frames."""
+        """The stored frames."""
         ...
 
     @property
@@ -68,11 +68,11 @@ class Joins(Protocol):
         ...
 
     def seen(self, both: Both, joint: Joint) -> None:
-        """Take note of a seam."""
+        """Record a seam."""
         ...
 
     def check(self) -> None:
-        """Refuse (LayerError) the seams, once all frames are written and before the layer has its name."""
+        """Refuse bad seams (LayerError), after the last frame and before the layer gets its final name."""
         ...
 
 
@@ -82,10 +82,10 @@ class Run:
 
     Attributes:
         shot: The shot, open.
-        out: The layer to write, or None for one in memory.
-        options: What to do and how.
-        report: Its report, in which the garments are.
-        joins: Chunks to join into the layer, in place of solving; None to solve.
+        out: The layer to write, or None for a layer in memory.
+        options: Options of the run.
+        report: The report, with the garments filled in.
+        joins: Chunks to join into the layer instead of solving; None to solve.
     """
 
     shot: Shot
@@ -95,7 +95,7 @@ class Run:
     joins: Joins | None = None
 
     def refine(self) -> Layer | None:
-        """Solve and write all frames; returns the layer where it is in memory.
+        """Solve and write all frames; returns the layer if in memory.
 
         Raises:
             SolveError: No frame could be solved.
@@ -111,10 +111,10 @@ class Run:
         return layer
 
     def _write_layer(self) -> Layer | None:
-        """Solve all frames and write them, or leave them as a chunk; returns the layer where it is in memory."""
+        """Solve all frames and write the layer or the chunk; returns the layer if in memory."""
         began, options = clock.perf_counter(), self.options
         provenance = made_from(self.shot, self.out, options) | dict(self.joins.record if self.joins else {})
-        known = len(self.shot.warnings)  # What is said of the shot itself has been.
+        known = len(self.shot.warnings)  # Warnings about the shot itself are already reported.
         part = [time for time in (self._times[k] for k in self._numbers) if time is not None]
         made = {"mode": options.mode, "velocities": options.velocities, "overwrite": options.overwrite}
         made["times"] = part if len(part) < len(self.shot.scene.times) else None
@@ -149,7 +149,7 @@ class Run:
 
     @property
     def _is_chunk(self) -> bool:
-        """Whether the finished frames are what is wanted, for `stitch`."""
+        """Whether the run makes a chunk for `stitch` instead of a layer."""
         return self.options.preroll is not None
 
     @cached_property
@@ -159,14 +159,14 @@ class Run:
 
     @cached_property
     def _numbers(self) -> range:
-        """Numbers of the time codes wanted: all that are open, or of a whole shot those in the range of frames."""
+        """Numbers of the time codes to solve: all open time codes, or for a chunk those of the shot in ``frames``."""
         if self.joins is not None:
             return self.joins.numbers
         return numbers_in(self.shot.scene.times, self.options.frames if self._is_chunk else None)
 
     @cached_property
     def solver(self) -> ShotSolver:
-        """Solves the shot's frames, here and in other processes, which find the same colliders."""
+        """Solves the shot's frames, here and in worker processes, with the same colliders everywhere."""
         options = self.options
         if AUTO in options.colliders:
             options = dataclasses.replace(options, colliders=self.shot.colliders)
@@ -180,12 +180,12 @@ class Run:
 
     @property
     def _preroll(self) -> int:
-        """Frames solved before a chunk, where frames depend on one another."""
+        """Frames solved before a chunk if frames depend on their predecessors."""
         asked = PREROLL if self.options.preroll is None else self.options.preroll
         return 0 if self.options.temporal == "off" else asked
 
     def _solved(self, frames: FrameFolder | None) -> Outcomes:
-        """Frames in order, those of an interrupted run among them, joined where several processes solved them."""
+        """Frames in order, including reused frames of an interrupted run, joined if solved by several processes."""
         times, numbers, options, joins = self._times, self._numbers, self.options, self.joins
         mover = SafeMover(self.shot, options, self.solver.levels)
         if joins is not None:
@@ -203,7 +203,7 @@ class Run:
                 yield from solved if self._is_chunk else joined(solved, mover, self.report.warn)
 
     def _warn_of_finished(self, frames: FrameFolder, count: int) -> None:
-        """Warn where frames of an earlier run are used, or could have been."""
+        """Warn if frames of an earlier run are used, or could have been."""
         if frames.dropped:
             are, them = ("is", "it") if frames.dropped == 1 else ("are", "them")
             dropped = counted(frames.dropped, "finished frame")
@@ -214,7 +214,7 @@ class Run:
             self.report.warn(WARNINGS["resumed"](kept=kept, again=again))
 
     def _write_frames(self, writer: LayerWriter | None, solved: Outcomes, count: int) -> None:
-        """Write each frame as it comes, then close the layer; a chunk's frames are in its folder."""
+        """Write each frame as soon as solved, then close the layer; a chunk's frames are already in its folder."""
         report, options = self.report, self.options
         written, shot, began = 0.0, {"shot": report.shot}, clock.perf_counter()
         for done, outcome in enumerate(solved, start=1):
@@ -248,7 +248,7 @@ class Run:
         say_what_was(report)
 
     def _write_frame(self, writer: LayerWriter | None, outcome: Outcome) -> float:
-        """Write one time code's result and record it; returns the seconds that writing took."""
+        """Write the result of one time code and record the result; returns the seconds spent writing."""
         self.report.frames.append(outcome.record)
         if not outcome.points:
             name, error = _name_of(outcome.time), str(outcome.record["error"])
@@ -268,14 +268,14 @@ class Run:
 
 
 def numbers_in(every: Sequence[float], frames: tuple[float, float] | None) -> range:
-    """Numbers of the time codes of a shot in a range; a shot without samples has one frame.
+    """Numbers of the shot's time codes within a range; a shot without samples has one frame.
 
     Args:
         every: Time codes of the whole shot, in order.
         frames: First and last time code; None for all.
 
     Raises:
-        AbsentError: No time code lies there.
+        AbsentError: No time code lies in the range.
     """
     if frames is None:
         return range(max(len(every), 1))
@@ -297,12 +297,12 @@ def _name_of(time: float | None) -> str:
 
 
 def ending(seconds: float, count: int, workers: int) -> str:
-    """When a run will end, or "" where that is soon.
+    """When a run will end, as text; "" if soon.
 
     Args:
-        seconds: What the first `TIMED_FRAMES` frames took [s].
+        seconds: Duration of the first `TIMED_FRAMES` frames [s].
         count: Frames of the run.
-        workers: Processes that share them; the first one's frames are the first to come.
+        workers: Processes sharing the frames; the first frames to arrive are the first process's.
     """
     frames = -(-count // workers) - TIMED_FRAMES
     left = frames * seconds / TIMED_FRAMES
@@ -314,10 +314,10 @@ def ending(seconds: float, count: int, workers: int) -> str:
 
 
 def peak_memory_mb() -> float | None:
-    """Peak resident memory of this process [MB]; None where the system does not tell, as on Windows."""
+    """Peak resident memory of this process [MB]; None if unknown, as on Windows."""
     if resource is None:
         return None
-    if sys.platform == "linux":  # Its getrusage counts the program that started this one too.
+    if sys.platform == "linux":  # On Linux, getrusage also counts the parent program.
         status = Path("/proc/self/status").read_text(encoding="ascii")
         return round(int(status.partition("VmHWM:")[2].split()[0]) / 1024.0, 1)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

@@ -1,4 +1,4 @@
-"""Frames that did not settle or were not solved: for warnings, `--strict` and reports."""
+"""Finds frames not settled or not solved, for warnings, `--strict` and reports."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ COLLAPSED, LIMITED, UNSOLVED = "collapsed", "time limit", "not solved"
 
 @dataclass(frozen=True)
 class Unsettled:
-    """A frame of a garment that did not settle.
+    """A garment's frame that did not settle.
 
     Attributes:
-        level: The level at which it did not.
-        remaining_move: RMS of H0^-1 F there, in local edge lengths; None where there was nothing to solve.
-        stopped: Why its steps ended, as `LevelReport` says it, `COLLAPSED`, `LIMITED` or `UNSOLVED`.
-        size: Of the cage over its rest shape's, where it has collapsed.
-        error: Why it was not solved, "" where it was.
+        level: The unsettled level.
+        remaining_move: RMS of H0^-1 F at the level, in local edge lengths; None if the frame was not solved.
+        stopped: Reason for the end of the steps, as in `LevelReport`, or `COLLAPSED`, `LIMITED` or `UNSOLVED`.
+        size: Size of a collapsed cage relative to its rest shape.
+        error: Reason for an unsolved frame, else "".
     """
 
     level: int
@@ -30,7 +30,7 @@ class Unsettled:
     error: str = ""
 
     def __str__(self) -> str:
-        """In words."""
+        """Description in words."""
         if self.error:
             return self.error
         if self.size is not None:
@@ -45,14 +45,14 @@ def in_words(entry: Mapping[str, Any]) -> str:
 
 
 def unsettled(entry: Mapping[str, Any], tolerance: float) -> Unsettled | None:
-    """Whether one garment's frame did not settle.
+    """The unsettled state of a garment's frame, or None if settled.
 
-    It did not where a level's last descent ended because no step lowered the energy while it was not at rest, or where
-    the finest level's remaining move is over `FAR` tolerances. A cage that has collapsed was not solved at all.
+    A frame is unsettled if a level's last descent ended because no step lowered the energy although the level was not
+    at rest, or if the finest level's remaining move exceeds `FAR` tolerances. A collapsed cage is not solved at all.
 
     Args:
-        entry: The frame's telemetry of the garment.
-        tolerance: Of the solve, in local edge lengths.
+        entry: The garment's telemetry in the frame.
+        tolerance: Tolerance of the solve, in local edge lengths.
     """
     if "not_solved" in entry:
         return Unsettled(0, None, UNSOLVED, error=str(entry["not_solved"]))
@@ -74,12 +74,12 @@ def unsettled(entry: Mapping[str, Any], tolerance: float) -> Unsettled | None:
 def unsettled_frames(
     garments: Sequence[Mapping[str, Any]], frames: Sequence[Mapping[str, Any]], *, tolerance: float
 ) -> list[dict[str, Any]]:
-    """Every frame of every garment that did not settle, garment by garment.
+    """All unsettled frames, garment by garment.
 
     Args:
-        garments: Of a report: with their paths.
-        frames: Of the same report.
-        tolerance: Of the solve, in local edge lengths.
+        garments: A report's garments, with paths.
+        frames: The same report's frames.
+        tolerance: Tolerance of the solve, in local edge lengths.
 
     Returns:
         Plain values: path, time and the fields of `Unsettled`.

@@ -1,4 +1,4 @@
-"""Solves frames of a shot: the one place where USD meets the solver; picks device and threads."""
+"""Solves frames of a shot: connects USD and the solver, and chooses device and threads."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from .options import RefineOptions
 from .untagged import open_with_colliders
 
 MOST_THREADS = 4
-"""Threads beyond which a frame's kernels gain nothing: the metric's solve stays on one."""
+"""Most useful threads for a frame's kernels: the metric's solve is single-threaded."""
 Outcomes = Generator[Outcome, None, None]
 
 
 def prepare_device(device: str) -> None:
-    """Start Warp, and keep torch on one thread: its sums depend on how many share them.
+    """Start Warp, and limit torch to one thread: torch's sums depend on the number of threads.
 
     Raises:
-        UsageError: CUDA was asked for and is not there.
+        UsageError: CUDA was requested but is missing.
     """
     start_warp()
     torch.set_num_threads(1)
@@ -40,7 +40,7 @@ def prepare_device(device: str) -> None:
 
 
 def open_for(shot: str | Stage, options: RefineOptions) -> Shot:
-    """Open a shot with the options that concern reading."""
+    """Open a shot with the reading options."""
     return open_with_colliders(
         shot,
         garments=options.garments,
@@ -54,27 +54,27 @@ def open_for(shot: str | Stage, options: RefineOptions) -> Shot:
 
 
 class ShotSolver:
-    """Solves time codes of a shot, in this process or in one that it is sent to.
+    """Solves time codes of a shot, in this process or after pickling in another process.
 
     Attributes:
         levels: Subdivisions of each garment.
     """
 
     def __init__(self, shot: str, levels: list[int], options: RefineOptions, *, opened: Shot | None = None) -> None:
-        """Take a shot, for this process open; each other one opens it for itself."""
+        """Take a shot; ``opened`` is used in this process only, other processes open the shot again."""
         self.levels = levels
         self._shot, self._options = shot, dataclasses.replace(options, progress=None)
         self._threads = min(MOST_THREADS, max(1, (os.cpu_count() or 1) // options.workers))
         self._opened = opened
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave the stage behind, since each process opens its own, perhaps in another folder."""
+        """Drop the open stage: each process opens the shot itself, perhaps in a different working directory."""
         weights = self._options.weights
         options = self._options if weights is None else dataclasses.replace(self._options, weights=weights.absolute())
         return self.__dict__ | {"_opened": None, "_shot": os.path.abspath(self._shot), "_options": options}
 
     def __call__(self, times: Sequence[float | None]) -> Outcomes:
-        """Solve time codes in order; one that fails yields its error, and the next starts from the last good one."""
+        """Solve time codes in order; a failed one yields its error, the next starts from the last solved frame."""
         device = self._options.device
         prepare_device(device)
         shot = self._opened = self._opened or open_for(self._shot, self._options)
@@ -92,11 +92,11 @@ class ShotSolver:
                 outcome = Outcome(time, state.points, state.reused, record, state.heat)
             except (SolveError, StageError) as error:
                 outcome = Outcome(time, (), (), {"time": time, "error": str(error)})
-            leave_if_asked()  # before a frame is taken that a signal broke off
+            leave_if_asked()  # A signal may have cut the frame short.
             yield outcome
 
     def _begin(self, shot: Shot, refiner: Refiner, times: Sequence[float | None]) -> None:
-        """Begin in the middle of a shot, where its cage crosses, with the cage walked there from an earlier frame."""
+        """Start a shot in the middle, if its cage crosses itself, with the cage advanced from an earlier frame."""
         earlier = [] if not times or times[0] is None else shot.times_until(times[0])
         settings = {"times": earlier, "device": self._options.device, "threads": self._threads}
         found = cages_walked(shot.scene, self._options.solve_settings(), shot.frame, **settings)
@@ -105,17 +105,17 @@ class ShotSolver:
 
 
 def sampled_at(shot: Shot, time: float | None) -> list[bool]:
-    """For each garment, whether the layer gets a sample at a time code: its own authored times, or the first of all."""
+    """For each garment, whether the layer gets a sample at a time code: an authored time code, or the shot's first."""
     first = shot.scene.times[0] if shot.scene.times else None
     return [time in source.times if source.times else time == first for source in shot.sources]
 
 
 def time_frames(shot: Shot, options: RefineOptions, levels: list[int]) -> dict[str, float]:
-    """Wall time of a cold frame, of a warm one on average, and of the whole shot by these [s], on this machine.
+    """Measure the wall time of a cold frame and the mean of warm frames, and estimate the whole shot's [s].
 
     Args:
-        shot: The shot, of which up to three frames in the middle are solved: one cold, then two warm.
-        options: Those of a run.
+        shot: The shot; up to three frames in the middle are solved: one cold, then two warm.
+        options: Options of a run.
         levels: Subdivisions of each garment.
     """
     prepare_device(options.device)

@@ -1,7 +1,7 @@
-"""Joins chunks, folders of finished frames that `refine --preroll` leaves, into one layer by the ordinary writer.
+"""Joins chunks, the folders of finished frames written by `refine --preroll`, into a layer with the ordinary writer.
 
-Each chunk begins a few frames early, in the pre-roll. The chunk before holds the same frames: over them the cloth goes
-from one solution to the other, by the rule of `joined`.
+Each chunk begins a few frames early, in the pre-roll. The previous chunk holds the same frames: `joined` blends the two
+solutions over the pre-roll.
 """
 
 from __future__ import annotations
@@ -32,22 +32,22 @@ from .run import fine_meshes, numbers_in
 from .solve import open_for
 
 SEAM_BOUND = 0.05
-"""Most that a seam may add to a frame's move, RMS over a garment, in mean fine edges; `docs/farm.md` has figures."""
+"""Largest increase of a frame's move by a seam, RMS over a garment, in mean fine edges; figures in `docs/farm.md`."""
 _OF_ONE_CHUNK = ("frames",)
-"""Options in which chunks of one shot differ."""
+"""Options allowed to differ between chunks of one shot."""
 
 
 @dataclass(frozen=True)
 class Seam:
-    """How far a garment moves between two chunks because they were solved apart.
+    """Extra motion of a garment between two chunks because the chunks were solved separately.
 
     Attributes:
-        after: Time code of the first frame after it.
+        after: Time code of the first frame after the seam.
         path: The garment.
-        rms: What it adds to a frame's move at most, RMS over the vertices, in mean fine edge lengths.
-        largest: The same of the vertex that it moves most.
-        frames: Over how many frames both are joined; 0 where cloth jumps.
-        why: Why it jumps, or "".
+        rms: Largest increase of a frame's move, RMS over the vertices, in mean fine edge lengths.
+        largest: Largest increase of a single vertex's move, in mean fine edge lengths.
+        frames: Number of joined frames; 0 if the cloth jumps.
+        why: Reason for a jump, or "".
     """
 
     after: float
@@ -58,7 +58,7 @@ class Seam:
     why: str = ""
 
     def __str__(self) -> str:
-        """Place and distance in one line."""
+        """Position and distance in one line."""
         how = f"a frame, over {counted(self.frames, 'frame')}" if self.frames else "at once"
         move = f"seam at {self.after:g}: <{self.path}> moves {self.rms:.3g} fine edges RMS, {self.largest:.3g} at most"
         return f"{move}, {how}" + (f" ({self.why})" if self.why else "")
@@ -70,7 +70,7 @@ class _Chunk:
 
     Attributes:
         folder: The folder.
-        run: Its record.
+        run: The record of the run.
     """
 
     folder: Path
@@ -78,43 +78,43 @@ class _Chunk:
 
     @cached_property
     def finished(self) -> Finished:
-        """Its frames."""
+        """The stored frames."""
         return Finished(self.folder)
 
     @cached_property
     def numbers(self) -> list[int]:
-        """Numbers of the frames that are there, failed ones among them, in order."""
+        """Numbers of the stored frames, including failed frames, in order."""
         return sorted(self.finished.kept | self.finished.failed)
 
     @property
     def is_whole(self) -> bool:
-        """Whether every frame is there."""
+        """Whether every frame is stored."""
         return self.numbers == list(range(*self.run[CHUNK]))
 
     @property
     def times(self) -> list[float]:
-        """Time codes of the frames that are there."""
+        """Time codes of the stored frames."""
         return [time for k in self.numbers if (time := self.run["times"][k]) is not None]
 
     @property
     def shot(self) -> Path:
-        """The shot, by the record."""
+        """Path of the shot, from the record."""
         return (self.folder.resolve().parent / self.run["shot"]).resolve()
 
     @property
     def preroll(self) -> int:
-        """Most frames solved before its first one."""
+        """Most frames solved before the first frame."""
         return 0 if self.run["options"].get("temporal") == "off" else int(self.run["options"]["preroll"])
 
     def decisive(self) -> dict[str, Any]:
-        """Everything that must be the same in all chunks, flat."""
+        """Everything required to be equal in all chunks, as a flat record."""
         options = {name: value for name, value in self.run["options"].items() if name not in _OF_ONE_CHUNK}
         plain = {name: self.run.get(name) for name in ("version", "code", "unsaved", "levels")}
         plain |= {"files of the shot": _hashes(self.run), "frames of the shot": self.run["times"]}
         return plain | {f"--{name.replace('_', '-')}": value for name, value in options.items()}
 
     def options(self, **more: Any) -> RefineOptions:
-        """Options to join it with: the frames are solved, so without weights and on the CPU."""
+        """Options for joining: without weights and on the CPU, because the frames are already solved."""
         left = ("frames", "preroll", "weights", "device")
         plain = {name: value for name, value in self.run["options"].items() if name not in left}
         paths = "absolute" if Path(self.run["shot"]).is_absolute() else "relative"
@@ -123,7 +123,7 @@ class _Chunk:
 
 @dataclass(eq=False)
 class _Joins:
-    """Chunks to join, and the seams that were met; `run.Joins`."""
+    """Chunks to join and the measured seams; implements `run.Joins`."""
 
     parts: Sequence[_Chunk]
     meshes: Sequence[PolygonMesh]
@@ -135,7 +135,7 @@ class _Joins:
 
     @property
     def frames(self) -> Folders:
-        """The frames of all chunks; points that do not fit a mesh are damaged."""
+        """The frames of all chunks; points not matching a mesh count as damaged."""
         counts = [mesh.vertex_count for mesh in self.meshes]
         return Folders(
             {k: found for part in self.parts for found in [Finished(part.folder, counts=counts)] for k in part.numbers}
@@ -147,7 +147,7 @@ class _Joins:
         return self.parts[0].preroll
 
     def seen(self, both: Both, joint: Joint) -> None:
-        """Measure a seam; one whose last frame failed on either side is unknown."""
+        """Measure a seam; unknown if the last frame failed in either chunk."""
         after = self.parts[0].run["times"][both[-1][1].seam]
         for index, (path, mesh) in enumerate(zip(self.paths, self.meshes, strict=True)):
             moves = _moves(both, joint, index, mesh.half_edges.edges)
@@ -156,7 +156,7 @@ class _Joins:
                 self.seams.append(Seam(after, path, rms, largest, 0 if joint.why else len(both), joint.why))
 
     def check(self) -> None:
-        """Refuse a seam that moves too far, or of which nothing is known though frames depend on one another."""
+        """Refuse a seam with too large a move, or an unmeasured seam although frames depend on their predecessors."""
         worst = max(self.seams, key=lambda seam: seam.rms, default=None)
         if worst is not None and worst.rms > self.bound:
             count = ceil(worst.rms * (worst.frames + 1) / self.bound) if self.bound > 0 else 0
@@ -185,24 +185,25 @@ def stitch(
     report_to: str | Path | None = None,
     overwrite: bool = False,
 ) -> tuple[RefineReport, list[Seam]]:
-    """Join chunks of one shot into one layer. Joined cloth is moved so that nothing newly crosses or is in bodies.
+    """Join chunks of one shot into one layer. Joined cloth is moved without new intersections or vertices in bodies.
 
     Args:
-        chunks: Folders that `refine_shot` left with ``preroll``, in any order; a folder of them stands for all in it.
+        chunks: Folders written by `refine_shot` with ``preroll``, in any order; a folder of chunks stands for all
+            inside.
         out: Layer to write.
-        frames: First and last time code that the layer must have; None for all of the shot.
-        seam_bound: Most that a seam may add to a frame's move, RMS over a garment, in mean fine edge lengths.
-        shot: The shot where it is not where the chunks say.
+        frames: First and last time code of the layer; None for the whole shot.
+        seam_bound: Largest increase of a frame's move by a seam, RMS over a garment, in mean fine edge lengths.
+        shot: Path of the shot, if moved since the chunks were made.
         root: A small root layer to write, with the layer over the shot.
-        report_to: Where the report goes, a JSON file or a folder.
+        report_to: Path of the report, a JSON file or a folder.
         overwrite: Whether existing files may be replaced.
 
     Returns:
         The report, as of one run of all frames, and the seams in order.
 
     Raises:
-        UsageError: A frame is missing or doubled, chunks are not of one shot, version and set of options, or of another
-            version of the shot, or a file exists.
+        UsageError: A frame is missing or doubled; chunks differ in shot, version or options, or the shot has changed
+            since; or a file exists.
         StageError: The shot cannot be read.
         LayerError: A frame is damaged, a seam moves too far, or the layer cannot be written or is invalid.
     """
@@ -232,11 +233,11 @@ def check_seams(
     seam_bound: float = SEAM_BOUND,
     shot: str | Path | None = None,
 ) -> list[Seam]:
-    """Measure the seams of chunks that follow one another, and write nothing: others may still be missing.
+    """Measure the seams of consecutive chunks, without writing; chunks may still be missing.
 
     Args:
         chunks: As for `stitch`.
-        of: One of them, to measure its own seams alone; what else is in its folder need not be of the shot, or whole.
+        of: A chunk, to measure its seams only; unrelated or incomplete chunks in its folder are ignored.
         seam_bound: As for `stitch`.
         shot: As for `stitch`.
 
@@ -274,7 +275,7 @@ def check_seams(
 
 
 def _make_folder(folder: Path) -> None:
-    """Make a folder for a layer where it is missing (LayerError)."""
+    """Create a missing folder for a layer (LayerError)."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -283,7 +284,7 @@ def _make_folder(folder: Path) -> None:
 
 @contextmanager
 def _opened_shot(part: _Chunk, shot: str | Path | None) -> Iterator[Shot]:
-    """A chunk's shot, open and checked to be what the chunk was refined from."""
+    """A chunk's shot, opened and checked against the record of the chunk."""
     opened = open_for(str(shot or part.shot), part.options())
     try:
         _check_same_shot(part, made_from(opened, part.folder, part.options()))
@@ -300,7 +301,7 @@ def _joins(parts: Sequence[_Chunk], opened: Shot, bound: float, **more: Any) -> 
 
 
 def _opened(chunks: Sequence[str | Path]) -> list[_Chunk]:
-    """The chunks by their frames; what else lies in a folder of them is left out."""
+    """The chunks sorted by frames; unrelated entries in a folder of chunks are ignored."""
     found: dict[Path, _Chunk] = {}
     for place in map(Path, chunks):
         run = record_in(place)
@@ -317,13 +318,13 @@ def _opened(chunks: Sequence[str | Path]) -> list[_Chunk]:
 
 
 def _is_of_chunk(run: Mapping[str, Any]) -> bool:
-    """Whether a record is of a chunk, as `run` writes it."""
+    """Whether a record is of a chunk, as written by `run`."""
     kinds = {CHUNK: list, "times": list, "levels": list, "options": dict, "inputs": dict, "shot": str}
     return all(isinstance(run.get(name), kind) for name, kind in kinds.items())
 
 
 def _check_alike(parts: Sequence[_Chunk], *, one_shot: bool) -> None:
-    """Refuse chunks of other shots, versions or options."""
+    """Refuse chunks of different shots, versions or options."""
     first = parts[0]
     for part in parts[1:]:
         one, other = first.decisive(), part.decisive()
@@ -338,7 +339,7 @@ def _check_alike(parts: Sequence[_Chunk], *, one_shot: bool) -> None:
 
 
 def _check_same_shot(part: _Chunk, made: Mapping[str, Any]) -> None:
-    """Refuse a shot that is not what a chunk was refined from, and a chunk of another version of this package."""
+    """Refuse a shot changed since the chunk was refined, and a chunk of a different version of this package."""
     if _hashes(made) != _hashes(part.run):
         raise UsageError(f"the shot has changed since {part.folder} was refined from it; refine the chunks anew")
     if names := [name for name in ("version", "code") if made[name] != part.run.get(name)]:
@@ -347,12 +348,12 @@ def _check_same_shot(part: _Chunk, made: Mapping[str, Any]) -> None:
 
 
 def _hashes(run: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Names and digests of the files of the shot, wherever they lie."""
+    """Names and digests of the shot's files, without folders."""
     return sorted((Path(name).name, str(value)) for name, value in run["inputs"].items())
 
 
 def _check_frames(parts: Sequence[_Chunk], frames: tuple[float, float] | None) -> range:
-    """Refuse frames that are missing, doubled, or not asked for; returns the numbers of those asked for."""
+    """Refuse missing, doubled or unrequested frames; returns the numbers of the requested frames."""
     every = parts[0].run["times"]
     owners: dict[int, list[_Chunk]] = {}
     for part in parts:
@@ -377,12 +378,12 @@ def _check_frames(parts: Sequence[_Chunk], frames: tuple[float, float] | None) -
 
 
 def _span(times: Sequence[float]) -> str:
-    """First and last of some time codes as ``--frames`` takes them."""
+    """First and last of some time codes, as in ``--frames``."""
     return f"{min(times):g}:{max(times):g}" if times else "none"
 
 
 def _spans(times: Sequence[float], every: Sequence[float]) -> str:
-    """Time codes as ranges without a gap among all of them."""
+    """Time codes as contiguous ranges within all time codes."""
     runs: list[list[float]] = []
     for time in times:
         if runs and every.index(time) == every.index(runs[-1][-1]) + 1:
@@ -393,9 +394,10 @@ def _spans(times: Sequence[float], every: Sequence[float]) -> str:
 
 
 def _moves(both: Both, joint: Joint, index: int, edges: np.ndarray) -> list[tuple[float, float]] | None:
-    """By how much a seam moves a garment, RMS and at most, in mean edges; None where nothing tells.
+    """Extra moves of a garment at a seam, RMS and largest, in mean edges; None if unknown.
 
-    In equal parts, and by how much cloth lags behind where it may not go on; at once where it jumps.
+    Joined frames move by equal parts of the difference plus the lag of blocked cloth; a jump moves by the whole
+    difference.
     """
     moves, lag = [], np.zeros(1)
     jump: tuple[float, float] | None = None
@@ -417,6 +419,6 @@ def _moves(both: Both, joint: Joint, index: int, edges: np.ndarray) -> list[tupl
 
 
 def _size(moves: np.ndarray, edge: float) -> tuple[float, float]:
-    """Of moves of vertices, shape (V, 3), RMS and at most, in edges."""
+    """RMS and largest length of vertex displacements, shape (V, 3), in edges."""
     distances = np.linalg.norm(moves, axis=1) / edge
     return float(np.sqrt(np.mean(distances**2))), float(distances.max(initial=0.0))

@@ -25,15 +25,15 @@ class Row:
     Attributes:
         shot: Input file.
         layer: Output layer.
-        state: "done", "in part", "failed", "skipped" (the layer was there), "interrupted" (with frames kept) or "not
-            done" (the batch was interrupted before a frame of it).
-        exit_code: Its own, or None where it was not done.
-        frames: Time codes that were asked for.
-        failed_frames: Those without a sample.
+        state: "done", "in part", "failed", "skipped" (the layer existed), "interrupted" (with frames kept) or "not
+            done" (the batch was interrupted before a frame of the shot).
+        exit_code: Exit code of the shot, or None if not done.
+        frames: Number of requested time codes.
+        failed_frames: Time codes without a sample.
         seconds_a_frame: Wall time [s], or None without frames.
-        crossings: Edges through faces that are left, in all frames; None where none were looked for.
-        warnings: What the user should know.
-        error: What ended it, or "".
+        crossings: Edges through faces in the result, in all frames; None if not measured.
+        warnings: Warnings for the user.
+        error: The error, or "".
     """
 
     shot: str
@@ -54,7 +54,7 @@ def row_of(shot: str | Path, layer: Path, done: RefineReport | PhysGraphError | 
     Args:
         shot: Input file.
         layer: Output layer.
-        done: Its report, the error that ended it, or None where the batch was interrupted.
+        done: The report, the error, or None if the batch was interrupted.
     """
     if done is None:
         return _interrupted(str(shot), layer)
@@ -75,7 +75,7 @@ def row_of(shot: str | Path, layer: Path, done: RefineReport | PhysGraphError | 
 
 
 def _interrupted(shot: str, layer: Path) -> Row:
-    """The row of a shot that a batch did not come to, or was at."""
+    """The row of a shot unfinished or not begun when the batch was interrupted."""
     kept = kept_for(layer)
     if kept is None:
         return Row(shot, str(layer))
@@ -83,7 +83,7 @@ def _interrupted(shot: str, layer: Path) -> Row:
 
 
 def exit_code_of(rows: Sequence[Row]) -> int:
-    """The exit code of a batch that came to its end: that of all its shots where they agree; 1 where all failed; 3."""
+    """The exit code of a complete batch: the shots' code if all agree; 1 if all failed; else 3."""
     codes = {row.exit_code for row in rows}
     if len(codes) == 1 and (only := codes.pop()) is not None:
         return only
@@ -95,8 +95,8 @@ def write_summary(path: Path, rows: Sequence[Row], *, exit_code: int) -> None:
 
     Args:
         path: The file.
-        rows: One a shot.
-        exit_code: What the batch ends with.
+        rows: A row per shot.
+        exit_code: The exit code of the batch.
 
     Raises:
         LayerError: The file cannot be written.
@@ -106,11 +106,11 @@ def write_summary(path: Path, rows: Sequence[Row], *, exit_code: int) -> None:
 
 
 def check_summary(path: Path, *, overwrite: bool) -> None:
-    """Refuse to write a summary over a file that is none, or where none can be written.
+    """Refuse a summary path holding a different file, or an unwritable path.
 
     Raises:
         UsageError: The file exists, is no summary and may not be replaced, or is a folder.
-        LayerError: Its folder cannot be written.
+        LayerError: The folder cannot be written.
     """
     check_place(path)
     if path.exists() and not (overwrite or _is_summary(path)):

@@ -1,4 +1,4 @@
-"""Meshes that garments touch and that nothing names as colliders: found, named, and taken by ``auto``."""
+"""Finds meshes touched by garments but not named as colliders; the collider ``auto`` uses such meshes."""
 
 from __future__ import annotations
 
@@ -29,20 +29,20 @@ from ..usd.stage import at_time
 from ..usd.view import Stage
 
 AUTO = "auto"
-"""In place of a collider: all that the shot names, and the meshes that garments touch."""
+"""Pseudo-collider: all colliders named by the shot, and the meshes touched by garments."""
 MOST_ASKED = 32
-"""Most open meshes that are tried as garments."""
+"""Most open meshes tried as garments."""
 NEAR = 0.025
-"""How near a body is taken for one that cloth lies on [m]: solvers keep up to 2 cm, and rounding adds."""
+"""Distance within which cloth lies on a body [m]: solvers keep up to 2 cm, plus rounding."""
 FAR = f"no cloth comes within {1e3 * NEAR:.0f} mm of it"
-"""Reason for which a mesh is left that cloth does not touch."""
+"""Reason given for leaving a mesh not touched by cloth."""
 MOST_FRAMES = 10
-"""Most frames, spread over the shot, in which it is looked what cloth touches."""
+"""Most frames, spread over the shot, searched for contact."""
 LIES_ALONG = 2.0
-"""Distance within which a mesh lies along cloth, in what cloth keeps from a body, its offset and thickness: the outer
-skin of a thick export and a button on the cloth are about as far again."""
+"""Distance within which a mesh lies along cloth, relative to the cloth's offset plus thickness. The outer skin of a
+thick export, or a button on the cloth, is about twice as far as the cloth keeps from a body."""
 MOST_OF = 0.95
-"""Fraction of a mesh's points that lies along cloth and moves with it."""
+"""Least fraction of a mesh's points lying along cloth and moving with the cloth."""
 
 
 @dataclass(frozen=True)
@@ -51,10 +51,10 @@ class Candidate:
 
     Attributes:
         path: The mesh.
-        reason: Why `AUTO` takes it, or leaves it.
-        shares: For each garment that touches it, the fraction of its vertices that is in it or near it, in the first
-            frame looked at where any is; empty where it is left.
-        pose: Where the mesh is in that frame, or None.
+        reason: Why `AUTO` takes or leaves the mesh.
+        shares: For each touching garment, the fraction of its vertices inside or near the mesh, in the first examined
+            frame with contact; empty for a mesh left out.
+        pose: Pose of the mesh in the first frame with contact, or None.
     """
 
     path: str
@@ -64,28 +64,28 @@ class Candidate:
 
     @property
     def is_taken(self) -> bool:
-        """Whether `AUTO` takes it."""
+        """Whether `AUTO` takes the mesh."""
         return bool(self.shares)
 
     @property
     def garment(self) -> str:
-        """Path of the garment that touches it most."""
+        """Path of the garment touching the mesh most."""
         return max(self.shares, key=lambda path: self.shares[path])
 
 
 def find_candidates(shot: Shot) -> list[Candidate]:
-    """Meshes that are neither garments nor colliders, taken where cloth overlaps them or lies within `NEAR` of them.
+    """Meshes that are neither garments nor colliders, taken if cloth overlaps the mesh or comes within `NEAR`.
 
-    Not taken are meshes that are not drawn, and trims and second skins: they lie along the cloth and move with it.
+    Invisible meshes are not taken, nor trims and second skins, which lie along the cloth and move with the cloth.
 
     Args:
         shot: An open shot.
 
     Returns:
-        What was found, the one that most of a garment touches first.
+        The candidates, sorted by the largest touching fraction of a garment, largest first.
 
     Raises:
-        StageError: USD cannot read the files any more.
+        StageError: USD can no longer read the files.
     """
     frames = sample_frames(shot.every_time, shot.frame, most=MOST_FRAMES)
     if not frames:
@@ -101,7 +101,7 @@ def find_candidates(shot: Shot) -> list[Candidate]:
 def _judged(
     path: str, poses: Iterator[tuple[int, Pose]], garments: Sequence[Garment], *, frames: Sequence[Frame]
 ) -> Candidate:
-    """A mesh that is drawn, given its poses by number of the frame, taken or left."""
+    """Judge a visible mesh, given its poses by frame number: taken or left."""
     start_warp()
     body = MeshBody(device="cpu", threads=1)
     for index, pose in poses:
@@ -121,7 +121,7 @@ def _judged(
 
 
 def _moves_with(garment: Garment, frames: Sequence[tuple[GarmentFrame, Pose]]) -> bool:
-    """Whether a mesh lies along a cage in the first of some frames, and stays near the same places of it in all."""
+    """Whether a mesh lies along a cage in the first frame, and stays near the same places of the cage in all frames."""
     (cloth, pose), *later = frames
     triangles = garment.mesh.triangulate(garment.rest).triangles
     surfaces = MeshBody(side="start", device="cpu", threads=1).pose(MeshPose(cloth.points, triangles))
@@ -154,12 +154,12 @@ def _weights(triangles: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def open_with_colliders(shot: str | os.PathLike[str] | Stage, *, colliders: Sequence[str] = (), **options: Any) -> Shot:
-    """Open a shot, where `AUTO` among the colliders stands for the candidates that are taken.
+    """Open a shot, replacing `AUTO` among the colliders by the candidates taken.
 
     Args:
-        shot: As `open_shot` takes it.
-        colliders: As `open_shot` takes them, or `AUTO` among them.
-        options: Its other options.
+        shot: As in `open_shot`.
+        colliders: As in `open_shot`, or `AUTO` among the paths.
+        options: Other options of `open_shot`.
 
     Raises:
         UsageError: When an option cannot be used.
@@ -173,15 +173,15 @@ def open_with_colliders(shot: str | os.PathLike[str] | Stage, *, colliders: Sequ
 
 
 def proposal(shot: str | Stage, meshes: Sequence[str], frames: tuple[float, float] | None) -> str:
-    """The command for a shot in which nothing is marked: open meshes that lie on closed ones are its garments.
+    """The command for a shot without tags: open meshes lying on closed meshes are the garments.
 
     Args:
         shot: The shot.
-        meshes: Its open meshes, the largest first.
+        meshes: Open meshes of the shot, the largest first.
         frames: First and last time code, or None.
 
     Returns:
-        The command, or "" where there are none, or they cannot be read together.
+        The command, or "" if no garment is found or the meshes cannot be read together.
     """
     try:
         with closing(open_shot(shot, garments=meshes[:MOST_ASKED], frames=frames)) as opened:
@@ -196,17 +196,17 @@ def proposal(shot: str | Stage, meshes: Sequence[str], frames: tuple[float, floa
 
 
 def command_of(shot: str, garments: Iterable[str], colliders: Iterable[str], *, rest: Sequence[str]) -> str:
-    """The command that refines a shot's garments with colliders; ``rest`` as of `rest_options`."""
+    """The command to refine a shot's garments with colliders; ``rest``: the result of `rest_options`."""
     out = str(Path(shot).with_suffix(".refined.usdc"))
     words = ["physgraph-usd", "refine", shot, "-o", out, *rest]
     return join([*words, *options_of("--garment", garments), *options_of("--collider", colliders)])
 
 
 def rest_options(strained: Iterable[tuple[str, Sequence[StrainedPart]]]) -> list[str]:
-    """``--rest auto`` as words of a command, where a garment needs it.
+    """``--rest auto`` as words of a command, if a garment needs the option.
 
     Args:
-        strained: For each garment where its rest shape is from, and the parts that are not of its size.
+        strained: For each garment the source of the rest shape, and the parts not sized like the rest shape.
     """
     wrong = any(part.needs_rest for source, parts in strained if not source.startswith(FITTED) for part in parts)
     return ["--rest", "auto"] if wrong else []
@@ -220,7 +220,7 @@ def options_of(name: str, values: Iterable[str]) -> list[str]:
 def _strained(
     shot: Shot, frames: Sequence[Frame], paths: Sequence[str]
 ) -> Iterator[tuple[str, Sequence[StrainedPart]]]:
-    """Source of the rest shape of some garments, and their parts that are not of its size."""
+    """For some garments, the source of the rest shape and the parts not sized like the rest shape."""
     for index, (garment, source) in enumerate(zip(shot.scene.garments, shot.sources, strict=True)):
         if garment.path in paths:
             cages = [frame.garments[index].points for frame in frames]
@@ -228,17 +228,17 @@ def _strained(
 
 
 def _fraction_at(body: MeshBody, pose: Pose, garment: Garment, cage: np.ndarray) -> float:
-    """Fraction of a cage's vertices that is in a body's closed part or near it or its open part.
+    """Fraction of a cage's vertices inside a body's closed part, or near the body.
 
     Args:
         body: The body.
-        pose: Where it is.
+        pose: Pose of the body.
         garment: The garment.
-        cage: Positions of its cage [m], shape (V, 3).
+        cage: Positions of the cage [m], shape (V, 3).
 
     Returns:
-        The fraction; 0 where it does not touch it. A room or a sky that holds all of it, with nothing near its walls,
-        is not touched.
+        The fraction; 0 without contact. A room or a sky around the whole cage, with no walls nearby, counts as no
+        contact.
     """
     fraction, edges = 0.0, torch.as_tensor(garment.mesh.half_edges.edges)
     for surface in body.pose(pose) if isinstance(pose, MeshPose) else ():

@@ -1,8 +1,7 @@
-"""Whether gravity pulls across the bodies that wear the garments, as on a stage whose upAxis is wrong.
+"""Detects gravity pulling across the wearers of the garments, as on a stage with a wrong upAxis.
 
-USD has two up axes, Y and Z, and a stage may name the wrong one. Neither a body nor a garment shows that alone: a table
-is wide and low, a sleeve runs along an arm. A garment that goes round a body, and a body that stands along the same
-axis, do.
+USD has two up axes, Y and Z, and a stage may name the wrong axis. A body or a garment alone is no evidence: a table is
+wide and low, a sleeve runs along an arm. A garment around a body, with the body standing along the same axis, is.
 """
 
 from __future__ import annotations
@@ -16,20 +15,20 @@ from ..solver.scene import Frame, Garment, Scene
 from .untagged import Candidate
 
 TWICE = 2.0
-"""Ratio from which a body stands and a garment goes round. Points of people who stand, walk or dance spread 2.4 to 8
-times as far upwards as forwards; a four-legged animal is at most half as long again as it is high."""
+"""Least ratio for a body to stand and for a garment to go round. Points of people standing, walking or dancing spread
+2.4 to 8 times as far upwards as forwards; a four-legged animal is at most half as long again as high."""
 
 
 def across_gravity(scene: Scene, frames: Sequence[Frame], beside: Sequence[Candidate]) -> tuple[str, str, str] | None:
-    """A garment, a body inside it, and the axis, "Y" or "Z", along which both stand, where gravity pulls across.
+    """A garment, a body inside the garment, and their common axis, "Y" or "Z", if gravity pulls across the axis.
 
-    A garment goes round an axis if `TWICE` as much of it faces both ways along gravity as both ways along the axis, in
-    the frames and in the rest shape: the rest shape of a person who lies stands.
+    A garment goes round an axis if `TWICE` as much area faces both ways along gravity as both ways along the axis, in
+    the frames and in the rest shape: the rest shape of a lying person stands.
 
     Args:
         scene: The scene.
         frames: A few of its frames.
-        beside: Bodies that garments touch and do not feel.
+        beside: Bodies touched by garments but not used as colliders.
     """
     down = int(np.abs(scene.gravity).argmax())
     for index, garment in enumerate(scene.garments):
@@ -47,14 +46,14 @@ def across_gravity(scene: Scene, frames: Sequence[Frame], beside: Sequence[Candi
 
 
 def _faces(garment: Garment, points: np.ndarray) -> np.ndarray:
-    """Area of a cage that faces along each axis, of the side from which less of it does [m^2], shape (3,)."""
+    """Area of a cage facing along each axis, the smaller of the two directions' areas [m^2], shape (3,)."""
     a, b, c = (points[corner] for corner in garment.mesh.triangulate(garment.rest).triangles.T)
     area = 0.5 * np.cross(b - a, c - a)
     return np.minimum(np.maximum(area, 0.0).sum(axis=0), np.maximum(-area, 0.0).sum(axis=0))
 
 
 def _around(frames: Sequence[Frame], garment: int, collider: int) -> list[Pose]:
-    """A collider's poses in the frames in which its bounds hold the middle of a garment."""
+    """A collider's poses in the frames in which its bounds contain the garment's centre."""
     found = []
     for frame in frames:
         pose, middle = frame.colliders[collider], frame.garments[garment].points.mean(axis=0)

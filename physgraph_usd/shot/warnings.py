@@ -1,6 +1,6 @@
-"""Every kind of warning that a run gives, its sentence and its remedy in one table, of which docs/trouble.md is made.
+"""All kinds of warnings given by a run, with sentence and remedy, in one table; docs/trouble.md is made from the table.
 
-What a stage holds that is odd or repaired is named by its reader, as `usd.stage.Notice`.
+Odd or repaired contents of a stage are reported by the stage's reader, as `usd.stage.Notice`.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from .settled import COLLAPSED, LIMITED, UNSOLVED, in_words
 from .untagged import AUTO, NEAR, Candidate, options_of
 
 MOST_NAMED = 3
-"""Most prims, parts or time codes that one warning names."""
+"""Most prims, parts or time codes named in one warning."""
 Entries = Mapping[float | None, Mapping[str, Any]]
 """A garment's telemetry by time code."""
 
@@ -27,7 +27,7 @@ class Warned(str):
     """The text of a warning of a kind.
 
     Attributes:
-        kind: Title of its kind.
+        kind: Title of the kind.
     """
 
     kind = ""
@@ -38,10 +38,10 @@ class Kind:
     """A kind of warning.
 
     Attributes:
-        title: What docs/trouble.md calls it.
-        advice: What docs/trouble.md says to do.
-        sentence: What is so, with figures in braces.
-        remedy: What to do, in brief, or "".
+        title: Title in docs/trouble.md.
+        advice: Advice in docs/trouble.md.
+        sentence: The warning, with figures in braces.
+        remedy: The remedy in brief, or "".
     """
 
     title: str
@@ -54,8 +54,8 @@ class Kind:
 
         Args:
             path: The garment, or "".
-            times: The time code that the figures are of, and others that it is so at.
-            figures: What the sentence and the remedy name.
+            times: The time code of the figures, then other affected time codes.
+            figures: Values for the sentence and the remedy.
         """
         first, *others = times or (None,)
         place = f"<{path}>" if path else ""
@@ -143,17 +143,17 @@ WARNINGS = {
 
 
 def advice_table() -> str:
-    """All kinds with what to do, as a table in Markdown."""
+    """All kinds with advice, as a table in Markdown."""
     rows = [f"| {kind.title} | {kind.advice} |" for kind in WARNINGS.values()]
     return "\n".join(["| it says | do |", "|---|---|", *rows]) + "\n"
 
 
 def of_strain(found: Mapping[str, Sequence[StrainedPart]], source: str) -> list[str]:
-    """A warning where parts are larger than their rest shape in most frames, or far smaller.
+    """A warning of parts larger than their rest shape in most frames, or far smaller.
 
     Args:
-        found: Strained parts of each garment, largest first, by its path.
-        source: Where the first one's rest shape is from.
+        found: Strained parts of each garment, largest first, by path.
+        source: Source of the first garment's rest shape.
     """
     named = []
     for path, parts in found.items():
@@ -167,12 +167,12 @@ def of_strain(found: Mapping[str, Sequence[StrainedPart]], source: str) -> list[
 
 
 def of_gravity(garment: str, body: str, axis: str, *, pull: str, source: str) -> str:
-    """A warning of gravity that pulls across a garment and the body inside it, which stand along an axis."""
+    """A warning of gravity pulling across the common axis of a garment and the body inside the garment."""
     return WARNINGS["gravity"](garment, body=body, axis=axis, pull=pull, source=source)
 
 
 def of_unfelt(found: Sequence[Candidate]) -> list[str]:
-    """A warning of the meshes that touch cloth unfelt, with what to type."""
+    """A warning of meshes touched by cloth but not used as colliders, with the options to type."""
     if not found:
         return []
     named = [f"<{each.path}> ({each.shares[each.garment]:.0%} of <{each.garment}>)" for each in found[:MOST_NAMED]]
@@ -185,7 +185,7 @@ def of_unfelt(found: Sequence[Candidate]) -> list[str]:
 
 
 def of_frames(report: RefineReport) -> list[str]:
-    """Warnings of what frames tell, kind by kind."""
+    """Warnings from the frames' telemetry, kind by kind."""
     by_garment = [
         (garment, {frame["time"]: frame["garments"][index] for frame in report.frames if "garments" in frame})
         for index, garment in enumerate(report.garments)
@@ -196,7 +196,7 @@ def of_frames(report: RefineReport) -> list[str]:
 
 
 def _of_jumps(garment: Mapping[str, Any], entries: Entries) -> Iterator[str]:
-    """A warning for each frame in which a garment's input left its place, and where it jumps from the first frame."""
+    """A warning for each frame in which a garment's input leaves its place, and for a jump from the first frame."""
     for name in ("broken_before", "jumped_from"):
         for time, entry in entries.items():
             if entry.get(name) is not None and time is not None:
@@ -204,7 +204,7 @@ def _of_jumps(garment: Mapping[str, Any], entries: Entries) -> Iterator[str]:
 
 
 def of_contact(garment: Mapping[str, Any], entries: Entries) -> Iterator[str]:
-    """A warning where a garment's result crosses cloth or bodies, or is inside one, with its worst frame."""
+    """A warning if a garment's result crosses cloth or bodies, or is inside a body, with the worst frame."""
     left = {
         time: [each for each in _measured(entry.get("contact", {})) if each[1]]
         for time, entry in entries.items()
@@ -229,7 +229,7 @@ def _measured(contact: Mapping[str, Any]) -> Iterator[tuple[str, int, int]]:
 
 
 def _of_unsolved(found: Sequence[Mapping[str, Any]]) -> Iterator[str]:
-    """Warnings of frames stopped by the time limit, and of frames on their cage, by garment."""
+    """Warnings of frames stopped by the time limit, and of unsolved frames, by garment."""
     kinds = {LIMITED: LIMITED, COLLAPSED: UNSOLVED, UNSOLVED: UNSOLVED}
     known = [(str(entry["path"]), kinds[entry["stopped"]], entry) for entry in found if entry["stopped"] in kinds]
     for path, kind in dict.fromkeys((path, kind) for path, kind, _ in known):
@@ -240,7 +240,7 @@ def _of_unsolved(found: Sequence[Mapping[str, Any]]) -> Iterator[str]:
 
 
 def _also(times: Sequence[float | None]) -> str:
-    """Words for the other time codes of a warning; "" without any."""
+    """Text listing the other time codes of a warning; "" without any."""
     if len(times) > MOST_NAMED:
         return f"also in {counted(len(times), 'other frame')}"
     names = ["default" if time is None else f"{time:g}" for time in times]

@@ -1,6 +1,6 @@
-"""USD in and out: the only rooms, with ``plugins/``, that import pxr."""
+"""USD in and out: together with ``plugins/``, the only code importing pxr."""
 
 import os
 
-# USD maps binary layers into memory: one that is cut short meanwhile would end the process. Read by pread, it raises.
+# USD memory-maps binary layers: a file truncated meanwhile would crash the process. With pread, USD raises an error.
 os.environ.setdefault("USDC_USE_PREAD", "1")

@@ -1,4 +1,4 @@
-"""Files that a shot is made of, and targets checked against them: inputs are never written, nor two results in one."""
+"""Lists the files of a shot, and checks output paths: never over an input, never two results in one file."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from .provenance import is_only_ours, read_record
 from .stage import USD_ERRORS, is_sound, quiet
 
 LAYER_SUFFIXES = (".usd", ".usda", ".usdc")
-"""Suffixes of the layers that we write."""
+"""Suffixes of written layers."""
 _UDIM = "<UDIM>"
 
 Target = tuple[str, Path]
-"""A result in words, and its file."""
+"""A result's description, and its file."""
 
 
 def files_of(shot: str | Path | Usd.Stage) -> set[Path]:
-    """Every file that a shot, a file or an open stage, is made of, or would be with other variants.
+    """Every file of a shot, given as a file or an open stage, including files of unselected variants.
 
-    Sublayers, references, payloads, value clips and assets such as textures, through all layers. A refined layer in it
-    is left out with what it needs: it is a result, which is not read and may be written again. A file that USD cannot
-    open is its only one.
+    The files are sublayers, references, payloads, value clips and assets such as textures, through all layers. Refined
+    layers and their dependencies are left out: results are not read and may be overwritten. If USD cannot open the
+    shot's file, the file itself is the only entry.
 
     Raises:
-        StageError: One is a pipe, at which USD would wait for ever.
+        StageError: A file is a pipe; USD would wait for ever.
     """
     found: set[Path] = set()
     if isinstance(shot, Usd.Stage):
@@ -49,7 +49,7 @@ def files_of(shot: str | Path | Usd.Stage) -> set[Path]:
 
 
 def _layer_of(file: Path) -> Sdf.Layer | None:
-    """The layer in a file; None where USD cannot read one."""
+    """The layer in a file; None if USD cannot read the file."""
     try:
         layer = Sdf.Layer.FindOrOpen(str(file)) if Usd.Stage.IsSupportedFile(str(file)) and file.is_file() else None
         return layer if layer is not None and is_sound(layer) else None
@@ -65,13 +65,13 @@ def _is_result(file: Path) -> bool:
 
 
 def _named_in(file: Path) -> Iterator[str]:
-    """Files that a layer names, selected or not, as absolute paths."""
+    """Files named by a layer, selected or not, as absolute paths."""
     layer = _layer_of(file)
     if layer is None:
         return
     try:
         names = list(chain(*UsdUtils.ExtractExternalReferences(str(file))))
-    except USD_ERRORS:  # a damaged file, which the stage's reader names
+    except USD_ERRORS:  # The file is damaged; the stage's reader reports the damage.
         return
     for name in names:
         path = Sdf.ComputeAssetPathRelativeToLayer(layer, name)
@@ -82,7 +82,7 @@ def _named_in(file: Path) -> Iterator[str]:
 
 
 def check_targets(targets: Sequence[Target], inputs: Iterable[Path]) -> None:
-    """Refuse (UsageError) to write over an input, or two results into one file; links count as what they lead to."""
+    """Refuse (UsageError) to write over an input, or two results into one file; links are resolved."""
     read = {_identity(file): file for file in inputs}
     written: dict[object, str] = {}
     for what, path in targets:
@@ -96,7 +96,7 @@ def check_targets(targets: Sequence[Target], inputs: Iterable[Path]) -> None:
 
 
 def _identity(path: Path) -> object:
-    """A key that is the same for two paths to one file, whether the file is there or not."""
+    """A key equal for two paths to the same file, whether the file exists or not."""
     try:
         found = os.stat(path)
     except OSError:
@@ -106,7 +106,7 @@ def _identity(path: Path) -> object:
 
 
 def check_suffix(what: str, path: Path, known: Sequence[str]) -> None:
-    """Refuse (UsageError) a file's name whose suffix is none of those known."""
+    """Refuse (UsageError) a file name with an unknown suffix."""
     if path.suffix not in known:
         suffix = f"the suffix '{path.suffix}'" if path.suffix else "no suffix"
         raise UsageError(f"{what} {path} has {suffix}; known suffixes: {', '.join(known)}")

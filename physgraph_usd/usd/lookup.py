@@ -1,6 +1,6 @@
-"""Values, looked up at ``--set``, the prim, its ancestors, the bound material, the fallback.
+"""Looks up values at ``--set``, the prim, its ancestors, the bound material, the fallback.
 
-Any numeric type is accepted, and Blender's ``userProperties:`` namespace, because a trip through a host program changes
+Any numeric type is accepted, and Blender's ``userProperties:`` namespace: a round trip through a host program changes
 both and moves the attribute to the parent transform.
 """
 
@@ -21,7 +21,7 @@ from .stage import at_time, in_brief, timecode
 _OVERRIDE = re.compile(r"^(?:<?(?P<prim>/[^<>=.]*)>?\.)?(?P<name>[A-Za-z_][\w:]*)=(?P<value>.*)$")
 _WORDS = {"true": 1.0, "on": 1.0, "yes": 1.0, "false": 0.0, "off": 0.0, "no": 0.0}
 USER_PROPERTIES = "userProperties:"
-"""Namespace in which Blender exports custom properties."""
+"""Blender's namespace for exported custom properties."""
 
 
 @dataclass(frozen=True)
@@ -29,9 +29,9 @@ class Override:
     """One ``--set``.
 
     Attributes:
-        prim: Prim path at or above the garments or colliders it is for; "/" means every one.
+        prim: Prim path at or above the affected garments or colliders; "/" means all.
         row: The attribute.
-        value: Its value.
+        value: The value.
     """
 
     prim: Sdf.Path
@@ -47,10 +47,10 @@ class Found:
         row: The attribute.
         source: The source in words, for the report.
         attribute: The authored attribute, or None for a constant.
-        constant: The value when there is no attribute; None when nothing gives one.
+        constant: The value when there is no attribute; None without any value.
         scale: Factor from the stage's number to SI.
-        compute: SI value at a time code, of a value that follows from others; else None.
-        varies: Whether one of these others is animated.
+        compute: For a derived value, the SI value at a time code; else None.
+        varies: Whether an input of a derived value is animated.
     """
 
     row: Property
@@ -67,7 +67,7 @@ class Found:
         return self.varies or (self.attribute is not None and self.attribute.ValueMightBeTimeVarying())
 
     def at(self, time: float | None) -> float | None:
-        """Value in SI at a time code, None when nothing gives one; SchemaError when it is none, or beyond limits."""
+        """Value in SI at a time code, None without a value; SchemaError for a wrong type or a value beyond limits."""
         if self.compute is not None:
             return check_limits(self.row, self.compute(time), self.source)
         if self.attribute is None:
@@ -76,7 +76,7 @@ class Found:
 
 
 def parse_overrides(texts: Sequence[str]) -> tuple[Override, ...]:
-    """Read ``</prim>.attribute=value`` or ``attribute=value`` texts; UsageError names one that cannot be used."""
+    """Read ``</prim>.attribute=value`` or ``attribute=value`` texts; UsageError names an invalid text."""
     return tuple(_parse_override(text) for text in texts)
 
 
@@ -100,7 +100,7 @@ def _parse_override(text: str) -> Override:
 def check_overrides(
     overrides: Sequence[Override], garments: Sequence[Sdf.Path], colliders: Sequence[Sdf.Path] = ()
 ) -> None:
-    """Refuse an override that is for no garment, or no collider; UsageError names it and those there are."""
+    """Refuse an override without a matching garment or collider; UsageError lists the known paths."""
     for override in overrides:
         kind, paths = ("collider", colliders) if override.row.short in COLLIDER else ("garment", garments)
         if not any(path.HasPrefix(override.prim) for path in paths):
@@ -116,9 +116,9 @@ def with_ancestors(prim: Usd.Prim) -> Iterator[Usd.Prim]:
 
 
 def authored(prim: Usd.Prim, name: str) -> Usd.Attribute | None:
-    """Return the attribute that gives a prim's value under a name, or under Blender's name for it.
+    """Return the attribute for a prim's value, under the name or Blender's variant of the name.
 
-    It is the prim's own, or the one that its own is connected to, as a material's interface is.
+    The attribute is the prim's own, or the source of its connection, as for a material's interface.
     """
     for full in (name, USER_PROPERTIES + name):
         attribute = prim.GetAttribute(full)
@@ -129,14 +129,14 @@ def authored(prim: Usd.Prim, name: str) -> Usd.Attribute | None:
 
 
 def connected(attribute: Usd.Attribute) -> Usd.Attribute | None:
-    """Return the attribute with a value of its own that a single connection leads to in one step, if any."""
+    """Return the source attribute of a single, one-step connection if the source has a value, else None."""
     sources = attribute.GetConnections() if attribute else []
     found = attribute.GetStage().GetAttributeAtPath(sources[0]) if len(sources) == 1 else None
     return found if found and found.HasAuthoredValue() and not found.HasAuthoredConnections() else None
 
 
 def nearest(prim: Usd.Prim, name: str) -> Usd.Attribute | None:
-    """Return the authored attribute on the prim or its nearest ancestor that has one."""
+    """Return the authored attribute on the prim or the nearest ancestor."""
     return next((found for each in with_ancestors(prim) if (found := authored(each, name))), None)
 
 
@@ -169,16 +169,16 @@ def find_value(prim: Usd.Prim, row: Property, overrides: Sequence[Override] = ()
 
 
 def _override(prim: Usd.Prim, row: Property, overrides: Sequence[Override]) -> Override | None:
-    """The ``--set`` of an attribute that is nearest to a prim, the last of those on one prim; None without any."""
+    """The ``--set`` nearest to a prim for an attribute, the last if several name the same prim; None without any."""
     matching = [each for each in overrides if each.row.name == row.name and prim.GetPath().HasPrefix(each.prim)]
     return max(reversed(matching), key=lambda each: each.prim.pathElementCount, default=None)
 
 
 def find_token(prim: Usd.Prim, row: Property, overrides: Sequence[Override] = ()) -> tuple[str, str]:
-    """Token by ``--set``, of the prim, its nearest ancestor, or the fallback, and its source in words.
+    """Token from ``--set``, the prim, its nearest ancestor, or the fallback, and the source in words.
 
     Raises:
-        SchemaError: The value is none of the row's tokens.
+        SchemaError: The value is not among the row's tokens.
     """
     override = _override(prim, row, overrides)
     if override is not None:
@@ -190,22 +190,22 @@ def find_token(prim: Usd.Prim, row: Property, overrides: Sequence[Override] = ()
 
 
 def check_token(row: Property, value: object, source: str) -> str:
-    """Return a token when it is one of its row's; SchemaError gives value, source and choices."""
+    """Return a token if valid for the row; SchemaError gives value, source and choices."""
     if value not in row.tokens:
         raise SchemaError(f"{source} is {value!r}; it must be one of {', '.join(row.tokens)}")
     return str(value)
 
 
 def source_name(attribute: Usd.Attribute) -> str:
-    """An attribute as in reports: ``</prim>.name``."""
+    """An attribute's name in reports: ``</prim>.name``."""
     return f"<{attribute.GetPrim().GetPath()}>.{attribute.GetName()}"
 
 
 def read_number(attribute: Usd.Attribute, time: float | None) -> float:
-    """Read an attribute of any numeric type; SchemaError when it holds something else."""
+    """Read an attribute of any numeric type; SchemaError for a value of another type."""
     code = timecode(time)
     resolved = attribute.GetResolveInfo(code).GetSource()
-    if resolved in {Usd.ResolveInfoSourceNone, Usd.ResolveInfoSourceFallback}:  # samples only, asked for the default
+    if resolved in {Usd.ResolveInfoSourceNone, Usd.ResolveInfoSourceFallback}:  # The attribute has samples only.
         code = Usd.TimeCode.EarliestTime()
     value = attribute.Get(code)
     if value is None:
@@ -217,7 +217,7 @@ def read_number(attribute: Usd.Attribute, time: float | None) -> float:
 
 
 def check_limits(row: Property, value: float, source: str) -> float:
-    """Return the value when it is finite and inside its limits; SchemaError gives value, source and limits."""
+    """Return a finite value within the row's limits; SchemaError gives value, source and limits."""
     with np.errstate(over="ignore"):
         finite = np.isfinite(np.float32(value))
     if not (finite and is_within(value, row.minimum, row.maximum)):
@@ -231,7 +231,7 @@ def check_limits(row: Property, value: float, source: str) -> float:
 
 
 def is_within(value: float, low: float | None, high: float | None) -> bool:
-    """Whether a value is inside limits, compared in float32 as the schema's attributes hold both."""
+    """Whether a value is inside limits, compared in float32, the precision of the schema's attributes."""
     with np.errstate(over="ignore"):
         single = np.float32(value)
     return bool(np.float32(-np.inf if low is None else low) <= single <= np.float32(np.inf if high is None else high))

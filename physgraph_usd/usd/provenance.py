@@ -1,7 +1,7 @@
-"""A refined layer's provenance: stage metadata that it must repeat, its record, and the root that shows it.
+"""A refined layer's provenance: stage metadata copied from the shot, the record, and the root layer over the shot.
 
-The record lies in ``customLayerData["physgraph"]``. It holds no clock and, unless asked for, no absolute path of this
-machine, so the same input gives the same bytes.
+The record lies in ``customLayerData["physgraph"]``. The record holds no clock time and, unless asked for, no absolute
+path of this machine: the same input gives the same bytes.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from .write.atomic import prepare_target, publish, temporary_path
 
 RECORD = "physgraph"
 CONTENTS = "contents"
-"""Entry of the record: a digest of what the layer holds, since who copies a record copies no layer."""
+"""Entry of the record: a digest of the layer's contents, to detect a record copied into a different layer."""
 FAILED, UNSOLVED, UNSETTLED, CROSSED = "failed", "unsolved", "unsettled", "crossed"
-"""Entries of the record: time codes without a sample; frames of garments that were not solved and follow their cage;
-those that were written though they did not settle; edges left through faces, where over a tenth of the input's are."""
+"""Entries of the record: time codes without a sample; unsolved frames of garments, following their cage; frames written
+but not settled; edges left through faces, if over a tenth of the input's."""
 LACKING = (FAILED, UNSOLVED, UNSETTLED, CROSSED)
-"""Defects of a layer; the first two make every run one that was done in part, the others a strict one."""
+"""Defects of a layer: with the first two, any run counts as done in part; with the rest, a strict run."""
 _LIST = (Vt.StringArray, list)
 _TYPES: dict[str, Any] = {
     "garments": _LIST,
@@ -38,13 +38,14 @@ _TYPES: dict[str, Any] = {
     "left_out": Mapping,
 }
 METADATA = ("upAxis", "metersPerUnit", "kilogramsPerUnit", "defaultPrim", "startTimeCode", "endTimeCode")
-"""Stage metadata that a refined layer has in common with its shot."""
+"""Stage metadata shared by a refined layer and its shot."""
 
 
 def copy_stage_metadata(stage: Usd.Stage, layer: Sdf.Layer, *, span: tuple[float, float] | None = None) -> None:
-    """Repeat the metadata of a shot in a new layer; ``span`` is the range where the shot authors none.
+    """Copy the metadata of a shot to a new layer; ``span`` is the time range if the shot authors none.
 
-    Time codes per second are always authored: a layer without them counts as 24 and USD would rescale its samples.
+    Time codes per second are always authored: a layer without authored rate counts as 24 and USD would rescale its
+    samples.
     """
     layer.timeCodesPerSecond = stage.GetTimeCodesPerSecond()
     layer.framesPerSecond = stage.GetFramesPerSecond()
@@ -59,12 +60,12 @@ def copy_stage_metadata(stage: Usd.Stage, layer: Sdf.Layer, *, span: tuple[float
 
 
 def author_record(layer: Sdf.Layer, record: Mapping[str, Any]) -> None:
-    """Write the record into ``customLayerData["physgraph"]``, once all else is written; None entries are left out."""
+    """Write the record into ``customLayerData["physgraph"]`` after all other contents; None entries are left out."""
     layer.customLayerData = {RECORD: _plain(dict(record) | {CONTENTS: _contents(layer)})}
 
 
 def _contents(layer: Sdf.Layer) -> str:
-    """Digest of what a layer has opinions on and at which times, without the values; of its other layer data too."""
+    """Digest of a layer's specs and sample times, without values; includes the other layer data."""
     digest = hashlib.sha256()
     others = sorted(set(layer.customLayerData) - {RECORD})
     digest.update(repr((str(layer.subLayerPaths), others)).encode())
@@ -83,7 +84,7 @@ def _contents(layer: Sdf.Layer) -> str:
 
 
 def is_only_ours(layer: Sdf.Layer) -> bool:
-    """Whether a layer with our record holds what we wrote into it and nothing else, such as a shot stitched to it."""
+    """Whether a layer with our record is unmodified, and for example has no shot stitched in."""
     record = read_record(layer)
     try:
         return record is not None and record.get(CONTENTS) == _contents(layer)
@@ -92,9 +93,9 @@ def is_only_ours(layer: Sdf.Layer) -> bool:
 
 
 def read_record(layer: Sdf.Layer) -> dict[str, Any] | None:
-    """The record of a layer that says it is ours, or None; a damaged file has none.
+    """The record of a refined layer, or None; a damaged file has no record.
 
-    Anybody can write one: entries that are read and are of another type than ours are left out.
+    Anyone may write a record: known entries of an unexpected type are left out.
     """
     try:
         record = layer.customLayerData.get(RECORD)
@@ -106,7 +107,7 @@ def read_record(layer: Sdf.Layer) -> dict[str, Any] | None:
 
 
 def is_result_of(path: Path, record: Mapping[str, Any], *, settled: bool = False) -> bool:
-    """Whether a file is a layer with these entries in its record and every frame, settled ones if asked for."""
+    """Whether a file is a complete layer with the given record entries, and with settled frames if asked for."""
     expected = Sdf.Layer.CreateAnonymous()
     expected.customLayerData = {RECORD: _plain(record)}
     try:
@@ -119,21 +120,21 @@ def is_result_of(path: Path, record: Mapping[str, Any], *, settled: bool = False
 
 
 def recorded_shot(layer: Sdf.Layer) -> str | None:
-    """The shot that a layer's record names, seen from where the layer is; None where it names none."""
+    """The shot named by a layer's record, relative to the layer's location; None if not named."""
     named = (read_record(layer) or {}).get("shot")
     return layer.ComputeAbsolutePath(str(named)) if named else None
 
 
 def refined_layers(stage: Usd.Stage) -> list[Sdf.Layer]:
-    """Layers of a stage that hold refined garments: mute them to find the coarse shot below."""
+    """Layers of a stage with refined garments; muting the layers shows the coarse shot below."""
     found = (layer for layer in stage.GetUsedLayers() if (read_record(layer) or {}).get("garments"))
     return sorted(found, key=lambda layer: layer.identifier)
 
 
 def mute_refined(stage: Usd.Stage) -> list[str]:
-    """Hide every layer of refined garments on this stage alone, so that what artists changed above them counts.
+    """Mute every layer of refined garments on this stage only, so artists' changes above such layers count.
 
-    One that holds other things as well, or is the root, stays. Returns the identifiers of the layers hidden.
+    Layers with additional contents, and the root layer, are not muted. Returns the identifiers of the muted layers.
     """
     found = (layer for layer in refined_layers(stage) if layer != stage.GetRootLayer())
     identifiers = [layer.identifier for layer in found if is_only_ours(layer)]
@@ -143,7 +144,7 @@ def mute_refined(stage: Usd.Stage) -> list[str]:
 
 
 def refuse_refined(stage: Usd.Stage, paths: Iterable[Sdf.Path] = ()) -> None:
-    """Refuse (StageError) a root that is a refined layer, and garments refined in a layer with other things."""
+    """Refuse (StageError) a refined layer as root, and garments refined in a layer with additional contents."""
     for layer in refined_layers(stage):
         record, name = read_record(layer) or {}, Path(layer.identifier).name
         instead = f"refine the shot that it was made from, {record.get('shot') or 'which was in memory'}"
@@ -157,9 +158,9 @@ def refuse_refined(stage: Usd.Stage, paths: Iterable[Sdf.Path] = ()) -> None:
 
 
 def selections(prims: Iterable[Usd.Prim]) -> tuple[str, ...]:
-    """Variant selections in force on prims, above them and on their materials, sorted.
+    """Active variant selections on prims, their ancestors and their materials, sorted.
 
-    They are paths such as ``/World/coat{fit=loose}``; a set with nothing selected has an empty selection.
+    Each is a path such as ``/World/coat{fit=loose}``; a variant set without selection has an empty selection.
     """
     found = set()
     for prim in prims:
@@ -171,9 +172,9 @@ def selections(prims: Iterable[Usd.Prim]) -> tuple[str, ...]:
 
 
 def unsaved_layers(stage: Usd.Stage) -> tuple[str, ...]:
-    """Names of a stage's layers whose content is in no file: edited and not saved, or in memory alone.
+    """Names of a stage's layers with unsaved content: edited, or in memory only.
 
-    A layer in memory that holds no prims, such as an empty session, is none of them, unless it is the root.
+    An in-memory layer without prims, such as an empty session layer, is not listed unless the layer is the root.
     """
     dirty = [layer for layer in stage.GetUsedLayers() if layer.dirty]
     dirty = [layer for layer in dirty if layer.rootPrims or not layer.anonymous or layer == stage.GetRootLayer()]
@@ -181,7 +182,7 @@ def unsaved_layers(stage: Usd.Stage) -> tuple[str, ...]:
 
 
 def file_hashes(stage: Usd.Stage, folder: Path | None, *, absolute: bool = False) -> dict[str, str]:
-    """SHA-256 of every layer that a stage is composed from, value clips included, by `asset_path` from a folder."""
+    """SHA-256 of every layer composed by a stage, including value clips, by `asset_path` from a folder."""
     files = {Path(layer.realPath) for layer in stage.GetUsedLayers() if layer.realPath}
     for prim in Usd.PrimRange.Stage(stage, TRAVERSAL):
         if prim.HasAuthoredMetadata("clips"):
@@ -198,7 +199,7 @@ def file_hashes(stage: Usd.Stage, folder: Path | None, *, absolute: bool = False
 
 
 def asset_path(path: str | Path, folder: Path | None, *, absolute: bool = False) -> str:
-    """A path as seen from a folder, as USD writes it; absolute on request and where there is no relative one."""
+    """A path relative to a folder, in USD notation; absolute on request or if no relative path exists."""
     full = Path(path).resolve()
     if absolute or folder is None:
         return full.as_posix()
@@ -210,7 +211,7 @@ def asset_path(path: str | Path, folder: Path | None, *, absolute: bool = False)
 
 
 def _plain(value: Any) -> Any:
-    """Bring a record to types that layer metadata holds; an array is one of points, shape (V, 3), float32."""
+    """Convert a record to types valid in layer metadata; an array holds points, shape (V, 3), float32."""
     if isinstance(value, Mapping):
         return {str(key): _plain(item) for key, item in sorted(value.items(), key=str) if item is not None}
     if isinstance(value, np.ndarray):
@@ -223,7 +224,7 @@ def _plain(value: Any) -> Any:
 
 
 def _plain_list(items: list[Any]) -> Any:
-    """Bring a list to the narrowest array that holds it."""
+    """Convert a list to the narrowest suitable array type."""
     if items and all(isinstance(item, int) and not isinstance(item, bool) for item in items):
         return Vt.IntArray(items)
     if items and all(isinstance(item, int | float) and not isinstance(item, bool) for item in items):
@@ -232,10 +233,10 @@ def _plain_list(items: list[Any]) -> Any:
 
 
 def write_root(path: Path, *, layer: Path, shot: Path, absolute: bool = False, overwrite: bool = False) -> Path:
-    """Write a small root layer that shows a refined layer over its shot, and return its path.
+    """Write a small root layer with a refined layer over its shot, and return the root's path.
 
-    It repeats the shot's stage metadata, expression variables included: those are read from a root layer alone. It
-    names both files from its own folder, or by absolute paths.
+    The root copies the shot's stage metadata, including expression variables: USD reads these from a root layer only.
+    Both files are named relative to the root's folder, or by absolute paths.
 
     Raises:
         UsageError: The root exists and may not be replaced.

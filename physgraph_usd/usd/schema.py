@@ -1,8 +1,8 @@
-"""The codeless schemas: one table of every attribute, and the folder of their files.
+"""The codeless schemas: a table of all attributes, and the folder of the schema files.
 
-Everything reads attributes by the names in this table, so it also works where the schemas are not registered.
-``schemas/physgraph_usd_schemas/`` is written from it by ``python -m physgraph_usd.usd.schema_files``. pxr is imported
-only to register.
+All code reads attributes by the names in this table, and works without registered schemas.
+``python -m physgraph_usd.usd.schema_files`` writes ``schemas/physgraph_usd_schemas/`` from the table. pxr is imported
+for registration only.
 """
 
 from __future__ import annotations
@@ -21,23 +21,23 @@ MATERIAL_API = "PhysGraphMaterialAPI"
 NAMESPACE = "physgraph:"
 MATERIAL = "physgraph:material:"
 AUTO_LEVEL = -1
-"""Level that asks for as many subdivisions as the fabric's buckling wavelength needs."""
+"""Level value for automatic choice: as many subdivisions as the fabric's buckling wavelength needs."""
 
 SI = " SI, whatever the stage's metersPerUnit."
-"""End of the doc of every property that has a unit."""
+"""End of the doc of every property with a unit."""
 REFINEMENT, FABRIC, REST = "Refinement", "Fabric", "Rest Shape"
 CONTACT, PAINTED, COLLISION = "Contact", "Painted Maps", "Collider"
 """Display groups."""
 SIDES = ("auto", "winding", "start", "front", "back")
 """Rules for the side of a mesh on which cloth belongs.
 
-"auto": outside of pieces that are closed. An open mesh is on "winding" where it has pieces with an inside and most of
-the cloth is outside of them, on "front" or "back" where it is a floor or a wall with the cloth on that side; else cloth
-belongs where the coarse cloth around a vertex is.
-"winding": outside of pieces that are closed or have openings of at most half their own area, by the generalised
-winding number; of the others the side on which the coarse cloth is.
-"start": the side on which the coarse cloth is, of every piece, closed or not.
-"front", "back": that side of the authored faces of open pieces; outside of closed ones.
+"auto": outside of closed pieces. For an open mesh: "winding" if some pieces have an inside and most of the cloth is
+outside; "front" or "back" for a floor or a wall with the cloth on one side; else the side of the coarse cloth around
+each vertex.
+"winding": outside of pieces closed or with openings of at most half their own area, by the generalised winding number;
+for other pieces the side of the coarse cloth.
+"start": the side of the coarse cloth, for every piece, closed or not.
+"front", "back": the named side of the authored faces of open pieces; outside of closed pieces.
 """
 AXES = ("X", "Y", "Z", "-X", "-Y", "-Z")
 """Directions along the stage's axes."""
@@ -49,24 +49,23 @@ class Property:
     """One property of a schema.
 
     Attributes:
-        schema: API schema that has it.
+        schema: API schema of the property.
         name: Full attribute name.
         type: Sdf type name; "rel" is a relationship.
-        fallback: Value that refining takes where nothing gives one; None when that means something else, see
-            ``doc``. The schema files have none: an ancestor, a material or ``--set`` may give the value.
-        unit: SI unit, "" when it has none.
-        minimum: Least value allowed, or None; of a primvar, of each of its values.
-        maximum: Greatest value allowed, or None. A sheet of steel is inside those of the fabric; beyond them energies
-            leave the range of numbers. The stiffest preset is some hundred times the softest; paint may go a hundred
-            times farther.
-        doc: Its meaning, for the schema's documentation.
+        fallback: Value used when none is given; None for a special meaning, see ``doc``. The schema files have no
+            fallbacks: an ancestor, a material or ``--set`` may give the value.
+        unit: SI unit, or "".
+        minimum: Least allowed value, or None; for a primvar, of each element.
+        maximum: Greatest allowed value, or None. Limits of fabrics include a sheet of steel; beyond the limits energies
+            overflow. The stiffest preset is some hundred times the softest; paint may go a hundred times farther.
+        doc: Meaning, for the schema's documentation.
         label: Display name.
         group: Display group.
-        soft: Ends of the range in which artists work, for sliders; None for what is no number. A value beyond them is
-            taken, with a warning.
-        uniform: Whether it cannot be animated.
-        interpolation: Of a primvar, else "".
-        tokens: Words that a token may be.
+        soft: Usual range for artists, for sliders; None for non-numeric properties. A value outside is accepted with a
+            warning.
+        uniform: Whether the property cannot be animated.
+        interpolation: Interpolation of a primvar, else "".
+        tokens: Allowed words of a token.
     """
 
     schema: str
@@ -119,11 +118,11 @@ _FABRIC_ROWS = (
     ("density", "Density", _JERSEY.density, "kg/m^2", (1e-4, 1e5), (0.01, 2.0), "Mass per area."),
     ("thickness", "Thickness", _JERSEY.thickness, "m", (1e-6, 1.0), (1e-4, 1e-2), "Thickness of the cloth."),
 )  # fmt: skip
-"""Fabric values in the order in which they are documented: name, label, fallback, unit, limits, soft limits, doc."""
+"""Fabric values in documentation order: name, label, fallback, unit, limits, soft limits, doc."""
 
 
 def _material(schema: str, fallbacks: bool) -> tuple[Property, ...]:
-    """Rows of the fabric values; what a material leaves out is the garment's to take from elsewhere."""
+    """Rows of the fabric values; values missing in a material are looked up elsewhere for the garment."""
     limit = Property(
         schema, MATERIAL + "stretchLimit", "float", None, "%", 0.0, 1000.0,
         "Strain along warp or weft from which the cloth is twenty times as stiff; without one it never is.",
@@ -148,7 +147,7 @@ def _material(schema: str, fallbacks: bool) -> tuple[Property, ...]:
 
 
 def _ease(way: str) -> Property:
-    """Row of the length that cloth has along warp or weft and its rest shape does not show."""
+    """Row of the length of cloth along warp or weft in excess of the rest shape."""
     doc = f"Length along the {way} that the cloth has and the rest shape does not show; folds come from it."
     return Property(
         GARMENT_API, f"physgraph:rest:{way}Ease", "float", 0.0, "%", -50.0, 100.0, doc,
@@ -157,7 +156,7 @@ def _ease(way: str) -> Property:
 
 
 def _scale(name: str, label: str, fallback: float, *, most: float, soft: float, doc: str) -> Property:
-    """Row of a painted map, whose values artists choose from 0 to ``soft``."""
+    """Row of a painted map; artists choose values from 0 to ``soft``."""
     full = f"primvars:{NAMESPACE}{name}"
     return Property(
         GARMENT_API, full, "float[]", fallback, "", 0.0, most, doc, label, PAINTED, (0.0, soft), interpolation="vertex"
@@ -273,7 +272,7 @@ PROPERTIES: tuple[Property, ...] = (
     ),
     *_material(MATERIAL_API, fallbacks=False),
 )  # fmt: skip
-"""Every property of the three schemas, in the order in which they are documented."""
+"""All properties of the three schemas, in documentation order."""
 
 GARMENT: dict[str, Property] = {row.short: row for row in PROPERTIES if row.schema == GARMENT_API}
 """Rows of the garment schema by short name."""
@@ -282,12 +281,12 @@ COLLIDER: dict[str, Property] = {row.short: row for row in PROPERTIES if row.sch
 
 
 def fabric_values(fabric: Fabric) -> dict[str, float]:
-    """Values of a fabric by the schema's short names, without those that it has not."""
+    """Values of a fabric by the schema's short names, without unset values."""
     return {name: value for name, value in every_fabric_value(fabric).items() if value is not None}
 
 
 def every_fabric_value(fabric: Fabric) -> dict[str, float | None]:
-    """Values of a fabric by the schema's short names, None for those that it has not."""
+    """Values of a fabric by the schema's short names, None for unset values."""
     return {
         "stretchStiffness": fabric.stretch,
         "weftStretchStiffness": fabric.weft_stretch,
@@ -307,13 +306,13 @@ def find_property(text: str) -> Property:
     """Find a garment's or collider's property by full name, without ``physgraph:`` and ``material:``, or by last word.
 
     Raises:
-        UsageError: When there is none, or a word may mean several; the message lists the names.
+        UsageError: When the name is unknown or ambiguous; the message lists the names.
     """
     rows = GARMENT | COLLIDER
     for row in rows.values():
         if text in {row.name, row.name.removeprefix(NAMESPACE), row.short}:
             return row
-    # "stiffness" is the last word of the guide's alone, but a fabric has three of them.
+    # "stiffness" is the last word of the guide's only, but a fabric has three stiffnesses.
     meant = [row for row in rows.values() if row.short.lower().endswith(text.lower())]
     if len(meant) == 1 and meant[0].name.rsplit(":", 1)[-1] == text:
         return meant[0]
@@ -325,20 +324,20 @@ def find_property(text: str) -> Property:
 
 
 def nearest_property(text: str, rows: Iterable[Property]) -> Property | None:
-    """The property whose short name is spelt most like a text's; None when none is like it."""
+    """The property with the short name spelt most like a text; None without a similar name."""
     by_name = {row.short: row for row in rows}
     return next((by_name[name] for name in get_close_matches(_short(text), by_name, n=1)), None)
 
 
 def schema_path() -> Path:
-    """Folder that holds plugInfo.json, for PXR_PLUGINPATH_NAME: in the installed package or beside it in a checkout."""
+    """Folder of plugInfo.json, for PXR_PLUGINPATH_NAME: in the installed package or next to it in a checkout."""
     package = Path(__file__).resolve().parents[1]
     inside = package / "schemas"
     return inside if (inside / "plugInfo.json").exists() else package.parent / "schemas" / "physgraph_usd_schemas"
 
 
 def register() -> None:
-    """Make USD know the schemas; has no effect once any typed prim definition was read, or when they are known."""
+    """Register the schemas with USD; no effect if already known, or once any typed prim definition was read."""
     from pxr import Plug  # noqa: PLC0415  the table must be readable where pxr is missing
 
     registry = Plug.Registry()

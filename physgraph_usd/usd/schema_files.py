@@ -14,7 +14,7 @@ from pathlib import Path
 from .schema import COLLIDER_API, GARMENT_API, MATERIAL, MATERIAL_API, PROPERTIES, SI, Property, schema_path
 
 APPLIES_TO = {GARMENT_API: ["Mesh"], COLLIDER_API: ["Mesh", "Gprim"], MATERIAL_API: ["Material"]}
-"""Prim types that each schema can be applied to."""
+"""Prim types allowed for each schema."""
 DOCS = {
     GARMENT_API: "A coarse animated garment that physgraph-usd refines. Values are SI, whatever the stage's units.",
     COLLIDER_API: "A prim that garments collide with. Values are SI, whatever the stage's units.",
@@ -49,7 +49,7 @@ def _otherwise(row: Property) -> str:
 
 
 def _limits(row: Property) -> str:
-    """The values allowed, and those that artists work with, in usda."""
+    """Allowed values and usual values, in usda."""
     if row.tokens:
         return f"        allowedTokens = [{', '.join(_number(row, token) for token in row.tokens)}]\n"
     hard = _range(row, "hard", row.minimum, row.maximum)
@@ -58,7 +58,7 @@ def _limits(row: Property) -> str:
 
 
 def _range(row: Property, name: str, low: float | None, high: float | None) -> str:
-    """One dictionary of limits in usda; of an array they are arrays of one value each, as its type is."""
+    """One dictionary of limits in usda; for an array property each limit is an array with a single element."""
     ends = {key: _number(row, value) for key, value in (("minimum", low), ("maximum", high)) if value is not None}
     lines = [
         f"                {row.type} {key} = {f'[{end}]' if row.interpolation else end}\n" for key, end in ends.items()
@@ -67,7 +67,7 @@ def _range(row: Property, name: str, low: float | None, high: float | None) -> s
 
 
 def _property(row: Property) -> str:
-    """One property in usda, without a fallback: an editor would show it although something else gives the value."""
+    """One property in usda, without a fallback: an editor would show it although the value comes from elsewhere."""
     otherwise = f" Where nothing gives it: {_otherwise(row)}." if _otherwise(row) else ""
     doc = f'        doc = "{row.doc}{f" [{row.unit}]" if row.unit else ""}{otherwise}"\n'
     shown = f'        displayGroup = "{row.group}"\n        displayName = "{row.label}"\n'
@@ -112,7 +112,7 @@ def schema_files() -> dict[str, str]:
 
 
 def attribute_table() -> str:
-    """Every property of the schemas as the table of docs/attributes.md."""
+    """All properties of the schemas as the table of docs/attributes.md."""
     lines = [
         "| attribute | display name | type | where nothing gives it | unit, limits | soft limits | |",
         "|---" * 7 + "|",
@@ -134,7 +134,7 @@ def _table_row(row: Property) -> str:
 
 
 def _ends(row: Property, low: float | None, high: float | None) -> str:
-    """A range in words, "" when it has no end."""
+    """A range in words, "" for an unbounded range."""
     ends = ["" if value is None else _number(row, value) for value in (low, high)]
     return " .. ".join(ends).strip() if any(ends) else ""
 
@@ -143,7 +143,7 @@ def main(folder: Path | None = None) -> None:
     """Write the files.
 
     Args:
-        folder: Where to write; where `schema_path` finds them when None.
+        folder: Target folder; `schema_path` if None.
     """
     for name, text in schema_files().items():
         ((folder or schema_path()) / name).write_text(text, encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Opening a stage: what is wrong with it, its units, axes and gravity."""
+"""Opens a stage: composition problems, units, axes and gravity."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ if TYPE_CHECKING:
     from ..solver.mesh.weld import Weld
 
 _PARSER_RULE = re.compile(r"parse error matching \S.*?(?= at '| at line|$)")
-"""The name of a rule of USD's own parser, which tells a user nothing."""
+"""The name of a rule of USD's own parser, of no use to a user."""
 USD_ERRORS: tuple[type[Exception], ...] = (Tf.ErrorException, *filter(None, [getattr(Tf, "CppException", None)]))
-"""Exceptions of pxr; it has the second, for files that end too early, since 24.11."""
+"""Exceptions of pxr; the second exists since USD 24.11, for truncated files."""
 MOST_REASONS, LONGEST_REASON = 4, 300
 _WARNED = re.compile(r"(?:In <([^>]*)>: )?(.*(?:sublayer|asset|ycle|prim).*)")
 UP_AXIS = "upAxis of the stage"
 """Default source of gravity's direction."""
 STANDARD_GRAVITY = 9.81
-"""Magnitude of gravity when no physics scene gives one [m/s^2]."""
+"""Magnitude of gravity without a physics scene's [m/s^2]."""
 MOST_GRAVITY = 1e5
-"""Gravity beyond which a magnitude is a mistake [m/s^2]."""
+"""Largest plausible magnitude of gravity [m/s^2]."""
 FALLBACK_METRES_PER_UNIT = 0.01
 """USD's meaning of an unauthored metersPerUnit [m]."""
 _HUGE = 1e15
-"""Sizes and rates of a stage are less than this, and more than its inverse: single precision holds what they scale."""
+"""Upper limit of sizes and rates of a stage, and inverse of the lower limit: scaled values fit in single precision."""
 _RATE = "rate; author one above 0, such as 24"
 _TIME = "time code; author one or remove it"
 _NUMBERS = {
@@ -45,19 +45,19 @@ _NUMBERS = {
     "startTimeCode": (_TIME, False),
     "endTimeCode": (_TIME, False),
 }
-"""Stage metadata that are numbers: what each is and what to author, and whether it must be above zero."""
+"""Numeric stage metadata: kind, advice for authoring, and whether the number must be above zero."""
 TRAVERSAL = Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate)
-"""Active, loaded, defined prims, those inside instances included."""
+"""Active, loaded, defined prims, including prims inside instances."""
 
 
 @dataclass(frozen=True)
 class Notice:
-    """A warning for the user about something that did not stop the work.
+    """A warning for the user about an issue that did not stop the work.
 
     Attributes:
         path: Prim path, or "" for the stage.
-        time: Time code, or None when it holds at all times.
-        message: The finding, and what was done about it.
+        time: Time code, or None for all times.
+        message: The finding, and the remedy applied.
     """
 
     path: str
@@ -70,26 +70,26 @@ class Notice:
 
 
 def at_time(time: float | None) -> str:
-    """The end of a place in messages: " at time code 3", or "" for None."""
+    """Suffix of a place in messages: " at time code 3", or "" for None."""
     return "" if time is None else f" at time code {time:g}"
 
 
 def timecode(time: float | None) -> Usd.TimeCode:
-    """USD's time code for ours; None is the default value."""
+    """USD's time code for a number; None is the default value."""
     return Usd.TimeCode.Default() if time is None else Usd.TimeCode(time)
 
 
 def value_at(attribute: Usd.Attribute, time: float | None) -> Any:
-    """An attribute's value at a time code, None where it is blocked.
+    """An attribute's value at a time code, None if blocked.
 
-    At the default, at which a shot is read whose garments have no samples, it may be the first sample.
+    At the default time, used for shots whose garments have no samples, the value may be the first sample.
     """
     value = attribute.Get(timecode(time))
     return first_value(attribute) if value is None and time is None else value
 
 
 def first_value(attribute: Usd.Attribute) -> Any:
-    """An attribute's first sample that is neither blocked nor empty, or its default where it has no samples."""
+    """An attribute's first sample neither blocked nor empty, or the default without samples."""
     first = attribute.Get(Usd.TimeCode.EarliestTime())
     others = attribute.GetTimeSamples()[1:] if first is None or np.size(first) == 0 else ()
     later = (attribute.Get(time) for time in others)
@@ -102,19 +102,19 @@ class GarmentSource:
 
     Attributes:
         path: Prim path.
-        kept_faces: Authored faces that the garment keeps (no holes, three corners or more), order kept, int32.
+        kept_faces: Authored faces kept by the garment (no holes, three corners or more), order kept, int32.
         skinned: Whether the points came from baking UsdSkel skinning.
-        instance_roots: Prims that must become ``instanceable = false`` in the output.
-        times: The garment's own authored times in range; empty for a still one.
-        sources: Where each value comes from, by its short name.
+        instance_roots: Prims to author as ``instanceable = false`` in the output.
+        times: The garment's own authored times in range; empty for a still garment.
+        sources: Source of each value, by short name.
         animated: Short names of the values whose source has time samples.
-        apart_from: Colliders and garments that it is kept apart from, by path, and what excludes each.
-        left_out: Its own authored times outside the range, where the layer holds it still.
-        velocities: Whether the shot has velocities for it.
-        absent: Its own authored times in range at which it has no shape, ascending; the layer has blocks there.
-        subsets: Faces of the cage in each GeomSubset, by its name.
-        weld: The mesh as authored and as the solver has it, without holes.
-        words: Words in the names of the prim, the prim above it, its materials, and subsets that cover most of it.
+        apart_from: Colliders and garments excluded from contact, by path, with the excluding target.
+        left_out: Authored times outside the range; the layer holds the garment still there.
+        velocities: Whether the shot has velocities for the garment.
+        absent: Authored times in range at which the garment has no shape, ascending; blocked in the layer.
+        subsets: Faces of the cage in each GeomSubset, by name.
+        weld: The mesh as authored and as solved, without holes.
+        words: Words in the names of the prim, its parent, its materials, and subsets covering most of the mesh.
     """
 
     path: Sdf.Path
@@ -134,7 +134,7 @@ class GarmentSource:
 
     @property
     def left_out_words(self) -> str:
-        """Number and place of its samples outside the range; "" when there are none."""
+        """Number and range of samples outside the frame range; "" without any."""
         before, after = ([f"{t:g}" for t in self.left_out if (t < self.times[0]) == early] for early in (True, False))
         spans = " and ".join(" to ".join(dict.fromkeys([span[0], span[-1]])) for span in (before, after) if span)
         return f"{len(self.left_out)} of {len(self.left_out) + len(self.times)} samples, {spans}" if spans else ""
@@ -142,17 +142,17 @@ class GarmentSource:
 
 @contextlib.contextmanager
 def pxr_errors(what: str, kind: type[PhysGraphError] = StageError) -> Iterator[None]:
-    """Turn an error that USD raises into ours of a kind: ``what`` was being done, and the first reasons of USD."""
+    """Convert a USD error to ``kind``; the message is ``what``, the failed action, and USD's first reasons."""
     try:
         yield
     except USD_ERRORS as error:
         raise kind(f"{what}: {reason_of(error)}") from error
-    except UnicodeDecodeError as error:  # a damaged crate hands out names that are no text
+    except UnicodeDecodeError as error:  # Names in a damaged crate file are not valid text.
         raise kind(f"{what}: a name in the file is no text; the file is damaged") from error
 
 
 def reason_of(error: Exception) -> str:
-    """Give the first reasons inside a USD error, without its C++ places and calls."""
+    """The first reasons inside a USD error, without C++ locations and calls."""
     try:
         text = str(error)
     except UnicodeDecodeError:
@@ -165,13 +165,13 @@ def reason_of(error: Exception) -> str:
 
 
 def in_brief(value: object) -> str:
-    """A text of USD's or a value on one line of bounded length, without the names of USD's parser."""
+    """A USD message or a value on one line of bounded length, without USD's parser rules."""
     text = _PARSER_RULE.sub("parse error", " ".join(str(value).split()))
     return text if len(text) <= LONGEST_REASON else f"{text[:LONGEST_REASON]} ..."
 
 
 def root_metadata(stage: Usd.Stage, key: str) -> object | None:
-    """Read stage metadata as authored, whatever its type; None when unauthored."""
+    """Stage metadata as authored, of any type; None when unauthored."""
     for layer in (stage.GetSessionLayer(), stage.GetRootLayer()):
         if layer is not None and layer.pseudoRoot.HasInfo(key):
             return layer.pseudoRoot.GetInfo(key)
@@ -179,7 +179,7 @@ def root_metadata(stage: Usd.Stage, key: str) -> object | None:
 
 
 def check_metadata(stage: Usd.Stage) -> None:
-    """Refuse (StageError) units, rates and a range that are no numbers of their kind: the layer repeats them."""
+    """Refuse (StageError) invalid units, rates and time range, because the refined layer copies the metadata."""
     for key, (what, positive) in _NUMBERS.items():
         value = root_metadata(stage, key)
         number = float(value) if isinstance(value, int | float) else math.nan
@@ -190,7 +190,7 @@ def check_metadata(stage: Usd.Stage) -> None:
 
 
 def bad_rate(stage: Usd.Stage) -> str:
-    """The fault in the time codes per second of a stage's layers, on which USD may never return, or ""."""
+    """An invalid timeCodesPerSecond among a stage's layers, or ""; USD may loop for ever on such a rate."""
     for layer in sorted(stage.GetUsedLayers(), key=lambda layer: layer.anonymous):
         if not 1.0 / _HUGE < layer.timeCodesPerSecond < _HUGE:
             name, rate = layer.GetDisplayName(), layer.timeCodesPerSecond
@@ -199,7 +199,7 @@ def bad_rate(stage: Usd.Stage) -> str:
 
 
 def metres_per_unit(stage: Usd.Stage) -> tuple[float, list[Notice]]:
-    """Length of one stage unit [m], and what is odd about it; never raises."""
+    """Length of one stage unit [m], and notices; never raises."""
     authored = root_metadata(stage, "metersPerUnit")
     if authored is None:
         return FALLBACK_METRES_PER_UNIT, [Notice("", None, "metersPerUnit is not authored; 0.01 (centimetres) assumed")]
@@ -217,9 +217,9 @@ class Units:
     Attributes:
         metres: Length of one stage unit [m].
         kilograms: Mass of one stage unit [kg].
-        up: Unit vector that points up, against gravity where there is any, shape (3,).
+        up: Upward unit vector, against gravity if present, shape (3,).
         gravity: Gravity [m/s^2], shape (3,).
-        gravity_source: Source of its direction, in words.
+        gravity_source: Source of gravity's direction, in words.
     """
 
     metres: float
@@ -229,14 +229,14 @@ class Units:
     gravity_source: str = UP_AXIS
 
     def pulled(self, axis: str, source: str) -> Units:
-        """The units with gravity as strong as here along an axis, one of `AXES`, that a source gives."""
+        """The units with gravity of equal strength along an axis, one of `AXES`, with the given source."""
         down = (-1.0 if axis.startswith("-") else 1.0) * np.eye(3)["XYZ".index(axis[-1])]
         strength = float(np.linalg.norm(self.gravity))
         return replace(self, up=-down, gravity=strength * down, gravity_source=source)
 
 
 def read_units(stage: Usd.Stage) -> tuple[Units, list[Notice]]:
-    """Units, up axis and gravity of a stage, and what is odd about them; never raises."""
+    """Units, up axis and gravity of a stage, and notices; never raises."""
     metres, notices = metres_per_unit(stage)
     mass = root_metadata(stage, "kilogramsPerUnit")
     kilograms = float(mass) if isinstance(mass, int | float) and math.isfinite(mass) and mass > 0 else 1.0
@@ -247,7 +247,7 @@ def read_units(stage: Usd.Stage) -> tuple[Units, list[Notice]]:
 
 
 def up_vector(stage: Usd.Stage) -> tuple[np.ndarray, list[Notice]]:
-    """Unit vector that points up, shape (3,), and what is odd about it; never raises."""
+    """Upward unit vector, shape (3,), and notices; never raises."""
     authored = root_metadata(stage, "upAxis") or UsdGeom.GetFallbackUpAxis()
     if authored in {"Y", "Z"}:
         return np.array([0.0, 0.0, 1.0] if authored == "Z" else [0.0, 1.0, 0.0]), []
@@ -260,7 +260,7 @@ def gravity(stage: Usd.Stage, up: np.ndarray, metres: float) -> tuple[np.ndarray
     UsdPhysics: a zero direction means down, a negative infinite magnitude means earth's; units are stage lengths.
 
     Returns:
-        Gravity [m/s^2], shape (3,), the source of its direction in words, and what is odd about it.
+        Gravity [m/s^2], shape (3,), the source of the direction in words, and notices.
     """
     direction, magnitude, source, notices = -up, STANDARD_GRAVITY, UP_AXIS, []
     scenes = (UsdPhysics.Scene(prim) for prim in Usd.PrimRange.Stage(stage, TRAVERSAL))
@@ -282,13 +282,13 @@ def gravity(stage: Usd.Stage, up: np.ndarray, metres: float) -> tuple[np.ndarray
 
 
 def list_meshes(stage: Usd.Stage) -> tuple[str, ...]:
-    """Paths of all meshes on the stage, those inside instances included."""
+    """Paths of all meshes on the stage, including meshes inside instances."""
     return tuple(str(prim.GetPath()) for prim in Usd.PrimRange.Stage(stage, TRAVERSAL) if UsdGeom.Mesh(prim))
 
 
 @contextlib.contextmanager
 def quiet() -> Iterator[UsdUtils.CoalescingDiagnosticDelegate]:
-    """Keep USD's own warnings off the terminal; what matters in them becomes notices."""
+    """Keep USD's own warnings off the terminal; relevant warnings become notices."""
     delegate = UsdUtils.CoalescingDiagnosticDelegate()
     try:
         yield delegate
@@ -297,12 +297,12 @@ def quiet() -> Iterator[UsdUtils.CoalescingDiagnosticDelegate]:
 
 
 def is_there(path: str | Path) -> bool:
-    """Whether the resolver of assets finds a file; layers in memory are there."""
+    """Whether the asset resolver finds a file; in-memory layers count as found."""
     return Sdf.Layer.IsAnonymousLayerIdentifier(str(path)) or bool(Ar.GetResolver().Resolve(str(path)))
 
 
 def check_there(path: str | Path) -> None:
-    """Refuse a file that is not there (AbsentError), and a pipe or a folder (StageError)."""
+    """Refuse a missing file (AbsentError), and a pipe or a folder (StageError)."""
     if not is_there(path):
         raise AbsentError(f"no such file: {path}")
     if not Sdf.Layer.IsAnonymousLayerIdentifier(str(path)):
@@ -312,13 +312,13 @@ def check_there(path: str | Path) -> None:
 
 
 def is_sound(layer: Sdf.Layer) -> bool:
-    """Whether a layer holds every prim that it lists. USD ends the process at a listed prim without a spec."""
+    """Whether a layer has a spec for every listed prim; USD crashes on a listed prim without a spec."""
     paths = paths_in(layer)
     return all(not path.isEmpty and (not path.IsPrimPath() or layer.GetPrimAtPath(path)) for path in paths)
 
 
 def paths_in(layer: Sdf.Layer) -> list[Sdf.Path]:
-    """Paths of everything that a layer has an opinion on."""
+    """Paths of all specs in a layer."""
     paths: list[Sdf.Path] = []
     layer.Traverse(Sdf.Path.absoluteRootPath, lambda path: paths.append(Sdf.Path(path)))
     return paths
@@ -328,8 +328,8 @@ def open_layer(path: str | Path, kind: type[PhysGraphError] = LayerError) -> Sdf
     """Open a layer.
 
     Raises:
-        AbsentError: It is not there.
-        PhysGraphError: Of that kind, when it cannot be read.
+        AbsentError: The file does not exist.
+        PhysGraphError: Of type ``kind``, when the layer cannot be read.
     """
     check_there(path)
     with pxr_errors(f"cannot read {path}", kind), quiet():
@@ -340,7 +340,7 @@ def open_layer(path: str | Path, kind: type[PhysGraphError] = LayerError) -> Sdf
 
 
 def shot_name(shot: str | Usd.Stage) -> str:
-    """A shot's file, or for a stage that has none the name of its root layer in memory."""
+    """A shot's file, or the name of the root layer for an in-memory stage."""
     if isinstance(shot, str):
         return shot
     root = shot.GetRootLayer()
@@ -348,16 +348,16 @@ def shot_name(shot: str | Usd.Stage) -> str:
 
 
 def open_stage(shot: str | Usd.Stage) -> tuple[Usd.Stage, list[Notice]]:
-    """Open a stage of our own, for reading.
+    """Open a separate stage, for reading.
 
     Args:
-        shot: The shot file, opened with all payloads; or an open stage, shown alike and not changed.
+        shot: The shot file, opened with all payloads; or an open stage, reproduced and not changed.
 
     Returns:
-        The stage, and a notice for each layer, reference or payload that is missing.
+        The stage, and a notice for each missing layer, reference or payload.
 
     Raises:
-        StageError: When the file or a layer that it needs cannot be read, or references run in a circle.
+        StageError: When the file or a required layer cannot be read, or references run in a circle.
     """
     path = shot_name(shot)
     if isinstance(shot, str):
@@ -372,7 +372,7 @@ def open_stage(shot: str | Usd.Stage) -> tuple[Usd.Stage, list[Notice]]:
         problems = composition_problems(stage, [item.commentary for item in diagnostics.TakeUncoalescedDiagnostics()])
         rates = {layer.GetDisplayName(): layer.timeCodesPerSecond for layer in stage.GetUsedLayers()}
     endless = [name for name, rate in rates.items() if not math.isfinite(rate)]
-    if endless:  # USD looks for samples without end.
+    if endless:  # USD would search for samples for ever.
         message = f"timeCodesPerSecond of @{endless[0]}@ is {rates[endless[0]]}; author the shot's rate, such as 24"
         raise StageError(f"cannot read {path}: {message}")
     broken = [notice.message for notice, missing in problems if not missing]
@@ -382,11 +382,11 @@ def open_stage(shot: str | Usd.Stage) -> tuple[Usd.Stage, list[Notice]]:
 
 
 def composition_problems(stage: Usd.Stage, warnings: Sequence[str]) -> list[tuple[Notice, bool]]:
-    """Arcs that USD could not follow, and whether a file or prim is just missing: no circle, no file that is damaged.
+    """Arcs not followed by USD, each with a flag: True for a missing file or prim, False for a circle or damage.
 
     Args:
         stage: The stage.
-        warnings: USD's diagnostics while it opened, read where USD is too old to list its composition errors.
+        warnings: USD's diagnostics during opening, used if USD is too old to list composition errors.
     """
     errors = getattr(stage, "GetCompositionErrors", None)
     if errors is None:
@@ -404,7 +404,7 @@ def composition_problems(stage: Usd.Stage, warnings: Sequence[str]) -> list[tupl
 
 
 def refuse_missing_arcs(prim: Usd.Prim, notices: Sequence[Notice]) -> None:
-    """Refuse a prim that a missing payload or reference, one of the notices of `open_stage`, would have changed."""
+    """Refuse a prim affected by a missing payload or reference; ``notices`` as returned by `open_stage`."""
     for notice in notices:
         if notice.path and prim.GetPath().HasPrefix(Sdf.Path(notice.path)):
             raise StageError(f"<{prim.GetPath()}> is incomplete: {notice.message}")

@@ -11,11 +11,11 @@ from pxr import Usd, UsdGeom
 from .lookup import with_ancestors
 
 SAME_TIME = 1e-6
-"""Time codes closer than this are one: layer offsets leave rounding behind."""
+"""Time codes closer than this count as equal: layer offsets leave rounding errors."""
 
 
 def transform_chain(prim: Usd.Prim) -> list[UsdGeom.Xformable]:
-    """Return the transforms that place a prim, nearest first, up to one that resets the stack."""
+    """The transforms placing a prim, nearest first, up to a reset of the transform stack."""
     chain = []
     for each in with_ancestors(prim):
         transform = UsdGeom.Xformable(each)
@@ -27,14 +27,14 @@ def transform_chain(prim: Usd.Prim) -> list[UsdGeom.Xformable]:
 
 
 def garment_times(prim: Usd.Prim) -> tuple[float, ...]:
-    """Every authored time code of the points and of the transforms that place the prim, ascending."""
+    """All authored time codes of the points and of the prim's transforms, ascending."""
     return merge([*UsdGeom.Mesh(prim).GetPointsAttr().GetTimeSamples(), *transform_times(prim)])
 
 
 def transform_times(prim: Usd.Prim) -> list[float]:
-    """Every authored time code of the transforms that place a prim, in no order.
+    """All authored time codes of a prim's transforms, unordered.
 
-    A transform that a spline animates has its knots and the whole time codes between them.
+    A transform animated by a spline contributes the knots and the whole time codes between the knots.
     """
     chain = transform_chain(prim)
     sampled = [time for transform in chain for time in transform.GetTimeSamples()]
@@ -52,7 +52,7 @@ def _spline_times(attribute: Usd.Attribute) -> list[float]:
 
 
 def merge(times: Iterable[float]) -> tuple[float, ...]:
-    """Sort time codes and drop those that repeat one earlier in the input up to rounding."""
+    """Sort time codes and drop near duplicates of earlier input entries."""
     merged: list[tuple[float, int]] = []
     for time, rank in sorted((time, rank) for rank, time in enumerate(times)):
         if merged and time - merged[-1][0] <= SAME_TIME:
@@ -63,13 +63,13 @@ def merge(times: Iterable[float]) -> tuple[float, ...]:
 
 
 def snap(times: Iterable[float], merged: Sequence[float]) -> tuple[float, ...]:
-    """Replace each time code by the one that ``merge`` kept for it."""
+    """Replace each time code by the nearest time code kept by ``merge``."""
     known = np.asarray(merged)
     return tuple(float(known[np.abs(known - time).argmin()]) for time in times)
 
 
 def within(times: Iterable[float], frames: tuple[float, float] | None) -> tuple[float, ...]:
-    """Time codes inside a closed range, up to rounding; all of them when there is none."""
+    """Time codes inside a closed range, up to rounding; all time codes without a range."""
     if frames is None:
         return tuple(times)
     return tuple(time for time in times if frames[0] - SAME_TIME <= time <= frames[1] + SAME_TIME)

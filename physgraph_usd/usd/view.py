@@ -1,4 +1,4 @@
-"""The view of an open stage, so that a second stage can show the same and be changed without touching the first."""
+"""Captures the view of an open stage, to open an equal second stage without changing the first."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ _NOT_FOR_ROOT = {"subLayers", "subLayerOffsets", "customLayerData", "documentati
 
 @dataclass(frozen=True, eq=False)
 class StageView:
-    """An open stage's layers as they are in memory, and how they are composed.
+    """An open stage's in-memory layers and composition settings.
 
     Attributes:
-        root: Root layer, the stage's own: edits that are not saved are in it and in the layers that it names.
+        root: The stage's own root layer; the root and its sublayers include unsaved edits.
         session: A copy of the session layer.
         muted: Identifiers of muted layers.
         load: Rules for loading payloads.
@@ -38,7 +38,7 @@ class StageView:
 
     @classmethod
     def of(cls, stage: Usd.Stage) -> StageView:
-        """Look at a stage; it is not changed."""
+        """Capture a stage without changing the stage."""
         return cls(
             stage.GetRootLayer(),
             _session_of(stage),
@@ -51,16 +51,16 @@ class StageView:
 
     @classmethod
     def of_layer(cls, root: Sdf.Layer) -> StageView:
-        """A shot as it is opened from its root layer."""
+        """The view of a shot freshly opened from its root layer."""
         nothing = Usd.Stage.OpenMasked(root, Usd.StagePopulationMask())
         return replace(cls.of(nothing), population=Usd.StagePopulationMask.All())
 
     def open(self, *, over: Sequence[Sdf.Layer] = (), mask: Usd.StagePopulationMask | None = None) -> Usd.Stage:
-        """Open a second stage that shows the same; sublayers of its session go over the first one's session.
+        """Open a second stage with equal contents; sublayers of its session go over the first stage's session.
 
         Args:
-            over: Layers to lay over everything, strongest first; keep them alive as long as the stage.
-            mask: Prims to compose; None for all that the first stage has.
+            over: Layers to lay over everything, strongest first; keep the layers alive as long as the stage.
+            mask: Prims to compose; None for all prims of the first stage.
         """
         session = root_over(self.session, [layer.identifier for layer in (*over, self.session)])
         population = self.population if mask is None else mask
@@ -72,20 +72,20 @@ class StageView:
 
 
 def _session_of(stage: Usd.Stage) -> Sdf.Layer:
-    """A copy of a stage's session layer, empty where it is muted; the files that it names are found from anywhere."""
+    """A copy of a stage's session layer, empty if muted, with absolute asset paths."""
     copy = Sdf.Layer.CreateAnonymous("session.usda")
     session = stage.GetSessionLayer()
     if session is not None and not stage.IsLayerMuted(session.identifier):
         copy.TransferContent(session)
         if not session.anonymous:
             UsdUtils.ModifyAssetPaths(copy, session.ComputeAbsolutePath)
-    # As a sublayer without its own rate it would have 24 time codes per second, and USD would rescale its samples.
+    # A sublayer without authored rate has 24 time codes per second, and USD would rescale its samples.
     copy.timeCodesPerSecond = stage.GetTimeCodesPerSecond()
     return copy
 
 
 def root_over(source: Sdf.Layer, below: list[str]) -> Sdf.Layer:
-    """Make an anonymous root layer with the stage metadata of a shot's root and the sublayers ``below``."""
+    """An anonymous root layer with the stage metadata of a shot's root and the sublayers ``below``."""
     root = Sdf.Layer.CreateAnonymous(".usda")
     for key in source.pseudoRoot.ListInfoKeys():
         if key not in _NOT_FOR_ROOT and "elocates" not in key:

@@ -1,1 +1,1 @@
-"""The page of a run: pictures, plots over time, what was modelled and why, warnings; one file that needs no network."""
+"""The page of a run: pictures, plots over time, modelled terms with reasons, and warnings, in a single offline file."""

@@ -1,4 +1,4 @@
-"""Pieces of a page: the document, tables, and the look that all of them share."""
+"""Parts of a page: the document, tables, and the shared style."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ def document(title: str, body: str, *, script: str = "") -> str:
     """A whole page.
 
     Args:
-        title: Its title, plain text.
+        title: Title, plain text.
         body: HTML.
-        script: JavaScript that runs when the page is there.
+        script: JavaScript run after loading.
     """
     head = f"<meta charset='utf-8'><title>{html.escape(title)}</title><link rel='icon' href='data:,'>"
     last = f"<script>{script}</script>" if script else ""
@@ -47,7 +47,7 @@ def table(name: str, head: Sequence[str], rows: Sequence[Sequence[str]], *, numb
         name: The element's id.
         head: Titles of the columns.
         rows: Cells.
-        numbers: Columns that are set to the right.
+        numbers: Columns aligned to the right.
     """
 
     def cells(values: Sequence[str], tag: str) -> str:

@@ -1,8 +1,7 @@
 """Draws triangle meshes on the CPU: a z-buffer, a soft key light and light from the whole sky.
 
-One kernel fills depth maps: the eye's, and one for each direction that light comes from. A vertex is lit from a
-direction if no surface lies before it in that direction's map. Light is interpolated between the vertices. No GPU and
-no display.
+One kernel fills depth maps, for the eye and for each direction of light. A vertex is lit from a direction if no surface
+occludes the vertex in the direction's map. Light is interpolated between the vertices. No GPU or display is needed.
 """
 
 # Warp reads a kernel's annotations itself; to a type checker they are calls, and vectors have no operators.
@@ -30,19 +29,19 @@ BACKGROUND = np.array([0.80, 0.80, 0.79])
 """Linear colour of the studio."""
 
 SKY_MAPS, SKY_SIZE = 12, 256
-"""Depth maps of the sky, each for a direction and its opposite, and their width [pixels]."""
+"""Depth maps of the sky, each for a pair of opposite directions, and the width of a map [pixels]."""
 
 KEY_MAPS, KEY_SIZE = 6, 512
-"""Depth maps of the key light, and their width [pixels]: its shadows have edges, those of the sky have none."""
+"""Depth maps of the key light, and the width of a map [pixels]: larger, because only key shadows have visible edges."""
 
 GROUND_CELLS, GROUND_BLUR = 84, 5
-"""Cells along a side of the ground's square grid, and cells that its light is averaged over."""
+"""Cells along a side of the ground's square grid, and width in cells of the blur of the ground's light."""
 
 FAR = wp.constant(wp.float32(1e30))
-"""Depth of nothing."""
+"""Depth of an empty pixel."""
 
 EDGE = wp.constant(wp.float32(1e-4))
-"""Part of a triangle by which it is drawn larger, against rounding: neighbours leave no pixel between them."""
+"""Relative enlargement of a drawn triangle, against rounding: no pixel gaps between neighbours."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +67,7 @@ class View:
         eye: Position, shape (3,).
         axes: Rows are right, up and backward, shape (3, 3).
         tangent: Half height of the picture at distance 1.
-        nearest: Distance under which nothing is drawn.
+        nearest: Near clipping distance.
     """
 
     eye: np.ndarray
@@ -79,7 +78,7 @@ class View:
     def project(self, points: np.ndarray, size: tuple[int, int]) -> np.ndarray:
         """Column and row [pixels] and minus the inverse distance, which is linear in the picture, shape (N, 3).
 
-        They are no numbers where a point is too near, or behind the eye.
+        NaN for a point too near or behind the eye.
         """
         seen = (points - self.eye) @ self.axes.T
         inverse = 1.0 / np.minimum(seen[:, 2], -self.nearest)
@@ -92,13 +91,13 @@ def fit_view(points: np.ndarray, aspect: float, *, azimuth: float = 25.0, elevat
     """Place a camera so that all points fit.
 
     Args:
-        points: Everything that must be seen, Y up, shape (N, 3).
+        points: Points to show, Y up, shape (N, 3).
         aspect: Width over height of the picture.
         azimuth: Camera's angle about Y from +Z towards +X [degrees].
         elevation: Camera's angle above the ground [degrees].
 
     Returns:
-        A long-lens view that looks at the middle of the points.
+        A long-lens view centred on the points.
     """
     a, e = np.radians([azimuth, elevation])
     back = np.array([np.cos(e) * np.sin(a), np.sin(e), np.cos(e) * np.cos(a)])
@@ -144,7 +143,7 @@ def draw(surfaces: Sequence[Surface | DrawnMesh], view: View, *, size: tuple[int
 
 
 def encode_color(color: tuple[float, float, float]) -> tuple[int, int, int]:
-    """Convert one linear colour to the 8-bit colour that ``draw`` shows for it."""
+    """Convert a linear colour to the 8-bit colour drawn by ``draw``."""
     red, green, blue = _encode(np.array(color))
     return int(red), int(green), int(blue)
 
@@ -171,7 +170,7 @@ def _ground(points: np.ndarray, floor: float | None) -> Surface:
 
 
 def _in_view(seen: np.ndarray, triangles: np.ndarray, picture: np.ndarray) -> np.ndarray:
-    """Numbers of the vertices of the triangles that the picture may show."""
+    """Numbers of the triangles' vertices possibly in the picture."""
     columns, rows = seen[:, 0][triangles.T], seen[:, 1][triangles.T]
     right, below = columns.min(axis=0) > picture.shape[1], rows.min(axis=0) > picture.shape[0]
     inside = (columns.max(axis=0) >= 0) & (rows.max(axis=0) >= 0) & ~right & ~below
@@ -179,7 +178,7 @@ def _in_view(seen: np.ndarray, triangles: np.ndarray, picture: np.ndarray) -> np
 
 
 def _shade(solid: Surface, ground: Surface, view: View, visible: np.ndarray) -> np.ndarray:
-    """Factors of the colour at each vertex of the surfaces and of the ground: all fronts, then all backs, (2 N, 3)."""
+    """Shading factors at each vertex of the surfaces and the ground: all fronts, then all backs, shape (2 N, 3)."""
     points, up = np.concatenate([solid.points, ground.points]), np.tile([0.0, 1.0, 0.0], (len(ground.points), 1))
     normals = np.concatenate([vertex_normals(solid), up])
     spots, facing, towards = np.tile(points, (2, 1)), np.concatenate([normals, -normals]), _unit(KEY) @ view.axes
@@ -201,9 +200,9 @@ def _shade(solid: Surface, ground: Surface, view: View, visible: np.ndarray) -> 
 def _light(
     solid: Surface, spots: np.ndarray, facing: np.ndarray, *, visible: np.ndarray, towards: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Parts of the sky's and of the key's light that reach spots with given normals, shape (N,).
+    """Fractions of sky light and of key light reaching spots with given normals, shape (N,).
 
-    The maps are as large as the visible points ask for; outside of them all is lit.
+    The maps cover the visible points; everything outside is lit.
     """
     light = np.zeros((len(spots), 3), np.float32)
     places, normals, found = (_vectors(each) for each in (spots, facing, light))
@@ -224,7 +223,7 @@ def _light(
 
 
 def _depths(rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
-    """Least and greatest depth in each pixel of a map with nothing in it."""
+    """Empty maps of least and greatest depth per pixel."""
     return np.full((rows, columns), FAR, np.float32), np.full((rows, columns), -FAR, np.float32)
 
 
@@ -235,14 +234,14 @@ def _rasterize(
     *,
     colored: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None,
 ) -> None:
-    """Draw triangles one after another, on one thread, so that pixels need no locks.
+    """Draw triangles sequentially on one thread, so pixels need no locks.
 
     Args:
         seen: Column, row and depth of each vertex, shape (V, 3).
         triangles: Corners, shape (T, 3).
         depths: Least and greatest depth in each pixel.
-        colored: Factor of the colour at each vertex, fronts before backs, shape (2 V, 3), colour of each triangle, and
-            the picture that the nearest triangles are drawn into.
+        colored: Shading factor at each vertex, fronts before backs, shape (2 V, 3), colour of each triangle, and the
+            picture to draw into.
     """
     shade, colors, picture = colored or (np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 0, 3), np.float32))
     corners = wp.array(np.ascontiguousarray(triangles, np.int32), dtype=wp.int32, device="cpu", copy=False)
@@ -270,13 +269,13 @@ def _draw_triangle(
     far: wp.array2d(dtype=wp.float32),
     picture: wp.array2d(dtype=wp.vec3),
 ):
-    """Draw one triangle into the depths, and into the picture unless that is empty."""
+    """Draw one triangle into the depths, and into the picture if not empty."""
     t = first + wp.tid()
     i, j, k = triangles[t, 0], triangles[t, 1], triangles[t, 2]
     a, b, c = seen[i], seen[j], seen[k]
     ab, ac = b - a, c - a
     area = ab[0] * ac[1] - ab[1] * ac[0]
-    if not wp.abs(area) > 0.0:  # A vertex behind the eye is no number.
+    if not wp.abs(area) > 0.0:  # A vertex behind the eye is NaN.
         return
     back = wp.where(area > 0.0, shade.shape[0] / 2, 0)  # Rows run downwards: fronts turn the other way.
     low, high = wp.min(wp.min(a, b), c), wp.max(wp.max(a, b), c)
@@ -291,7 +290,7 @@ def _draw_triangle(
         depth = a[2] + x * depth_column + y * depth_row
         for column in range(left, right):
             inside = wp.min(wp.min(v, w), 1.0 - v - w) >= -EDGE
-            if picture.shape[0] == 0:  # Without branches it takes half the time.
+            if picture.shape[0] == 0:  # Code without branches takes half the time.
                 near[row, column] = wp.min(near[row, column], wp.where(inside, depth, FAR))
                 far[row, column] = wp.max(far[row, column], wp.where(inside, depth, -FAR))
             elif inside and depth < near[row, column]:
@@ -316,7 +315,7 @@ def _add_light(
     far: wp.array2d(dtype=wp.float32),
     light: wp.array(dtype=wp.vec3),
 ):
-    """Add what reaches a spot, a pixel above its surface, from a map's direction, or from its opposite behind it."""
+    """Add light from a map's direction, or from the opposite direction, to a spot one pixel above its surface."""
     i = first + wp.tid()
     at = turn * (spots[i] + pixel * facing[i]) - shift
     incidence = wp.dot(facing[i], wp.vec3(turn[2, 0], turn[2, 1], turn[2, 2]))
@@ -357,7 +356,7 @@ def _disk(count: int) -> np.ndarray:
 
 
 def _hemisphere(count: int) -> np.ndarray:
-    """Evenly spread unit directions above the ground, one of each pair of opposites, shape (count, 3)."""
+    """Evenly spread unit directions above the ground, as representatives of opposite pairs, shape (count, 3)."""
     flat = _disk(count)
     height = 1.0 - (flat**2).sum(axis=1)
     return np.stack([flat[:, 0] * np.sqrt(1.0 + height), height, flat[:, 1] * np.sqrt(1.0 + height)], axis=1)

@@ -1,4 +1,4 @@
-"""Lines over time codes as inline SVG, a few kilobytes each; a script of a few lines reads values at the cursor."""
+"""Plots values over time codes as inline SVG, a few kilobytes each; a short script shows the values at the cursor."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ WIDTH, HEIGHT = 1120, 190
 LEFT, RIGHT, TOP, BOTTOM = 64, 12, 8, 24
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7a5195", "#8c6d31", "#6e6e6e")
 MARKED = 60
-"""Most samples that get a dot each."""
+"""Most samples drawn with a dot each."""
 
 SCRIPT = """
 for (const svg of document.querySelectorAll("svg.plot")) {
@@ -56,13 +56,13 @@ class Axis:
 
 
 def plot(name: str, title: str, times: Sequence[float], lines: Mapping[str, Sequence[float | None]]) -> str:
-    """A plot with its title and legend, or "" where there is nothing to draw.
+    """A plot with title and legend, or "" without data.
 
     Args:
         name: The element's id.
-        title: What is drawn, with its unit.
+        title: Plotted quantity, with unit.
         times: Time codes, ascending.
-        lines: For each line, a value at each time code, None where there is none.
+        lines: For each line, a value per time code, None if missing.
     """
     shown = {label: [_finite(value) for value in values] for label, values in lines.items()}
     shown = {label: values for label, values in shown.items() if any(value is not None for value in values)}
@@ -94,7 +94,7 @@ def _finite(value: float | None) -> float | None:
 
 
 def _ticks(low: float, high: float) -> list[float]:
-    """Round numbers from under the least value to over the greatest."""
+    """Round numbers from below the least value to above the greatest."""
     span = high - low or abs(high) or 1.0
     rough = span / 4.0
     power = 10.0 ** math.floor(math.log10(rough))
@@ -119,7 +119,7 @@ def _frame(ticks: Sequence[float], times: Sequence[float], across: Axis, up: Axi
 
 
 def _line(values: Sequence[float | None], times: Sequence[float], across: Axis, up: Axis, *, colour: str) -> str:
-    """One line, broken where values are missing."""
+    """One line, broken at missing values."""
     parts: list[list[str]] = [[]]
     for time, value in zip(times, values, strict=True):
         if value is None:
@@ -142,7 +142,7 @@ def _line(values: Sequence[float | None], times: Sequence[float], across: Axis, 
 
 
 def _legend(name: str, labels: Sequence[str]) -> str:
-    """Names of the lines, and room for their values at the cursor."""
+    """Names of the lines, and space for the values at the cursor."""
     spans = "".join(
         f"<span><i style='background:{COLOURS[i % len(COLOURS)]}'></i>{html.escape(label)} <b></b></span>"
         for i, label in enumerate(labels)

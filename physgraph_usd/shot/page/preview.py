@@ -1,4 +1,4 @@
-"""Draws a refined layer beside the shot it was made from: PNG stills and GIF loops, headless."""
+"""Draws a refined layer beside its input shot: PNG stills and GIF loops, headless."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ ELEVATIONS = (-30.0, 45.0)
 """Elevations of a close picture's camera [degrees]."""
 
 COMPRESSION = {"compress_level": 1}
-"""Of a PNG: the most that Pillow offers takes as long as drawing and saves a tenth."""
+"""Of a PNG: Pillow's strongest compression takes as long as drawing and saves a tenth."""
 
 INK, FAINT = (38, 40, 44), (112, 114, 118)
 """Colours of the labels."""
@@ -48,19 +48,19 @@ def preview(
     Args:
         layer: A refined layer, or a shot.
         out: Picture to write: ``.png`` draws one time, ``.gif`` a loop.
-        shot: The shot under the layer; found in the layer's own record when None.
-        times: Time codes to draw; the last sample for a PNG and all samples for a GIF when None.
+        shot: The shot under the layer; read from the layer's record if None.
+        times: Time codes to draw; if None, the last sample for a PNG and all samples for a GIF.
         size: Width and height [pixels].
-        camera: Azimuth and elevation [degrees]; `CAMERA` when None.
-        overwrite: Whether a picture that is there may be replaced.
+        camera: Azimuth and elevation [degrees]; `CAMERA` if None.
+        overwrite: Whether an existing picture may be replaced.
 
     Returns:
         The picture written.
 
     Raises:
         UsageError: When the suffix is unknown, a PNG is asked for several times, or the picture exists, is a link or is
-            one of the shot's.
-        LayerError: When nothing can be written there.
+            a file of the shot.
+        LayerError: When the picture cannot be written.
         StageError: When a stage cannot be opened or shows no mesh.
     """
     layer, out = Path(layer), Path(out)
@@ -92,13 +92,13 @@ def preview(
 
 
 class Pictures:
-    """A refined layer beside the shot it was made from, or a plain shot alone.
+    """A refined layer beside its input shot, or a plain shot alone.
 
-    Both sides are drawn in the same way; the input is subdivided smoothly into as many faces as the refined cloth has.
+    Both sides are drawn in the same way; the input is subdivided smoothly to the face count of the refined cloth.
 
     Attributes:
         times: Time codes with samples.
-        rate: Time codes a second.
+        rate: Time codes per second.
     """
 
     def __init__(
@@ -110,7 +110,7 @@ class Pictures:
             layer: A refined layer, or a plain shot.
             shot: The shot under the layer; None for a plain shot.
             size: Width and height of a picture [pixels].
-            codes: Time codes that may be drawn, for which skinned meshes are skinned; all when None.
+            codes: Time codes to skin skinned meshes for; all if None.
 
         Raises:
             StageError: A stage cannot be opened.
@@ -128,7 +128,7 @@ class Pictures:
             stage.bake(tuple(code for code in (codes or self.times) if code is not None))
 
     def draw(self, codes: Sequence[float | None], camera: tuple[float, float] = CAMERA) -> list[Image.Image]:
-        """Draw some time codes as one camera sees them.
+        """Draw some time codes with one camera.
 
         Raises:
             StageError: A stage shows no mesh.
@@ -144,7 +144,7 @@ class Pictures:
         return [self._compose(self._sides(code), code, view, floor) for code in codes]
 
     def draw_close(self, worst: Worst) -> Image.Image:
-        """Draw both sides about a place in refined cloth, from where its outer side faces.
+        """Draw both sides around a place in refined cloth, seen from the cloth's outer side.
 
         Raises:
             StageError: The stage does not show the mesh.
@@ -165,7 +165,7 @@ class Pictures:
         return self._compose(sides, worst.time, view, -np.inf)
 
     def _in_picture(self, meshes: Sequence[DrawnMesh]) -> np.ndarray:
-        """Points in a box a little larger than the garments, so that a body shows around them."""
+        """Points in a box a little larger than the garments, to show the surrounding body."""
         if not meshes:
             return np.zeros((0, 3))
         points = np.concatenate([mesh.points for mesh in meshes])
@@ -200,13 +200,13 @@ class Pictures:
 
 
 def label(pen: ImageDraw.ImageDraw, corner: tuple[int, int], height: int, *, lines: Sequence[str]) -> None:
-    """Write a panel's title and, smaller, what it shows.
+    """Write a panel's title and, smaller, further lines.
 
     Args:
         pen: Draws on the picture.
         corner: The panel's left and top [pixels].
         height: The panel's height [pixels].
-        lines: The title, empty for none, and what stands below it.
+        lines: The title, empty for none, and the lines below.
     """
     unit = height // 36
     left, top = corner[0] + unit, corner[1]
@@ -220,7 +220,7 @@ def label(pen: ImageDraw.ImageDraw, corner: tuple[int, int], height: int, *, lin
 
 
 def _save_loop(pictures: list[Image.Image], stream: BinaryIO, rate: float, codes: Sequence[float | None]) -> None:
-    """Write a GIF with one palette for all frames and the shot's own speed."""
+    """Write a GIF with a common palette for all frames, at the shot's speed."""
     chosen = [pictures[i] for i in np.linspace(0, len(pictures) - 1, 4).astype(int)]
     strip = Image.new("RGB", (chosen[0].width, sum(p.height for p in chosen)))
     for i, picture in enumerate(chosen):

@@ -38,12 +38,12 @@ def write_folder(report: RefineReport, folder: Path, shot: Shot) -> None:
     """Write a run's report as JSON and as a page.
 
     Args:
-        report: The report of a run that wrote a layer.
-        folder: Where it goes; made where it is not there.
+        report: The report of a run with a written layer.
+        folder: The folder; created if missing.
         shot: The shot, open.
 
     Raises:
-        LayerError: It cannot be written.
+        LayerError: A file cannot be written.
     """
     began = clock.perf_counter()
     series = [read_series(report, index) for index in range(len(report.garments))]
@@ -100,11 +100,11 @@ def _warnings(report: RefineReport) -> str:
 
 
 def _pictures(report: RefineReport, shot: Shot) -> str:
-    """The worst place from near, and coarse beside fine at a few time codes."""
+    """A close picture of the worst place, and coarse beside fine at a few time codes."""
     title = "<h2>Before and after</h2>"
     if find_spec("PIL") is None:
         return f"{title}<p class='note'>No pictures: PIL is missing; pip install 'physgraph-usd[preview]'</p>"
-    kind = importlib.import_module(".preview", __package__).Pictures  # Needs an extra that a report can do without.
+    kind = importlib.import_module(".preview", __package__).Pictures  # Needs an optional extra.
     written = [frame["time"] for frame in report.frames if "garments" in frame]
     times = [written[0], written[-1]][: len(written)]
     worst = worst_place(report, shot)
@@ -136,7 +136,7 @@ def _times(report: RefineReport) -> str:
 
 
 def _model(report: RefineReport) -> str:
-    """Terms that were modelled and left out, and why."""
+    """Modelled terms and omitted terms, with reasons."""
     return (
         "<h2>What was modelled</h2>"
         + table("modelled", ("term", "how"), list(report.modelled.items()))
@@ -146,7 +146,7 @@ def _model(report: RefineReport) -> str:
 
 
 def _garments(report: RefineReport) -> str:
-    """Size, level and fabric of each garment, and where the values come from."""
+    """Size, level and fabric of each garment, and the sources of the values."""
     rows = [
         (
             garment["path"],

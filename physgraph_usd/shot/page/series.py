@@ -27,7 +27,7 @@ class Series:
         energy: Energy by term, and of the upsampled input [mJ].
         strain: Size of the edges' extension [%].
         inside: Vertices inside bodies, before and after.
-        depth: Depth of the deepest [mm], before and after.
+        depth: Depth of the deepest vertex [mm], before and after.
         crossings: Edges through faces, of bodies and of cloth, before and after.
         time: Milliseconds of each stage.
         jerk: RMS third difference of the detail [fine edges].
@@ -44,7 +44,7 @@ class Series:
 
 
 def read_series(report: RefineReport, index: int) -> Series:
-    """One garment's lines from a report's frames; a value is None where a frame does not say it."""
+    """One garment's lines from a report's frames; None for a frame without the value."""
     found = Series(report.garments[index]["path"])
     for place, frame in enumerate(report.frames):
         entry = frame["garments"][index] if "garments" in frame else {}
@@ -83,13 +83,13 @@ def _milliseconds(entry: dict[str, Any], frame: dict[str, Any]) -> dict[str, flo
 
 
 def add_jerk(series: Sequence[Series], report: RefineReport, shot: Shot, layer: Path) -> None:
-    """Measure how unsteady the detail is, from the layer that was written.
+    """Measure the unsteadiness of the detail, from the written layer.
 
     Args:
-        series: Lines of every garment; each gets its jerk where four samples in a row are there.
+        series: Lines of every garment; jerk is added for each run of four consecutive samples.
         report: The run's report.
         shot: The shot, open.
-        layer: The layer that was written.
+        layer: The written layer.
     """
     written = RefinedLayer(layer)
     chains = refine_garments(shot.scene.garments, [garment["level"] for garment in report.garments])
@@ -108,7 +108,7 @@ def add_jerk(series: Sequence[Series], report: RefineReport, shot: Shot, layer: 
 def _detail(
     written: RefinedLayer, shot: Shot, time: float | None, *, index: int, steps: Sequence[Any]
 ) -> np.ndarray | None:
-    """Fine positions less the linearly upsampled cage [m], or None where the frame has no sample."""
+    """Fine positions minus the linearly upsampled cage [m], or None for a frame without a sample."""
     try:
         fine = written.points(shot, index, time)
         coarse = shot.frame(time).garments[index].points
@@ -120,6 +120,6 @@ def _detail(
 
 
 def third_difference(detail: Sequence[np.ndarray]) -> float:
-    """RMS over the vertices of the third difference of four states, in their unit."""
+    """RMS over the vertices of the third difference of four states, in the states' unit."""
     third = np.diff(np.stack(detail), n=3, axis=0)[0]
     return float(np.sqrt(np.square(third).sum(axis=1).mean())) if len(third) else 0.0

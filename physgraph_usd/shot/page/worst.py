@@ -1,4 +1,4 @@
-"""The first things that a report's page says: one sentence of verdict, and the place where refined cloth is worst."""
+"""Head of a report's page: a one-sentence verdict, and the worst place in the refined cloth."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from ...usd.read.reader import Shot
 from ..report import RefineReport
 
 CLOSE = 0.12
-"""Radius of a close picture over the diagonal of the mesh's bounds: folds are large, and one sees where they are."""
+"""Radius of a close picture relative to the diagonal of the mesh's bounds: large enough to show the surroundings."""
 CROSSINGS, INSIDE = "edges pass through faces", "vertices are inside bodies"
 
 
@@ -32,7 +32,7 @@ class Worst:
         time: Time code.
         path: Prim of the refined mesh.
         vertex: Number of the vertex.
-        reason: What is to be seen there.
+        reason: Description of the fault.
     """
 
     time: float | None
@@ -42,7 +42,7 @@ class Worst:
 
 
 def verdict(report: RefineReport) -> str:
-    """One sentence about a run: faults first, then what is right, and the time."""
+    """One-sentence verdict of a run: faults first, then successes, and the time."""
     count, failed = len(report.frames), len(report.failed)
     wrong = [f"{failed} of {count} frames could not be solved"] if failed else []
     right = [f"{_many(count - failed, 'frame')} refined"]
@@ -61,10 +61,10 @@ def verdict(report: RefineReport) -> str:
 
 
 def worst_place(report: RefineReport, shot: Shot) -> Worst | None:
-    """The place with the most crossings and vertices inside bodies of a run; where there are none, the most folds.
+    """The place with most crossings and vertices inside bodies; without any, the place with most folds.
 
     Args:
-        report: The report of a run that wrote a layer.
+        report: The report of a run with a written layer.
         shot: The shot, open.
     """
     frames = [frame for frame in report.frames if frame.get("garments")]
@@ -89,7 +89,7 @@ def worst_place(report: RefineReport, shot: Shot) -> Worst | None:
 
 
 def _left(report: RefineReport, frame: dict[str, Any]) -> dict[str, int]:
-    """Faults that are left in a frame, as far as they were looked for."""
+    """Faults remaining in a frame, as far as measured."""
     found: dict[str, int] = {}
     for contact in report.measured(frame):
         bodies = [each["after"] for each in (contact.get("bodies") or {}).values()]
@@ -106,7 +106,7 @@ def _folds(frame: dict[str, Any]) -> float:
 
 
 def _faults(report: RefineReport, shot: Shot, time: float | None, points: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """For each garment: 1 at vertices inside bodies, and 1 more where edges or faces cross, shape (V,)."""
+    """For each garment: 1 at vertices inside bodies, plus 1 at crossing edges or faces, shape (V,)."""
     cloth = SceneCloth(shot.scene, _levels(report), dtype=torch.float32, device="cpu", threads=1)
     cloth.bodies.pose(shot.frame(time).colliders)
     level, origin = _finest(report, shot), np.concatenate(points).mean(axis=0)
@@ -130,7 +130,7 @@ def _angles(report: RefineReport, shot: Shot, points: Sequence[np.ndarray]) -> l
 
 
 def _densest(points: np.ndarray, weights: np.ndarray) -> tuple[int, float]:
-    """The heaviest vertex of the heaviest cube of a close picture's size, and the cube's weight."""
+    """The heaviest vertex in the heaviest cube the size of a close picture, and the cube's weight."""
     size = CLOSE * float(np.linalg.norm(np.ptp(points, axis=0)))
     cell = np.unique(np.floor(points / max(size, 1e-9)), axis=0, return_inverse=True)[1].reshape(-1)
     sums = np.bincount(cell, weights)

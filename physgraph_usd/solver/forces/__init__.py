@@ -1,6 +1,6 @@
-"""Forces: one file a term of the potential.
+"""Forces: one file per term of the potential.
 
-A new term is one file and one line here.
+A new term needs one file and one line here.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from .membrane import in_plane_terms
 def elastic_terms(
     level: Level, fabrics: Sequence[Fabric], *, raised: Sequence[bool] | None = None
 ) -> tuple[Force, ...]:
-    """The terms of the cloth itself.
+    """The elastic terms of the cloth.
 
     Args:
         level: The level.
         fabrics: Fabric of each garment.
-        raised: For each garment, whether its bending stiffness is raised where edges are too long for its folds; none
-            is when None.
+        raised: For each garment, whether bending stiffness is raised at edges too long for the garment's folds; None
+            for no garment.
     """
     weft = None
     if any(fabric.weft_bend is not None for fabric in fabrics):
@@ -42,7 +42,7 @@ def elastic_terms(
 
 
 def body_terms(level: Level, fabrics: Sequence[Fabric], *, gravity: np.ndarray) -> tuple[Force, ...]:
-    """The terms that act on the cloth's mass.
+    """The terms proportional to the cloth's mass.
 
     Args:
         level: The level.
@@ -53,7 +53,7 @@ def body_terms(level: Level, fabrics: Sequence[Fabric], *, gravity: np.ndarray) 
 
 
 def _carried(level: Level, fabrics: Sequence[Fabric], raised: Sequence[bool]) -> Tensor:
-    """The bending stiffness that hinges of raised garments have at least [N m], shape (H,); 0 where none bends."""
+    """Least bending stiffness of the hinges of raised garments [N m], shape (H,); 0 for no bound."""
     owner, ends = level.hinge_garment.long(), level.hinges[:, :2]
     painted = level.spring_scale[find_edges(level.springs.cpu().numpy(), ends.cpu().numpy())]
     edge = level.spacing[ends.long()].mean(dim=1)

@@ -1,4 +1,4 @@
-"""Forces, and the sum of them that an integrator sees."""
+"""Forces, and their sum for the integrator."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ wp.set_module_options(KERNELS)
 class Force(Protocol):
     """One term of the potential.
 
-    A term writes its force by hand; tests hold it against finite differences of its energy.
+    A term computes its force by hand-written code; tests compare the force with finite differences of the energy.
     """
 
     name: str
@@ -37,49 +37,49 @@ class Force(Protocol):
         ...
 
     def rest_matrix(self) -> sp.csr_matrix | None:
-        """The term's scalar Hessian at rest [N/m], shape (V, V), or None when it has none."""
+        """The term's scalar Hessian at rest [N/m], shape (V, V), or None."""
         ...
 
 
 class _Last:
-    """The last answer of terms that do not change, on the CPU: on CUDA recorded steps write into tensors unseen."""
+    """The last result of constant terms, on the CPU only: on CUDA recorded steps write into tensors unseen."""
 
     def __init__(self) -> None:
-        """Start without an answer."""
+        """Start without a result."""
         self._asked: tuple[Tensor, int] | None = None
         self._answer: tuple[Tensor, Tensor] | None = None
 
     def recall(self, x: Tensor) -> tuple[Tensor, Tensor] | None:
-        """Energy and force, to be written to, if they are those at x."""
+        """Energy and a writable force, if known at x."""
         if self._answer is None or self._asked is None or self._asked[0] is not x or self._asked[1] != x._version:
             return None
         return self._answer[0], self._answer[1].clone()
 
     def keep(self, x: Tensor, energy: Tensor, force: Tensor) -> None:
-        """Remember an answer."""
+        """Remember a result."""
         if not x.is_cuda:
             self._asked, self._answer = (x, x._version), (energy, force.clone())
 
 
 class ForceModule:
-    """The sum of the terms that one frame needs.
+    """The sum of the terms of one frame.
 
     Attributes:
         forces: The terms, in order.
     """
 
     def __init__(self, forces: Sequence[Force], *, remembers: bool = False) -> None:
-        """Keep the terms in order; the order fixes the rounding of their sum.
+        """Keep the terms in order; the order fixes the rounding of the sum.
 
         Args:
             forces: The terms.
-            remembers: Whether their last answer is reused at the same positions: for terms that do not change.
+            remembers: Whether the last result is reused at the same positions: for constant terms.
         """
         self.forces = tuple(forces)
         self._lasting, self._last = self.forces, _Last() if remembers else None
 
     def joined_by(self, more: Sequence[Force]) -> ForceModule:
-        """This module's terms and more; if it remembers, its own are not evaluated anew at the same positions."""
+        """This module's terms and more; this module's remembered result is still used at the same positions."""
         joined = ForceModule((*self.forces, *more))
         joined._lasting, joined._last = self._lasting, self._last
         return joined
@@ -96,7 +96,7 @@ class ForceModule:
 
     @staticmethod
     def _sum(terms: Sequence[Force], x: Tensor, so_far: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-        """Energy and force with some terms added; the force is written to."""
+        """Energy and force with some terms added; the force is modified in place."""
         energy, force = so_far
         for term in terms:
             energy = energy + term.add_force(x, force)
@@ -105,7 +105,7 @@ class ForceModule:
     def energy_and_force_each(
         self, x: Float[Tensor, "vertices 3"], garments: int
     ) -> tuple[Float[Tensor, " garments"], Float[Tensor, "vertices 3"]]:
-        """Energy of each garment [J], float64, and force [N] at positions x [m]; for terms that can be `split`."""
+        """Energy of each garment [J], float64, and force [N] at positions x [m]; requires terms with `split`."""
         force = torch.zeros_like(x)
         energy = torch.zeros(garments, dtype=torch.float64, device=x.device)
         for term in self.forces:
@@ -123,7 +123,7 @@ class ForceModule:
         return torch.stack([term.diagonal(x) for term in self.forces]).sum(dim=0)
 
     def rest_matrix(self) -> sp.csr_matrix:
-        """Sum of the terms' scalar rest Hessians [N/m], shape (V, V); zero when no term has one."""
+        """Sum of the terms' scalar rest Hessians [N/m], shape (V, V); zero if no term has a Hessian."""
         parts = [matrix for term in self.forces if (matrix := term.rest_matrix()) is not None]
         total = parts[0]
         for part in parts[1:]:
@@ -152,8 +152,8 @@ _GATHER = overloads(_gather_corners, wp.int32, wp.int32, VECTOR, VECTOR)
 class Elements:
     """Elements of N corners, with buffers for their energies and corner forces.
 
-    Element kernels write one force per corner; vertices then gather theirs, so no two threads
-    write the same place and the sum's order is fixed.
+    Element kernels write one force per corner, then each vertex gathers its corners: no two threads write to the same
+    place and the order of each sum is fixed.
 
     Attributes:
         count: Number of elements.
@@ -204,7 +204,7 @@ class Elements:
         Args:
             x: Positions [m].
             force: Force [N], added to in place.
-            given: The kernel's own arrays that change from call to call, by their places; always the same places.
+            given: The kernel's own arrays that change from call to call, by position; always the same positions.
 
         Returns:
             Energy [J], float64 scalar.
@@ -225,8 +225,8 @@ def element_overloads(
         kernel: Kernel of (first, x, corners, parameters..., energy, corner_force) with generic arrays.
         width: Corners of an element.
         parameters: Number of scalar arrays before energy.
-        vector_parameters: Number of arrays of vectors before them.
-        quad_parameters: Number of arrays of four values before these.
+        vector_parameters: Number of arrays of vectors before the scalar arrays.
+        quad_parameters: Number of arrays of four values before the arrays of vectors.
 
     Returns:
         The concrete kernel for each torch scalar type.

@@ -7,12 +7,12 @@
 | D | ``rigidity`` | bending stiffness [N m] |
 | theta | atan2(n1 x n2 . e, n1 . n2) | signed angle between the triangles' normals [rad] |
 | s_h | ``level.hinge_shape`` | l0^2 / (A1 + A2) at edges, 2 A / l0^2 at a quad's diagonal (`level.rest_shape`) |
-| | `grain.bending_factor` | where warp and weft differ: D by the direction in which a hinge bends |
+| | `grain.bending_factor` | for different warp and weft: D by the bending direction of a hinge |
 
-At an edge of a quad the normal is that of the triangle from the edge to the middle of the opposite side, the mean over
-both splits of the quad. theta - theta0 is taken modulo a full turn into [-pi, pi], so the energy is continuous wherever
-a hinge turns: a hem pressed to theta0 = 3 may pass pi. Its force changes sign half a turn from theta0.
-Gradient after Bridson, Marino, Fedkiw, "Simulation of Clothing with Folds and Wrinkles", 2003.
+At an edge of a quad the normal is the normal of the triangle from the edge to the midpoint of the opposite side, the
+mean over both splits of the quad. theta - theta0 is taken modulo a full turn into [-pi, pi], so the energy is
+continuous for every rotation of a hinge: a hem pressed to theta0 = 3 may pass pi. The force changes sign half a turn
+from theta0. Gradient after Bridson, Marino, Fedkiw, "Simulation of Clothing with Folds and Wrinkles", 2003.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ _SIX = wp.types.vector(length=6, dtype=wp.int32)
 
 @wp.func
 def _larger(a: Any, b: Any):
-    """The larger of two numbers; that of Warp takes five instructions, for numbers that are none."""
+    """The larger of two numbers; Warp's function takes five instructions, to handle NaN."""
     return wp.where(a > b, a, b)
 
 
@@ -55,7 +55,7 @@ def _larger(a: Any, b: Any):
 def _angle(y: wp.float32, x: wp.float32) -> wp.float32:  # pyright: ignore[reportRedeclaration]
     """The angle of (x, y) to 2e-7 rad, by a minimax polynomial of the arctangent on [0, 1], without a branch.
 
-    The C library's takes as long where angles are alike, and twice as long where they are not.
+    The C library's function takes as long for similar angles, and twice as long for varied angles.
     """
     along = wp.abs(x)
     across = wp.abs(y)
@@ -82,7 +82,7 @@ def _angle(y: wp.float64, x: wp.float64) -> wp.float64:
 
 @wp.func
 def _bent(axis: Any, ik: Any, il: Any, weight: Any, rest_angle: Any):
-    """Energy [J] of a hinge and the forces [N] on j, k and l, by its sides from i."""
+    """Energy [J] of a hinge and the forces [N] on j, k and l, from the hinge's sides starting at i."""
     one = type(weight)(1.0)
     n1 = wp.cross(axis, ik)
     n2 = wp.cross(il, axis)
@@ -143,7 +143,7 @@ def _bending_of_quads(
     corner = corners[h]
     xi = x[corner[0]]
     axis = x[corner[1]] - xi
-    # Differences first: in single precision they are exact where sums of positions are not.
+    # Differences first: in single precision differences are exact, sums of positions are not.
     ik = ((x[corner[2]] - xi) + (x[corner[3]] - xi)) * half
     il = ((x[corner[4]] - xi) + (x[corner[5]] - xi)) * half
     stored, at_j, at_k, at_l = _bent(axis, ik, il, weight[h], rest_angle[h])
@@ -165,9 +165,9 @@ class _Kind:
     """Hinges with the same number of corners.
 
     Attributes:
-        which: Their numbers among the level's, shape (K,).
+        which: Numbers among the level's hinges, shape (K,).
         corners: Corner vertices, shape (K, 4) between triangles and in quads, (K, 6) at edges of quads.
-        elements: Their launches.
+        elements: The launches.
     """
 
     which: Int[Tensor, " hinges"]
@@ -197,9 +197,9 @@ class Bending:
 
         Args:
             level: The level.
-            rigidity: Bending stiffness D of each garment [N m]; along the warp where the weft's differs.
-            weft: Bending stiffness along the weft [N m]; None where it is the warp's, or no grain is known.
-            least: Bending stiffness that a hinge has at least [N m]; None where that is its own.
+            rigidity: Bending stiffness D of each garment [N m]; along the warp if the weft's differs.
+            weft: Bending stiffness along the weft [N m]; None if equal to the warp's, or without grain.
+            least: Least bending stiffness of each hinge [N m]; None for no bound.
         """
         owner = level.hinge_garment.long()
         scaled = rigidity.to(level.rest)[owner] * level.bend_scale
@@ -223,7 +223,7 @@ class Bending:
         ]
 
     def resting_at(self, rest_angle: Float[Tensor, " hinges"]) -> Bending:
-        """These springs with other angles at rest [rad], which are read anew at each evaluation."""
+        """A copy with different rest angles [rad], read again at each evaluation."""
         bending = copy.copy(self)
         bending.rest_angle = rest_angle
         return bending
@@ -237,7 +237,7 @@ class Bending:
         return energy
 
     def split(self, x: Float[Tensor, "vertices 3"]) -> tuple[Float[Tensor, " parts"], Int[Tensor, " parts"]]:
-        """Energy of each hinge [J] where the force was added last, and its garment."""
+        """Energy of each hinge [J] at the last evaluated positions, and the hinge's garment."""
         energy = torch.zeros_like(self.weight)
         for each in self._kinds:
             energy[each.which] = each.elements.energy
@@ -249,7 +249,7 @@ class Bending:
         for each in self._kinds:
             jacobian = hinge_jacobian(x, each.corners)
             value = self.weight[each.which].unsqueeze(1) * (jacobian**2).sum(dim=2) / 3.0
-            if each.corners.shape[1] == 6:  # A triangle's corner stands twice, with half of its gradient each time.
+            if each.corners.shape[1] == 6:  # A triangle's corner is repeated, with half of its gradient each time.
                 twice = (each.corners[:, 2::2] == each.corners[:, 3::2]).repeat_interleave(2, dim=1)
                 value[:, 2:] *= torch.where(twice, 2.0, 1.0)
             add_at(total, each.corners.long().reshape(-1), value.reshape(-1))
@@ -258,8 +258,8 @@ class Bending:
     def rest_matrix(self) -> sp.csr_matrix:
         """The Hessian of the rest shape's pattern, each hinge unfolded flat [N/m]: w row^T row (Bergou et al. 2006).
 
-        A row is the derivative of the angle by the corners' heights above the flat hinge; constants are in its null
-        space, and on a flat rest shape so is every linear function.
+        A row is the derivative of the angle by the corners' heights above the flat hinge. Constants are in the null
+        space, and on a flat rest shape every linear function is too.
         """
         count, rest = self._level.vertex_count, self._level.rest.double().cpu().numpy()
         total = sp.csr_matrix((count, count))
@@ -273,7 +273,7 @@ class Bending:
 
 
 def flat_rows(rest: np.ndarray, hinges: np.ndarray) -> np.ndarray:
-    """dtheta/dz of each hinge laid flat [1/m], in the shape of its corners; zero at triangles without area."""
+    """dtheta/dz of each flattened hinge [1/m], in the shape of the corners; zero at triangles without area."""
     xi, xj, xk, xl = (rest[hinges[:, columns]].mean(axis=1) for columns in _places(hinges.shape[1]))
     axis, ik, il = xj - xi, xk - xi, xl - xi
     square = (axis**2).sum(axis=1)
@@ -292,7 +292,7 @@ def flat_rows(rest: np.ndarray, hinges: np.ndarray) -> np.ndarray:
 def hinge_jacobian(
     x: Float[Tensor, "vertices 3"], hinges: Int[Tensor, "hinges corners"]
 ) -> Float[Tensor, "hinges corners 3"]:
-    """dtheta/dx at the four or six corners of each hinge [1/m]; zero rows where a triangle has no area."""
+    """dtheta/dx at the four or six corners of each hinge [1/m]; zero rows at triangles without area."""
     places = _places(hinges.shape[1])
     xi, xj, xk, xl = (x[hinges[:, columns].long()].mean(dim=1) for columns in places)
     axis, ik, il = xj - xi, xk - xi, xl - xi
@@ -311,5 +311,5 @@ def hinge_jacobian(
 
 
 def _places(width: int) -> tuple[list[int], list[int], list[int], list[int]]:
-    """The columns of a hinge's four or six corners that make up i, j, k and l."""
+    """The columns of a hinge's four or six corners for i, j, k and l."""
     return ([0], [1], [2], [3]) if width == 4 else ([0], [1], [2, 3], [4, 5])

@@ -1,14 +1,14 @@
-"""Contact: pushes vertices out of bodies, each body seen as a plane near each vertex.
+"""Contact: pushes vertices out of bodies, each body approximated by a plane near each vertex.
 
     E = 1/2 sum_v k_c a_v phi_v^2
 
 | symbol | here | meaning |
 |---|---|---|
-| phi_v | max(offset - n_v . (x_v - c_v), 0) | how far v is inside the body grown by the offset [m] |
-| c_v, n_v | ``Planes`` | closest point of the body and its outward normal, found by whoever makes this term |
+| phi_v | max(offset - n_v . (x_v - c_v), 0) | depth of v inside the body enlarged by the offset [m] |
+| c_v, n_v | ``Planes`` | closest point of the body and its outward normal, found by the creator of the term |
 | k_c | ``stiffness`` | [N/m^3] |
 
-The planes stay while the term lives, so it is a function of x alone.
+The planes are constant during the life of the term, so the energy is a function of x only.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ wp.set_module_options(KERNELS)
 
 @dataclass(frozen=True, eq=False)
 class Planes:
-    """One body as some vertices see it; each vertex occurs once.
+    """One body as seen by some vertices; each vertex occurs once.
 
     Attributes:
         vertex: Vertex of each plane, ascending, shape (N,), int32.
@@ -71,10 +71,10 @@ _PUSH = overloads(_push, VECTOR, wp.int32, VECTOR, SCALAR, SCALAR, SCALAR, VECTO
 
 
 class Contact:
-    """Springs between vertices and the planes that stand for bodies.
+    """Springs between vertices and the planes representing bodies.
 
     Attributes:
-        planes: What the vertices see, one entry a body.
+        planes: One entry per body.
         stiffness: k_c [N/m^3].
     """
 
@@ -85,8 +85,8 @@ class Contact:
 
         Args:
             level: The level.
-            planes: One entry a body.
-            stiffness: k_c, one for all or one a vertex.
+            planes: One entry per body.
+            stiffness: k_c, a single value or one per vertex.
         """
         self.stiffness = stiffness
         self.planes = tuple(each for each in planes if len(each.vertex))
@@ -100,7 +100,7 @@ class Contact:
 
     @staticmethod
     def _prepare(level: Level, planes: Planes, weight: Tensor, energy: Tensor) -> Launch:
-        start_warp()  # Views of tensors do not start Warp by themselves.
+        start_warp()  # Creating tensor views does not start Warp.
         x = vectors(torch.zeros_like(level.rest))
         plane_arrays = [argument(planes.vertex), vectors(planes.normal), argument(planes.height)]
         inputs = [x, *plane_arrays, argument(weight), argument(energy), x]
@@ -115,28 +115,28 @@ class Contact:
         return energy
 
     def split(self, x: Float[Tensor, "vertices 3"]) -> tuple[Float[Tensor, " parts"], Int[Tensor, " parts"]]:
-        """Energy of each plane [J] where the force was added last, and its garment."""
+        """Energy of each plane [J] at the last evaluated positions, and the vertex's garment."""
         owners = [self._level.vertex_garment[each.vertex.long()] for each in self.planes]
         return 0.5 * torch.cat(self._buffers), torch.cat(owners)
 
     def depths(self, x: Float[Tensor, "vertices 3"]) -> list[Float[Tensor, " planes"]]:
-        """How far each vertex is behind each of its planes [m], not below zero; one entry a body."""
+        """Depth of each vertex behind each of its planes [m], not below zero; one entry per body."""
         return [(each.height - (each.normal * x[each.vertex.long()]).sum(dim=1)).clamp_min(0.0) for each in self.planes]
 
     def near(self, level: Level) -> Bool[Tensor, "vertices 1"]:
-        """Which vertices see a plane."""
+        """Whether each vertex has a plane."""
         near = torch.zeros_like(level.free)
         for each in self.planes:
             near[each.vertex.long()] = True
         return near
 
     def diagonal(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " vertices"]:
-        """k_c a_v / 3 where a plane pushes [N/m]."""
+        """k_c a_v / 3 at pushing planes [N/m]."""
         out = torch.zeros_like(x[:, 0])
         for planes, weight, depth in zip(self.planes, self._weights, self.depths(x), strict=True):
             out[planes.vertex.long()] += torch.where(depth > 0, weight / 3.0, torch.zeros_like(weight))
         return out
 
     def rest_matrix(self) -> sp.csr_matrix | None:
-        """None: at rest nothing touches."""
+        """None: no contact at rest."""
         return None

@@ -52,7 +52,7 @@ class Gravity:
         return -(self.weight * x).sum(dtype=torch.float64)
 
     def split(self, x: Float[Tensor, "vertices 3"]) -> tuple[Float[Tensor, " parts"], Int[Tensor, " parts"]]:
-        """Energy of each vertex [J] at positions x [m], and its garment."""
+        """Energy of each vertex [J] at positions x [m], and the vertex's garment."""
         return -(self.weight * x).sum(dim=1), self._owner
 
     def diagonal(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " vertices"]:

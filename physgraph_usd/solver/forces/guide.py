@@ -1,4 +1,4 @@
-"""Guide: ties the average of the fine cloth around each coarse vertex to the coarse animation's own average there.
+"""Guide: ties the average of the fine cloth around each coarse vertex to the same average of the coarse animation.
 
     E = 1/2 sum_c k_g A_c s_c |(R x)_c - (R P x_c)_c|^2 + 1/2 sum_v k_g a_v p_v |x_v - (P x_c)_v|^2
 
@@ -8,11 +8,11 @@
 | A_c | coarse vertex area, the sum of its part of fine areas [m^2] |
 | R | ``average`` | row-normalised transpose of the prolongation P, weighted by fine area |
 | s_c | painted ``guideScale`` |
-| p_v | 10 pin / (1 - pin) | soft pins: 0 where the pin weight is 0, grows without bound towards 1 |
+| p_v | 10 pin / (1 - pin) | soft pins: 0 for pin weight 0, unbounded towards 1 |
 
-The target is the average of the upsampled cage, not the cage vertex itself: at a rim and where the cage is
-curved the average lies inside the vertex, and cloth at rest would be pushed outwards (by 0.2 fine edges at a rim).
-Wrinkles whose mean is zero over a coarse vertex's neighbourhood cost nothing, so large motion stays the artist's.
+The target is the average of the upsampled cage, not the cage vertex itself: at a rim and on a curved cage the average
+lies inside the vertex, and cloth at rest would be pushed outwards (by 0.2 fine edges at a rim). Wrinkles with zero mean
+over a coarse vertex's neighbourhood cost nothing, so large motion remains under the artist's control.
 """
 
 from __future__ import annotations
@@ -55,10 +55,10 @@ class GuideMap:
 
 
 class Guide:
-    """The guide of one level: weights that last, a target for each frame.
+    """The guide of one level: constant weights, a new target in each frame.
 
     Attributes:
-        coarse: The cage that it was aimed at when it was made [m].
+        coarse: The cage targeted at creation [m].
     """
 
     name = "guide"
@@ -69,11 +69,11 @@ class Guide:
         guide_map: GuideMap,
         stiffness: Float[Tensor, " coarse"],
     ) -> None:
-        """Weigh the ties of a level; `retarget` gives them coarse positions.
+        """Weigh the ties of a level; `retarget` sets the coarse positions.
 
         Args:
             level: The level.
-            guide_map: Its averaging operator.
+            guide_map: Averaging operator of the level.
             stiffness: k_g s_c at each coarse vertex [N/m^3].
         """
         self._map, self._level = guide_map, level
@@ -90,14 +90,14 @@ class Guide:
         self.coarse = torch.zeros_like(self._target)
 
     def retarget(self, coarse: Float[Tensor, "coarse 3"]) -> Guide:
-        """These ties, to the coarse positions of one frame [m]."""
+        """These ties, with the coarse positions of one frame as target [m]."""
         guide = copy.copy(self)
         guide.coarse, guide._base = coarse, self._level.base.apply(coarse)
         guide._target = self._map.average.apply(guide._base)
         return guide
 
     def aim(self, coarse: Float[Tensor, "coarse 3"]) -> None:
-        """Tie to other coarse positions [m] in place: whoever holds this term, or recorded it, follows."""
+        """Change the target to new coarse positions [m] in place, also for every holder and recording of this term."""
         self._base.copy_(self._level.base.apply(coarse))
         self._target.copy_(self._map.average.apply(self._base))
 
@@ -114,7 +114,7 @@ class Guide:
         return energy
 
     def split(self, x: Float[Tensor, "vertices 3"]) -> tuple[Float[Tensor, " parts"], Int[Tensor, " parts"]]:
-        """Energy of each tie [J] at positions x [m], and its garment."""
+        """Energy of each tie [J] at positions x [m], and the tie's garment."""
         lag = self._map.average.apply(x) - self._target
         energy, owner = 0.5 * (self._weight * lag * lag).sum(dim=1), self._map.garment
         if not self._has_soft_pins:
@@ -128,14 +128,14 @@ class Guide:
         return torch.as_tensor(value, dtype=x.dtype, device=x.device)
 
     def hessian(self) -> sp.csr_matrix:
-        """The exact scalar Hessian R^T W R + pins [N/m], shape (V, V), for solvers outside."""
+        """The exact scalar Hessian R^T W R + pins [N/m], shape (V, V), for external solvers."""
         spread = self._map.spread_matrix
         return sp.csr_matrix(spread @ sp.diags(self._coarse_weight) @ spread.T + sp.diags(self._pin_weight))
 
     def rest_matrix(self) -> sp.csr_matrix:
         """The lumped guide [N/m]: the row sums of R^T W R on the diagonal.
 
-        The exact product couples every pair of fine vertices around a coarse one, which would fill the factor; lumping
-        agrees with it on long waves, and stretch and bending outweigh it on short ones.
+        The exact product couples every pair of fine vertices around a coarse vertex, which would fill the factor.
+        Lumping is accurate for long waves; for short waves stretch and bending outweigh the guide.
         """
         return sp.csr_matrix(sp.diags(self._map.spread_matrix @ self._coarse_weight + self._pin_weight))

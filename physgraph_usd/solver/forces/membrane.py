@@ -1,4 +1,4 @@
-"""Membrane: triangles with warp, weft and a shear stiffness of their own.
+"""Membrane: triangles with separate warp, weft and shear stiffness.
 
     E = sum_t A_t (1/2 C11 e1^2 + 1/2 C22 e2^2 + C12 e1 e2 + 1/2 G s^2 + limits),   e_i = |f_i| - 1
     C11 = Y1 / (1 - nu^2),   C22 = Y2 / (1 - nu^2),   C12 = nu sqrt(C11 C22),   nu = 1/3
@@ -9,21 +9,20 @@
 |---|---|---|
 | Y1, Y2 | ``youngs``, ``weft`` | 2D Young's modulus along warp and weft [N/m] |
 | G | ``shear`` | shear stiffness [N/m] |
-| f1, f2 | columns of F | where the deformation takes unit vectors along warp and weft |
-| s | | sine of the angle by which they are sheared, rounded off where one vanishes |
-| e | ``limit`` | strain from which the cloth stiffens |
+| f1, f2 | columns of F | images of the unit vectors along warp and weft under the deformation |
+| s | | sine of the shear angle, rounded off for a vanishing vector |
+| e | ``limit`` | strain beyond which the cloth stiffens |
 | A_t | ``level.membrane_area`` | rest area [m^2] |
 
-Warp and weft stretch as springs do, and shear counts by angle, after Baraff and Witkin, "Large Steps in Cloth
-Simulation", 1998; the coupling makes the sheet orthotropic, nu^2 the product of its two Poisson's ratios. For small
-strains that is linear elasticity. For large ones Green's strain would grow with the square of a length, and cages have
-triangles that are stretched threefold: there the cloth would be stiffer than its fabric by as much.
+Warp and weft stretch like springs, and shear counts by angle, after Baraff and Witkin, "Large Steps in Cloth
+Simulation", 1998; the coupling makes the sheet orthotropic, nu^2 the product of the two Poisson's ratios. For small
+strains the model is linear elasticity. For large strains Green's strain would grow with the square of a length, and
+cages have triangles stretched threefold: there the cloth would be too stiff by as much.
 
 With G = 0.375 Y the sheet is isotropic and equals the edge springs of an equilateral mesh for small strains. Otherwise
-the material's axes matter: `grain.axes` defines them for a triangle. Painted stretch scales multiply all
-constants.
+the material's axes matter: `grain.axes` defines them for a triangle. Painted stretch scales multiply all constants.
 
-There is no barrier against inversion: cloth buckles long before it matters.
+There is no barrier against inversion: cloth buckles long before inversion matters.
 """
 
 from __future__ import annotations
@@ -50,20 +49,20 @@ wp.set_module_options(FUSED)
 POISSON = 1.0 / 3.0
 """Poisson's ratio between warp and weft; edge springs have the same."""
 ISOTROPIC = 0.375
-"""Shear stiffness of an isotropic sheet with that ratio, in Young's moduli."""
+"""Shear stiffness of an isotropic sheet with Poisson's ratio `POISSON`, in Young's moduli."""
 STIFFER = 20.0
-"""How much stiffer cloth is beyond its limit: the tensile curves of the measured fabrics rise ten- to thirtyfold."""
+"""Stiffening factor beyond the limit: the tensile curves of the measured fabrics steepen ten- to thirtyfold."""
 STIFFEST = 1.0
-"""Most that `sliver_weight` lets A |g|^2 be: a right-angled triangle with equal sides has it."""
+"""Upper bound of A |g|^2 after `sliver_weight`: the value of a right-angled isosceles triangle."""
 ROUNDING = 0.2
-"""Length of warp or weft, of 1 at rest, under which the direction of shear fades."""
+"""Length of warp or weft, relative to rest, below which the shear direction fades."""
 NO_LIMIT = 1e9
-"""A strain that nothing reaches."""
+"""A strain never reached."""
 
 
 @wp.func
 def _beyond(limit: Any, strain: Any, stiffness: Any):
-    """The stress by which cloth is stiffer beyond its limit, times the rest area [N m]."""
+    """The additional stress beyond the limit, times the rest area [N m]."""
     return wp.where(strain > limit, type(strain)(STIFFER) * stiffness * (strain - limit), type(strain)(0.0))
 
 
@@ -101,7 +100,7 @@ def _membrane(
     more1 = _beyond(limit[t], e1, c[0])
     more2 = _beyond(limit[t], e2, c[1])
     stored = s1 * e1 + s2 * e2 + more1 * (e1 - limit[t]) + more2 * (e2 - limit[t])
-    # Shear by the angle between them; directions fade where one vanishes.
+    # Shear by the angle between f1 and f2; directions fade for a vanishing vector.
     rounding = limit.dtype(ROUNDING) * limit.dtype(ROUNDING)
     n1 = q1 + rounding
     n2 = q2 + rounding
@@ -148,8 +147,8 @@ class Membrane:
             level: The level.
             youngs: 2D Young's modulus of each garment along the warp [N/m]; zero for garments of edge springs.
             shear: Shear stiffness of each garment [N/m]; zero for garments of edge springs.
-            weft: 2D Young's modulus of each garment along the weft [N/m]; None where it is the warp's.
-            limit: Strain from which each garment's cloth stiffens; None where none does.
+            weft: 2D Young's modulus of each garment along the weft [N/m]; None if equal to the warp's.
+            limit: Strain beyond which each garment's cloth stiffens; None for no limit.
         """
         owner = level.membrane_garment.long()
         weight = level.membrane_scale * level.membrane_area
@@ -172,11 +171,11 @@ class Membrane:
         return self._elements.evaluate(x, force)
 
     def split(self, x: Float[Tensor, "vertices 3"]) -> tuple[Float[Tensor, " parts"], Int[Tensor, " parts"]]:
-        """Energy of each triangle [J] where the force was added last, and its garment."""
+        """Energy of each triangle [J] at the last evaluated positions, and the triangle's garment."""
         return self._elements.energy, self._level.membrane_garment
 
     def diagonal(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " vertices"]:
-        """A third of the trace of each corner's block, limits left out, geometric part only where it stiffens [N/m].
+        """A third of the trace of each corner's block, without limits, geometric part only if stiffening [N/m].
 
         With g = (g1, g2) the gradient of the corner's shape function, d_i = f_i / |f_i|, r_i the derivative of the sine
         by f_i and s_i the stress along f_i: trace = C11 g1^2 + C22 g2^2 + 2 C12 g1 g2 d1.d2 + G |g1 r1 + g2 r2|^2
@@ -205,7 +204,7 @@ class Membrane:
     def rest_matrix(self) -> sp.csr_matrix:
         """The trace of each block of the Hessian at rest [N/m]: C11 + C66 along the warp, C22 + C66 along the weft.
 
-        On an equilateral mesh with G = 0.375 Y it equals the springs' matrix.
+        On an equilateral mesh with G = 0.375 Y the matrix equals the springs' matrix.
         """
         triangles = self._level.membrane.cpu().numpy()
         gradient = shape_gradients(self._level).double().cpu().numpy()
@@ -223,10 +222,11 @@ class Membrane:
 
 
 def sliver_weight(level: Level) -> Float[Tensor, " triangles"]:
-    """1 for sound triangles; what makes a sliver as stiff for a corner's move as the stiffest sound one, shape (T,).
+    """1 for sound triangles; for slivers, the factor limiting stiffness to the stiffest sound triangle's, shape (T,).
 
-    A corner's move strains a triangle by the gradient g of its shape function, so it feels A |g|^2 stiffnesses: 0.58 of
-    an equilateral triangle's, without bound of a sliver's.
+    A corner's move strains a triangle by the gradient g of its shape function, with a stiffness proportional to A
+    |g|^2:
+    0.58 for an equilateral triangle, unbounded for slivers.
     """
     gradient = shape_gradients(level).square().sum(dim=2).amax(dim=1)
     return (STIFFEST / (level.membrane_area * gradient).clamp_min(1e-12)).clamp_max(1.0)
@@ -239,14 +239,14 @@ def shape_gradients(level: Level) -> Float[Tensor, "triangles 3 2"]:
 
 
 def in_plane_terms(level: Level, fabrics: Sequence[Fabric]) -> tuple[Force, ...]:
-    """Edge springs for the garments whose fabric these can stand for, the membrane for the others.
+    """Edge springs for the garments with a suitable fabric, the membrane for the others.
 
     Args:
         level: The level.
         fabrics: Fabric of each garment.
 
     Returns:
-        The terms that some garment needs; each is zero on the other's garments.
+        The terms needed by some garment; each term is zero on the garments of the opposite kind.
     """
     woven = torch.tensor([fabric.has_membrane for fabric in fabrics], dtype=torch.bool)
 
@@ -267,7 +267,7 @@ def in_plane_terms(level: Level, fabrics: Sequence[Fabric]) -> tuple[Force, ...]
 
 
 def shear_stiffness(fabric: Fabric) -> float:
-    """Shear stiffness of a fabric [N/m]; where it has none of its own, that of a sheet as stiff both ways."""
+    """Shear stiffness of a fabric [N/m]; by default the value of an isotropic sheet."""
     if fabric.shear is not None:
         return fabric.shear
     weft = fabric.stretch if fabric.weft_stretch is None else fabric.weft_stretch

@@ -1,13 +1,13 @@
-"""Seams: what forces do to cloth whose sewn points are one.
+"""Seams: transforms forces for cloth with sewn points.
 
     E'(x) = E(A x),    F'(x) = A^T F(A x)
 
 | symbol | here | meaning |
 |---|---|---|
-| A | ``Seam.closed`` | sewn points at their mean, at a vertex that may not move, or on the edge they follow |
-| A^T | ``Seam.shared`` | each of n points at one place feels an n-th of the forces on all |
+| A | ``Seam.closed`` | moves sewn points to their mean, to a fixed vertex, or onto the followed edge |
+| A^T | ``Seam.shared`` | each of n coincident points gets an n-th of the total force |
 
-So a seam holds exactly, however stiff the cloth, and an integrator need not know of it: steps that would open it change
+Seams hold exactly, however stiff the cloth, and need no support by integrators: steps that would open a seam change
 neither energy nor force.
 """
 
@@ -27,12 +27,12 @@ from .base import ForceModule
 
 
 class Seam:
-    """Points of a level that are sewn together.
+    """Sewn points of a level.
 
     Attributes:
-        pairs: Vertices taken for one, each any number of times, shape (N, 2): those at one place, and each vertex
-            between two others with the nearer of these.
-        label: A number for each vertex, the same for vertices taken for one, shape (V,).
+        pairs: Vertices treated as one, possibly repeated, shape (N, 2): coincident vertices, and each vertex following
+            an edge with the nearer end of the edge.
+        label: A number for each vertex, equal for vertices treated as one, shape (V,).
     """
 
     def __init__(self, level: Level, pairs: np.ndarray, between: OnEdge | None = None) -> None:
@@ -40,8 +40,8 @@ class Seam:
 
         Args:
             level: The level.
-            pairs: Vertices at one place, each any number of times, shape (N, 2).
-            between: Vertices that lie on an edge between others. None of its ends lies on an edge.
+            pairs: Coincident vertices, possibly repeated, shape (N, 2).
+            between: Vertices lying on edges. The ends of the edges do not lie on edges themselves.
         """
         self._between = None
         together = pairs
@@ -68,7 +68,7 @@ class Seam:
         self._fraction = Stencil(sp.csr_matrix(sp.diags((~held).astype(float)) @ mean), dtype=dtype, device=device)
 
     def closed(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
-        """Sewn points brought together; points that are together keep their bits."""
+        """Positions with sewn points moved together; coincident points are unchanged to the bit."""
         points = x[self._place]
         first = points[self._first]
         out = x.clone()
@@ -76,14 +76,14 @@ class Seam:
         return out if self._between is None else self._between.placed(out)
 
     def shared(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
-        """Forces on sewn points, A^T F; none on points sewn to a vertex that may not move."""
+        """Forces on sewn points, A^T F; zero on points sewn to a fixed vertex."""
         out = force.clone() if self._between is None else self._between.handed_on(force)
         out[self._place] = self._fraction.apply(out[self._place])
         return out
 
 
 class _Between:
-    """Vertices that follow points of edges."""
+    """Vertices following points on edges."""
 
     def __init__(self, level: Level, on: OnEdge) -> None:
         device, dtype = level.device, level.dtype
@@ -99,29 +99,29 @@ class _Between:
         self._ends = Stencil(ends, dtype=dtype, device=device)
 
     def placed(self, x: Tensor) -> Tensor:
-        """Positions with the vertices on their edges; x is written to."""
+        """Positions with the vertices on their edges; x is modified in place."""
         start = x[self._start]
         x[self._vertex] = torch.where(self._free, start + self._part * (x[self._end] - start), x[self._vertex])
         return x
 
     def handed_on(self, force: Tensor) -> Tensor:
-        """Forces with those on the vertices given to the ends of their edges."""
+        """Forces with the vertices' forces moved to the ends of their edges."""
         out = force + self._ends.apply(force[self._vertex].contiguous())
         out[self._vertex] = 0.0
         return out
 
 
 def _lowest(pairs: np.ndarray, count: int) -> np.ndarray:
-    """The lowest of the vertices that pairs join to each, itself where none do, shape (V,)."""
+    """The lowest vertex connected to each vertex by pairs, shape (V,)."""
     label = joined_by(pairs, count) if len(pairs) else np.arange(count)
     return np.unique(label, return_index=True)[1][label]
 
 
 class SewnForces:
-    """The forces on cloth whose seams are closed."""
+    """The forces on cloth with closed seams."""
 
     def __init__(self, field: ForceModule, seam: Seam) -> None:
-        """Take the forces of the cloth as if it were in pieces, and its seam."""
+        """Take the forces of the unsewn cloth, and the seam."""
         self._field, self._seam = field, seam
 
     def energy_and_force(self, x: Float[Tensor, "vertices 3"]) -> tuple[Float[Tensor, ""], Float[Tensor, "vertices 3"]]:
@@ -130,7 +130,7 @@ class SewnForces:
         return energy, self._seam.shared(force)
 
     def diagonal(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " vertices"]:
-        """A third of the trace of each vertex's Hessian block [N/m], the mean of those of sewn points."""
+        """A third of the trace of each vertex's Hessian block [N/m], averaged over sewn points."""
         apart = self._field.diagonal(self._seam.closed(x)).unsqueeze(1).expand(-1, 3)
         together = self._seam.shared(apart.contiguous())[:, 0]
         return torch.where(together > 0, together, apart[:, 0])

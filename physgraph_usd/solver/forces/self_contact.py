@@ -1,14 +1,14 @@
-"""Contact of cloth with cloth: springs that keep parts apart, each pair seen as a plane.
+"""Contact of cloth with cloth: springs that keep parts apart, each pair represented by a plane.
 
     E = 1/2 sum_g k_g phi_g^2,   phi_g = max(offset_g - n_g . sum_i w_gi x_i, 0)
 
 | symbol | here | meaning |
 |---|---|---|
-| sum_i w_gi x_i | ``vectors`` | from one point to another: vertex, face (1, -b0, -b1, -b2), edges (1-s, s, t-1, -t) |
-| n_g | ``PairConstraints.normal`` | the side on which the first point lies, a unit vector |
+| sum_i w_gi x_i | ``vectors`` | from point to point: vertex, face (1, -b0, -b1, -b2), edges (1-s, s, t-1, -t) |
+| n_g | ``PairConstraints.normal`` | the side of the first point, a unit vector |
 | k_g | ``PairConstraints.stiffness`` | k_c times the pair's area [N/m] |
 
-Pairs, weights and normals stay while the term lives, so it is a function of x alone, and a convex one.
+Pairs, weights and normals are constant during the life of the term, so the energy is a convex function of x only.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ wp.set_module_options(KERNELS)
 
 @dataclass(frozen=True, eq=False)
 class PairConstraints:
-    """Pairs of material points that keep to their sides of one another.
+    """Pairs of material points kept on their sides.
 
     Attributes:
         corners: Vertices of each pair, shape (N, 4), int32.
-        weight: Their weights, shape (N, 4); each row sums to 0.
+        weight: Weights of the vertices, shape (N, 4); each row sums to 0.
         normal: From the second point to the first, unit, shape (N, 3).
         offset: Distance kept [m], shape (N,).
         stiffness: [N/m], shape (N,).
@@ -48,7 +48,7 @@ class PairConstraints:
     stiffness: Float[Tensor, " gaps"]
 
     def with_more(self, other: PairConstraints) -> PairConstraints:
-        """These pairs and others."""
+        """Both sets of pairs combined."""
         return PairConstraints(
             *(torch.cat([getattr(self, each.name), getattr(other, each.name)]) for each in fields(self))
         )
@@ -58,7 +58,7 @@ class PairConstraints:
         return (self.weight.unsqueeze(2) * x[self.corners.long()]).sum(dim=1)
 
     def penetration(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " gaps"]:
-        """How far each pair is under its offset [m], not below zero."""
+        """Depth of each pair below its offset [m], not below zero."""
         return (self.offset - (self.normal * self.vectors(x)).sum(dim=1)).clamp_min(0.0)
 
 
@@ -92,7 +92,7 @@ _KEEP_APART = element_overloads(_keep_apart, width=4, parameters=2, vector_param
 
 
 class SelfContact:
-    """Springs that keep pairs of material points apart.
+    """Springs keeping pairs of material points apart.
 
     Attributes:
         gaps: The pairs.
@@ -111,18 +111,18 @@ class SelfContact:
         return self._elements.evaluate(x, force)
 
     def split(self, x: Float[Tensor, "vertices 3"]) -> tuple[Float[Tensor, " parts"], Int[Tensor, " parts"]]:
-        """Energy of each pair [J] where the force was added last, and the garment of its first corner."""
+        """Energy of each pair [J] at the last evaluated positions, and the garment of the first corner."""
         return self._elements.energy, self._level.vertex_garment[self.gaps.corners[:, 0].long()]
 
     def diagonal(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " vertices"]:
-        """k w^2 / 3 of the pairs that push, summed at each vertex [N/m]."""
+        """k w^2 / 3 of the pushing pairs, summed at each vertex [N/m]."""
         value = (
             (self.gaps.penetration(x) > 0).to(x).unsqueeze(1) * self.gaps.stiffness.unsqueeze(1) * self.gaps.weight**2
         )
-        # Not `index_add_`: on CUDA its order, and so its rounding, changes from run to run.
+        # Not `index_add_`: on CUDA its order, and thus its rounding, changes from run to run.
         out = torch.zeros_like(x[:, 0])
         return out.index_put_((self.gaps.corners.long().reshape(-1),), value.reshape(-1) / 3.0, accumulate=True)
 
     def rest_matrix(self) -> sp.csr_matrix | None:
-        """None: at rest nothing touches."""
+        """None: no contact at rest."""
         return None

@@ -5,10 +5,10 @@
 | symbol | here | meaning |
 |---|---|---|
 | Y | ``youngs`` | 2D Young's modulus [N/m] |
-| a_e | ``level.spring_area`` | a third of the adjacent triangles' areas [m^2], weighted so that quads are isotropic |
+| a_e | ``level.spring_area`` | a third of the adjacent triangles' areas [m^2], weighted to make quads isotropic |
 | l0 | ``level.spring_length`` | rest length [m] |
 
-Springs cannot express shear on its own: an isotropic sheet of them has nu = 1/3 and G = 0.375 Y.
+Springs cannot express an independent shear stiffness: an isotropic sheet of springs has nu = 1/3 and G = 0.375 Y.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class Stretch:
         return self._elements.evaluate(x, force)
 
     def split(self, x: Float[Tensor, "vertices 3"]) -> tuple[Float[Tensor, " parts"], Int[Tensor, " parts"]]:
-        """Energy of each spring [J] where the force was added last, and its garment."""
+        """Energy of each spring [J] at the last evaluated positions, and the spring's garment."""
         return self._elements.energy, self._level.spring_garment
 
     def diagonal(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " vertices"]:

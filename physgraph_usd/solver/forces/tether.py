@@ -50,7 +50,7 @@ class Tether:
         self.predicted, self.stiffness = predicted, stiffness
 
     def aim(self, predicted: Float[Tensor, "vertices 3"], stiffness: float) -> None:
-        """Tie to other positions [m], with another stiffness [1/s^2], in place."""
+        """Tie to new positions [m], with a new stiffness [1/s^2], in place."""
         self.predicted.copy_(predicted)
         self.stiffness = stiffness
         self._weight.copy_(stiffness * self._density * self._area)
@@ -63,7 +63,7 @@ class Tether:
         return 0.5 * (pull * stray).sum(dtype=torch.float64)
 
     def split(self, x: Float[Tensor, "vertices 3"]) -> tuple[Float[Tensor, " parts"], Int[Tensor, " parts"]]:
-        """Energy of each vertex's spring [J] at positions x [m], and its garment."""
+        """Energy of each vertex's spring [J] at positions x [m], and the vertex's garment."""
         return 0.5 * self._weight * (x - self.predicted).square().sum(dim=1), self._level.vertex_garment
 
     def diagonal(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " vertices"]:

@@ -1,1 +1,1 @@
-"""One frame of garments that are solved together: from where their cloth was to where it is."""
+"""One frame of a group of garments: from the cloth's start to its solution."""

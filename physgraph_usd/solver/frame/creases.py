@@ -1,19 +1,18 @@
-"""Crease memory: hinges that stay bent come to rest where they are bent, so that worn cloth does not iron itself.
+"""Crease memory: hinges that stay bent shift their rest angle towards the bend, so worn cloth does not iron itself.
 
     c <- c + (1 - exp(-dt / tau)) (wrap(theta - theta0) - c),   a hinge rests at theta0 + s c
 
 | symbol | here | meaning |
 |---|---|---|
-| c | ``bent`` | remembered bend of a hinge beyond its rest shape's [rad] |
-| theta | `Level.angles` | its angle in the frame that this one starts from [rad] |
-| dt | ``elapsed`` | time since that frame [s] |
+| c | ``bent`` | remembered bend of a hinge beyond the rest shape's angle [rad] |
+| theta | `Level.angles` | angle in the frame used as start [rad] |
+| dt | ``elapsed`` | time since the start frame [s] |
 | tau | `Fabric.crease_time` | [s] |
-| s | `SHARE` | part of the bend that friction between yarns holds |
+| s | `SHARE` | fraction of the bend held by friction between yarns |
 
-This is the standard linear solid in bending: a spring beside a spring and a dashpot in series. A pose that is held
-bends against 1 - s of the stiffness in the end, and a crease in cloth that nothing pulls fades with tau / (1 - s). The
-memory stays between the angles that the hinge has had, and is the same throughout a frame, so a frame's energy has the
-bounds that it has without.
+This is the standard linear solid in bending: a spring parallel to a spring and a dashpot in series. A held pose finally
+bends against 1 - s of the stiffness, and a crease in unloaded cloth fades with tau / (1 - s). The memory stays within
+the range of past angles, and is constant during a frame, so a frame's energy has the same bounds as without memory.
 """
 
 from __future__ import annotations
@@ -30,10 +29,10 @@ from .start import SLOWER, SLOWEST
 from .values import FrameInput, State
 
 SHARE = 0.5
-"""Part of a bend that stays, a round number: plain cotton that was folded flat opens by about half in tests of crease
-recovery (ISO 2313), other cloth by more."""
+"""Fraction of a bend remaining, a round number: flat-folded plain cotton opens by about half in tests of crease
+recovery (ISO 2313), other fabrics by more."""
 SET = 4.0
-"""Crease times after which cloth in a held pose rests: a memory is then within 2% of the angle that it follows."""
+"""Crease times until cloth in a held pose rests: the memory is then within 2% of its target angle."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,8 +41,8 @@ class Creases:
 
     Attributes:
         bent: Remembered bends [rad], shape (H,).
-        rest_angle: Angles at which hinges rest therefore [rad], shape (H,).
-        pace: Part of its usual pace at which cloth in a held pose slows down, so that it rests when creases have set.
+        rest_angle: Resulting rest angles of the hinges [rad], shape (H,).
+        pace: Slow-down rate of cloth in a held pose, relative to the usual, so that cloth rests once creases have set.
     """
 
     bent: Float[Tensor, " hinges"]
@@ -56,17 +55,17 @@ class Creases:
 
 
 def keeps_creases(frame: FrameInput) -> bool:
-    """Whether some fabric keeps creases."""
+    """Whether any fabric keeps creases."""
     return any(each.fabric.crease_time > 0 for each in frame.garments)
 
 
 def creases_of(level: Level, frame: FrameInput, last: State | None) -> Creases | None:
-    """Creases of a frame, by where the cloth was in the one that it starts from; None where no fabric keeps any.
+    """Creases of a frame, from the cloth's angles in the start frame; None if no fabric keeps creases.
 
     Args:
         level: The finest level.
         frame: The frame.
-        last: What the frame that it starts from left, or None for a cold start.
+        last: State left by the start frame, or None for a cold start.
     """
     if last is None or last.fine is None or not keeps_creases(frame):
         return None
@@ -84,15 +83,15 @@ def creases_of(level: Level, frame: FrameInput, last: State | None) -> Creases |
 
 
 def _rate(time: float, elapsed: float) -> float:
-    """Part of the way to its angle that a memory goes."""
+    """Relaxation of a memory towards its target angle, as a fraction."""
     return -math.expm1(-max(elapsed, 0.0) / time) if time > 0 else 0.0
 
 
 def _wrapped(angle: Float[Tensor, " hinges"]) -> Float[Tensor, " hinges"]:
-    """Angles less whole turns, in [-pi, pi]."""
+    """Angles minus whole turns, in [-pi, pi]."""
     return angle - 2.0 * math.pi * torch.round(angle / (2.0 * math.pi))
 
 
 def _hinge_counts(level: Level) -> list[int]:
-    """Number of hinges of each garment, in whose order they lie."""
+    """Number of hinges of each garment; hinges are sorted by garment."""
     return torch.bincount(level.hinge_garment.long(), minlength=len(level.spans)).tolist()

@@ -1,12 +1,12 @@
-"""Values that the cage gives to the fine cloth: the last frame's detail, and the places of what no solve moves.
+"""Carries the last frame's detail along with the cage, and places all vertices not moved by the solve.
 
-Detail is x - S x_c, with S the smooth map from the cage. Each cage vertex has an orthonormal frame made of its normal
-and of a tangent that is a fixed linear combination of the triangles' edges, so frames turn with the surface. What
-interpolates to the fine vertices is how frames have turned: tangents of neighbours may point anywhere, also against one
-another, and have no mean.
+Detail is x - S x_c, with S the smooth map from the cage. Each cage vertex has an orthonormal frame from its normal and
+a tangent. The tangent is a fixed linear combination of the triangles' edges, so frames rotate with the surface. The
+rotation of the frames is interpolated to the fine vertices, not the frames: tangents of neighbours may point in any
+direction, even opposite, and have no mean.
 
-Fixed vertices are placed by the cage, corners of faces without area follow the cloth beside them, and rigid parts the
-cloth under them.
+Fixed vertices are placed by the cage, corners of faces without area follow the neighbouring cloth, and rigid parts the
+cloth below.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from .rigid_parts import RigidParts
 from .values import State
 
 NEAREST = 1e-6
-"""Distance under which points count as at one place, in edge lengths."""
+"""Distance below which points count as coincident, in edge lengths."""
 
 
 class MovingFrames:
@@ -84,7 +84,7 @@ class MovingFrames:
     def _turned(
         self, before: Float[Tensor, "coarse 3 3"], after: Float[Tensor, "coarse 3 3"]
     ) -> Float[Tensor, "vertices 3 3"]:
-        """How cage frames have turned, interpolated to the fine vertices; not at all where either is no frame."""
+        """Rotation of the cage frames, interpolated to the fine vertices; identity if either frame is degenerate."""
         turned = torch.einsum("cij,ckj->cik", after, before)
         whole = (torch.linalg.det(turned) > 0.5).unsqueeze(1).unsqueeze(2)
         turned = torch.where(whole, turned, torch.eye(3, dtype=turned.dtype, device=turned.device))
@@ -93,10 +93,10 @@ class MovingFrames:
 
 
 class Followers:
-    """Fixed vertices, and corners of faces without area, which move with what lies beside them, by nearness."""
+    """Fixed vertices, and corners of faces without area; the latter follow their neighbours, weighted by nearness."""
 
     def __init__(self, level: Level, garments: Sequence[Garment], meshes: Sequence[PolygonMesh]) -> None:
-        """Find them at a level; ``meshes`` are its garments' polygons."""
+        """Find the followers of a level; ``meshes`` are the garments' polygons."""
         self._rigid = RigidParts(level, garments)
         parts = zip(meshes, level.spans, strict=True)
         edges = np.concatenate([mesh.half_edges.edges.astype(np.int64) + span.start for mesh, span in parts])
@@ -108,7 +108,7 @@ class Followers:
         length = np.linalg.norm(rest[ends[:, 0]] - rest[ends[:, 1]], axis=1)
         near = 1.0 / np.maximum(length, NEAREST * float(level.spacing.mean()))
         beside = sp.csr_matrix((near, (row, ends[:, 1])), shape=(len(self._which), level.vertex_count))
-        # What hangs together with no cloth at all stays: the margin makes its matrix one that can be inverted.
+        # Parts without any adjacent cloth stay: the margin makes the matrix invertible.
         degree = sp.diags(np.bincount(row, near, len(self._which)) * (1.0 + 1e-9))
         self._inverse = splu(sp.csc_matrix(degree - beside[:, self._which])) if len(row) else None
         self._fixed = np.flatnonzero(~level.free.cpu().numpy().ravel())
@@ -116,12 +116,13 @@ class Followers:
         self._beside, self._from_coarse = sp.csr_matrix(beside @ sp.diags(1.0 - idle)), level.from_coarse
 
     def placed(self, x: Placed, origin: np.ndarray, coarse: np.ndarray) -> np.ndarray:
-        """World positions [m], shape (V, 3), of which these are placed by the cage's and by the others.
+        """World positions [m], shape (V, 3), with followers placed by the cage and by the solved vertices.
 
-        Fixed vertices are the upsampled cage's own; a corner is moved off it as its neighbours are on the mean.
+        Fixed vertices take the upsampled cage's positions; a corner's offset from the cage is the mean of its
+        neighbours'.
 
         Args:
-            x: Where the cloth is, about the origin [m].
+            x: Positions of the cloth, about the origin [m].
             origin: World position [m], shape (3,).
             coarse: The cage's world positions [m], shape (C, 3).
         """
@@ -137,7 +138,7 @@ class Followers:
 def orthonormal(
     normal: Float[Tensor, "vertices 3"], tangent: Float[Tensor, "vertices 3"]
 ) -> Float[Tensor, "vertices 3 3"]:
-    """Frames from normals and rough tangents, columns are tangent, bitangent, normal; any where both vanish."""
+    """Frames from normals and rough tangents, columns are tangent, bitangent, normal; arbitrary if both vanish."""
     normal = torch.nn.functional.normalize(normal, dim=1, eps=1e-30)
     tangent = tangent - (tangent * normal).sum(dim=1, keepdim=True) * normal
     tangent = torch.nn.functional.normalize(tangent, dim=1, eps=1e-30)
@@ -145,10 +146,10 @@ def orthonormal(
 
 
 def tangent_operator(triangles: np.ndarray, rest: np.ndarray) -> sp.csr_matrix:
-    """Sparse map from cage positions to one tangent a vertex.
+    """Sparse map from cage positions to one tangent per vertex.
 
-    A vertex's reference direction at rest is projected into each incident triangle and written as a combination of that
-    triangle's two edges; the same combination of the deformed edges is that triangle's vote.
+    A vertex's reference direction at rest is projected into each incident triangle and written as a combination of the
+    triangle's two edges; the same combination of the deformed edges is the triangle's vote.
 
     Args:
         triangles: Corner vertices, shape (T, 3).
@@ -176,7 +177,7 @@ def tangent_operator(triangles: np.ndarray, rest: np.ndarray) -> sp.csr_matrix:
 
 
 def _reference_directions(triangles: np.ndarray, rest: np.ndarray) -> np.ndarray:
-    """One tangent direction per cage vertex in the rest shape: its first edge, projected."""
+    """One tangent direction per cage vertex in the rest shape: the vertex's first edge, projected."""
     normal = np.zeros_like(rest)
     area = np.cross(rest[triangles[:, 1]] - rest[triangles[:, 0]], rest[triangles[:, 2]] - rest[triangles[:, 0]])
     for corner in range(3):
@@ -189,7 +190,7 @@ def _reference_directions(triangles: np.ndarray, rest: np.ndarray) -> np.ndarray
 
 
 def mean_edge(triangles: np.ndarray, rest: np.ndarray) -> float:
-    """Mean edge of triangles [m]; 1 where there are none."""
+    """Mean edge of triangles [m]; 1 without triangles."""
     if not len(triangles):
         return 1.0
     sides = rest[triangles] - rest[np.roll(triangles, 1, axis=1)]

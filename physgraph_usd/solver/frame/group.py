@@ -1,4 +1,4 @@
-"""Garments that are solved together: their levels, and what of their forces and solve lasts from frame to frame."""
+"""Garments solved together: their levels, and all data kept from frame to frame."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ class Group:
     Attributes:
         garments: The garments.
         gravity: [m/s^2], shape (3,).
-        settings: How to solve.
-        levels: Their levels, cage first.
+        settings: Settings of the solve.
+        levels: The levels, cage first.
         guide_maps: The guide's averaging operator of each level.
-        moving_frames: Of the cage, which carry the last frame's detail.
-        followers: What no solve moves.
+        moving_frames: Frames of the cage, to carry the last frame's detail.
+        followers: Vertices not moved by the solve.
         cloth: The cloth's contact with itself.
         seams: The seam of each level, or None.
     """
@@ -55,7 +55,7 @@ class Group:
     followers: Followers
     cloth: ClothContact
     seams: list[Seam | None]
-    # The lasting terms by materials, of the last ones alone; and integrators with what they recorded.
+    # The lasting terms of the last materials only; and integrators with their recordings.
     _forces: dict[tuple[object, ...], list[LevelForces]] = field(default_factory=dict)
     _integrators: dict[Callable[[], Integrator], Integrator] = field(default_factory=dict)
 
@@ -74,12 +74,12 @@ class Group:
 
         Args:
             garments: Garments solved together.
-            refinements: Their refinements.
+            refinements: Refinements of each garment.
             gravity: [m/s^2], shape (3,).
-            settings: How to solve.
+            settings: Settings of the solve.
             dtype: Scalar type of the solve.
             device: "cpu" or a CUDA device.
-            threads: Most threads that a kernel uses on the CPU.
+            threads: Most threads per kernel on the CPU.
         """
         about = [recentred(garment) for garment in garments]
         levels = build_levels(about, refinements, dtype=dtype, device=device, threads=threads)
@@ -106,7 +106,7 @@ class Group:
         return torch.as_tensor(array, dtype=self.levels[0].dtype, device=self.levels[0].device)
 
     def cage(self, frames: Sequence[GarmentFrame]) -> Cage:
-        """Where the cages are."""
+        """Positions of the cages."""
         world = np.concatenate([frame.points for frame in frames])
         origin = world.mean(axis=0) if len(world) else np.zeros(3)
         return Cage(world, origin, self.tensor(world - origin))
@@ -124,12 +124,12 @@ class Group:
 
     @property
     def integrator(self) -> Integrator:
-        """The settings' integrator, built when first asked for."""
+        """The settings' integrator, built on first use."""
         return self._built(self.settings.method.build)
 
     @property
     def untangler(self) -> Integrator:
-        """Makes the steps that draw apart what crosses: forces that end there mislead the network."""
+        """Integrator to pull crossing cloth apart: forces ending at a crossing mislead the network."""
         return self._built(QuasiNewton)
 
     def _built(self, build: Callable[[], Integrator]) -> Integrator:
@@ -143,12 +143,12 @@ class Group:
         *,
         settings: ContactSettings | None = None,
     ) -> FrameContact | None:
-        """Contact of a frame's cloth, or None when nothing may touch.
+        """Contact of a frame's cloth, or None without possible contact.
 
         Args:
             frame: The frame.
-            cage: Where the cages are.
-            settings: How contact is solved; the group's own when None.
+            cage: Positions of the cages.
+            settings: Contact settings; the group's own when None.
         """
         settings = settings or self.settings.contact
         touching = frame.touching if settings.form != "off" else ()
@@ -163,7 +163,7 @@ class Group:
         return FrameContact(self.levels, cage.points, bodies=bodies, cloth=cloth, **cloths)
 
     def upsampled(self, frames: Sequence[GarmentFrame]) -> list[np.ndarray]:
-        """World positions of each garment [m] on its cage's smooth surface, not solved."""
+        """World positions of each garment [m] on its cage's smooth surface, unsolved."""
         cage, finest = self.cage(frames), self.levels[-1]
         smooth = unhindered(finest.smooth_base.apply(cage.points))
         points = self.followers.placed(smooth, cage.origin, cage.world)
@@ -172,7 +172,7 @@ class Group:
     def energies(
         self, frames: Sequence[GarmentFrame], points: Sequence[np.ndarray], touching: Sequence[Touching] = ()
     ) -> dict[str, float]:
-        """Energy of each term [J] at the garments' world positions [m], what touches there found anew."""
+        """Energy of each term [J] at the garments' world positions [m], with contact detected again."""
         module, contact, origin = self.potential(frames, touching)
         x = self.tensor(np.concatenate(points) - origin)
         touched = () if contact is None else contact.at(self.levels[-1]).terms(x)[1]
@@ -186,9 +186,9 @@ class Group:
         *,
         touching: Sequence[Touching] = (),
     ) -> tuple[list[np.ndarray], dict[str, Any]]:
-        """World positions [m] as near to wanted ones as nothing newly crosses on the way, and out of bodies.
+        """World positions [m] as near to the wanted as possible without new crossings on the way, and out of bodies.
 
-        Also what touches and crosses there, as plain values; none where nothing may touch.
+        Also returns contact and crossings at the result, as plain values; empty without possible contact.
         """
         _, contact, origin = self.potential(frames, touching)
         if contact is None:
@@ -215,7 +215,7 @@ class Group:
     def potential(
         self, frames: Sequence[GarmentFrame], touching: Sequence[Touching] = ()
     ) -> tuple[ForceModule, FrameContact | None, np.ndarray]:
-        """The finest level's forces in a frame, what the cloth may touch, and where its origin is [m], to judge by."""
+        """The finest level's forces in a frame, the contact, and the origin's world position [m], to judge results."""
         cage = self.cage(frames)
         contact = self.contact(FrameInput(frames, touching=touching), cage)
         aim = cage.points if contact is None else contact.aim

@@ -1,7 +1,7 @@
-"""Memory of a garment's last frames, and from which of them the next one starts: values, replaced frame by frame.
+"""Memory of a garment's last frames, and the choice of the start frame: values, replaced frame by frame.
 
-A frame starts from the last one, unless that one was broken: where the input leaves its place for one frame and comes
-back, what was solved there is no start for what follows. Then the frame before it is.
+A frame starts from the last frame, unless the last frame was broken: if the input leaves its place for a single frame
+and comes back, the solution of the broken frame is no start. The frame before is used instead.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from ..scene import Frame, GarmentFrame
 from .values import State, join
 
 RETURNED = 0.25
-"""Fraction of its move into a broken frame by which the input may miss its place before it, to have come back. What
-moves on evenly misses it by twice that move, and what turns round by less only if it moves by less than an edge."""
+"""Tolerance for the input's return after a broken frame, as a fraction of the move into the broken frame. Even motion
+misses the earlier place by twice the move; a reversal misses by less only if the move is below an edge."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,14 +27,14 @@ class SolvedFrame:
 
     Attributes:
         time: Time code.
-        frame: What it was solved for.
-        colliders: Poses of all of the scene's bodies then.
-        near: Numbers of those that it could touch.
-        part: Numbers of the garments that it was solved with.
+        frame: The garment's input.
+        colliders: Poses of all of the scene's bodies.
+        near: Numbers of the bodies within reach.
+        part: Numbers of the garments solved together.
         points: Fine positions [m].
-        state: What it leaves to the next.
-        crossing: Which fine vertices belong to cloth that crosses cloth.
-        first: Whether it was solved with none before it.
+        state: State for the next frame.
+        crossing: Whether each fine vertex belongs to cloth that crosses cloth.
+        first: Whether no frame was solved before.
     """
 
     time: float | None
@@ -53,8 +53,8 @@ class Memory:
     """Memory of one garment.
 
     Attributes:
-        last: The last frame that was solved.
-        before: The one that it started from.
+        last: The last solved frame.
+        before: The start frame of ``last``.
         solved: Whether the last result is a solution.
     """
 
@@ -65,14 +65,14 @@ class Memory:
 
 @dataclass(frozen=True, eq=False)
 class Origin:
-    """Start of a frame of garments that are solved together.
+    """Start of a frame of garments solved together.
 
     Attributes:
-        frames: The frame of each garment that it starts from; None where there is none.
-        state: What they left, joined and moved as the cages have moved since; None for a cold start.
-        motion: The rigid motion that brings the cages of those frames closest to this frame's.
-        broken: Time code of the last frame, where the input left its place in it alone; else None.
-        jumped: Time code of the first frame, where the input jumped from there to the second; else None.
+        frames: The start frame of each garment; None without one.
+        state: State left by the start frames, joined and moved along with the cages; None for a cold start.
+        motion: The rigid motion from the start frames' cages closest to this frame's cages.
+        broken: Time code of the last frame, if only the last frame's input left its place; else None.
+        jumped: Time code of the first frame, if the input jumped from the first frame to the second; else None.
         gap: Whether the time between samples is too long.
     """
 
@@ -84,9 +84,10 @@ class Origin:
     gap: bool
 
     def moved(self, part: tuple[int, ...], frame: Frame, near: Sequence[int], gravity: np.ndarray) -> float:
-        """How far bodies that garments may touch have moved since, seen from the cages [m].
+        """Largest motion of nearby bodies since the start frame, relative to the cages [m].
 
-        Infinite if more than poses changed. Gravity counts as a body: its direction's end at a metre.
+        Infinite if more than poses changed. Gravity counts as a body: the end of its direction at a distance of one
+        metre.
         """
         known = [each for each in self.frames if each is not None]
         down = gravity / max(float(np.linalg.norm(gravity)), 1e-30)
@@ -98,7 +99,7 @@ class Origin:
         return farthest
 
     def elapsed(self, time: float | None, seconds: float) -> list[float]:
-        """Time from the frame that each garment starts from to a time code [s]; 0 where one of them has none.
+        """Time from each garment's start frame to a time code [s]; 0 without either.
 
         Args:
             time: The time code.
@@ -108,7 +109,7 @@ class Origin:
         return [0.0 if time is None or start is None else seconds * (time - start) for start in starts]
 
     def telemetry(self, walked_from: float | None) -> dict[str, object]:
-        """Telemetry of the start, given the time code from which a cold frame's cage walked here, or None."""
+        """Telemetry of the start, given the time code from which a cold frame's cage was advanced, or None."""
         found: dict[str, object] = {"start": "cold: the time between samples is too long"} if self.gap else {}
         if walked_from is not None:
             found["start"] = f"cold: the cage walked here from time code {walked_from:g}"
@@ -122,14 +123,14 @@ class Origin:
 def origin_of(
     part: tuple[int, ...], frame: Frame, memories: Sequence[Memory], *, near: Sequence[int], edge: float, gap: bool
 ) -> Origin:
-    """From which frame garments start.
+    """Choose the frame to start from.
 
     Args:
         part: Numbers of the garments.
-        frame: The frame that is to be solved.
-        memories: What is remembered of each of them.
-        near: The bodies that they may touch.
-        edge: Mean edge of their cages [m].
+        frame: The frame to be solved.
+        memories: Memory of each garment.
+        near: Numbers of the bodies within reach.
+        edge: Mean edge of the cages [m].
         gap: Whether the time between samples is too long.
     """
     near_by = {"near": near, "edge": edge}
@@ -140,12 +141,12 @@ def origin_of(
     state = None if gap or len(known) < len(part) else join([each.state for each in known])
     motion = _motion(known, [frame.garments[index] for index in part]) if state is not None else AT_REST
     if state is not None and any(each.part != part for each in known):
-        state = replace(state, clean=False)  # What was solved apart may cross.
+        state = replace(state, clean=False)  # Garments solved apart may cross.
     return Origin(frames, None if state is None else state.carried(motion), motion, broken, jumped, gap)
 
 
 def _motion(known: Sequence[SolvedFrame], now: Sequence[GarmentFrame]) -> Rigid:
-    """The rigid motion that brings cages closest to where they are now; none where they start from different frames."""
+    """The rigid motion closest to the cages' motion; identity if garments start from different frames."""
     before, after = ([each.points for each in frames] for frames in ([each.frame for each in known], now))
     if len({each.time for each in known}) > 1 or any(a.shape != b.shape for a, b in zip(before, after, strict=True)):
         return AT_REST
@@ -155,7 +156,7 @@ def _motion(known: Sequence[SolvedFrame], now: Sequence[GarmentFrame]) -> Rigid:
 def _broken(
     part: tuple[int, ...], frame: Frame, memories: Sequence[Memory], *, near: Sequence[int], edge: float
 ) -> float | None:
-    """Time code of the last frame, if garments' input left its place in it alone."""
+    """Time code of the last frame, if only the last frame's input left its place."""
     pairs = [(each.last, each.before) for each in memories if each.last is not None and each.before is not None]
     if len(pairs) == len(part):
         for index, (last, before) in zip(part, pairs, strict=True):
@@ -167,7 +168,7 @@ def _broken(
 def jumped_from(
     part: tuple[int, ...], frame: Frame, memories: Sequence[Memory], *, near: Sequence[int], edge: float
 ) -> float | None:
-    """Time code of the first frame, if garments' input jumped from there to the second and stays there."""
+    """Time code of the first frame, if garments' input jumped from the first frame to the second and stays there."""
     for index, each in zip(part, memories, strict=True):
         first, second = each.before, each.last
         if first is None or second is None or not first.first:
@@ -178,7 +179,7 @@ def jumped_from(
 
 
 def is_same(part: tuple[int, ...], frame: Frame, memories: Sequence[Memory], near: Sequence[int]) -> bool:
-    """Whether garments and the bodies that they may touch are what they were, solved together, and creases at rest."""
+    """Whether garments and nearby bodies are unchanged, were solved together, and creases are at rest."""
     for index, each in zip(part, (each.last for each in memories), strict=True):
         if each is None or each.part != part or near != each.near:
             return False
@@ -194,12 +195,12 @@ def is_same(part: tuple[int, ...], frame: Frame, memories: Sequence[Memory], nea
 
 
 def set_alike(a: GarmentFrame, b: GarmentFrame) -> bool:
-    """Whether an artist's settings are the same in two frames."""
+    """Whether the artist's settings are equal in two frames."""
     return (a.fabric, a.guide, a.detail, a.offset) == (b.fabric, b.guide, b.detail, b.offset)
 
 
 def cage_moved(known: SolvedFrame, now: GarmentFrame) -> float:
-    """How far any point of a garment's cage has moved since a frame [m]; infinite where that is no length."""
+    """Largest move of a garment's cage points since a frame [m]; infinite if not a length."""
     if now.points.shape != known.frame.points.shape:
         return np.inf
     far = float(np.linalg.norm(now.points - known.frame.points, axis=1).max(initial=0.0))
@@ -209,7 +210,7 @@ def cage_moved(known: SolvedFrame, now: GarmentFrame) -> float:
 def bodies_moved(
     known: SolvedFrame, colliders: Sequence[Pose | None], near: Sequence[int], *, along: Rigid = AT_REST
 ) -> float:
-    """How far any of some bodies is from where a motion takes it since a frame [m]; infinite where not comparable."""
+    """Largest deviation of bodies from a rigid motion since a frame [m]; infinite if not comparable."""
     farthest = 0.0
     for body in near:
         before, after = known.colliders[body], colliders[body]
@@ -226,15 +227,15 @@ def came_back(
     near: Sequence[int],
     edge: float,
 ) -> bool:
-    """Whether the input left its place in the last frame alone.
+    """Whether the input left its place in the last frame only.
 
     Args:
         last: The last frame.
-        before: The one that it started from.
+        before: The start frame of ``last``.
         now: The garment in this frame.
         colliders: Poses of all bodies in this frame.
-        near: Those that the garment may touch.
-        edge: Mean edge of the cage [m]; what moves less is no break: the cloth follows it.
+        near: Numbers of the bodies within the garment's reach.
+        edge: Mean edge of the cage [m]; a smaller move is no break: the cloth follows the move.
     """
     near = sorted({*near, *before.near})
     away = max(cage_moved(last, now), bodies_moved(last, colliders, near))
@@ -250,14 +251,14 @@ def jumped_in(
     near: Sequence[int],
     edge: float,
 ) -> bool:
-    """Whether the input left its place in the first of three frames alone.
+    """Whether the input left its place in the first of three frames only.
 
     Args:
         first: The first frame.
-        second: The one after it.
+        second: The second frame.
         now: The garment in this frame, the third.
         colliders: Poses of all bodies in this frame.
-        near: Those that the garment may touch.
+        near: Numbers of the bodies within the garment's reach.
         edge: As for `came_back`.
     """
     near = sorted({*near, *first.near, *second.near})

@@ -1,7 +1,7 @@
-"""Where a run that begins in the middle of a shot finds its cloth: the cage walks there from an earlier frame.
+"""Finds the start of a run in the middle of a shot: the cage is advanced from an earlier frame.
 
-Cloth that walks from frame to frame crosses nothing new, but a cage that crosses in the middle of a shot cannot always
-be drawn apart by itself. An earlier one often can, and the cage alone walks at a small part of what a frame costs.
+Cloth advanced from frame to frame gains no new crossings, but a cage crossing itself in the middle of a shot cannot
+always be pulled apart. An earlier frame often can, and advancing the cage alone costs a small fraction of a frame.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ def cages_walked(
     device: str = "cpu",
     threads: int = 1,
 ) -> tuple[Refiner, float] | None:
-    """Walk a scene's cages to the first frame of a run, where cloth walks and feels cloth.
+    """Advance a scene's cages to the first frame of a run, if frames are continued and self contact is on.
 
     Args:
         scene: The scene.
-        settings: How the run is solved.
+        settings: Settings of the run.
         frame_at: Reads a time code.
         times: The shot's time codes up to the run's first, in order.
-        device: Where the run is solved.
-        threads: Most threads that a kernel uses on the CPU.
+        device: Device of the run.
+        threads: Most threads per kernel on the CPU.
 
     Returns:
         As `lead_in`.
@@ -46,23 +46,23 @@ def cages_walked(
 def lead_in(
     cages: Refiner, frame_at: Callable[[float | None], Frame], times: Sequence[float]
 ) -> tuple[Refiner, float] | None:
-    """Walk the cage to a run's first frame from one where it does not cross, or comes clean by itself.
+    """Advance the cage to a run's first frame from a frame without crossings, or solvable without crossings.
 
-    That frame is looked for 0, 1, 2, 4, 8, ... frames before; where none comes clean, it is the shot's first.
+    The start frame is searched 0, 1, 2, 4, 8, ... frames back; if no frame comes clean, the shot's first frame is used.
 
     Args:
-        cages: A refiner of the shot that does not subdivide.
-        frame_at: Reads a time code; one that cannot be read or solved is left out.
+        cages: A refiner of the shot without subdivision.
+        frame_at: Reads a time code; unreadable or unsolvable time codes are skipped.
         times: The shot's time codes up to the run's first, in order.
 
     Returns:
-        The refiner there, and the time code that it walked from; None where the first frame's cage does not
-        cross, or is the shot's first.
+        The refiner at the run's first frame, and the start time code; None if the run's first cage does not cross, or
+        is the shot's first.
     """
     last = len(times) - 1
     try:
         needed = last > 0 and _crosses(cages, frame_at(times[last]))
-    except StageError:  # It is told of where the frame is solved.
+    except StageError:  # Solving the frame will report the error.
         needed = False
     if not needed:
         return None
@@ -76,7 +76,7 @@ def lead_in(
 
 
 def _crosses(cages: Refiner, frame: Frame) -> bool:
-    """Whether a cage that is to keep its sides crosses itself, or another one, in a frame."""
+    """Whether a cage with self contact crosses itself or another cage in a frame."""
     refuse_far(cages.scene, frame)
     for part in cages.parts_of(frame):
         contact = cages.group_of(part).potential([frame.garments[index] for index in part])[1]
@@ -86,14 +86,14 @@ def _crosses(cages: Refiner, frame: Frame) -> bool:
 
 
 def _is_clean(cages: Refiner, frame_at: Callable[[float | None], Frame], time: float) -> bool:
-    """Whether nothing crosses in the cage that is solved at a time code by itself."""
+    """Whether nothing crosses in the cage solved at a time code without history."""
     cages.forget()
     entries = _solve(cages, frame_at, time)
     return bool(entries) and all(not entry["contact"]["cloth"]["after"]["crossings"] for entry in entries)
 
 
 def _solve(cages: Refiner, frame_at: Callable[[float | None], Frame], time: float) -> list[dict[str, Any]]:
-    """Telemetry of each garment whose cloth may touch cloth; nothing of a frame that cannot be solved."""
+    """Telemetry of each garment with cloth contact; empty for an unsolvable frame."""
     try:
         state: Any = cages.solve(frame_at(time))
     except (SolveError, StageError):

@@ -28,13 +28,13 @@ from ..scene import Garment, GarmentFrame
 
 @dataclass(frozen=True, eq=False)
 class LevelForces:
-    """Terms that one level's cloth feels, frame after frame.
+    """Terms acting on one level's cloth, frame after frame.
 
     Attributes:
-        level: The level, its rest lengths those of the cloth.
+        level: The level, with the cloth's rest lengths.
         terms: Stretch, membrane, bending and gravity.
         guide: The guide, without a target.
-        metric: The factorised rest Hessian of all of them.
+        metric: The factorised rest Hessian of all terms.
         density: Areal density of each garment [kg/m^2].
         bends: Whether any cloth resists bending.
         unresolved: Whether some garment's edges are too long for its folds, and its bending stiffness raised.
@@ -51,28 +51,28 @@ class LevelForces:
     def without_facets(
         self, x: Float[Tensor, "vertices 3"], below: Float[Tensor, "coarse 3"], smooth: Stencil
     ) -> Float[Tensor, "vertices 3"]:
-        """The move that takes a coarser mesh's facets out of x, as `facets` gives it [m]; none where nothing bends."""
+        """The move to remove a coarser mesh's facets from x, as in `facets` [m]; zero if nothing resists bending."""
         return facets(self.level, x, below, smooth.apply) if self.bends else torch.zeros_like(x)
 
     def module(
         self, coarse: Float[Tensor, "coarse 3"], rest_angle: Float[Tensor, " hinges"] | None = None
     ) -> ForceModule:
-        """All terms of one frame, given its recentred coarse positions [m], and angles at rest [rad] if not its own."""
+        """All terms of one frame, given the recentred coarse positions [m], and optional rest angles [rad]."""
         return ForceModule((*self._resting_at(rest_angle), self.guide.retarget(coarse)))
 
     def _resting_at(self, rest_angle: Float[Tensor, " hinges"] | None) -> tuple[Force, ...]:
-        """The lasting terms, with other angles at rest [rad] where these are given."""
+        """The lasting terms, with optional different rest angles [rad]."""
         if rest_angle is None:
             return self.terms
         return tuple(each.resting_at(rest_angle) if isinstance(each, Bending) else each for each in self.terms)
 
     def system(self, module: ForceModule, tie: tuple[float, Float[Tensor, "vertices 3"]] | None = None) -> System:
-        """The system of a frame in which nothing touches, given its terms; the tie as for `lasting_system`."""
+        """The system of a frame without contact, given its terms; the tie as in `lasting_system`."""
         forces = module.forces if tie is None else (*module.forces, self.tether(*tie))
         return self.system_in(ForceModule(forces, remembers=True))
 
     def system_in(self, field: ForceField, metric: Preconditioner | None = None, *, lasting: bool = False) -> System:
-        """The system of the level in any field, by its own metric or another one."""
+        """The system of the level in any field, with the level's metric by default."""
         level, metric = self.level, self.metric if metric is None else metric
         return System(field, metric, free=level.free, spacing=level.spacing, level=level, lasting=lasting)
 
@@ -89,14 +89,14 @@ class LevelForces:
         *,
         rest_angle: Float[Tensor, " hinges"] | None = None,
     ) -> System:
-        """The system of a frame in which nothing touches: the same in every frame, aimed anew.
+        """The system of a frame without contact: reused in every frame, with new targets.
 
-        What was recorded of its steps serves in the next frame too.
+        Recorded steps remain valid in the next frame.
 
         Args:
             coarse: Recentred coarse positions [m].
             tie: Stiffness [1/s^2] and predicted positions [m] of a tether, or None.
-            rest_angle: Angles at rest [rad], if not the terms' own.
+            rest_angle: Rest angles [rad], to replace the terms' own.
         """
         kind = tie is not None, rest_angle is not None
         if kind not in self._lasting:
@@ -115,7 +115,7 @@ class LevelForces:
 
     @cached_property
     def _lasting(self) -> dict[tuple[bool, bool], tuple[System, Guide, Tether | None, Tensor | None]]:
-        """Systems that `lasting_system` gave, by whether they are tied, and whether they rest at other angles."""
+        """Systems returned by `lasting_system`, by presence of a tie and of rest angles."""
         return {}
 
     def tether(self, stiffness: float, predicted: Float[Tensor, "vertices 3"]) -> Tether:
@@ -135,9 +135,9 @@ def build_forces(
 
     Args:
         level: The level.
-        guide_map: Its averaging operator.
+        guide_map: Averaging operator of the level.
         garments: The garments.
-        frames: Their values at one time code.
+        frames: Values of the garments at one time code.
         gravity: [m/s^2], shape (3,).
     """
     fabrics = [frame.fabric for frame in frames]
@@ -173,7 +173,7 @@ def blame(
     error: Exception,
     at: float | None,
 ) -> str:
-    """Name prims, time code and the terms that are not finite at the upsampled cage."""
+    """Name prims, time code and the terms not finite at the upsampled cage."""
     energies = lasting.module(coarse).energies(lasting.level.base.apply(coarse))
     broken = [name for name, value in energies.items() if not np.isfinite(value)] or ["none at the input"]
     return f"{named(garments, at)}: {error}; terms that are not finite: {', '.join(broken)}"

@@ -1,4 +1,4 @@
-"""Outcome of a frame's solve: the cloth shown, what it leaves to the next frame, and what the report says."""
+"""Outcome of a frame's solve: the visible cloth, the state for the next frame, and the report's entries."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ from .values import State
 
 
 def refuse_swallowed(problem: Problem) -> None:
-    """Refuse cloth wholly in a body, deeper than it is large: pushed out, it would be nowhere near its cage.
+    """Refuse cloth wholly in a body, deeper than its own size: pushed out, the cloth would be far from its cage.
 
     Raises:
-        SolveError: There is such cloth.
+        SolveError: Some cloth is wholly in a body.
     """
     depths = [] if problem.contact is None else problem.contact.depths
     for garment, each, (deep, body) in zip(problem.group.garments, problem.frame.garments, depths, strict=False):
@@ -37,10 +37,10 @@ def refuse_swallowed(problem: Problem) -> None:
 
 
 def scaled(problem: Problem, x: Placed) -> Placed:
-    """The cloth with its detail scaled as asked for [m], within bounds, as far as nothing newly crosses.
+    """The cloth with scaled detail [m], within bounds, as far as possible without new crossings.
 
     Raises:
-        SolveError: It is not finite or out of bounds.
+        SolveError: The cloth is not finite or out of bounds.
     """
     group, view = problem.group, problem.view(problem.finest)
     pairs = zip(problem.frame.garments, group.garments, strict=True)
@@ -53,7 +53,7 @@ def scaled(problem: Problem, x: Placed) -> Placed:
 
 
 def state_left(problem: Problem, x: Placed) -> State:
-    """State from which the next frame starts.
+    """State for the start of the next frame.
 
     Args:
         problem: The frame.
@@ -76,13 +76,13 @@ def state_left(problem: Problem, x: Placed) -> State:
 
 
 def telemetry_of(problem: Problem, x: Tensor, module: ForceModule, *, reports: Sequence[LevelReport]) -> dict[str, Any]:
-    """How a frame was solved and how its result lies, as plain values.
+    """Telemetry of a frame's solve and result, as plain values.
 
     Args:
         problem: The frame.
         x: The result [m].
         module: The terms at the finest level.
-        reports: Those of the levels' rounds.
+        reports: Reports of the levels' rounds.
     """
     finest = problem.forces[-1].level
     base = finest.base.apply(problem.cage.points)
@@ -96,14 +96,14 @@ def telemetry_of(problem: Problem, x: Tensor, module: ForceModule, *, reports: S
 
 
 def measured(problem: Problem, x: Tensor) -> tuple[dict[str, object], np.ndarray]:
-    """Measures of contact: near parts and crossings, also of what is off but to be measured.
+    """Measures of contact: near parts and crossings, including contact switched off but measured.
 
     Args:
         problem: The frame.
         x: The result [m].
 
     Returns:
-        Plain values, and which vertices belong to cloth that crosses, shape (V,), bool.
+        Plain values, and whether each vertex belongs to crossing cloth, shape (V,), bool.
     """
     group, settings = problem.group, problem.group.settings.contact.to_measure()
     judge = problem.contact if settings is None else group.contact(problem.frame, problem.cage, settings=settings)

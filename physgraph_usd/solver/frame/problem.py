@@ -1,4 +1,4 @@
-"""One frame of a group, ready to be solved: its cage, what it may touch, where it starts, and each level of it."""
+"""One frame of a group, ready to be solved: cage, contact, start, and levels."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from .start import Start, start_of
 from .values import Cage, FrameInput, State
 
 NEAR = 10.0
-"""Remaining move [tolerances] under which a warm frame in contact is done after a part of its steps."""
+"""Remaining move [tolerances] below which a warm frame in contact may finish after a fraction of its steps."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,15 +33,16 @@ class LevelProblem:
     """One level of a frame.
 
     Attributes:
-        lasting: Its terms that last as long as the materials.
-        module: All of its terms where nothing touches.
-        alone: Its system where nothing touches, tied to its start in a warm frame.
-        view: What its cloth may touch, or None.
-        integrator: What makes the steps.
-        untangler: What makes those that draw apart what crosses.
-        budget: When to stop.
-        near: Remaining move [tolerances] under which a frame in contact is done after a part of its steps; 0 for never.
-        outward: As `leave_saddle` takes it.
+        lasting: Terms that last as long as the materials.
+        module: All terms without contact.
+        alone: The system without contact, tied to the start in a warm frame.
+        view: Contact of the level's cloth, or None.
+        integrator: Makes the steps.
+        untangler: Makes the steps to pull crossings apart.
+        budget: Stopping criteria.
+        near: Remaining move [tolerances] below which a frame in contact may finish after a fraction of its steps; 0 for
+            never.
+        outward: As in `leave_saddle`.
     """
 
     lasting: LevelForces
@@ -67,13 +68,13 @@ class LevelProblem:
         *,
         last: System | None = None,
     ) -> System:
-        """The system with the terms of what is near.
+        """The system with contact terms.
 
         Args:
-            view: What the cloth may touch, as seen from x.
-            touched: The terms of what is near.
-            x: Positions at which they are weighed [m].
-            last: The last round's system, whose metric may serve on.
+            view: Contact of the cloth, as detected at x.
+            touched: The contact terms.
+            x: Positions used to weigh the contact terms [m].
+            last: The last round's system, whose metric may be reused.
         """
         if not touched and view.seam is None:
             return self.alone
@@ -87,21 +88,21 @@ class LevelProblem:
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """One frame, ready to be solved; all positions are about the cages' mean.
+    """One frame, ready to be solved; all positions are relative to the cages' mean.
 
     Attributes:
-        began: When the frame began [s].
+        began: Start of the frame's computation [s].
         group: The garments.
         frame: The frame.
-        cage: Where the cages are.
-        aim: The cage that the fine cloth follows [m].
+        cage: Positions of the cages.
+        aim: The cage followed by the fine cloth [m].
         forces: The lasting terms of each level, coarsest first.
-        contact: What the cloth may touch, or None.
-        start: Where the cloth starts.
-        walked: Where the cages walked to from an earlier frame [m], for a cold start; or None.
-        before: Where it was [m], float64; None where there is no last frame.
-        tether: How stiffly it is tied to its start [1/s^2]; None where it is not.
-        creases: What its cloth remembers of its folds; None where it starts cold, or remembers none.
+        contact: Contact of the cloth, or None.
+        start: Start of the cloth.
+        walked: Cages advanced from an earlier frame [m], for a cold start; or None.
+        before: Fine positions in the last frame [m], float64; None without a last frame.
+        tether: Stiffness of the tie to the start [1/s^2]; None without tie.
+        creases: Crease memory of the cloth; None for a cold start, or without creases.
     """
 
     began: float
@@ -129,14 +130,14 @@ class Problem:
 
     @cached_property
     def carried(self) -> Float[Tensor, "vertices 3"]:
-        """The finest vertices with the last frame's detail, as far as they come from where they were [m]."""
+        """The finest vertices with the last frame's detail, moved from their last positions as far as allowed [m]."""
         view, warm = self.view(self.finest), self.start.detailed
         assert warm is not None
         return warm if view is None or self.before is None else view.moved(self.before, warm)
 
     @property
     def finest(self) -> int:
-        """Number of the finest level: that of the subdivisions."""
+        """Number of the finest level, equal to the number of subdivisions."""
         return len(self.forces) - 1
 
     def view(self, index: int) -> LevelContact | None:
@@ -145,7 +146,7 @@ class Problem:
 
     @property
     def levels(self) -> range:
-        """Numbers of the levels that are solved: all in a cold frame that is nested or has crossings to untangle."""
+        """Numbers of the levels to solve: all in a cold frame if nested or with crossings to untangle."""
         from_cage = not self.warm and (self.group.settings.method.nested or self.crossed)
         return range(0 if from_cage else self.finest, self.finest + 1)
 
@@ -153,21 +154,21 @@ class Problem:
         """One level.
 
         Args:
-            index: Its number.
-            since: When the frame was ready to be solved [s].
+            index: Number of the level.
+            since: Time at which the frame was ready to be solved [s].
         """
         lasting, settings = self.forces[index], self.group.settings
         angles = self.creases.rest_angle if self.creases is not None and index == self.finest else None
         module = lasting.module(self.aim, angles)
         tie = None if self.tether is None or self.start.detailed is None else (self.tether, self.start.detailed)
-        # What is recorded of a level's steps on CUDA serves in the next frame too.
+        # Recorded steps of a level on CUDA are reused in the next frame.
         recorded = lasting.level.device != "cpu"
         alone = lasting.lasting_system(self.aim, tie, rest_angle=angles) if recorded else lasting.system(module, tie)
         budget = settings.budget(self.finest - index, since, warm=self.warm)
-        if self.creases is not None and self.start.held:  # What fades is less than the stopping measure sees.
+        if self.creases is not None and self.start.held:  # The stopping measure misses fading creases.
             budget = replace(budget, rest=0.0)
         budget = replace(budget, steps=0) if self.start.rests else budget
-        # With creases the stopping measure sees less of what is left than there is.
+        # With creases the stopping measure underestimates the remaining move.
         near = NEAR if self.warm and self.creases is None else 0.0
         who = (self.group.integrator, self.group.untangler)
         return LevelProblem(lasting, module, alone, self.view(index), *who, budget, near, self.group.outward)
@@ -175,11 +176,11 @@ class Problem:
     def begun(
         self, index: int, below: Float[Tensor, "below 3"] | None
     ) -> tuple[Float[Tensor, "vertices 3"], Float[Tensor, "vertices 3"] | None]:
-        """Where a level begins [m], and the move that takes a coarser mesh's facets out of it; None in a warm frame.
+        """Start of a level [m], and the move to remove a coarser mesh's facets; None in a warm frame.
 
         Args:
             index: Number of the level.
-            below: Positions of the next coarser level [m]; None where the level is the first.
+            below: Positions of the next coarser level [m]; None for the first level.
         """
         level = self.forces[index].level
         view, warm = self.view(index), self.start.detailed
@@ -187,7 +188,7 @@ class Problem:
             return self.carried, None
         linear, smooth = level.from_below, level.smooth_from_below
         first = below is None
-        if below is None:  # Only the cage itself starts where the cages walked to.
+        if below is None:  # Only the cage level starts from the advanced cages.
             below = self.aim if index or self.walked is None else self.walked
         if first or linear is None or smooth is None:
             linear, smooth = level.base, level.smooth_base
@@ -200,19 +201,19 @@ class Problem:
 
 
 def begin(group: Group, frame: FrameInput, last: State | None) -> Problem:
-    """Make a frame ready to be solved.
+    """Prepare a frame for solving.
 
     Args:
         group: The garments.
         frame: The frame.
-        last: What the last frame left, or None for a cold start.
+        last: State left by the last frame, or None for a cold start.
     """
     began = time.perf_counter()
     forces, cage, settings = group.forces_for(frame.garments), group.cage(frame.garments), group.settings
     known = None if settings.temporal == "off" else last
     before = None if last is None else last.about(cage.origin)
     creases = creases_of(forces[-1].level, frame, known)
-    moved = frame.moved if settings.temporal == "tether" else np.inf  # Nothing else slows it down.
+    moved = frame.moved if settings.temporal == "tether" else np.inf  # Only the tether slows the cloth down.
     reset = {"frames": group.moving_frames, "finest": forces[-1].level, "reset": settings.reset}
     start = start_of(known, cage, **reset, moved=moved, pace=1.0 if creases is None else creases.pace)
     contact = group.contact(frame, cage)

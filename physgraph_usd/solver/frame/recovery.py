@@ -1,4 +1,4 @@
-"""Recovery of frames that end worse than a start from the cage would: they are started anew."""
+"""Recovery of frames with a result worse than expected from a start at the cage: such frames are restarted."""
 
 from __future__ import annotations
 
@@ -15,27 +15,27 @@ from .solve import solve_frame
 from .values import FrameInput, Solved, State
 
 ROUNDING = 1e-3
-"""Fraction of the energies' size by which two energies count as equal: sums are in single precision."""
+"""Fraction of the energies' size below which two energies count as equal: sums are in single precision."""
 MOST_WAIT = 64
-"""Most frames between two starts from the cage. The wait doubles with each start that does not help, so such starts
-cost little in a shot whose cloth cannot be drawn apart."""
+"""Most frames between two starts from the cage. The wait doubles with each unsuccessful start, so such starts cost
+little in a shot with cloth impossible to pull apart."""
 
 
 class RunawayError(SolveError):
-    """Cloth that ends with more energy than its upsampled cage, from wherever it starts."""
+    """Cloth ending with more energy than its upsampled cage, from any start."""
 
 
 def solve_soundly(group: Group, frame: FrameInput, last: State | None) -> Solved:
-    """Solve a frame, and once more from the cage where the result is unsound.
+    """Solve a frame, and once more from the cage if the result is unsound.
 
-    A result is unsound if cloth crosses, or if its energy is above the upsampled cage's without self contact, which is
-    as large as the cage crosses itself deeply. The second result stands if less crosses in it, or as much and its
-    energy is lower than one above the cage's.
+    A result is unsound if cloth crosses, or if its energy is above the upsampled cage's energy without self contact
+    (the self contact energy is as large as the cage's own crossings are deep). The second result is used if fewer
+    crossings remain, or equally many and the first energy is above the cage's and the second is lower.
 
     Args:
-        group: Garments that are solved together.
+        group: Garments solved together.
         frame: The frame.
-        last: What the last frame left, or None for a cold start.
+        last: State left by the last frame, or None for a cold start.
 
     Raises:
         SolveError: As `solve_frame`.
@@ -58,12 +58,12 @@ def solve_soundly(group: Group, frame: FrameInput, last: State | None) -> Solved
 
 
 def _waiting(solved: Solved, failures: int, wait: int) -> Solved:
-    """The result, with the number of starts from the cage that did not help, and of frames until the next one."""
+    """The result, with the number of unsuccessful starts from the cage, and of frames until the next such start."""
     return replace(solved, state=replace(solved.state, failures=failures, wait=wait))
 
 
 def _unsound(telemetry: Mapping[str, Any]) -> str:
-    """Why a result is unsound; "" where it is not."""
+    """Why a result is unsound; "" if sound."""
     if crossings := _crossings(telemetry):
         return f"it kept {crossings:,} crossings"
     excess = _excess(telemetry)

@@ -1,4 +1,4 @@
-"""Frames in, states out: the frames of a scene in order, each started from the last one where that helps."""
+"""Refines the frames of a scene in order; each frame starts from the last frame if useful."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from .scene_frame import SceneCloth, SceneFrame
 from .settings import SolveSettings
 
 LIMIT, LEAST_LIMIT, LIMIT_PER_VERTEX = 20.0, 120.0, 0.01
-"""A frame stops where it stands after so many times the median of the shot's frames, but never before so many seconds
-and so many a fine vertex: the slowest cold frames of the samples and shots take 0.6 ms a vertex on one core, and the
-first frame of a machine may compile kernels, some 15 s. No ordinary frame is to end by the clock."""
+"""Time limit of a frame: a multiple of the median over the shot's frames, but at least a number of seconds plus seconds
+per fine vertex. The slowest cold frames of the samples and shots take 0.6 ms per vertex on one core, and the first
+frame on a machine may compile kernels, some 15 s. No ordinary frame should reach the limit."""
 
 
 class Refiner:
     """Refines the frames of one scene in order.
 
-    Garments that cannot touch in a frame are solved apart, the others together.
+    Garments unable to touch in a frame are solved separately, the others together.
 
     Attributes:
         scene: The scene.
@@ -50,15 +50,15 @@ class Refiner:
 
         Args:
             scene: The scene.
-            settings: How to solve.
+            settings: Settings of the solve.
             levels: Subdivisions of each garment; the garments' own when None.
             dtype: Scalar type of the solve.
             device: "cpu" or a CUDA device.
-            threads: Most threads that a kernel uses on the CPU; the result does not depend on it.
+            threads: Most threads per kernel on the CPU; the result does not depend on the number.
             heat_map: Whether states hold a heat map.
 
         Raises:
-            GarmentError: A rest shape cannot be solved on.
+            GarmentError: A rest shape is invalid.
         """
         chosen = levels if levels is not None else [garment.level for garment in scene.garments]
         self._cloth = SceneCloth(scene, chosen, dtype=dtype, device=device, threads=threads)
@@ -66,7 +66,7 @@ class Refiner:
         self._memories = (Memory(),) * len(scene.garments)
         self._time: float | None = None
         self._walked: tuple[Sequence[np.ndarray | None], float] | None = None
-        self._seconds: list[float] = []  # What frames took that came to their end.
+        self._seconds: list[float] = []  # Durations of completed frames.
 
     @property
     def refinements(self) -> list[tuple[Refinement, ...]]:
@@ -75,50 +75,50 @@ class Refiner:
 
     @property
     def groups(self) -> list[Group]:
-        """A group for each garment alone, in the order of the garments."""
+        """A single-garment group for each garment, in the order of the garments."""
         return [self.group_of((index,)) for index in range(len(self.scene.garments))]
 
     def group_of(self, part: tuple[int, ...]) -> Group:
-        """The group of garments solved together, built when first asked for."""
+        """The group of garments solved together, built on first use."""
         return self._cloth.group(part, self._settings)
 
     def forget(self) -> None:
-        """Start the next frame cold, as if it were the first."""
+        """Start the next frame cold, like the first."""
         self._cloth.bodies.forget()
         self._memories, self._time, self._walked = (Memory(),) * len(self._memories), None, None
 
     def begin_at(self, cages: Refiner, *, since: float) -> None:
-        """Start the first frame, where it is cold, with the cage that another refiner walked to it.
+        """Start the first frame, if cold, with the cage advanced by another refiner.
 
         Args:
-            cages: A refiner of the same scene that does not subdivide, and has solved that frame.
-            since: The time code from which it walked, for the report.
+            cages: A refiner of the same scene without subdivision, after solving the first frame.
+            since: The start time code of the advance, for the report.
         """
         self._walked = [None if each.last is None else each.last.points for each in cages._memories], since
 
     def use(self, settings: SolveSettings) -> None:
-        """Solve the frames that follow in another way, the next one cold; levels and metrics are kept."""
+        """Solve all following frames with new settings, the next frame cold; levels and metrics are kept."""
         self._settings = settings
         self.forget()
 
     def fork(self, settings: SolveSettings) -> Refiner:
-        """A refiner that goes on from this one's last frame in another way; levels, metrics and bodies are shared."""
+        """A refiner continuing from this one's last frame with new settings; levels, metrics and bodies are shared."""
         other = copy(self)
         other._settings = settings
         return other
 
     def parts_of(self, frame: Frame) -> list[tuple[int, ...]]:
-        """Numbers of the garments that are solved together in a frame."""
+        """Numbers of the garments solved together in a frame."""
         return self._cloth.parts_of(frame, self._settings)
 
     def touching(self, part: tuple[int, ...], frame: Frame) -> tuple[Touching, ...]:
-        """The surfaces that garments solved together may touch in a frame."""
+        """The surfaces within reach of garments solved together in a frame."""
         self._cloth.bodies.pose(frame.colliders)
         frames = [frame.garments[index] for index in part]
         return self._cloth.touching(part, frames, self._cloth.near(part, frames, self._settings))
 
     def refine(self, frames: Iterable[Frame]) -> Iterator[State]:
-        """Solve frames in order, one state a frame.
+        """Solve frames in order, one state per frame.
 
         Raises:
             SolveError: A term of the potential is not finite.
@@ -127,13 +127,13 @@ class Refiner:
             yield self.solve(frame)
 
     def solve(self, frame: Frame, wanted: Sequence[bool] | None = None) -> State:
-        """Solve one frame, starting from the last one solved where that helps.
+        """Solve one frame, starting from the last solved frame if useful.
 
-        Garments that could not be solved follow their cages, where others could.
+        Unsolvable garments follow their cages, if at least one garment was solved.
 
         Args:
             frame: The frame.
-            wanted: For each garment, whether it is asked for; all when None.
+            wanted: For each garment, whether a result is wanted; all when None.
 
         Raises:
             GarmentError: A position is out of bounds.
@@ -148,7 +148,7 @@ class Refiner:
 
     @property
     def _limit(self) -> float:
-        """Seconds after which a frame stops where it stands."""
+        """Time limit of a frame [s]."""
         if self._settings.frame_limit is not None:
             return self._settings.frame_limit
         count = sum(chain[-1].mesh.vertex_count for chain in self.refinements if chain)
@@ -157,7 +157,7 @@ class Refiner:
     def _solve(self, frame: Frame, wanted: Sequence[bool] | None) -> State:
         refuse_far(self.scene, frame)
         gap = self._is_gap(frame.time)
-        if self._settings.temporal == "off":  # A frame by itself is a function of that frame alone, to the bit.
+        if self._settings.temporal == "off":  # Without history the result depends on this frame only, to the bit.
             self._cloth.bodies.forget()
         self._cloth.bodies.pose(frame.colliders)
         count = len(frame.garments)
@@ -173,7 +173,7 @@ class Refiner:
         return State(frame.time, tuple(points), tuple(telemetry), tuple(reused), tuple(heat))
 
     def energy(self, frame: Frame, points: Sequence[np.ndarray]) -> float:
-        """Energy [J] of all garments at given world positions [m], what touches there found anew."""
+        """Energy [J] of all garments at given world positions [m], with contact detected again."""
         refuse_far(self.scene, frame)
         total = 0.0
         for part in self.parts_of(frame):
@@ -184,16 +184,15 @@ class Refiner:
     def moved_safely(
         self, frame: Frame, start: Sequence[np.ndarray | None], wanted: Sequence[np.ndarray | None]
     ) -> list[tuple[np.ndarray | None, dict[str, Any]]]:
-        """Move cloth as near to wanted positions as nothing newly crosses on the way, and out of bodies; no solve.
+        """Move cloth towards wanted positions as far as possible without new crossings, and out of bodies; no solve.
 
         Args:
             frame: The frame.
-            start: Where each garment is, world positions [m], shape (V_fine, 3).
-            wanted: Where it is to go, the same; those that are solved together with one of None are taken as they are.
+            start: Positions of each garment, world space [m], shape (V_fine, 3).
+            wanted: Target positions, of the same form; a part with a garment of None is used unchanged.
 
         Returns:
-            For each garment its positions, and what touches and crosses there as telemetry has it: empty where nothing
-            may.
+            For each garment its positions, and contact and crossings as in telemetry: empty without possible contact.
         """
         refuse_far(self.scene, frame)
         found: list[tuple[np.ndarray | None, dict[str, Any]]] = [(each, {}) for each in wanted]
@@ -208,7 +207,7 @@ class Refiner:
         return found
 
     def _heat(self, index: int, points: np.ndarray | None) -> dict[str, np.ndarray] | None:
-        """A garment's heat map, where it has positions [m]."""
+        """A garment's heat map, or None without positions [m]."""
         memory = self._memories[index]
         crossing = memory.last.crossing if memory.solved and memory.last is not None else None
         return None if points is None else self._cloth.heat(index, points, crossing)

@@ -1,4 +1,4 @@
-"""Rigid parts of garments: buttons, pullers and rivets, which move with the cloth under them."""
+"""Rigid parts of garments: buttons, pullers and rivets, moving with the cloth below."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from ..rigid import best_motion
 from ..scene import Garment
 
 LEAST = 12
-"""Fewest vertices of the cloth that a part follows."""
+"""Fewest cloth vertices followed by a part."""
 
 
 class RigidParts:
-    """The rigid parts of a level, each with the vertices of the cloth under it."""
+    """The rigid parts of a level, each with the vertices of the cloth below."""
 
     def __init__(self, level: Level, garments: Sequence[Garment]) -> None:
-        """Find the cloth around each part's middle, no farther than half its size and an edge."""
+        """Find the cloth around each part's centre, within the part's radius plus an edge."""
         self._parts: list[tuple[np.ndarray, np.ndarray]] = []
         rest, spacing = level.rest.double().cpu().numpy(), float(level.spacing.mean())
         cloth = (level.vertex_area > 0).cpu().numpy()
@@ -42,10 +42,10 @@ class RigidParts:
     def place(
         self, out: Float[np.ndarray, "vertices 3"], from_coarse: sp.csr_matrix, coarse: Float[np.ndarray, "coarse 3"]
     ) -> None:
-        """Move the parts from their places on the upsampled cage to the cloth [m]; ``out`` is written to.
+        """Move the parts from their positions on the upsampled cage to the cloth [m]; ``out`` is modified in place.
 
-        Each part goes with the best rigid motion of the cloth under it, and then away from the cloth until no vertex
-        under it is nearer to the part than on the cage.
+        Each part follows the best rigid motion of the cloth below, and then moves away from the cloth until no vertex
+        below is nearer to the part than on the cage.
         """
         for members, under in self._parts:
             base, cage = from_coarse[under] @ coarse, from_coarse[members] @ coarse

@@ -1,4 +1,4 @@
-"""A frame of a whole scene: which garments are solved together, taken over, or left on their cages."""
+"""A frame of a whole scene: groups of garments are solved, reused, or left on their cages."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ from .values import FrameInput, split
 
 
 class SceneCloth:
-    """Levels, groups and bodies that the frames of a scene are solved with; one frame's bodies are posed at a time.
+    """Levels, groups and bodies for the frames of a scene; bodies are posed for one frame at a time.
 
     Attributes:
         scene: The scene.
         refinements: The subdivisions of each garment, coarsest first.
-        bodies: The bodies that garments may touch.
+        bodies: All bodies.
     """
 
     def __init__(self, scene: Scene, levels: Sequence[int], *, dtype: torch.dtype, device: str, threads: int) -> None:
@@ -42,10 +42,10 @@ class SceneCloth:
             levels: Subdivisions of each garment.
             dtype: Scalar type of the solve.
             device: "cpu" or a CUDA device.
-            threads: Most threads that a kernel uses on the CPU.
+            threads: Most threads per kernel on the CPU.
 
         Raises:
-            GarmentError: A rest shape cannot be solved on.
+            GarmentError: A rest shape is invalid.
         """
         for garment in scene.garments:
             if wrong := out_of_bounds(garment.rest):
@@ -58,7 +58,7 @@ class SceneCloth:
         self._parts = {together: Parts(scene.garments, together=together) for together in (False, True)}
 
     def group(self, part: tuple[int, ...], settings: SolveSettings) -> Group:
-        """The group of garments solved together, built when first asked for; levels and metrics stay."""
+        """The group of garments solved together, built on first use; levels and metrics are kept."""
         known = self._groups.get(part)
         if known is None:
             garments = [self.scene.garments[index] for index in part]
@@ -68,15 +68,15 @@ class SceneCloth:
         return self._groups[part]
 
     def parts_of(self, frame: Frame, settings: SolveSettings) -> list[tuple[int, ...]]:
-        """Numbers of the garments that are solved together in a frame."""
+        """Numbers of the garments solved together in a frame."""
         return self._parts[settings.contact.cloth != "off"].of(frame.garments)
 
     def upsampled(self, index: int, points: np.ndarray) -> np.ndarray:
-        """A cage's positions [m] on its mesh as it is subdivided, linearly."""
+        """A cage's positions [m] on its subdivided mesh, linearly."""
         return reduce(lambda x, step: np.asarray(step.linear @ x), self.refinements[index], points)
 
     def near(self, part: Sequence[int], frames: Sequence[GarmentFrame], settings: SolveSettings) -> tuple[int, ...]:
-        """Numbers of the bodies that garments may touch."""
+        """Numbers of the bodies within reach of garments."""
         found: set[int] = set()
         for index, frame in zip(part, frames, strict=True):
             garment = self.scene.garments[index]
@@ -91,7 +91,7 @@ class SceneCloth:
         points: Sequence[np.ndarray],
         settings: SolveSettings,
     ) -> set[int]:
-        """Numbers of the bodies whose bounds solved cloth meets, given its positions [m]."""
+        """Numbers of the bodies whose bounds meet the solved cloth, given the cloth's positions [m]."""
         found: set[int] = set()
         for index, frame, solved in zip(part, frames, points, strict=True):
             garment = self.scene.garments[index]
@@ -102,19 +102,19 @@ class SceneCloth:
     def touching(
         self, part: Sequence[int], frames: Sequence[GarmentFrame], near: Sequence[int]
     ) -> tuple[Touching, ...]:
-        """Surfaces of bodies, and the distance that each garment keeps from them."""
+        """Surfaces of bodies, and the distance kept from each by each garment."""
         felt = [self.scene.garments[index].colliders for index in part]
         pairs = zip(felt, frames, strict=True)
         offsets = [[frame.offset if body in bodies else None for body in near] for bodies, frame in pairs]
         return self.bodies.touching(near, offsets)
 
     def heat(self, index: int, points: np.ndarray, crossing: np.ndarray | None) -> dict[str, np.ndarray]:
-        """Where a garment is inside bodies whose bounds it meets, pushed by them or not, and where cloth crosses.
+        """Depth of a garment inside bodies with overlapping bounds, pushing or not, and crossings of cloth.
 
         Args:
             index: Number of the garment.
             points: World positions [m], shape (V, 3).
-            crossing: Which vertices belong to cloth that crosses cloth, shape (V,); none when None.
+            crossing: Whether each vertex belongs to cloth that crosses cloth, shape (V,); None for no vertex.
         """
         garment, chain = self.scene.garments[index], self.refinements[index]
         near = self.bodies.near(garment, bounds_of(points), 0.0)
@@ -134,8 +134,8 @@ class Answer:
 
     Attributes:
         points: Fine positions [m], world space.
-        telemetry: What the report says.
-        memory: What its next frame needs.
+        telemetry: Entries for the report.
+        memory: Memory for the next frame.
     """
 
     points: np.ndarray
@@ -145,16 +145,16 @@ class Answer:
 
 @dataclass(frozen=True, eq=False)
 class SceneFrame:
-    """One frame of a scene, about to be solved part by part.
+    """One frame of a scene, to be solved part by part.
 
     Attributes:
-        cloth: What the scene is solved with; its bodies are posed.
-        settings: How to solve.
+        cloth: Levels, groups and bodies of the scene; the bodies are posed.
+        settings: Settings of the solve.
         frame: The frame.
-        memories: What is remembered of each garment's last frames.
-        gap: Whether the time since the last frame is too long to start from it.
-        walked: World positions of each cage [m] that another refiner walked here, and from which time code; or None.
-        limit: Seconds after which the frame stops where it stands.
+        memories: Memory of each garment's last frames.
+        gap: Whether the time since the last frame is too long for a warm start.
+        walked: World positions of each cage [m] advanced here by another refiner, and the start time code; or None.
+        limit: Time limit of the frame [s].
     """
 
     cloth: SceneCloth
@@ -166,7 +166,7 @@ class SceneFrame:
     limit: float
 
     def solve(self, asked: Sequence[bool]) -> tuple[dict[int, Answer], list[bool]]:
-        """Answers by garment, of the parts asked for; and for all garments whether they equal the last ones.
+        """Answers by garment, of the requested parts; and for all garments whether the answers equal the last frame's.
 
         Raises:
             SolveError: No garment could be solved.
@@ -192,9 +192,9 @@ class SceneFrame:
         return found, reused
 
     def _answer(self, part: tuple[int, ...], near: tuple[int, ...], *, same: bool) -> list[Answer]:
-        """Garments upsampled, taken over, or solved."""
+        """Garments upsampled, reused, or solved."""
         first, points = self.cloth.scene.garments[part[0]], self.frame.garments[part[0]].points
-        if has_collapsed(first, points):  # It is alone, and the next frame starts from the last one solved.
+        if has_collapsed(first, points):  # Solved alone; the next frame starts from the last solved frame.
             entry = {"start": "not solved: the cage has collapsed", "collapsed": size_left(first, points)}
             return [Answer(self.cloth.upsampled(part[0], points), entry, replace(self.memories[part[0]], solved=False))]
         if not same:
@@ -206,14 +206,14 @@ class SceneFrame:
         ]
 
     def _on_cages(self, part: tuple[int, ...], error: SolveError) -> list[Answer]:
-        """Garments that could not be solved, on their cages' smooth surface; the next frame starts from one before."""
+        """Unsolvable garments, on their cages' smooth surface; the next frame starts from an earlier frame."""
         entry: dict[str, object] = {"start": "not solved: it follows its cage", "not_solved": str(error)}
         points = self.cloth.group(part, self.settings).upsampled([self.frame.garments[index] for index in part])
         memories = [replace(self.memories[index], solved=False) for index in part]
         return [Answer(x, entry, each) for x, each in zip(points, memories, strict=True)]
 
     def _solve_part(self, part: tuple[int, ...], near: tuple[int, ...]) -> list[Answer]:
-        """Solve garments together; bodies that the cloth reaches only as it is solved are taken up."""
+        """Solve garments together; bodies reached only by the solved cloth are added, and the solve is repeated."""
         frames, memories = [self.frame.garments[index] for index in part], [self.memories[index] for index in part]
         group = self.cloth.group(part, self.settings)
         origin = origin_of(part, self.frame, memories, near=near, edge=self._edge(part), gap=self.gap)
@@ -248,7 +248,7 @@ class SceneFrame:
         return found
 
     def _jumped(self, part: tuple[int, ...], near: tuple[int, ...]) -> bool:
-        """Whether the last frame, which garments would be taken over from, started from a first one unlike it."""
+        """Whether the last frame, a candidate for reuse, started from a first frame at a different place."""
         memories = [self.memories[index] for index in part]
         return jumped_from(part, self.frame, memories, near=near, edge=self._edge(part)) is not None
 
@@ -266,14 +266,14 @@ class SceneFrame:
         return found
 
     def _cage_walked(self, part: tuple[int, ...]) -> tuple[np.ndarray, float] | None:
-        """World positions of cages that another refiner walked to this frame [m], and from which time code."""
+        """World positions of cages advanced to this frame by another refiner [m], and the start time code."""
         if self.walked is None:
             return None
         found = [each for each in (self.walked[0][index] for index in part) if each is not None]
         return (np.concatenate(found), self.walked[1]) if len(found) == len(part) else None
 
     def _refuse_strayed(self, part: tuple[int, ...], points: Sequence[np.ndarray]) -> None:
-        """Refuse cloth that has strayed from its cage."""
+        """Refuse cloth strayed from its cage."""
         for index, fine in zip(part, points, strict=True):
             last = self.memories[index].last
             before = None if last is None else last.frame.points

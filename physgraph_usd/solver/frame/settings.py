@@ -1,4 +1,4 @@
-"""How each frame is solved."""
+"""Settings of the solve of each frame."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from ..integrate import LEARNED, METHODS, Method
 from ..integrate.solve import Budget
 
 COARSE_STEPS, COARSE_TOLERANCE = 4, 0.1
-"""Steps and tolerance of a coarse level over the finest's: coarse steps are cheap and set the folds."""
+"""Steps and tolerance of a coarse level relative to the finest: coarse steps are cheap and shape the folds."""
 EXTRA = 3
-"""Steps of the finest level of a cold frame beyond its own, over those, while it is far from rest."""
+"""Extra steps of the finest level of a cold frame far from rest, relative to its regular steps."""
 REST = 2.0
-"""Tolerances by which cloth at rest may stray before a frame that starts from it moves it."""
+"""Remaining move, in tolerances, below which a frame starting from cloth at rest makes no step."""
 
 
 @dataclass(frozen=True)
 class Reset:
-    """When a frame starts cold.
+    """Thresholds for a cold start.
 
     Attributes:
         move: RMS motion of the cage between samples, in mean cage edges, above which detail is dropped.
@@ -35,19 +35,19 @@ class Reset:
 
 @dataclass(frozen=True)
 class SolveSettings:
-    """How each frame is solved.
+    """Settings of the solve of each frame.
 
     Attributes:
-        method: The integrator and whether it is nested.
-        steps: Most steps at the finest level; each level below it may take four times as many.
+        method: The integrator, and whether levels are nested.
+        steps: Most steps at the finest level; each coarser level may take four times as many.
         tolerance: Stop when the RMS of H0^-1 F is under this many local edge lengths.
-        budget_ms: Milliseconds of solving a frame, or None.
-        frame_limit: Seconds after which a frame stops where it stands; None for a multiple of what frames take.
+        budget_ms: Time limit for solving a frame [ms], or None.
+        frame_limit: Time limit after which a frame stops in its current state [s]; None for a multiple of usual frames.
         temporal: "tether", "warm" or "off".
         tether: Tether stiffness [1/s^2].
-        reset: When a frame starts cold.
-        contact: How contact is solved.
-        cancelled: Asked before each step: whether nobody waits for the result any more; or None.
+        reset: Thresholds for a cold start.
+        contact: Contact settings.
+        cancelled: Asked before each step whether the result is no longer needed; or None.
     """
 
     method: Method = METHODS[LEARNED]
@@ -62,12 +62,12 @@ class SolveSettings:
     cancelled: Callable[[], bool] | None = None
 
     def budget(self, below: int, clock: float, *, warm: bool) -> Budget:
-        """Steps and deadline of a level; the finest makes one step in any case.
+        """Steps and deadline of a level; the finest level makes at least one step.
 
         Args:
-            below: How many levels lie above it.
-            clock: When the frame was ready to be solved [s].
-            warm: Whether it starts from the last frame's result.
+            below: Number of levels finer than this level.
+            clock: Time at which the frame was ready to be solved [s].
+            warm: Whether the level starts from the last frame's result.
         """
         deadline = None
         if self.budget_ms is not None:

@@ -1,8 +1,7 @@
 """One frame, from a cage to fine cloth: begin, descend level by level with safe moves, scale the detail, report.
 
-`solve_frame` is the way of every frame, cold or warm. Each level begins at what the one below found, untangles what
-crosses there, and makes rounds: what is near is detected, the integrator steps, and cloth moves as far as nothing newly
-crosses.
+`solve_frame` solves every frame, cold or warm. Each level begins at the coarser level's result, untangles crossings,
+and makes rounds: contact is detected, the integrator steps, and cloth moves as far as possible without new crossings.
 """
 
 from __future__ import annotations
@@ -29,22 +28,22 @@ from .problem import LevelProblem, begin
 from .values import FrameInput, Solved, State
 
 STEPS, LONGEST = 4, 16
-"""Steps of a round where something is near, and where nothing is: then pairs are found anew."""
+"""Steps of a round with contact, and without: pairs are detected again after a round."""
 MOST, TOUCHING = 40, 3
-"""Steps of a level where something touches: so many times the budget's, but no more than the first, or the budget's."""
+"""Most steps of a level with contact: a multiple of the budget's, at most `MOST`, or the budget's if larger."""
 FEWER = 1.0 / 3.0
-"""Part of its steps after which a warm frame in contact is done, if it is near rest: one round."""
+"""Fraction of the steps after which a warm frame in contact may finish, if near rest: one round."""
 UNTANGLINGS, WARM_UNTANGLINGS = 25, 4
-"""Most rounds that untangle what crosses: from cold at the cage, and in a warm frame."""
+"""Most untangling rounds: at the cage in a cold frame, and in a warm frame."""
 
 
 def solve_frame(group: Group, frame: FrameInput, last: State | None) -> Solved:
     """Solve one frame.
 
     Args:
-        group: Garments that are solved together.
+        group: Garments solved together.
         frame: The frame.
-        last: What the last frame left, or None for a cold start.
+        last: State left by the last frame, or None for a cold start.
 
     Raises:
         SolveError: A term of the potential is not finite, or cloth lies wholly in a body.
@@ -82,15 +81,15 @@ def solve_frame(group: Group, frame: FrameInput, last: State | None) -> Solved:
 def solve_one_level(
     problem: LevelProblem, x: Tensor, smoothing: Tensor | None
 ) -> tuple[Placed, list[LevelReport], ForceModule]:
-    """Solve a level, in rounds where something may touch.
+    """Solve a level, in rounds if contact is possible.
 
     Args:
         problem: The level.
-        x: Where it begins [m], shape (V, 3).
-        smoothing: The move that takes a coarser mesh's facets out of a cold start [m]; None in a warm frame.
+        x: Start positions [m], shape (V, 3).
+        smoothing: The move to remove a coarser mesh's facets in a cold start [m]; None in a warm frame.
 
     Returns:
-        Final positions [m], a report a round, and the terms at the end.
+        Final positions [m], a report per round, and the terms at the end.
     """
     level, view, budget = problem.level, problem.view, problem.budget
     if view is None:
@@ -122,13 +121,13 @@ def solve_one_level(
         replaceable = smoothing is None and integrator.name != problem.untangler.name
         if carry.setbacks >= PATIENCE or (replaceable and _went_up(reports)):
             integrator, carry = problem.untangler, None
-        elif blocked:  # Corrections of the guard were made for other positions.
+        elif blocked:  # The guard's corrections do not apply to the blocked positions.
             carry = None if carry.setbacks else replace(carry, x=x)
     return x, reports, ForceModule((*problem.module.forces, *terms))
 
 
 def _untangle(problem: LevelProblem, view: LevelContact, x: Placed) -> tuple[Placed, list[LevelReport]]:
-    """Rounds of few steps in which contours shorten, at the cage and where the last level or frame left any."""
+    """Rounds of few steps to shorten intersection contours: at the cage, and for crossings left from before."""
     level, budget = problem.level, problem.budget
     cold, start = level.index == 0, x
     x = view.laid_back(x) if cold else x
@@ -146,23 +145,23 @@ def _untangle(problem: LevelProblem, view: LevelContact, x: Placed) -> tuple[Pla
 
 
 def _most_steps(budget: Budget, report: LevelReport, *, touched: bool) -> int:
-    """How many steps a level makes, by its last round's report: more where something touches or it is far from rest."""
+    """Most steps of a level, given the last round's report: more with contact or far from rest."""
     most = budget.steps + budget.extra * budget.is_far(report.remaining_move)
     return max(most, min(MOST, TOUCHING * budget.steps)) if touched else most
 
 
 def _went_up(reports: list[LevelReport]) -> bool:
-    """Whether the last round began at a higher energy than the one before it, whose steps ran into unseen contact."""
+    """Whether the last round began at a higher energy than the round before, whose steps met undetected contact."""
     return len(reports) > 1 and reports[-1].energy_before > reports[-2].energy_before
 
 
 def _is_last(report: LevelReport, *, blocked: bool) -> bool:
-    """Whether no round follows one of this report; it does where one that settled was blocked."""
+    """Whether the rounds end here: no step was made, the budget is spent, or the cloth settled and was not blocked."""
     return report.stopped == "budget" or not report.steps or (report.stopped == "tolerance" and not blocked)
 
 
 def _round_budget(budget: Budget, system: System, *, first: bool, steps: int) -> Budget:
-    """The budget of a round: what a contact's metric calls a small move is that much smaller."""
+    """The budget of a round; with a contact metric the tolerance shrinks, because the metric underestimates moves."""
     shrunk = SMOOTH if isinstance(system.metric, HeldMetric) else 1.0
     rest = budget.rest if first else 1.0
     tolerance, least = shrunk * budget.tolerance, budget.least if first else 0

@@ -1,4 +1,4 @@
-"""Where a frame's solve starts: from the last one's detail, or from the upsampled cage, and why."""
+"""Start of a frame's solve: from the last frame's detail, or from the upsampled cage, with the reason."""
 
 from __future__ import annotations
 
@@ -16,26 +16,25 @@ from .settings import Reset
 from .values import Cage, State
 
 WORTH, LEAST_STRAIN, MOST_STRAIN = 2.0, 0.5, 1.0
-"""A frame starts cold where the 99th percentile of the edges' strain under carried detail is over so many times the
-upsampled cage's and over the second, or over the third: a crumpled cage tears the detail that it carries."""
+"""Limits of the 99th percentile of edge strain with carried detail. A frame starts cold above the first, relative to
+the upsampled cage's, if also above the second, and always above the third: a crumpled cage tears carried detail."""
 STILL = 0.02
-"""Motion of the farthest point of cage and bodies between samples, in mean cage edges, below which a pose is held:
-there slow settling shows, so cloth slows down."""
+"""Largest motion of cage and bodies between samples, in mean cage edges, for a held pose: slow settling is visible in a
+held pose, so the cloth is slowed down."""
 SLOWER, SLOWEST = 2.0, 2.0**8
-"""In a held pose the tether holds cloth so many times as stiffly as in the frame before; where that is so many times as
-stiffly as ever, cloth stays where it is: it has a third of a second to settle, and one sees what moves after that.
-Cloth that keeps creases takes as long as these need to set (`creases`)."""
+"""Growth of the tether stiffness per frame of a held pose, and the factor at which cloth rests: cloth has a third of a
+second to settle, later motion would be visible. Cloth with creases takes as long as creases need to set (`creases`)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """Where a frame's solve starts.
+    """Start of a frame's solve.
 
     Attributes:
         why: "warm", or "at rest" or "cold" with the reason.
         detailed: The finest vertices with the last frame's detail [m], shape (V, 3); None in a cold start.
-        held: For how many frames the pose of all that the cloth feels has been held.
-        slowed: How many times as stiffly as ever the tether holds it therefore; from `SLOWEST` on it rests.
+        held: Number of frames with a held pose of everything felt by the cloth.
+        slowed: Resulting factor of the tether stiffness; from `SLOWEST` on the cloth rests.
     """
 
     why: str
@@ -45,7 +44,7 @@ class Start:
 
     @property
     def rests(self) -> bool:
-        """Whether the cloth stays where it is."""
+        """Whether the cloth stays in place."""
         return self.slowed >= SLOWEST
 
 
@@ -59,16 +58,16 @@ def start_of(
     moved: float = np.inf,
     pace: float = 1.0,
 ) -> Start:
-    """Carry the last frame's detail along, unless the cage jumped or it would tear the cloth.
+    """Carry the last frame's detail along, unless the cage jumped or carried detail would tear the cloth.
 
     Args:
-        state: What the last frame left, or None for a cold start.
-        cage: Where the cages are.
-        frames: Of the cage.
+        state: State left by the last frame, or None for a cold start.
+        cage: Positions of the cages.
+        frames: Frames of the cage.
         finest: The finest level.
-        reset: When a frame starts cold.
-        moved: How far what the cloth may touch has moved since [m]; infinite where more than poses has changed.
-        pace: Part of its usual pace at which cloth in a held pose slows down.
+        reset: Thresholds for a cold start.
+        moved: Largest motion of nearby bodies since [m]; infinite if more than poses changed.
+        pace: Slow-down rate of cloth in a held pose, relative to the usual.
     """
     if state is None:
         return Start("cold")
@@ -89,14 +88,14 @@ def start_of(
 
 
 def slowing(held: int, motion: float, pace: float = 1.0) -> tuple[int, float]:
-    """For how many frames a pose has now been held, and how many times as stiffly the tether holds cloth in it.
+    """Number of frames of a held pose including now, and the resulting factor of the tether stiffness.
 
-    Never so stiffly that the cloth would be slower than what moves slowly: the cage, or what touches it.
+    The factor is bounded to keep the cloth faster than slow motion of the cage or of touching bodies.
 
     Args:
-        held: For how many frames it had been before.
-        motion: How far any point of cage or bodies has moved since, in mean cage edges.
-        pace: Part of its usual pace at which cloth slows down.
+        held: Number of frames before.
+        motion: Largest motion of a cage or body point since, in mean cage edges.
+        pace: Slow-down rate of cloth, relative to the usual.
     """
     if motion >= STILL:
         return 0, 1.0

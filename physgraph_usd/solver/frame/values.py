@@ -1,4 +1,4 @@
-"""Input, state and result of a frame's solve: values that nothing writes to."""
+"""Input, state and result of a frame's solve: immutable values."""
 
 from __future__ import annotations
 
@@ -22,13 +22,12 @@ class FrameInput:
     """Input of a group for one frame.
 
     Attributes:
-        garments: Its garments at this time code.
+        garments: The garments at this time code.
         at: The time code, for errors.
-        touching: Surfaces that the garments may touch.
-        moved: How far these have moved since the last frame [m]; infinite where more than poses has changed.
-        walked: World positions that the cages walked to from an earlier frame [m], shape (C, 3), where a cold frame
-            starts; or None.
-        elapsed: Time since the frame that each garment starts from [s]; () where none does.
+        touching: Surfaces within reach of the garments.
+        moved: Largest motion of the surfaces since the last frame [m]; infinite if more than poses changed.
+        walked: World positions of cages advanced from an earlier frame [m], shape (C, 3), for a cold start; or None.
+        elapsed: Time since each garment's start frame [s]; () for a cold start.
     """
 
     garments: Sequence[GarmentFrame]
@@ -41,12 +40,12 @@ class FrameInput:
 
 @dataclass(frozen=True, eq=False)
 class Cage:
-    """Where the cages of a group are.
+    """Positions of a group's cages.
 
     Attributes:
         world: World positions [m], shape (C, 3), float64.
-        origin: Their mean [m], shape (3,).
-        points: Positions about it [m], in the scalar type of the solve.
+        origin: Mean of the world positions [m], shape (3,).
+        points: Positions relative to the origin [m], in the scalar type of the solve.
     """
 
     world: np.ndarray
@@ -56,20 +55,20 @@ class Cage:
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """State that one frame leaves to the next.
+    """State passed from frame to frame.
 
     Attributes:
         coarse: Cage positions [m], world space.
         detail: Fine positions minus the smooth base [m], shape (V, 3).
         frames: Cage frames, columns are tangent, bitangent, normal, shape (C, 3, 3).
-        held: For how many frames the pose had been held.
-        fine: Fine positions [m], world space, float64, from which cloth walks on; None before it was solved.
-        clean: Whether nothing of what was solved together crosses there.
-        bent: What the finest hinges of each garment remember of their bends [rad], shape (H,), None where nothing is
-            remembered; () where no garment has creases.
-        creeps: Whether creases go on changing, so that the same input leads to another frame.
-        failures: How many starts from the cage in a row have not mended an unsound result.
-        wait: Frames until the next such start.
+        held: Number of frames of a held pose.
+        fine: Fine positions [m], world space, float64, to continue from; None before the first solve.
+        clean: Whether nothing crosses among the garments solved together.
+        bent: Remembered bends of the finest hinges of each garment [rad], shape (H,), None for a garment without
+            memory; () if no garment has creases.
+        creeps: Whether creases still change, so that equal input gives a different frame.
+        failures: Consecutive starts from the cage that did not cure an unsound result.
+        wait: Frames until the next start from the cage.
     """
 
     coarse: Float[Tensor, "coarse 3"]
@@ -101,7 +100,7 @@ class State:
         )
 
     def about(self, origin: np.ndarray) -> Placed | None:
-        """Fine positions about an origin [m], float64, where cloth walks; else None."""
+        """Fine positions relative to an origin [m], float64, or None before the first solve."""
         return None if self.fine is None else Placed(self.fine - torch.as_tensor(origin).to(self.fine))
 
 
@@ -111,9 +110,9 @@ class Solved:
 
     Attributes:
         points: World positions of each garment [m].
-        state: What the next frame starts from.
+        state: State for the next frame.
         telemetry: Plain values.
-        crossing: For each garment, which vertices belong to cloth that crosses cloth, shape (V,), bool.
+        crossing: For each garment, whether each vertex belongs to cloth that crosses cloth, shape (V,), bool.
     """
 
     points: list[np.ndarray]
@@ -123,7 +122,7 @@ class Solved:
 
 
 def join(parts: Sequence[State]) -> State:
-    """The states of several garments as one."""
+    """Join the states of several garments."""
     whole = (torch.cat([getattr(part, name) for part in parts]) for name in ("coarse", "detail", "frames"))
     fine = [part.fine for part in parts if part.fine is not None]
     walked = torch.cat(fine) if len(fine) == len(parts) else None
@@ -139,7 +138,7 @@ def split(state: State, coarse: Sequence[slice], fine: Sequence[slice]) -> list[
     """The state of each garment of a group.
 
     Args:
-        state: The group's.
+        state: State of the group.
         coarse: Cage vertices of each garment.
         fine: Fine vertices of each garment.
     """

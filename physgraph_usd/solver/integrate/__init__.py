@@ -1,7 +1,7 @@
-"""Integrators: forces in, displacements out.
+"""Integrators: from forces to displacements.
 
-A new integrator is one file and one line in `METHODS`. Methods that are only compared stand in `lab.methods`, which
-registers them when it is imported.
+A new integrator needs one file and one line in `METHODS`. Methods for comparison only are in `lab.methods` and are
+registered on import.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from .weights import load_network, shipped_network
 
 @dataclass(frozen=True)
 class Method:
-    """An integrator and how it is used.
+    """An integrator and its use.
 
     Attributes:
         build: Makes the integrator.
@@ -34,22 +34,22 @@ class Method:
 
 
 def _shipped() -> Integrator:
-    """The integrator of the network that ships."""
+    """The integrator of the shipped network."""
     return _guarded(shipped_network(LEARNED))
 
 
 def _guarded(network: Physgraph) -> Integrator:
-    """The integrator of a network, with quasi-Newton to spare."""
+    """The guarded integrator of a network, with quasi-Newton as spare."""
     return Guard(LearnedMetric(network), spare=QuasiNewton())
 
 
 LEARNED = "physgraph"
-"""Name of the method whose every step is the network's, and of the kind of its weights."""
+"""Name of the learned method, and of the kind of its weights."""
 METHODS: dict[str, Method] = {
     LEARNED: Method(_shipped, nested=True),
     "quasi-newton": Method(QuasiNewton, nested=True),
 }
-"""Every method by its name: those of the command line, and what `register` adds."""
+"""All methods by name: methods of the command line, and methods added by `register`."""
 
 
 def register(name: str, method: Method) -> None:
@@ -58,15 +58,15 @@ def register(name: str, method: Method) -> None:
 
 
 def method_named(name: str, weights: Path | None = None) -> Method:
-    """The method of that name.
+    """The method of a given name.
 
     Args:
-        name: A name out of `METHODS`.
-        weights: A file for a learned one, in place of what ships.
+        name: A name in `METHODS`.
+        weights: Weights file for a learned method, instead of the shipped weights.
 
     Raises:
-        UsageError: No method has that name, or it has no weights.
-        WeightsError: The file is missing, damaged or of another kind.
+        UsageError: The name is unknown, or the method has no weights.
+        WeightsError: The file is missing, damaged or of a different kind.
     """
     if name not in METHODS:
         raise UsageError(f"unknown integrator '{name}'; known integrators: {', '.join(METHODS)}")

@@ -1,4 +1,4 @@
-"""Integrators, and the little of the physics that they see: forces and a metric."""
+"""Integrators, and their view of the physics: forces and a metric."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from torch import Tensor
 from ..level import Level
 
 Solver = Callable[[Tensor], Tensor]
-"""From right-hand sides [N] to solutions [m], shape (V, 3)."""
+"""Maps right-hand sides [N] to solutions [m], shape (V, 3)."""
 
 
 @runtime_checkable
 class ForceField(Protocol):
-    """The only part of the physics that an integrator sees."""
+    """The only part of the physics visible to an integrator."""
 
     def energy_and_force(self, x: Float[Tensor, "vertices 3"]) -> tuple[Float[Tensor, ""], Float[Tensor, "vertices 3"]]:
         """Energy [J] and force [N] at positions x [m]."""
@@ -32,11 +32,11 @@ class ForceField(Protocol):
 
 @runtime_checkable
 class Preconditioner(Protocol):
-    """A fixed, symmetric positive definite matrix that can be solved with."""
+    """A fixed, symmetric positive definite matrix with a fast solve."""
 
     @property
     def diagonal(self) -> Float[Tensor, " vertices"]:
-        """Its diagonal [N/m]."""
+        """The diagonal [N/m]."""
         ...
 
     def solve(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
@@ -44,13 +44,13 @@ class Preconditioner(Protocol):
         ...
 
     def stiffened(self, stiffness: Float[Tensor, " vertices"]) -> Solver:
-        """R H0^-1 R, R = min(1, D / K)^1/2: the solve for cloth as stiff as K [N/m] where that is more than D, H0's."""
+        """R H0^-1 R, R = min(1, D / K)^1/2, D = diag H0: the solve for cloth of stiffness max(D, K) [N/m]."""
         ...
 
 
 @runtime_checkable
 class Shortened(Preconditioner, Protocol):
-    """A preconditioner that has a shorter answer, for steps that are made without a line search."""
+    """A preconditioner with an additional shorter answer, for steps without a line search."""
 
     def short(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
         """The shorter answer [m]."""
@@ -58,19 +58,19 @@ class Shortened(Preconditioner, Protocol):
 
 
 class System:
-    """One level in one frame, as an integrator sees it.
+    """One level in one frame, as seen by an integrator.
 
     Attributes:
-        free: False where a vertex may not move, shape (V, 1).
+        free: False at fixed vertices, shape (V, 1).
         spacing: Mean rest edge length at each vertex [m], shape (V,).
-        level: The level's mesh; None for a system that has none.
-        lasting: Whether it is used again, in the next frame or for another descent.
-        expected: Most steps that are to be made; recording pays where they are many or the system is lasting.
+        level: The level's mesh, or None.
+        lasting: Whether the system is reused, in the next frame or for another descent.
+        expected: Most steps to be made; recording pays for many steps or a lasting system.
         field: The forces.
         metric: H0.
         evaluations: Number of force evaluations so far.
         metric_solves: Number of metric solves so far.
-        failed: Number of those evaluations that line searches spent that found no step.
+        failed: Number of evaluations in failed line searches.
     """
 
     def __init__(
@@ -83,7 +83,7 @@ class System:
         level: Level | None = None,
         lasting: bool = False,
     ) -> None:
-        """Join a force field with its metric and its mask."""
+        """Combine a force field with its metric and mask."""
         self.lasting, self.expected = lasting, 0
         self.field, self.metric = field, metric
         self.free, self.spacing, self.level = free, spacing, level
@@ -97,11 +97,11 @@ class System:
         return self.evaluations, self.metric_solves, self.failed
 
     def has_same_metric(self, other: System) -> bool:
-        """Whether what was learned of the curvature under another system holds under this one."""
+        """Whether curvature information from the ``other`` system is valid for this system."""
         return self.metric is other.metric
 
     def energy_and_force(self, x: Float[Tensor, "vertices 3"]) -> tuple[float, Float[Tensor, "vertices 3"]]:
-        """Energy [J] and force [N]; the force on vertices that may not move is zero."""
+        """Energy [J] and force [N]; the force on fixed vertices is zero."""
         self.evaluations += 1
         energy, force = self.field.energy_and_force(x)
         return float(energy), force if self._all_free else force * self._mask
@@ -109,18 +109,18 @@ class System:
     def apply_metric_inverse(
         self, force: Float[Tensor, "vertices 3"], solver: Solver | None = None
     ) -> Float[Tensor, "vertices 3"]:
-        """H0^-1 F [m]: the displacement that a linear cloth of the rest shape would answer with.
+        """H0^-1 F [m]: the displacement of a linear cloth of the rest shape under F.
 
         Args:
             force: F [N].
-            solver: What the metric gave to be used in place of H0^-1, or None.
+            solver: A solve provided by the metric to replace H0^-1, or None.
         """
         self.metric_solves += 1
         move = self.metric.solve(force) if solver is None else solver(force)
         return move if self._all_free else move * self._mask
 
     def apply_short_inverse(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
-        """H0^-1 F [m] for a step without a line search: shorter where the metric has a shorter answer."""
+        """H0^-1 F [m] for a step without a line search: the shorter answer if available."""
         short = self._short
         if short is None:
             return self.apply_metric_inverse(force)
@@ -130,7 +130,7 @@ class System:
 
     @cached_property
     def _short(self) -> Callable[[Tensor], Tensor] | None:
-        """The shorter answer, if any; found once, since testing for a protocol reads all properties."""
+        """The shorter answer, if any; cached, because testing for a protocol reads all properties."""
         return self.metric.short if isinstance(self.metric, Shortened) else None
 
     def diagonal(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " vertices"]:
@@ -139,12 +139,12 @@ class System:
 
     @cached_property
     def rest_diagonal(self) -> Float[Tensor, " vertices"]:
-        """Diagonal of H0 [N/m], positive; 1 where a vertex may not move."""
+        """Diagonal of H0 [N/m], positive; 1 at fixed vertices."""
         return self.metric.diagonal.to(self.spacing)
 
     @cached_property
     def reach(self) -> Float[Tensor, " vertices"]:
-        """The spacing [m], and 0 where a vertex may not move."""
+        """The spacing [m], and 0 at fixed vertices."""
         return self.spacing * self._mask.squeeze(1)
 
     def remaining_move(self, preconditioned: Float[Tensor, "vertices 3"]) -> float:
@@ -152,25 +152,25 @@ class System:
         return float(self.relative_move(preconditioned))
 
     def relative_move(self, preconditioned: Float[Tensor, "vertices 3"]) -> Float[Tensor, ""]:
-        """`remaining_move` where it was computed, float64."""
+        """`remaining_move` as a tensor on the device, float64."""
         relative = preconditioned.square().sum(dim=1) / self.spacing.square()
         return (relative.sum(dtype=torch.float64) / self.free.sum().clamp_min(1)).sqrt()
 
 
 @dataclass(frozen=True, eq=False)
 class Carry:
-    """The state that an integrator hands from one step to the next.
+    """The state passed from step to step by an integrator.
 
     Attributes:
         x: Positions [m].
         energy: Energy at x [J].
         force: Force at x [N].
-        preconditioned: H0^-1 F at x [m] where the integrator knows it.
-        mover: Who made the last step: the integrator's name, "truncated", "halved", "quartered", "fallback" or
+        preconditioned: H0^-1 F at x [m], if known.
+        mover: Maker of the last step: the integrator's name, "truncated", "halved", "quartered", "fallback" or
             "stayed".
         memory: The integrator's own state.
-        setbacks: Corrections of the guard in a row, up to this step.
-        remaining: `System.remaining_move` at x, where the integrator knows it.
+        setbacks: Consecutive corrections by the guard, up to this step.
+        remaining: `System.remaining_move` at x, if known.
     """
 
     x: Float[Tensor, "vertices 3"]
@@ -183,7 +183,7 @@ class Carry:
     remaining: float | None = None
 
     def moved_by(self, mover: str) -> Carry:
-        """This carry under another mover's name."""
+        """This carry with a different mover."""
         return replace(self, mover=mover)
 
 
@@ -204,15 +204,15 @@ class Integrator(Protocol):
 
 @runtime_checkable
 class Resumable(Protocol):
-    """An integrator that can continue when the forces change a little."""
+    """An integrator able to continue after a small change of the forces."""
 
     def resume(self, system: System, carry: Carry) -> Carry:
-        """Evaluate the carry's positions under the system's forces, keeping what was learned of their curvature."""
+        """Evaluate the carry's positions under the system's forces, keeping curvature information."""
         ...
 
 
 def resumed(integrator: Integrator, system: System, carry: Carry) -> Carry:
-    """Go on from a carry under a system whose forces are a little different; start again where that is all one can."""
+    """Continue from a carry under a system with slightly changed forces; restart if the integrator cannot continue."""
     if isinstance(integrator, Resumable):
         return integrator.resume(system, carry)
     return integrator.start(system, carry.x)
@@ -220,15 +220,15 @@ def resumed(integrator: Integrator, system: System, carry: Carry) -> Carry:
 
 @runtime_checkable
 class Following(Protocol):
-    """An integrator that learns from steps that another makes."""
+    """An integrator able to learn from external steps."""
 
     def follow(self, system: System, carry: Carry, x: Float[Tensor, "vertices 3"]) -> Carry:
-        """Evaluate x [m] and remember the displacement from the carry to there as a step of its own."""
+        """Evaluate x [m] and remember the displacement from the carry to x as a step."""
         ...
 
 
 def followed(integrator: Integrator, system: System, carry: Carry, x: Float[Tensor, "vertices 3"]) -> Carry:
-    """Go on from x [m], to which another than the integrator has moved; start again where that is all one can."""
+    """Continue from x [m], reached by an external step; restart if the integrator cannot follow."""
     if isinstance(integrator, Following):
         return integrator.follow(system, carry, x)
     return integrator.start(system, x)

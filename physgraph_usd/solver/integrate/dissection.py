@@ -1,6 +1,7 @@
 """Nested dissection (George 1973): a mesh is cut into halves by a line of vertices, and each half again.
 
-Eliminated leaves first, all parts of one depth are independent of each other, which `multifrontal` makes use of.
+With leaves eliminated first, all parts of one depth are independent of each other; `multifrontal` uses the
+independence.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components
 
 LEAF = 96
-"""Vertices of a part that is not cut any further: its inverse is dense."""
+"""Most vertices of an uncut part: the inverse of an uncut part is dense."""
 
 
 @dataclass(frozen=True)
@@ -20,9 +21,9 @@ class Dissection:
     """The order of elimination of a graph.
 
     Attributes:
-        order: Vertices in the order of their elimination, shape (V,).
-        starts: First vertex of each node in that order, and their number, shape (nodes + 1,); leaves first.
-        parent: The node that cut the part that a node lies in; -1 at the root, shape (nodes,).
+        order: Vertices in elimination order, shape (V,).
+        starts: First vertex of each node in elimination order, and the vertex count, shape (nodes + 1,); leaves first.
+        parent: The separator node above each node; -1 at the root, shape (nodes,).
         stages: First node of each depth, deepest first, and the number of nodes.
     """
 
@@ -33,11 +34,11 @@ class Dissection:
 
 
 def dissect(graph: sp.csr_matrix, *, leaf: int = LEAF) -> Dissection:
-    """Cut a graph in halves until its parts are small.
+    """Cut a graph into halves until the parts are small.
 
     Args:
         graph: Symmetric pattern, shape (V, V).
-        leaf: Vertices of a part that is not cut any further.
+        leaf: Most vertices of an uncut part.
     """
     count = graph.shape[0]
     depths = max(0, int(np.ceil(np.log2(max(count, 1) / leaf))))
@@ -49,7 +50,7 @@ def dissect(graph: sp.csr_matrix, *, leaf: int = LEAF) -> Dissection:
         inside = depth_of == depths
         piece = connected_components(sp.coo_matrix((np.ones(ends.shape[1]), ends), shape=(count, count)))[1]
         distance = _distances(ends, _farthest(ends, piece, inside, count), count)
-        # Pieces that do not hang together come one after another.
+        # Disconnected pieces are ordered one after another.
         upper, cut = _halves(distance + piece.astype(np.int64) * count, part, inside, ends=ends)
         depth_of[cut] = depth
         part = np.where(inside & ~cut, 2 * part + upper, part)
@@ -65,7 +66,7 @@ def dissect(graph: sp.csr_matrix, *, leaf: int = LEAF) -> Dissection:
 
 
 def _farthest(ends: np.ndarray, piece: np.ndarray, inside: np.ndarray, count: int) -> np.ndarray:
-    """A vertex of each connected piece that lies far out: the last that is reached from any other."""
+    """A peripheral vertex of each connected piece: the vertex farthest from an arbitrary start."""
     vertices = np.flatnonzero(inside)
     _, first = np.unique(piece[vertices], return_index=True)
     distance = _distances(ends, vertices[first], count)
@@ -74,7 +75,7 @@ def _farthest(ends: np.ndarray, piece: np.ndarray, inside: np.ndarray, count: in
 
 
 def _distances(ends: np.ndarray, sources: np.ndarray, count: int) -> np.ndarray:
-    """Edges from the nearest source."""
+    """Distance from the nearest source, in edges."""
     graph = sp.csr_matrix((np.ones(ends.shape[1], np.int8), (ends[0], ends[1])), shape=(count, count))
     distance = np.full(count, count)
     distance[sources] = 0
@@ -92,7 +93,7 @@ def _distances(ends: np.ndarray, sources: np.ndarray, count: int) -> np.ndarray:
 def _halves(
     distance: np.ndarray, part: np.ndarray, inside: np.ndarray, *, ends: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Which vertices lie beyond the median distance of their part, and which ones on it touch them."""
+    """The vertices beyond the median distance of their part, and the separator: their neighbours at the median."""
     vertices = np.flatnonzero(inside)
     ordered = vertices[np.lexsort((distance[vertices], part[vertices]))]
     labels, first, sizes = np.unique(part[ordered], return_index=True, return_counts=True)

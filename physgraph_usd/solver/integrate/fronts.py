@@ -1,7 +1,7 @@
-"""Where every entry goes when a matrix of a known pattern is factorised front by front (`multifrontal`).
+"""Index tables for factorising a matrix of a known pattern front by front (`multifrontal`).
 
-A node's front is the dense matrix of its own vertices and of its border: the vertices above it that it is coupled to
-once all below it are eliminated. Nodes of one depth are put together in batches of fronts of one size.
+A node's front is the dense matrix of the node's own vertices and its border: the vertices above, coupled to the node
+after all vertices below are eliminated. Nodes of equal depth are grouped in batches of fronts of equal size.
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ from torch import Tensor
 from .dissection import Dissection
 
 SMALLEST = 0.7
-"""Least width of a batch's fronts, over that of its widest, to which all are padded."""
+"""Least width of a batch's fronts relative to the widest; all fronts are padded to the widest."""
 BATCH = 1 << 24
 """Most entries of a batch of fronts."""
 NOWHERE = 1 << 40
-"""A place that no buffer has: it keeps what is padding out of all results."""
+"""An index outside every buffer, to exclude padding from all results."""
 
 
 @dataclass(frozen=True, eq=False)
 class Received:
-    """Entries that the nodes of a batch receive from one child each; `NOWHERE` where there is none.
+    """Entries received by the nodes of a batch from one child each; `NOWHERE` for none.
 
     Attributes:
-        rows: First places of the rows of its update, shape (nodes, border).
-        columns: Places in such a row, shape (nodes, border).
-        places: Row and column of each in the node's front, shape (nodes, border).
+        rows: First index of each row of the child's update, shape (nodes, border).
+        columns: Index within a row, shape (nodes, border).
+        places: Row and column of each entry in the node's front, shape (nodes, border).
     """
 
     rows: Int[Tensor, "nodes border"]
@@ -43,22 +43,22 @@ class Received:
 
 @dataclass(frozen=True, eq=False)
 class Batch:
-    """Nodes of one depth that are eliminated together, their fronts padded to one size.
+    """Nodes of equal depth eliminated together, with fronts padded to equal size.
 
-    A front has a node's own vertices first, its border from ``inner`` on, and one more row and column for padding.
+    A front has a node's own vertices first, the border from ``inner`` on, and one more row and column for padding.
 
     Attributes:
         inner: Most vertices of a node.
         side: Width of the fronts.
-        unit: Places on the diagonals of the flat fronts that no vertex has.
-        source: Entries of the matrix that the fronts begin with, shape (entries,).
-        target: Their places in the flat fronts, shape (entries,).
-        received: From a first and from a second child.
-        rows: First places of the inner rows in the pass up, shape (nodes, inner).
-        columns: Places in such a row, shape (nodes, width).
-        down: First places, in the pass down, of what a node adds to the rows of its border, shape (nodes, border).
-        updates: First places of the rows of the border's matrix in the depth's updates, shape (nodes, border).
-        ranks: Places in such a row, shape (nodes, border).
+        unit: Indices of padding on the diagonals of the flat fronts.
+        source: Matrix entries copied to the fronts, shape (entries,).
+        target: Indices of the copied entries in the flat fronts, shape (entries,).
+        received: Entries from a first and from a second child.
+        rows: First indices of the inner rows in the pass up, shape (nodes, inner).
+        columns: Indices within a row, shape (nodes, width).
+        down: First indices, in the pass down, of a node's entries in the rows of its border, shape (nodes, border).
+        updates: First indices of the rows of the border's matrix in the depth's updates, shape (nodes, border).
+        ranks: Indices within a row, shape (nodes, border).
     """
 
     inner: int
@@ -76,14 +76,14 @@ class Batch:
     def fronts(
         self, values: Float[Tensor, " entries"], updates: Float[Tensor, " places"]
     ) -> Float[Tensor, "nodes width width"]:
-        """The fronts, from the matrix's entries and the children's updates, whose last is zero."""
+        """The fronts, from the matrix's entries and the children's updates, whose last entry is zero."""
         count, side = len(self.rows), self.side
         flat = values.new_zeros(count * side * side)
         flat[self.unit] = 1.0
         flat[self.target] = values[self.source]
         first = torch.arange(count, device=values.device).mul_(side * side)[:, None, None]
         for child in self.received:
-            # Each child adds in a turn of its own, so no place is added to twice in a call.
+            # Each child adds in a separate call, so no call adds twice to the same place.
             where = first + child.places[:, :, None] * side + child.places[:, None, :]
             flat[where] += updates[joined(child.rows, child.columns, updates)]
         return flat.reshape(count, side, side)[:, :-1, :-1]
@@ -92,32 +92,32 @@ class Batch:
 def joined(
     rows: Int[Tensor, "nodes rows"], columns: Int[Tensor, "nodes columns"], buffer: Tensor
 ) -> Int[Tensor, "nodes rows columns"]:
-    """Places of rows' columns in a flat buffer; its last where one of the two is nowhere."""
+    """Indices of rows' columns in a flat buffer; the last index if row or column is nowhere."""
     return (rows[:, :, None] + columns[:, None, :]).clamp_(max=len(buffer) - 1)
 
 
 class Tree:
-    """The nodes of a dissection with the borders that a pattern gives them; vertices in the order of elimination.
+    """The nodes of a dissection with their borders for a given pattern; vertices in elimination order.
 
-    The pass up has a row for each vertex: its node's vertices, then the node's border. The pass down has one, too: the
-    vertices of each node that has it in its border.
+    The pass up has a row for each vertex: the vertices of the vertex's node, then the node's border. The pass down also
+    has a row for each vertex: the vertices of each node with the vertex in its border.
 
     Attributes:
         stages: First node of each depth, deepest first, and the number of nodes.
-        updates: Entries of the borders' matrices of each depth.
-        up_starts: First entry of each row of the pass up, and their number, shape (V + 1,).
-        up_lists: Where the columns of each row of the pass up begin among ``up_columns``, shape (V,).
+        updates: Number of entries of the borders' matrices of each depth.
+        up_starts: First entry of each row of the pass up, and the entry count, shape (V + 1,).
+        up_lists: Start of each row's columns in ``up_columns``, for the pass up, shape (V,).
         up_columns: Columns of each node's rows; a vertex of the border counts from V, shape (columns,).
-        down_starts: First entry of each row of the pass down, and their number, shape (V + 1,).
+        down_starts: First entry of each row of the pass down, and the entry count, shape (V + 1,).
         down_columns: Columns of the rows, shape (entries,).
     """
 
     def __init__(self, pattern: sp.csr_matrix, dissection: Dissection) -> None:
-        """Follow the elimination.
+        """Simulate the elimination.
 
         Args:
             pattern: Symmetric pattern, shape (V, V).
-            dissection: An order for it.
+            dissection: An elimination order for the pattern.
         """
         count = self._count = pattern.shape[0]
         self.stages, self._first, self._last = dissection.stages, dissection.starts[:-1], dissection.starts[1:]
@@ -142,7 +142,7 @@ class Tree:
         self._lay_out_passes(node)
 
     def _borders(self, owner: np.ndarray, parent: np.ndarray) -> np.ndarray:
-        """Node times number of vertices plus vertex, of all vertices of all borders, ascending."""
+        """Node times vertex count plus vertex, for all vertices of all borders, ascending."""
         beyond = self._column >= self._last[owner]
         inner, ends = owner[beyond] * self._count + self._column[beyond], np.searchsorted(owner[beyond], self.stages)
         found, below = [], np.zeros(0, np.int64)
@@ -155,7 +155,7 @@ class Tree:
         return np.concatenate(found)
 
     def _lay_out_passes(self, node: np.ndarray) -> None:
-        """The rows and columns of both passes; ``node`` is each vertex's."""
+        """The rows and columns of both passes; ``node`` is the node of each vertex."""
         width = self._size + self._border
         lists = np.cumsum(width) - width
         self.up_starts = np.concatenate([[0], np.cumsum(width[node])])
@@ -172,7 +172,7 @@ class Tree:
         self.down_columns = ranges(self._first[self._owner[by_row]], sizes)
 
     def batches(self, begin: int, end: int) -> Iterator[np.ndarray]:
-        """The nodes of a depth, from one to another, in batches of about one width."""
+        """The nodes of a depth, from ``begin`` to ``end``, in batches of similar width."""
         width = (self._size + self._border)[begin:end]
         nodes, width = begin + np.argsort(-width, kind="stable"), -np.sort(-width)
         while len(nodes):
@@ -182,7 +182,7 @@ class Tree:
             nodes, width = nodes[count:], width[count:]
 
     def batch(self, nodes: np.ndarray, *, device: str) -> Batch:
-        """A batch of nodes of one depth, on a device."""
+        """A batch of nodes of equal depth, on a device."""
         inner, most = max(int(self._size[nodes].max()), 1), int(self._border[nodes].max())
         side, parent_rows, child_rows = inner + most + 1, np.arange(inner), np.arange(most)
         size, border = self._size[nodes, None], self._border[nodes, None]
@@ -223,7 +223,7 @@ class Tree:
         return np.concatenate([self._entry[chosen], self._entry[chosen[beyond]]]), number * side**2 + target
 
     def _received(self, nodes: np.ndarray, inner: int, side: int, *, slot: int) -> tuple[np.ndarray, ...] | None:
-        """The arrays of `Received`, or None where no node has a child in that place."""
+        """The arrays of `Received`, or None if no node has a child in the slot."""
         child = self._children[nodes, slot, None]
         border = np.where(child >= 0, self._border[child], 0)
         if not border.any():
@@ -242,13 +242,13 @@ class Tree:
 
 
 def ranges(starts: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """starts[0], starts[0] + 1, ..., counts[0] of them; then those of the others."""
+    """Concatenation of the ranges starts[i], starts[i] + 1, ..., each with counts[i] numbers."""
     before = np.cumsum(counts) - counts
     return np.repeat(starts - before, counts) + np.arange(int(counts.sum()))
 
 
 def _children(parent: np.ndarray) -> np.ndarray:
-    """The two children of each node, -1 where there is none, shape (nodes, 2)."""
+    """The two children of each node, -1 for none, shape (nodes, 2)."""
     children = np.full((len(parent), 2), -1)
     child = np.flatnonzero(parent >= 0)
     above = parent[child]

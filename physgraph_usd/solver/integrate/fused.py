@@ -1,9 +1,9 @@
-"""`Physgraph` as two kernels around a few products of matrices, on the CPU and on CUDA.
+"""`Physgraph` as two kernels around a few matrix products, on the CPU and on CUDA.
 
-In torch a step at 26,000 vertices writes some forty arrays; on a CPU that costs several force evaluations. Here one
-kernel finds normals, means over the neighbours and scalar products in a single pass, so that what a vertex gathers from
-its neighbours is still at hand when it is used; the layers are products of matrices, and a second kernel combines. A
-normal part is a number times the normal; its products come from that number.
+In torch a step at 26,000 vertices writes some forty arrays; on a CPU the cost is several force evaluations. Here one
+kernel computes normals, neighbour means and scalar products in a single pass, so values gathered from the neighbours
+are used while still cached. The layers are matrix products, and a second kernel combines. A normal part is a number
+times the normal; its products are computed from the number.
 """
 
 # Warp's kernels are typed by values that only Warp reads.
@@ -34,10 +34,10 @@ Families = tuple[tuple[int, bool], ...]
 
 
 class FusedPhysgraph:
-    """A network's weights and buffers for one number of vertices, in float32.
+    """A network's weights and buffers for a given number of vertices, in float32.
 
     Attributes:
-        bases: Names of the vectors that are handed over; the others are parts that the kernels take of them.
+        bases: Names of the input vectors; the kernels derive the other vectors as parts.
     """
 
     def __init__(self, network: Physgraph, vertices: int, longest: float, *, device: str, threads: int) -> None:
@@ -87,14 +87,14 @@ class FusedPhysgraph:
         *,
         frame: Callable[[], VertexFrame],
     ) -> Float[Tensor, "vertices 3"]:
-        """The displacement [m], no longer than allowed.
+        """The displacement [m], limited to the longest allowed.
 
         Args:
-            bases: The vectors that `bases` names [m].
+            bases: The vectors named by `bases` [m].
             spacing: Mean rest edge at each vertex [m].
-            reach: The same, and 0 where a vertex may not move [m].
-            step: Number of steps made before, a scalar on the device while steps are recorded.
-            frame: Gives the surroundings of the vertices; called where parts need them.
+            reach: The spacing, and 0 at fixed vertices [m].
+            step: Number of previous steps, a scalar on the device while steps are recorded.
+            frame: Gives the surroundings of the vertices; called only if parts need them.
         """
         torch.stack(list(bases), out=self._rows[: len(self.bases)])
         changed = {}
@@ -120,16 +120,16 @@ class FusedPhysgraph:
 
 @functools.lru_cache(maxsize=8)
 def fused_physgraph(network: Physgraph, vertices: int, longest: float, *, device: str, threads: int) -> FusedPhysgraph:
-    """A `FusedPhysgraph`, reused in the next frame; the network's weights must not change any more."""
+    """A `FusedPhysgraph`, reused in the next frame; the network's weights must stay constant."""
     return FusedPhysgraph(network, vertices, longest, device=device, threads=threads)
 
 
 def in_rows(names: Sequence[str]) -> tuple[tuple[str, ...], tuple[int, ...], Parts]:
-    """The rows that vectors of these names are made of.
+    """Rows of the kernels' table for vectors of given names.
 
     Returns:
-        The whole vectors, which are the first rows; those of them whose means over the neighbours are the last rows; of
-        each name its row and whether it is the normal part of that.
+        The whole vectors, which are the first rows; the whole vectors with neighbour means as the last rows; for each
+        name its row and whether the name is the normal part of the row.
     """
     split = [name.partition(".")[::2] for name in names]
     wholes = tuple(dict.fromkeys(whole for whole, _ in split))
@@ -144,15 +144,16 @@ def in_rows(names: Sequence[str]) -> tuple[tuple[str, ...], tuple[int, ...], Par
 
 @functools.cache
 def seeing(parts: Parts, pairs: Pairs, smoothed: tuple[int, ...], families: Families) -> wp.Kernel:
-    """The kernel that finds the normal, the neighbours' means and the features of each vertex.
+    """The kernel computing the normal, the neighbours' means and the features of each vertex.
 
     Args:
-        parts: Row of each vector, and whether it is the normal part of that.
-        pairs: The vectors whose products are features.
-        smoothed: Rows whose means over the neighbours are the last rows.
-        families: Family of each vector, over whose mean square its products are taken, and whether it counts in that.
+        parts: Row of each vector, and whether the vector is the normal part of the row.
+        pairs: Pairs of vectors with products as features.
+        smoothed: Rows with neighbour means in the last rows.
+        families: Family of each vector, whose mean square normalises the products, and whether the vector counts in the
+            mean.
     """
-    # Warp's hash of a kernel does not see all values that functions of any type are made with; the name carries them.
+    # Warp's kernel hash misses some values captured by generic functions; the module name includes them.
     made = hashlib.sha256(repr((parts, pairs, smoothed, families)).encode()).hexdigest()[:16]
     measure, compare = _measuring(1 + max(row for row, _ in parts), smoothed), _comparing(parts, families)
     show = _showing(parts, pairs, 1 + max(families)[0])
@@ -184,7 +185,7 @@ def seeing(parts: Parts, pairs: Pairs, smoothed: tuple[int, ...], families: Fami
 
 
 def _measuring(rows: int, smoothed: tuple[int, ...]) -> Any:
-    """The function that gives a vertex's rows in local edges and writes those that are means over its neighbours."""
+    """The function computing a vertex's rows in local edges and writing its neighbour means."""
     table = wp.types.matrix(shape=(rows, 3), dtype=wp.float32)
     means = wp.types.matrix(shape=(max(len(smoothed), 1), 3), dtype=wp.float32)
     wholes = rows - len(smoothed)
@@ -216,7 +217,7 @@ def _measuring(rows: int, smoothed: tuple[int, ...]) -> Any:
 
 
 def _comparing(parts: Parts, families: Families) -> Any:
-    """The function that divides rows by the root mean square of their family's vectors, and gives the mean squares."""
+    """The function dividing rows by the root mean square of their family's vectors, and returning the mean squares."""
     kinds, rows = 1 + max(family for family, _ in families), 1 + max(row for row, _ in parts)
     table = wp.types.matrix(shape=(rows, 3), dtype=wp.float32)
     column = wp.types.vector(length=kinds, dtype=wp.float32)
@@ -244,7 +245,7 @@ def _comparing(parts: Parts, families: Families) -> Any:
 
 
 def _showing(parts: Parts, pairs: Pairs, kinds: int) -> Any:
-    """The function that writes what the network sees of a vertex: squares, products, logarithms of the mean squares."""
+    """The function writing the network's features of a vertex: squares, products, logarithms of the mean squares."""
     every = wp.types.vector(length=len(parts), dtype=wp.float32)
     terms = (*((a, a) for a in range(len(parts))), *pairs)
 
@@ -275,7 +276,7 @@ def _showing(parts: Parts, pairs: Pairs, kinds: int) -> Any:
 
 @functools.cache
 def combining(parts: Parts) -> wp.Kernel:
-    """The kernel that combines vectors of which these are the rows and normal parts."""
+    """The kernel combining the vectors, given as rows and normal parts."""
 
     @wp.kernel(module="unique")
     def combine(

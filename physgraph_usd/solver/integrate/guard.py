@@ -1,4 +1,4 @@
-"""The guard: keeps an integrator's step only if the energy falls."""
+"""The guard: accepts an integrator's step only if the energy falls."""
 
 from __future__ import annotations
 
@@ -12,27 +12,27 @@ from .base import Carry, Integrator, System, followed, resumed
 from .quasi_newton import backtrack, truncated
 
 PATIENCE = 4
-"""Corrections in a row after which an integrator is replaced by its spare."""
+"""Consecutive corrections before an integrator is replaced by its spare."""
 
 
 class Guard:
-    """Wraps any integrator; with it no descent ends above its start, whatever the integrator proposes.
+    """Wraps any integrator; no guarded descent ends above its start, for any proposed steps.
 
-    The start is the upsampled cage in a cold frame, and the last frame's detail in a warm one.
+    The start is the upsampled cage in a cold frame, and the last frame's detail in a warm frame.
 
-    A step that raises the energy is truncated where it turns triangles (`truncated`), then halved, quartered, and
-    replaced by a step along H0^-1 F with a line search.
-    From a shortened step the integrator continues with its memory, if it can take over another's step. From one that
-    was replaced it starts anew: its memory misled it. After `PATIENCE` corrections in a row the spare
-    integrator, where there is one, makes the level's other steps. ``Carry.mover`` names the mover.
+    A step that raises the energy is truncated at turned triangles (`truncated`), then halved, quartered, and replaced
+    by a step along H0^-1 F with a line search. After a shortened step the integrator continues with its memory, if able
+    to follow an external step. After a replaced step the integrator restarts, because its memory was misleading. After
+    `PATIENCE` consecutive corrections the spare integrator, if given, makes the level's remaining steps.
+    ``Carry.mover`` names the mover.
     """
 
     def __init__(self, inner: Integrator, *, spare: Integrator | None = None) -> None:
         """Wrap an integrator.
 
         Args:
-            inner: It proposes the steps.
-            spare: One that needs no guard, for levels at which the other fails, or None.
+            inner: Integrator proposing the steps.
+            spare: Integrator without need of a guard, for levels at which ``inner`` fails, or None.
         """
         self.name = inner.name
         self._inner, self._spare = inner, spare
@@ -42,14 +42,14 @@ class Guard:
         return self._inner.start(system, x)
 
     def resume(self, system: System, carry: Carry) -> Carry:
-        """Go on under forces that changed a little, as who made the last step can."""
+        """Continue after a small change of the forces, with the integrator of the last step."""
         spare = self._spare_of(carry)
         if spare is not None:
             return replace(resumed(spare, system, carry), setbacks=carry.setbacks)
         return resumed(self._inner, system, carry)
 
     def step(self, system: System, carry: Carry) -> Carry:
-        """One step whose energy is not above the last one's."""
+        """Make a step without raising the energy."""
         spare = self._spare_of(carry)
         if spare is not None:
             return replace(spare.step(system, carry), setbacks=carry.setbacks)
@@ -57,7 +57,7 @@ class Guard:
         if math.isfinite(proposed.energy) and proposed.energy <= carry.energy:
             return proposed
         corrected = replace(self._corrected(system, carry, proposed), setbacks=carry.setbacks + 1)
-        if corrected.mover == "stayed" and self._spare is not None:  # It may lower the energy where H0^-1 F does not.
+        if corrected.mover == "stayed" and self._spare is not None:  # The spare may succeed where H0^-1 F fails.
             return replace(self._spare.step(system, self._spare.start(system, carry.x)), setbacks=PATIENCE)
         spare = self._spare_of(corrected)
         if spare is None:
@@ -66,7 +66,7 @@ class Guard:
         return replace(handed, mover=corrected.mover, setbacks=corrected.setbacks)
 
     def _corrected(self, system: System, carry: Carry, proposed: Carry) -> Carry:
-        """Where a step that raised the energy is cut back or replaced."""
+        """The carry after shortening or replacing a step that raised the energy."""
         move = proposed.x - carry.x
         if bool(move.isfinite().all()):
             cut = truncated(system, carry.x, move)
@@ -82,5 +82,5 @@ class Guard:
         return self._inner.start(system, found[0]).moved_by("fallback")
 
     def _spare_of(self, carry: Carry) -> Integrator | None:
-        """Who makes the steps after a carry in the wrapped integrator's place, or None."""
+        """The spare integrator if responsible after this carry, or None."""
         return self._spare if carry.setbacks >= PATIENCE else None

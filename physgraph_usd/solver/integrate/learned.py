@@ -1,13 +1,13 @@
-"""The learned integrator: one force evaluation a step, no line search; the guard around it keeps it safe.
+"""The learned integrator: one force evaluation per step, no line search; the surrounding guard ensures safety.
 
 | symbol | here | meaning |
 |---|---|---|
-| H0^-1 F | ``preconditioned`` | displacement that a linear cloth of the rest shape would answer with [m] |
-| v_i | ``vectors`` | what the network may combine, in local edge lengths |
-| c_i | ``coefficients`` | what the network answers |
+| H0^-1 F | ``preconditioned`` | displacement of a linear cloth of the rest shape under F [m] |
+| v_i | ``vectors`` | vectors for the network to combine, in local edge lengths |
+| c_i | ``coefficients`` | output of the network |
 | D | ``move`` | sum_i c_i v_i, no longer than `LONGEST` edges at any vertex |
 
-The network sees a `System` and nothing else.
+The network sees a `System` only.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ from .vertex_frame import VertexFrame
 NetworkT = TypeVar("NetworkT", bound=nn.Module)
 
 LONGEST = 5.0
-"""Most edge lengths that a vertex moves in a step."""
+"""Longest move of a vertex in a step, in edge lengths."""
 
 
 class LearnedMetric:
-    """`physgraph`: a network chooses, vertex by vertex, how a few vectors make the step."""
+    """`physgraph`: a network chooses coefficients of a few vectors, vertex by vertex, for the step."""
 
     name = "physgraph"
 
@@ -46,8 +46,8 @@ class LearnedMetric:
 
         Args:
             network: The network.
-            fuse: Run it in `fused`'s kernels where no gradient is asked for.
-            record: On CUDA, record a step and replay it.
+            fuse: Use the kernels of `fused` if no gradient is needed.
+            record: On CUDA, record a step and replay the recording.
         """
         self._network = network
         self._trained = not any(parameter.requires_grad for parameter in network.parameters())
@@ -55,14 +55,14 @@ class LearnedMetric:
         self._recordings = Recordings[Recording]()
 
     def start(self, system: System, x: Float[Tensor, "vertices 3"]) -> Carry:
-        """Evaluate x with an empty memory; the network counts as precisely as the system does."""
+        """Evaluate x with an empty memory; the network runs in the system's precision."""
         self._network = placed(self._network, system, x.dtype)
         energy, force = system.energy_and_force(x)
         none = torch.zeros_like(x)
         return Carry(x, energy, force, system.apply_short_inverse(force), self.name, Memory(none, (none, none)))
 
     def resume(self, system: System, carry: Carry) -> Carry:
-        """Evaluate the carry's positions under forces that changed a little; the memory is kept."""
+        """Evaluate the carry's positions after a small change of the forces; the memory is kept."""
         energy, force = system.energy_and_force(carry.x)
         return Carry(carry.x, energy, force, system.apply_short_inverse(force), self.name, carry.memory)
 
@@ -74,11 +74,11 @@ class LearnedMetric:
         return self._reached(system, carry, carry.x + move, move)
 
     def follow(self, system: System, carry: Carry, x: Float[Tensor, "vertices 3"]) -> Carry:
-        """Evaluate x [m] and remember the displacement to there as a step of the network's."""
+        """Evaluate x [m] and remember the displacement to x as a step of the network."""
         return self._reached(system, carry, x, x - carry.x)
 
     def _reached(self, system: System, carry: Carry, x: Tensor, move: Tensor) -> Carry:
-        """The carry at x [m], a displacement away from the last one's."""
+        """The carry at x [m], a displacement away from the previous carry."""
         energy, force = system.energy_and_force(x)
         image = system.apply_short_inverse(force)
         memory = carry.memory.after(carry, move, force, image, dot=self._dot(system))
@@ -89,7 +89,7 @@ class LearnedMetric:
         return self._combined(carry, system=system, fused=self._fused(system))
 
     def _fused(self, system: System) -> FusedPhysgraph | None:
-        """The network in kernels, where it runs so."""
+        """The network as kernels, or None if not fused."""
         if not self._fuse or system.spacing.dtype != torch.float32:
             return None
         threads = 1 if system.level is None else system.level.threads
@@ -104,7 +104,7 @@ class LearnedMetric:
         fused: FusedPhysgraph | None,
         secant: Callable[[Carry], Tensor] | None = None,
     ) -> Tensor:
-        """The network's combination of vectors [m]; a recording gives the L-BFGS direction by itself."""
+        """The network's combination of vectors [m]; a recording provides its own L-BFGS direction."""
         names, step = self._network.config.vectors, carry.memory.step
         frame = cache(lambda: VertexFrame(level_of(system), carry.x))
         whole = partial(_vector, system=system, carry=carry, secant=secant or _secant_direction)
@@ -116,13 +116,13 @@ class LearnedMetric:
         return limited(move, system.spacing) * system.free
 
     def _dot(self, system: System) -> Dot:
-        """The scalar product: numbers where nothing is lost by waiting for them."""
+        """The scalar product: returns numbers if waiting for numbers costs nothing."""
         alone = system.level is None or len(system.level.spans) == 1
         waits = alone and self._trained and not system.spacing.is_cuda and not self.records(system)
         return dot if waits else partial(garment_dot, system.level)
 
     def records(self, system: System) -> bool:
-        """Whether a system's steps are recorded: on CUDA, once trained, where it is used again or takes many."""
+        """Whether a system's steps are recorded: on CUDA, once trained, for a reused system or many steps."""
         few = system.level is None or len(system.level.spans) <= MOST_GARMENTS
         return self._record and few and pays(system)
 
@@ -130,7 +130,7 @@ class LearnedMetric:
         """The recording of a system's steps."""
 
         def make() -> Recording:
-            # A recording keeps what its kernels write to: what is cached for all may be dropped.
+            # A recording keeps its kernels' buffers alive: the shared cache may drop them.
             propose = partial(self._combined, system=system, fused=self._fused(system))
             return Recording(system, propose, dot=self._dot(system))
 
@@ -144,7 +144,7 @@ def _secant_direction(carry: Carry) -> Tensor:
 
 
 def _vector(name: str, *, system: System, carry: Carry, secant: Callable[[Carry], Tensor]) -> Tensor:
-    """One of `network.WHOLE` [m]; zero where the past does not reach so far."""
+    """One of `network.WHOLE` [m]; zero if the history is too short."""
     memory: Memory = carry.memory
     if name == "secant":
         return secant(carry)
@@ -159,14 +159,14 @@ def _vector(name: str, *, system: System, carry: Carry, secant: Callable[[Carry]
 
 
 def placed(network: NetworkT, system: System, dtype: torch.dtype) -> NetworkT:
-    """The network on the system's device and of a scalar type: itself, or a copy."""
+    """The network on the system's device and in a scalar type: the same object or a copy."""
     parameter, device = next(network.parameters()), system.spacing.device
     fits = (parameter.device, parameter.dtype) == (device, dtype)
     return network if fits else copy.deepcopy(network).to(device=device, dtype=dtype)
 
 
 def limited(move: Float[Tensor, "vertices 3"], spacing: Float[Tensor, " vertices"]) -> Float[Tensor, "vertices 3"]:
-    """The displacement, shortened to `LONGEST` local edge lengths at each vertex."""
+    """The displacement, limited to `LONGEST` local edge lengths at each vertex."""
     size = move.square().sum(dim=1, keepdim=True).clamp_min(torch.finfo(move.dtype).tiny).sqrt()
     return move * (LONGEST * spacing.unsqueeze(1) / size).clamp_max(1.0)
 
@@ -174,11 +174,11 @@ def limited(move: Float[Tensor, "vertices 3"], spacing: Float[Tensor, " vertices
 def vectors_of(
     names: Sequence[str], whole: Callable[[str], Tensor], *, frame: Callable[[], VertexFrame]
 ) -> list[Tensor]:
-    """The vectors of given names [m]; those with a dot are parts of whole ones (`vertex_frame.PARTS`).
+    """The vectors of given names [m]; names with a dot are parts of whole vectors (`vertex_frame.PARTS`).
 
     Args:
-        names: Names out of `network.VECTORS`.
-        whole: Gives a vector without a dot in its name.
+        names: Names in `network.VECTORS`.
+        whole: Gives a vector for a name without a dot.
         frame: Gives the surroundings of the vertices.
     """
     found: dict[str, Tensor] = {}
@@ -192,11 +192,11 @@ def vectors_of(
 
 
 def garment_dot(level: Level | None, a: Tensor, b: Tensor) -> Tensor:
-    """The scalar product of two fields in each garment, at each of its vertices; (1, 1) for one garment."""
+    """The scalar product of two fields in each garment, at each vertex of the garment; (1, 1) for a single garment."""
     if level is None or len(level.spans) == 1:
         return torch.dot(a.reshape(-1), b.reshape(-1)).reshape(1, 1)
     each, owner = (a * b).sum(dim=1, keepdim=True), level.vertex_garment.long()
-    if len(level.spans) <= MOST_GARMENTS:  # In an order that is the same on every run.
+    if len(level.spans) <= MOST_GARMENTS:  # In a fixed order.
         return torch.stack([each[span].sum(dim=0) for span in level.spans])[owner]
     return each.new_zeros(len(level.spans), 1).index_add_(0, owner, each)[owner]
 
@@ -205,7 +205,7 @@ def level_of(system: System) -> Level:
     """The level of a system.
 
     Raises:
-        SolveError: It has none.
+        SolveError: The system has no level.
     """
     if system.level is None:
         raise SolveError("this network needs a mesh, and the system has none")

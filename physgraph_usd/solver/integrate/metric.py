@@ -22,16 +22,17 @@ except ImportError:  # Linux on ARM has no wheel.
     cholespy = None
 
 FACTOR = "scipy" if cholespy is None else "cholespy"
-"""Whose factors are used on the CPU."""
+"""Library used for factors on the CPU."""
 REGULARISATION = 1e-7
-"""Added to the diagonal, relative to its mean: keeps loose parts without a guide definite."""
+"""Regularisation of the diagonal, relative to its mean: keeps loose parts without a guide definite."""
 
 
 def on_edges(matrix: sp.csr_matrix, edges: np.ndarray) -> sp.csr_matrix:
-    """A graph Laplacian with a matrix's negative couplings along edges and its row sums.
+    """A graph Laplacian with a matrix's negative couplings along edges and the same row sums.
 
-    The rest form of bending also couples vertices across two triangles. Those entries double the time of a solve, and
-    take the gap at equal steps from 6.9% to 6.1% at best: on a sleeve, elsewhere by nothing (benchmarks/metric.py).
+    The rest form of bending also couples vertices across two triangles. Including the additional couplings doubles the
+    time of a solve, and reduces the gap at equal steps from 6.9% to 6.1% on a sleeve, elsewhere not at all
+    (benchmarks/metric.py).
 
     Args:
         matrix: Symmetric, positive semi-definite [N/m], shape (V, V).
@@ -52,7 +53,7 @@ class Metric:
     """H0, factorised: the same matrix for x, y and z.
 
     Attributes:
-        diagonal: Of H0 [N/m], float64; 1 where a vertex may not move, shape (V,).
+        diagonal: Diagonal of H0 [N/m], float64; 1 at fixed vertices, shape (V,).
         entries: Number of the matrix's entries.
     """
 
@@ -61,7 +62,7 @@ class Metric:
 
         Args:
             matrix: Symmetric positive semi-definite [N/m], shape (V, V).
-            free: False where a vertex may not move: its row becomes the identity's.
+            free: False at fixed vertices, whose rows become identity rows.
             dtype: Scalar type of the right-hand sides.
         """
         self._mask, self._free, self._matrix = free.to(dtype), free.squeeze(1), matrix
@@ -80,7 +81,7 @@ class Metric:
         return other
 
     def merged(self, label: np.ndarray) -> MergedMetric:
-        """The metric of the same cloth with all vertices of a label as one; the same one while the labels stay.
+        """The metric of the same cloth with all vertices of equal label merged; cached while the labels stay the same.
 
         Args:
             label: A number for each vertex, shape (V,).
@@ -101,22 +102,22 @@ class Metric:
         self.diagonal = torch.where(self._free, diagonal / scale, 1.0)
 
     def solve(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
-        """H0^-1 F [m]; zero where a vertex may not move."""
+        """H0^-1 F [m]; zero at fixed vertices."""
         return self._solver(force * self._scaled).mul_(self._mask)
 
     def between(self, factor: Float[Tensor, "vertices 1"]) -> Solver:
-        """The solve of R H0^-1 R F [m], R a diagonal, in no more passes than that of H0^-1 F."""
+        """The solve of R H0^-1 R F [m], R a diagonal, in as few passes as for H0^-1 F."""
         before, after = self._scaled * factor, self._mask * factor
         return lambda force: self._solver(force * before).mul_(after)
 
     def stiffened(self, stiffness: Float[Tensor, " vertices"]) -> Solver:
-        """R H0^-1 R, as `Preconditioner` has it."""
+        """R H0^-1 R, as in `Preconditioner`."""
         diagonal = self.diagonal.to(stiffness)
         return self.between((diagonal / torch.maximum(diagonal, stiffness)).sqrt().unsqueeze(1))
 
 
 class MergedMetric(Metric):
-    """The metric of cloth some of whose vertices are one: the first of each label stands for all.
+    """The metric of cloth with merged vertices: the first vertex of each label represents all.
 
     Attributes:
         label: A number for each vertex, shape (V,).
@@ -128,9 +129,9 @@ class MergedMetric(Metric):
         """Add up the rows and columns of each label, and factorise.
 
         Args:
-            matrix: As `Metric` takes it.
+            matrix: As in `Metric`.
             label: A number for each vertex, shape (V,).
-            free: False where a vertex may not move; then none of its label may.
+            free: False at fixed vertices; one fixed vertex fixes the whole label.
             dtype: Scalar type of the right-hand sides.
         """
         _, first, group = np.unique(label, return_index=True, return_inverse=True)
@@ -150,28 +151,28 @@ class MergedMetric(Metric):
         )
 
     def plus(self, springs: Float[Tensor, " vertices"]) -> Metric:
-        """The metric held by springs [N/m]; what holds one vertex of a label holds all."""
+        """The metric with added springs [N/m]; a spring on one vertex of a label holds all."""
         return super().plus(add_at(torch.zeros_like(springs), self._representative, springs))
 
     def solve(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
-        """H0^-1 of each label's force together [m], the same move for all of it."""
+        """H0^-1 of each label's total force [m], the same move for all vertices of the label."""
         return super().solve(self._sum.apply(force))[self._representative]
 
     def between(self, factor: Float[Tensor, "vertices 1"]) -> Solver:
-        """The solve of R H0^-1 R F [m], each label's force together."""
+        """The solve of R H0^-1 R F [m], with the forces of each label summed."""
         return lambda force: self.solve(force * factor).mul_(factor)
 
     def _hold(self, stiffness: Float[Tensor, " vertices"]) -> None:
-        """Factorise with a diagonal [N/m], of which each vertex has its part."""
+        """Factorise with a diagonal [N/m], shared between the vertices of each label."""
         super()._hold(stiffness)
         self.diagonal = self.diagonal[self._representative] / self._members
 
 
 class HostFactors:
-    """Factors of matrices that differ in their diagonal, and in one factor of all else, on the CPU."""
+    """Factors, on the CPU, of matrices with common couplings up to a factor and different diagonals."""
 
     def __init__(self, couplings: sp.csr_matrix, dtype: torch.dtype) -> None:
-        """Keep all but the diagonal, shape (V, V)."""
+        """Keep the off-diagonal couplings, shape (V, V)."""
         self._couplings, self._dtype = couplings, dtype
 
     def factorised(self, scale: float, diagonal: Float[Tensor, " vertices"]) -> Solver:
@@ -197,17 +198,17 @@ def _of_cholespy(module: Any, matrix: sp.coo_matrix, dtype: torch.dtype) -> Solv
 
 
 def _of_scipy(matrix: sp.coo_matrix) -> Solver:
-    """The solve by an LU factor without pivoting, which a positive definite matrix does not need."""
+    """The solve by an LU factor without pivoting, not needed for a positive definite matrix."""
     options = {"SymmetricMode": True}
     factor = splu(sp.csc_matrix(matrix), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
     return lambda force: torch.as_tensor(factor.solve(force.double().numpy()), dtype=force.dtype)
 
 
 class DeviceFactors:
-    """Factors of such matrices on CUDA, where only the first passes through the host."""
+    """Factors of such matrices on CUDA; only the first factorisation passes through the host."""
 
     def __init__(self, couplings: sp.csr_matrix, dtype: torch.dtype, device: str) -> None:
-        """Find where all but the diagonal goes, shape (V, V)."""
+        """Find the positions of the off-diagonal couplings, shape (V, V)."""
         count, each = couplings.shape[0], sp.coo_matrix(couplings)
         rows, columns = (np.concatenate([ends, np.arange(count)]) for ends in (each.row, each.col))
         order = np.lexsort((columns, rows))

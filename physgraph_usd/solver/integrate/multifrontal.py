@@ -1,24 +1,24 @@
-"""A sparse Cholesky factor for CUDA: found by batches of dense matrices, solved by a handful of sparse products.
+"""A sparse Cholesky factor for CUDA: computed by batches of dense matrices, solved by a few sparse products.
 
-A triangular solve walks the matrix row after row: on a GPU that takes 2 ms at 30,000 vertices and 11 ms at 330,000,
-however fast the memory is. After a nested dissection all blocks of one depth are independent of each other, so with the
-inverses of the diagonal blocks stored (Alvarado, Pothen and Schreiber 1993) a solve is one product a depth down the
-tree and one up again:
+A triangular solve traverses the matrix row after row: on a GPU this takes 2 ms at 30,000 vertices and 11 ms at 330,000,
+however fast the memory. After a nested dissection all blocks of one depth are independent of each other. With stored
+inverses of the diagonal blocks (Alvarado, Pothen and Schreiber 1993) a solve is one product per depth down the tree and
+one up again:
 
     down, leaves first:   y_S = f_S - sum_C W_SC y_C                    C: descendants of S
     up, root first:       x_S = A_SS'^-1 y_S - sum_B W_BS^T x_B         B: ancestors of S
 
 | symbol | here | meaning |
 |---|---|---|
-| S | a node | vertices of a leaf, or of the line that cuts a part |
+| S | a node | vertices of a leaf, or of a separator |
 | A' | ``fronts`` | the matrix after the descendants are eliminated |
 | W_BS | ``w`` | A'_BS A'_SS^-1 |
 
-The factorisation is multifrontal (Duff and Reid 1983): the fronts of a depth are dense matrices of about one size, so a
-few calls of batched linear algebra in float64 eliminate them all. Where entries go is found once for a pattern; a
-matrix with other values takes milliseconds. Nothing is added to one place twice in a call, so equal matrices give equal
-factors. cuDSS 1.0 takes 1.7 ms for a solve at 330,000 vertices where this takes 0.7 (docs/notes/learned.md), and a
-graph that is captured around it stays empty, so steps could not be recorded.
+The factorisation is multifrontal (Duff and Reid 1983): the fronts of a depth are dense matrices of similar size,
+eliminated by a few calls of batched linear algebra in float64. Index tables are computed once per pattern; a matrix
+with different values takes milliseconds. No call adds twice to the same place, so equal matrices give equal factors.
+cuDSS 1.0 takes 1.7 ms for a solve at 330,000 vertices, this solver 0.7 ms (docs/notes/learned.md), and a graph captured
+around cuDSS stays empty, so steps could not be recorded.
 """
 
 # Warp's kernels are typed by values that only Warp reads.
@@ -45,26 +45,26 @@ from .fronts import Tree, joined
 wp.set_module_options(KERNELS)
 
 BLOCK = 64
-"""Threads that share a row's sum on CUDA."""
+"""Threads sharing a row's sum on CUDA."""
 
 
 class Elimination:
     """The elimination of all matrices of one pattern.
 
     Attributes:
-        order: Vertices in the order of their elimination, shape (V,).
+        order: Vertices in elimination order, shape (V,).
         device: "cpu" or a CUDA device.
-        rows: First vertex of each depth in that order, deepest first, and their number.
-        tables: Of the pass down and of the pass up: first entries of the rows, first columns of the rows, columns.
+        rows: First vertex of each depth in elimination order, deepest first, and the vertex count.
+        tables: For the pass down and the pass up: first entries of the rows, first columns of the rows, columns.
     """
 
     def __init__(self, pattern: sp.csr_matrix, *, device: str, leaf: int | None = None) -> None:
-        """Find an order and where every entry goes.
+        """Find an order and the index tables.
 
         Args:
             pattern: Symmetric pattern, shape (V, V).
-            device: Where matrices are factorised and solved.
-            leaf: Vertices of a part that is not cut any further, or None for what suits CUDA.
+            device: Device for factors and solves.
+            leaf: Most vertices of an uncut part, or None for a value suited to CUDA.
         """
         cut = dissect(pattern) if leaf is None else dissect(pattern, leaf=leaf)
         tree = Tree(pattern, cut)
@@ -83,11 +83,11 @@ class Elimination:
         ]
 
     def factor(self, values: Float[Tensor, " entries"], dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-        """The entries of the pass down and of the pass up, each with one more that means nothing.
+        """The entries of the pass down and of the pass up, each with an unused last entry.
 
         Args:
-            values: Entries of a positive definite matrix in the order of the pattern's, float64.
-            dtype: Of the result.
+            values: Entries of a positive definite matrix in the pattern's order, float64.
+            dtype: Type of the result.
 
         Raises:
             SolveError: The matrix is not positive definite.
@@ -116,7 +116,7 @@ class Elimination:
 
 
 def _inverse(matrices: Tensor) -> tuple[Tensor, Tensor]:
-    """Inverses of symmetric matrices, and which of them are not positive definite."""
+    """Inverses of symmetric matrices, and flags for matrices not positive definite."""
     factors, info = torch.linalg.cholesky_ex(matrices)
     unit = torch.eye(matrices.shape[1], dtype=matrices.dtype, device=matrices.device)
     half = torch.linalg.solve_triangular(factors, unit.expand_as(matrices), upper=False)
@@ -130,8 +130,8 @@ class DissectedSolver:
         """Factorise.
 
         Args:
-            elimination: That of the matrix's pattern.
-            values: The matrix's entries in the order of the pattern's, float64.
+            elimination: Elimination of the matrix's pattern.
+            values: The matrix's entries in the pattern's order, float64.
             dtype: Scalar type of the right-hand sides.
 
         Raises:

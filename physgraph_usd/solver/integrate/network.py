@@ -1,9 +1,8 @@
-"""The network of the learned integrator `physgraph`; its inputs are numbers without units, of no force by name.
+"""The network of the learned integrator `physgraph`; its inputs are unitless numbers, and name no force.
 
-It gives the coefficients by which a few vectors per vertex are combined. Its features are only what a rotation does not
-change: scalar products over the mean square, and the logarithm of that. So the displacement turns with the cloth
-exactly, whatever the weights; and each vertex sees its own surroundings alone, so that a patch moves as it would in any
-garment.
+The network outputs the coefficients of a few vectors per vertex. Its features are rotation invariant only: scalar
+products relative to the mean square, and the logarithm of the mean square. Therefore the displacement rotates exactly
+with the cloth, for any weights. Each vertex sees only its own surroundings, so a patch moves equally in any garment.
 """
 
 from __future__ import annotations
@@ -23,12 +22,12 @@ WHOLE = ("metric", "metric1", "metric2", "move1", "move2", "diagonal", "diagonal
 """Vectors of a vertex: H0^-1 F now and one and two steps ago, the last displacements, the force over H0's diagonal now
 and before, the L-BFGS direction."""
 VECTORS = (*WHOLE, *(f"{name}.{part}" for name in WHOLE for part in PARTS))
-"""Vectors that can be combined: those and their parts."""
+"""Vectors available for combination: `WHOLE` and the parts."""
 
 FLOOR = 1e-9
-"""Lengths below this many edges count as none."""
+"""Lengths below this many edges count as zero."""
 LOG_SCALE, LOG_OFFSET = 0.25 / math.log(10.0), 1.5
-"""The network sees (log10 + 3) / 2 of a length: of its square's natural logarithm so much, and this."""
+"""Scale and offset of lengths: (log10 + 3) / 2 of a length, from the natural logarithm of the squared length."""
 
 
 @dataclass(frozen=True)
@@ -36,8 +35,8 @@ class PhysgraphConfig:
     """Size of a `Physgraph`.
 
     Attributes:
-        vectors: Names out of `VECTORS`.
-        width: Numbers per vertex inside.
+        vectors: Names in `VECTORS`.
+        width: Hidden numbers per vertex.
         depth: Hidden layers.
     """
 
@@ -47,7 +46,7 @@ class PhysgraphConfig:
 
 
 class Physgraph(nn.Module):
-    """Coefficients of vectors from what rotations leave alone; untrained it answers with the first vector itself."""
+    """Coefficients of vectors from rotation-invariant features; an untrained network returns the first vector."""
 
     def __init__(self, config: PhysgraphConfig) -> None:
         """Make the layers; the last one starts at zero."""
@@ -64,7 +63,7 @@ class Physgraph(nn.Module):
         self.register_buffer("_family", torch.tensor(families_of(config.vectors)), persistent=False)
         self.register_buffer("_mean", family_means(config.vectors), persistent=False)
         self.encode = nn.Linear(count + len(first) + self._mean.shape[1], width)
-        self.encode_means = nn.Linear(1, width, bias=False)  # Of the number of steps; the weights' files name it so.
+        self.encode_means = nn.Linear(1, width, bias=False)  # Of the number of steps; weights files fix the name.
         self.hidden = nn.ModuleList(nn.Linear(width, width) for _ in range(config.depth - 1))
         self.decode = nn.Linear(width, count)
         nn.init.zeros_(self.decode.weight)
@@ -77,7 +76,7 @@ class Physgraph(nn.Module):
 
         Args:
             vectors: The configuration's vectors, in local edge lengths.
-            step: Number of steps made before, a scalar on the device while steps are recorded.
+            step: Number of previous steps, a scalar on the device while steps are recorded.
         """
         square = vectors.square().sum(dim=2)  # V N
         size = (square @ self._mean + FLOOR**2).sqrt()  # V K
@@ -94,9 +93,9 @@ class Physgraph(nn.Module):
 
 
 def families_of(names: Sequence[str]) -> tuple[int, ...]:
-    """The family of each vector: forces over the diagonal are one, displacements the other.
+    """The family of each vector: forces over the diagonal form one family, displacements the second.
 
-    They differ in size by what H0^-1 carries from afar. Families are numbered in the order in which they come.
+    Families differ in size because H0^-1 collects distant forces. Families are numbered in order of appearance.
     """
     kinds = [name.startswith("diagonal") for name in names]
     order = list(dict.fromkeys(kinds))
@@ -104,12 +103,12 @@ def families_of(names: Sequence[str]) -> tuple[int, ...]:
 
 
 def counted(names: Sequence[str]) -> tuple[bool, ...]:
-    """Which vectors count in their family's mean square: all but normal parts of those that are there themselves."""
+    """Whether each vector counts in its family's mean square: all but normal parts of vectors present themselves."""
     return tuple(not (part == "normal" and whole in names) for whole, _, part in (n.partition(".") for n in names))
 
 
 def family_means(names: Sequence[str]) -> Float[Tensor, "vectors families"]:
-    """The matrix that gives each family's mean square out of the squares of all vectors."""
+    """The matrix mapping the squares of all vectors to each family's mean square."""
     families = torch.tensor(families_of(names))
     members = families[:, None] == torch.arange(int(families.max()) + 1)
     members = (members & torch.tensor(counted(names))[:, None]).float()
@@ -117,10 +116,10 @@ def family_means(names: Sequence[str]) -> Float[Tensor, "vectors families"]:
 
 
 def pairs_of(names: Sequence[str]) -> Int[Tensor, "2 pairs"]:
-    """The vectors whose scalar products a network sees.
+    """The pairs of vectors with scalar products as features.
 
-    Those between whole vectors, between a mean and its own vector, and between a part and the first of its kind. Normal
-    parts are parallel: of their products a few say everything, and that with the vector itself is their square.
+    Pairs of whole vectors, pairs of a vector and its mean, and pairs of a part and the first part of its kind. Normal
+    parts are parallel: a few products determine all, and the product with the vector itself is the square.
     """
     split = [name.partition(".")[::2] for name in names]
     kinds = [kind for _, kind in split]
@@ -136,5 +135,5 @@ def pairs_of(names: Sequence[str]) -> Int[Tensor, "2 pairs"]:
 
 
 def clock_of(step: int | Tensor) -> Any:
-    """The number of steps made, as networks see it."""
+    """The number of steps made, as a feature."""
     return torch.log1p(step) - 1.5 if isinstance(step, Tensor) else math.log1p(step) - 1.5

@@ -1,11 +1,11 @@
-"""Quasi-Newton: L-BFGS (`secants`) whose first guess of the inverse Hessian is the metric's.
+"""Quasi-Newton: L-BFGS (`secants`) with the metric's inverse as first guess of the inverse Hessian.
 
-A step costs one metric solve and, when the first trial is accepted, one force evaluation.
+A step costs one metric solve and, if the first trial is accepted, one force evaluation.
 
-H0 is of the rest shape. A collapsed triangle is up to 10^5 times as stiff, so that H0^-1 F goes much too far there and
-a line search shortens the steps of the whole garment to nothing. After such a step the metric is made as stiff as the
-present state is (`Preconditioner.stiffened`), which shortens moves there and nowhere else; for as many steps as there
-are secants, since a triangle that opens would stay as slow as it was.
+H0 describes the rest shape. A collapsed triangle is up to 10^5 times as stiff, so H0^-1 F goes much too far there and a
+line search shortens the steps of the whole garment to nothing. After such a step the metric is stiffened to the present
+state (`Preconditioner.stiffened`), which shortens moves at collapsed triangles only. Stiffening lasts for as many steps
+as there are secants, because an opening triangle would otherwise remain slow.
 """
 
 from __future__ import annotations
@@ -26,24 +26,25 @@ from .secants import Secant, dot, secant_direction
 ARMIJO = 1e-4
 MAX_BACKTRACKS = 12
 SHORTENED = 0.01
-"""Fraction of its length to which a step is shortened from which on secants are dropped and the metric is stiffened."""
+"""Fraction of the full length below which a shortened step drops the secants and stiffens the metric."""
 TURN = math.cos(math.radians(45.0))
-"""Cosine of the angle by which a triangle may turn in a step that failed: the angle between two neighbours then
-changes by a quarter turn at most, so that none is turned over."""
+"""Cosine of the largest turn of a triangle after a failed step: the angle between two neighbours then changes by at
+most a quarter turn, and no triangle is turned over."""
 CUTS = 8
-"""Most times that a vertex's move is halved; what is left of it then is under half a percent."""
+"""Most halvings of a vertex's move, down to under half a percent."""
 
 
 def truncated(
     system: System, x: Float[Tensor, "vertices 3"], move: Float[Tensor, "vertices 3"]
 ) -> Float[Tensor, "vertices 3"] | None:
-    """A move [m] cut back at the corners of triangles that it would turn by more than `TURN`; None without any.
+    """A move [m] shortened at the corners of triangles turning by more than `TURN`; None if no triangle does.
 
-    The corners of such triangles are halved until none is left. What is cut turns others, so all are examined again.
+    The moves of the corners are halved until no triangle turns too far. Shortening affects neighbouring triangles, so
+    all triangles are examined again.
 
     Args:
         system: The level.
-        x: Where the move starts [m].
+        x: Start of the move [m].
         move: Displacement [m].
     """
     level = system.level
@@ -70,7 +71,7 @@ class QuasiNewton:
 
         Args:
             history: Number of secants kept.
-            record: On CUDA, record a step on H0 and replay it.
+            record: On CUDA, record a step on H0 and replay the recording.
         """
         self._history = history
         self._record, self._recordings = record and history == SECANTS, Recordings[_Trial]()
@@ -81,7 +82,7 @@ class QuasiNewton:
         return self._begin(system, x, energy, force, inverse=None)
 
     def resume(self, system: System, carry: Carry) -> Carry:
-        """Evaluate x anew under forces that changed a little; the secants are kept."""
+        """Evaluate x again after a small change of the forces; the secants are kept."""
         memory: _Memory = carry.memory
         energy, force = system.energy_and_force(carry.x)
         memory = replace(memory, image=system.apply_metric_inverse(force, memory.inverse))
@@ -90,8 +91,9 @@ class QuasiNewton:
     def step(self, system: System, carry: Carry) -> Carry:
         """One secant step with a backtracking line search; the energy never rises by more than rounding.
 
-        A step that had to be shortened much drops the secants: they misled it, and its own is mostly rounding. Where
-        the next one has to be, too, the metric misled both, and the one after uses the present state's stiffness.
+        A strongly shortened step drops the secants, which were misleading, and gives no secant itself, being mostly
+        rounding. If the next step is also strongly shortened, the metric misled both, and the following step uses the
+        present state's stiffness.
         """
         memory = self._softened(system, carry) if carry.memory.stiff >= self._history else carry.memory
         tried = self._replayed(system, carry) if memory.inverse is None and self.records(system) else None
@@ -122,7 +124,7 @@ class QuasiNewton:
         return self._record and pays(system)
 
     def _replayed(self, system: System, carry: Carry) -> Carry | None:
-        """The carry after a step's first trial; None where that is not good enough."""
+        """The carry after a step's first trial; None if the trial is not good enough."""
         secants = carry.memory.secants
         known = Memory(carry.force, (carry.memory.image, carry.memory.image), secants)
         after = self._recordings.of(system, lambda: _Trial(system)).step(replace(carry, memory=known))
@@ -137,7 +139,7 @@ class QuasiNewton:
         return self._carry(x, energy, force, _Memory((), inverse, image, int(inverse is not None)))
 
     def _softened(self, system: System, carry: Carry) -> _Memory:
-        """The memory of a carry with the metric at rest in place of one that was stiffened."""
+        """The memory of a carry, with the stiffened metric replaced by the rest metric."""
         memory: _Memory = carry.memory
         secants = tuple(replace(each, image=system.apply_metric_inverse(each.yields)) for each in memory.secants)
         return _Memory(secants, None, system.apply_metric_inverse(carry.force))
@@ -146,11 +148,11 @@ class QuasiNewton:
         return Carry(x, energy, force, memory.image, self.name, memory)
 
     def _present(self, system: System, x: Tensor) -> Solver:
-        """A guess of the inverse Hessian by the present state's stiffness."""
+        """A guess of the inverse Hessian from the present state's stiffness."""
         return system.metric.stiffened(system.diagonal(x))
 
     def _forget(self, system: System, carry: Carry) -> Carry:
-        """No secant step lowers the energy: drop the secants; without any, try one step on the diagonal, then stay."""
+        """After a failed secant step, drop the secants; without secants, try one step on the diagonal, then stay."""
         memory: _Memory = carry.memory
         if memory.secants:
             inverse = self._present(system, carry.x)
@@ -165,14 +167,14 @@ class QuasiNewton:
 
 @dataclass(frozen=True, eq=False)
 class _Memory:
-    """The memory of the steps made.
+    """The memory of previous steps.
 
     Attributes:
         secants: Secants, oldest first.
         inverse: First guess of the inverse Hessian; None for H0^-1.
-        image: That of the present force.
-        shortened: Whether it begins with a step that had to be shortened much.
-        stiff: Number of the step since the metric was stiffened, from 1 on; 0 where it was not.
+        image: The guess applied to the present force.
+        shortened: Whether the memory begins with a strongly shortened step.
+        stiff: Number of steps since the metric was stiffened, from 1 on; 0 if not stiffened.
     """
 
     secants: tuple[Secant, ...]
@@ -183,7 +185,7 @@ class _Memory:
 
 
 _MISLED = "misled"
-"""Who made a trial whose secant changes nothing."""
+"""Mover name of a trial with a useless secant."""
 
 
 class _Trial(Recording):
@@ -207,7 +209,7 @@ class _Trial(Recording):
 
 
 def _tensor_dot(a: Tensor, b: Tensor) -> Tensor:
-    """The scalar product of two fields, for which nobody waits."""
+    """The scalar product of two fields, without waiting for the number."""
     return torch.dot(a.reshape(-1), b.reshape(-1))
 
 
@@ -217,11 +219,11 @@ def _is_enough(
     """Whether a step lowers the energy enough.
 
     Args:
-        before: Where it starts.
-        energy: Where it ends [J].
-        slope: force . direction at its start [J].
-        end: The same at its end, where it may be accepted by that; or None.
-        length: Its length over the direction's.
+        before: Start of the step.
+        energy: Energy at the end [J].
+        slope: force . direction at the start [J].
+        end: force . direction at the end, to accept a step by the force; or None.
+        length: Length of the step relative to the direction.
     """
     if energy <= before.energy - ARMIJO * length * slope:
         return True
@@ -232,23 +234,23 @@ def _is_enough(
 def backtrack(
     system: System, carry: Carry, direction: Float[Tensor, "vertices 3"], slope: float, *, by_force: bool = False
 ) -> tuple[Tensor, float, Tensor] | None:
-    """Shorten a step until the energy falls enough (Armijo): first where it turns triangles, then everywhere.
+    """Shorten a step until the energy falls enough (Armijo): first at turned triangles, then everywhere.
 
-    Everywhere by quadratic interpolation.
+    Shortening everywhere uses quadratic interpolation.
 
-    Near rest the fall is lost in the energy's rounding, but not in the force's: there, by the force, a step is accepted
-    that does not go past the least energy by farther than it started before it (Hager and Zhang 2005, the approximate
-    Wolfe rule).
+    Near rest the decrease is lost in the energy's rounding, but not in the force's. There a step is accepted by the
+    force if it overshoots the minimum by no more than the distance covered before (Hager and Zhang 2005, the
+    approximate Wolfe rule).
 
     Args:
         system: The system.
-        carry: Where the step starts.
+        carry: Start of the step.
         direction: Displacement of the full step [m].
         slope: force . direction [J].
-        by_force: Whether that rule is used too; the energy may then rise by its rounding.
+        by_force: Whether to use the approximate Wolfe rule too; the energy may then rise by rounding.
 
     Returns:
-        Positions, energy and force after the step, or None when no step lowers the energy.
+        Positions, energy and force after the step, or None if no step lowers the energy.
     """
     if not slope > 0:
         return None

@@ -1,10 +1,10 @@
 """Steps on CUDA: recorded once as a graph of kernels and replayed.
 
-A step of some hundred small kernels costs a GPU a tenth of a millisecond and Python several: replayed, only the first
-is left. A graph reads and writes buffers that stay where they are, so a carry is copied in before it and out after.
+A step of some hundred small kernels costs a tenth of a millisecond on a GPU, and several in Python: a replay saves the
+latter. A graph reads and writes fixed buffers, so a carry is copied in before a replay and out after.
 
-The L-BFGS direction is a combination of fields whose coefficients depend on their scalar products alone, so one product
-of matrices, a kernel of one thread a garment and one more product replace the two loops of `secants`.
+The L-BFGS direction is a combination of fields with coefficients depending on scalar products only, so one product of
+matrices, a kernel of one thread per garment and one more product replace the two loops of `secants`.
 
 | symbol | field | meaning |
 |---|---|---|
@@ -39,13 +39,13 @@ wp.set_module_options(KERNELS)
 SECANTS = 5
 """Secants kept."""
 MOST_GARMENTS = 8
-"""Garments solved together beyond which steps are not recorded: each has scalar products of its own."""
+"""Most garments solved together with recorded steps: each garment has separate scalar products."""
 KEPT = 6
-"""Recordings kept: of the levels of a garment, or of two."""
+"""Recordings kept: enough for the levels of one or two garments."""
 WORTH = 6
-"""Steps from which those of a system that is used only once are recorded: recording costs as much as four."""
+"""Least number of steps for recording a system used only once: recording costs as much as four steps."""
 COMBINED, FIELDS = 3 * SECANTS + 2, 3 * SECANTS + 6
-"""Fields that the L-BFGS direction combines, and all."""
+"""Number of fields combined by the L-BFGS direction, and of all fields."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +65,7 @@ class Memory:
     step: int | Tensor = 0
 
     def after(self, carry: Carry, move: Tensor, force: Tensor, image: Tensor, *, dot: Dot) -> Memory:
-        """The memory after a displacement [m] from a carry with this one to where force [N] and image [m] are."""
+        """The memory after a displacement [m] from a carry with this memory; force [N] and image [m] are at the end."""
         assert carry.preconditioned is not None
         newest = Secant(move, carry.force - force, carry.preconditioned - image, dot)
         images = (carry.preconditioned, self.images[0])
@@ -73,7 +73,7 @@ class Memory:
 
 
 class Propose(Protocol):
-    """Gives the next displacement [m] from a carry, with whoever gives its L-BFGS direction."""
+    """Gives the next displacement [m] from a carry, given a function for the L-BFGS direction."""
 
     def __call__(self, carry: Carry, *, secant: Callable[[Carry], Tensor]) -> Tensor:
         """The displacement [m]."""
@@ -81,7 +81,7 @@ class Propose(Protocol):
 
 
 class Recording:
-    """The steps of one system on CUDA; those of the network, and what any integrator's have in common."""
+    """The recorded steps of one system on CUDA: for the network, and as base class for any integrator."""
 
     def __init__(self, system: System, propose: Propose, *, dot: Dot, together: bool = False) -> None:
         """Make the buffers.
@@ -89,8 +89,8 @@ class Recording:
         Args:
             system: The system.
             propose: Gives the next displacement [m].
-            dot: The scalar product for steps that are not recorded.
-            together: Whether all garments have one L-BFGS direction.
+            dot: The scalar product for unrecorded steps.
+            together: Whether all garments share one L-BFGS direction.
         """
         self._system, self._propose, self._dot = system, propose, dot
         like = {"dtype": system.spacing.dtype, "device": system.spacing.device}
@@ -120,15 +120,15 @@ class Recording:
         return self._judged(carry, replace(after, energy=energy, remaining=remaining), others)
 
     def _judged(self, before: Carry, after: Carry, measures: Sequence[float]) -> Carry:
-        """The carry to go on with, by the one before, the one after and what `_measures` found."""
+        """The carry to continue with, from the carries before and after and the results of `_measures`."""
         return after
 
     def _measures(self, before: Carry, after: Carry, move: Tensor) -> list[Tensor]:
-        """Numbers of a step beside its energy and remaining move."""
+        """Numbers of a step beside the energy and the remaining move."""
         return []
 
     def _fields_of(self, carry: Carry) -> list[Tensor]:
-        """The fields of a carry, in their order."""
+        """The fields of a carry, in buffer order."""
         memory: Memory = carry.memory
         assert carry.preconditioned is not None
         unused = (Secant(self._nothing, self._nothing, self._nothing),) * (SECANTS - len(memory.secants))
@@ -137,14 +137,14 @@ class Recording:
         return [*fields, carry.force, carry.preconditioned, carry.x, memory.force, *memory.images]
 
     def _carry_of(self, fields: Tensor, step: int | Tensor) -> Carry:
-        """The carry whose fields these are; its energy is not known."""
+        """The carry of given fields; the energy is unknown."""
         force, image, x, before, *images = fields[3 * SECANTS :]
         moves, yields, images_of_yields = (fields[k * SECANTS : (k + 1) * SECANTS] for k in range(3))
         secants = tuple(Secant(*each, dot=self._dot) for each in zip(moves, yields, images_of_yields, strict=True))
         return Carry(x, math.nan, force, image, "physgraph", Memory(before, (images[0], images[1]), secants, step))
 
     def _direction(self, _: Carry) -> Tensor:
-        """The L-BFGS direction of each garment [m], of the carry in the buffers."""
+        """The L-BFGS direction of each garment [m], for the carry in the buffers."""
         flat, out = self._fields[:COMBINED].reshape(COMBINED, -1), torch.empty_like(self._nothing)
         parts = [flat[:, 3 * span.start : 3 * span.stop] for span in self._spans]
         for part, products in zip(parts, self._products, strict=True):
@@ -155,7 +155,7 @@ class Recording:
         return out
 
     def _run(self) -> None:
-        """The first step as it is, which loads every kernel; the second is recorded; all others are replayed."""
+        """Run the first step unrecorded, to load every kernel; record the second; replay all later steps."""
         if not self._loaded or not self._fields.is_cuda:
             self._loaded = True
             self._advance()
@@ -169,12 +169,12 @@ class Recording:
                 graph.capture_end()
             torch.cuda.current_stream().wait_stream(side)
             self._graph = graph
-            self._system.metric_solves -= 1  # recording is no solve
+            self._system.metric_solves -= 1  # Recording is no solve.
         self._graph.replay()
         self._system.metric_solves += 1
 
     def _advance(self) -> None:
-        """The kernels of a step: those of a step that is not recorded, between buffers."""
+        """The kernels of a step, as for an unrecorded step, between buffers."""
         system, before = self._system, self._carry_of(self._fields, self._step)
         move = self._propose(before, secant=self._direction)
         x = before.x + move
@@ -199,14 +199,14 @@ RecordingT = TypeVar("RecordingT", bound=Recording)
 
 
 class Recordings(Generic[RecordingT]):
-    """The recordings of the last few lasting systems, and the last of another."""
+    """The recordings of the last few lasting systems, and of the last non-lasting system."""
 
     def __init__(self) -> None:
-        """Keep none yet."""
+        """Start empty."""
         self._kept: dict[System, RecordingT] = {}
 
     def of(self, system: System, make: Callable[[], RecordingT]) -> RecordingT:
-        """The recording of a system's steps, made where there is none."""
+        """The recording of a system's steps, created if missing."""
         recording = self._kept.pop(system, None)
         if recording is None:
             recording = make()
@@ -219,15 +219,15 @@ class Recordings(Generic[RecordingT]):
 
 
 def pays(system: System) -> bool:
-    """Whether a system's steps are worth recording: on CUDA, where it is used again or takes many."""
+    """Whether recording a system's steps is worthwhile: on CUDA, for a reused system or many steps."""
     return system.spacing.is_cuda and (system.lasting or system.expected >= WORTH)
 
 
 @functools.cache
 def _anchor(device: torch.device) -> torch.cuda.CUDAGraph:
-    """A graph that stays, and with it the memory that all recordings on a device share.
+    """A permanent graph, to own the memory pool shared by all recordings on a device.
 
-    They are replayed one after another and leave nothing in it.
+    Recordings are replayed one after another and leave no data in the pool.
     """
     graph, one = torch.cuda.CUDAGraph(), torch.zeros((), device=device)
     with torch.cuda.device(device), torch.cuda.graph(graph):
@@ -237,7 +237,7 @@ def _anchor(device: torch.device) -> torch.cuda.CUDAGraph:
 
 @contextmanager
 def uncollected() -> Iterator[None]:
-    """Hold back the garbage collector: it may free an earlier frame's device memory, which no recording allows."""
+    """Suspend the garbage collector, which might free an earlier frame's device memory: not allowed while recording."""
     running = gc.isenabled()
     gc.disable()
     try:
@@ -283,7 +283,7 @@ def two_loops(
 
 
 def _overload(scalar: type) -> wp.Kernel:
-    """The coefficients of the L-BFGS direction from the vectors' scalar products, one thread a garment."""
+    """The coefficients of the L-BFGS direction from the vectors' scalar products, one thread per garment."""
     each = wp.types.vector(length=SECANTS, dtype=scalar)
 
     @wp.kernel(module="unique")

@@ -1,14 +1,14 @@
-"""Where a descent from a coarser mesh starts: without its facets, and off the saddle.
+"""Start of a descent from a coarser mesh: removes the coarser mesh's facets, and leaves the saddle.
 
-A linear map from a coarser mesh leaves its triangles flat and its edges sharp. Bending is weak beside stretch at the
-size of an edge, so the metric hardly sees such facets and a descent ends before they are gone. A smooth map takes them
-out; only across the surface, for in its plane the linear one is right.
+A linear map from a coarser mesh leaves flat triangles and sharp edges. Bending is weak compared with stretch at the
+size of an edge, so the metric hardly sees the facets and a descent ends before the facets are gone. A smooth map
+removes them; it is used across the surface only, because in the plane the linear map is right.
 
 Flat compressed cloth has no force out of its plane, and no integrator would ever buckle it.
 
-Where edges are shorter than at rest and the cloth is still flat, vertices start a little off the surface, up and down
-by a fixed pattern. The amplitude is a part of what takes the compression up: an edge of strain s does so with a slope
-of sqrt(2 s), so what slope there is already counts against it. The start is kept only if it has less energy.
+If edges are shorter than at rest and the cloth is still flat, vertices start a little off the surface, up and down by a
+fixed pattern. The amplitude is a fraction of the full relief: an edge of strain s is relieved by a slope of sqrt(2 s),
+less any existing slope. The new start is kept only if its energy is lower.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from ..mesh.stencil import add_at
 from .base import System
 
 AMPLITUDE = 0.3
-"""Part of the slope that is lacking, in edge lengths: from 0.3 to 1 the answers are equally good."""
+"""Fraction of the missing slope, in edge lengths: values from 0.3 to 1 give equally good results."""
 LEAST_COMPRESSION = 1e-3
-"""Compression that cloth takes in its plane."""
+"""Compression tolerated in the cloth's plane."""
 TRIES = 4
 
 
@@ -37,13 +37,13 @@ def facets(
     coarse: Float[Tensor, "coarse 3"],
     smooth: Callable[[Tensor], Tensor],
 ) -> Float[Tensor, "vertices 3"]:
-    """The move across the surface that takes a coarser mesh's facets out [m]; 0 where a vertex may not move.
+    """The move across the surface to remove a coarser mesh's facets [m]; 0 at fixed vertices.
 
     Args:
         level: The level.
-        x: Where a linear map put its vertices [m].
-        coarse: Vertices of that mesh [m].
-        smooth: The smooth map from there.
+        x: Vertices placed by a linear map [m].
+        coarse: Vertices of the coarser mesh [m].
+        smooth: The smooth map from the coarser mesh.
     """
     normal = _normals(level, x)
     return ((smooth(coarse) - x) * normal).sum(dim=1, keepdim=True) * normal * level.free
@@ -52,16 +52,16 @@ def facets(
 def leave_saddle(
     system: System, level: Level, x: Float[Tensor, "vertices 3"], *, outward: Float[Tensor, " garments"]
 ) -> Float[Tensor, "vertices 3"]:
-    """Positions from which compressed cloth can buckle.
+    """Start positions for compressed cloth to buckle.
 
     Args:
         system: The level in this frame.
         level: The same level's topology and rest shape.
         x: Start positions [m].
-        outward: 1 for garments whose winding is counter-clockwise seen from outside, else -1.
+        outward: 1 for garments wound counter-clockwise seen from outside, else -1.
 
     Returns:
-        Positions [m] of no more energy than x; x itself where nothing is compressed and flat.
+        Positions [m] with no more energy than x; x itself if nothing is compressed and flat.
     """
     missing, normal = _missing_slope(level, x)
     if not bool((missing > 0).any()):
@@ -79,7 +79,7 @@ def leave_saddle(
 def _missing_slope(
     level: Level, x: Float[Tensor, "vertices 3"]
 ) -> tuple[Float[Tensor, " vertices"], Float[Tensor, "vertices 3"]]:
-    """How much steeper each vertex's edges would have to be, over sqrt(2), and the normals."""
+    """Missing slope of each vertex's edges, over sqrt(2), and the normals."""
     normal = _normals(level, x)
     ends = level.edges.long()
     span = x[ends[:, 1]] - x[ends[:, 0]]
@@ -96,14 +96,14 @@ def _missing_slope(
 
 
 def _normals(level: Level, x: Tensor) -> Float[Tensor, "vertices 3"]:
-    """Unit normals of the vertices, by the areas round them; 0 where there are none."""
+    """Unit normals of the vertices, weighted by area; 0 without area."""
     places = level.triangles.long().T.reshape(-1)
     normal = add_at(torch.zeros_like(x), places, level.normals(x).repeat(3, 1))
     return torch.nn.functional.normalize(normal, dim=1, eps=1e-30)
 
 
 def _pattern(count: int) -> Float[Tensor, " vertices"]:
-    """Numbers between -1 and 1 that depend on the vertex alone (the finaliser of SplitMix64)."""
+    """Numbers between -1 and 1 depending only on the vertex number (the finaliser of SplitMix64)."""
     bits = (np.arange(count, dtype=np.uint64) + np.uint64(1)) * np.uint64(0x9E3779B97F4A7C15)
     bits = (bits ^ (bits >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     bits = (bits ^ (bits >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)

@@ -1,14 +1,14 @@
-"""Secants of past steps, and the L-BFGS direction that they give (Nocedal 1980).
+"""Secants of past steps, and the resulting L-BFGS direction (Nocedal 1980).
 
 | symbol | here | meaning |
 |---|---|---|
 | s_i, y_i | ``move``, ``yields`` | differences of positions and of negative forces |
 | z_i | ``image`` | H0^-1 y_i, a difference of preconditioned forces: no extra solve |
 | rho_i | 1 / ``curvature`` | 1 / s_i.y_i |
-| gamma | s.y / y.z of the newest secant | scales H0^-1 to the curvature last seen |
+| gamma | s.y / y.z of the newest secant | scales H0^-1 to the latest curvature |
 
-Scalar products are numbers for cloth that is one problem, or tensors: one for each garment, at its vertices, so
-that garments do not mix, nobody waits for a number and gradients flow through.
+Scalar products are numbers for cloth solved as one problem, or tensors: one per garment, at each vertex of the garment.
+Tensors keep garments independent, avoid waiting for a number, and let gradients flow.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ from jaxtyping import Float
 from torch import Tensor
 
 Dot = Callable[[Tensor, Tensor], Any]
-"""The scalar product of two fields: a float, or a tensor of one number a garment, at each of its vertices."""
+"""The scalar product of two fields: a float, or a tensor of one number per garment, at each vertex of the garment."""
 
 
 def dot(a: Tensor, b: Tensor) -> float:
-    """The scalar product of two fields as one number."""
+    """The scalar product of two fields as a number."""
     return float(torch.dot(a.reshape(-1), b.reshape(-1)))
 
 
 @dataclass(frozen=True, eq=False)
 class Secant:
-    """A difference of positions, of negative forces, of their images under H0^-1, and the scalar product to use."""
+    """Differences of positions, of negative forces, of their images under H0^-1, and the scalar product to use."""
 
     move: Tensor
     yields: Tensor
@@ -43,7 +43,7 @@ class Secant:
 
     @cached_property
     def curvature(self) -> Any:
-        """s.y, infinite where it is not safely positive: the secant then changes nothing."""
+        """s.y, infinite if not safely positive: the secant then has no effect."""
         dot = self.dot
         curvature, size = dot(self.move, self.yields), dot(self.yields, self.image)
         floor = 1e-8 * (dot(self.move, self.move) * dot(self.yields, self.yields)) ** 0.5
@@ -57,7 +57,7 @@ def secant_direction(
 ) -> Float[Tensor, "vertices 3"]:
     """The L-BFGS direction [m].
 
-    The two-loop recursion needs H0^-1 (F - sum alpha_i y_i) = H0^-1 F - sum alpha_i z_i, and so no solve.
+    The two-loop recursion needs H0^-1 (F - sum alpha_i y_i) = H0^-1 F - sum alpha_i z_i, and thus no solve.
 
     Args:
         force: F [N].
@@ -78,12 +78,12 @@ def secant_direction(
 
 
 def _plus(field: Tensor, weight: Any, other: Tensor) -> Tensor:
-    """A field and a multiple of another; in place for numbers."""
+    """A field plus a multiple of another; in place for numbers."""
     return torch.addcmul(field, weight, other) if isinstance(weight, Tensor) else field.add_(other, alpha=weight)
 
 
 def _scaled(image: Tensor, newest: Secant) -> Tensor:
-    """An image times gamma, which is 1 where the newest secant changes nothing."""
+    """An image times gamma; gamma is 1 if the newest secant has no effect."""
     size, good = newest.dot(newest.yields, newest.image), newest.curvature < math.inf
     if not isinstance(size, Tensor):
         return image.mul_(newest.curvature / size if good else 1.0)

@@ -15,22 +15,21 @@ from ..deadline import is_over
 from .base import Carry, Integrator, System, resumed
 
 FAR = 50.0
-"""Remaining moves, in tolerances, above which a level is not solved: at the default tolerance a tenth of a fine edge,
-which shows."""
+"""Remaining move, in tolerances, above which a level counts as unsolved: by default a visible tenth of a fine edge."""
 
 
 @dataclass(frozen=True)
 class Budget:
-    """When to stop.
+    """Stopping criteria.
 
     Attributes:
         steps: Most steps at one level.
         tolerance: Stop when the RMS of H0^-1 F is under this many local edge lengths.
-        deadline: `time.perf_counter` value after which no step begins but the first `least`, or None.
-        rest: Tolerances under which no step is made from the start: what rests but for a little stays where it is.
-        extra: Steps beyond those, while the remaining move is over `FAR` tolerances.
-        cancelled: Asked before each step: whether nobody waits for the result any more; or None.
-        least: Steps that the deadline does not prevent.
+        deadline: `time.perf_counter` value after which only the first `least` steps may begin, or None.
+        rest: Remaining move, in tolerances, below which no step is made from the start: cloth nearly at rest stays.
+        extra: Additional steps while the remaining move is over `FAR` tolerances.
+        cancelled: Asked before each step whether the result is no longer needed; or None.
+        least: Number of steps exempt from the deadline.
     """
 
     steps: int
@@ -42,12 +41,12 @@ class Budget:
     least: int = 0
 
     def is_spent(self, steps: int) -> bool:
-        """Whether no step may begin after so many, whatever the cloth's state."""
+        """Whether no further step may begin after ``steps`` steps, whatever the cloth's state."""
         late = self.deadline is not None and steps >= self.least and time.perf_counter() >= self.deadline
         return late or is_over() or (self.cancelled is not None and self.cancelled())
 
     def is_far(self, remaining_move: float) -> bool:
-        """Whether so much remaining move takes extra steps; never where the tolerance is 0."""
+        """Whether the remaining move justifies extra steps; never for tolerance 0."""
         return self.tolerance > 0 and not remaining_move <= FAR * self.tolerance
 
 
@@ -66,9 +65,9 @@ class LevelReport:
         remaining_move: RMS of H0^-1 F at the end, in local edge lengths.
         milliseconds: Wall time of the level.
         stopped: "tolerance", "steps", "budget" or "stalled".
-        movers: How many steps each mover made.
-        energies: Energy of each term at the end [J], where the solver's caller asked for them.
-        failed: Evaluations of line searches that found no step.
+        movers: Number of steps by mover.
+        energies: Energy of each term at the end [J], if requested by the solver's caller.
+        failed: Evaluations in failed line searches.
     """
 
     level: int
@@ -110,11 +109,11 @@ def descend(
         integrator: Any integrator.
         x: Start positions [m].
         level: Index for the report.
-        budget: When to stop.
-        resume: The last carry of a solve under forces that differ a little, to go on from; None starts at x.
+        budget: Stopping criteria.
+        resume: The last carry of a solve under slightly different forces, to continue from; None starts at x.
 
     Returns:
-        What the integrator carries at the end, the final positions among it, and the report.
+        The integrator's last carry, including the final positions, and the report.
 
     Raises:
         SolveError: The energy at the start or at the end is not finite.

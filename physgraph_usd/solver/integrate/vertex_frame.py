@@ -1,11 +1,12 @@
-"""The surface around each vertex: its normal and its neighbours.
+"""The surface around each vertex: normal and neighbours.
 
-A vector v of a vertex gives others that turn with the cloth as v does, and that a network may combine:
+From a vector v of a vertex, further vectors are derived. All rotate with the cloth like v, so a network may combine
+them:
 
-| name | vector | what for |
+| name | vector | purpose |
 |---|---|---|
-| ``v.normal`` | (v . n) n | cloth is soft across itself and stiff along itself |
-| ``v.smooth`` | mean of v over the neighbours | coarse and fine waves want steps of different lengths |
+| ``v.normal`` | (v . n) n | cloth is soft across the surface and stiff along the surface |
+| ``v.smooth`` | mean of v over the neighbours | coarse and fine waves need steps of different lengths |
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ PARTS = ("normal", "smooth")
 
 
 class VertexFrame:
-    """The surroundings of every vertex at positions x; each part is found when it is first used."""
+    """The surroundings of every vertex at positions x; each part is computed on first use."""
 
     def __init__(self, level: Level, x: Float[Tensor, "vertices 3"]) -> None:
         """Take positions x [m]; no gradients flow through the normals."""
@@ -49,7 +50,7 @@ class VertexFrame:
 
     @cached_property
     def normal(self) -> Float[Tensor, "vertices 3"]:
-        """Area-weighted unit normals; zero where triangles have no area."""
+        """Area-weighted unit normals; zero at triangles without area."""
         out = torch.empty_like(self._x)
         self._tables.normals({2: vectors(self._x), 3: vectors(out)})
         return out
@@ -61,13 +62,12 @@ class VertexFrame:
 
     @property
     def mesh(self) -> tuple[wp.array, ...]:
-        """The mesh, for kernels: where each vertex's triangles start, their other corners; where its edges start, their
-        far ends."""
+        """Kernel arrays: starts of each vertex's triangles, their other corners, starts of its edges, the far ends."""
         return self._tables.mesh
 
 
 class _Tables:
-    """Triangles, edges and neighbours of each vertex of a level, ready for the kernels."""
+    """Triangles, edges and neighbours of each vertex of a level, prepared for the kernels."""
 
     def __init__(self, level: Level) -> None:
         count, device, dtype = len(level.rest), str(level.rest.device), level.rest.dtype
@@ -121,7 +121,7 @@ def normal_of(
     starts: wp.array(dtype=wp.int32),
     others: wp.array(dtype=wp.vec2i),
 ):
-    """Area-weighted unit normal of a vertex; zero where triangles have no area."""
+    """Area-weighted unit normal of a vertex; zero at triangles without area."""
     total = x[i] - x[i]
     for k in range(starts[i], starts[i + 1]):
         total += wp.cross(x[others[k][0]] - x[i], x[others[k][1]] - x[i])

@@ -1,7 +1,7 @@
-"""Weights on disk: safetensors that say what they are, and are refused by name when they are not what they say.
+"""Weights on disk: safetensors with a self-description, refused with a clear error if the description does not match.
 
-The file's metadata holds the kind of network, its configuration, the format's version and a hash of the numbers, so a
-file that was cut, edited or made for another version never reaches a garment.
+The file's metadata holds the kind of network, the configuration, the format's version and a hash of the numbers. A
+truncated, edited or incompatible file never reaches a garment.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from .learned import LearnedMetric
 from .network import VECTORS, Physgraph, PhysgraphConfig
 
 VERSION = "2"
-"""Format of the file and meaning of the features; other versions are refused."""
+"""Format of the file and meaning of the features; different versions are refused."""
 FOLDER = Path(__file__).resolve().parents[2] / "weights"
-"""The weights that ship with the solver."""
+"""Folder of the shipped weights."""
 
 
 class Learned(Integrator, Protocol):
-    """An integrator whose steps a network proposes."""
+    """An integrator with steps proposed by a network."""
 
     def propose(self, system: System, carry: Carry) -> Float[Tensor, "vertices 3"]:
         """The displacement of the next step [m]."""
@@ -44,10 +44,10 @@ class Kind:
     """A kind of network.
 
     Attributes:
-        config: Class of its configuration, a dataclass.
-        network: Class of the network, made from a configuration, which it keeps as ``config``.
+        config: Class of the configuration, a dataclass.
+        network: Class of the network, constructed from a configuration and keeping the configuration as ``config``.
         integrator: Makes the unguarded integrator of a network.
-        file: The .safetensors that ships.
+        file: The shipped .safetensors.
     """
 
     config: type[Any]
@@ -57,7 +57,7 @@ class Kind:
 
 
 KINDS = {"physgraph": Kind(PhysgraphConfig, Physgraph, LearnedMetric, FOLDER / "physgraph.safetensors")}
-"""Every kind of network by its name in files of weights; `register_kind` adds to it."""
+"""All kinds of networks by their name in weights files; `register_kind` adds a kind."""
 
 
 def register_kind(name: str, kind: Kind) -> None:
@@ -71,17 +71,17 @@ def kind_of(network: nn.Module) -> str:
 
 
 def integrator_of(network: nn.Module) -> Learned:
-    """The unguarded integrator that uses a network."""
+    """The unguarded integrator of a network."""
     return KINDS[kind_of(network)].integrator(network)
 
 
 def make_network(config: Any) -> Any:
-    """An untrained network of the kind that a configuration is of."""
+    """An untrained network of the configuration's kind."""
     return next(kind.network for kind in KINDS.values() if isinstance(config, kind.config))(config)
 
 
 def save_network(network: nn.Module, file: Path) -> str:
-    """Write weights and what they are.
+    """Write weights with their self-description.
 
     Args:
         network: The network.
@@ -105,15 +105,15 @@ def load_network(file: Path, *, kind: str, device: str = "cpu") -> nn.Module:
     """Read weights.
 
     Args:
-        file: A file that `save_network` wrote.
-        kind: A name out of `KINDS`.
-        device: Where to put them.
+        file: A file written by `save_network`.
+        kind: A name in `KINDS`.
+        device: Device for the weights.
 
     Returns:
         The network, ready for use.
 
     Raises:
-        WeightsError: The file is missing, damaged, of another kind or of another version.
+        WeightsError: The file is missing, damaged, of a different kind or of a different version.
     """
     tensors, about = _read(Path(file))
     if about.get("version") != VERSION:
@@ -127,7 +127,7 @@ def load_network(file: Path, *, kind: str, device: str = "cpu") -> nn.Module:
         network.load_state_dict(tensors)
     except KeyError as error:
         raise WeightsError(f"{file} does not fit its own configuration: {error} is missing from it") from error
-    except (ValueError, TypeError, RuntimeError) as error:  # RuntimeError: also what is nested without end
+    except (ValueError, TypeError, RuntimeError) as error:  # RuntimeError: also endless nesting
         raise WeightsError(f"{file} does not fit its own configuration: {error}") from error
     if not all(bool(value.isfinite().all()) for value in tensors.values() if value.is_floating_point()):
         raise WeightsError(f"{file} holds numbers that are not finite")
@@ -136,16 +136,16 @@ def load_network(file: Path, *, kind: str, device: str = "cpu") -> nn.Module:
 
 @cache
 def shipped_network(kind: str) -> Any:
-    """The network of a kind with the weights that ship.
+    """The network of a kind with the shipped weights.
 
     Raises:
-        WeightsError: They are not there.
+        WeightsError: The weights are missing.
     """
     return load_network(KINDS[kind].file, kind=kind)
 
 
 def weights_hash(file: Path) -> str:
-    """The hash that a file of weights names, "" where it names none."""
+    """The hash recorded in a weights file, "" if missing."""
     return _read(Path(file))[1].get("sha256", "")
 
 
@@ -171,7 +171,7 @@ def _read(file: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
 
 
 def _config(kind: str, values: dict[str, Any]) -> Any:
-    """A configuration out of a file, which names every field; a list there is a tuple."""
+    """A configuration from a file, with every field present; lists become tuples."""
     config = KINDS[kind].config
     for each in fields(config):
         _ = values[each.name]
@@ -183,7 +183,7 @@ def _config(kind: str, values: dict[str, Any]) -> Any:
 
 
 def random_network(config: Any, *, seed: int, scale: float = 1.0) -> Any:
-    """A network with random weights, the last layer's too: what the guard must withstand."""
+    """A network with random weights, including the last layer: a stress test for the guard."""
     generator = torch.Generator().manual_seed(seed)
     network = make_network(config)
     with torch.no_grad():

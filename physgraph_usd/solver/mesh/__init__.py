@@ -1,1 +1,1 @@
-"""Polygon meshes: topology, subdivision and the attributes that ride along."""
+"""Polygon meshes: topology, subdivision and attributes."""

@@ -1,8 +1,8 @@
-"""Attributes of a mesh that is refined: values on vertices, faces and corners, and subsets.
+"""Refines the attributes of a mesh: values on vertices, faces and corners, and subsets.
 
-Values of floating type are interpolated linearly, in float64, and come back in their own type. Of anything else
-(integers, booleans, strings) a fine element takes the value of its nearest parent: the one of largest weight, then of
-lowest number.
+Floating-point values are interpolated linearly, in float64, and returned in their own type. For other types (integers,
+booleans, strings) a fine element copies the value of its nearest parent: the parent of largest weight, then of lowest
+number.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from .topology import PolygonMesh, find_edges
 
 
 def vertex_values(refinements: Sequence[Refinement], values: np.ndarray) -> np.ndarray:
-    """Refine values that belong to vertices (interpolation "vertex" or "varying").
+    """Refine values on vertices (interpolation "vertex" or "varying").
 
     Args:
-        refinements: Coarse to fine; none returns the values.
+        refinements: Coarse to fine; if empty, the values are returned.
         values: One per coarse vertex, shape (V, ...).
 
     Returns:
@@ -64,10 +64,10 @@ def parent_faces(refinements: Sequence[Refinement]) -> np.ndarray:
 
 
 def uniform_values(refinements: Sequence[Refinement], values: np.ndarray) -> np.ndarray:
-    """Refine values that belong to faces: a child has its parent's.
+    """Refine values on faces: a child has its parent's value.
 
     Args:
-        refinements: Coarse to fine; none returns the values.
+        refinements: Coarse to fine; if empty, the values are returned.
         values: One per coarse face, shape (F, ...).
 
     Returns:
@@ -88,13 +88,13 @@ def uniform_values(refinements: Sequence[Refinement], values: np.ndarray) -> np.
 def corner_values(
     refinements: Sequence[Refinement], counts: np.ndarray, indices: np.ndarray, values: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Refine indexed values that belong to corners (interpolation "faceVarying"), such as texture coordinates.
+    """Refine indexed values on corners (interpolation "faceVarying"), such as texture coordinates.
 
-    The values have a topology of their own, whose seams stay seams; it is split by the same rule, so that its faces and
-    corners come in the order of the refined mesh.
+    The values have their own topology, with seams preserved; the topology is split by the same rule, so faces and
+    corners are in the order of the refined mesh.
 
     Args:
-        refinements: Of the mesh itself, coarse to fine; none returns indices and values.
+        refinements: Refinements of the mesh, coarse to fine; if empty, indices and values are returned.
         counts: Corners per coarse face, shape (F,).
         indices: Value of each coarse corner, shape (C,).
         values: Shape (N, ...).
@@ -103,7 +103,7 @@ def corner_values(
         Value of each fine corner, shape (C_fine,), int32, and the fine values, shape (N_fine, ...), of the same type.
 
     Raises:
-        ValueError: An index is out of range, or the faces are not those that were refined.
+        ValueError: An index is out of range, or the faces do not match the refined mesh.
     """
     values = np.asarray(values)
     topology = PolygonMesh(counts, indices, len(values))
@@ -116,10 +116,10 @@ def corner_values(
 
 
 def face_subset(refinements: Sequence[Refinement], faces: np.ndarray) -> np.ndarray:
-    """Refine a subset of faces; subsets that partition a mesh still do.
+    """Refine a subset of faces; a partition stays a partition.
 
     Args:
-        refinements: Coarse to fine; none returns the faces.
+        refinements: Coarse to fine; if empty, the faces are returned.
         faces: Coarse faces, shape (K,).
 
     Returns:
@@ -134,11 +134,11 @@ def vertex_subset(refinements: Sequence[Refinement], vertices: np.ndarray) -> np
     """Refine a subset of vertices.
 
     Args:
-        refinements: Coarse to fine; none returns the vertices.
+        refinements: Coarse to fine; if empty, the vertices are returned.
         vertices: Coarse vertices, shape (K,).
 
     Returns:
-        The fine vertices all of whose parents are inside, ascending, int32.
+        The fine vertices with all parents inside, ascending, int32.
 
     Raises:
         ValueError: A vertex is out of range.
@@ -159,11 +159,12 @@ def edge_subset(refinements: Sequence[Refinement], edges: np.ndarray) -> np.ndar
     """Refine a subset of edges, such as creases.
 
     Args:
-        refinements: Coarse to fine; none returns the edges.
-        edges: Coarse edges by their vertices, in either order, shape (K, 2). Pairs that are no edge are passed over.
+        refinements: Coarse to fine; if empty, the edges are returned.
+        edges: Coarse edges by their vertices, in either order, shape (K, 2). Pairs that are no edge are skipped.
 
     Returns:
-        Fine edges by their vertices, shape (K 2^levels, 2), int32; those of one coarse edge in its direction, in a row.
+        Fine edges by their vertices, shape (K 2^levels, 2), int32; the parts of a coarse edge in its direction, in a
+        row.
     """
     edges = np.asarray(edges, np.int32).reshape(-1, 2)
     for refinement in refinements:

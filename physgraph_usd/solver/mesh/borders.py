@@ -1,4 +1,4 @@
-"""Open borders of meshes: their edges, and which border edge is nearest to a border vertex."""
+"""Open borders of meshes: their edges, and the border edge nearest to a border vertex."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ SPACING = 0.25
 MOST_SAMPLES = 64
 """Most sample points of one edge."""
 NEAREST = 16
-"""Most sample points examined for each vertex, its own two edges' included."""
+"""Most sample points examined for each vertex, including the vertex's own two edges."""
 
 
 def open_edges(mesh: PolygonMesh) -> Int[np.ndarray, "edges 2"]:
-    """End vertices of the edges with one face."""
+    """End vertices of the edges with a single face."""
     half = mesh.half_edges
     return half.edges[(half.count == 1) & (half.edges[:, 0] != half.edges[:, 1])].astype(np.int64)
 
 
 @dataclass(frozen=True, eq=False)
 class OnEdge:
-    """Vertices and the point of an edge that is nearest to each.
+    """Vertices, each with the nearest point on an edge.
 
     Attributes:
         vertex: Numbers of the vertices, shape (N,).
-        edge: End vertices of the edge of each, shape (N, 2).
-        part: Where on the edge the nearest point lies, from 0 to 1, shape (N,).
-        distance: Distance to that point [m], shape (N,).
+        edge: End vertices of each vertex's edge, shape (N, 2).
+        part: Position of the nearest point on the edge, from 0 to 1, shape (N,).
+        distance: Distance to the nearest point [m], shape (N,).
     """
 
     vertex: Int[np.ndarray, " near"]
@@ -41,11 +41,11 @@ class OnEdge:
     distance: Float[np.ndarray, " near"]
 
     def where(self, kept: np.ndarray) -> OnEdge:
-        """Some of them."""
+        """The selected rows."""
         return OnEdge(self.vertex[kept], self.edge[kept], self.part[kept], self.distance[kept])
 
     def at(self, points: Float[np.ndarray, "vertices 3"]) -> OnEdge:
-        """Places and distances of the vertices in another pose."""
+        """Nearest points and distances of the vertices in a new pose."""
         return _on_edges(points, self.vertex, self.edge)
 
     def place(self, points: Float[np.ndarray, "vertices 3"]) -> Float[np.ndarray, "near 3"]:
@@ -60,13 +60,13 @@ def nearest_edges(
     edges: Int[np.ndarray, "edges 2"],
     within: Float[np.ndarray, " some"],
 ) -> OnEdge:
-    """The nearest edge of each vertex that does not end in it and has no neighbour of it at an end.
+    """The nearest edge of each vertex, excluding edges at the vertex or at a neighbour.
 
     Args:
         points: Positions [m].
-        vertices: Vertices that look for an edge.
+        vertices: Vertices to find an edge for.
         edges: Open edges of all borders.
-        within: Distance within which each vertex looks [m].
+        within: Search radius of each vertex [m].
     """
     length = np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1) if len(edges) else np.zeros(0)
     spacing = SPACING * float(np.median(length)) if len(edges) else 0.0
@@ -94,14 +94,14 @@ def nearest_edges(
 
 
 def finer_side(points: Float[np.ndarray, "vertices 3"], borders: np.ndarray, near: OnEdge) -> OnEdge:
-    """Of vertices on edges of other borders those that follow such an edge: the finer border follows the coarser.
+    """Select, among vertices on edges of different borders, the followers: the finer border follows the coarser.
 
-    No edge that is followed ends in a vertex that follows.
+    No followed edge ends in a following vertex.
 
     Args:
         points: Positions [m].
         borders: Open edges, shape (E, 2).
-        near: Vertices of the borders and the edges they lie on.
+        near: Vertices of the borders and the edges below.
     """
     length = np.linalg.norm(points[borders[:, 0]] - points[borders[:, 1]], axis=1)
     own = np.full(len(points), np.inf)
@@ -118,7 +118,7 @@ def finer_side(points: Float[np.ndarray, "vertices 3"], borders: np.ndarray, nea
 
 
 def _neighbours(edges: np.ndarray, vertex: np.ndarray, edge: np.ndarray) -> np.ndarray:
-    """Whether an edge ends in a vertex or in one that an open edge joins to it, shape (N,)."""
+    """Whether an edge ends in a vertex or in a neighbour of the vertex along open edges, shape (N,)."""
     size = int(max(edges.max(), vertex.max(initial=0))) + 1
     known = np.sort(np.concatenate([edges[:, 0] * size + edges[:, 1], edges[:, 1] * size + edges[:, 0]]))
     beside = (edge == vertex[:, None]).any(axis=1)

@@ -1,4 +1,4 @@
-"""Sharp edges of closed pieces, such as the rim of a thick garment: smooth subdivision and rest angles keep them."""
+"""Sharp edges of closed pieces, such as the rim of a thick garment, kept by smooth subdivision and rest angles."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 from .topology import PolygonMesh, face_normals, find_edges
 
 SHARP = 45.0
-"""Angle between the normals of two faces at rest from which their edge is sharp [degrees]."""
+"""Least angle between the rest normals of two faces for a sharp edge [degrees]."""
 
 
 def creases_of(
@@ -25,17 +25,17 @@ def creases_of(
         return np.zeros((0, 2), np.int32)
     half, normal = mesh.half_edges, face_normals(mesh, rest)
     one, two = mesh.twin_corners[closed[mesh.indices[mesh.twin_corners[:, 0]]]].T
-    same = np.where(half.forward[one] != half.forward[two], 1.0, -1.0)  # Neighbours may be wound unlike.
+    same = np.where(half.forward[one] != half.forward[two], 1.0, -1.0)  # Neighbours may have opposite winding.
     cosine = same * (normal[mesh.corner_face[one]] * normal[mesh.corner_face[two]]).sum(axis=1)
     return half.edges[half.edge[one[cosine < np.cos(np.radians(SHARP))]]]
 
 
 def halves_of(edges: Int[np.ndarray, "edges 2"], middle: Int[np.ndarray, " edges"]) -> Int[np.ndarray, "halves 2"]:
-    """Edges of the next subdivision along edges with given middle vertices, lower vertex first, in order."""
+    """Edges of the next subdivision along edges with given midpoints, lower vertex first, in order."""
     halves = np.concatenate([np.stack([edges[:, side], middle], axis=1) for side in (0, 1)])
     return halves[np.lexsort((halves[:, 1], halves[:, 0]))].astype(np.int32)
 
 
 def crease_mask(mesh: PolygonMesh, creases: Int[np.ndarray, "creases 2"]) -> Bool[np.ndarray, " edges"] | None:
-    """Whether each edge of a mesh is one of the creases; None without creases."""
+    """Whether each edge of a mesh is a crease; None without creases."""
     return find_edges(creases, mesh.half_edges.edges) >= 0 if len(creases) else None

@@ -1,4 +1,4 @@
-"""Defects of a mesh, named element by element. Nothing here stops a refinement but indices out of range."""
+"""Finds defects of a mesh, element by element. Only indices out of range stop a refinement."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ import numpy as np
 from .topology import PolygonMesh
 
 FLAT = 1e-7
-"""A face whose area is below this fraction of its longest edge squared has none, at the resolution of float32."""
+"""Area, as a fraction of the longest edge squared, below which a face counts as having no area in float32."""
 
 
 @dataclass(frozen=True)
 class Defect:
-    """One thing that is wrong.
+    """One defect.
 
     Attributes:
         kind: "index-out-of-range", "degenerate-face", "zero-area-face", "duplicate-face", "non-manifold-edge",
             "inconsistent-winding", "bow-tie-vertex" or "isolated-point".
         index: The face, vertex or, for edges, row of ``mesh.half_edges.edges``.
-        message: The same in words.
+        message: Description in words.
     """
 
     kind: str
@@ -31,12 +31,12 @@ class Defect:
 
 
 def defects(mesh: PolygonMesh, points: np.ndarray | None = None) -> list[Defect]:
-    """Find everything that is wrong with a mesh.
+    """Find all defects of a mesh.
 
     Args:
-        mesh: Any mesh; faces with an index out of range are named and left out of the other checks, so edges are then
-            numbered without them.
-        points: Positions, shape (V, 3); without them no areas are checked.
+        mesh: Any mesh; faces with an index out of range are reported and left out of the other checks, so edges are
+            then numbered without such faces.
+        points: Positions, shape (V, 3); without positions no areas are checked.
 
     Returns:
         Defects by kind, in the order of :attr:`Defect.kind`, then by index; empty for a clean manifold mesh.
@@ -54,19 +54,19 @@ def defects(mesh: PolygonMesh, points: np.ndarray | None = None) -> list[Defect]
 
 
 def in_brief(found: Sequence[Defect]) -> list[str]:
-    """A line for each kind of defects: the first in words, and how many more there are."""
+    """A line for each kind of defects: the first in words, and the number of further defects."""
     kinds = Counter(defect.kind for defect in found)
     first = {defect.kind: defect.message for defect in reversed(found)}
     return [first[kind] + (f", and {count - 1:,} more" if count > 1 else "") for kind, count in kinds.items()]
 
 
 def _named(kind: str, indices: Iterable[int], message: str) -> list[Defect]:
-    """One defect per index; the message has a place for it."""
+    """One defect per index; the message has a placeholder for the index."""
     return [Defect(kind, int(index), message.format(index)) for index in indices]
 
 
 def _face_defects(mesh: PolygonMesh, points: np.ndarray | None, names: np.ndarray) -> list[Defect]:
-    """Check faces; ``names`` are their numbers for the user."""
+    """Check faces; ``names`` are the face numbers to report."""
     degenerate, duplicate = mesh.counts < 3, np.zeros(mesh.face_count, bool)
     for size in np.unique(mesh.counts):
         faces = np.flatnonzero(mesh.counts == size)
@@ -82,7 +82,7 @@ def _face_defects(mesh: PolygonMesh, points: np.ndarray | None, names: np.ndarra
 
 
 def _areas_vanish(mesh: PolygonMesh, points: np.ndarray) -> np.ndarray:
-    """Whether each face's area is negligible beside its longest edge squared, shape (F,)."""
+    """Whether each face's area is negligible compared with its longest edge squared, shape (F,)."""
     here, there = points[mesh.indices], points[mesh.indices[mesh.next_corner]]
     origin = here[mesh.starts[mesh.corner_face]]
     twice = np.cross(here - origin, there - origin)
@@ -93,7 +93,7 @@ def _areas_vanish(mesh: PolygonMesh, points: np.ndarray) -> np.ndarray:
 
 
 def _edge_defects(mesh: PolygonMesh) -> list[Defect]:
-    """Check edges; a face that runs twice through one, because it repeats a vertex, counts once there."""
+    """Check edges; a face containing an edge twice, because of a repeated vertex, counts once."""
     half = mesh.half_edges
     proper = half.edges[:, 0] != half.edges[:, 1]
     forward = np.bincount(half.edge, half.forward, len(half.edges))
@@ -112,7 +112,7 @@ def _edge_defects(mesh: PolygonMesh) -> list[Defect]:
 
 
 def _pair(edge: np.ndarray) -> str:
-    """An edge for the user."""
+    """An edge in words."""
     return f"{edge[0]}-{edge[1]}"
 
 

@@ -1,8 +1,8 @@
-"""The surface that a renderer draws from a polygon mesh: without holes, and subdivided where its scheme says so.
+"""The surface drawn by a renderer from a polygon mesh: without holes, and subdivided if the scheme requires.
 
-A mesh of scheme Catmull-Clark or Loop is a cage of a smooth limit surface. Its vertices are moved to the limit surface,
-after as many subdivisions as bring the flat faces between them near enough to it. The distance left falls to a quarter
-with each subdivision, as the square of the edge length.
+A mesh of scheme Catmull-Clark or Loop is a cage of a smooth limit surface. The mesh is subdivided until its flat faces
+are near enough to the limit surface, and the vertices are moved onto the limit surface. The remaining distance falls to
+a quarter with each subdivision, as the square of the edge length.
 """
 
 from __future__ import annotations
@@ -18,25 +18,24 @@ from .subdivide import Refinement, fine_count, smooth, subdivide
 from .topology import PolygonMesh, find_edges
 
 MOST_VERTICES = 25_000
-"""Most vertices that a mesh is subdivided to, about as many as the cloth over it has. Frames of a shirt of 22,000
-vertices over a body of 53,000 take half as long again as over one of 13,000: its hierarchy is refitted in each."""
+"""Most vertices after subdivision, about as many as the cloth on top. Frames of a shirt of 22,000 vertices over a body
+of 53,000 take half as long again as over a body of 13,000: the body's hierarchy is refitted in each frame."""
 NEAR_PART = 0.95
-"""Fraction of the surface that has to be near enough: nostrils and fingertips would ask for more everywhere."""
+"""Fraction of the surface required to be near enough: nostrils and fingertips would ask for more everywhere."""
 _SHARP = 0.5
-"""Sharpness from which an edge or a vertex counts as sharp in a subdivision: USD's fractions are rounded."""
+"""Sharpness from which an edge or a vertex counts as sharp in a subdivision: USD's fractional sharpness is rounded."""
 TO_LIMIT = 4.0 / 3.0
-"""A vertex's distance to the limit surface over its move in one subdivision: 1 + 1/4 + 1/16 + ..."""
+"""Ratio of a vertex's distance to the limit surface to its move in one subdivision: 1 + 1/4 + 1/16 + ..."""
 
 
 @dataclass(frozen=True, eq=False)
 class DrawnSurface:
-    """Faces as they are drawn.
+    """Faces as drawn.
 
     Attributes:
         mesh: The faces without holes.
-        stencil: Matrix from the authored points to those of the faces, shape (V, V_authored); None where they are the
-            authored ones.
-        error: Distance from the limit surface that is left over `NEAR_PART` of the surface, in the points' unit.
+        stencil: Matrix from the authored points to the points of the faces, shape (V, V_authored); None for identity.
+        error: Remaining distance from the limit surface over `NEAR_PART` of the surface, in the points' unit.
     """
 
     mesh: PolygonMesh
@@ -44,7 +43,7 @@ class DrawnSurface:
     error: float = 0.0
 
     def place(self, points: np.ndarray) -> np.ndarray:
-        """Points of the faces, shape (V, 3), from the authored ones; a point that is not finite spoils its neighbours'.
+        """Points of the faces, shape (V, 3), from the authored points; a non-finite point spoils its neighbours'.
 
         Args:
             points: Authored points, shape (V_authored, 3).
@@ -54,12 +53,12 @@ class DrawnSurface:
 
 @dataclass(frozen=True, eq=False)
 class ControlMesh:
-    """A mesh that is subdivided, and what is sharp on it.
+    """A subdivision cage with sharp features.
 
     Attributes:
         mesh: The faces.
-        creases: Sharpness of each edge, the number of subdivisions in which it stays a crease, shape (E,).
-        corners: The same of each vertex, shape (V,).
+        creases: Sharpness of each edge, the number of subdivisions as a crease, shape (E,).
+        corners: Sharpness of each vertex, shape (V,).
     """
 
     mesh: PolygonMesh
@@ -72,8 +71,8 @@ class ControlMesh:
 
         Args:
             mesh: The faces.
-            edges: Ends of the edges that are creases, shape (C, 2).
-            creases: Their sharpness, shape (C,).
+            edges: Ends of the crease edges, shape (C, 2).
+            creases: Sharpness of the crease edges, shape (C,).
             corners: Sharpness of each vertex, shape (V,).
         """
         row = find_edges(mesh.half_edges.edges, edges)
@@ -82,7 +81,7 @@ class ControlMesh:
         return ControlMesh(mesh, sharpness, corners)
 
     def subdivided(self) -> tuple[Refinement, sparse.csr_matrix, ControlMesh]:
-        """The refinement, the matrix of its smooth placement, and the finer cage."""
+        """The refinement, the matrix of the smooth placement, and the finer cage."""
         step = subdivide(self.mesh)
         stencil = smooth(self.mesh, step, creased=self.creases >= _SHARP, corners=self.corners >= _SHARP)
         sharp = np.flatnonzero(self.creases >= _SHARP)
@@ -97,14 +96,14 @@ class ControlMesh:
 def drawn_surface(
     cage: ControlMesh, points: np.ndarray, *, holes: np.ndarray, scheme: str, within: float
 ) -> DrawnSurface:
-    """The faces that a renderer draws.
+    """The faces drawn by a renderer.
 
     Args:
         cage: The authored faces.
-        points: Authored points of any one pose, shape (V, 3): they decide the number of subdivisions.
-        holes: Numbers of the authored faces that are holes.
-        scheme: "catmullClark", "loop", or another for faces that are drawn flat.
-        within: Distance from the limit surface that is near enough, in the points' unit.
+        points: Authored points of any pose, shape (V, 3), to choose the number of subdivisions.
+        holes: Numbers of the authored hole faces.
+        scheme: "catmullClark", "loop", or another word for flat faces.
+        within: Allowed distance from the limit surface, in the points' unit.
     """
     kept = ~np.isin(np.arange(cage.mesh.face_count), holes)
     if scheme not in ("catmullClark", "loop") or not cage.mesh.face_count:
@@ -123,13 +122,14 @@ def drawn_surface(
 
 
 def flatness(cage: ControlMesh, points: np.ndarray) -> float:
-    """Distance from the limit surface of the faces between vertices on it, over `NEAR_PART` of the surface.
+    """Distance of flat faces, with vertices on the limit surface, from the limit surface, over `NEAR_PART` of its area.
 
-    A vertex that subdivision makes is as far from the face of the old vertices, all moved by one subdivision.
+    The distance is estimated from the vertices added by a subdivision: their distance from the flat faces of the old
+    vertices after smoothing.
 
     Args:
         cage: The cage.
-        points: Its points, shape (V, 3).
+        points: Points of the cage, shape (V, 3).
     """
     step, stencil, _ = cage.subdivided()
     count = cage.mesh.vertex_count
@@ -139,7 +139,7 @@ def flatness(cage: ControlMesh, points: np.ndarray) -> float:
 
 
 def _to_limit(cage: ControlMesh) -> sparse.csr_matrix:
-    """The matrix that moves vertices to the limit surface, shape (V, V)."""
+    """The matrix moving vertices to the limit surface, shape (V, V)."""
     count = cage.mesh.vertex_count
     moved = cage.subdivided()[1][:count, :]
     same = sparse.identity(count, format="csr")
@@ -147,7 +147,7 @@ def _to_limit(cage: ControlMesh) -> sparse.csr_matrix:
 
 
 def _some_faces(mesh: PolygonMesh, kept: np.ndarray) -> PolygonMesh:
-    """The mesh with some of its faces."""
+    """The mesh with a selection of its faces."""
     if kept.all():
         return mesh
     return PolygonMesh(mesh.counts[kept], mesh.indices[kept[mesh.corner_face]], mesh.vertex_count)

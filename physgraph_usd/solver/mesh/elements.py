@@ -1,10 +1,10 @@
 """Elastic elements of cloth: springs, membrane triangles and hinges of meshes of triangles and quads.
 
-A quad split along one diagonal is stiffer at the ends of that diagonal, and vertices there stand up on folds. So no
-element prefers a diagonal. Springs and the membrane of a quad are the mean over both splits. A hinge between two
-faces bends round their common edge, and a quad's normal there is that of the triangle from the edge to the middle of
-the opposite side. The twist of a quad is measured round the diagonal that splits it: small twists are the same
-round either.
+A quad split along one diagonal is stiffer at the ends of the diagonal, and vertices there stand up on folds. Therefore
+no element prefers a diagonal. Springs and the membrane of a quad are the mean over both splits. A hinge between two
+faces bends about the common edge, and a quad's normal at the edge is the normal of the triangle from the edge to the
+midpoint of the opposite side. The twist of a quad is measured about the diagonal of its split: small twists are equal
+about either diagonal.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from .topology import PolygonMesh, TriangleSplit, edges_of
 
 QUAD_SPRING = (0.75, 1.5)
 """Factors of the springs along a quad's sides and diagonals. A grid of squares of Young's modulus Y then has
-C11 = 9/8 Y, C12 = C66 = 3/8 Y: isotropic, for C11 - C12 = 2 C66, with nu = 1/3, as a lattice of triangles has."""
+C11 = 9/8 Y, C12 = C66 = 3/8 Y: isotropic, because C11 - C12 = 2 C66, with nu = 1/3, like a lattice of triangles."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,12 +26,12 @@ class ElasticElements:
 
     Attributes:
         springs: End vertices, lexicographic, shape (S, 2).
-        membrane: Corner vertices of triangles; the third side of a quad's is its diagonal, shape (M, 3).
-        share: Fraction of the area that a triangle stands for: a half where it is of a quad, shape (M,).
-        face: The face that a triangle is part of, shape (M,).
-        hinges: Edge i-j, the corners k, k' of the first face opposite to it, and l, l' of the second; k = k' at a
+        membrane: Corner vertices of triangles; the third side of a quad's triangle is a diagonal, shape (M, 3).
+        share: Fraction of the area represented by a triangle: a half for a quad's triangle, shape (M,).
+        face: The face of each triangle, shape (M,).
+        hinges: Edge i-j, the corners k, k' of the first face opposite to the edge, and l, l' of the second; k = k' at a
             triangle, shape (H, 6).
-        twists: Whether a hinge is a quad's own, round the diagonal i-j that splits it, shape (H,).
+        twists: Whether a hinge is a quad's twist about its diagonal i-j, shape (H,).
     """
 
     springs: np.ndarray
@@ -45,12 +45,12 @@ class ElasticElements:
 def elastic_elements(mesh: PolygonMesh, split: TriangleSplit, rest: np.ndarray) -> ElasticElements:
     """The elements of a mesh.
 
-    A quad that is not convex at rest, or has an edge or a corner without extent, and a larger polygon count as the
-    triangles that they are split into.
+    A quad not convex at rest, or with an edge or a corner without extent, and any larger polygon count as the triangles
+    of their split.
 
     Args:
         mesh: The mesh.
-        split: Its sound triangles.
+        split: Sound triangles of the mesh.
         rest: Rest positions [m], shape (V, 3), float64.
     """
     quads = _convex_quads(mesh, split, rest)
@@ -75,7 +75,7 @@ def elastic_elements(mesh: PolygonMesh, split: TriangleSplit, rest: np.ndarray) 
 
 
 def _convex_quads(mesh: PolygonMesh, split: TriangleSplit, rest: np.ndarray) -> np.ndarray:
-    """Numbers of the quads of which both splits are two triangles that face the same way."""
+    """Numbers of the quads with two consistently facing triangles in both splits."""
     faces, count = np.unique(split.face, return_counts=True)
     faces = faces[(count == 2) & (mesh.counts[faces] == 4)]
     corners = rest[mesh.indices[mesh.starts[faces, None] + np.arange(4)]]
@@ -85,19 +85,19 @@ def _convex_quads(mesh: PolygonMesh, split: TriangleSplit, rest: np.ndarray) -> 
 
 
 def hinges_of(triangles: np.ndarray, quads: np.ndarray | None = None) -> np.ndarray:
-    """Find the pairs of faces that share an edge with no third one.
+    """Find the pairs of faces sharing a manifold edge.
 
-    The sign of the angle does not depend on the winding when the normals are taken as
-    ``n1 = (xj - xi) x (xk - xi)`` and ``n2 = (xl - xi) x (xj - xi)``: flat is zero even where windings disagree.
+    The sign of the angle does not depend on the winding when the normals are taken as ``n1 = (xj - xi) x (xk - xi)``
+    and ``n2 = (xl - xi) x (xj - xi)``: flat is zero even if windings disagree.
 
     Args:
-        triangles: Vertices, shape (T, 3). Triangles that repeat a vertex are passed over.
-        quads: Vertices, shape (Q, 4), without repeated ones; none when None.
+        triangles: Vertices, shape (T, 3). Triangles with a repeated vertex are skipped.
+        quads: Vertices, shape (Q, 4), without repeated vertices; None for no quads.
 
     Returns:
-        Hinges (i, j, k, k', l, l'), shape (H, 6), int32, in lexicographic order of the shared edge: the edge i-j as the
-        first face runs through it, its corners k and k' opposite to the edge, and l and l' of the second face; a
-        triangle's corner stands twice. Pairs of which one is the other turned over are left out.
+        Hinges (i, j, k, k', l, l'), shape (H, 6), int32, in lexicographic order of the shared edge: the edge i-j in the
+        direction of the first face, the first face's corners k and k' opposite to the edge, and l and l' of the second
+        face; a triangle's corner is repeated. Pairs of a face and its own reverse are left out.
     """
     triangles = np.asarray(triangles, np.int64).reshape(-1, 3)
     triangles = triangles[(triangles != np.roll(triangles, 1, axis=1)).all(axis=1)]

@@ -1,4 +1,4 @@
-"""How Warp's kernels are compiled, and Warp started."""
+"""Starts Warp and compiles its kernels."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from ...errors import PhysGraphError
 
 _STDERR = 2
 _TARGET = "-target-cpu x86-64-v3" if torch.backends.cpu.get_cpu_capability() in ("AVX2", "AVX512") else "-march=native"
-"""Instructions of every x86-64 processor that has AVX2, so that kernels round alike on all of them."""
+"""Instruction set common to all x86-64 processors with AVX2, for equal rounding on every machine."""
 _FLAGS = (wp.config.cpu_compiler_flags or "-march=native").replace("-march=native", _TARGET)
 KERNELS = {"enable_backward": False, "cpu_compiler_flags": _FLAGS}
 """Options of Warp modules: no derivatives; on the CPU Warp's default flags, for the target instructions."""
 FUSED = KERNELS | {"cpu_compiler_flags": f"{_FLAGS} -ffp-contract=fast"}
-"""Options of modules whose kernels compute most: on the CPU a product and a sum are one instruction."""
+"""Options of modules with the heaviest kernels: on the CPU a product and a sum are fused into one instruction."""
 
 
 @functools.cache
 def start_warp() -> None:
-    """Start Warp, without what its library prints itself where no CUDA driver is found: most machines have none.
+    """Start Warp, without its library's messages about a missing CUDA driver, common to most machines.
 
     Raises:
-        PhysGraphError: Kernels have to be compiled, and there is no folder to keep them in.
+        PhysGraphError: Kernels need compiling, and the cache folder is missing or not writable.
     """
     wp.config.log_level = wp.LOG_WARNING
     try:
@@ -45,26 +45,26 @@ def _no_cache(why: str) -> PhysGraphError:
 
 
 def _compiled() -> list[Path]:
-    """Kernels of ours that were compiled for this user and version of Warp before."""
+    """Our kernels already compiled for this user and version of Warp."""
     package = __name__.split(".", maxsplit=1)[0]
     return [*Path(wp.config.kernel_cache_dir or "").glob(f"wp_{package}*")]
 
 
 def compile_kernels(device: str) -> None:
-    """Compile all kernels of modules that are imported; Warp keeps them for every later process."""
+    """Compile all kernels of imported modules; Warp caches the kernels for later processes."""
     start_warp()
     wp.force_load(device)
 
 
 def kernels_are_compiled() -> bool:
-    """Whether some of our kernels were compiled for this user and version of Warp before."""
+    """Whether some of our kernels are already compiled for this user and version of Warp."""
     start_warp()
     return bool(_compiled())
 
 
 @contextmanager
 def _stderr_to_nowhere() -> Iterator[None]:
-    """Keep off the terminal what C code prints; does nothing in a program that has no standard error."""
+    """Keep output of C code off the terminal; does nothing in a program without standard error."""
     try:
         saved = os.dup(_STDERR)
     except OSError:

@@ -1,4 +1,4 @@
-"""Lengths of edges, normals of triangles and angles of hinges, one kernel each: torch would take many passes."""
+"""Lengths of edges, normals of triangles and angles of hinges, one kernel each: torch would need many passes."""
 
 from __future__ import annotations
 
@@ -59,11 +59,11 @@ def _angles(
 
 LENGTHS, NORMALS = overloads(_lengths, wp.vec2i, VECTOR, SCALAR), overloads(_normals, wp.vec3i, VECTOR, VECTOR)
 ANGLES = overloads(_angles, _SIX, VECTOR, SCALAR)
-"""Of edges [m], of triangles, twice their areas long [m^2], and of hinges [rad]: kernels for `ElementValues`."""
+"""Kernels for `ElementValues`: edge lengths [m], normals of twice the triangle's area [m^2], hinge angles [rad]."""
 
 
 class ElementValues:
-    """A value of some elements, wherever their vertices are."""
+    """A value per element, at any vertex positions."""
 
     def __init__(
         self,
@@ -80,7 +80,7 @@ class ElementValues:
             kernels: For each scalar type a kernel of (first, elements, x, values).
             elements: Corner vertices, int32.
             like: Any positions, for their type and device.
-            shape: Of an element's value.
+            shape: Shape of an element's value.
             threads: Most threads on the CPU.
         """
         start_warp()  # Views of tensors do not start Warp by themselves.

@@ -1,4 +1,4 @@
-"""Pieces of a garment's mesh that are no sheet: closed shells, and small parts such as buttons, which are rigid."""
+"""Finds non-sheet pieces of a garment's mesh: closed shells, and small rigid parts such as buttons."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from jaxtyping import Bool, Float, Int
 from .topology import PolygonMesh, area_vectors, joined_by
 
 SMALL = 0.25
-"""Size of a closed piece under which it is a rigid part, in sizes of the largest piece."""
+"""Size, relative to the largest piece, below which a closed piece may be a rigid part."""
 LIGHT = 0.01
-"""Area under which a piece is a rigid part, in areas of the largest piece: either bound alone takes in pockets."""
+"""Area, relative to the largest piece, below which a piece may be rigid: either bound alone would include pockets."""
 
 
 @dataclass(frozen=True, eq=False)
 class PieceKinds:
-    """Vertices of the pieces that are no sheet.
+    """Vertices of the non-sheet pieces.
 
     Attributes:
-        closed: Whether each vertex belongs to a closed piece that is not rigid, shape (V,).
+        closed: Whether each vertex belongs to a closed, non-rigid piece, shape (V,).
         rigid: Number of the rigid part of each vertex, -1 for cloth, shape (V,).
-        joined: Whether faces asked to be rigid share vertices with cloth; these faces stay cloth.
+        joined: Whether faces marked as rigid share vertices with cloth; such faces stay cloth.
     """
 
     closed: Bool[np.ndarray, " vertices"]
@@ -35,13 +35,13 @@ def sort_pieces(
 ) -> PieceKinds:
     """Find the pieces.
 
-    A piece is rigid if it is closed and small beside the largest piece, if it is smaller than an edge of that, or if
-    all of its faces are asked for.
+    A piece is rigid if closed and small compared with the largest piece, if smaller than an edge of the largest piece,
+    or if all its faces are marked.
 
     Args:
         mesh: The mesh, welded.
         rest: Rest positions [m].
-        asked: Faces that are to be rigid.
+        asked: Faces marked as rigid.
     """
     ends = mesh.half_edges.edges
     piece = joined_by(ends, mesh.vertex_count)

@@ -1,4 +1,4 @@
-"""Whether an edge passes through a triangle, decided alike for every pair that shares an edge or a side."""
+"""Decides whether an edge passes through a triangle, consistently for all pairs with a common edge or side."""
 
 # Warp's kernels are typed by values that only Warp reads.
 # pyright: reportIndexIssue=false
@@ -21,7 +21,7 @@ def wide(v: wp.vec3f):
 
 @wp.func
 def turns_left(x: wp.array(dtype=wp.vec3f), e: wp.vec2i, p: wp.int32, q: wp.int32):
-    """Whether the line from p to q passes an edge on its left; of two faces at a side just one has it on its left."""
+    """Whether the line from p to q passes an edge on its left; consistent for the two faces at a side."""
     low, high = wp.min(p, q), wp.max(p, q)
     left = volume(wide(x[e[0]]), wide(x[e[1]]), wide(x[low]), wide(x[high])) >= wp.float64(0.0)
     return left == (p < q)
@@ -29,9 +29,9 @@ def turns_left(x: wp.array(dtype=wp.vec3f), e: wp.vec2i, p: wp.int32, q: wp.int3
 
 @wp.func
 def passes_through(x: wp.array(dtype=wp.vec3f), e: wp.vec2i, t: wp.vec3i):
-    """Whether an edge passes through a triangle; an end in its plane does not, a side belongs to one of its faces.
+    """Whether an edge passes through a triangle; an end in the plane does not count, a side belongs to one face.
 
-    An end at a corner does not: sewn cloth touches there, and rounding would decide the side.
+    An end at a corner does not count: sewn cloth touches there, and rounding would decide the side.
     """
     for i in range(3):
         if x[e[0]] == x[t[i]] or x[e[1]] == x[t[i]]:

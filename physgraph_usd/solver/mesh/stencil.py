@@ -1,4 +1,4 @@
-"""A sparse linear map on vertex arrays, applied on CPU or CUDA by one gather a row.
+"""A sparse linear map on vertex arrays, applied on CPU or CUDA by one gather per row.
 
 Gathering keeps the order of each sum fixed, so a run repeats bit for bit on either device.
 """
@@ -49,7 +49,7 @@ def overloads(kernel: Any, *kinds: Any) -> dict[torch.dtype, wp.Kernel]:
 
     Args:
         kernel: The kernel.
-        kinds: What each array holds: a type, or `SCALAR` or `VECTOR`.
+        kinds: Element type of each array: a type, or `SCALAR` or `VECTOR`.
     """
 
     def arrays(dtype: torch.dtype) -> list[Any]:
@@ -70,9 +70,9 @@ def vectors(tensor: Tensor) -> Any:
 
 
 def add_at(total: Tensor, places: Int[Tensor, " items"], values: Tensor) -> Tensor:
-    """Add values in place at first indices that may repeat, in the same order on every run; returns ``total``.
+    """Add values in place at first indices, possibly repeated, in the same order on every run; returns ``total``.
 
-    On CUDA the order of `index_add_`, and so its rounding, changes from run to run.
+    On CUDA the order of `index_add_`, and thus its rounding, changes from run to run.
     """
     if total.is_cuda:
         return total.index_put_((places,), values, accumulate=True)
@@ -80,7 +80,7 @@ def add_at(total: Tensor, places: Int[Tensor, " items"], values: Tensor) -> Tens
 
 
 class Stencil:
-    """A sparse matrix that maps (columns, 3) vertex arrays to (rows, 3) ones.
+    """A sparse matrix from (columns, 3) vertex arrays to (rows, 3) vertex arrays.
 
     Attributes:
         shape: (rows, columns).
@@ -119,15 +119,15 @@ def incidence(
 ) -> tuple[Int[Tensor, " starts"], Int[Tensor, " slots"]]:
     """List the corners at each vertex, in compressed rows for gathers by vertex.
 
-    Contact makes such rows in every round, so they are sorted where the elements lie.
+    Contact makes such rows in every round, therefore sorting runs on the elements' device.
 
     Args:
         elements: Vertices of each element, shape (N, K).
         vertex_count: Number of vertices V.
 
     Returns:
-        Where each vertex's row starts, shape (V + 1,), int32; and element * K + corner of each entry, ascending within
-        a row, shape (N K,), int32.
+        Start of each vertex's row, shape (V + 1,), int32; and element * K + corner of each entry, ascending within a
+        row, shape (N K,), int32.
     """
     flat = elements.reshape(-1)
     starts = torch.zeros(vertex_count + 1, dtype=torch.int32, device=elements.device)

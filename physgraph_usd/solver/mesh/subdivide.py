@@ -1,7 +1,7 @@
 """Subdivision of polygon meshes by sparse stencils, built once per topology.
 
-Each face is split by its own rule, so meshes of triangles, quads and larger polygons conform: a triangle into four
-triangles, any other polygon into quads around its centroid.
+Each face is split by a rule depending on the face only, so meshes of triangles, quads and larger polygons conform: a
+triangle into four triangles, any larger polygon into quads around its centroid.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ class Refinement:
 
     Attributes:
         mesh: The child. Its vertices are the parent's vertices, then one per parent edge, then one per parent polygon
-            of four or more corners, in face order. The children of a face lie side by side, in the parent's face order.
+            of four or more corners, in face order. The children of a face are consecutive, in the parent's face order.
         linear: Placement at vertices, midpoints and centroids, shape (V_child, V_parent), float64; rows sum to 1.
         parent_face: Parent of each child face, shape (F_child,), int32.
         edges: Parent edges (lo, hi), shape (E, 2), int32; child vertex ``V_parent + e`` is the midpoint of edge e.
@@ -72,7 +72,7 @@ def subdivide(mesh: PolygonMesh) -> Refinement:
 
 
 def fine_count(mesh: PolygonMesh, levels: int) -> int:
-    """Number of vertices after some subdivisions, exact unless faces repeat a corner, counted without making them.
+    """Number of vertices after subdivision, without building the meshes; exact unless faces repeat a corner.
 
     Args:
         mesh: The cage.
@@ -117,7 +117,7 @@ def _place_quads(mesh: PolygonMesh, midpoint: np.ndarray, starts: np.ndarray, in
 
 
 def face_points(mesh: PolygonMesh) -> np.ndarray:
-    """Child vertex at the centre of each parent face, shape (F,), int32; -1 for faces that get none."""
+    """Child vertex at the centre of each parent face, shape (F,), int32; -1 for faces without a centre vertex."""
     polygon = mesh.is_polygon
     first = mesh.vertex_count + len(mesh.half_edges.edges)
     return np.where(polygon, first + np.cumsum(polygon) - 1, -1).astype(np.int32)
@@ -139,15 +139,15 @@ def _linear(mesh: PolygonMesh) -> sparse.csr_matrix:
 
 
 def on_triangles(mesh: PolygonMesh, refinement: Refinement, split: TriangleSplit) -> sparse.csr_matrix:
-    """The linear placement with the centres of quads on the diagonals that split them, shape (V_child, V_parent).
+    """The linear placement with the centres of quads moved onto their split diagonals, shape (V_child, V_parent).
 
-    So placed, and with fans from first corners, the child lies on the parent's triangles and crosses what they cross,
-    but for what larger polygons become.
+    With fans from first corners, the child then lies on the parent's triangles and has the same crossings, except at
+    larger polygons.
 
     Args:
         mesh: The parent.
-        refinement: Its subdivision.
-        split: Its triangles.
+        refinement: Subdivision of the parent.
+        split: Triangles of the parent.
     """
     triangle = np.flatnonzero(np.diff(split.face, prepend=-1))
     face = split.face[triangle]
@@ -199,11 +199,11 @@ def compose(refinements: Sequence[Refinement]) -> sparse.csr_matrix:
 
 @dataclass(frozen=True, eq=False)
 class _Rules:
-    """Which smooth rule holds where."""
+    """Smooth rule for each edge and vertex."""
 
-    smooth_edge: np.ndarray  # (E,) the two faces decide
+    smooth_edge: np.ndarray  # (E,) rule of the two faces
     boundary: np.ndarray  # (E,) one face only, or a crease
-    smooth_vertex: np.ndarray  # (V,) all faces decide
+    smooth_vertex: np.ndarray  # (V,) rule of all faces
     rim_vertex: np.ndarray  # (V,) cubic B-spline along two boundary edges
 
 
@@ -212,20 +212,21 @@ def smooth(
 ) -> sparse.csr_matrix:
     """Build the smooth placement of the same child vertices.
 
-    Among triangles these are Loop's weights, ``beta = (5/8 - (3/8 + cos(2 pi / n) / 4)^2) / n``, and among polygons
-    those of Catmull and Clark, both as OpenSubdiv has them. An edge between a triangle and a polygon takes half of
-    either rule. A vertex between both takes each rule by the fraction of a full turn that a regular corner has, a sixth
-    or a fourth: with s the sum of them the rules are evaluated at valence 6 s and 4 s, and each corner adds its part.
-    That is the scheme of Stam and Loop (Quad/Triangle Subdivision, 2003) where s = 1, and the pure rule among one kind.
+    Triangles use Loop's weights, ``beta = (5/8 - (3/8 + cos(2 pi / n) / 4)^2) / n``, and polygons the weights of
+    Catmull and Clark, both as in OpenSubdiv. An edge between a triangle and a polygon uses half of either rule. A
+    vertex between both weights each rule by the fraction of a full turn of a regular corner, a sixth or a fourth: with
+    s the sum of the fractions, the rules are evaluated at valence 6 s and 4 s, and each corner adds its part. The
+    result is the scheme of Stam and Loop (Quad/Triangle Subdivision, 2003) for s = 1, and the pure rule for a single
+    kind of faces.
 
     Boundaries and creases are cubic B-splines. Fixed are: vertices with one face, with three or more edges on
-    boundaries and creases, on non-manifold edges or between several fans, isolated ones, and corners.
+    boundaries and creases, on non-manifold edges or between several fans, isolated vertices, and corners.
 
     Args:
         mesh: The parent.
-        refinement: Its subdivision, from :func:`subdivide`.
-        creased: Whether each edge is a sharp crease, shape (E,), bool; None without.
-        corners: Whether each vertex is a sharp corner, shape (V,), bool; None without.
+        refinement: Subdivision of the parent, from :func:`subdivide`.
+        creased: Whether each edge is a sharp crease, shape (E,), bool; None without creases.
+        corners: Whether each vertex is a sharp corner, shape (V,), bool; None without corners.
 
     Returns:
         Stencil, shape (V_child, V_parent), float64; rows sum to 1.
@@ -255,7 +256,7 @@ def _rules(mesh: PolygonMesh, creased: np.ndarray | None, corners: np.ndarray | 
 
 
 _Part = tuple[np.ndarray, np.ndarray, np.ndarray]
-"""Rows, columns and weights; columns are child vertices in their linear places."""
+"""Rows, columns and weights; columns are child vertices in their linear positions."""
 
 
 def _stack(rows: np.ndarray, columns: list[np.ndarray], weights: list[np.ndarray | float]) -> _Part:
@@ -265,7 +266,7 @@ def _stack(rows: np.ndarray, columns: list[np.ndarray], weights: list[np.ndarray
 
 
 def _fixed_part(mesh: PolygonMesh, rules: _Rules) -> _Part:
-    """Vertices that stay, midpoints of boundary and non-manifold edges, and face points."""
+    """Fixed vertices, midpoints of boundary and non-manifold edges, and face points."""
     edges = mesh.vertex_count + np.flatnonzero(~rules.smooth_edge)
     faces = face_points(mesh)
     kept = np.concatenate([np.flatnonzero(~rules.smooth_vertex & ~rules.rim_vertex), edges, faces[faces >= 0]])

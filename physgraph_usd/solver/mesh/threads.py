@@ -1,7 +1,7 @@
-"""Kernel launches prepared once: on the CPU in slices on several threads, on CUDA whole.
+"""Kernel launches prepared once: on the CPU in slices on several threads, on CUDA as a whole.
 
-Warp runs a CPU kernel on the calling thread and lets go of the interpreter meanwhile, so slices run side by side. Each
-item writes its own places only, so the number of threads changes no bit of the result.
+Warp runs a CPU kernel on the calling thread and releases the interpreter lock meanwhile, so slices run in parallel.
+Each item writes only to its own places, so the number of threads changes no bit of the result.
 """
 
 from __future__ import annotations
@@ -18,24 +18,24 @@ import warp as wp
 from torch import Tensor
 
 LEAST_PER_THREAD = 4000
-"""Items below which another thread costs more than it saves."""
+"""Items per thread below which an additional thread costs more than the gain."""
 LEAST_QUERIES = 250
-"""Such items where each queries a hierarchy or stands for many elements."""
+"""Items per thread, as above, for items that query a hierarchy or represent many elements."""
 SLICES, LEAST_SLICE = 8, 32
-"""Slices a thread there, and what they have at least on average: some items cost a hundred times as much as others, so
-whoever is free takes the next, and each is smaller than the one before, so that nobody waits long for the last."""
+"""Slices per thread for such items, and their least average size: some items cost a hundred times as much as average,
+so free threads take the next slice, and slices shrink to shorten the wait for the last."""
 
 WORKERS = 16
-"""Threads that share an item of many elements on CUDA, where few items leave most of the device idle."""
+"""Threads sharing an item of many elements on CUDA, because few items leave most of the device idle."""
 
 
 def workers_on(device: str) -> int:
-    """How many threads share an item of many elements."""
+    """Number of threads sharing an item of many elements."""
     return 1 if device == "cpu" else WORKERS
 
 
 class Launch:
-    """One kernel over items 0 to size - 1; the kernel's first parameter is its slice's first item."""
+    """A kernel over items 0 to size - 1; the kernel's first parameter is the first item of a slice."""
 
     def __init__(
         self,
@@ -52,10 +52,10 @@ class Launch:
         Args:
             kernel: Kernel of (first, *inputs).
             size: Number of items.
-            inputs: The kernel's arrays; those that change are given again at each call.
+            inputs: The kernel's arrays; changing arrays are given again at each call.
             device: "cpu" or a CUDA device.
             threads: Most threads to use on the CPU.
-            least: Items below which another of them costs more than it saves.
+            least: Items per thread below which an additional thread costs more than the gain.
         """
         self._threads = threads = max(1, min(threads, size // least)) if device == "cpu" else 1
         self._device = None if device == "cpu" else device
@@ -67,13 +67,13 @@ class Launch:
             self._commands = [whole] if slices == 1 else [_part(whole, a, b) for a, b in pairwise(bounds)]
 
     def change(self, changed: Mapping[int, Any]) -> None:
-        """Replace some inputs from now on, by their place in ``inputs``."""
+        """Replace some inputs from now on, by position in ``inputs``."""
         for command in self._commands:
             for place, array in changed.items():
                 command.set_param_at_index(place + 1, array)
 
     def __call__(self, changed: Mapping[int, Any]) -> None:
-        """Run with some inputs replaced, by their place in ``inputs``."""
+        """Run with some inputs replaced, by position in ``inputs``."""
         self.change(changed)
         if self._device is not None:
             stream = current_stream(self._device)
@@ -90,7 +90,7 @@ class Launch:
                 others.append(_pool(self._threads).submit(_run, left))
             _run(left)
         finally:
-            wait(others)  # The caller's arrays may go only when nobody works on them any more.
+            wait(others)  # The caller may free its arrays only after all threads have finished.
         for other in others:
             other.result()
 
@@ -104,7 +104,7 @@ def run(
     threads: int = 1,
     least: int = LEAST_PER_THREAD,
 ) -> None:
-    """Run a kernel once, as a `Launch` does."""
+    """Run a kernel once, like a `Launch`."""
     if device == "cpu":
         Launch(kernel, size, inputs, device=device, threads=threads, least=least)({})
     elif size:
@@ -112,40 +112,40 @@ def run(
 
 
 def argument(tensor: Tensor, dtype: type | None = None) -> Any:
-    """A contiguous tensor as an array that a kernel takes, without a copy, of so many values or of vectors.
+    """A contiguous tensor as a kernel argument, without a copy, with scalar or vector elements.
 
-    It cannot be asked anything, nor be part of a struct, but costs a third of an array of Warp's to make.
+    The result cannot be inspected, nor be part of a struct, but costs a third of a Warp array.
     """
     return wp.from_torch(tensor, dtype=dtype, requires_grad=False, return_ctype=True)
 
 
 def _tapered(size: int, slices: int) -> list[int]:
-    """Bounds of slices of which each is smaller by as much (trapezoid self-scheduling, Tzen and Ni 1993)."""
+    """Bounds of linearly shrinking slices (trapezoid self-scheduling, Tzen and Ni 1993)."""
     weight = slices * (slices + 1)
     return [size * i * (2 * slices + 1 - i) // weight for i in range(slices + 1)]
 
 
 def _part(whole: wp.Launch, begin: int, end: int) -> wp.Launch:
-    """A launch over some of its items: packing all parameters anew would take longer than many a slice."""
+    """A launch over a slice of the items: packing all parameters again would take longer than many slices."""
     part = copy.copy(whole)
     part.params = list(whole.params)
-    part.fwd_args = list(whole.fwd_args or ())  # They keep the arrays alive.
+    part.fwd_args = list(whole.fwd_args or ())  # Keeps the arrays alive.
     part.set_dim(end - begin)
     part.set_param_at_index(0, begin)
     return part
 
 
 def _run(commands: Iterator[wp.Launch]) -> None:
-    """Launch what is left."""
+    """Launch the remaining commands."""
     for command in commands:
         command.launch()
 
 
 def current_stream(device: str) -> wp.Stream:
-    """Torch's current stream on a CUDA device: kernels queue behind torch's work, also while a graph is captured."""
+    """Torch's current stream on a CUDA device: kernels queue behind torch's work, also during graph capture."""
     index = torch.device(device).index
     index = torch.cuda.current_device() if index is None else index
-    return _stream(device, torch._C._cuda_getCurrentRawStream(index))  # A stream of torch's costs more than a launch.
+    return _stream(device, torch._C._cuda_getCurrentRawStream(index))  # A torch stream object costs more than a launch.
 
 
 @functools.lru_cache(maxsize=64)
@@ -155,5 +155,5 @@ def _stream(device: str, handle: int) -> wp.Stream:
 
 @functools.cache
 def _pool(threads: int) -> ThreadPoolExecutor:
-    """Threads that wait for slices, shared by all launches of one width."""
+    """Threads waiting for slices, shared by all launches with the same number of threads."""
     return ThreadPoolExecutor(threads - 1, thread_name_prefix="thread")

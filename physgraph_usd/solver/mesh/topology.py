@@ -1,7 +1,7 @@
-"""Polygon meshes and the element lists that forces are summed over.
+"""Polygon meshes and the element lists for sums of forces.
 
-Everything is vectorised numpy on index arrays; positions appear only where a choice depends on them. The winding is the
-authored one throughout.
+All code is vectorised numpy on index arrays; positions appear only if a choice depends on them. The winding is the
+authored winding throughout.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from scipy import sparse
 from scipy.sparse import csgraph
 
 TIE = 1e-5
-"""Relative difference below which two splits of a face count as equal. Then the lowest vertex number decides, not
-rounding, the rotation of the cloth, its winding or the corner that a face starts at."""
+"""Relative difference below which two splits of a face count as equal. The lowest vertex number then decides,
+independent of rounding, the rotation of the cloth, the winding and the face's first corner."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,7 +24,7 @@ class Edges:
 
     Attributes:
         vertices: Edges with the lower vertex first, in lexicographic order, shape (E, 2), int32.
-        face_count: Number of triangles at each edge, shape (E,), int32; triangles that repeat a vertex do not count.
+        face_count: Number of triangles at each edge, shape (E,), int32; triangles with a repeated vertex do not count.
     """
 
     vertices: np.ndarray
@@ -37,7 +37,7 @@ class TriangleSplit:
 
     Attributes:
         triangles: Vertices, in face order and with the faces' winding, shape (T, 3), int32.
-        face: The face that each triangle comes from, shape (T,), int32.
+        face: The face of each triangle, shape (T,), int32.
     """
 
     triangles: np.ndarray
@@ -46,12 +46,12 @@ class TriangleSplit:
 
 @dataclass(frozen=True, eq=False)
 class HalfEdges:
-    """The edges of a polygon mesh, and the edge that leaves each corner.
+    """The edges of a polygon mesh, and the edge starting at each corner.
 
     Attributes:
-        edges: Undirected edges (lo, hi), lexicographic, shape (E, 2), int32; lo == hi where a face repeats a vertex.
-        edge: Edge from each corner to the next one of its face, shape (C,), int32.
-        forward: Whether that half-edge runs from lo to hi, shape (C,), bool.
+        edges: Undirected edges (lo, hi), lexicographic, shape (E, 2), int32; lo == hi if a face repeats a vertex.
+        edge: Edge from each corner to the next corner of the face, shape (C,), int32.
+        forward: Whether the half-edge runs from lo to hi, shape (C,), bool.
         count: Number of half-edges of each edge, shape (E,), int32: 1 on a boundary, 2 inside, more if non-manifold.
     """
 
@@ -68,9 +68,9 @@ class PolygonMesh:
     Attributes:
         counts: Vertices per face, shape (F,), int32.
         indices: Vertex of each corner, faces one after another, shape (C,), int32.
-        vertex_count: Number of vertices V, those that no face uses included.
-        least_polygon: Fewest corners of a face that subdivision splits into quads round its centre: 3 for Catmull and
-            Clark's scheme, 4 where triangles are split into four.
+        vertex_count: Number of vertices V, including unused vertices.
+        least_polygon: Fewest corners of a face split by subdivision into quads round its centre: 3 for Catmull and
+            Clark's scheme, 4 if triangles are split into four.
 
     Raises:
         ValueError: The counts are negative or do not sum to the number of indices.
@@ -82,7 +82,7 @@ class PolygonMesh:
     least_polygon: int = 4
 
     def __post_init__(self) -> None:
-        """Bring arrays to int32 and check that they fit together."""
+        """Convert arrays to int32 and check their sizes."""
         object.__setattr__(self, "counts", np.asarray(self.counts, np.int32).reshape(-1))
         object.__setattr__(self, "indices", np.asarray(self.indices, np.int32).reshape(-1))
         object.__setattr__(self, "vertex_count", int(self.vertex_count))
@@ -132,7 +132,7 @@ class PolygonMesh:
 
     @cached_property
     def half_edges(self) -> HalfEdges:
-        """Edges of the faces, and where each half-edge belongs."""
+        """Edges of the faces, and the edge of each half-edge."""
         here, there = self.indices.astype(np.int64), self.indices[self.next_corner].astype(np.int64)
         stride = max(self.vertex_count, 1)
         keys = np.minimum(here, there) * stride + np.maximum(here, there)
@@ -142,7 +142,7 @@ class PolygonMesh:
 
     @cached_property
     def twin_corners(self) -> np.ndarray:
-        """The two corners whose half-edges are one edge, of each edge with two, shape (N, 2), in the edges' order."""
+        """For each edge with two half-edges, the two corners of the half-edges, shape (N, 2), in the edges' order."""
         half = self.half_edges
         order, starts = np.argsort(half.edge, kind="stable"), np.cumsum(half.count) - half.count
         double = starts[(half.count == 2) & (half.edges[:, 0] != half.edges[:, 1])]
@@ -163,9 +163,9 @@ class PolygonMesh:
 
     @cached_property
     def fan_counts(self) -> np.ndarray:
-        """Number of fans at each vertex: groups of corners linked by edges they share, shape (V,), int32.
+        """Number of fans at each vertex: groups of corners linked by shared edges, shape (V,), int32.
 
-        It is 1 at manifold vertices, 2 or more where a surface touches itself in a point, 0 at isolated vertices.
+        The number is 1 at manifold vertices, 2 or more if a surface touches itself in a point, 0 at isolated vertices.
         """
         half = self.half_edges
         order = np.argsort(half.edge, kind="stable")
@@ -183,11 +183,11 @@ class PolygonMesh:
         """Split the faces into fans of triangles.
 
         Without points a fan starts at the first corner. On quads made by :func:`.subdivide.subdivide` these diagonals
-        run from a parent's corner to its face point, and so alternate in direction. Faces under three corners vanish.
+        run from a parent's corner to its face point, and thus alternate in direction. Faces under three corners vanish.
 
         Args:
-            points: Positions, shape (V, 3); when given, quads are split along the shorter diagonal (or the one that
-                lies inside, if they are concave) and larger polygons fan from the corner with the fattest fan.
+            points: Positions, shape (V, 3); when given, quads are split along the shorter diagonal (the inner diagonal
+                for concave quads) and larger polygons fan from the corner with the fattest fan.
 
         Returns:
             The triangles and the face of each.
@@ -225,7 +225,7 @@ def _fans(corners: np.ndarray) -> np.ndarray:
 
 
 def _fan_corner(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Corner from which to fan each face of one size: (F, n) to (F,)."""
+    """Start corner for the fan of each face of a given size: (F, n) to (F,)."""
     size = corners.shape[1]
     shape = np.asarray(points, np.float64)[corners]
     shape = shape - shape.mean(axis=1, keepdims=True)
@@ -265,7 +265,7 @@ def find_edges(edges: np.ndarray, pairs: np.ndarray) -> np.ndarray:
         pairs: Vertices in either order, shape (K, 2).
 
     Returns:
-        Row of each pair in ``edges``, shape (K,), int64; -1 for pairs that are not there.
+        Row of each pair in ``edges``, shape (K,), int64; -1 for missing pairs.
     """
     edges, pairs = np.asarray(edges, np.int64), np.asarray(pairs, np.int64).reshape(-1, 2)
     if len(edges) == 0:
@@ -286,7 +286,7 @@ def edges_of(triangles: np.ndarray, vertex_count: int) -> Edges:
         vertex_count: Number of vertices V.
 
     Returns:
-        Unique edges; a side from a vertex to itself is none.
+        Unique edges, without loops from a vertex to itself.
     """
     here, there, _, proper = _triangle_sides(triangles)
     kept = here != there
@@ -299,25 +299,25 @@ def edges_of(triangles: np.ndarray, vertex_count: int) -> Edges:
 
 
 def joined_by(edges: np.ndarray, count: int) -> np.ndarray:
-    """The piece of each of some vertices, by the edges that hold them together, shape (V,)."""
+    """The connected component of each vertex, by the edges, shape (V,)."""
     graph = sparse.coo_matrix((np.ones(len(edges), bool), (edges[:, 0], edges[:, 1])), shape=(count, count))
     return csgraph.connected_components(graph, directed=False)[1]
 
 
 def patches_with(edges: np.ndarray, some: np.ndarray, seeds: np.ndarray) -> np.ndarray:
-    """Of some vertices the patches, held together by the edges, that have a seed in them, shape (V,)."""
+    """Members of the patches of ``some`` vertices, connected by edges, with at least one seed, shape (V,)."""
     patch = joined_by(edges[some[edges].all(axis=1)], len(some))
     return some & np.isin(patch, patch[some & seeds])
 
 
 def adjacency(edges: np.ndarray, count: int) -> sparse.csr_matrix:
-    """Which vertices an edge joins."""
+    """Adjacency matrix of vertices joined by edges."""
     both = np.concatenate([edges, edges[:, ::-1]])
     return sparse.csr_matrix((np.ones(len(both), np.float32), (both[:, 0], both[:, 1])), shape=(count, count))
 
 
 def owned_sides(edges: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """The edges that each face owns, shape (T, 3): each edge once, -1 elsewhere."""
+    """The edges owned by each face, shape (T, 3): each edge exactly once, -1 elsewhere."""
     sides = triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
     edge = find_edges(edges, sides)
     owned = np.full(len(sides), -1, np.int32)

@@ -1,8 +1,8 @@
-"""Welding: coincident vertices of one mesh become one vertex of the solver's mesh.
+"""Welding: coincident vertices of a mesh become a single vertex of the solver's mesh.
 
 Exporters split a garment at its seams, and draw a sheet twice to show both sides. Bending forces, smooth surfaces and
-normals need a face on each side of an edge. So coincident open edges are joined in pairs, and of coincident faces the
-first is solved. Edges with more than two coincident copies stay apart: `seams` sews them.
+normals need a face on each side of an edge. Therefore coincident open edges are joined in pairs, and only the first of
+coincident faces is solved. Edges with more than two coincident copies stay apart: `seams` sews them.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from .subdivide import Refinement, face_points, subdivide_times
 from .topology import PolygonMesh, find_edges, joined_by
 
 AT_ONE_PLACE = 5e-3
-"""Distance under which vertices coincide, in mean edges: 4% of an edge after three subdivisions. With a thousandth, a
-border whose gap is near that is sewn at every second vertex, which is worse than either."""
+"""Distance below which vertices coincide, in mean edges: 4% of an edge after three subdivisions. With a thousandth, a
+border with a gap of about a thousandth would be sewn at every second vertex, worse than fully sewn or fully open."""
 WIDEST = 0.25
 """Largest seam tolerance, in mean edges."""
 
@@ -31,10 +31,11 @@ class Weld:
     """A mesh before and after welding.
 
     Attributes:
-        apart: The mesh as it was.
-        mesh: The welded mesh, wound alike: its faces are in the order of ``apart``, without those on an earlier one.
+        apart: The original mesh.
+        mesh: The welded mesh, consistently wound: faces in the order of ``apart``, without duplicates of an earlier
+            face.
         number: Vertex of the welded mesh for each vertex, shape (V,).
-        faces: Faces of ``apart`` that the welded mesh has, ascending.
+        faces: Faces of ``apart`` kept in the welded mesh, ascending.
     """
 
     apart: PolygonMesh
@@ -44,11 +45,11 @@ class Weld:
 
     @property
     def is_none(self) -> bool:
-        """Whether the mesh is as it was."""
+        """Whether the mesh is unchanged."""
         return self.mesh is self.apart
 
     def joined(self, values: np.ndarray) -> np.ndarray:
-        """Mean value of the vertices joined into each welded vertex, exact for equal values, shape (W, ...)."""
+        """Mean value over the vertices joined into each welded vertex, exact for equal values, shape (W, ...)."""
         if self.is_none:
             return values
         first = self._first
@@ -58,7 +59,7 @@ class Weld:
         return values[first] + (out / count).astype(values.dtype)
 
     def largest(self, values: Float[np.ndarray, " vertices"]) -> Float[np.ndarray, " welded"]:
-        """Largest value of the vertices joined into each welded vertex."""
+        """Largest value over the vertices joined into each welded vertex."""
         out = np.full(len(self._first), -np.inf)
         np.maximum.at(out, self.number, values)
         return out
@@ -68,13 +69,13 @@ class Weld:
         return values if self.is_none else values[self.number]
 
     def subdivided(self, levels: int) -> tuple[tuple[Refinement, ...], Weld]:
-        """Subdivisions of the mesh as it was, and the weld of the finest one."""
+        """Subdivisions of the original mesh, and the weld of the finest."""
         steps = subdivide_times(self.apart, levels)
         if not steps or self.is_none:
             return steps, unwelded(steps[-1].mesh) if steps else self
         welded, number, apart, faces = self.mesh, self.number, self.apart, self.faces
         for step, fine in zip(steps, subdivide_times(self.mesh, levels), strict=True):
-            # Children of a face that was turned over come in another order.
+            # A reversed face has its children in a different order.
             own = _sorted_corners(apart, number[apart.indices])
             face = _first_like(own, _sorted_corners(welded, welded.indices))
             of_edges = welded.vertex_count + find_edges(fine.edges, number[step.edges])
@@ -86,29 +87,29 @@ class Weld:
 
     @property
     def sides(self) -> Int[np.ndarray, " vertices"]:
-        """A number for each vertex; vertices with one normal share it. The two sides of a doubled sheet have two."""
+        """A number for each vertex, equal for vertices with a common normal; a doubled sheet has one per side."""
         shown = np.zeros(len(self.number), bool)
         shown[self.apart.indices[np.isin(self.apart.corner_face, self.faces)]] = True
         return np.unique(2 * self.number + ~shown, return_inverse=True)[1].reshape(-1)
 
     @cached_property
     def _first(self) -> np.ndarray:
-        """The first vertex of each welded one, shape (W,)."""
+        """The first vertex of each welded vertex, shape (W,)."""
         return np.unique(self.number, return_index=True)[1]
 
 
 def unwelded(mesh: PolygonMesh) -> Weld:
-    """A mesh that stays as it is."""
+    """The weld of an unchanged mesh."""
     return Weld(mesh, mesh, np.arange(mesh.vertex_count), np.arange(mesh.face_count))
 
 
 def weld(mesh: PolygonMesh, poses: Sequence[Float[np.ndarray, "vertices 3"]], within: float) -> Weld:
-    """Join the vertices of faces that lie on one another in every pose, and of open edges that do, two by two.
+    """Join the vertices of faces coincident in every pose, and of coincident open edges in pairs.
 
     Args:
         mesh: The mesh.
         poses: Positions [m], at least one.
-        within: Distance under which two vertices are at one place [m].
+        within: Distance below which two vertices coincide [m].
     """
     pairs = pairs_within(poses, np.unique(mesh.indices), within)
     pairs = pairs[~_in_one_face(mesh, pairs)]
@@ -134,9 +135,9 @@ def weld(mesh: PolygonMesh, poses: Sequence[Float[np.ndarray, "vertices 3"]], wi
 
 
 def wound_alike(mesh: PolygonMesh, points: Float[np.ndarray, "vertices 3"]) -> PolygonMesh:
-    """The mesh with faces turned over so that neighbours are wound alike; itself where none need be.
+    """The mesh with faces reversed for consistent winding of neighbours; the same object if already consistent.
 
-    Pieces in which some are not are wound counter-clockwise seen from outside.
+    Pieces with reversed faces are wound counter-clockwise seen from outside.
     """
     half, count = mesh.half_edges, mesh.face_count
     one, two = mesh.twin_corners.T
@@ -144,7 +145,7 @@ def wound_alike(mesh: PolygonMesh, points: Float[np.ndarray, "vertices 3"]) -> P
     if not unlike.any():
         return mesh
     a, b = mesh.corner_face[one].astype(np.int64), mesh.corner_face[two].astype(np.int64)
-    # Each face stands twice in a graph, as it is and turned: neighbours wound alike link like to like.
+    # The graph has two nodes per face, as authored and reversed: consistent neighbours link nodes of equal kind.
     links = np.concatenate(
         [np.stack([a, np.where(unlike, b + count, b)], 1), np.stack([a + count, np.where(unlike, b, b + count)], 1)]
     )
@@ -163,13 +164,13 @@ def wound_alike(mesh: PolygonMesh, points: Float[np.ndarray, "vertices 3"]) -> P
 
 
 def _lowest(count: int, links: np.ndarray) -> np.ndarray:
-    """The lowest of the vertices that links join to each, shape (count,)."""
+    """The lowest vertex linked to each vertex, shape (count,)."""
     label = joined_by(links, count)
     return np.unique(label, return_index=True)[1][label]
 
 
 def _first_like(corners: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """The first of other faces with the same sorted corners as each face; there is one, shape (F,)."""
+    """For each face, the first of the faces ``others`` with the same sorted corners, which must exist, shape (F,)."""
     width = max(corners.shape[1], others.shape[1])
     rows = [np.pad(each, ((0, 0), (width - each.shape[1], 0)), constant_values=-1) for each in (corners, others)]
     label = np.unique(np.concatenate(rows), axis=0, return_inverse=True)[1].reshape(-1)
@@ -194,7 +195,7 @@ def _corners_together(mesh: PolygonMesh, place: np.ndarray, one: np.ndarray, oth
 
 
 def _edge_pairs(mesh: PolygonMesh, place: np.ndarray) -> np.ndarray:
-    """Pairs of ends of coincident open edges, of which there are exactly two, shape (N, 2)."""
+    """Pairs of ends of coincident open edges with exactly two copies, shape (N, 2)."""
     edges = open_edges(mesh)
     edges = edges[place[edges[:, 0]] != place[edges[:, 1]]]
     turned = place[edges[:, 0]] > place[edges[:, 1]]
@@ -208,9 +209,9 @@ def _edge_pairs(mesh: PolygonMesh, place: np.ndarray) -> np.ndarray:
 
 
 def seam_reach(mesh: PolygonMesh, points: Float[np.ndarray, "vertices 3"], tolerance: float) -> float:
-    """Distance under which vertices coincide [m]: the tolerance, at least `AT_ONE_PLACE`, at most `WIDEST`.
+    """Distance below which vertices coincide [m]: the tolerance, at least `AT_ONE_PLACE`, at most `WIDEST`.
 
-    A larger tolerance would join neighbours of one border.
+    A larger tolerance would join neighbours on the same border.
     """
     ends = mesh.half_edges.edges
     edge = float(np.linalg.norm(points[ends[:, 0]] - points[ends[:, 1]], axis=1).mean())
@@ -230,7 +231,7 @@ def pairs_within(poses: Sequence[np.ndarray], which: np.ndarray, within: float) 
 
 
 def _in_one_face(mesh: PolygonMesh, pairs: np.ndarray) -> np.ndarray:
-    """Whether each pair of vertices has a face in common."""
+    """Whether each pair of vertices has a common face."""
     if not len(pairs):
         return np.zeros(0, bool)
     used = np.unique(pairs)
@@ -240,7 +241,7 @@ def _in_one_face(mesh: PolygonMesh, pairs: np.ndarray) -> np.ndarray:
     starts = np.searchsorted(mesh.indices[corners][order], np.arange(mesh.vertex_count + 1))
     found, known = np.zeros(len(pairs), bool), np.sort(key)
     widest = int(np.diff(starts)[used].max(initial=0))
-    for place in range(widest):  # The faces of the first vertex, one after another.
+    for place in range(widest):  # Loop over the faces of the first vertex.
         at = starts[pairs[:, 0]] + place
         there = at < starts[pairs[:, 0] + 1]
         face = mesh.corner_face[corners[order[np.where(there, at, 0)]]].astype(np.int64)
@@ -251,7 +252,7 @@ def _in_one_face(mesh: PolygonMesh, pairs: np.ndarray) -> np.ndarray:
 
 
 def _volumes(mesh: PolygonMesh, points: np.ndarray, piece: np.ndarray) -> np.ndarray:
-    """Signed volume between each face and the middle of its piece [m^3], shape (F,)."""
+    """Signed volume between each face and the centre of its piece [m^3], shape (F,)."""
     owner = piece[mesh.corner_face]
     sums, count = np.zeros((len(piece) * 2, 3)), np.bincount(owner, minlength=len(piece) * 2)
     np.add.at(sums, owner, points[mesh.indices])

@@ -1,1 +1,1 @@
-"""Checking: the rules that a refined layer must keep."""
+"""Checks refined layers against the rules."""

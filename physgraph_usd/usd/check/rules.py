@@ -1,6 +1,6 @@
-"""The rules that a refined layer and its garments must keep, one function each; `validate` runs them.
+"""The rules for a refined layer and its garments, one function each; `validate` runs the rules.
 
-Every function yields problems. USD's own validators check none of this.
+Every function yields problems. USD's own validators check none of these rules.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ TOGETHER = ("points", "faceVertexCounts", "faceVertexIndices", "extent", "normal
 
 @dataclass(frozen=True)
 class Problem:
-    """Something wrong with a layer.
+    """A fault in a layer.
 
     Attributes:
-        severity: ``error``: readers will fail or show something wrong; ``warning``: look at it.
+        severity: ``error``: readers will fail or show wrong results; ``warning``: worth a look.
         path: Prim or property path; "/" for the layer.
         time: Time code, or None for the default or at all times.
         message: The fault, with the values found.
-        rule: Name of the rule that found it, filled in by `validate`.
+        rule: Name of the rule, filled in by `validate`.
     """
 
     severity: str
@@ -58,7 +58,7 @@ class Fine:
     Attributes:
         prim: The fine mesh.
         layer: The refined layer.
-        times: Times to look at, the default (None) first.
+        times: Times to check, the default (None) first.
     """
 
     prim: Usd.Prim
@@ -75,7 +75,7 @@ class Fine:
         return None if value is None else np.asarray(value)
 
     def written(self, name: str) -> list[float]:
-        """Times at which the layer itself has samples of an attribute."""
+        """Sample times of an attribute in the refined layer itself."""
         return list(self.layer.ListTimeSamplesForPath(self.prim.GetPath().AppendProperty(name)))
 
     @cached_property
@@ -85,7 +85,7 @@ class Fine:
         return {"vertex": points, "varying": points, "uniform": faces, "faceVarying": corners, "constant": 1}
 
     def entries(self, name: str, time: float | None) -> np.ndarray:
-        """An attribute's composed array as numpy; empty where there is none."""
+        """An attribute's composed array as numpy; empty if missing."""
         array = self.array(name, time)
         return np.zeros(0, np.int32) if array is None else array
 
@@ -98,7 +98,7 @@ class Fine:
         return "" if good else str(reason)
 
     def problem(self, name: str, message: str, time: float | None = None, *, severity: str = "error") -> Problem:
-        """A problem with the prim or one of its properties."""
+        """A problem with the prim or a property of the prim."""
         path = self.prim.GetPath().AppendProperty(name) if name else self.prim.GetPath()
         return Problem(severity, str(path), time, message)
 
@@ -350,7 +350,7 @@ def whole_range(layer: Sdf.Layer) -> Iterator[Problem]:
 
 
 def times_with_values(layer: Sdf.Layer, name: str) -> list[float]:
-    """Time codes at which a layer has a value of an attribute, and no block."""
+    """Time codes at which a layer has an unblocked value of an attribute."""
     every = layer.ListTimeSamplesForPath(name)
     return [time for time in every if not isinstance(layer.QueryTimeSample(name, time), Sdf.ValueBlock)]
 
@@ -381,7 +381,7 @@ def same_metadata(layer: Sdf.Layer, shot: Usd.Stage) -> Iterator[Problem]:
 
 
 def is_mesh(path: str, composed: Usd.Stage) -> str:
-    """The reason why a path holds no editable mesh, or ""."""
+    """The reason for a path without an editable mesh, or ""."""
     prim = composed.GetPrimAtPath(path)
     if not prim:
         return "is not on the stage: the layer is not over the shot that it was made from"
@@ -391,14 +391,14 @@ def is_mesh(path: str, composed: Usd.Stage) -> str:
 
 
 def against_shot(layer: Sdf.Layer, coarse: Usd.Prim, target: Sdf.Path) -> Iterator[Problem]:
-    """Samples lie at the shot's own times, and the fine mesh is about where and as large as the coarse one."""
+    """Samples lie at the shot's own times, and the fine mesh matches the coarse mesh in position and size."""
     name = str(target.AppendProperty("points"))
     written = times_with_values(layer, name)
     for time in written:
         if reason := absence(coarse, time):
             yield _error(f"is a sample at a time at which the garment is not there: {reason}", name, time)
             return
-    if skel_root(coarse) is not None:  # A skeleton may move it; then its points are a bind pose.
+    if skel_root(coarse) is not None:  # The points of a skinned mesh are a bind pose.
         return
     authored = np.array(garment_times(coarse))
     for time in written:
@@ -418,12 +418,12 @@ def against_shot(layer: Sdf.Layer, coarse: Usd.Prim, target: Sdf.Path) -> Iterat
 
 
 def _compare(clouds: Sequence[tuple[np.ndarray, np.ndarray, float | None]], name: str) -> Iterator[Problem]:
-    """Compare fine and coarse clouds, placed in the world but for translation, by size and place, at some times.
+    """Compare fine and coarse clouds by size and position, at some times; in world axes, without translation.
 
-    A local length is none where the transform shears: cloth sags along the world's axis.
+    Local space is not used: a sheared transform distorts local lengths, and cloth sags along the world's axis.
 
-    A sample may be broken, such as one whose points are all at one place: it is enough to be as large as the coarse
-    mesh is at any of the times.
+    A sample may be broken, for example with all points at the same place: a size between the coarse mesh's smallest and
+    largest, within a factor of 4, is accepted.
     """
     whole = [(fine, below[np.isfinite(below).all(axis=1)], time) for fine, below, time in clouds]
     whole = [each for each in whole if len(each[1]) and np.isfinite(each[0]).all()]
@@ -439,15 +439,15 @@ def _compare(clouds: Sequence[tuple[np.ndarray, np.ndarray, float | None]], name
 
 
 def _size(cloud: np.ndarray) -> float:
-    """Diagonal of a cloud's box."""
+    """Diagonal of a cloud's bounding box."""
     return float(np.linalg.norm(np.ptp(cloud, axis=0)))
 
 
 def same_variants(layer: Sdf.Layer, shot: StageView, garments: Sequence[str]) -> Iterator[Problem]:
-    """The shot selects the variants of the layer; an error where a coarse mesh differs now, else a warning.
+    """The shot selects the variants of the layer; an error if a coarse mesh differs now, else a warning.
 
-    What a layer authors at a garment's path is stronger than variants: whatever is selected over it, it shows the
-    garment of the selections that were in force when it was made.
+    Opinions at a garment's path are stronger than variants: the layer shows the garment of the selections in force at
+    refinement, whatever is selected now.
     """
     recorded = [Sdf.Path(text) for text in (read_record(layer) or {}).get("variants", ())]
     mask = Usd.StagePopulationMask([*garments, *dict.fromkeys(path.GetPrimPath() for path in recorded)])
@@ -466,7 +466,7 @@ def same_variants(layer: Sdf.Layer, shot: StageView, garments: Sequence[str]) ->
 
 
 def _coarse(shot: StageView, mask: Usd.StagePopulationMask, selections: Sequence[Sdf.Path]) -> Usd.Stage:
-    """A shot without refined layers, with variants selected."""
+    """A shot without refined layers, with given variant selections."""
     selected = Sdf.Layer.CreateAnonymous("selections.usda")
     for path in selections:
         name, selection = path.GetVariantSelection()
@@ -477,7 +477,7 @@ def _coarse(shot: StageView, mask: Usd.StagePopulationMask, selections: Sequence
 
 
 def _selected(stage: Usd.Stage, path: Sdf.Path) -> Sdf.Path:
-    """A selection's path with the stage's selection in its place."""
+    """A selection's path, with the stage's current selection."""
     name, _ = path.GetVariantSelection()
     prim = stage.GetPrimAtPath(path.GetPrimPath())
     selection = prim.GetVariantSet(name).GetVariantSelection() if prim else ""
@@ -485,13 +485,13 @@ def _selected(stage: Usd.Stage, path: Sdf.Path) -> Sdf.Path:
 
 
 def _words(path: Sdf.Path) -> str:
-    """A selection as in ``fit=loose``."""
+    """A selection in words, such as ``fit=loose``."""
     name, selection = path.GetVariantSelection()
     return f"{name}={selection or 'nothing'}"
 
 
 def _cloth(stage: Usd.Stage, path: str) -> list[bytes | None]:
-    """Topology and points of a mesh, at the default and at its first, middle and last sample, to be compared."""
+    """Topology and points of a mesh, at the default and at the first, middle and last sample, for comparison."""
     mesh = UsdGeom.Mesh(stage.GetPrimAtPath(path))
     if not mesh:
         return []

@@ -1,4 +1,4 @@
-"""Checks a refined layer: our rules, on it alone and over its shot, and USD's own validators."""
+"""Checks a refined layer with our rules, alone and over its shot, and with USD's own validators."""
 
 from __future__ import annotations
 
@@ -30,21 +30,21 @@ from .validators import PLUGIN
 
 __all__ = ["Problem", "check_layer", "validate_layer"]
 _COUNTS = "InvalidSubsetFamily"
-"""USD's rule whose message lists indices: the same fault reads otherwise on the fine mesh."""
+"""USD rule whose message lists indices: the same fault has a different message on the fine mesh."""
 
 
 def validate_layer(layer: str | Path | Sdf.Layer, shot: str | Path | Usd.Stage | None = None) -> list[Problem]:
-    """Check a refined layer, by itself and over its shot.
+    """Check a refined layer, alone and over its shot.
 
     Args:
         layer: The layer, a file or in memory.
-        shot: The shot that it goes over, a file or an open stage; by default the one named in its record.
+        shot: The shot below the layer, a file or an open stage; by default the shot named in the layer's record.
 
     Returns:
-        Problems, errors first; each names its path and time. A recorded shot that is not there is one of them.
+        Problems, errors first; each names path and time. A missing recorded shot is a problem.
 
     Raises:
-        AbsentError: The layer or the shot is not there.
+        AbsentError: The layer or the shot does not exist.
         LayerError: The layer or the shot cannot be opened or read.
     """
     opened = layer if isinstance(layer, Sdf.Layer) else open_layer(layer)
@@ -68,7 +68,7 @@ def validate_layer(layer: str | Path | Sdf.Layer, shot: str | Path | Usd.Stage |
 
 
 def check_layer(layer: Sdf.Layer, shot: StageView | None, *, samples: int | None = None) -> list[Problem]:
-    """Run our rules on a layer, and over its shot where there is one.
+    """Run our rules on a layer, and over its shot if given.
 
     Args:
         layer: The refined layer.
@@ -79,7 +79,7 @@ def check_layer(layer: Sdf.Layer, shot: StageView | None, *, samples: int | None
     if shot is None:
         return problems
     paths = _garments(layer)
-    # Only the garments are composed: a set around them may be large.
+    # Only the garments are composed: the surrounding set may be large.
     mask = Usd.StagePopulationMask([path for name in paths for path in {name, _coarse_path(layer, name)}])
     with quiet():
         problems += _named("same_variants", same_variants(layer, shot, [_coarse_path(layer, name) for name in paths]))
@@ -98,7 +98,7 @@ def check_layer(layer: Sdf.Layer, shot: StageView | None, *, samples: int | None
 
 
 def _check_garment(prim: Usd.Prim, layer: Sdf.Layer, samples: int | None, *, coarse: Usd.Prim) -> Iterator[Problem]:
-    """Run the rules for one garment; for subsets that break a rule in the shot already there is a warning."""
+    """Run the rules for one garment; subsets already faulty in the shot give a warning."""
     written = times_with_values(layer, str(prim.GetPath().AppendProperty("points")))
     if samples is not None and len(written) > samples:
         written = [written[i] for i in np.linspace(0, len(written) - 1, samples).astype(int)]
@@ -113,12 +113,12 @@ def _check_garment(prim: Usd.Prim, layer: Sdf.Layer, samples: int | None, *, coa
 
 
 def _named(rule: str, problems: Iterable[Problem]) -> Iterator[Problem]:
-    """Name the rule in its problems."""
+    """Set the rule's name in problems."""
     return (replace(problem, rule=rule) for problem in problems)
 
 
 def _garments(layer: Sdf.Layer) -> Sequence[str]:
-    """Fine meshes by the record, or else every prim with points."""
+    """Fine meshes listed by the record, or else every prim with points."""
     named = (read_record(layer) or {}).get("garments")
     if named:
         return [str(path) for path in named]
@@ -133,14 +133,14 @@ def _coarse_path(layer: Sdf.Layer, path: str) -> str:
 
 
 def _own_validators(layer: Sdf.Layer, shot: StageView) -> list[Problem]:
-    """Problems that USD's validators, as many as there are, find in the layer and not in its shot."""
+    """Problems found by USD's validators, as far as available, in the layer but not in its shot."""
     try:
         from pxr import UsdValidation  # type: ignore[attr-defined] # noqa: PLC0415 - not in every host
     except ImportError:
         return []
     if not hasattr(UsdValidation, "ValidationContext"):
         return []
-    # Both with an anonymous session, whose name the messages repeat and `_without_names` drops.
+    # Both stages have an anonymous session layer; `_without_names` drops its name from the messages.
     (before, after), missing = _findings(UsdValidation, [shot.open(), shot.open(over=[layer])])
     fine = {path: _coarse_path(layer, path) for path in _garments(layer)}
     sites = {key[:2] for key in before}
@@ -154,14 +154,14 @@ def _own_validators(layer: Sdf.Layer, shot: StageView) -> list[Problem]:
 
 
 def _on_coarse(key: tuple[str, ...], fine: Mapping[str, str]) -> tuple[str, ...]:
-    """A finding on a sibling as it would read on its coarse mesh, whose faults it repeats."""
+    """A finding on a sibling, renamed to its coarse mesh: a sibling repeats the coarse mesh's faults."""
     for path, coarse in fine.items():
         key = tuple(part.replace(path, coarse) for part in key)
     return key
 
 
 def _is_meant(problem: Problem, fine: Mapping[str, str]) -> bool:
-    """Whether a finding is on purpose: skinning is taken off, and a family whose faces were all left out has none."""
+    """Whether a finding is intended: removed skinning, or a subset family whose faces were all left out."""
     emptied = problem.rule.endswith(_COUNTS) and "No indices in family" in problem.message
     return problem.path in fine and (emptied or problem.rule.endswith("MissingSkelBindingAPI"))
 
@@ -169,13 +169,13 @@ def _is_meant(problem: Problem, fine: Mapping[str, str]) -> bool:
 def _findings(
     module: Any, stages: Sequence[Usd.Stage]
 ) -> tuple[list[dict[tuple[str, str, str], Problem]], list[Problem]]:
-    """Findings on each stage by validator, place and message, and a warning that names the validators that fail.
+    """Findings on each stage by validator, place and message, and a warning naming the failed validators.
 
-    Some builds of USD lack the libraries of validators, or what those read: each one runs by itself.
+    Some builds of USD lack libraries or data of validators, so each validator runs separately.
     """
     registry, found, failed = module.ValidationRegistry(), [{} for _ in stages], []
     names = (str(metadata.name) for metadata in registry.GetAllValidatorMetadata())
-    for name in sorted(name for name in names if not name.startswith(f"{PLUGIN}:")):  # Ours have run.
+    for name in sorted(name for name in names if not name.startswith(f"{PLUGIN}:")):  # Our own rules have already run.
         try:
             context = module.ValidationContext([registry.GetOrLoadValidatorByName(name)])
             reports = [[_as_problem(module, each) for each in context.Validate(stage)] for stage in stages]
@@ -189,7 +189,7 @@ def _findings(
 
 
 def _as_problem(module: Any, found: Any) -> Problem:
-    """One finding of USD's as ours."""
+    """A USD finding as a `Problem`."""
     sites = found.GetSites()
     path = str(sites[0].GetProperty().GetPath() if sites and sites[0].IsProperty() else "")
     if sites and not path and sites[0].IsPrim():
@@ -199,5 +199,5 @@ def _as_problem(module: Any, found: Any) -> Problem:
 
 
 def _without_names(message: str) -> str:
-    """A message without the name of the anonymous root, which differs between stages."""
+    """A message without the name of the anonymous root layer, because the name differs between stages."""
     return " ".join(word for word in message.split() if "anon:" not in word)

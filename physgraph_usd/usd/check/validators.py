@@ -1,7 +1,7 @@
-"""The rules of `validate` as validators of UsdValidation, for usdchecker and host programs.
+"""Registers the rules of `validate` with UsdValidation, for usdchecker and host programs.
 
-They check refined layers in a stage's layer stack, as composed there; rules that compare with the shot below stay with
-`validate`. Registering from Python takes USD 26.5; plugins/usdvalidation holds the plugInfo.json that names each rule.
+The validators check refined layers in a stage's layer stack, as composed; rules comparing with the shot below stay in
+`validate`. Registering from Python needs USD 26.5; the plugInfo.json in plugins/usdvalidation names each rule.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from ..write.track import extent_of
 from .rules import LAYER_RULES, RULES, Fine, Problem, extent
 
 PLUGIN = "physgraph_validators"
-"""Name of the plug-in, by which its plugInfo.json and the names of the rules begin."""
+"""Name of the plug-in; prefix of the rules' names and of entries in its plugInfo.json."""
 EXTENT_FIXER = "recomputeExtent"
 
 
 def register() -> bool:
-    """Register every rule as ``PLUGIN:RULE``; False where this USD lets no Python register validators."""
+    """Register every rule as ``PLUGIN:RULE``; False if this USD cannot register validators from Python."""
     try:
         from pxr import UsdValidation  # type: ignore[attr-defined] # noqa: PLC0415 - not in every host
     except ImportError:
@@ -42,7 +42,7 @@ def register() -> bool:
 
 
 def _layer_task(module: Any, rule: Callable[[Sdf.Layer], Iterator[Problem]]) -> Callable[[Sdf.Layer], list[Any]]:
-    """A rule for layers; a layer that is no refined one breaks none."""
+    """A validator for layers; a layer without our record has no problems."""
 
     def task(layer: Sdf.Layer) -> list[Any]:
         if read_record(layer) is None:
@@ -53,7 +53,7 @@ def _layer_task(module: Any, rule: Callable[[Sdf.Layer], Iterator[Problem]]) -> 
 
 
 def _prim_task(module: Any, rule: Callable[[Fine], Iterator[Problem]]) -> Callable[[Usd.Prim, Any], list[Any]]:
-    """A rule for garments; a prim that no refined layer of the stage names breaks none."""
+    """A validator for garments; a prim not named by a refined layer of the stage has no problems."""
 
     def task(prim: Usd.Prim, _times: Any) -> list[Any]:
         fine = refined(prim)
@@ -65,7 +65,7 @@ def _prim_task(module: Any, rule: Callable[[Fine], Iterator[Problem]]) -> Callab
 
 
 def _errors(module: Any, name: str, problems: Iterable[Problem], site: Callable[[Sdf.Path], Any]) -> list[Any]:
-    """Our problems as UsdValidation's, by the rule's name."""
+    """Convert problems to UsdValidation errors, with the rule's name."""
     kinds = {"error": module.ValidationErrorType.Error, "warning": module.ValidationErrorType.Warn}
     found = []
     for problem in problems:
@@ -75,7 +75,7 @@ def _errors(module: Any, name: str, problems: Iterable[Problem], site: Callable[
 
 
 def refined(prim: Usd.Prim) -> Fine | None:
-    """A mesh that a refined layer of its stage names, or None."""
+    """A mesh named by a refined layer of its stage, or None."""
     if not UsdGeom.Mesh(prim):
         return None
     path = prim.GetPath()
@@ -86,7 +86,7 @@ def refined(prim: Usd.Prim) -> Fine | None:
 
 
 def _at(error: Any, target: Usd.EditTarget) -> Fine | None:
-    """The garment of an error, where the edit target is its refined layer."""
+    """The garment of an error, if the edit target is the refined layer."""
     sites = error.GetSites()
     prim = sites[0].GetProperty().GetPrim() if sites and sites[0].IsProperty() else Usd.Prim()
     fine = refined(prim) if prim else None

@@ -1,1 +1,1 @@
-"""Reading: garments, bodies, fabrics and times of a stage, as arrays in metres."""
+"""Reads garments, bodies, fabrics and times of a stage, as arrays in metres."""

@@ -1,4 +1,4 @@
-"""Time codes at which a prim has no shape, and why: nothing is read from another time in its place."""
+"""Finds time codes at which a prim has no shape, with the reason: shapes of different times are never substituted."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .placement import flattened
 
 _SHAPE = ("points", "faceVertexCounts", "faceVertexIndices")
 _MOST_NAMED = 3
-"""Most time codes that a notice names."""
+"""Most time codes named in a notice."""
 
 
 @dataclass(frozen=True)
@@ -23,8 +23,8 @@ class Samples:
     """Authored time codes of a garment.
 
     Attributes:
-        times: Those at which it has a shape, ascending.
-        absent: The others, ascending, with the reason in words.
+        times: Time codes with a shape, ascending.
+        absent: Time codes without a shape, ascending, with the reason in words.
     """
 
     times: tuple[float, ...] = ()
@@ -38,7 +38,7 @@ class Samples:
         return Samples(there, {time: reason for time, reason in reasons.items() if reason})
 
     def notices(self, path: str, times: Sequence[float]) -> list[Notice]:
-        """Notices of those of some time codes at which it is absent, one for each reason."""
+        """Notices of the garment's absences among some time codes, one for each reason."""
         found = []
         for reason in dict.fromkeys(self.absent[time] for time in times):
             named = named_times([time for time in times if self.absent[time] == reason])
@@ -48,18 +48,18 @@ class Samples:
 
 
 def absence(prim: Usd.Prim, time: float) -> str:
-    """Why a garment's mesh has no shape at a time code, in words; "" where it has one.
+    """Why a garment's mesh has no shape at a time code, in words; "" for a mesh with a shape.
 
-    A value is missing (`missing_value`), or the transform to the world scales the mesh to nothing or flat.
+    Either a value is missing (`missing_value`), or the transform to the world scales the mesh to nothing or flat.
     """
     matrix = np.array(UsdGeom.XformCache(timecode(time)).GetLocalToWorldTransform(prim), dtype=np.float64).T
     return missing_value(prim, time) or flattened(matrix)
 
 
 def missing_value(prim: Usd.Prim, time: float) -> str:
-    """Which part of a prim's shape or of the transforms that place it has no value at a time code; "" for none.
+    """Name the missing part of a prim's shape or transforms at a time code; "" for none.
 
-    An attribute without a value is blocked there. An empty array of a mesh that is not empty at all times is no shape.
+    A value is missing if blocked. An empty array counts as missing for a mesh not empty at all times.
     """
     code = timecode(time)
     for name in _SHAPE if UsdGeom.Mesh(prim) else ():

@@ -1,4 +1,4 @@
-"""Faults of authored attributes: beyond limits, misspelt, in the wrong place, connected to no value."""
+"""Finds faults of authored attributes: beyond limits, misspelt, misplaced, or connected to no value."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ _BLENDERS = {name.replace("physgraph:", "physgraph_") for name in _NAMES if name
 
 
 def authored_faults(garments: Sequence[Usd.Prim], colliders: Sequence[Usd.Prim]) -> list[Notice]:
-    """Notices of properties on prims, above them or on their materials, that are not read or are beyond limits.
+    """Notices of unread or out-of-limit properties on prims, their ancestors or their materials.
 
-    Those that are not read have the name that is spelt most like theirs.
+    A notice of an unread property suggests the most similar name.
     """
     notices: dict[Notice, None] = {}
     for prim in (*garments, *colliders):
@@ -42,7 +42,7 @@ def authored_faults(garments: Sequence[Usd.Prim], colliders: Sequence[Usd.Prim])
 
 
 def _animated_in_vain(prim: Usd.Prim, schema: str) -> Iterator[Usd.Attribute]:
-    """Attributes of a garment or collider that are read once, yet have samples that differ."""
+    """Attributes of a garment or collider read once although their samples differ."""
     for row in PROPERTIES:
         once = row.uniform or row.interpolation or schema == COLLIDER_API
         if row.schema != schema or row.type == "rel" or not once:
@@ -64,7 +64,7 @@ def _unread_on(prim: Usd.Prim, *, material: bool) -> Iterator[Notice]:
 
 
 def _fault(name: str, *, material: bool) -> str:
-    """The reason why a property of our namespace is not read, or ""."""
+    """The reason for not reading a property of our namespace, or ""."""
     if name in _NAMES:
         return "is not read on a material; author it on the garment" if material and MATERIAL not in name else ""
     near = nearest_property(name, PROPERTIES)
@@ -73,7 +73,7 @@ def _fault(name: str, *, material: bool) -> str:
 
 
 def _connection_fault(attribute: Usd.Attribute) -> str:
-    """The reason why the connection of an attribute is not followed, or ""."""
+    """The reason for not following an attribute's connection, or ""."""
     painted = attribute and attribute.GetName().startswith(PREFIX)
     if not attribute or not attribute.HasAuthoredConnections() or (connected(attribute) and not painted):
         return ""
@@ -82,7 +82,7 @@ def _connection_fault(attribute: Usd.Attribute) -> str:
 
 
 def beyond_limits(prim: Usd.Prim, schema: str = GARMENT_API) -> Iterator[tuple[Usd.Attribute, str, bool]]:
-    """Values that a garment or collider, its ancestors or its material author beyond limits.
+    """Out-of-limit values authored on a garment or collider, its ancestors or its material.
 
     Yields:
         The attribute, the fault with value and limits, and whether the limits are hard.
@@ -101,7 +101,7 @@ def beyond_limits(prim: Usd.Prim, schema: str = GARMENT_API) -> Iterator[tuple[U
 
 
 def _source(prim: Usd.Prim, row: Property) -> Usd.Attribute | None:
-    """The attribute that gives a value; None where none is authored."""
+    """The attribute giving a value; None if not authored."""
     if not row.interpolation:
         return find_value(prim, row).attribute
     primvar = UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance(row.name.removeprefix("primvars:"))
@@ -109,7 +109,7 @@ def _source(prim: Usd.Prim, row: Property) -> Usd.Attribute | None:
 
 
 def _extremes(attribute: Usd.Attribute) -> list[float]:
-    """Least and greatest number that an attribute holds at any time; empty where it holds none."""
+    """Least and greatest number held by an attribute at any time; empty without numbers."""
     codes = [Usd.TimeCode(time) for time in attribute.GetTimeSamples()] or [Usd.TimeCode.Default()]
     arrays = [np.asarray(attribute.Get(code)).ravel() for code in codes]
     numbers = [array for array in arrays if array.size and array.dtype.kind in "biuf"]

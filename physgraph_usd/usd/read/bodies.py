@@ -1,8 +1,7 @@
-"""Colliders, read from meshes and primitives and posed in world metres.
+"""Reads colliders from meshes and primitives, posed in world metres.
 
-A mesh is read as a renderer draws it: without holes, and subdivided by its scheme. A pose that cannot be used at some
-time is left out there, with a notice. A primitive that its transform makes into a shape without a name, such as an
-ellipsoid, becomes a mesh.
+A mesh is read as rendered: without holes, and subdivided by its scheme. An unusable pose is left out at its time, with
+a notice. A primitive transformed into a shape without a name, such as an ellipsoid, becomes a mesh.
 """
 
 from __future__ import annotations
@@ -25,11 +24,11 @@ from .absence import missing_value
 from .placement import is_flipped, place
 
 DRAWN_NEAR = 0.1
-"""Fraction of the contact offset within which a body is as it is drawn: cloth then stands no farther off by eye."""
+"""Largest error of a body's surface relative to the contact offset: a smaller error is invisible behind the offset."""
 _EVEN = 1e-4
-"""Relative difference under which two scales count as the same."""
+"""Relative difference below which two scales count as equal."""
 _LEAST_OFFSET = 1e-3
-"""Offset below which bodies are subdivided no finer [m]: an offset of 0 would ask for all that there are."""
+"""Least offset for choosing a body's subdivision [m]: an offset of 0 would ask for unlimited subdivision."""
 _PLANE_START = ("plane", "start")
 _KINDS = ("Sphere", "Capsule", "Cylinder", "Cube", "Plane", "Cone")
 _TURNS, _RISES = 64, 24
@@ -40,12 +39,12 @@ UPRIGHT = {
     "Y": np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]),
     "Z": np.eye(3),
 }
-"""For each axis token, the matrix that turns a shape about its third axis to it."""
+"""For each axis token, the matrix turning a shape about its third axis to the axis."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Faces:
-    """Authored arrays of a mesh's topology, the faces drawn from them, and their triangles, as authored and turned."""
+    """Authored topology arrays of a mesh, the drawn faces, and their triangles, as authored and reversed."""
 
     authored: tuple[np.ndarray, ...]
     drawn: DrawnSurface
@@ -57,14 +56,14 @@ class _Faces:
 
 @dataclass(eq=False)
 class ColliderReader:
-    """A collider with what is needed to pose it.
+    """A collider with everything needed for posing.
 
     Attributes:
-        prim: Its prim.
-        collider: Its constant data.
+        prim: The collider's prim.
+        collider: Constant data.
         metres: Length of one stage unit [m].
-        within: Distance from the surface that is drawn within which a mesh is near enough to it [m].
-        always: Whether it counts where it is invisible, too.
+        within: Allowed distance of the mesh from the drawn surface [m].
+        always: Whether the collider counts even while invisible.
     """
 
     prim: Usd.Prim
@@ -75,15 +74,15 @@ class ColliderReader:
     _faces: _Faces | None = None
 
     def on_side(self, side: str) -> ColliderReader:
-        """Return a reader of the collider on another side, one of `schema.SIDES`."""
+        """A reader of the collider on a different side, one of `schema.SIDES`."""
         return replace(self, collider=replace(self.collider, side=side))
 
     def pose(self, time: float | None, skinned: np.ndarray | None = None) -> tuple[Pose | None, tuple[Notice, ...]]:
-        """Pose at a time code, interpolated as USD does; None, with a notice why, where there is none.
+        """Pose at a time code, interpolated like USD; None, with a notice, without a usable pose.
 
         Args:
             time: The time code, or None for the default.
-            skinned: World positions of a mesh's points [m], in place of the authored ones; or None.
+            skinned: World positions of a mesh's points [m], to replace the authored points; or None.
         """
         if not self.always and _is_invisible(self.prim, time):
             message = f"no collider where it is invisible, unless {COLLIDER['collider:enabled'].name} is set to true"
@@ -131,10 +130,9 @@ class ColliderReader:
         return MeshPose(faces.drawn.place(placed), triangles), self._coarse(faces.drawn)
 
     def _faces_of(self, points: np.ndarray, authored: tuple[np.ndarray, ...]) -> _Faces:
-        """The faces that are drawn; the same as last time while the topology is the same.
+        """The drawn faces; cached while the topology stays the same.
 
-        They are subdivided, and quads are split, as they lie in the collider's first sample, whichever frame is read
-        first.
+        Subdivision and splitting of quads use the collider's first sample, whichever frame is read first.
         """
         if self._faces is None or not self._faces.are_of(authored):
             counts, indices, holes = authored
@@ -149,12 +147,12 @@ class ColliderReader:
         return self._faces
 
     def _scale(self) -> float:
-        """Length in metres of the longest unit of the prim's space, in its first sample."""
+        """Length in metres of the longest unit of the prim's space, in the first sample."""
         linear = self._matrix(Usd.TimeCode.EarliestTime())[:3, :3]
         return float(np.linalg.norm(linear, 2)) if np.isfinite(linear).all() and linear.any() else self.metres
 
     def _coarse(self, drawn: DrawnSurface) -> tuple[Notice, ...]:
-        """A notice of a mesh too coarse: its drawn surface comes through cloth at the contact offset."""
+        """A notice of a too coarse mesh: its drawn surface would show through cloth at the contact offset."""
         error = drawn.error * self._scale()
         if error <= self.within / DRAWN_NEAR:
             return ()
@@ -167,7 +165,7 @@ class ColliderReader:
             return None, (self._out(time, "its sizes or its axis are none that a shape can have"),)
         linear = matrix[:3, :3] @ axes
         if kind == "plane":
-            linear = linear / max(float(np.abs(linear).max()), np.finfo(float).tiny)  # Cubes of a scale can overflow.
+            linear = linear / max(float(np.abs(linear).max()), np.finfo(float).tiny)  # A scale's cube can overflow.
             normal = np.cross(linear[:, 0], linear[:, 1]) * np.sign(np.linalg.det(linear) or 1.0)
             if not np.linalg.norm(normal) > 0:
                 return None, (self._out(time, "its transform flattens it"),)
@@ -184,7 +182,7 @@ class ColliderReader:
         return MeshPose(points @ linear.T + matrix[:3, 3], triangles), ()
 
     def _bounded(self, pose: Pose, time: float | None) -> tuple[Pose | None, tuple[Notice, ...]]:
-        """The pose without what is out of bounds: the faces with such points, or a primitive itself."""
+        """The pose without out-of-bounds parts: without the faces at such points, or None for a primitive."""
         if not (message := out_of_bounds(pose.corners())):
             return pose, ()
         if not isinstance(pose, MeshPose):
@@ -201,16 +199,16 @@ class ColliderReader:
 def read_collider(
     prim: Usd.Prim, metres: float, *, overrides: Sequence[Override], offset: float
 ) -> tuple[ColliderReader | None, tuple[Notice, ...]]:
-    """Reader of a gprim as a collider, or None for a kind of prim that cloth cannot touch, and notices.
+    """Reader of a gprim as a collider, or None for an unsupported kind of prim, and notices.
 
     Args:
         prim: A gprim.
         metres: Length of one stage unit [m].
         overrides: Values of ``--set``.
-        offset: Least distance that a garment keeps from colliders [m].
+        offset: Least distance kept from colliders by a garment [m].
 
     Raises:
-        SchemaError: When its offset or its side cannot be used.
+        SchemaError: When the collider's offset or side is invalid.
     """
     path, kind = str(prim.GetPath()), str(prim.GetTypeName()).removesuffix("_1")
     if not UsdGeom.Mesh(prim) and kind not in _KINDS:
@@ -229,14 +227,14 @@ def _is_invisible(prim: Usd.Prim, time: float | None) -> bool:
 
 
 def _control_mesh(mesh: UsdGeom.Mesh, polygons: PolygonMesh) -> ControlMesh:
-    """The faces with their creases and corners, without those whose arrays do not fit together."""
+    """The faces with their creases and corners; creases or corners with inconsistent arrays are dropped."""
     ends, sharpness = np.zeros((0, 2), np.int32), np.zeros(0)
     attributes = (mesh.GetCreaseIndicesAttr(), mesh.GetCreaseLengthsAttr(), mesh.GetCreaseSharpnessesAttr())
     indices, lengths, given = (_array(attribute, None) for attribute in attributes)
     if len(lengths) and lengths.min() >= 2 and lengths.sum() == len(indices):
         chain = np.repeat(np.arange(len(lengths)), lengths)
         along = np.flatnonzero(chain[1:] == chain[:-1])
-        given = given[chain[along]] if len(given) == len(lengths) else given  # One a crease, or one an edge.
+        given = given[chain[along]] if len(given) == len(lengths) else given  # One value per crease, or one per edge.
         if len(given) == len(along):
             ends, sharpness = np.stack([indices[along], indices[along + 1]], axis=1), given
     corners = np.zeros(polygons.vertex_count)
@@ -248,15 +246,15 @@ def _control_mesh(mesh: UsdGeom.Mesh, polygons: PolygonMesh) -> ControlMesh:
 
 
 def _array(attribute: Usd.Attribute, time: float | None) -> np.ndarray:
-    """An attribute's array at a time code; empty where there is none."""
+    """An attribute's array at a time code; empty if missing."""
     value = value_at(attribute, time)
     return np.zeros(0, np.int32) if value is None else np.asarray(value)
 
 
 def _measures(prim: Usd.Prim, time: float | None) -> tuple[str, np.ndarray, np.ndarray | None]:
-    """Kind, half sizes in stage units, and the matrix whose columns are the shape's axes in the prim's space.
+    """Kind, half sizes in stage units, and the matrix with the shape's axes in the prim's space as columns.
 
-    A size that is no number is NaN, and an axis that USD does not know has no matrix.
+    A non-numeric size is NaN, and an unknown axis token gives None instead of the matrix.
     """
 
     def number(name: str, fallback: float) -> float:
@@ -277,7 +275,7 @@ def _measures(prim: Usd.Prim, time: float | None) -> tuple[str, np.ndarray, np.n
 
 
 def _frame_about(normal: np.ndarray) -> np.ndarray:
-    """A rotation whose third column is a direction."""
+    """A rotation with a given direction as third column."""
     third = normal / np.linalg.norm(normal)
     first = np.cross(np.eye(3)[np.abs(third).argmin()], third)
     first /= np.linalg.norm(first)

@@ -1,11 +1,11 @@
-"""The coarse cage: a mesh prim's topology, checked, and its points at a time, with broken ones repaired.
+"""Reads the coarse cage: a mesh prim's topology, checked, and its points at a time code, with broken points repaired.
 
-Faces that are holes or have fewer than three corners are left out. A topology that no solver could use is refused.
+Holes and faces with fewer than three corners are left out. An unusable topology is refused.
 
-Repair: a point that is not finite is put where its finite neighbours moved it since the last good sample: its position
-there plus the neighbours' mean displacement. Without finite neighbours it is held there; without an earlier good sample
-the next good one is used; without either it is the mean of its neighbours. It reads only the stage, never what was read
-before, so the order in which frames are read does not matter.
+Repair: a non-finite point moves with its finite neighbours since the last good sample: its old position plus the
+neighbours' mean displacement. Without finite neighbours the point keeps its old position; without an earlier good
+sample the next good sample is used; without either, the point is the mean of its neighbours. Repair reads only the
+stage, never results of earlier reads, so the order of reading frames does not matter.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ _CONTROLS = {
 }
 _SPLIT = "export the garment with one topology, or split the shot where it changes and use --frames"
 MOST_CORNERS, MOST_TWICE = 1000, 64
-"""Corners of a face beyond which a garment is refused, and of one that is there twice: subdivision joins all of them at
-one vertex, and what is near what there grows with their square. 1,000 take seconds, 2,000 on a body a minute, 500 twice
-half a minute."""
+"""Most corners of a face, and of each of two faces with equal corners. Subdivision joins all corners at a single
+vertex, and the number of contact pairs there grows with the square: 1,000 corners take seconds, 2,000 on a body a
+minute, two equal faces of 500 half a minute."""
 MOST_BROKEN = 0.1
-"""Largest part of the points that repair may replace."""
+"""Largest fraction of points replaced by repair."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,9 +40,9 @@ class Cage:
     """A garment's topology.
 
     Attributes:
-        mesh: Faces that are kept, in authored order and winding.
-        kept_faces: Numbers of these among the authored faces, int32.
-        notices: Faces and features that were left out.
+        mesh: Kept faces, in authored order and winding.
+        kept_faces: Numbers of the kept faces among the authored faces, int32.
+        notices: Faces and features left out.
     """
 
     mesh: PolygonMesh
@@ -51,10 +51,10 @@ class Cage:
 
 
 def read_cage(prim: Usd.Prim, vertex_count: int, times: Sequence[float]) -> Cage:
-    """Read the topology of a mesh with some number of points and some time codes (none for a still one).
+    """Read the topology of a mesh with a given number of points and time codes (none for a still mesh).
 
     Raises:
-        GarmentError: When it is empty, broken or varies in time.
+        GarmentError: When the topology is empty, broken or varies in time.
     """
     path, usd = str(prim.GetPath()), UsdGeom.Mesh(prim)
     counts_attr, indices_attr = usd.GetFaceVertexCountsAttr(), usd.GetFaceVertexIndicesAttr()
@@ -78,7 +78,7 @@ def read_cage(prim: Usd.Prim, vertex_count: int, times: Sequence[float]) -> Cage
 
 
 def read_integers(attribute: Usd.Attribute, time: float | None) -> np.ndarray:
-    """Integer array at a time code, or at the first sample where there is no default; empty when unauthored."""
+    """Integer array at a time code, or at the first sample if there is no default; empty when unauthored."""
     value = value_at(attribute, time)
     array = np.zeros(0) if value is None else np.asarray(value)
     if array.ndim != 1 or (len(array) and not np.issubdtype(array.dtype, np.integer)):
@@ -88,7 +88,7 @@ def read_integers(attribute: Usd.Attribute, time: float | None) -> np.ndarray:
 
 
 def refuse_varying(attribute: Usd.Attribute, times: Sequence[float]) -> None:
-    """Refuse (GarmentError) an attribute whose samples differ between the first and last time code."""
+    """Refuse (GarmentError) an attribute with different samples between the first and last time code."""
     samples = attribute.GetTimeSamples()
     if len(samples) < 2 or not times:
         return
@@ -104,7 +104,7 @@ def refuse_varying(attribute: Usd.Attribute, times: Sequence[float]) -> None:
 def check_topology(
     path: str, counts: np.ndarray, indices: np.ndarray, *, vertex_count: int, time: float | None
 ) -> None:
-    """Refuse a topology that no reader could use; GarmentError gives the faulty index or sum."""
+    """Refuse an unusable topology; GarmentError gives the faulty index or sum."""
     remedy = "export the mesh again or repair it in its host program"
     if len(counts) == 0 or vertex_count == 0 or not (counts >= 3).any():
         message = f"the mesh is empty: {vertex_count} points, {len(counts)} faces"
@@ -123,7 +123,7 @@ def check_topology(
 
 
 def _refuse_large_faces(path: str, counts: np.ndarray, indices: np.ndarray, keep: np.ndarray) -> None:
-    """Refuse faces of so many corners that no solve ends, or fewer where one lies on another."""
+    """Refuse faces with too many corners to solve; two equal faces have a lower limit."""
     starts, faces = np.cumsum(counts) - counts, dict[bytes, int]()
     for face in np.flatnonzero(keep & (counts > MOST_TWICE)).tolist():
         count = int(counts[face])
@@ -149,7 +149,7 @@ def _left_out(path: str, keep: np.ndarray, unknown_holes: int) -> list[Notice]:
 
 
 def _not_carried(usd: UsdGeom.Mesh) -> list[Notice]:
-    """Notices of subdivision features of the cage that refining does not honour."""
+    """Notices of the cage's subdivision features not supported by refining."""
     authored = [
         attribute.GetName()
         for attribute in (usd.GetCreaseIndicesAttr(), usd.GetCornerIndicesAttr())
@@ -162,7 +162,7 @@ def _not_carried(usd: UsdGeom.Mesh) -> list[Notice]:
 
 
 def _odd_controls(usd: UsdGeom.Mesh) -> list[Notice]:
-    """Notices of topology controls that USD does not define or that vary in time, which it forbids."""
+    """Notices of topology controls undefined in USD or, against USD's rules, varying in time."""
     path, notices = str(usd.GetPath()), []
     for name, tokens in _CONTROLS.items():
         attribute = usd.GetPrim().GetAttribute(name)
@@ -231,18 +231,18 @@ class PointReader:
         return as_points(value_at(self._attribute, time), self.path, "points", time=time)
 
     def _good_sample(self, time: float | None) -> np.ndarray | None:
-        """The nearest earlier sample whose points are all finite, else the nearest later one."""
+        """The nearest earlier sample with only finite points, else the nearest later such sample."""
         at = -np.inf if time is None else time
         earlier = [each for each in reversed(self._times) if each < at]
         for each in (*earlier, *(later for later in self._times if later > at)):
-            points = self._raw(each) if self._attribute.Get(each) else np.zeros((0, 3))  # It may be blocked there.
+            points = self._raw(each) if self._attribute.Get(each) else np.zeros((0, 3))  # The sample may be blocked.
             if len(points) == self.count and np.isfinite(points).all():
                 return points
         return None
 
 
 def as_points(value: object, path: str, name: str, *, time: float | None = None) -> np.ndarray:
-    """Turn a USD array of three-vectors into positions, shape (V, 3), float64; GarmentError where it is none."""
+    """Convert a USD array of three-vectors to positions, shape (V, 3), float64; GarmentError for other types."""
     if value is None:
         raise GarmentError(path, f"has no {name}", time=time, remedy="author point3f[] points, or leave the prim out")
     array = np.asarray(value)
@@ -255,15 +255,15 @@ def as_points(value: object, path: str, name: str, *, time: float | None = None)
 
 
 def repair(points: np.ndarray, edges: np.ndarray, reference: np.ndarray | None) -> np.ndarray:
-    """Replace points that are not finite, ring by ring inwards; others keep their bits.
+    """Replace non-finite points, ring by ring inwards; finite points are unchanged to the bit.
 
     Args:
         points: Positions, shape (V, 3).
         edges: Edges, shape (E, 2).
-        reference: Positions at a sample where all are finite, shape (V, 3), or None.
+        reference: Positions at a sample with only finite points, shape (V, 3), or None.
 
     Returns:
-        Positions, shape (V, 3), not finite where there is nothing to repair from.
+        Positions, shape (V, 3); not finite if nothing is available for repair.
     """
     base = np.zeros_like(points) if reference is None else reference
     out = points.copy()

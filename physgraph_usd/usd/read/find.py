@@ -1,4 +1,4 @@
-"""Garments and colliders of a stage, found by applied schema, path, name, glob or collection; which of them collide."""
+"""Finds garments and colliders of a stage by applied schema, path, name, glob or collection, and pairs for contact."""
 
 from __future__ import annotations
 
@@ -13,30 +13,30 @@ from ..schema import COLLIDER, COLLIDER_API, GARMENT, GARMENT_API
 from ..stage import TRAVERSAL, Notice, Units, list_meshes
 
 GRAVITY_OPTION = "--gravity"
-"""Source of gravity that was asked for."""
+"""Source of gravity set by the option."""
 _COLLECTION = ".collection:"
 _COLLIDERS_RELATIONSHIP = "physgraph:colliders"
 _SHOWN = 20
 MARKS = (GARMENT_API, COLLIDER_API, "PhysicsCollisionAPI")
-"""Schemas by which a prim, or one above it, decides whether cloth touches it."""
+"""Schemas that, on a prim or an ancestor, decide about contact with cloth."""
 EXCLUDE = "physgraph:contact:exclude"
 
 
 def has_schema(prim: Usd.Prim, name: str) -> bool:
-    """Whether an API schema is applied, also when it is not registered."""
+    """Whether an API schema is applied, registered or not."""
     return name in prim.GetPrimTypeInfo().GetAppliedAPISchemas()
 
 
 def find_garments(stage: Usd.Stage, wanted: Sequence[str] = ()) -> list[Usd.Prim]:
-    """Find the meshes to refine, in stage order, those inside instances included.
+    """Find the meshes to refine, in stage order, including meshes inside instances.
 
     Args:
         stage: The stage.
-        wanted: Prim paths (a transform stands for the meshes drawn below it), prim names, globs over paths, or
-            collections (``/Prim.collection:name``); empty: every mesh with PhysGraphGarmentAPI.
+        wanted: Prim paths (a transform stands for the meshes drawn below), prim names, globs over paths, or collections
+            (``/Prim.collection:name``); empty: every mesh with PhysGraphGarmentAPI.
 
     Raises:
-        AbsentError: When an item is not found; the message lists the meshes that there are.
+        AbsentError: When an item is not found; the message lists the stage's meshes.
         StageError: When nothing is named and nothing found.
     """
     if wanted:
@@ -62,19 +62,19 @@ def find_colliders(
     *,
     overrides: Sequence[Override] = (),
 ) -> list[Usd.Prim]:
-    """Find the gprims that garments may collide with, in stage order.
+    """Find the gprims garments may collide with, in stage order.
 
-    Invisible prims count, for they may be visible at other times; inactive and disabled ones do not.
+    Invisible prims are included because they may be visible at different times; inactive and disabled prims are not.
 
     Args:
         stage: The stage.
-        garments: The garments; they are no colliders.
-        wanted: As for ``find_garments``; empty: what the garments' ``physgraph:colliders`` name, and for garments
+        garments: The garments; never colliders.
+        wanted: As for ``find_garments``; empty: the targets of the garments' ``physgraph:colliders``, and for garments
             without targets every prim with PhysGraphColliderAPI or UsdPhysics' CollisionAPI.
         overrides: Values of ``--set``.
 
     Raises:
-        AbsentError: When a named one is not there.
+        AbsentError: When a named collider does not exist.
     """
     felt = [_colliders_named(stage, wanted, overrides)] if wanted else felt_by(stage, garments, overrides=overrides)
     chosen = {path for paths in felt for path in paths} - {prim.GetPath() for prim in garments}
@@ -88,11 +88,11 @@ def felt_by(
     *,
     overrides: Sequence[Override] = (),
 ) -> list[frozenset[Sdf.Path]]:
-    """For each garment, paths of the gprims that it may collide with; arguments as for ``find_colliders``.
+    """For each garment, paths of the gprims felt by the garment; arguments as for ``find_colliders``.
 
     Raises:
-        AbsentError: When a named one is not there.
-        StageError: When one that the garment's ``physgraph:colliders`` name is not.
+        AbsentError: When a collider in ``wanted`` does not exist.
+        StageError: When a target of the garment's ``physgraph:colliders`` does not exist.
     """
     found: dict[tuple[str, ...], frozenset[Sdf.Path]] = {}  # Many garments name the same colliders, or none.
     each = []
@@ -110,14 +110,14 @@ def felt_by(
 
 
 def _colliders_named(stage: Usd.Stage, named: Sequence[str], overrides: Sequence[Override]) -> frozenset[Sdf.Path]:
-    """Gprims that are named, or else those of every collider of the stage, without the disabled ones."""
+    """Named gprims, or else all colliders of the stage, without disabled gprims."""
     enabled = COLLIDER["collider:enabled"]
     found = _named_or_marked(stage, named)
     return frozenset(path for path in found if is_on(stage.GetPrimAtPath(path), enabled, overrides))
 
 
 def _named_or_marked(stage: Usd.Stage, named: Sequence[str]) -> list[Sdf.Path]:
-    """Gprims that are named, or else those of every collider of the stage."""
+    """Named gprims, or else all colliders of the stage."""
     if named:
         return list(dict.fromkeys(path for item in named for path in find_paths(stage, item, UsdGeom.Gprim)))
     marked = (prim for prim in traverse(stage) if _collides(prim))
@@ -125,7 +125,7 @@ def _named_or_marked(stage: Usd.Stage, named: Sequence[str]) -> list[Sdf.Path]:
 
 
 def purpose_notices(prims: Iterable[Usd.Prim], named: Sequence[str]) -> list[Notice]:
-    """Notices of garments and colliders that no final render shows, but for those marked or named themselves."""
+    """Notices of garments and colliders invisible in final renders, unless marked or named themselves."""
     notices = []
     for prim in prims:
         by_itself = {str(prim.GetPath()), prim.GetName()} & {*named}
@@ -140,7 +140,7 @@ def purpose_notices(prims: Iterable[Usd.Prim], named: Sequence[str]) -> list[Not
 def disabled_colliders(
     stage: Usd.Stage, garments: Sequence[Usd.Prim], wanted: Sequence[str], *, overrides: Sequence[Override]
 ) -> dict[Usd.Prim, Notice]:
-    """Gprims that are named or marked as colliders and are disabled, each with a notice of the attribute that does so.
+    """Gprims named or marked as colliders but disabled, each with a notice of the disabling attribute.
 
     Arguments are those of `find_colliders`.
     """
@@ -154,7 +154,7 @@ def disabled_colliders(
 
 
 def colliders_of(garments: Sequence[Usd.Prim]) -> list[str]:
-    """Paths that the garments' ``physgraph:colliders`` name."""
+    """Target paths of the garments' ``physgraph:colliders``."""
     return [str(path) for prim in garments for path in targets_of(prim, _COLLIDERS_RELATIONSHIP)]
 
 
@@ -164,12 +164,12 @@ def is_drawn(prim: Usd.Prim) -> bool:
 
 
 def instance_roots(prim: Usd.Prim) -> tuple[Sdf.Path, ...]:
-    """Instances that hold a prim, outermost first: what must become editable before the prim can be overridden."""
+    """Instances containing a prim, outermost first; an override of the prim requires the instances to be editable."""
     return tuple(each.GetPath() for each in reversed([*with_ancestors(prim)]) if each.IsInstance())
 
 
 def traverse(stage: Usd.Stage) -> Iterator[Usd.Prim]:
-    """All active, loaded, defined prims, those inside instances included."""
+    """All active, loaded, defined prims, including prims inside instances."""
     return iter(Usd.PrimRange.Stage(stage, TRAVERSAL))
 
 
@@ -180,7 +180,7 @@ def targets_of(prim: Usd.Prim, name: str) -> list[Sdf.Path]:
 
 
 def with_gravity(units: Units, garments: Sequence[Usd.Prim], asked: str | None) -> Units:
-    """Units with gravity along the axis that was asked for, or that garments author; as they are without either.
+    """Units with gravity along the requested axis, or along the axis authored on garments; unchanged without either.
 
     Args:
         units: The stage's units.
@@ -188,7 +188,7 @@ def with_gravity(units: Units, garments: Sequence[Usd.Prim], asked: str | None) 
         asked: One of `AXES`, or None.
 
     Raises:
-        SchemaError: An attribute is no axis, or two garments have different ones.
+        SchemaError: An attribute is no axis, or two garments have different axes.
     """
     if asked is not None:
         return units.pulled(asked, GRAVITY_OPTION)
@@ -208,19 +208,19 @@ def _collides(prim: Usd.Prim) -> bool:
 
 
 def find_paths(stage: Usd.Stage, item: str, kind: type, *, drawn: bool = True) -> list[Sdf.Path]:
-    """Paths of the prims of a class of UsdGeom that an item, as in `find_garments`, names.
+    """Paths of the prims of a UsdGeom class named by an item, as in `find_garments`.
 
     Args:
         stage: The stage.
         item: The item.
         kind: The class.
-        drawn: Whether proxies and guides count only where the item is their own path or name, or names nothing else.
+        drawn: Whether proxies and guides are skipped unless named by path or name, or unless nothing else is named.
 
     Raises:
-        AbsentError: There is none.
+        AbsentError: No prim is found.
     """
     pick = _drawn if drawn else list
-    if _COLLECTION in item:  # Each member by itself, so that excluded prims stay out.
+    if _COLLECTION in item:  # Members only, not prims below: excluded prims stay out.
         found = pick([prim for prim in _collection(stage, item) if kind(prim)])
     elif any(letter in item for letter in "*?["):
         matching = (prim for prim in traverse(stage) if fnmatch.fnmatchcase(str(prim.GetPath()), item))
@@ -238,17 +238,17 @@ def _named(stage: Usd.Stage, name: str) -> list[Usd.Prim]:
 
 
 def _below(root: Usd.Prim, kind: type) -> list[Usd.Prim]:
-    """The prim itself when it is of the kind, else those of the kind below it."""
+    """The prim itself if of the kind, else all prims of the kind below."""
     return [root] if kind(root) else [prim for prim in Usd.PrimRange(root, TRAVERSAL) if kind(prim)]
 
 
 def _drawn(prims: list[Usd.Prim]) -> list[Usd.Prim]:
-    """The prims that a final render shows, or all where it shows none."""
+    """The prims shown by a final render, or all prims if none is shown."""
     return [prim for prim in prims if is_drawn(prim)] or prims
 
 
 def _at_path(stage: Usd.Stage, item: str) -> Usd.Prim:
-    """The prim at a path; AbsentError when there is none, or it is inactive, undefined or abstract."""
+    """The prim at a path; AbsentError for a missing, inactive, undefined or abstract prim."""
     if not Sdf.Path.IsValidPathString(item):
         raise AbsentError(f"{item!r} is no prim path")
     prim = stage.GetPrimAtPath(item)
@@ -267,7 +267,7 @@ def _at_path(stage: Usd.Stage, item: str) -> Usd.Prim:
 
 
 def _collection(stage: Usd.Stage, item: str) -> list[Usd.Prim]:
-    """The prims of a collection; AbsentError lists those of the prim when there is none."""
+    """The prims of a collection; AbsentError lists the prim's collections."""
     path, name = item.split(_COLLECTION, 1)
     prim = _at_path(stage, path)
     collection = Usd.CollectionAPI.Get(prim, name)
@@ -285,13 +285,12 @@ def _mesh_list(stage: Usd.Stage) -> str:
 
 
 def read_apart(stage: Usd.Stage, garments: Sequence[Usd.Prim]) -> tuple[list[dict[Sdf.Path, str]], list[Notice]]:
-    """Gprims that each garment never touches, by ``physgraph:contact:exclude``: a hand in a pocket, a belt in a loop.
+    """Gprims never touched by each garment, by ``physgraph:contact:exclude``: a hand in a pocket, a belt in a loop.
 
     Two garments are apart when either excludes the other; a garment is never apart from itself, see selfCollision.
 
     Returns:
-        For each garment, the gprims, each with the target that excludes it; and a notice for each target that is not
-        there.
+        For each garment, the gprims, each with the excluding target; and a notice for each missing target.
     """
     excluded, notices = [], []
     for prim in garments:
@@ -307,7 +306,7 @@ def read_apart(stage: Usd.Stage, garments: Sequence[Usd.Prim]) -> tuple[list[dic
 
 
 def _excluded_by(stage: Usd.Stage, prim: Usd.Prim) -> tuple[dict[Sdf.Path, str], list[Notice]]:
-    """Gprims at and below the targets of one garment, and by which target."""
+    """Gprims at and below the targets of one garment, each with its target."""
     found: dict[Sdf.Path, str] = {}
     notices = []
     message = f"<{prim.GetPath()}>.{EXCLUDE}"

@@ -1,4 +1,4 @@
-"""One garment, read from its mesh prim."""
+"""Reads one garment from its mesh prim."""
 
 from __future__ import annotations
 
@@ -29,19 +29,19 @@ from .rest import Animation, Rest, read_rest, rests_bent
 from .skinning import Bake
 
 RIGID = "physgraph:rigid"
-"""Attribute of a subset of faces that are to be rigid, bool."""
+"""Attribute of a face subset to mark a rigid part, bool."""
 _SMALL, _LARGE = 0.01, 100.0
 _WORD = re.compile("[A-Z]?[a-z]+|[A-Z]+(?![a-z])")
 """A word of a name such as "LeatherBelt_geo1"."""
 _THICK = 10.0
-"""Fraction (one over it) of its size beyond which cloth keeps no distance: where all of it is near all of it, there are
-V^2 pairs, and cloth that is pushed out by more than it measures has no shape of the shot."""
+"""Inverse of the largest contact distance relative to the cloth's size. Beyond, all vertices are near all vertices,
+with V^2 pairs, and cloth pushed out by more than its size loses the shot's shape."""
 _PER_VERTEX = {UsdGeom.Tokens.vertex, UsdGeom.Tokens.varying}
 
 
 @dataclass(frozen=True, eq=False)
 class Request:
-    """The options of a run, and the units and skinning that the garments of a stage have in common.
+    """The options of a run, and units and skinning shared by the garments of a stage.
 
     Attributes:
         units: The stage's units.
@@ -49,7 +49,7 @@ class Request:
         frames: First and last time code, or None.
         level: Number of subdivisions for all, -1 for auto, or None.
         overrides: Values of ``--set``.
-        rest_frame: Time code whose points are the rest shape, "auto" for one fitted to the shot, or None.
+        rest_frame: Time code of the rest shape's points, "auto" for a shape fitted to the shot, or None.
         assumed_units: Whether metersPerUnit is not authored.
     """
 
@@ -64,16 +64,16 @@ class Request:
 
 @dataclass(frozen=True, eq=False)
 class GarmentReader:
-    """A garment with everything that is needed to read its frames.
+    """A garment with everything needed to read its frames.
 
     Attributes:
-        garment: Its constant data.
-        source: Its place on the stage.
-        values: Sources of its animated values.
-        points: Its points.
-        edges: Its edges as authored, shape (E, 2).
-        weld: Its mesh as authored and as solved.
-        notices: Warnings about it.
+        garment: Constant data.
+        source: Place on the stage.
+        values: Sources of the animated values.
+        points: The points.
+        edges: Edges as authored, shape (E, 2).
+        weld: The mesh as authored and as solved.
+        notices: Warnings about the garment.
     """
 
     garment: Garment
@@ -87,10 +87,10 @@ class GarmentReader:
     def frame(self, prim: Usd.Prim, metres: float, time: float | None) -> tuple[GarmentFrame, tuple[Notice, ...]]:
         """The garment at a time code, and notices of repairs.
 
-        A garment that is not there is all at one place, where nothing is near it: other garments may have a frame.
+        All points of an absent garment are at one place, without contact: other garments may still have a frame.
 
         Args:
-            prim: Its mesh prim.
+            prim: The garment's mesh prim.
             metres: Length of one stage unit [m].
             time: Time code, or None for the default.
         """
@@ -112,7 +112,7 @@ class GarmentReader:
 
 
 def samples_of(prim: Usd.Prim, bake: Bake) -> Samples:
-    """Authored time codes of a garment; a skinned one has its skeleton's, samples added by baking do not count."""
+    """Authored time codes of a garment; a skinned garment has its skeleton's, without samples added by baking."""
     skinned = bake.skinned.get(prim.GetPath())
     times = merge([*skinned.times, *transform_times(prim)]) if skinned else garment_times(prim)
     samples = Samples.of(prim, times)
@@ -124,11 +124,11 @@ def samples_of(prim: Usd.Prim, bake: Bake) -> Samples:
 
 
 def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], samples: Samples, request: Request) -> GarmentReader:
-    """Read a garment from its mesh prim; ``roots`` are the instances that hold it on the stage as opened.
+    """Read a garment from its mesh prim; ``roots`` are the instances containing the garment on the stage as opened.
 
     Raises:
         GarmentError: When the garment is broken.
-        SchemaError: When one of its values cannot be used.
+        SchemaError: When a value of the garment is invalid.
     """
     every = samples.times
     times, first = within(every, request.frames), every[0] if every else None
@@ -180,7 +180,7 @@ def _animation(
     every: Sequence[float],
     times: Sequence[float],
 ) -> Animation:
-    """A garment's points over the shot, given its time codes and those that are refined; each is read once."""
+    """A garment's points over the shot, given all its time codes and the refined time codes; each is read once."""
 
     @cache
     def read(time: float | None) -> tuple[np.ndarray, tuple[Notice, ...]]:
@@ -191,7 +191,7 @@ def _animation(
 
 
 def _constants(prim: Usd.Prim, request: Request) -> tuple[dict[str, Any], dict[str, str]]:
-    """Values of a garment that never change over a shot, by field name, and their sources by schema name."""
+    """Constant values of a garment, by field name, and their sources by schema name."""
     names = ("contact:selfCollision", "refine:raiseBending", "refine:level")
     self_contact, raises, level = (find_value(prim, GARMENT[name], request.overrides) for name in names)
     if request.level is not None and level.source != "--set":
@@ -206,14 +206,14 @@ def _constants(prim: Usd.Prim, request: Request) -> tuple[dict[str, Any], dict[s
 
 
 def has_velocities(prim: Usd.Prim, count: int) -> bool:
-    """Whether a mesh has velocities of as many points, by default or at any of its samples."""
+    """Whether a mesh has velocities matching its point count, by default or at any sample."""
     attribute = UsdGeom.Mesh(prim).GetVelocitiesAttr()
     codes = (Usd.TimeCode.Default(), *map(Usd.TimeCode, attribute.GetTimeSamples()))
     return any(len(attribute.Get(code) or ()) == count for code in codes)
 
 
 def _pieces(prim: Usd.Prim, weld: Weld, rest: np.ndarray, kept: np.ndarray) -> tuple[dict[str, Any], list[Notice]]:
-    """Closed pieces and rigid parts by field name, and notices of them."""
+    """Closed pieces and rigid parts by field name, and notices about pieces."""
     asked = np.zeros(len(kept), bool)
     for subset in UsdGeom.Subset.GetGeomSubsets(UsdGeom.Imageable(prim), UsdGeom.Tokens.face):
         attribute = subset.GetPrim().GetAttribute(RIGID)
@@ -255,7 +255,7 @@ def _words(prim: Usd.Prim, subsets: Sequence[str]) -> tuple[str, ...]:
 def _rest_and_weld(
     prim: Usd.Prim, mesh: PolygonMesh, animation: Animation, request: Request, *, matrix: np.ndarray
 ) -> tuple[Rest, Weld]:
-    """Rest shape as authored or fitted, and the weld of the borders that stay together there and over the shot."""
+    """Rest shape as authored or fitted, and the weld of the borders coincident in the rest shape and over the shot."""
     poses = [*animation.poses(1).values()] or [animation.first]
     within = seam_reach(mesh, poses[0], seam_tolerance(prim, request.overrides))
     found = weld(mesh, poses, within)
@@ -272,7 +272,7 @@ def seam_tolerance(prim: Usd.Prim, overrides: Sequence[Override]) -> float:
 
 
 def _rest(prim: Usd.Prim, weld: Weld, animation: Animation, request: Request, *, matrix: np.ndarray) -> Rest:
-    """Rest shape; authored points of a skinned mesh are placed by its bind transform in place of the mesh's matrix."""
+    """Rest shape; authored points of a skinned mesh are placed by the bind transform instead of the mesh's matrix."""
     bound, first = matrix, animation.times[0] if animation.times else None
     if prim.GetPath() in request.bake.skinned:
         rows = request.bake.rest_transform(prim.GetPath(), first)
@@ -302,7 +302,7 @@ def _painted(
 
 
 def _size_notices(path: str, points: np.ndarray, request: Request) -> list[Notice]:
-    """A notice of the size in metres when units were assumed or it is no garment's."""
+    """A notice of the size in metres if units were assumed or the size is implausible for a garment."""
     size = np.ptp(points, axis=0)
     largest = float(size.max())
     if not request.assumed_units and _SMALL <= largest <= _LARGE:
@@ -312,7 +312,7 @@ def _size_notices(path: str, points: np.ndarray, request: Request) -> list[Notic
 
 
 def _unit_notices(prim: Usd.Prim, matrix: np.ndarray, request: Request) -> list[Notice]:
-    """A notice of each layer in other units whose points no scale corrects; USD never converts."""
+    """A notice of each layer with different units and no scale to correct its points; USD never converts."""
     scale, metres = float(np.cbrt(abs(np.linalg.det(matrix[:3, :3])))), request.units.metres
     notices = []
     for layer in dict.fromkeys(spec.layer for spec in UsdGeom.Mesh(prim).GetPointsAttr().GetPropertyStack()):
@@ -333,7 +333,7 @@ def is_visible(prim: Usd.Prim, times: Sequence[float]) -> bool:
 def read_painted(prim: Usd.Prim, short: str, count: int) -> tuple[np.ndarray, tuple[Notice, ...]]:
     """A painted multiplier or pin of a mesh at each point, shape (count,), float64, and notices.
 
-    Constant ones are inherited from ancestors as USD does.
+    Constant primvars are inherited from ancestors, as in USD.
 
     Args:
         prim: Mesh prim.
@@ -360,16 +360,16 @@ def read_painted(prim: Usd.Prim, short: str, count: int) -> tuple[np.ndarray, tu
         message = f"{len(values)} values with {interpolation} interpolation on {count} points"
         raise SchemaError(f"{where} has {message}; author one value per point (vertex) or one for all (constant)")
     notices: tuple[Notice, ...] = ()
-    if row is GARMENT["pin"] and (values > 1.0).any():  # Weights that other programs paint are over 1 by rounding.
+    if row is GARMENT["pin"] and (values > 1.0).any():  # Painted weights may exceed 1 by rounding.
         message = f"{row.name} goes up to {values.max():g}; values over 1 are taken as 1"
         values, notices = np.minimum(values, 1.0), (Notice(str(prim.GetPath()), None, message),)
-    for index in (int(values.argmin()), int(values.argmax())) if count else ():  # NaN is either's first.
+    for index in (int(values.argmin()), int(values.argmax())) if count else ():  # Both find NaN first.
         check_limits(row, float(values[index]), f"{where}[{index}]")
     return values, notices
 
 
 def _primvar(prim: Usd.Prim, name: str) -> UsdGeom.Primvar | None:
-    """The authored primvar of a name, or of the name that Blender's exporter makes of it: no colons."""
+    """The authored primvar of a name, or of the name in Blender's export, without colons."""
     for spelled in (name, name.replace(":", "_")):
         primvar = UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance(spelled)
         if primvar and primvar.HasAuthoredValue():

@@ -1,8 +1,8 @@
-"""Which way a garment's warp lies: along v of its texture coordinates where these are a pattern, else downwards.
+"""Finds the direction of a garment's warp: along v of the texture coordinates if they are a pattern, else downwards.
 
-Texture coordinates are a pattern where they keep the cloth's shape: garments from a cutting program have them, and most
-unwraps come near. Where they do not, or there are none, the warp runs the way a garment is cut: down the cloth of the
-rest shape. ``primvars:physgraph:grain`` turns it.
+Texture coordinates are a pattern if they preserve the cloth's shape: exactly for garments from a cutting program,
+nearly for most unwraps. Without a pattern, the warp runs down the cloth of the rest shape, like the usual cut of a
+garment. ``primvars:physgraph:grain`` turns the warp.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from ...solver.scene import Grain
 from ..stage import first_value
 
 SKEWED = 1.5
-"""Ratio of the two stretches of a face's texture coordinates from which these do not keep its shape."""
+"""Ratio of a face's two texture stretches from which the texture coordinates count as not shape-preserving."""
 PATTERN = 0.8
-"""Part of the area on which they must, to be a pattern."""
+"""Least fraction of the area with shape-preserving texture coordinates in a pattern."""
 _NAMES = ("st", "uv", "UVMap", "map1")
 _FLAT = 1e-12
 
@@ -34,13 +34,13 @@ def read_grain(
     up: np.ndarray,
     painted: dict[str, np.ndarray],
 ) -> tuple[Grain, str]:
-    """The grain of a garment, and where it comes from, in words.
+    """The grain of a garment, and its source, in words.
 
     Args:
         prim: Mesh prim.
-        weld: Its kept faces, as authored and welded.
+        weld: The kept faces, as authored and welded.
         rest: Rest positions as authored [m], shape (V, 3).
-        kept: Numbers of these among the authored faces, shape (F,).
+        kept: Numbers of the kept faces among the authored faces, shape (F,).
         up: The stage's upward direction, shape (3,).
         painted: Values of ``easeScale``, ``gather`` [%] and ``grain`` [degrees] at each point, each of shape (V,).
     """
@@ -60,21 +60,21 @@ def read_grain(
 
 
 def _down(normal: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """Direction on each face that leads down most steeply, shape (F, 3); 0 where a face lies level."""
+    """Steepest downward direction on each face, shape (F, 3); 0 for a level face."""
     down = normal * (normal @ up)[:, None] - up
     length = np.linalg.norm(down, axis=1, keepdims=True)
     return np.where(length > 1e-3, down / np.maximum(length, 1e-3), 0.0)
 
 
 def _texture_coordinates(prim: Usd.Prim, mesh: PolygonMesh, kept: np.ndarray) -> tuple[str, np.ndarray] | None:
-    """Name and value at each corner of the kept faces, shape (C, 2), of the first texture coordinates that fit."""
+    """Name, and values at the kept faces' corners, shape (C, 2), of the first valid texture coordinates."""
     api = UsdGeom.PrimvarsAPI(prim)
     every = [each.GetPrimvarName() for each in api.GetPrimvars() if "texCoord2" in str(each.GetTypeName())]
     for name in dict.fromkeys([each for each in _NAMES if each in every] + every):
         primvar = api.GetPrimvar(name)
         try:
             flat = primvar.ComputeFlattened(Usd.TimeCode.EarliestTime())
-        except Tf.ErrorException:  # Indices of another type: what writes the layer names them.
+        except Tf.ErrorException:  # Indices of a wrong type: the layer writer reports such primvars.
             continue
         values = np.zeros((0, 2)) if flat is None else np.asarray(flat, np.float64)
         if primvar.GetInterpolation() == UsdGeom.Tokens.faceVarying:
@@ -87,16 +87,16 @@ def _texture_coordinates(prim: Usd.Prim, mesh: PolygonMesh, kept: np.ndarray) ->
 
 
 def _kept_corners(prim: Usd.Prim, kept: Sequence[int] | np.ndarray) -> np.ndarray:
-    """Numbers of the kept faces' corners among all of the authored faces'."""
+    """Numbers of the kept faces' corners among all authored corners."""
     counts = np.asarray(first_value(UsdGeom.Mesh(prim).GetFaceVertexCountsAttr()), np.int64)
     starts = np.concatenate([[0], np.cumsum(counts)])
     return np.concatenate([np.arange(starts[face], starts[face + 1]) for face in kept]) if len(kept) else starts[:0]
 
 
 def _along_v(mesh: PolygonMesh, rest: np.ndarray, corners: np.ndarray) -> np.ndarray | None:
-    """Direction of v on each face, shape (F, 3), or None where the coordinates are no pattern.
+    """Direction of v on each face, shape (F, 3), or None if the coordinates are no pattern.
 
-    Over each face positions are fitted by p = u P_u + v P_v; the area weighs which faces keep their shape.
+    Over each face positions are fitted by p = u P_u + v P_v; shape-preserving faces are weighted by area.
     """
     starts, face = mesh.starts[: mesh.face_count], mesh.corner_face
 

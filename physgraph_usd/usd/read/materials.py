@@ -1,20 +1,20 @@
-"""A garment's fabric at a time, and the source of each value.
+"""Reads a garment's fabric at a time code, and the source of each value.
 
-After ``--set``, the garment, its ancestors and the ``physgraph:material:`` values of the bound materials come those of
-the deformable-body proposal for UsdPhysics (AOUSD PR #111, commit 63c74d79); the schema's fallbacks come last.
+After ``--set``, the garment, its ancestors and the ``physgraph:material:`` values of the bound materials come the
+values of the deformable-body proposal for UsdPhysics (AOUSD PR #111, commit 63c74d79); the schema's fallbacks are last.
 
-In the proposal a stiffness is the material's own (``physics:surfaceStretchStiffness`` and its relatives), or follows
+In the proposal a stiffness is authored on the material (``physics:surfaceStretchStiffness`` and similar), or derived
 from Young's modulus E, Poisson's ratio nu and the thickness h of the mesh:
 
     stretch = E h,   shear = E h / (2 (1 + nu)),   bend = E h^3 / (12 (1 - nu^2))
 
-The proposal writes stretch = E h / (1 - nu^2), of a strip whose width is held; ours is that of a free one.
+The proposal writes stretch = E h / (1 - nu^2), for a strip with fixed width; ours is for a free strip.
 
-It follows from them where the material authors E or nu, or has ``PhysicsSurfaceDeformableMaterialAPI``; missing ones
-are then the proposal's fallbacks: 1e6 Pa, 0.3, 1 mm, 1000 kg/m^3. -inf means that a value is not given, and so does a
-density of 0.
+Stiffnesses are derived if the material authors E or nu, or has ``PhysicsSurfaceDeformableMaterialAPI``; missing values
+are then the proposal's fallbacks: 1e6 Pa, 0.3, 1 mm, 1000 kg/m^3. -inf means a missing value, and so does a density of
+0.
 
-All are in stage units. With m = metersPerUnit and M = kilogramsPerUnit, their SI values are: stretch and shear
+All are in stage units. With m = metersPerUnit and M = kilogramsPerUnit, SI values are: stretch and shear
 M v [N/m], bending M m^2 v [N m], E M/m v [Pa], volumetric density M/m^3 v [kg/m^3], thickness m v [m].
 """
 
@@ -47,7 +47,7 @@ STIFFNESSES = {
     "shearStiffness": "physics:surfaceShearStiffness",
     "bendStiffness": "physics:surfaceBendStiffness",
 }
-"""Attributes of the proposal's material by the short names of ours."""
+"""Attributes of the proposal's material by our short names."""
 _WOVEN = ("weftStretchStiffness", "weftBendStiffness", "stretchLimit")
 _EASE = ("rest:warpEase", "rest:weftEase")
 _FRAME_VALUES = (
@@ -59,23 +59,23 @@ YOUNGS = "physics:youngsModulus"
 POISSONS = "physics:poissonsRatio"
 THICKNESSES = "physics:thicknesses"
 OLD_THICKNESS = "physics:surfaceThickness"
-"""On the material, before the thickness moved to the mesh."""
+"""Thickness on the material, before the proposal moved the thickness to the mesh."""
 ON_MATERIAL = (*STIFFNESSES.values(), DENSITY, YOUNGS, POISSONS, OLD_THICKNESS)
-"""Every attribute that is read from a material."""
+"""All attributes read from a material."""
 Thickness = tuple[Found, np.ndarray | None, tuple[Notice, ...]]
-"""The mean, the thickness at each point over the mean, shape (V,), where it differs, and what is odd about it."""
+"""The mean, the thickness at each point over the mean, shape (V,), or None if constant, and notices."""
 _API = "PhysicsSurfaceDeformableMaterialAPI"
 _YOUNGS_FALLBACK, _POISSONS_FALLBACK, _DENSITY_FALLBACK = 1e6, 0.3, 1000.0
 
 
 @dataclass(frozen=True, eq=False)
 class Values:
-    """Every value of a garment that may change from frame to frame.
+    """All values of a garment allowed to change from frame to frame.
 
     Attributes:
         found: Source of each value, by short name.
         volumetric: Whether the density is per volume, to be multiplied by the thickness.
-        thickness: Thickness at each point over the mean, shape (V,), where stiffnesses follow it; else None.
+        thickness: Thickness at each point over the mean, shape (V,), if stiffnesses depend on the thickness; else None.
         notices: Warnings about the values.
     """
 
@@ -91,11 +91,11 @@ class Values:
 
     @property
     def animated(self) -> frozenset[str]:
-        """Short names of the values whose source is animated."""
+        """Short names of the values with an animated source."""
         return frozenset(name for name, found in self.found.items() if found.animated)
 
     def fabric(self, time: float | None) -> Fabric:
-        """Fabric at a time code, SI; SchemaError when a value cannot be used."""
+        """Fabric at a time code, SI; SchemaError for an invalid value."""
         stretch, bend, thickness, density = (
             self.number(name, time) for name in ("stretchStiffness", "bendStiffness", "thickness", "density")
         )
@@ -112,9 +112,9 @@ class Values:
         )
 
     def thickness_scale(self, name: str) -> np.ndarray | float:
-        """Factor of a stiffness at each point where it follows the thickness there, shape (V,), else 1.
+        """Factor of a stiffness at each point, shape (V,), if derived from the thickness, else 1.
 
-        The painted multiplier of stretching is shear's too: it follows the thickness where both do.
+        The painted stretch multiplier also scales shear: the factor is used if both are derived from the thickness.
         """
         names = ("bendStiffness",) if name == "bendStiffness" else ("stretchStiffness", "shearStiffness")
         if self.thickness is None or not all(self.found[each].compute for each in names):
@@ -122,7 +122,7 @@ class Values:
         return self.thickness ** (3 if name == "bendStiffness" else 1)
 
     def number(self, name: str, time: float | None) -> float:
-        """Any other value at a time code, by short name."""
+        """A value at a time code, by short name; 0 if unset."""
         return float(self.found[name].at(time) or 0.0)
 
 
@@ -144,12 +144,12 @@ def find_values(prim: Usd.Prim, units: Units, overrides: Sequence[Override]) -> 
 
 
 def has_value(attribute: Usd.Attribute | None) -> bool:
-    """Whether an attribute gives a value: -inf is the proposal's word for none."""
+    """Whether an attribute gives a value: the proposal uses -inf for none."""
     return attribute is not None and read_number(attribute, None) != -math.inf
 
 
 def stiffness(materials: Sequence[Usd.Prim], row: Property, thickness: Found, *, units: Units) -> Found | None:
-    """A stiffness that a material authors, or that follows from its Young's modulus; None when there is neither."""
+    """A stiffness authored on a material, or derived from its Young's modulus; None without either."""
     scale = units.kilograms * (units.metres**2 if row.short == "bendStiffness" else 1.0)
     for material in materials:
         attribute = authored(material, STIFFNESSES[row.short])
@@ -161,7 +161,7 @@ def stiffness(materials: Sequence[Usd.Prim], row: Property, thickness: Found, *,
 
 
 def density(materials: Sequence[Usd.Prim], row: Property, units: Units) -> Found | None:
-    """Density per volume that a material gives [kg/m^3], or None."""
+    """Density per volume given by a material [kg/m^3], or None."""
     for material in materials:
         attribute = authored(material, DENSITY)
         if attribute is not None and has_value(attribute) and read_number(attribute, None) != 0:
@@ -172,7 +172,7 @@ def density(materials: Sequence[Usd.Prim], row: Property, units: Units) -> Found
 
 
 def read_thickness(prim: Usd.Prim, materials: Sequence[Usd.Prim], row: Property, *, units: Units) -> Thickness | None:
-    """Thickness on the mesh, or by its older name on the material; None when there is neither, SchemaError when bad."""
+    """Thickness on the mesh, or by its older name on the material; None without either, SchemaError for a bad value."""
     on_mesh = authored(prim, THICKNESSES)
     if on_mesh is not None and np.size(on_mesh.Get(Usd.TimeCode.EarliestTime())):
         return _on_mesh(prim, on_mesh, row, units=units)
@@ -186,7 +186,7 @@ def read_thickness(prim: Usd.Prim, materials: Sequence[Usd.Prim], row: Property,
 
 
 def is_elastic(material: Usd.Prim) -> bool:
-    """Whether stiffnesses that a material does not author follow from its Young's modulus, authored or not."""
+    """Whether unauthored stiffnesses of a material are derived from its Young's modulus, authored or not."""
     schemas = material.GetMetadata("apiSchemas")
     named = schemas.GetAddedOrExplicitItems() if isinstance(schemas, Sdf.TokenListOp) else []
     return _API in named or any(has_value(authored(material, name)) for name in (YOUNGS, POISSONS))

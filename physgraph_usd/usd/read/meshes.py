@@ -1,4 +1,4 @@
-"""Meshes of any stage as they are drawn: world positions, triangles and colours at a time; points of refined layers."""
+"""Reads meshes of any stage as drawn: world positions, triangles and colours; and points of refined layers."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from .placement import place
 from .reader import Shot
 
 NEUTRAL = (0.55, 0.54, 0.52)
-"""Linear colour of a mesh without one."""
+"""Linear colour of a mesh without colour."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +56,7 @@ class DrawnMesh:
         return self.face_colors[self._split.face]
 
     def subdivided(self, faces: int) -> DrawnMesh:
-        """Smooth subdivision into at least so many polygons; vertices at one place are one."""
+        """Smooth subdivision into at least ``faces`` polygons; coincident vertices are merged."""
         places, label = np.unique(self.points, axis=0, return_inverse=True)
         mesh = PolygonMesh(self.mesh.counts, label.reshape(-1)[self.mesh.indices], len(places))
         found = replace(self, points=places, mesh=mesh)
@@ -71,13 +71,13 @@ class DrawnStage:
     """A shot, alone or under a layer, composed in an anonymous root.
 
     Args:
-        shot: The shot's file, which gives units, axis and rates.
+        shot: The shot's file, the source of units, axis and rates.
         over: A layer put over the shot, or None.
-        turn: Rotation of the world in which it is drawn, shape (3, 3); None turns what gravity of the shot, or of the
-            layer, pulls down.
+        turn: Rotation of the world for drawing, shape (3, 3); None turns gravity of the shot, or of the layer,
+            downwards.
 
     Raises:
-        StageError: When a file cannot be opened, or its rate is none.
+        StageError: When a file cannot be opened, or its rate is invalid.
     """
 
     def __init__(self, shot: Path, over: Path | None = None, *, turn: np.ndarray | None = None) -> None:
@@ -100,7 +100,7 @@ class DrawnStage:
     def times(self, paths: tuple[str, ...]) -> tuple[float, ...]:
         """Time codes at which prims, or all meshes when none are named, have points, transforms or skeletons.
 
-        Under a refined layer only those from its first sample to its last: outside it holds still.
+        Under a refined layer, only time codes from its first to its last sample: outside, the layer holds still.
         """
         found: list[float] = []
         for prim in traverse(self.stage):
@@ -131,7 +131,7 @@ class DrawnStage:
         return tuple(str(prim.GetPath()) for prim in applied if UsdGeom.Mesh(prim))
 
     def meshes(self, time: float | None) -> list[DrawnMesh]:
-        """Every visible mesh of purpose default or render at a time code, in stage order, but those without faces."""
+        """All visible meshes of purpose default or render at a time code, in stage order, if not empty."""
         code = timecode(time)
         transforms = UsdGeom.XformCache(code)
         drawn = []
@@ -150,35 +150,35 @@ class DrawnStage:
 
 
 def upright(up: np.ndarray) -> np.ndarray:
-    """Smallest rotation that turns a unit vector, shape (3,), into Y, shape (3, 3)."""
+    """Smallest rotation from a unit vector, shape (3,), to Y, shape (3, 3)."""
     x, y, z = up
-    if y <= -1.0 + 1e-9:  # Many turn it over; this one goes about Z.
+    if y <= -1.0 + 1e-9:  # The rotation by 180 degrees is not unique; choose the axis Z.
         return np.diag([-1.0, -1.0, 1.0])
     cross = np.array([[0.0, x, 0.0], [-x, 0.0, -z], [0.0, z, 0.0]])
     return np.eye(3) - cross + cross @ cross / (1.0 + y)
 
 
 def _gravity_of(layer: Sdf.Layer) -> str | None:
-    """The axis that a refined layer was asked to take for gravity's; None where there is none."""
+    """The gravity axis in a refined layer's recorded options; None if not set."""
     options = (read_record(layer) or {}).get("options")
     asked = options.get("gravity") if isinstance(options, dict) else None
     return asked if asked in AXES else None
 
 
 def shot_of(layer: Path) -> Path | None:
-    """The shot that a refined layer was made from; None when a layer does not name one."""
+    """The shot recorded in a refined layer; None if not recorded."""
     shot = recorded_shot(open_layer(layer, StageError))
     return Path(shot) if shot else None
 
 
 def refined_in(layer: Path) -> tuple[str, ...]:
-    """Return the paths whose points a layer authors itself."""
+    """Paths of the prims with points authored in a layer."""
     paths = paths_in(open_layer(layer, StageError))
     return tuple(sorted(str(path.GetPrimPath()) for path in paths if path.IsPropertyPath() and path.name == "points"))
 
 
 def _read(mesh: UsdGeom.Mesh, code: Usd.TimeCode, matrix: np.ndarray) -> DrawnMesh | None:
-    """One mesh in local space and units, or None when it cannot be drawn."""
+    """One mesh in local space and units, or None if not drawable."""
     points, counts, indices = (
         attribute.Get(code)
         for attribute in (mesh.GetPointsAttr(), mesh.GetFaceVertexCountsAttr(), mesh.GetFaceVertexIndicesAttr())
@@ -193,7 +193,7 @@ def _read(mesh: UsdGeom.Mesh, code: Usd.TimeCode, matrix: np.ndarray) -> DrawnMe
     if not usable or not np.isfinite(positions).all():
         return None
     left = mesh.GetOrientationAttr().Get(code) == "leftHanded"
-    # By the signs of stretches: a scale's cube can overflow.
+    # Use the determinant's sign only: the cube of a scale can overflow.
     if left != (np.linalg.slogdet(matrix[:3, :3])[0] < 0):
         ends = np.cumsum(counts)
         indices = indices[np.repeat(2 * ends - counts - 1, counts) - np.arange(len(indices))]
@@ -220,7 +220,7 @@ def _colors(mesh: UsdGeom.Mesh, code: Usd.TimeCode, faces: int) -> np.ndarray:
 
 
 def _material_color(prim: Usd.Prim) -> np.ndarray | None:
-    """Diffuse colour of the preview surface bound to a prim, or None when it has none or a texture."""
+    """Diffuse colour of the preview surface bound to a prim, or None without colour or with a texture."""
     material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
     if not material:
         return None
@@ -240,7 +240,7 @@ class RefinedLayer:
     """
 
     def __init__(self, path: Path) -> None:
-        """Open the layer; LayerError when it is no refined one."""
+        """Open the layer; LayerError for a layer without record."""
         layer = Sdf.Layer.FindOrOpen(str(path))
         record = None if layer is None else read_record(layer)
         if layer is None or record is None:
@@ -249,12 +249,12 @@ class RefinedLayer:
         self.targets = tuple(str(each) for each in record.get("garments", ()))
 
     def target(self, shot: Shot, index: int) -> str | None:
-        """Path of a garment's fine mesh by number; None in a layer without a sample of it."""
+        """Path of a garment's fine mesh by number; None if the layer does not contain the garment."""
         coarse = str(shot.sources[index].path)
         return next((each for each in self.targets if each in (coarse, f"{coarse}_refined")), None)
 
     def points(self, shot: Shot, index: int, time: float | None) -> np.ndarray | None:
-        """World positions [m] of a garment's fine mesh by number, shape (V, 3), or None where it has no sample."""
+        """World positions [m] of a garment's fine mesh by number, shape (V, 3), or None without a sample."""
         target = self.target(shot, index)
         if target is None:
             return None

@@ -1,4 +1,4 @@
-"""The placement of a prim in the world, in metres."""
+"""Computes the placement of a prim in the world, in metres."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ..stage import Notice, timecode
 
 _SINGULAR = 1e-9
 _EXTREME = 1e30
-"""A scale beyond which, or under one over which, no volume is a number."""
+"""Largest scale, and inverse of the smallest, for finite volumes."""
 _REMEDY = "give the prim and its ancestors a scale other than zero there, or leave that time out with --frames"
 
 
@@ -25,16 +25,16 @@ def to_metres(prim: Usd.Prim, metres: float, time: float | None) -> np.ndarray:
         time: Time code, or None for the default.
 
     Raises:
-        GarmentError: When it cannot be inverted.
+        GarmentError: When the matrix is not invertible.
     """
     return check_matrix(prim, UsdGeom.XformCache(timecode(time)).GetLocalToWorldTransform(prim), metres, time=time)
 
 
 def check_matrix(prim: Usd.Prim, rows: Gf.Matrix4d, metres: float, *, time: float | None) -> np.ndarray:
-    """Turn USD's row-vector matrix into a column-vector matrix to metres.
+    """Convert USD's row-vector matrix to a column-vector matrix to metres.
 
     Raises:
-        GarmentError: When it is singular, not finite, projective or of a scale that is no length.
+        GarmentError: When the matrix is singular, not finite, projective or of extreme scale.
     """
     matrix = np.array(rows, dtype=np.float64).T.copy()
     path = str(prim.GetPath())
@@ -54,7 +54,7 @@ def check_matrix(prim: Usd.Prim, rows: Gf.Matrix4d, metres: float, *, time: floa
 
 
 def flattened(matrix: np.ndarray) -> str:
-    """By how much a matrix for column vectors, shape (4, 4), scales if it has no inverse, in words; else ""."""
+    """The scales of a matrix for column vectors, shape (4, 4), in words if the matrix is singular; else ""."""
     if not np.isfinite(matrix).all():
         return ""
     stretches = np.linalg.svd(matrix[:3, :3], compute_uv=False)
@@ -65,20 +65,20 @@ def flattened(matrix: np.ndarray) -> str:
 
 
 def place(points: np.ndarray, matrix: np.ndarray) -> np.ndarray:
-    """Apply a (4, 4) column-vector matrix to points, shape (V, 3); those that are not finite stay so."""
+    """Apply a (4, 4) column-vector matrix to points, shape (V, 3); non-finite points stay non-finite."""
     with np.errstate(invalid="ignore", over="ignore"):
         return points @ matrix[:3, :3].T + matrix[:3, 3]
 
 
 def is_flipped(prim: Usd.Prim, matrix: np.ndarray) -> bool:
-    """Whether the authored winding is clockwise seen from outside, in the world."""
+    """Whether the authored winding is clockwise seen from outside, in world space."""
     left_handed = UsdGeom.Mesh(prim).GetOrientationAttr().Get(Usd.TimeCode.EarliestTime()) == UsdGeom.Tokens.leftHanded
     linear = matrix[:3, :3] / max(float(np.abs(matrix[:3, :3]).max()), np.finfo(float).tiny)
     return left_handed != bool(np.linalg.det(linear) < 0)
 
 
 def check_placement(prim: Usd.Prim, metres: float, times: Sequence[float]) -> tuple[Notice, ...]:
-    """A notice where mirroring switches on or off; GarmentError where a prim cannot be placed."""
+    """A notice of a switch in mirroring; GarmentError for an invalid transform."""
     mirrored = [bool(np.linalg.det(to_metres(prim, metres, time)[:3, :3]) < 0) for time in times]
     switches = [time for time, now, then in zip(times[1:], mirrored[1:], mirrored, strict=False) if now != then]
     message = "its transform starts or stops mirroring here; the winding of its first time code is used throughout"

@@ -1,11 +1,11 @@
-"""A shot, opened for reading: its scene, its frames, and the places of its garments on the stage.
+"""A shot, opened for reading: scene, frames, and the places of the garments on the stage.
 
     with contextlib.closing(open_shot("shot.usda")) as shot:
         for time in shot.scene.times:
             frame = shot.frame(time)
 
-Everything handed out is in metres and world space with the stage's own axes. A shot without samples has no times; its
-one frame is ``shot.frame(None)``.
+All results are in metres and world space with the stage's own axes. A shot without samples has no times; its only frame
+is ``shot.frame(None)``.
 """
 
 from __future__ import annotations
@@ -66,17 +66,17 @@ from .timing import timing_notices
 
 
 class Shot:
-    """An opened stage, ready to be asked for frames.
+    """An opened stage, ready to read frames.
 
     Attributes:
         stage: The composed stage, with skinning baked in an anonymous session layer; never edited on disk.
-        path: The shot file, or the name of a stage that has none.
-        view: The stage's view before anything was baked into it or muted on it.
-        unsaved: Names of its layers whose content is in no file.
-        scene: Everything that stays the same over the shot.
+        path: The shot file, or the name of an in-memory stage.
+        view: The stage's view before baking and muting.
+        unsaved: Names of the stage's layers with unsaved content.
+        scene: Constant data of the shot.
         sources: Place of each garment on the stage, in the scene's order.
         colliders: Paths of the collider prims found.
-        selections: Variant selections in force on what the garments depend on, as paths `/World/coat{fit=loose}`.
+        selections: Active variant selections the garments depend on, as paths `/World/coat{fit=loose}`.
         warnings: Warnings for the user; grows as frames are read.
         metres_per_unit: Length of one stage unit [m].
         gravity_source: Source of gravity's direction, in words.
@@ -92,7 +92,7 @@ class Shot:
         readers: Sequence[GarmentReader],
         bodies: Sequence[ColliderReader],
     ) -> None:
-        """Put together the parts that ``open_shot`` read."""
+        """Combine the parts read by ``open_shot``."""
         self.path, self.stage, self.view = path, stage, view
         self.colliders: tuple[str, ...] = ()
         self.selections: tuple[str, ...] = ()
@@ -116,26 +116,26 @@ class Shot:
             time: Time code, or None for the default.
 
         Raises:
-            GarmentError: When it cannot be inverted.
+            GarmentError: When the matrix is not invertible.
         """
         return to_metres(self.stage.GetPrimAtPath(self.sources[index].path), self.metres_per_unit, time)
 
     def local(self, index: int, time: float | None) -> np.ndarray:
-        """A garment's coarse points in its own space and units at a time code, by number, shape (V, 3), float64.
+        """A garment's coarse points in local space and units at a time code, by number, shape (V, 3), float64.
 
         Raises:
-            GarmentError: They are broken.
+            GarmentError: The points are broken.
         """
         reader = self._readers[index]
         return reader.weld.joined(reader.points.read(time, reader.edges)[0])
 
     def times_until(self, last: float) -> list[float]:
-        """Time codes at which any garment has a sample, outside the range of frames too, up to a last one, in order."""
+        """Time codes with a sample of any garment, including outside the frame range, up to ``last``, in order."""
         return [time for time in self.every_time if time < last] + [last]
 
     @property
     def every_time(self) -> tuple[float, ...]:
-        """Time codes at which any garment has a sample, outside the range of frames too."""
+        """Time codes with a sample of any garment, including outside the frame range."""
         return merge(time for source in self.sources for time in (*source.times, *source.left_out))
 
     def frame(self, time: float | None) -> Frame:
@@ -143,8 +143,8 @@ class Shot:
 
         Raises:
             GarmentError: When a garment is broken or out of bounds at this time.
-            SchemaError: When an animated value cannot be used.
-            StageError: When USD cannot read the files any more.
+            SchemaError: When an animated value is invalid.
+            StageError: When USD can no longer read the files.
         """
         leave_if_asked()
         garments, notices = [], []
@@ -167,10 +167,10 @@ class Shot:
         return frame
 
     def with_values(self, overrides: Sequence[str]) -> Shot:
-        """A copy of the shot whose frames have other ``--set`` values; values that only opening reads stay.
+        """A copy of the shot with other ``--set`` values in its frames; values read only on opening are kept.
 
         Raises:
-            UsageError: When one cannot be read, or is for no garment.
+            UsageError: When a text is invalid, or has no matching garment.
         """
         asked = parse_overrides(overrides)
         check_overrides(asked, [source.path for source in self.sources], [Sdf.Path(path) for path in self.colliders])
@@ -188,7 +188,7 @@ class Shot:
         return other
 
     def close(self) -> None:
-        """Let go of the stage; nothing can be read afterwards."""
+        """Release the stage; nothing can be read afterwards."""
         self._readers, self._bodies = (), ()
         del self.stage, self.view, self._request
 
@@ -208,27 +208,27 @@ def open_shot(
     """Open a shot for refining.
 
     Args:
-        shot: The shot file, any that USD opens; or an open stage, read as it stands and not changed.
-        garments: Prim paths, prim names, globs over paths or collections (``/Prim.collection:name``); empty: the
-            meshes with PhysGraphGarmentAPI.
-        colliders: The same for colliders; empty: what the garments name, else every prim with PhysGraphColliderAPI
-            or UsdPhysics' CollisionAPI.
-        frames: First and last time code in composed stage time; None: every authored one.
+        shot: The shot file, in any format known to USD; or an open stage, read in its current state and not changed.
+        garments: Prim paths, prim names, globs over paths or collections (``/Prim.collection:name``); empty: the meshes
+            with PhysGraphGarmentAPI.
+        colliders: Likewise for colliders; empty: the colliders named by the garments, else every prim with
+            PhysGraphColliderAPI or UsdPhysics' CollisionAPI.
+        frames: First and last time code in composed stage time; None: every authored time code.
         level: Number of subdivisions, -1 for auto; None: each garment's own.
-        overrides: ``</prim>.attribute=value`` texts; without a prim they are for every garment.
-        rest_frame: Time code whose points are the rest shape of every garment, or "auto" for a shape fitted to all of
-            the shot; both go before authored rest shapes. Without one a shape is fitted where none is authored.
-        gravity: Axis of the stage along which gravity pulls, one of `AXES`; None: as the stage says.
-        skip_invisible: Leave out garments that are invisible at all their time codes.
+        overrides: ``</prim>.attribute=value`` texts; without a prim, for every garment.
+        rest_frame: Time code whose points are the rest shape of every garment, or "auto" for a shape fitted to the
+            whole shot; both override authored rest shapes. None: the authored shape, or else a fitted shape.
+        gravity: Axis of the stage along which gravity pulls, one of `AXES`; None: the stage's gravity.
+        skip_invisible: Leave out garments invisible at all their time codes.
 
     Returns:
-        The shot; its ``warnings`` name everything that was assumed, left out or repaired.
+        The shot; its ``warnings`` name everything assumed, left out or repaired.
 
     Raises:
-        UsageError: When an option cannot be used.
+        UsageError: When an option is invalid.
         StageError: When the stage cannot be read, or has no such garment or collider.
         GarmentError: When a garment is broken.
-        SchemaError: When an attribute cannot be used.
+        SchemaError: When an attribute is invalid.
     """
     asked = parse_overrides(overrides)
     _check_options(frames, level, rest_frame)
@@ -272,7 +272,7 @@ def open_shot(
 
 
 def _check_options(frames: tuple[float, float] | None, level: int | None, rest_frame: float | str | None) -> None:
-    """Refuse options that no stage could satisfy."""
+    """Refuse options invalid for every stage."""
     if frames is not None and not (all(map(math.isfinite, frames)) and frames[0] <= frames[1]):
         raise UsageError(f"frames {frames[0]:g}:{frames[1]:g} are no range; give FIRST:LAST")
     if level is not None:
@@ -285,7 +285,7 @@ def _check_options(frames: tuple[float, float] | None, level: int | None, rest_f
 
 
 def _find(stage: Usd.Stage, garments: Sequence[str], notices: Sequence[Notice]) -> list[Usd.Prim]:
-    """Find the garments; an error also names the files that are missing from the stage."""
+    """Find the garments; an error also lists the stage's missing files."""
     try:
         return find_garments(stage, garments)
     except StageError as error:
@@ -304,7 +304,7 @@ def _link(
     request: Request,
     notices: list[Notice],
 ) -> tuple[list[GarmentReader], list[ColliderReader]]:
-    """Garments with their seams and the numbers of the colliders that they feel, and these colliders."""
+    """Garments with their seams and the numbers of their colliders, and the colliders."""
     readers = _sewn(stage, readers, request, notices)
     prims = [stage.GetPrimAtPath(reader.source.path) for reader in readers]
     cloth = {prim.GetPath() for prim in prims}
@@ -335,7 +335,7 @@ def _link(
 def _sewn(
     stage: Usd.Stage, readers: Sequence[GarmentReader], request: Request, notices: list[Notice]
 ) -> list[GarmentReader]:
-    """Garments with their seams; adds notices of borders that run side by side and are not sewn."""
+    """Garments with their seams; adds notices of adjacent borders not sewn."""
     prims = [stage.GetPrimAtPath(reader.source.path) for reader in readers]
     every = _every_time(readers)
 
@@ -354,20 +354,20 @@ def _sewn(
 
 
 def _every_time(readers: Sequence[GarmentReader]) -> tuple[float, ...]:
-    """Time codes at which any garment has a sample, outside the range of frames too."""
+    """Time codes with a sample of any garment, including outside the frame range."""
     return merge(time for reader in readers for time in (*reader.source.times, *reader.source.left_out))
 
 
 def _with_sides(
     stage: Usd.Stage, readers: Sequence[GarmentReader], bodies: Sequence[ColliderReader]
 ) -> list[ColliderReader]:
-    """Colliders, with sides chosen for open meshes on "auto" by where the cloth is in the first frame of the shot."""
+    """Colliders, with sides chosen for open meshes on "auto" from the cloth's position in the shot's first frame."""
     asked = [body for body in bodies if (body.collider.kind, body.collider.side) == ("mesh", "auto")]
     time, cages = _first_cages(stage, readers, asked[0].metres) if asked else (None, [])
     found = [*bodies]
     for number, body in enumerate(bodies):
         if body in asked:
-            front = body.on_side("front")  # Its faces are wound as they look in the world.
+            front = body.on_side("front")  # On side "front", faces are wound as seen in world space.
             pose, _ = front.pose(time)
             felt = [cage for reader, cage in zip(readers, cages, strict=True) if number in reader.garment.colliders]
             side = choose_side(pose.points, pose.triangles, felt) if isinstance(pose, MeshPose) else "auto"
@@ -378,7 +378,7 @@ def _with_sides(
 def _first_cages(
     stage: Usd.Stage, readers: Sequence[GarmentReader], metres: float
 ) -> tuple[float | None, list[np.ndarray]]:
-    """The first time code of the shot at which all cages can be read, and these [m]; none where there is none."""
+    """The first time code with all cages readable, and the cages [m]; None and empty cages if there is none."""
     for time in _every_time(readers) or (None,):
         try:
             prims = [stage.GetPrimAtPath(reader.source.path) for reader in readers]
@@ -392,7 +392,7 @@ def _first_cages(
 def _timing(
     stage: Usd.Stage, readers: Sequence[GarmentReader], bodies: Sequence[ColliderReader], *, bake: Bake
 ) -> list[Notice]:
-    """Notices of samples of garments, and of the bodies that they feel, which do not fit in time."""
+    """Notices of samples of garments and their bodies with mismatched timing."""
     garments = [(stage.GetPrimAtPath(reader.source.path), reader.source) for reader in readers]
     felt_by = [
         [number for number, reader in enumerate(readers) if index in reader.garment.colliders]
@@ -410,11 +410,11 @@ def _read(
     notices: list[Notice],
     skip_invisible: bool,
 ) -> list[GarmentReader]:
-    """Bake the skinning of garments and bodies and read every garment that is not left out."""
+    """Bake the skinning of garments and bodies and read every enabled garment."""
     on = [prim for prim in prims if is_on(prim, GARMENT["enabled"], request.overrides)]
     notices += [_left_out(prim, "is disabled") for prim in prims if prim not in on]
     roots: dict[Sdf.Path, tuple[Sdf.Path, ...]] = {prim.GetPath(): instance_roots(prim) for prim in on}
-    # A level, and what is known of a shot beforehand, are the same whatever part of it is refined.
+    # Bake the whole shot: the chosen level and the plan must not depend on the frame range.
     notices += request.bake.add([*roots], None, bodies=bodies)
     readers, every = [], []
     for path, instances in roots.items():

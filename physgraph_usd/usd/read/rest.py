@@ -1,9 +1,9 @@
-"""A garment's rest shape in metres, and its source.
+"""Reads or fits a garment's rest shape in metres, and its source.
 
-The first of these: the points at the time code of ``--rest``, ``physics:restShapePoints``, ``primvars:rest``,
-``primvars:Pref``, the points' default value, a shape fitted to the median length that each edge has over the shot.
-``--rest auto`` asks for the fitted shape whatever is authored. Authored shapes are placed in the world as the garment
-at its first time code, or by a skinned garment's bind transform.
+The first available of: the points at the time code of ``--rest``, ``physics:restShapePoints``, ``primvars:rest``,
+``primvars:Pref``, the points' default value, a shape fitted to the median length of each edge over the shot.
+``--rest auto`` requests the fitted shape even if a shape is authored. Authored shapes are placed in the world like the
+garment at its first time code, or by a skinned garment's bind transform.
 """
 
 from __future__ import annotations
@@ -27,24 +27,24 @@ from ..stage import Notice, first_value
 from .cage import as_points, repair
 
 AUTO = "auto"
-"""Asks for the fitted rest shape where another one is authored, in place of a time code."""
+"""Value of ``--rest`` to request the fitted rest shape even if a shape is authored."""
 FITTED = "fitted to the shot"
 """First words of the source of a fitted rest shape."""
 MOST_FITTED = 50
-"""Most time codes that a rest shape is fitted to, spread over the shot. Medians of 25 time codes are within 0.2 to 1.3%
-of those of all 24 to 60 on five real shots, those of 9 within 0.6 to 4.3%."""
+"""Most time codes used to fit a rest shape, spread over the shot. On five real shots, medians of 25 time codes are
+within 0.2 to 1.3% of the medians of all 24 to 60, medians of 9 within 0.6 to 4.3%."""
 STEPS = 100
-"""Steps of a fit. On five real shots lengths then are within 0.1 to 0.6% of their medians (root mean square), as after
+"""Steps of a fit. On five real shots lengths are then within 0.1 to 0.6% of their medians (root mean square), as after
 400 to 1,500 steps without momentum."""
 HOLD = 1e-6
-"""Stiffness that ties a fitted shape to its place, in mean stiffnesses: enough for a factor, nothing to a length."""
+"""Stiffness holding a fitted shape in place, in mean stiffnesses: makes the matrix regular, keeps lengths."""
 SHORTEST = 1e-3
-"""In mean edges; shorter ones pull no harder."""
+"""Length, in mean edges, below which edges pull no harder."""
 _AUTHORED = ("physics:restShapePoints", "primvars:rest", "primvars:Pref")
 _BENT = ("restShape", "restShapeDefault")
 _PER_CORNER = UsdGeom.Tokens.faceVarying
 _SAME_PLACE = 1e-6
-"""Part of a rest shape's size by which corners of a point may differ: what single precision leaves of it."""
+"""Tolerance for equal corners of a point, relative to the rest shape's size: the rounding of single precision."""
 _TINY = 1e-9
 _MOST_SCALED = 2.0
 
@@ -55,8 +55,8 @@ class Rest:
 
     Attributes:
         points: Rest positions [m], shape (V, 3), float64.
-        source: Their source in words, for the report.
-        notices: Warnings about them.
+        source: Source in words, for the report.
+        notices: Warnings about the rest shape.
     """
 
     points: np.ndarray
@@ -69,8 +69,8 @@ class Animation:
     """A garment's points over the shot.
 
     Attributes:
-        times: Every authored time code, whatever part of the shot is refined.
-        first: Positions at the first time code that is refined, or at the default [m], shape (V, 3).
+        times: All authored time codes, independent of the frame range.
+        first: Positions at the first refined time code, or at the default [m], shape (V, 3).
         read: Positions at a time code, or at the default [m], shape (V, 3), and notices of repairs.
     """
 
@@ -79,9 +79,9 @@ class Animation:
     read: Callable[[float | None], tuple[np.ndarray, tuple[Notice, ...]]]
 
     def poses(self, most: int = MOST_FITTED) -> dict[float | None, np.ndarray]:
-        """Positions at time codes spread over the shot, by time code, without frames that cannot be read.
+        """Positions at up to ``most`` readable time codes spread over the shot, by time code.
 
-        At most so many; of a shot whose frames are all broken, the first pose that is refined.
+        Frames with broken points are skipped; for a shot without readable frames the result is empty.
         """
         poses = dict[float | None, np.ndarray]()
         picks = np.linspace(0, len(self.times) - 1, min(most, len(self.times))).round().astype(int)
@@ -105,13 +105,13 @@ def read_rest(
     Args:
         prim: Mesh prim.
         weld: Faces of the cage, as authored and welded.
-        asked: Time code whose points are the rest shape, `AUTO`, or None.
+        asked: Time code of the rest shape's points, `AUTO`, or None.
         animation: Points over the shot.
         place: From local rest points to metres, (V, 3) to (V, 3).
-        baked: Layer of baked skinning, whose points are no rest shape.
+        baked: Layer of baked skinning; its points are not used as rest shape.
 
     Raises:
-        GarmentError: When an authored rest shape does not fit the mesh, or the rest shape cannot be used.
+        GarmentError: When an authored rest shape does not fit the mesh, or the rest shape is invalid.
     """
     edges, first, odd = weld.apart.half_edges.edges, animation.first, list[Notice]()
     if asked == AUTO:
@@ -158,13 +158,12 @@ def _fitted(weld: Weld, animation: Animation, *, by: str = "") -> Rest:
 
 
 def _checked(prim: Usd.Prim, edges: np.ndarray, rest: Rest, *, first: np.ndarray) -> Rest:
-    """A rest shape with notices of edges without length, and of a size that differs from the animation's.
+    """A rest shape with notices of edges without length, and of a size different from the animation's.
 
-    Points at one place are sewn together where the animation has them at one place, too; the faces between them are no
-    cloth.
+    Coincident rest points are sewn together if also coincident in the animation; the faces in between are no cloth.
 
     Raises:
-        GarmentError: When all of its points are at one place, or one is out of bounds.
+        GarmentError: When all points coincide, or a point is out of bounds.
     """
     path = str(prim.GetPath())
     if message := out_of_bounds(rest.points):
@@ -194,7 +193,7 @@ def _checked(prim: Usd.Prim, edges: np.ndarray, rest: Rest, *, first: np.ndarray
 
 
 def rests_bent(prim: Usd.Prim) -> tuple[bool, list[Notice]]:
-    """Whether hinges rest at the rest shape's angles (``physics:restBendAnglesDefault``); a notice of an older word."""
+    """Whether hinges rest at the rest shape's angles (``physics:restBendAnglesDefault``); a notice of an old token."""
     attribute = nearest(prim, "physics:restBendAnglesDefault")
     if attribute is None:
         return False, []
@@ -205,7 +204,7 @@ def rests_bent(prim: Usd.Prim) -> tuple[bool, list[Notice]]:
 
 
 def _authored(prim: Usd.Prim, count: int, notices: list[Notice]) -> tuple[np.ndarray, str] | None:
-    """Local rest points of an attribute other than ``points``; adds to the notices."""
+    """Local rest points of an attribute besides ``points``; adds to the notices."""
     for name in _AUTHORED:
         attribute = prim.GetAttribute(name)
         if not attribute or not attribute.HasAuthoredValue():
@@ -234,14 +233,14 @@ def _authored(prim: Usd.Prim, count: int, notices: list[Notice]) -> tuple[np.nda
 
 
 def _of_corners(attribute: Usd.Attribute, values: np.ndarray, count: int) -> tuple[np.ndarray | None, Notice]:
-    """Rest points of values per corner, shape (C, 3); None where corners of a point differ. And a notice."""
+    """Rest points from values per corner, shape (C, 3), or None if corners of a point differ; and a notice."""
     prim = attribute.GetPrim()
     corners = np.asarray(first_value(UsdGeom.Mesh(prim).GetFaceVertexIndicesAttr()))
     path, name = str(prim.GetPath()), attribute.GetName()
     if len(corners) != len(values):
         message = f"{name} has {len(values)} values, one per corner, for {len(corners)} corners; it is not the rest"
         return None, Notice(path, None, f"{message} shape; author one value per point (vertex interpolation)")
-    points = np.tile(values.mean(axis=0), (count, 1))  # Of points in no face, which are no cloth.
+    points = np.tile(values.mean(axis=0), (count, 1))  # Default for points in no face, which are no cloth.
     points[corners] = values
     size = np.ptp(values, axis=0).max(initial=0.0)
     apart = np.flatnonzero(~(np.abs(points[corners] - values).max(axis=1) <= _SAME_PLACE * size))
@@ -261,8 +260,9 @@ def _default_points(prim: Usd.Prim, baked: Sdf.Layer) -> np.ndarray | None:
 
 
 def _braced(mesh: PolygonMesh) -> np.ndarray:
-    """Pairs of vertices, shape (E, 2), whose distances make a mesh's metric: its edges, and of faces with more than
-    three corners each corner with the next but one."""
+    """Pairs of vertices, shape (E, 2), whose distances make a mesh's metric: the edges, and in faces with more than
+    three corners each corner with the next but one.
+    """
     corner, after = np.arange(len(mesh.indices)), mesh.next_corner[mesh.next_corner]
     diagonal = mesh.next_corner[after] != corner
     pairs = np.stack([mesh.indices[corner], mesh.indices[after]], axis=1)[diagonal]
@@ -270,23 +270,23 @@ def _braced(mesh: PolygonMesh) -> np.ndarray:
 
 
 def median_shape(edges: np.ndarray, poses: Sequence[np.ndarray]) -> tuple[np.ndarray, int]:
-    """Fit a shape to the median length of each edge: sum of (l - m)^2 / m over the edges, least by majorization.
+    """Fit a shape to the median length of each edge: minimise the sum of (l - m)^2 / m over the edges by majorization.
 
-    A single pose has its own stretch; medians belong to none, yet cloth comes near them nearly everywhere. Poses that
-    have collapsed are left out, for garments are hidden by scaling them to nothing.
-    The method is SMACOF (de Leeuw 1977): each step solves a Laplace equation with the edges' present directions, with
-    the momentum of Nesterov (1983), which starts anew where the sum grows (O'Donoghue and Candes 2015).
+    A single pose has its own stretch; median lengths may fit no exact shape, yet cloth comes near them almost
+    everywhere. Collapsed poses are left out, because garments are hidden by scaling to nothing. The method is SMACOF
+    (de Leeuw 1977): each step solves a Laplace equation with the current edge directions, with the momentum of Nesterov
+    (1983), restarted whenever the sum grows (O'Donoghue and Candes 2015).
 
     Args:
         edges: End vertices, shape (E, 2).
         poses: Positions of the same vertices, each of shape (V, 3), at least one.
 
     Returns:
-        The shape, (V, 3), and which pose was nearest to the medians; the fit starts there.
+        The shape, (V, 3), and the index of the pose nearest to the medians; the fit starts from this pose.
     """
     lengths = np.array([np.linalg.norm(np.subtract(*pose[edges.T]), axis=1) for pose in poses])
     total = lengths.sum(axis=1)
-    whole = total > COLLAPSED * np.sort(total)[-2:][0]  # One of them may be blown up.
+    whole = total > COLLAPSED * np.sort(total)[-2:][0]  # The largest pose may be blown up.
     median = np.median(lengths[whole] if whole.any() else lengths, axis=0)
     nearest = int(np.abs(lengths - median).sum(axis=1).argmin())
     shape = np.array(poses[nearest], np.float64)

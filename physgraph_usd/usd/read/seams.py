@@ -1,4 +1,4 @@
-"""Seams of a shot that welding does not close, and borders that run side by side and are not sewn."""
+"""Finds seams of a shot not closed by welding, and adjacent borders not sewn."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from ...solver.scene import Garment
 from ..stage import Notice
 
 POSES = 10
-"""Number of frames, spread over the shot. Sewn points are together in all of them."""
+"""Number of frames, spread over the shot, in which sewn points must coincide."""
 BESIDE = 0.1
-"""Distance between two borders under which they run side by side, in border edges."""
+"""Distance below which two borders count as adjacent, in border edges."""
 LONG = 4
-"""Fewest border edges side by side that are worth a warning."""
+"""Fewest adjacent border edges for a warning."""
 Cages = Sequence[np.ndarray | None]
 """World positions of each garment [m] in one frame; None for an absent garment."""
 
@@ -26,15 +26,15 @@ Cages = Sequence[np.ndarray | None]
 def sewn_garments(
     garments: Sequence[Garment], tolerances: Sequence[float], poses: Callable[[int], Iterator[Cages]]
 ) -> tuple[list[Garment], list[Notice]]:
-    """Garments with the places at which their vertices are sewn, and notices of borders side by side.
+    """Garments with the positions of their sewn vertices, and notices of adjacent unsewn borders.
 
-    Vertices of any garments are sewn if they are together in every pose, those of one garment only if they are in its
-    rest shape, too.
+    Vertices of different garments are sewn if coincident in every pose; vertices of the same garment must also coincide
+    in the rest shape.
 
     Args:
         garments: The garments, welded.
-        tolerances: Seam tolerance of each garment [m], as `seam_reach` takes it.
-        poses: Cages in at most so many frames of the shot.
+        tolerances: Seam tolerance of each garment [m], as in `seam_reach`.
+        poses: Cages in at most the given number of frames.
     """
     first = next(poses(1), None)
     if first is None:
@@ -57,7 +57,7 @@ def sewn_garments(
 
 
 class _Cloth:
-    """All garments of a shot side by side; vertices are numbered through."""
+    """All garments of a shot combined; vertices are numbered consecutively."""
 
     def __init__(self, garments: Sequence[Garment], reaches: Sequence[float]) -> None:
         self._garments = garments
@@ -71,7 +71,7 @@ class _Cloth:
         self._used = np.concatenate(used)
 
     def together(self, cages: Cages) -> np.ndarray:
-        """World positions of all vertices [m], NaN where a garment is not there."""
+        """World positions of all vertices [m], NaN for absent garments."""
         none = [np.full((len(garment.rest), 3), np.nan) for garment in self._garments]
         return np.concatenate([blank if each is None else each for each, blank in zip(cages, none, strict=True)])
 
@@ -87,7 +87,7 @@ class _Cloth:
         return shortest[vertices]
 
     def look(self, points: np.ndarray) -> tuple[np.ndarray, OnEdge, OnEdge]:
-        """Pairs of coincident vertices, border vertices on an edge of another border, and vertices beside one."""
+        """Pairs of coincident vertices, border vertices on an edge of another border, and those beside an edge."""
         pairs = pairs_within([points], self._used, float(self._reach.max(initial=0.0)))
         together = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1) <= self.reach(*pairs.T)
         pairs = pairs[together & self._rest_together(pairs)]
@@ -109,7 +109,7 @@ class _Cloth:
         return apart | (near.at(self._rest).distance <= self.reach(near.vertex, near.edge[:, 0]))
 
     def sewn(self, points: np.ndarray, pairs: np.ndarray, between: OnEdge) -> list[Garment]:
-        """Garments with the places of their sewn vertices, seams closed: the mean of a pair, or a point on an edge."""
+        """Garments with the closed positions of their sewn vertices: the mean of a pair, or a point on an edge."""
         between = finer_side(points, self._borders, between)
         group = joined_by(pairs, len(points)) if len(pairs) else np.arange(len(points))
         sums, count = np.zeros((group.max(initial=-1) + 1, 3)), np.bincount(group)
@@ -124,7 +124,7 @@ class _Cloth:
         return [replace(each, sewn_at=at) if np.isfinite(at).any() else each for each, at in pieces]
 
     def notices(self, points: np.ndarray, beside: OnEdge) -> list[Notice]:
-        """A notice of each garment with a border that runs along one without being sewn to it."""
+        """A notice of each garment with a border adjacent to another border and not sewn."""
         found = []
         known = np.zeros(len(points), bool)
         known[beside.vertex] = True

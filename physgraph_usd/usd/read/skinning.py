@@ -1,7 +1,7 @@
-"""UsdSkel skinning and blend shapes, baked into an anonymous layer of the session.
+"""Bakes UsdSkel skinning and blend shapes into an anonymous layer of the session.
 
-Nothing is written to disk and the stage's own layers are not touched. After baking, a skinned mesh has point samples
-like any other, in its own local space.
+Nothing is written to disk and the stage's own layers are not touched. After baking, a skinned mesh has ordinary point
+samples, in its own local space.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from .find import instance_roots
 
 @dataclass(frozen=True, eq=False)
 class Skinned:
-    """A mesh that UsdSkel deforms.
+    """A mesh deformed by UsdSkel.
 
     Attributes:
         path: Prim path.
-        root: Its skel root.
-        times: Authored time codes of its skeleton's animation and placement, ascending.
-        query: UsdSkel's query of its binding.
+        root: The skel root.
+        times: Authored time codes of the skeleton's animation and placement, ascending.
+        query: UsdSkel's query of the binding.
         skeleton: The skeleton's prim path.
         animation: The animation's prim path, or None.
     """
@@ -41,11 +41,11 @@ class Skinned:
 
 
 class Bake:
-    """The anonymous layer that holds baked points, on top of the stage.
+    """The anonymous layer of baked points, on top of the stage.
 
     Attributes:
         skinned: The baked meshes, by prim path.
-        layer: The anonymous layer; keep it alive as long as the stage.
+        layer: The anonymous layer; keep the layer alive as long as the stage.
     """
 
     def __init__(self, stage: Usd.Stage) -> None:
@@ -53,17 +53,17 @@ class Bake:
         self._stage = stage
         self.skinned: dict[Sdf.Path, Skinned] = {}
         self.layer = Sdf.Layer.CreateAnonymous("physgraph-skinning.usda")
-        # Without its own rate a layer has 24 time codes per second, and USD would rescale the baked samples.
+        # A layer without authored rate has 24 time codes per second, and USD would rescale the baked samples.
         self.layer.timeCodesPerSecond = stage.GetTimeCodesPerSecond()
         stage.GetSessionLayer().subLayerPaths.insert(0, self.layer.identifier)
 
     def add(
         self, garments: Sequence[Sdf.Path], frames: tuple[float, float] | None, *, bodies: Sequence[Sdf.Path] = ()
     ) -> list[Notice]:
-        """Bake those of the prims that are skinned, bodies also at the garments' times; notices of those that seem so.
+        """Bake the skinned prims, bodies also at the garments' times; notices of prims with unused joint influences.
 
         Args:
-            garments: Mesh prims; those inside instances become editable in the anonymous layer.
+            garments: Mesh prims; prims inside instances become editable in the anonymous layer.
             frames: First and last time code, or None for all.
             bodies: Colliders.
 
@@ -85,7 +85,7 @@ class Bake:
         return [notice for path in paths if path not in found for notice in _unskinned(self._stage.GetPrimAtPath(path))]
 
     def prims(self) -> list[Sdf.Path]:
-        """Paths of the skeletons and animations that move what was baked."""
+        """Paths of the skeletons and animations of the baked meshes."""
         found = [path for skinned in self.skinned.values() for path in (skinned.skeleton, skinned.animation)]
         return [path for path in dict.fromkeys(found) if path is not None]
 
@@ -98,18 +98,18 @@ class Bake:
 
 
 def skel_root(prim: Usd.Prim) -> Usd.Prim | None:
-    """Return the skel root above a prim; None when there is none and UsdSkel leaves the prim alone."""
+    """The skel root above a prim; None if UsdSkel does not affect the prim."""
     return next((each for each in with_ancestors(prim) if UsdSkel.Root(each)), None)
 
 
 def make_editable(stage: Usd.Stage, layer: Sdf.Layer, path: Sdf.Path) -> None:
-    """Author ``instanceable = false`` in a layer for every instance that holds a prim."""
+    """Author ``instanceable = false`` in a layer for every instance containing a prim."""
     while roots := instance_roots(stage.GetPrimAtPath(path)):
         Sdf.CreatePrimInLayer(layer, roots[0]).instanceable = False
 
 
 def find_skinning(stage: Usd.Stage, path: Sdf.Path) -> Skinned | None:
-    """The skinning of a mesh by UsdSkel; None when there is none."""
+    """The skinning of a mesh by UsdSkel, or None."""
     prim = stage.GetPrimAtPath(path)
     root = skel_root(prim)
     if root is None:
@@ -130,7 +130,7 @@ def find_skinning(stage: Usd.Stage, path: Sdf.Path) -> Skinned | None:
 
 
 def _times_of(prim: Usd.Prim, found: Mapping[Sdf.Path, Skinned]) -> Sequence[float]:
-    """Time codes of a garment that is yet to be baked."""
+    """Time codes of a garment before baking."""
     skinned = found.get(prim.GetPath())
     return garment_times(prim) if skinned is None else [*skinned.times, *transform_times(prim)]
 
@@ -142,7 +142,7 @@ def _bake(
     *,
     frames: tuple[float, float] | None,
 ) -> None:
-    """Bake each skel root once, with all other skinned prims switched off meanwhile; some at further time codes."""
+    """Bake each skel root once, with unwanted skinned prims deactivated meanwhile; some at additional time codes."""
     first, last = frames or (-np.inf, np.inf)
     interval = Gf.Interval(first - SAME_TIME, last + SAME_TIME)
     keep = [skinned.path for skinned in wanted]
@@ -166,9 +166,9 @@ def _bake(
 def _sample_animation(
     stage: Usd.Stage, layer: Sdf.Layer, skinned: Skinned, times: Sequence[float], *, interval: Gf.Interval
 ) -> None:
-    """Give the animation a sample, in a passing layer, at each time code that only a transform or the cloth has.
+    """In a temporary layer, sample the animation at the time codes of transforms and cloth too.
 
-    UsdSkel bakes where the animation has samples; between them baked points would run along a chord.
+    UsdSkel bakes at the animation's samples; in between, baked points would move along a chord.
     """
     animation = stage.GetPrimAtPath(skinned.animation) if skinned.animation else None
     if animation is None or animation.IsInstanceProxy():
@@ -188,14 +188,14 @@ def _sample_animation(
 
 
 def _others(stage: Usd.Stage, roots: Iterable[Sdf.Path], keep: Sequence[Sdf.Path]) -> list[Sdf.Path]:
-    """Skinnable prims below the roots that are not wanted and hold nothing that is."""
+    """Skinnable prims below the roots, except wanted prims and their ancestors."""
     below = [prim for root in roots for prim in Usd.PrimRange(stage.GetPrimAtPath(root))]
     skinnable = [prim.GetPath() for prim in below if UsdSkel.IsSkinnablePrim(prim)]
     return [path for path in skinnable if not any(each.HasPrefix(path) for each in keep)]
 
 
 def _check(stage: Usd.Stage, layer: Sdf.Layer, skinned: Skinned, *, frames: tuple[float, float] | None) -> None:
-    """Turn a rigid mesh's baked transform into points; GarmentError when an animation in range gave neither."""
+    """Convert a rigid mesh's baked transform to points; GarmentError if baking in range produced neither."""
     if layer.GetAttributeAtPath(skinned.path.AppendProperty("points")) is not None:
         return
     if layer.GetAttributeAtPath(skinned.path.AppendProperty(UsdGeom.Tokens.xformOpOrder)) is not None:
@@ -208,7 +208,7 @@ def _check(stage: Usd.Stage, layer: Sdf.Layer, skinned: Skinned, *, frames: tupl
 
 
 def _rigid_points(stage: Usd.Stage, layer: Sdf.Layer, path: Sdf.Path) -> None:
-    """Move a baked transform into the points, so that the prim keeps the transform of its layers."""
+    """Move a baked transform into the points, so the prim keeps the transform of its layers."""
     mesh = UsdGeom.Mesh.Get(stage, path)
     times = mesh.GetTimeSamples() or [None]
     codes = [timecode(time) for time in times]
@@ -226,7 +226,7 @@ def _rigid_points(stage: Usd.Stage, layer: Sdf.Layer, path: Sdf.Path) -> None:
 
 
 def _unskinned(prim: Usd.Prim) -> list[Notice]:
-    """A notice of joint influences that UsdSkel does not use."""
+    """A notice of joint influences not used by UsdSkel."""
     binding = UsdSkel.BindingAPI(prim)
     if not binding.GetJointIndicesAttr().HasAuthoredValue():
         return []

@@ -1,4 +1,4 @@
-"""The meshes of a stage and whether each could be refined; for ``inspect``, so it never raises on a mesh."""
+"""Lists the meshes of a stage and whether each can be refined; for ``inspect``, so never raises on a mesh."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ class MeshReport:
 
     Attributes:
         path: Prim path.
-        garment: Whether it has PhysGraphGarmentAPI.
-        points: Number of points; 0 when they cannot be read.
-        faces: Number of faces that would be refined.
-        is_open: Whether most of its faces are in pieces that are not closed.
-        times: Authored time codes of points and transforms, not those of a skeleton.
-        problem: Why it could not be refined; "" when it could.
-        notices: Warnings that refining would give of it.
+        garment: Whether the mesh has PhysGraphGarmentAPI.
+        points: Number of points; 0 if unreadable.
+        faces: Number of faces to be refined.
+        is_open: Whether open pieces have more faces than closed pieces.
+        times: Authored time codes of points and transforms, without a skeleton's.
+        problem: Why the mesh cannot be refined; "" for none.
+        notices: Warnings of refining the mesh.
     """
 
     path: str
@@ -47,9 +47,9 @@ class Survey:
     """A stage and its meshes.
 
     Attributes:
-        path: The shot file, or the name of a stage that has none.
+        path: The shot file, or the name of an in-memory stage.
         metres_per_unit: Length of one stage unit [m].
-        meshes: Every mesh.
+        meshes: All meshes.
         notices: Warnings about the stage itself.
     """
 
@@ -60,7 +60,7 @@ class Survey:
 
 
 def survey(shot: str | Usd.Stage) -> Survey:
-    """Survey every mesh of a shot, broken ones included; StageError when the file cannot be opened at all."""
+    """Survey all meshes of a shot, including broken meshes; StageError if the file cannot be opened at all."""
     path = shot_name(shot)
     stage, notices = open_stage(shot)
     with pxr_errors(f"cannot read {path}"), quiet():
@@ -70,13 +70,13 @@ def survey(shot: str | Usd.Stage) -> Survey:
 
 
 def _survey_mesh(prim: Usd.Prim, metres: float) -> MeshReport:
-    """One mesh; never raises, a broken one has a problem."""
+    """One mesh; never raises, a broken mesh has a problem."""
     path = str(prim.GetPath())
     garment, count = has_schema(prim, GARMENT_API), 0
     try:
         with pxr_errors(f"cannot read <{path}>"):
             samples = Samples.of(prim, garment_times(prim))
-            times = samples.times or tuple(samples.absent)  # Where it is at none, reading says what is wrong.
+            times = samples.times or tuple(samples.absent)  # A mesh absent at all times: reading raises the reason.
             first = times[0] if times else None
             points = PointReader(prim, first)
             count = points.count

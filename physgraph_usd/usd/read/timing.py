@@ -1,4 +1,4 @@
-"""Samples of garments and of the bodies that they feel, compared: outside its samples USD holds a prim still."""
+"""Compares samples of garments and their bodies: USD holds a prim still outside its samples."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from .skinning import Bake
 def timing_notices(
     garments: Sequence[tuple[Usd.Prim, GarmentSource]], bodies: Sequence[tuple[Usd.Prim, Sequence[int]]], bake: Bake
 ) -> list[Notice]:
-    """One notice for each prim whose samples do not fit in time.
+    """One notice for each prim with mismatched sample times.
 
     Args:
         garments: Mesh prims and their sources.
-        bodies: Prims of bodies, and the numbers of the garments that feel each.
+        bodies: Prims of bodies, and for each the numbers of the garments in contact.
         bake: Baked skinning.
     """
     found: dict[Sdf.Path, list[str]] = {prim.GetPath(): _rates(prim, bake) for prim, _ in garments}
@@ -29,7 +29,7 @@ def timing_notices(
 
 
 def _misses(body: Usd.Prim, garment: GarmentSource, bake: Bake) -> Iterator[str]:
-    """Faults of a body's samples beside those of a garment, in words."""
+    """Faults of a body's sample times compared with a garment's, in words."""
     own, cloth = _own_times(body, bake), garment.times
     if not cloth and UsdGeom.Mesh(body) and UsdGeom.Mesh(body).GetPointsAttr().Get() is None and own:
         yield f"has no points by default, at which still garments are read; its sample at {own[0]:g} is used"
@@ -47,7 +47,7 @@ def _misses(body: Usd.Prim, garment: GarmentSource, bake: Bake) -> Iterator[str]
 
 
 def _own_times(prim: Usd.Prim, bake: Bake) -> tuple[float, ...]:
-    """Every authored time code of a body; a skinned one has its skeleton's."""
+    """All authored time codes of a body; a skinned body has its skeleton's."""
     skinned = bake.skinned.get(prim.GetPath())
     if skinned:
         return merge([*skinned.times, *transform_times(prim)])
@@ -55,7 +55,7 @@ def _own_times(prim: Usd.Prim, bake: Bake) -> tuple[float, ...]:
 
 
 def _rates(prim: Usd.Prim, bake: Bake) -> list[str]:
-    """A sentence for each layer of another rate than the stage's that holds samples of a prim."""
+    """A sentence for each layer with samples of a prim and a rate different from the stage's."""
     stage = prim.GetStage()
     root, rate = stage.GetRootLayer(), stage.GetTimeCodesPerSecond()
     layers = dict.fromkeys(layer for layer in _layers(prim, bake) if layer.timeCodesPerSecond != rate)

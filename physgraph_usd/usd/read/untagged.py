@@ -1,4 +1,4 @@
-"""Meshes of a stage that are neither garments nor colliders, posed in a few frames."""
+"""Finds meshes of a stage that are neither garments nor colliders, posed in a few frames."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ Box = np.ndarray
 def unnamed_meshes(
     shot: Shot, times: Sequence[float | None], boxes: Sequence[Box]
 ) -> Iterator[tuple[str, str, Iterator[tuple[int, Pose]]]]:
-    """Meshes that are neither garments nor colliders of a shot, and where they are in some frames.
+    """Meshes that are neither garments nor colliders of a shot, and their poses in some frames.
 
     Args:
         shot: An open shot.
         times: Time codes of the frames.
-        boxes: Bounds of garments and their neighbourhood in each.
+        boxes: Bounds of garments and their neighbourhood in each frame.
 
     Yields:
-        The path of each, in stage order; why cloth does not touch it, or ""; and the frames in which its bounds meet a
-        garment's, by number, with its pose there: to be taken before the next path.
+        The path of each mesh, in stage order; the reason for no contact, or ""; and the numbers and poses of the frames
+        in which its bounds meet a garment's: to be consumed before the next path.
 
     Raises:
-        StageError: USD cannot read the files any more.
+        StageError: USD can no longer read the files.
     """
     in_shot = {*shot.colliders, *(garment.path for garment in shot.scene.garments)}
     in_shot |= {path for source in shot.sources for path in source.apart_from}
@@ -62,7 +62,7 @@ def unnamed_meshes(
 
 
 def _why_left(prim: Usd.Prim, times: Sequence[float | None]) -> str:
-    """The reason for which no cloth touches a mesh: a schema that decides, its purpose or its visibility; or ""."""
+    """The reason for no contact with a mesh: a deciding schema, the purpose or the visibility; or ""."""
     for each in with_ancestors(prim):
         if mark := next((mark for mark in MARKS if has_schema(each, mark)), None):
             return f"{mark} on <{each.GetPath()}> marks it, and this run does not have it"
@@ -77,7 +77,7 @@ def _is_skinned(prim: Usd.Prim) -> bool:
 
 
 def _may_meet(prim: Usd.Prim, metres: float, times: Sequence[float | None], boxes: Sequence[Box]) -> bool:
-    """Whether the bounds that USD gives a mesh meet the boxes; True where its points move and its extent does not."""
+    """Whether a mesh's USD bounds meet the boxes; True if the points are animated but an authored extent is not."""
     extent, points = UsdGeom.Mesh(prim).GetExtentAttr(), UsdGeom.Mesh(prim).GetPointsAttr()
     if extent.HasAuthoredValue() and points.ValueMightBeTimeVarying() and not extent.ValueMightBeTimeVarying():
         return True
@@ -107,17 +107,17 @@ def _meets(bounds: Box, box: Box) -> bool:
 
 
 def _same_place(a: Pose | None, b: Pose | None) -> bool:
-    """Whether two poses have the same points, to float32's rounding of them."""
+    """Whether two poses have the same points, up to float32 rounding."""
     if not isinstance(a, MeshPose) or not isinstance(b, MeshPose) or a.points.shape != b.points.shape:
         return False
     return bool(np.allclose(a.points, b.points, rtol=1e-5, atol=1e-6, equal_nan=True))
 
 
 class _Skinning:
-    """Joint skinning of meshes at single time codes, without blend shapes: near enough to find contact with cloth."""
+    """Joint skinning of meshes at single time codes, without blend shapes: accurate enough to find cloth contact."""
 
     def __init__(self, shot: Shot, paths: Sequence[Sdf.Path]) -> None:
-        """Find the skeletons of meshes, on a stage as the shot's was before garments were baked."""
+        """Find the skeletons of meshes, on a stage like the shot's before garments were baked."""
         self._metres, self._stage = shot.metres_per_unit, None
         self._bound: Mapping[Sdf.Path, tuple[UsdSkel.SkeletonQuery, UsdSkel.SkinningQuery]] = {}
         if paths:
@@ -140,11 +140,11 @@ class _Skinning:
                         yield path, (skeleton, query)
 
     def pose(self, reader: ColliderReader, time: float | None) -> Pose | None:
-        """A mesh at a time code, skinned where joints bend it."""
+        """A mesh at a time code, skinned if bent by joints."""
         return reader.pose(time, self._points(reader.prim.GetPath(), time))[0]
 
     def _points(self, path: Sdf.Path, time: float | None) -> np.ndarray | None:
-        """World positions of a skinned mesh [m], shape (V, 3), float64; None for one that no joints bend."""
+        """World positions of a skinned mesh [m], shape (V, 3), float64; None for a mesh not bent by joints."""
         if path not in self._bound or self._stage is None:
             return None
         skeleton, query = self._bound[path]

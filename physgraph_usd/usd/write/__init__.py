@@ -1,1 +1,1 @@
-"""Writing: layers, primvars, samples; a file is complete or not there."""
+"""Writes layers, primvars and samples; a file is complete or absent."""

@@ -1,8 +1,8 @@
-"""A file that is either complete under its final name or not there at all.
+"""Writes files atomically: a file is complete under its final name or absent.
 
-A file is written next to its target under a temporary name that carries the host and the process id, flushed to the
-disk, and moved over the target in one step. A killed process can leave only the temporary file; the next run on the
-same host removes it. Those of other hosts, whose processes cannot be asked, are never removed.
+A file is written next to its target under a temporary name with host and process id, flushed to disk, and moved over
+the target in one step. A killed process can leave only the temporary file; the next run on the same host removes the
+file. Temporary files of different hosts are never removed: their processes cannot be checked.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from typing import BinaryIO
 from ...errors import LayerError, UsageError
 
 NO_LINK = getattr(os, "O_NOFOLLOW", 0)
-"""Flag of `os.open` that follows no link; Windows has none."""
+"""Flag of `os.open` to refuse links; Windows has none."""
 ASSET_PATHS = ("relative", "absolute")
-"""Forms of a path in a file: from the file's folder, or from the root of the file system."""
+"""Forms of a path in a file: relative to the file's folder, or absolute."""
 HOST = re.sub(r"[^\w-]", "_", socket.gethostname()) or "host"
-"""This machine in the names of temporary files."""
+"""Name of this machine, for temporary file names."""
 
 
 def temporary_path(target: Path, *, suffix: str = ".usdc") -> Path:
@@ -31,7 +31,7 @@ def temporary_path(target: Path, *, suffix: str = ".usdc") -> Path:
 
 
 def prepare_target(target: Path, *, overwrite: bool) -> None:
-    """Check that a target may be written and remove temporary files that dead processes left beside it.
+    """Check that a target may be written, and remove temporary files left beside the target by dead processes.
 
     Raises:
         UsageError: The target exists and may not be replaced, or is a folder or a link.
@@ -50,13 +50,13 @@ def prepare_target(target: Path, *, overwrite: bool) -> None:
 
 
 def remove_stale(target: Path) -> list[Path]:
-    """Remove this host's temporary files of a target whose process is gone, and this process's; returns them."""
+    """Remove a target's temporary files made on this host by dead processes or by this process; returns the files."""
     pattern = re.compile(re.escape(f"{target.name}.{HOST}.") + r"(\d+)\.tmp(\.\w+)?")
     removed = []
     for path in sorted(target.parent.iterdir()):
         match = pattern.fullmatch(path.name)
         if match and not _is_other_process(int(match[1])):
-            # Where the file is still open, Windows refuses and the file stays.
+            # Windows refuses to remove an open file.
             with suppress(OSError):
                 path.unlink()
                 removed.append(path)
@@ -64,7 +64,7 @@ def remove_stale(target: Path) -> list[Path]:
 
 
 def _is_other_process(pid: int) -> bool:
-    """Whether another live process has this id; on Windows no process is asked, since os.kill would end it."""
+    """Whether a different live process has the id; always False on Windows, where os.kill would end the process."""
     if pid == os.getpid() or os.name == "nt":
         return False
     try:
@@ -77,18 +77,18 @@ def _is_other_process(pid: int) -> bool:
 
 
 def check_no_link(target: Path) -> None:
-    """Refuse (UsageError) a link to a file, a folder or nothing, which nobody named; one to a device may be used."""
+    """Refuse (UsageError) a link to a file, to a folder or to nothing; a link to a device is allowed."""
     if target.is_symlink() and (target.is_file() or target.is_dir() or not target.exists()):
         raise UsageError(f"{target} is a link to {os.readlink(target)}; name that, or remove the link")
 
 
 def make_file(path: Path) -> BinaryIO:
-    """Open a file for writing, emptied where it is there; OSError where it is a link, or cannot be written."""
+    """Open a file for writing, truncated; OSError for a link or an unwritable file."""
     return os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | NO_LINK, 0o666), "wb")
 
 
 def write_text(target: Path, text: str) -> None:
-    """Write a text as UTF-8, whole or not at all (LayerError); its folder is made where it is missing."""
+    """Write a text as UTF-8, whole or not at all (LayerError); creates the folder if missing."""
     temporary = temporary_path(target, suffix="")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -103,7 +103,7 @@ def write_text(target: Path, text: str) -> None:
 
 
 def check_place(target: Path) -> None:
-    """Refuse a place where no file can be made later; its folder may be missing.
+    """Refuse a path where no file can be created later; the folder may be missing.
 
     Raises:
         UsageError: The target is a folder or a link, or a file stands where a folder is needed.
@@ -135,7 +135,7 @@ def publish(temporary: Path, target: Path) -> None:
 
 
 def _flush(path: Path) -> None:
-    """Ask the system to bring a file or folder to the disk."""
+    """Flush a file or folder to disk."""
     flags = os.O_RDONLY if os.name != "nt" else os.O_RDWR
     handle = os.open(path, flags)
     try:

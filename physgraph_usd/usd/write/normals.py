@@ -1,4 +1,4 @@
-"""Smooth vertex normals of a polygon mesh, at a small part of the cost of a solve."""
+"""Smooth vertex normals of a polygon mesh, at a small fraction of a solve's cost."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class VertexNormals:
 
         n_v = sum_f a_f / |sum_f a_f|,   a_f = 1/2 sum_i (p_i - p_0) x (p_{i+1} - p_0),
 
-    which is exact for planar polygons and independent of how a non-planar one would be cut (Newell's normal).
+    exact for planar polygons and independent of the triangulation of a non-planar polygon (Newell's normal).
 
     Attributes:
         vertex_count: V.
@@ -32,7 +32,8 @@ class VertexNormals:
         Args:
             mesh: The mesh.
             left_handed: Whether faces run clockwise seen from outside.
-            welded: A number for each vertex; vertices of one number have one normal. None if no vertices are welded.
+            welded: A number for each vertex; vertices with equal numbers share a normal. None if no vertices are
+                welded.
         """
         self.vertex_count, self._welded = mesh.vertex_count, welded
         counts = np.asarray(mesh.counts, np.int64)
@@ -48,7 +49,7 @@ class VertexNormals:
     def __call__(self, points: np.ndarray) -> np.ndarray:
         """Unit normals at positions, both of shape (V, 3), float32.
 
-        A vertex without area takes its neighbours', or +Y where it has none.
+        A vertex without area gets its neighbours' normal, or +Y without neighbours.
         """
         a, b, c, d = (np.take(points, corners, axis=0) for corners in self._diagonals)
         areas = _cross(b - a, d - c)
@@ -77,7 +78,7 @@ class VertexNormals:
 def _vector_area_corners(
     counts: np.ndarray, starts: np.ndarray, indices: np.ndarray
 ) -> tuple[tuple[np.ndarray, ...], sparse.csr_matrix | None]:
-    """Vertices (a, b, c, d) whose (b - a) x (d - c) sum to twice each face's vector area, and the sum over faces."""
+    """Vertices (a, b, c, d) with (b - a) x (d - c) summing to twice each face's vector area, and the sum over faces."""
     if np.all(counts == 3):
         a, b, c = indices.reshape(-1, 3).T
         return (a, b, a, c), None

@@ -1,4 +1,4 @@
-"""Opinions over a garment's prim that do not move: its fine topology, values used, and what these take the place of."""
+"""Authors a garment's static opinions: fine topology, values used, and blocks of replaced coarse properties."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ EMPTIED = {
     "cornerIndices": _TYPES.IntArray,
     "cornerSharpnesses": _TYPES.FloatArray,
 }
-"""Written as empty arrays where authored: a block would read as None at the default time."""
+"""Written as empty arrays if authored: a block would read as None at the default time."""
 _REWRITTEN = {"points", "normals", "velocities", "accelerations", "extent", "faceVertexCounts", "faceVertexIndices"}
 _ELSEWHERE = ("primvars:", "skel:", "xformOp", "physgraph:")
 REST_POINTS = "physics:restShapePoints"
 
 
 def author_topology(stream: LayerStream, target: Sdf.Path, prim: Usd.Prim, fine: FineMap) -> None:
-    """Author counts, indices, ``subdivisionScheme`` none, and hide everything that belongs to the coarse topology.
+    """Author counts, indices, ``subdivisionScheme`` none, and hide all coarse-topology properties.
 
     Here and below ``target`` is the prim to author on and ``prim`` the coarse mesh as composed.
     """
@@ -51,7 +51,7 @@ def author_topology(stream: LayerStream, target: Sdf.Path, prim: Usd.Prim, fine:
 
 
 def speed_notices(prim: Usd.Prim, *, written: bool) -> list[Notice]:
-    """Notices that velocities and accelerations of a coarse mesh are blocked, or velocities written anew."""
+    """Notices of blocked velocities and accelerations of a coarse mesh, or of velocities recomputed."""
     blocked = "are blocked: they belong to the coarse points"
     message = {
         "velocities": "are written anew, from the refined points" if written else blocked,
@@ -66,7 +66,7 @@ def speed_notices(prim: Usd.Prim, *, written: bool) -> list[Notice]:
 
 
 def author_rest_points(stream: LayerStream, target: Sdf.Path, prim: Usd.Prim, fine: FineMap) -> list[Notice]:
-    """Refine the rest shape of the deformable-body schema; notices of other arrays that may no longer fit."""
+    """Refine the rest shape of the deformable-body schema; notices of other arrays unfit for the fine mesh."""
     notices = []
     sizes = {fine.count(kind): kind for kind in ("faceVarying", "uniform", "vertex")}
     for attribute in prim.GetAuthoredAttributes():
@@ -92,12 +92,12 @@ def author_rest_points(stream: LayerStream, target: Sdf.Path, prim: Usd.Prim, fi
 
 
 def author_unskinned(stream: LayerStream, target: Sdf.Path, prim: Usd.Prim, *, skinned: bool) -> None:
-    """Take a mesh out of skinning: its points are the skinned ones already, if ``skinned``."""
+    """Remove a mesh from skinning; ``skinned``: whether its points are already skinned."""
     for name in ("skel:joints", "skel:blendShapes"):
         if prim.GetAttribute(name).HasAuthoredValue():
             stream.block(target.AppendProperty(name), _TYPES.TokenArray)
     if skinned and not prim.GetAttribute("primvars:skel:jointIndices").HasAuthoredValue():
-        # Influences of an ancestor reach the mesh whether or not it has the schema; no skeleton stops them.
+        # An ancestor's influences reach the mesh with or without the schema; an empty skeleton target stops skinning.
         edit_schemas(stream, target, added=["SkelBindingAPI"])
         spec = stream.prim(target)
         skeleton = spec.relationships.get("skel:skeleton") or Sdf.RelationshipSpec(spec, "skel:skeleton", False)
@@ -107,7 +107,7 @@ def author_unskinned(stream: LayerStream, target: Sdf.Path, prim: Usd.Prim, *, s
 
 
 def delete_schema(stream: LayerStream, target: Sdf.Path, name: str) -> None:
-    """Remove an applied API schema, whatever weaker layer applies it."""
+    """Remove an applied API schema, whichever weaker layer applies the schema."""
     edit_schemas(stream, target, deleted=[name])
 
 
@@ -123,7 +123,7 @@ def edit_schemas(
 
 
 def open_instances(stream: LayerStream, source: GarmentSource) -> list[Notice]:
-    """Make the instances that hold a garment editable, with one notice each."""
+    """Make the instances containing a garment editable, with one notice each."""
     notices = []
     for root in source.instance_roots:
         stream.prim(root).SetInfo("instanceable", False)
@@ -134,10 +134,10 @@ def open_instances(stream: LayerStream, source: GarmentSource) -> list[Notice]:
 def make_sibling(stream: LayerStream, prim: Usd.Prim) -> Sdf.Path:
     """Define the refined sibling of a mesh, ``<name>_refined``, make the mesh its proxy, and return the sibling's path.
 
-    The sibling references the mesh, so everything not refined (bindings, transforms, visibility) follows it.
+    The sibling references the mesh and inherits all unrefined properties (bindings, transforms, visibility).
 
     Raises:
-        LayerError: There is such a prim already.
+        LayerError: A prim of the sibling's name exists.
     """
     coarse = prim.GetPath()
     path = coarse.ReplaceName(f"{coarse.name}_refined")
@@ -154,14 +154,14 @@ def make_sibling(stream: LayerStream, prim: Usd.Prim) -> Sdf.Path:
     delete_schema(stream, path, GARMENT_API)
     for child in prim.GetFilteredChildren(Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate)):
         if UsdGeom.Xformable(child) or UsdSkel.BlendShape(child):
-            # Only subsets and looks belong to both; a nested mesh would be drawn twice.
+            # Only subsets and looks belong to both meshes; a nested mesh would be drawn twice.
             stream.prim(path.AppendChild(child.GetName())).SetInfo("active", False)
     _copy_collection_binding(stream, path, prim)
     return path
 
 
 def _copy_collection_binding(stream: LayerStream, target: Sdf.Path, prim: Usd.Prim) -> None:
-    """Bind directly a material that reaches the mesh through a collection, which does not hold the sibling."""
+    """Bind directly a material bound to the mesh by a collection, which does not hold the sibling."""
     for purpose in (UsdShade.Tokens.allPurpose, UsdShade.Tokens.preview, UsdShade.Tokens.full):
         material, relationship = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial(purpose)
         if not material or "material:binding:collection" not in relationship.GetName():
@@ -173,9 +173,9 @@ def _copy_collection_binding(stream: LayerStream, target: Sdf.Path, prim: Usd.Pr
 
 
 def author_used_values(stream: LayerStream, source: GarmentSource, garment: Garment, values: GarmentFrame) -> None:
-    """Author the level, fabric, guide and detail of the first time code, except those whose source is animated.
+    """Author the level, fabric, guide and detail of the first time code, except animated values.
 
-    An artist can change one and refine again.
+    An artist can change a value and refine again.
     """
     edit_schemas(stream, source.path, added=[GARMENT_API])
     level = source.path.AppendProperty("physgraph:refine:level")

@@ -1,6 +1,6 @@
-"""Stages as plain arrays: what samples are written from and pictures are drawn from.
+"""Plain-array records of stages, for writing sample stages and drawing pictures.
 
-No pxr here, so that geometry code and tests can use these records without a USD library.
+No pxr here, so geometry code and tests can use the records without a USD library.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class Look:
 
 @dataclass(frozen=True, eq=False)
 class FaceVarying:
-    """Values on face corners with a topology of their own, as UVs with seams have.
+    """Values on face corners with a separate topology, such as UVs with seams.
 
     Attributes:
         values: Distinct values, shape (N, 2).
@@ -46,7 +46,7 @@ class Skin:
 
     Attributes:
         joints: Joint numbers, shape (V, K).
-        weights: Weights that sum to 1 per vertex, shape (V, K).
+        weights: Weights with sum 1 per vertex, shape (V, K).
     """
 
     joints: np.ndarray
@@ -79,12 +79,12 @@ class PlainMesh:
         counts: Vertices per face, shape (F,).
         indices: Vertices of the face corners, shape (C,).
         points: Default positions, the rest shape of a garment [stage units], shape (V, 3).
-        look: Material of every face that no subset claims.
+        look: Material of all faces outside the subsets.
         role: ``garment``, ``collider`` or ``prop``.
         samples: Positions at the stage's times, shape (T, V, 3), or None.
         transforms: Local matrices (column vectors) at the stage's times, shape (T, 4, 4), or None.
         uv: Texture coordinates, or None.
-        subsets: Faces claimed by further materials: (look, face numbers).
+        subsets: Faces with different materials: (look, face numbers).
         pin: 1 where the fine cloth follows the coarse cloth exactly, shape (V,), or None.
         fabric: Material values authored on a garment, or None.
         level: Number of subdivisions authored on a garment.
@@ -118,7 +118,7 @@ class PlainStage:
     Attributes:
         name: Name of the default prim.
         doc: Purpose of the shot, one sentence.
-        meshes: Its meshes.
+        meshes: The meshes.
         times: Time codes of every sample, ascending.
         skeleton: Skeleton of the skinned meshes, or None.
         rate: Time codes per second.

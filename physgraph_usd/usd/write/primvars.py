@@ -24,25 +24,25 @@ from ..stage import Notice, timecode
 from .stream import LayerStream
 
 STALE = ("primvars:normals", "primvars:skel:jointIndices", "primvars:skel:jointWeights")
-"""Primvars that are hidden, not refined: our normals replace the first, the others would skin a second time."""
+"""Primvars hidden instead of refined: the first is replaced by our normals, the rest would skin the mesh twice."""
 
 
 def carry_primvars(
     stream: LayerStream, target: Sdf.Path, prim: Usd.Prim, fine: FineMap, *, span: tuple[float, float] | None
 ) -> list[Notice]:
-    """Author every primvar of a coarse mesh that depends on topology, refined, with its time samples.
+    """Author all topology-dependent primvars of a coarse mesh, refined, with their time samples.
 
-    One that does not fit its own mesh is hidden, since its values would fit the fine mesh even less.
+    A primvar not matching its own mesh is hidden, because the values would match the fine mesh even less.
 
     Args:
         stream: The layer.
         target: Prim to author on.
         prim: Coarse mesh as composed.
         fine: Map to the fine mesh.
-        span: First and last time code that matter, or None for all.
+        span: First and last relevant time code, or None for all.
 
     Returns:
-        Notices of primvars that were hidden, and why.
+        Notices of hidden primvars, with the reason.
     """
     notices = []
     for primvar in UsdGeom.PrimvarsAPI(prim).GetPrimvarsWithAuthoredValues():
@@ -63,7 +63,7 @@ def carry_primvars(
 
 
 def _numbers_points(primvar: UsdGeom.Primvar) -> bool:
-    """Whether a primvar is a number for each point that no other point has, as ids are."""
+    """Whether a primvar holds a unique whole number per point, such as ids."""
     if primvar.GetInterpolation() not in (UsdGeom.Tokens.vertex, UsdGeom.Tokens.varying):
         return False
     values = np.asarray(primvar.ComputeFlattened(Usd.TimeCode.EarliestTime()))
@@ -81,7 +81,7 @@ def _hide(stream: LayerStream, target: Sdf.Path, primvar: UsdGeom.Primvar) -> No
 def _carry(
     stream: LayerStream, target: Sdf.Path, primvar: UsdGeom.Primvar, fine: FineMap, span: tuple[float, float] | None
 ) -> None:
-    """Author one primvar at its default and each of its times."""
+    """Author one primvar at the default and at each time sample."""
     path = target.AppendProperty(primvar.GetAttr().GetName())
     indices_path = target.AppendProperty(f"{path.name}:indices")
     was_indexed, is_indexed = primvar.IsIndexed(), False
@@ -129,9 +129,9 @@ def _times(times: Sequence[float], span: tuple[float, float] | None) -> Iterable
 def carry_subsets(
     stream: LayerStream, target: Sdf.Path, prim: Usd.Prim, fine: FineMap, *, span: tuple[float, float] | None
 ) -> list[Notice]:
-    """Author the indices of every subset of a mesh, refined; a partition stays a partition.
+    """Author the indices of all subsets of a mesh, refined; a partition stays a partition.
 
-    Arguments are as for `carry_primvars`. Returns notices of subsets that could not be refined and are emptied.
+    Arguments are as for `carry_primvars`. Returns notices of subsets not refinable and emptied.
     """
     notices = []
     imageable = UsdGeom.Imageable(prim)
@@ -163,10 +163,10 @@ class FineMap:
         """Prepare the map.
 
         Args:
-            cage: The coarse mesh that was refined.
-            refinements: Coarse to fine; none means that the fine mesh is the cage.
-            counts: Authored corners per face, shape (F,), dropped faces included.
-            kept: Authored faces that the cage has, shape (F_cage,).
+            cage: The coarse mesh before refinement.
+            refinements: Coarse to fine; empty if the fine mesh is the cage.
+            counts: Authored corners per face, shape (F,), including dropped faces.
+            kept: Numbers of the authored faces in the cage, shape (F_cage,).
         """
         self.cage = cage
         self.fine = refinements[-1].mesh if refinements else cage
@@ -177,7 +177,7 @@ class FineMap:
 
     @cached_property
     def stencil(self) -> sparse.csr_matrix | None:
-        """From coarse to fine vertices; None at level 0."""
+        """Stencil from coarse to fine vertices; None at level 0."""
         return compose(self._refinements) if self._refinements else None
 
     @cached_property
@@ -205,7 +205,7 @@ class FineMap:
         return self.kept_corners[values[indices]]
 
     def count(self, interpolation: str) -> int:
-        """Number of authored elements of an interpolation; ValueError when it depends on no topology."""
+        """Number of authored elements of an interpolation; ValueError for an interpolation independent of topology."""
         counts = dict.fromkeys(("vertex", "varying"), self.cage.vertex_count)
         counts |= {"uniform": self._face_count, "faceVarying": int(self._starts[-1])}
         if interpolation not in counts:
@@ -220,14 +220,14 @@ class FineMap:
         Args:
             interpolation: ``vertex``, ``varying``, ``uniform`` or ``faceVarying``.
             values: Shape (N, ...).
-            indices: Value of each element where the primvar is indexed, shape (elements,).
-            smooth: Whether values between two are meaningful; otherwise the nearest parent's is taken.
+            indices: Value of each element of an indexed primvar, shape (elements,).
+            smooth: Whether values can be interpolated; otherwise the nearest parent's value is used.
 
         Returns:
-            Fine values, or None where the authored ones stay; and fine indices, or None where there are none.
+            Fine values, or None if the authored values stay; and fine indices, or None without indices.
 
         Raises:
-            ValueError: The number of elements is not the mesh's, or an index is out of range.
+            ValueError: The number of elements differs from the mesh's, or an index is out of range.
         """
         elements = len(values) if indices is None else len(indices)
         if elements != self.count(interpolation):
@@ -242,7 +242,7 @@ class FineMap:
         return self.interpolate(flat), None
 
     def interpolate(self, values: np.ndarray) -> np.ndarray:
-        """Refine floating values on vertices linearly, shape (V, ...) to (V_fine, ...), type kept."""
+        """Refine floating-point values on vertices linearly, shape (V, ...) to (V_fine, ...), type kept."""
         if self.stencil is None:
             return values
         flat = values.reshape(len(values), int(np.prod(values.shape[1:])))
@@ -251,7 +251,7 @@ class FineMap:
     def _picked(
         self, interpolation: str, values: np.ndarray, indices: np.ndarray | None
     ) -> tuple[np.ndarray | None, np.ndarray | None]:
-        """Take each fine element's value from one coarse element; words and paths by index alone."""
+        """Copy each fine element's value from a single coarse element; words and paths by index only."""
         picks = {"uniform": "parent_face", "faceVarying": "nearest_corner"}.get(interpolation, "nearest_vertex")
         chosen: np.ndarray = getattr(self, picks)
         if indices is None and values.dtype != object:
@@ -259,7 +259,7 @@ class FineMap:
         return None, (chosen if indices is None else indices[chosen]).astype(np.int32)
 
     def _corners(self, values: np.ndarray, indices: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
-        """Refine values on corners along their own topology, so that seams stay seams."""
+        """Refine values on corners along their own topology, preserving seams."""
         coarse = self.kept_corners if indices is None else np.asarray(indices)[self.kept_corners]
         fine, refined = corner_values(self._refinements, self.cage.counts, coarse.astype(np.int32), values)
         return (refined[fine], None) if indices is None else (refined, fine.astype(np.int32))
@@ -270,7 +270,7 @@ class FineMap:
         Args:
             element: ``face``, ``point`` or ``edge``.
             indices: Authored indices; pairs of vertices for edges.
-            exclusive: Whether a vertex must not fall into two subsets of the family, and none may be lost.
+            exclusive: Whether each vertex must stay in exactly one subset of the family.
 
         Raises:
             ValueError: The element type is unknown or an index is out of range.
@@ -296,7 +296,7 @@ class FineMap:
 
 
 def to_numpy(value: Any) -> tuple[np.ndarray, bool]:
-    """A ``Vt`` array as numpy, shape (N, ...), and whether values between two are meaningful.
+    """A ``Vt`` array as numpy, shape (N, ...), and whether the values can be interpolated.
 
     Quaternions are not interpolated: q and -q are the same rotation. Strings, tokens and asset paths become objects.
 
@@ -314,7 +314,7 @@ def to_numpy(value: Any) -> tuple[np.ndarray, bool]:
 
 
 def to_vt(array: np.ndarray, like: Any) -> Any:
-    """An array, shape (N, ...), as the ``Vt`` type of another value."""
+    """An array, shape (N, ...), converted to the ``Vt`` type of ``like``."""
     kind = type(like)
     if array.dtype == object:
         return kind(array.tolist())

@@ -92,7 +92,7 @@ def _write_primvars(usd: UsdGeom.Mesh, mesh: PlainMesh) -> None:
 
 
 def _write_looks(stage: Usd.Stage, usd: UsdGeom.Mesh, mesh: PlainMesh) -> None:
-    """Bind the mesh's material, or a partition of face subsets when it has more than one."""
+    """Bind the mesh's material, or a partition of face subsets for several materials."""
     if not mesh.subsets:
         UsdShade.MaterialBindingAPI.Apply(usd.GetPrim()).Bind(_material(stage, mesh.look))
         return

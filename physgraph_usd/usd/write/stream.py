@@ -1,6 +1,6 @@
-"""A layer written piece by piece, whose written parts leave memory.
+"""Writes a layer piece by piece and releases the written parts from memory.
 
-Author through ``Sdf``, not through a stage: nothing is composed, so a time sample costs no more than its copy.
+Author through ``Sdf``, not through a stage: nothing is composed, so a time sample costs no more than a copy.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ from .atomic import prepare_target, publish, temporary_path
 IN_MEMORY = "refined.usda"
 """Name of a layer in memory."""
 FLUSH_BYTES = 16_000_000
-"""Pending array bytes at which the layer is saved; each save rewrites a few kilobytes of tables."""
+"""Pending array bytes before the layer is saved; each save rewrites a few kilobytes of tables."""
 
 
 class LayerStream:
-    """One new layer, atomic and streaming, or in memory.
+    """A new layer, written atomically and in pieces, or in memory.
 
-    Values go to a temporary binary layer beside the target; `commit` moves it to the final name, converting to text
-    where the target asks for it. Leaving the ``with`` block without `commit` removes the temporary file. A layer
-    without a target is anonymous, stays in memory and touches no disk.
+    Values go to a temporary binary layer beside the target; `commit` moves the layer to the final name, converting to
+    text for a ``.usda`` target. Leaving the ``with`` block without `commit` removes the temporary file. A layer without
+    a target is anonymous, stays in memory and touches no disk.
     """
 
     def __init__(self, target: Path | None, *, overwrite: bool = False) -> None:
-        """Start a temporary layer, or one in memory.
+        """Start a temporary layer, or an in-memory layer.
 
         Args:
             target: Final path, ``.usdc``, ``.usda`` or ``.usd``; None for a layer in memory.
@@ -67,20 +67,20 @@ class LayerStream:
         """The layer being written.
 
         Raises:
-            LayerError: It is already committed or discarded.
+            LayerError: The layer is already committed or discarded.
         """
         if self._layer is None:
             raise LayerError(f"{self.target} is closed; nothing more can be written to it")
         return self._layer
 
     def prim(self, path: Sdf.Path) -> Sdf.PrimSpec:
-        """The ``over`` at a path, made with its ancestors where missing."""
+        """The ``over`` at a path, created with its ancestors if missing."""
         return self.layer.GetPrimAtPath(path) or Sdf.CreatePrimInLayer(self.layer, path)
 
     def attribute(
         self, path: Sdf.Path, type_name: Sdf.ValueTypeName, *, uniform: bool = False, interpolation: str = ""
     ) -> Sdf.AttributeSpec:
-        """The attribute spec at a path, made where missing; ``interpolation`` is authored as metadata, if any."""
+        """The attribute spec at a path, created if missing; ``interpolation`` is authored as metadata, if any."""
         spec = self.layer.GetAttributeAtPath(path)
         if spec is None:
             variability = Sdf.VariabilityUniform if uniform else Sdf.VariabilityVarying
@@ -90,7 +90,7 @@ class LayerStream:
         return spec
 
     def set(self, path: Sdf.Path, value: Any, *, time: float | None = None) -> None:
-        """Author one value, a ``Vt`` array or a plain one, of an existing attribute spec; LayerError on a full disk."""
+        """Author a value, a ``Vt`` array or a plain value, of an existing attribute spec; LayerError on a full disk."""
         if time is None:
             self.layer.GetAttributeAtPath(path).default = value
         else:
@@ -100,11 +100,11 @@ class LayerStream:
             self.flush()
 
     def block(self, path: Sdf.Path, type_name: Sdf.ValueTypeName) -> None:
-        """Hide every weaker value of an attribute, its samples included."""
+        """Hide all weaker values of an attribute, including samples."""
         self.attribute(path, type_name).default = Sdf.ValueBlock()
 
     def flush(self) -> None:
-        """Save pending values and let go of their memory.
+        """Save pending values and release their memory.
 
         Raises:
             LayerError: The disk is full or gone.
@@ -121,7 +121,7 @@ class LayerStream:
         self._pending = 0
 
     def commit(self) -> Path | None:
-        """Move the layer to its final path and return it; None for a layer in memory, which stays in ``layer``.
+        """Move the layer to its final path, and return the path; None for an in-memory layer, still in ``layer``.
 
         Raises:
             LayerError: The disk is full, or the target is held open by another program.
@@ -130,7 +130,7 @@ class LayerStream:
         if self.target is None or self.temporary is None:
             return None
         finished = self._as_text(self.target) if self.target.suffix == ".usda" else self.temporary
-        # A layer that is still mapped into memory cannot be moved on Windows.
+        # Windows cannot move a memory-mapped layer.
         self._layer = None
         publish(finished, self.target)
         self.discard()
@@ -150,14 +150,14 @@ class LayerStream:
         return path
 
     def discard(self) -> None:
-        """Remove the temporary file, if it is still there; a layer in memory stays."""
+        """Remove the temporary file, if present; an in-memory layer stays."""
         if self.temporary is None:
             return
         self._layer = None
         self.temporary.unlink(missing_ok=True)
 
     def _failure(self, error: Tf.ErrorException) -> LayerError:
-        """An error with the reason why a save failed, in one line."""
+        """An error with the reason of a failed save, in one line."""
         reasons = reason_of(error).split("; ")
         # Some versions report unrelated trouble first, such as a plugin that failed to load.
         reason = next((each for each in reasons if "writ" in each.lower()), reasons[0])
@@ -170,7 +170,7 @@ class LayerStream:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Remove the temporary file unless it was committed."""
+        """Remove the temporary file unless committed."""
         self.discard()
 
 

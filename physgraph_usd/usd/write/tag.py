@@ -1,4 +1,4 @@
-"""Marks garments and colliders of a shot, in a new layer over it."""
+"""Tags garments and colliders of a shot, in a new layer over the shot."""
 
 from __future__ import annotations
 
@@ -31,26 +31,26 @@ def tag(
     asset_paths: str = "relative",
     overwrite: bool = False,
 ) -> Path:
-    """Apply the schemas to prims of a shot, in a new layer that shows the shot and can be refined.
+    """Apply the schemas to prims of a shot, in a new layer over the shot, ready for refining.
 
     Args:
         shot: The shot file; never edited.
-        out: Layer to write; it sublayers the shot.
-        garments: Prim paths, names, globs or collections of meshes; with a preset and without these, the tagged ones.
-        colliders: The same, of anything with a surface.
-        preset: Name of a fabric whose values are authored on the garments, or None.
-        side: Where cloth belongs at the colliders, one of `SIDES`, or None.
-        values: Of each garment, by its prim path: values to author, by the schema's short names, after the preset's.
-        asset_paths: "relative" or "absolute": how the layer names the shot.
+        out: Layer to write, with the shot as sublayer.
+        garments: Prim paths, names, globs or collections of meshes; if empty and a preset is given, the tagged
+            garments.
+        colliders: Prim paths, names, globs or collections of surfaces.
+        preset: Name of a fabric to author on the garments, or None.
+        side: Side of the colliders for the cloth, one of `SIDES`, or None.
+        values: Values to author after the preset's, by the garment's prim path and the schema's short names.
+        asset_paths: "relative" or "absolute": form of the shot's path in the layer.
         overwrite: Whether an existing file may be replaced.
 
     Returns:
         The layer's path.
 
     Raises:
-        UsageError: Nothing was named, the preset or the side is unknown or for nothing that was named, or the file
-            exists.
-        StageError: A named prim is not there, lies in an instance, or is no surface.
+        UsageError: Nothing was named, the preset or the side is unknown or not applicable, or the file exists.
+        StageError: A named prim is missing, lies in an instance, or is no surface.
         LayerError: The layer cannot be written.
     """
     if not garments and not colliders and preset is None:
@@ -84,13 +84,13 @@ def tag(
 
 
 def _check_word(what: str, word: str | None, words: Sequence[str]) -> None:
-    """Refuse a word that is none of some words."""
+    """Refuse an unknown word."""
     if word is not None and word not in words:
         raise UsageError(f"unknown {what} {word!r}; known {what}s: {', '.join(words)}")
 
 
 def _check_values(values: Mapping[str, Mapping[str, float]]) -> None:
-    """Refuse a value that refining would refuse."""
+    """Refuse values invalid for refining."""
     try:
         for path, items in values.items():
             for name, value in items.items():
@@ -100,7 +100,7 @@ def _check_values(values: Mapping[str, Mapping[str, float]]) -> None:
 
 
 def _check_editable(prim: Usd.Prim) -> None:
-    """Refuse prims on which an opinion would be ignored or mean nothing."""
+    """Refuse prims on which an opinion would have no effect."""
     if prim.IsInstanceProxy():
         remedy = "tag the prim in the asset, or name it when refining"
         raise StageError(f"<{prim.GetPath()}> lies in an instance, where a layer over the shot cannot reach; {remedy}")
@@ -118,10 +118,10 @@ def _applied(layer: Sdf.Layer, prim: Usd.Prim, schema: str) -> Sdf.PrimSpec:
 
 
 def _author_over(spec: Sdf.PrimSpec, prim: Usd.Prim, row: Property, value: float | None) -> None:
-    """Author one attribute's default over what a prim has; None hides that, as a value that another preset left."""
+    """Author an attribute's default over a prim's opinions; None hides opinions, such as an earlier preset's value."""
     if value is not None:
         _author(spec, row, round(value) if row.type == "int" else value)
-        if prim.GetAttribute(row.name).HasAuthoredConnections():  # They would go before the value.
+        if prim.GetAttribute(row.name).HasAuthoredConnections():  # Connections are stronger than the value.
             spec.attributes[row.name].connectionPathList.ClearEditsAndMakeExplicit()
         return
     for attribute in map(prim.GetAttribute, (row.name, USER_PROPERTIES + row.name)):

@@ -1,7 +1,7 @@
-"""The animated opinions of one garment, one time code after the other.
+"""Writes the animated opinions of one garment, one time code after another.
 
-Points, normals, extent and velocities; heat maps, which show how deep vertices are in a body and which cross; and the
-``extentsHint`` of models above it, a box cached by hand, which finer cloth may leave.
+Points, normals, extent and velocities; heat maps of depth inside bodies and of crossings; and the ``extentsHint`` of
+ancestor models, a hand-cached box possibly too small for the finer cloth.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from .stream import LayerStream
 
 PREFIX = "primvars:physgraph:"
 HEAT = ("penetration", "crossing")
-"""Depth in the deepest body [mm], 0 outside; and 1 at the corners of edges and faces that cross, 0 elsewhere."""
+"""Depth in the deepest body [mm], 0 outside; and 1 at the corners of crossing edges and faces, 0 elsewhere."""
 ATTRIBUTE = "extentsHint"
 TYPES = {
     "points": Sdf.ValueTypeNames.Point3fArray,
@@ -29,7 +29,7 @@ TYPES = {
     "extent": Sdf.ValueTypeNames.Float3Array,
     "velocities": Sdf.ValueTypeNames.Vector3fArray,
 }
-"""Attributes of a garment whose samples come frame by frame."""
+"""Attributes of a garment written frame by frame."""
 _FIRST = Usd.TimeCode.EarliestTime()
 _PURPOSES = ("default", "render", "proxy", "guide")
 
@@ -43,31 +43,31 @@ class _Sample:
 
 
 def refuse_not_finite(values: np.ndarray, place: str) -> None:
-    """Refuse (LayerError) values that are NaN or infinite, and name the first; ``place`` begins the message."""
+    """Refuse (LayerError) NaN or infinite values, naming the first; ``place`` begins the message."""
     if not np.isfinite(values).all():
         first = int(np.argwhere(~np.isfinite(values))[0][0])
         raise LayerError(f"{place}: value {first} is {values[first].tolist()}, not finite")
 
 
 def _set_sample(stream: LayerStream, path: Sdf.Path, values: np.ndarray, time: float | None) -> None:
-    """Author values that are solved: all of them go into a layer here, finite."""
+    """Author solved values; all solved values enter the layer here, checked to be finite."""
     refuse_not_finite(values, f"<{path}>" + at_time(time))
     kind = Vt.FloatArray if values.ndim == 1 else Vt.Vec3fArray
     stream.set(path, kind.FromNumpy(values), time=time)
 
 
 class PointTrack:
-    """Writes one garment's samples as they come, holding at most three in memory.
+    """Writes one garment's samples in order, holding at most three in memory.
 
-    A run of equal samples is written by its first and last only; USD gives the same value between them. With
-    velocities every sample is written, since a velocity belongs to its own time.
+    Only the first and last of a run of equal samples are written; USD gives the same value in between. With velocities
+    every sample is written, because each velocity belongs to a sample's time.
 
-    Velocities are differences of samples between which the cloth moves on. A sample with none beside it has the shot's
-    own velocity, or a block.
+    Velocities are differences of samples connected by continuous motion. A sample without connected neighbours gets the
+    shot's own velocity, or a block.
 
     Attributes:
         box: Extent of the last sample.
-        unknown: Time codes of the samples whose velocities are blocked.
+        unknown: Time codes of the samples with blocked velocities.
     """
 
     def __init__(
@@ -82,17 +82,17 @@ class PointTrack:
         own: Callable[[float | None], np.ndarray | None] = lambda _: None,
         absent: Sequence[float] = (),
     ) -> None:
-        """Author the attributes, still without values.
+        """Author the attributes, without values.
 
         Args:
             stream: The layer.
             target: Prim to author on.
             normals: Normals of local points.
-            rest: Local points for the default time, shape (V, 3); None takes the first that come.
-            still: Whether the garment's input has no samples: only a default is written until something moves.
-            rate: Time codes per second for velocities; None leaves them out.
-            own: The shot's velocities at a time code [units/s], shape (V, 3), float32; None where it has none.
-            absent: Time codes to block, ascending: the garment is not there.
+            rest: Local points for the default time, shape (V, 3); if None, the first sample's points.
+            still: Whether the garment's input has no samples: only a default is written until the cloth moves.
+            rate: Time codes per second for velocities; None leaves velocities out.
+            own: The shot's velocities at a time code [units/s], shape (V, 3), float32; None without velocities.
+            absent: Time codes to block, ascending: the garment is absent.
         """
         self._stream, self._normals = stream, normals
         self._paths = {name: target.AppendProperty(name) for name in TYPES}
@@ -124,8 +124,8 @@ class PointTrack:
             time: Time code, or None for the default of a shot without samples.
             points: Fine points [m], world space, shape (V, 3).
             to_metres: Local space to world metres, shape (4, 4), for column vectors.
-            changed: False when the world points are known to equal the last ones.
-            cut: Whether the cloth jumps here from the sample before.
+            changed: False when the world points are known to equal the previous sample's.
+            cut: Whether the cloth jumps to this sample from the previous sample.
 
         Raises:
             LayerError: The points are not finite, or the matrix cannot be inverted.
@@ -151,7 +151,7 @@ class PointTrack:
         self._take(_Sample(time, points), moved=self._last is None or not np.array_equal(points, self._last.points))
 
     def _take(self, sample: _Sample, *, moved: bool) -> None:
-        """Author a sample, and the end of the run before it; one that equals the last is the end of a run."""
+        """Author a sample, and the end of the previous run; a sample equal to the previous sample extends the run."""
         last = self._last
         if last is not None and not moved:
             if self._rate is None or self._still:
@@ -199,7 +199,7 @@ class PointTrack:
             self._queue.clear()
 
     def _block_until(self, time: float) -> None:
-        """Author blocks where the garment is not there before a time code; samples after one begin anew."""
+        """Author blocks at the garment's absences before a time code; samples after a block start a new run."""
         while self._absent and self._absent[0] < time:
             self._end_run()
             self._end_stretch()
@@ -220,7 +220,7 @@ class PointTrack:
             _set_sample(self._stream, self._paths[name], value, time)
 
     def _author_velocity(self, at: _Sample, before: _Sample, after: _Sample) -> None:
-        """Author the velocity of a sample by finite differences [units/s], or the shot's own where it is alone."""
+        """Author the velocity of a sample by finite differences [units/s], or the shot's own for an isolated sample."""
         seconds = (after.time - before.time) / (self._rate or 24.0)
         velocity = (after.points.astype(np.float64) - before.points) / seconds if seconds else self._own(at.time)
         if velocity is not None:
@@ -235,7 +235,7 @@ class PointTrack:
 
 
 def to_local(world: np.ndarray, to_metres: np.ndarray, path: str, time: float | None) -> np.ndarray:
-    """Bring world metres to local units, shape (V, 3): float64 inside, float32 out.
+    """Convert world metres to local units, shape (V, 3): float64 inside, float32 out.
 
     Args:
         world: Positions [m], shape (V, 3).
@@ -269,9 +269,9 @@ def extent_of(points: np.ndarray) -> np.ndarray:
 
 
 class HeatTrack:
-    """Writes one garment's heat maps as they come; an attribute is authored when its first values do.
+    """Writes one garment's heat maps in order; an attribute is authored with its first values.
 
-    A run of equal samples is written by its first and last only.
+    Only the first and last of a run of equal samples are written.
     """
 
     def __init__(self, stream: LayerStream, target: Sdf.Path, count: int, *, still: bool) -> None:
@@ -281,13 +281,13 @@ class HeatTrack:
             stream: The layer.
             target: Prim to author on.
             count: Number of fine vertices.
-            still: Whether the garment's input has no samples: a default is written in place of the first one.
+            still: Whether the garment's input has no samples: a default is written instead of the first sample.
         """
         self._stream, self._target, self._count, self._still = stream, target, count, still
         self._runs: dict[str, tuple[np.ndarray, float | None]] = {}
 
     def check(self, heat: Mapping[str, np.ndarray], time: float | None) -> None:
-        """Refuse values that are not one number a vertex."""
+        """Refuse arrays without exactly one number per vertex."""
         for name, values in heat.items():
             place = f"<{self._path(name)}>" + at_time(time)
             if name not in HEAT:
@@ -296,7 +296,7 @@ class HeatTrack:
                 raise LayerError(f"{place}: needs {self._count} values, got shape {values.shape}")
 
     def write(self, time: float | None, heat: Mapping[str, np.ndarray]) -> None:
-        """Write the maps of a time code by name, each of shape (V,); one that is left out has no sample here."""
+        """Write the maps of a time code by name, each of shape (V,); an omitted map gets no sample."""
         for name, array in heat.items():
             values = np.ascontiguousarray(array, np.float32)
             if name not in self._runs:
@@ -322,10 +322,10 @@ class HeatTrack:
 
 
 class ModelHints:
-    """Grows the authored hints of one garment's ancestors so that they hold the fine cloth."""
+    """Enlarges the authored extent hints of one garment's ancestors to contain the fine cloth."""
 
     def __init__(self, stream: LayerStream, stage: Usd.Stage, path: Sdf.Path, *, purpose: str) -> None:
-        """Find the ancestors of a coarse garment with a hint; the fine mesh's purpose chooses the box to grow."""
+        """Find the ancestors of a coarse garment with a hint; the fine mesh's purpose chooses the box to enlarge."""
         self._stream, self._stage = stream, stage
         self._prim = stage.GetPrimAtPath(path)
         self._row = 2 * _PURPOSES.index(purpose if purpose in _PURPOSES else "default")
@@ -336,7 +336,7 @@ class ModelHints:
                 self._models.append(prim)
 
     def write(self, time: float | None, box: np.ndarray) -> None:
-        """Grow the hints by the local extent of the fine mesh, shape (2, 3), at a time code."""
+        """Enlarge the hints by the local extent of the fine mesh, shape (2, 3), at a time code."""
         if not self._models:
             return
         cache = UsdGeom.XformCache(timecode(time))
@@ -349,7 +349,7 @@ class ModelHints:
                 self._grow(model, time, grown)
 
     def _grow(self, model: Usd.Prim, time: float | None, corners: np.ndarray) -> None:
-        """Author the union of a hint and eight corners, at a time where the hint is animated, else as default."""
+        """Author the union of a hint and eight corners, at the time code for an animated hint, else as default."""
         attribute = model.GetAttribute(ATTRIBUTE)
         time = time if attribute.GetNumTimeSamples() > 0 else None
         path = model.GetPath().AppendProperty(ATTRIBUTE)

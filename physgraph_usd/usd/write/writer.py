@@ -1,7 +1,7 @@
-"""Refined garments in one new layer, written frame after frame.
+"""Writes refined garments into one new layer, frame after frame.
 
-The layer holds overs only (and, in sibling mode, the refined siblings). Everything that depends on topology is authored
-once, when the writer opens; points, normals, extent and velocities come per time code. It is atomic by `stream`.
+The layer holds overs only (and, in sibling mode, the refined siblings). Topology-dependent properties are authored
+once, when the writer opens; points, normals, extent and velocities per time code. `stream` makes the write atomic.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ MODES = ("over", "sibling")
 
 
 class LayerWriter:
-    """One refined layer; a context manager. Leaving it after an error leaves nothing under the final name.
+    """One refined layer; a context manager. After an error no file is left under the final name.
 
     Attributes:
-        notices: Properties hidden, emptied or changed, and why.
+        notices: Properties hidden, emptied or changed, with the reason.
     """
 
     def __init__(
@@ -54,21 +54,21 @@ class LayerWriter:
         overwrite: bool = False,
         times: Sequence[float] | None = None,
     ) -> None:
-        """Start the layer and author everything that does not move.
+        """Start the layer and author all static opinions.
 
         Args:
             shot: The opened shot; never edited.
-            refinements: Per garment, coarse to fine; none keeps the cage.
-            out: Layer to write, ``.usdc``, ``.usda`` or ``.usd``; None for one in memory.
+            refinements: Per garment, coarse to fine; empty to keep the cage.
+            out: Layer to write, ``.usdc``, ``.usda`` or ``.usd``; None for an in-memory layer.
             mode: ``over`` replaces the garment; ``sibling`` adds ``<name>_refined`` and makes the garment its proxy.
-            velocities: Whether to author velocities, by finite differences, where the shot has none too.
+            velocities: Whether to author velocities, by finite differences, even for garments without velocities.
             provenance: Further entries of the record in ``customLayerData["physgraph"]``.
             overwrite: Whether an existing file may be replaced.
-            times: Time codes that will be written where they are not all of the shot; garments without a sample there
-                are not in the layer.
+            times: Time codes to be written, if not all of the shot; garments without a sample at any of the time codes
+                are left out of the layer.
 
         Raises:
-            UsageError: The mode is unknown, or the file exists or is one that the shot is made of.
+            UsageError: The mode is unknown, or the file exists or belongs to the shot.
             LayerError: The layer cannot be written.
         """
         if mode not in MODES:
@@ -88,7 +88,7 @@ class LayerWriter:
             self._cleanup = stack.pop_all()
 
     def _author_still(self, refinements: Sequence[Sequence[Refinement]]) -> None:
-        """Author metadata and the opinions of each garment that its topology decides."""
+        """Author metadata and the topology-dependent opinions of each garment."""
         times = self._shot.scene.times
         span = (times[0], times[-1]) if times else None
         provenance.copy_stage_metadata(self._shot.stage, self._stream.layer, span=span)
@@ -114,11 +114,11 @@ class LayerWriter:
 
         Args:
             time: The stage's own time code, later than the last; None once, for a shot without samples.
-            points: Per garment, fine points [m], world space, shape (V_fine, 3), or None where the garment has no
-                sample at this time.
-            changed: Per garment, False where the points are known to equal the last ones.
-            cuts: Per garment, whether the cloth jumps here from its sample before; () for none.
-            heat: Per garment, its heat maps by name, each of shape (V_fine,), or None; () for no heat maps.
+            points: Per garment, fine points [m], world space, shape (V_fine, 3), or None for a garment without a sample
+                at this time.
+            changed: Per garment, False when the points are known to equal the previous sample's.
+            cuts: Per garment, whether the cloth jumps here from the previous sample; () for none.
+            heat: Per garment, heat maps by name, each of shape (V_fine,), or None; () for no heat maps.
 
         Raises:
             LayerError: A point is not finite, counts do not match, times do not ascend, or the disk is full.
@@ -146,10 +146,10 @@ class LayerWriter:
         return [mesh.target for mesh in self._meshes.values()]
 
     def close(self, *, lacking: Mapping[str, Any] | None = None) -> Path | None:
-        """Finish, validate and move the layer to its final path, which is returned; None for a layer in memory.
+        """Finish, validate and move the layer to its final path; returns the path, or None for an in-memory layer.
 
         Args:
-            lacking: Entries of the record about frames that are missing or unsettled.
+            lacking: Entries of the record about missing or unsettled frames.
 
         Raises:
             LayerError: The layer is invalid or cannot be written.
@@ -182,7 +182,7 @@ class LayerWriter:
 
     @property
     def layer(self) -> Sdf.Layer:
-        """The layer being written, or in memory; LayerError when it is a file that is closed."""
+        """The layer being written or in memory; LayerError for a closed file."""
         return self._stream.layer
 
     def __enter__(self) -> LayerWriter:
@@ -192,7 +192,7 @@ class LayerWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Close after success; after an error remove what was written."""
+        """Close after success; after an error remove the written parts."""
         try:
             if error is None and self._open:
                 self.close()
@@ -202,11 +202,11 @@ class LayerWriter:
 
 
 class _RefinedMesh:
-    """The refined mesh of one garment as it is written.
+    """The refined mesh of one garment during writing.
 
     Attributes:
-        target: Its path.
-        notices: Properties hidden, emptied or changed, and why.
+        target: Prim path of the fine mesh.
+        notices: Properties hidden, emptied or changed, with the reason.
     """
 
     def __init__(
@@ -222,7 +222,7 @@ class _RefinedMesh:
     ) -> None:
         """Author the defaults of a garment, by number and refinements, coarse to fine, and start its tracks.
 
-        It is blocked at the time codes at which it is absent.
+        The garment is blocked at the absent time codes.
         """
         source, times = shot.sources[index], shot.scene.times
         prim, span = shot.stage.GetPrimAtPath(source.path), (times[0], times[-1]) if times else None
@@ -251,14 +251,14 @@ class _RefinedMesh:
     def write(
         self, time: float | None, points: np.ndarray, heat: Mapping[str, np.ndarray], *, changed: bool, cut: bool
     ) -> None:
-        """Write one time code, as `LayerWriter.write` takes it."""
+        """Write one time code; arguments as in `LayerWriter.write`."""
         points = self._weld.split(points)
         self._track.write(time, points, self._shot.to_metres(self._index, time), changed=changed, cut=cut)
         self._hints.write(time, self._track.box)
         self._heat.write(time, {name: self._weld.split(values) for name, values in heat.items()})
 
     def check(self, points: np.ndarray | None, heat: Mapping[str, np.ndarray], time: float | None) -> None:
-        """Refuse points and heat maps that do not fit."""
+        """Refuse points and heat maps of the wrong shape."""
         count = self._weld.mesh.vertex_count
         if points is not None and points.shape != (count, 3):
             place = f"<{self.target}>" + at_time(time)
@@ -266,11 +266,11 @@ class _RefinedMesh:
         self._heat.check(heat, time)
 
     def finish(self) -> None:
-        """Author what waited for a next sample."""
+        """Author pending samples at the end."""
         self._track.finish()
 
     def unknown_velocities(self) -> list[Notice]:
-        """A notice of samples alone between cuts, at which the shot has no velocities either."""
+        """A notice of samples isolated between cuts, for a shot without velocities at the samples."""
         if not self._track.unknown:
             return []
         message = f"its velocities are blocked at {named_times(self._track.unknown)}: it has no sample beside that one"
@@ -285,7 +285,7 @@ def _check_sizes(
     heat: Sequence[Mapping[str, np.ndarray] | None],
     time: float | None,
 ) -> None:
-    """Refuse points and heat maps that do not fit the garments, of which there are ``count``."""
+    """Refuse points and heat maps not matching the garments; ``count``: the number of garments."""
     if len(points) != count:
         raise LayerError(f"{len(points)} arrays of points for {count} garments")
     if heat and len(heat) != count:
@@ -295,7 +295,7 @@ def _check_sizes(
 
 
 def _facts(shot: Shot, targets: Sequence[Sdf.Path], out: Path | None) -> dict[str, Any]:
-    """Entries of the record about the garments, and the shot that they were read from."""
+    """Entries of the record about the garments and their shot."""
     pairs = zip(targets, shot.sources, strict=False)
     return {
         "shot": None if shot.view.root.anonymous else provenance.asset_path(shot.path, out and out.parent),
@@ -306,7 +306,7 @@ def _facts(shot: Shot, targets: Sequence[Sdf.Path], out: Path | None) -> dict[st
 
 
 def _garments_in(shot: Shot, times: Sequence[float] | None) -> list[int]:
-    """Numbers of the garments with a sample at one of the time codes; one without samples has the shot's first."""
+    """Numbers of the garments with a sample at a given time code; a garment without samples has the shot's first."""
     every = range(len(shot.sources))
     if times is None:
         return [*every]
@@ -318,7 +318,7 @@ def _own_velocities(prim: Usd.Prim, fine: FineMap, time: float | None) -> np.nda
     """Velocities of the coarse mesh at a time code between its first and last sample, refined linearly [units/s].
 
     Returns:
-        Shape (V_fine, 3), float32; None where there are none that fit.
+        Shape (V_fine, 3), float32; None without valid velocities.
     """
     attribute = UsdGeom.Mesh(prim).GetVelocitiesAttr()
     samples, value = attribute.GetTimeSamples(), value_at(attribute, time)
@@ -331,7 +331,7 @@ def _own_velocities(prim: Usd.Prim, fine: FineMap, time: float | None) -> np.nda
 
 
 def _refined_default(prim: Usd.Prim, fine: FineMap) -> np.ndarray | None:
-    """Authored default points, refined linearly, shape (V_fine, 3), float32; None where there are none that fit."""
+    """Authored default points, refined linearly, shape (V_fine, 3), float32; None without valid points."""
     value = UsdGeom.Mesh(prim).GetPointsAttr().Get(Usd.TimeCode.Default())
     if value is None or len(value) != fine.cage.vertex_count:
         return None
