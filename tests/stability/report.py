@@ -172,7 +172,7 @@ hold `quasi-newton` to bounds. What a test there expects to fail fails here too,
 A cell says whether the case passed and what was measured. "all" is for what no method decides; n/a means that the case
 does not concern the column. `adam`, `gd` and the learned `physgraph` and `physgraph-paper` are guarded; `quasi-newton`,
 `newton` and `physgraph` are nested, the others start at the finest level, where nothing that starts crossed is drawn
-apart. `auto`, refine's default, is `physgraph`, nested or at the finest level alone, and has no column of its own.
+apart. `physgraph`, nested, is what refine takes by default.
 {passed} of {measured} measured cells pass; of `quasi-newton`'s and of those under "all" {own} of {all_own}.
 
 {table}

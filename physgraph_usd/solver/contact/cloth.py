@@ -188,19 +188,20 @@ class ClothView:
         return self._springs.constraints(near)
 
     def measure(
-        self, before: Float[Tensor, "vertices 3"], x: Float[Tensor, "vertices 3"]
+        self, before: Float[Tensor, "vertices 3"] | None, x: Float[Tensor, "vertices 3"]
     ) -> tuple[dict[str, dict[str, int]], Bool[Tensor, " vertices"]]:
-        """What crosses before and after, as plain values, and the vertices of what does after.
+        """Crossings before and after, as plain values, and the vertices of those after.
 
-        What safe moves reached from where nothing crossed is not looked for again: nothing crosses there.
+        Positions that safe moves reached from a start without crossings have none and are not searched again.
 
         Args:
-            before: The upsampled cage [m]: it may cross where the cage does not.
+            before: The upsampled cage [m]; None where the cage does not cross itself, and nothing is searched.
             x: The result [m].
         """
         found = self.crossings(x)
+        first = Crossings.none(x.device) if before is None else crossings(self.parts, before)
         said = {
             name: {"crossings": each.count, "between_garments": int(np.triu(self.mesh.between(each), 1).sum())}
-            for name, each in (("before", crossings(self.parts, before)), ("after", found))
+            for name, each in (("before", first), ("after", found))
         }
         return said, self.mesh.crossed(found)

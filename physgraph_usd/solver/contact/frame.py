@@ -264,7 +264,7 @@ class FrameContact:
         if self._bodies is not None:
             said |= self._bodies.measure(finest, base, x, view=view.bodies)
         if view.cloth is not None:
-            cloth, crossing = view.cloth.measure(view.closed(base), x)
+            cloth, crossing = view.cloth.measure(view.closed(base) if self.crossed else None, x)
             near = view.cloth.came_near
             near = view.cloth.term(x) is not None if near is None else near
             said["cloth"] = {"near": near or any(each["crossings"] for each in cloth.values()), **cloth}
