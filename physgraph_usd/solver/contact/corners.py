@@ -72,7 +72,7 @@ def lift_over(
 
 
 def _up(corners: Float[Tensor, "triangles 3 3"], away: Float[Tensor, "triangles 3"]) -> Float[Tensor, "triangles 3"]:
-    """Unit ways out of what comes through a face between its points: of a needle not sideways, but past its tip."""
+    """Unit directions out of a surface that pierces a face between sample points: past a needle's tip, not sideways."""
     normal = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normal = torch.nn.functional.normalize(normal, dim=1, eps=1e-30)
     cosine = (normal * away).sum(dim=1, keepdim=True)

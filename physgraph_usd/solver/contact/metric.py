@@ -70,7 +70,7 @@ class HeldMetric:
         return (force * self._rough).add_(held, alpha=SMOOTH)
 
     def stiffened(self, stiffness: Float[Tensor, " vertices"]) -> Solver:
-        """P with max(K, stiffness - D) for K: the solve for cloth that is as stiff as that [N/m] where it is more."""
+        """P with max(K, stiffness - D) in place of K: the solve for cloth with at least the given stiffness [N/m]."""
         other = HeldMetric(self._plain, torch.maximum(self.stiff, stiffness - self._plain.diagonal.to(stiffness)))
 
         def solve(force: Tensor) -> Tensor:
