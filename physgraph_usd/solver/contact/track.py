@@ -88,7 +88,7 @@ class Track:
         return replace(self, at=at, known=known), which[kept], normal[kept], (distance * sign)[kept]
 
     def between(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Numbers of the vertices that are between overlapping parts of a closed surface at x [m]; which are in two."""
+        """Indices of vertices between overlapping parts of a closed surface at x [m]; mask of those in two parts."""
         still = torch.equal(x, self.at)
         moved = torch.zeros_like(self.known) if still else (x - self.at).norm(dim=1)
         which = torch.nonzero((self.known - moved < 0) & self.offset.isfinite()).squeeze(1)
