@@ -26,8 +26,7 @@ ROUNDING = wp.constant(wp.float64(2.4e-7))
 
 @wp.struct
 class Motion:
-    """Where vertices are, where they go, which pairs are asked for, the gap that these keep, and what is near where
-    nothing moves."""
+    """Positions, displacements, queried vertices, gap to keep, and search radii without motion."""
 
     start: wp.array(dtype=wp.vec3d)
     path: wp.array(dtype=wp.vec3d)
@@ -43,8 +42,7 @@ class Motion:
 
 @wp.struct
 class Boxes:
-    """Of each cluster: the box it starts in, its mean path, how far its vertices leave that, and how near it looks; and
-    the boxes of its edges and faces."""
+    """Per cluster: start box, mean path, deviation from the path, search distance, boxes of edges and faces."""
 
     low: wp.array(dtype=wp.vec3d)
     high: wp.array(dtype=wp.vec3d)
@@ -60,8 +58,7 @@ class Boxes:
 
 @wp.struct
 class Swept:
-    """Of each cluster: the box that it sweeps, widened by how near it looks and how far it may leave its paths, and how
-    near it looks."""
+    """Per cluster: swept box, widened by search distance and path tolerance; and the search distance."""
 
     low: wp.array(dtype=wp.vec3f)
     high: wp.array(dtype=wp.vec3f)

@@ -410,8 +410,7 @@ def find_clusters(
     out: wp.array(dtype=wp.vec3i),
     found: wp.array(dtype=wp.int32),
 ):
-    """Clusters that those of each group can come near, in it and in groups after it; counted also where there is no
-    room. Each worker takes a part of a group's clusters."""
+    """Candidate clusters of each group, in it and in later groups; counted even without room, split among workers."""
     a = (first + wp.tid()) // workers
     b = wp.int32(0)
     p = patches.wide_count + a

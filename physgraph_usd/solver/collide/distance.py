@@ -82,7 +82,7 @@ def weights_of_edges(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
 
 @wp.func
 def weights_of(face: wp.bool, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
-    """Weights in the shortest way to the vertex a from the triangle b, c, d, or to the edge a-b from the edge c-d."""
+    """Weights in the shortest vector from triangle b, c, d to vertex a, or from edge c-d to edge a-b."""
     if face:
         return weights_on_triangle(a, b, c, d)
     return weights_of_edges(a, b, c, d)
