@@ -50,10 +50,14 @@ class Sheet:
 
 @wp.struct
 class Patches:
-    """Of each patch: its own clusters and all, its plane, the half-planes of its domain, and what lies there; the wide
-    and the small patch that each cluster is an own one of, and the wide one that each small one lies in, -1 for wide
-    ones; the least cosine between its faces and its plane; and of each cluster its centre and radius at rest. The own
-    clusters of the small patches are groups: those that lie in each domain as a whole, by number."""
+    """The monotone patches of a level: planes, domains, and clusters.
+
+    For each patch: its own clusters and all its clusters, its plane, the half-planes of its domain, the faces and
+    clusters in the domain, the wide patch that contains it (-1 for wide patches), and the least cosine between its
+    faces and its plane. For each cluster: the wide and the small patch with the cluster among its own, and the
+    cluster's centre and radius at rest. The own clusters of the small patches form groups; for each domain the groups
+    wholly inside are listed by index.
+    """
 
     wide: wp.array(dtype=wp.int32)
     small: wp.array(dtype=wp.int32)

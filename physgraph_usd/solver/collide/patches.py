@@ -84,8 +84,10 @@ def fitted(
 
 @wp.func
 def has_changed(patches: Patches, p: wp.int32, change: wp.array(dtype=wp.float32), other: wp.array(dtype=wp.float32)):
-    """Whether a gradient in a patch has changed by more than the margin at one of two positions; in its plane it
-    changes by more than at rest, by one over the cosine."""
+    """True if a gradient in a patch has changed by more than the margin at one of two positions.
+
+    In the patch's plane the change is larger than at rest, by the inverse cosine.
+    """
     most = MARGIN * patches.flattest[p]
     for n in range(patches.first_member[p], patches.first_member[p + 1]):
         c = patches.members[n]
@@ -105,8 +107,10 @@ def least_of(
     worker: wp.int32,
     workers: wp.int32,
 ):
-    """m of a patch over a move in one worker's part of its faces, by Q fitted half way; `NOTHING` where it is less than
-    what is wanted."""
+    """m of a patch over a move in one worker's share of the faces.
+
+    Q is fitted half way. The result is `NOTHING` if m is less than the wanted m.
+    """
     q1, q2 = fitted(patches, p, start, path, wp.where(moves, wp.float64(0.5), wp.float64(0.0)))
     least = wp.float32(1.0)
     for k in range(patches.first_face[p] + worker, patches.first_face[p + 1], workers):
@@ -138,8 +142,10 @@ def measure_patches(
     wanted: wp.array(dtype=wp.bool),
     found: wp.array(dtype=wp.float32),
 ):
-    """m of some of the wanted patches over a move along straight paths, by each worker; of small ones only where that
-    of the wide one round them, which is known, is not enough in every case."""
+    """m of some wanted patches over a move along straight paths, by each worker.
+
+    Small patches are measured only if the known m of the surrounding wide patch is not enough in every case.
+    """
     place = (first + wp.tid()) + begin_at * workers
     p, worker = place // workers, place % workers
     if not wanted[p] or patches.first_face[p] == patches.first_face[p + 1]:
@@ -164,8 +170,10 @@ def find_lost(
     other: wp.array(dtype=wp.float32),
     lost: wp.array(dtype=wp.int32),
 ):
-    """Whether m of any patch is less than is relied on over a move; known where its gradients have changed little at
-    both ends."""
+    """Mark if m of any patch over a move is less than the required m.
+
+    Patches whose gradients have changed little at both ends pass without a measurement.
+    """
     place = first + wp.tid()
     p, worker = place // workers, place % workers
     if lost[0] > 0 or relied[p] == NOTHING:
@@ -186,8 +194,10 @@ def find_changes(
     lost: wp.array(dtype=wp.int32),
     change: wp.array(dtype=wp.float32),
 ):
-    """The greatest change of a gradient in each cluster from the nearer of two positions to a third, where it counts
-    still."""
+    """Largest change of a gradient in each cluster from the nearer of two positions to a third.
+
+    Skipped if the result is no longer needed.
+    """
     i = first + wp.tid()
     if lost[0] > 0:
         return
@@ -209,8 +219,11 @@ def change_of(t: wp.vec3i, r: wp.vec3f, before: wp.array(dtype=wp.vec3d), x: wp.
 
 @wp.kernel
 def measure_rest(first: wp.int32, parts: Topology, rest: wp.array(dtype=wp.vec3f)):
-    """Of each face at rest what turns sides into a gradient: one over its first side, and of its second side what lies
-    along that over its height, and one over the height."""
+    """Coefficients that turn the sides of each face into a gradient at rest.
+
+    Let b be the first side's length, and h and s the second side's components across and along the first side. The
+    coefficients are 1 / b, s / h and 1 / h.
+    """
     i = first + wp.tid()
     for k in range(parts.first_face[i], parts.first_face[i + 1]):
         t = parts.faces[k]

@@ -9,7 +9,8 @@ import numpy as np
 from .orient import pieces_of
 
 ASKED = 64
-"""Vertices of a cage, spread over it, whose winding numbers stand for all: enough to tell a half from a quarter."""
+"""Number of cage vertices, spread over the cage, whose winding numbers stand for all: enough to tell a half from a
+quarter."""
 INSIDE = 0.5
 """Winding number from which a point is inside."""
 CLEAR = 0.75

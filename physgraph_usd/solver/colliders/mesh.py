@@ -147,7 +147,7 @@ class MeshSurface:
         self._faces = self._faces.turned() if rigid else Faces(self)
 
     def _place(self, pose: MeshPose) -> np.ndarray:
-        """Recentre a pose; vertices without a face are moved onto a vertex with a face."""
+        """Recentre a pose; vertices without a face are moved to the origin."""
         used = pose.points[self._used]
         used = np.where(np.isfinite(used), used, 0.0)
         self.origin = 0.5 * (used.min(axis=0) + used.max(axis=0))
@@ -344,7 +344,7 @@ class Faces:
         return torch.nn.functional.normalize(normal, dim=1, eps=1e-30)
 
     def bare(self, whole: bool) -> tuple[wp.Mesh, Tensor] | None:
-        """The faces that lie bare, or that no other passes through besides, and their numbers; None without any."""
+        """Mesh and indices of the exposed faces, only of wholly exposed faces if ``whole``; None without any."""
         if whole not in self._skins:
             every = torch.arange(len(self._surface.corners), device=self._surface.device)
             hidden = self.is_buried(every)

@@ -183,7 +183,7 @@ def _clear_among(some: Tensor, x: Tensor, distance: Tensor, *, edges: Tensor) ->
 
 
 def _ask_edges(kernel: wp.Kernel, edges: Tensor, x: Tensor, distance: Tensor, *more: Any) -> None:
-    """Launch over edges; the kernel's first arguments are the points, the edges and the ends' distances."""
+    """Launch over edges; the kernel's first arguments are the edges, the points and the points' distances."""
     if not len(edges):
         return
     start_warp()  # Views of tensors do not start Warp by themselves.
