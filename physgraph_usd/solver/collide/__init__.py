@@ -1,1 +1,1 @@
-"""Detection: what is near what, and what would touch on its way. Positions in, answers out; nothing is remembered."""
+"""Collision detection: near pairs, and pairs that would touch on their paths. Stateless: positions in, pairs out."""

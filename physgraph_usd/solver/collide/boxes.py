@@ -1,4 +1,4 @@
-"""Boxes of clusters and of their parts while all vertices move along straight paths."""
+"""Bounding boxes of clusters and of their parts while all vertices move along straight paths."""
 
 # Warp's kernels are typed by values that only Warp reads.
 # pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportIndexIssue=false, reportCallIssue=false, reportGeneralTypeIssues=false
@@ -19,15 +19,14 @@ from .topology import Topology
 wp.set_module_options(KERNELS)
 
 FAR = wp.constant(wp.float64(1.0e30))
-"""Corner of a box that holds nothing."""
+"""Corner of an empty box."""
 ROUNDING = wp.constant(wp.float64(2.4e-7))
-"""What boxes in single precision are widened by, of their corners' distance from the origin."""
+"""Widening of single-precision boxes, as a fraction of their corners' distance from the origin."""
 
 
 @wp.struct
 class Motion:
-    """Where vertices are, where they go, which pairs are asked for, the gap that these keep, and what is near where
-    nothing moves."""
+    """Positions, displacements, queried vertices, gap to keep, and search radii without motion."""
 
     start: wp.array(dtype=wp.vec3d)
     path: wp.array(dtype=wp.vec3d)
@@ -43,8 +42,7 @@ class Motion:
 
 @wp.struct
 class Boxes:
-    """Of each cluster: the box it starts in, its mean path, how far its vertices leave that, and how near it looks; and
-    the boxes of its edges and faces."""
+    """Per cluster: start box, mean path, deviation from the path, search distance, boxes of edges and faces."""
 
     low: wp.array(dtype=wp.vec3d)
     high: wp.array(dtype=wp.vec3d)
@@ -60,8 +58,7 @@ class Boxes:
 
 @wp.struct
 class Swept:
-    """Of each cluster: the box that it sweeps, widened by how near it looks and how far it may leave its paths, and how
-    near it looks."""
+    """Per cluster: swept box, widened by search distance and path tolerance; and the search distance."""
 
     low: wp.array(dtype=wp.vec3f)
     high: wp.array(dtype=wp.vec3f)
@@ -70,7 +67,7 @@ class Swept:
 
 @wp.func
 def overlap(low: wp.vec3f, high: wp.vec3f, other_low: wp.vec3f, other_high: wp.vec3f):
-    """Whether two boxes meet; all six comparisons are made, for a wrong guess at a branch costs more."""
+    """True if two boxes overlap. All six comparisons are made: a mispredicted branch costs more."""
     first = wp.where(low[0] <= other_high[0], 1, 0) & wp.where(low[1] <= other_high[1], 1, 0)
     second = wp.where(low[2] <= other_high[2], 1, 0) & wp.where(other_low[0] <= high[0], 1, 0)
     third = wp.where(other_low[1] <= high[1], 1, 0) & wp.where(other_low[2] <= high[2], 1, 0)
@@ -79,7 +76,7 @@ def overlap(low: wp.vec3f, high: wp.vec3f, other_low: wp.vec3f, other_high: wp.v
 
 @wp.func
 def outside(low: wp.vec3d, high: wp.vec3d, other_low: wp.vec3d, other_high: wp.vec3d, reach: wp.float64):
-    """Whether two boxes are farther apart than a reach along an axis."""
+    """True if two boxes are farther apart than a reach along an axis."""
     for axis in range(3):
         if low[axis] > other_high[axis] + reach or other_low[axis] > high[axis] + reach:
             return True
@@ -88,25 +85,25 @@ def outside(low: wp.vec3d, high: wp.vec3d, other_low: wp.vec3d, other_high: wp.v
 
 @wp.func
 def lowest_of(v: wp.vec3d):
-    """A corner in single precision, no higher."""
+    """A corner in single precision, rounded down."""
     return single(v - ROUNDING * wp.abs(v))
 
 
 @wp.func
 def highest_of(v: wp.vec3d):
-    """A corner in single precision, no lower."""
+    """A corner in single precision, rounded up."""
     return single(v + ROUNDING * wp.abs(v))
 
 
 @wp.func
 def room_of(boxes: Boxes, motion: Motion, i: wp.int32, j: wp.int32):
-    """Distance of parts of two clusters from which on nothing is asked: nearness, or what pairs keep in a move."""
+    """Distance from which parts of two clusters are ignored: the search distance, or the gap to keep in a move."""
     return boxes.radius[i] + boxes.radius[j] + motion.floor
 
 
 @wp.func
 def pass_by(boxes: Boxes, i: wp.int32, j: wp.int32, room: wp.float64):
-    """Whether two clusters keep a distance on their way: the box that one sweeps, seen from the other, does."""
+    """True if two clusters keep a distance on their paths, by the box swept by the first relative to the second."""
     way = boxes.mean[i] - boxes.mean[j]
     reach = room + boxes.spread[i] + boxes.spread[j]
     low, high = boxes.low[i] + wp.min(way, wp.vec3d()), boxes.high[i] + wp.max(way, wp.vec3d())
@@ -123,7 +120,7 @@ def pass_by(boxes: Boxes, i: wp.int32, j: wp.int32, room: wp.float64):
 
 @wp.kernel
 def sweep_boxes(first: wp.int32, parts: Topology, motion: Motion, swept: Swept):
-    """The box that each cluster sweeps, wherever on its path each vertex is: some may stop while others go on."""
+    """Box swept by each cluster, with each vertex anywhere on its path: some vertices may stop while others move on."""
     i = first + wp.tid()
     low, high = wp.vec3d(FAR), wp.vec3d(-FAR)
     reach, near = wp.float64(0.0), wp.float64(0.0)
@@ -142,7 +139,7 @@ def sweep_boxes(first: wp.int32, parts: Topology, motion: Motion, swept: Swept):
 
 @wp.func
 def mean_path(parts: Topology, path: wp.array(dtype=wp.vec3d), i: wp.int32):
-    """The mean path of a cluster's vertices, and how far one leaves it at most."""
+    """Mean path of a cluster's vertices, and the largest deviation of a vertex from it."""
     total, most = wp.vec3d(), wp.float64(0.0)
     begin, end = parts.first_corner[i], parts.first_corner[i + 1]
     for k in range(begin, end):
@@ -155,7 +152,7 @@ def mean_path(parts: Topology, path: wp.array(dtype=wp.vec3d), i: wp.int32):
 
 @wp.kernel
 def bound_parts(first: wp.int32, parts: Topology, motion: Motion, active: wp.array(dtype=wp.int32), boxes: Boxes):
-    """The box that each of some clusters starts in, and those of its edges and faces."""
+    """Start boxes of some clusters, and of their edges and faces."""
     i = active[first + wp.tid()]
     lowest, highest = wp.vec3d(FAR), wp.vec3d(-FAR)
     for k in range(parts.first_corner[i], parts.first_corner[i + 1]):
@@ -176,7 +173,7 @@ def bound_parts(first: wp.int32, parts: Topology, motion: Motion, active: wp.arr
 
 @wp.kernel
 def average_paths(first: wp.int32, parts: Topology, motion: Motion, active: wp.array(dtype=wp.int32), boxes: Boxes):
-    """Of each of some clusters its mean path, how far vertices leave that, how near it looks, and if it is asked."""
+    """Mean path of some clusters, largest deviation of a vertex from it, search distance, and whether it is queried."""
     i = active[first + wp.tid()]
     asked, radius = wp.int32(0), wp.float64(0.0)
     for k in range(parts.first_corner[i], parts.first_corner[i + 1]):
@@ -192,7 +189,7 @@ def average_paths(first: wp.int32, parts: Topology, motion: Motion, active: wp.a
 
 
 def room_for_swept(size: int, device: str) -> Any:
-    """Boxes of whole paths to be filled."""
+    """Uninitialized boxes of whole paths."""
     swept = Swept()
     swept.low, swept.high = (wp.empty(size, dtype=wp.vec3f, device=device) for _ in range(2))
     swept.near = wp.empty(size, dtype=wp.float64, device=device)
@@ -200,7 +197,7 @@ def room_for_swept(size: int, device: str) -> Any:
 
 
 def room_for_boxes(parts: Parts) -> Any:
-    """Boxes to be filled."""
+    """Uninitialized boxes."""
     size, device = parts.count, parts.level.device
     boxes = Boxes()
     for name in ("low", "high", "mean"):
@@ -214,12 +211,12 @@ def room_for_boxes(parts: Parts) -> Any:
 
 
 class _Nothing:
-    """What a motion holds of vertices where nothing is said of them; kernels only read it.
+    """Default vertex arrays of a motion; kernels only read them.
 
     Attributes:
         all: True for each vertex.
-        tangle: -1 for each.
-        zero: 0 for each.
+        tangle: -1 for each vertex.
+        zero: 0 for each vertex.
     """
 
     def __init__(self, count: int, device: torch.device) -> None:
@@ -231,7 +228,7 @@ class _Nothing:
     @staticmethod
     @functools.lru_cache(maxsize=4)
     def of(count: int, device: torch.device) -> _Nothing:
-        """The same arrays for the same number of vertices."""
+        """Cached arrays for a number of vertices."""
         return _Nothing(count, device)
 
 
@@ -246,16 +243,16 @@ def motion_of(
     slack: Tensor | None = None,
     half: float = 0.0,
 ) -> Any:
-    """What kernels read of the vertices; pairs are near ones where a radius is given.
+    """Vertex data as a Warp struct; a radius makes it a query for near pairs.
 
     Args:
         start: Positions [m], float64, shape (V, 3).
-        path: How far each vertex goes [m], float64, shape (V, 3).
-        asked: Only pairs with one of these vertices are asked for; all where None, shape (V,).
-        tangle: The tangle that each vertex is in, int32, -1 where in none; or None.
-        radius: How near is near, as for `Reach` [m], or None.
+        path: Displacement of each vertex [m], float64, shape (V, 3).
+        asked: Vertices of which each queried pair must contain at least one; all if None, shape (V,).
+        tangle: The tangle of each vertex, int32, -1 outside tangles; or None.
+        radius: Search radius, as for `Reach` [m], or None.
         play: As for `Reach` [m], or None.
-        slack: How far each vertex may be elsewhere [m], or None.
+        slack: Position tolerance of each vertex [m], or None.
         half: As for `Reach`.
     """
     motion, nothing = Motion(), _Nothing.of(len(start), start.device)

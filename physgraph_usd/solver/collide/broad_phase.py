@@ -1,8 +1,9 @@
-"""Broad phase: the pairs of clusters whose parts can come near one another, or touch, on straight paths.
+"""Broad phase: pairs of clusters whose parts can come near one another, or touch, on straight paths.
 
-Nearly all that boxes find are neighbours on the cloth. Those in one monotone patch (`patches`) cannot touch; and where
-m of the patch times their distance in its plane is more than is asked for, or m times the least cosine between faces
-and plane more than the part of their distance at rest that is, they are not near either, and left out.
+Nearly all pairs with overlapping boxes are neighbours on the cloth. Pairs in one monotone patch (`patches`) cannot
+touch. They are not near either, and are omitted, if m of the patch times their distance in its plane exceeds the search
+distance, or if m times the least cosine between faces and plane exceeds the searched fraction of their distance at
+rest.
 """
 
 # Warp's kernels are typed by values that only Warp reads.
@@ -29,31 +30,31 @@ from .topology import Topology
 wp.set_module_options(KERNELS)
 
 ROOM = 48
-"""Pairs of a cluster that there is room for before they are counted."""
+"""Pairs per cluster with room before the pairs are counted."""
 LEAST = wp.constant(wp.float32(0.01))
-"""What m is asked to be at least: single precision rounds it to some millionths."""
+"""Least m used for proofs: single precision rounds m to a few millionths."""
 KNOWN = 3
-"""Positions of which it is known that they are near the paths, and how far clusters went to them."""
+"""Most cached positions found to be near the paths, with the clusters' displacements to them."""
 GRADES = wp.constant(64)
-"""Grades of m in which is noted what is relied on."""
+"""Number of grades in which the required m is recorded."""
 APART, OUT = wp.constant(1), wp.constant(2)
-"""What patches prove of two clusters: that they do not touch on any path that is served, or that they are not near."""
+"""Proofs of patches for two clusters: no touch on any covered path, or not near."""
 
 
 @dataclass(frozen=True, eq=False)
 class ClusterPairs:
-    """Pairs of clusters, all that matter while vertices stay near the paths that they were found for.
+    """All pairs of clusters that matter while vertices stay near the paths of the search.
 
     Attributes:
         parts: The parts.
-        start: Where the vertices were [m], float64.
-        path: Where they went from there [m], float64.
-        slack: How far they may be from these paths [m].
-        pairs: The clusters of each pair, the lower one first, shape (N, 2), int32.
-        active: Clusters that occur in pairs, int32.
-        apart: Which pairs are proved not to touch on the paths: they can only be near, shape (N,).
-        allowed: How much nearer those of each pair may come while parts that were listed serve [m], shape (N,).
-        relied: What is relied on of m of each patch, by what is proved with it; -1 where nothing is.
+        start: Start positions of the paths [m], float64.
+        path: Displacements along the paths [m], float64.
+        slack: Largest distance of the vertices from the paths [m].
+        pairs: The clusters of each pair, the lower index first, shape (N, 2), int32.
+        active: Clusters in pairs, int32.
+        apart: True for pairs proved not to touch on the paths, which can only be near, shape (N,).
+        allowed: Largest approach of each pair for which a list of parts stays valid [m], shape (N,).
+        relied: Required m of each patch for its proofs; -1 without proofs.
     """
 
     parts: Parts
@@ -85,12 +86,12 @@ class ClusterPairs:
         Args:
             parts: The parts.
             start: Positions [m], float64.
-            end: Where the vertices go [m], float64; None where nothing moves.
-            radius: How near each vertex looks [m], float64.
-            slack: How far each may be from its path [m], float64.
-            allowed: How far each may go while parts that were listed serve [m], float64.
-            half: What lies in one garment is asked for only within this part of its distance at rest.
-            asked: Only pairs with one of these clusters; all where None.
+            end: End positions [m], float64; None without motion.
+            radius: Search radius of each vertex [m], float64.
+            slack: Largest distance of each vertex from its path [m], float64.
+            allowed: Displacement of each vertex for which a list of parts stays valid [m], float64.
+            half: Fraction of the distance at rest within which parts of one garment are searched.
+            asked: Clusters of which each pair must contain at least one; all if None.
         """
         path = torch.zeros_like(start) if end is None else end - start
         enough = half + float(MARGIN)
@@ -105,11 +106,11 @@ class ClusterPairs:
         return ClusterPairs(parts, start, path, slack, pairs, active, found[:, 2] == APART, least, relied)
 
     def nearer(self, before: Float[Tensor, "vertices 3"], *places: Float[Tensor, "vertices 3"]) -> Tensor:
-        """How much nearer the clusters of each pair can have come to one of two places [m], or to one, float64.
+        """Upper bound of each pair's approach to the nearer of one or two reference positions [m], float64.
 
         Args:
-            before: Where the vertices were [m].
-            places: The places: what is known of them is kept, so they must not be written to.
+            before: Positions of the vertices [m].
+            places: Reference positions, cached by tensor: do not write to them.
 
         Returns:
             Shape (pairs,).
@@ -121,7 +122,7 @@ class ClusterPairs:
         return out
 
     def _gone(self, before: Tensor, x: Tensor) -> tuple[wp.array, wp.array]:
-        """How far the vertices of each cluster in a pair went on the mean, and how far from that at most [m]."""
+        """Mean displacement of each active cluster's vertices, and the largest deviation from the mean [m]."""
         for start, end, known in self._went:
             if start is before and end is x:
                 return known
@@ -133,13 +134,13 @@ class ClusterPairs:
         return mean, spread
 
     def covers(self, start: Float[Tensor, "vertices 3"], end: Float[Tensor, "vertices 3"] | None) -> bool:
-        """Whether it serves for a move between positions, or for positions: m of its patches must do there.
+        """True if the pairs are valid for a move or for positions, including the proofs by m.
 
-        What is known of positions is kept, so they must not be written to.
+        Results are cached by tensor: do not write to the positions.
 
         Args:
             start: Positions [m], float64.
-            end: Where the vertices go [m], float64; None where nothing moves.
+            end: End positions [m], float64; None without motion.
         """
         lost = torch.zeros(1, dtype=torch.int32, device=start.device)
         places = (start, start if end is None else end)
@@ -153,7 +154,7 @@ class ClusterPairs:
         return True
 
     def _changes(self, x: Tensor, lost: Tensor) -> wp.array:
-        """What has changed in each cluster at x [m]; ``lost`` becomes 1 where a vertex is not near its path."""
+        """Changes of the gradients in each cluster at x [m]; ``lost`` becomes 1 if a vertex is not near its path."""
         for known, change in self._near:
             if known is x:
                 return change
@@ -163,19 +164,19 @@ class ClusterPairs:
 
     @cached_property
     def _end(self) -> Float[Tensor, "vertices 3"]:
-        """Where the paths end [m]."""
+        """End positions of the paths [m]."""
         return self.start + self.path
 
 
 def _keep(known: list[Any], one: tuple[Any, ...]) -> None:
-    """Keep one more of what is known, and no more than so many."""
+    """Add an entry to a cache of bounded size."""
     if not any(all(a is b for a, b in zip(each[:-1], one[:-1], strict=True)) for each in known):
         known.append(one)
         del known[:-KNOWN]
 
 
 def launch(parts: Parts, kernel: wp.Kernel, size: int, *inputs: object, least: int = LEAST_PER_THREAD) -> None:
-    """Run a kernel over clusters or pairs of clusters; another thread is worth it from so many items."""
+    """Run a kernel over clusters or pairs of clusters; a further thread needs a minimum number of items."""
     launched = {"device": parts.level.device, "threads": parts.level.threads, "least": least}
     run(kernel, size, [parts.topology, *inputs], **launched)
 
@@ -183,7 +184,7 @@ def launch(parts: Parts, kernel: wp.Kernel, size: int, *inputs: object, least: i
 def _in_boxes(
     parts: Parts, motion: Any, m: Tensor, *, half: float, asked: Bool[Tensor, " clusters"] | None
 ) -> tuple[Int[Tensor, "pairs 3"], Float[Tensor, " patches"]]:
-    """Pairs of clusters whose boxes meet on their way, what is proved of them, and what that relies on of m."""
+    """Pairs of clusters with overlapping swept boxes, their proofs, and the m required by the proofs."""
     size, device = parts.count, str(m.device)
     swept = room_for_swept(size, device)
     launch(parts, sweep_boxes, size, motion, swept)
@@ -214,17 +215,17 @@ def _in_boxes(
 
 
 def _relied(m: Float[Tensor, " patches"], grades: Tensor) -> Float[Tensor, " patches"]:
-    """The highest grade that was noted of each patch, as a part of its m; -1 where nothing is relied on."""
+    """Highest grade recorded for each patch, as a fraction of its m; -1 without proofs."""
     highest = (grades * torch.arange(int(GRADES) + 1, dtype=torch.uint8, device=m.device)).amax(dim=1)
     return torch.where(highest > 0, highest * (m / float(GRADES)), float(NOTHING))
 
 
 @wp.struct
 class Proofs:
-    """m of each patch, what is relied on of it, and the part of distances at rest within which cloth is asked for.
+    """m of each patch, the m required by proofs, and the searched fraction of distances at rest.
 
-    What is relied on is noted as a mark in one of `GRADES` grades of m, rounded up: marks of several threads are the
-    same whichever comes last, and a greatest value would not be, since on the CPU Warp finds one without a lock.
+    The required m is recorded as marks in `GRADES` grades of m, rounded up: marks set by several threads do not depend
+    on their order. A maximum would, because Warp's atomic maximum takes no lock on the CPU.
     """
 
     m: wp.array(dtype=wp.float32)
@@ -241,7 +242,7 @@ def gap_in(patches: Patches, p: wp.int32, i: wp.int32, j: wp.int32):
 
 @wp.func
 def note(proofs: Proofs, p: wp.int32, needed: wp.float32):
-    """Mark what is relied on of a patch's m, which is greater."""
+    """Mark the m required of a patch; the required m is less than the patch's m."""
     grade = wp.min(wp.int32(wp.ceil(needed / proofs.m[p] * wp.float32(GRADES))), GRADES)
     proofs.grades[p * (GRADES + 1) + grade] = wp.uint8(1)
 
@@ -255,7 +256,7 @@ def proved_by(
     i: wp.int32,
     j: wp.int32,
 ):
-    """What a patch proves of two clusters, and how much of m that needs is noted."""
+    """Proof of a patch for two clusters; the required m is marked."""
     if proofs.m[p] <= LEAST + MARGIN:
         return 0
     begin, end = patches.first_inside[p], patches.first_inside[p + 1]
@@ -283,7 +284,7 @@ def proved(
     i: wp.int32,
     j: wp.int32,
 ):
-    """What the patches round two clusters prove of them."""
+    """Proof for two clusters by the patches that contain them."""
     most = proved_by(patches, proofs, reach, patches.wide[i], i, j)
     if most < OUT:
         most = wp.max(most, proved_by(patches, proofs, reach, patches.small[i], i, j))
@@ -302,7 +303,7 @@ def have_both(
     a: wp.int32,
     b: wp.int32,
 ):
-    """Whether a patch has two groups, and proves that nothing of the two is near; what that needs is noted."""
+    """True if a patch contains two groups and proves that no parts of the two are near; the required m is marked."""
     needed = wp.max(proofs.half / patches.flattest[p], LEAST)
     if proofs.m[p] <= needed + MARGIN:
         return False
@@ -322,7 +323,7 @@ def lie_apart(
     a: wp.int32,
     b: wp.int32,
 ):
-    """Whether a patch round two groups proves that nothing of the two is near."""
+    """True if a patch containing two groups proves that no parts of the two are near."""
     small, other = patches.wide_count + a, patches.wide_count + b
     if have_both(patches, proofs, patches.within[small], a, b):
         return True
@@ -337,13 +338,13 @@ def lie_apart(
 
 @wp.func
 def feel(parts: Topology, i: wp.int32, j: wp.int32):
-    """Whether the garments of two clusters feel one another."""
+    """True if the garments of two clusters may be in contact."""
     return parts.meets[parts.garment[i] * parts.garments + parts.garment[j]] != 0
 
 
 @wp.func
 def box_of(patches: Patches, swept: Swept, begin: wp.int32, end: wp.int32, step: wp.int32):
-    """The box of some clusters of a group."""
+    """Bounding box of some clusters of a group."""
     lowest, highest = wp.vec3f(wp.float32(FAR)), wp.vec3f(wp.float32(-FAR))
     for n in range(begin, end, step):
         lowest = wp.min(lowest, swept.low[patches.own[n]])
@@ -360,7 +361,7 @@ def join_boxes(
     all_low: wp.array(dtype=wp.vec3f),
     all_high: wp.array(dtype=wp.vec3f),
 ):
-    """The box of each group's clusters."""
+    """Bounding box of each group's clusters."""
     a = first + wp.tid()
     p = patches.wide_count + a
     lowest, highest = box_of(patches, swept, patches.first_own[p], patches.first_own[p + 1], 1)
@@ -382,7 +383,7 @@ def pairs_of(
     begin: wp.int32,
     end: wp.int32,
 ):
-    """Write the pairs of a cluster and others that it can come near, those that are own ones of a patch, in a row."""
+    """Write the pairs of a cluster and a patch's own clusters that the cluster can come near, consecutively."""
     for k in range(begin, end):
         j = patches.own[k]
         if not overlap(swept.low[i], swept.high[i], swept.low[j], swept.high[j]):
@@ -409,8 +410,7 @@ def find_clusters(
     out: wp.array(dtype=wp.vec3i),
     found: wp.array(dtype=wp.int32),
 ):
-    """Clusters that those of each group can come near, in it and in groups after it; counted also where there is no
-    room. Each worker takes a part of a group's clusters."""
+    """Candidate clusters of each group, in it and in later groups; counted even without room, split among workers."""
     a = (first + wp.tid()) // workers
     b = wp.int32(0)
     p = patches.wide_count + a
@@ -448,7 +448,7 @@ def find_asked(
     out: wp.array(dtype=wp.vec3i),
     found: wp.array(dtype=wp.int32),
 ):
-    """Clusters that those asked for can come near, each pair once, as `find_clusters` has them."""
+    """Candidate clusters for the queried clusters, each pair once, in the layout of `find_clusters`."""
     n = first + wp.tid()
     i, b = which[n], wp.int32(0)
     query = wp.bvh_query_aabb(tree, swept.low[i], swept.high[i])
@@ -473,7 +473,7 @@ def find_strays(
     slack: wp.array(dtype=wp.float64),
     lost: wp.array(dtype=wp.int32),
 ):
-    """Whether a vertex is farther from its path than it may be."""
+    """Mark vertices farther from their path than their tolerance."""
     v = first + wp.tid()
     if lost[0] > 0:
         return
@@ -493,7 +493,7 @@ def average(
     mean: wp.array(dtype=wp.vec3d),
     spread: wp.array(dtype=wp.float64),
 ):
-    """How far the vertices of each of some clusters went on the mean, and how far from that at most."""
+    """Mean displacement of some clusters' vertices, and the largest deviation from the mean."""
     i = active[first + wp.tid()]
     path_of_it, most = mean_path(parts, path, i)
     mean[i] = path_of_it
@@ -511,7 +511,7 @@ def approach(
     other_spread: wp.array(dtype=wp.float64),
     out: wp.array(dtype=wp.float64),
 ):
-    """How much nearer the clusters of each pair can have come to one of two places."""
+    """Upper bound of the approach of each pair's clusters to the nearer of two reference positions."""
     n = first + wp.tid()
     i, j = clusters[n][0], clusters[n][1]
     here = wp.length(mean[i] - mean[j]) + spread[i] + spread[j]

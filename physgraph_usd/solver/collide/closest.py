@@ -1,4 +1,4 @@
-"""Closest points of the cloth's own faces, each point asked of its own set of them."""
+"""Closest points on subsets of the cloth's own faces."""
 
 # Warp's kernels are typed by values that only Warp reads.
 # pyright: reportArgumentType=false, reportIndexIssue=false, reportCallIssue=false
@@ -20,7 +20,7 @@ from .domains import holds
 wp.set_module_options(KERNELS)
 
 FAR = wp.constant(wp.float64(1.0e30))
-"""Distance of what has no faces to look at."""
+"""Distance for an empty subset."""
 
 
 @wp.kernel
@@ -61,13 +61,13 @@ def displacements_to(
     which: Int[Tensor, " asked"],
     sets: csr_matrix,
 ) -> Float[Tensor, "asked 3"]:
-    """Displacements from the closest point of a set of faces to each of some vertices [m], float64; 0 from empty sets.
+    """Displacements from the closest point of a set of faces to each query vertex [m], float64; 0 for empty sets.
 
     Args:
         level: The level.
         x: Positions [m].
-        asked: Numbers of the vertices.
-        which: The row of the set that each is asked of.
+        asked: Indices of the query vertices.
+        which: The row of each query vertex's set.
         sets: Faces of each set, shape (sets, T).
     """
     at, device = x.double().contiguous(), level.device

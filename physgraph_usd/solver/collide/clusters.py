@@ -1,6 +1,6 @@
-"""A level's vertices, edges and faces in clusters that hang together: one query of a hierarchy for all of a cluster.
+"""Connected clusters of a level's vertices, edges and faces, each sharing a single hierarchy query.
 
-Almost all that a query of a single edge finds are its neighbours, and most of its time goes into finding them.
+A query of a single edge mostly finds the edge's neighbours, and spends most of its time on them.
 """
 
 # Warp's arrays are typed by values that only Warp reads.
@@ -20,9 +20,10 @@ class Clusters:
 
     Attributes:
         count: Number of clusters.
-        vertices: Warp arrays: the first vertex of each cluster, the faces' corners in the clusters' order.
-        edges: Warp arrays: the first edge of each cluster, the edges' ends in the clusters' order, their numbers.
-        faces: Warp arrays: the same of the faces, which belong where their first corners do.
+        vertices: Warp arrays: first vertex of each cluster, the faces' corners in cluster order.
+        edges: Warp arrays: first edge of each cluster, the edges' ends in cluster order, the edges' indices.
+        faces: Warp arrays: first face of each cluster, the faces' corners and indices; a face belongs to the cluster of
+            its first corner.
         garment: Warp array: the garment of each cluster.
     """
 
@@ -31,8 +32,8 @@ class Clusters:
 
         Args:
             level: The level.
-            beside: Adjacency of its vertices, shape (V, V).
-            sides: The edges that each face owns, -1 for those that another face owns, shape (T, 3).
+            beside: Adjacency of the vertices, shape (V, V).
+            sides: The edges owned by each face, -1 for edges owned by another face, shape (T, 3).
         """
         start_warp()  # Views of tensors do not start Warp by themselves.
         self._device = level.device
@@ -57,7 +58,7 @@ class Clusters:
 
 
 def _in_space(cluster: np.ndarray, level: Level) -> np.ndarray:
-    """The same clusters in the order of a curve through them at rest (Morton 1966): near ones lie near in memory."""
+    """Clusters renumbered along a space-filling curve at rest (Morton 1966), for memory locality."""
     rest = level.rest.double().cpu().numpy()
     count = int(cluster.max(initial=-1)) + 1
     size = np.maximum(np.bincount(cluster, minlength=count), 1)
@@ -74,7 +75,7 @@ def _in_space(cluster: np.ndarray, level: Level) -> np.ndarray:
 
 
 def gathered(beside: sp.csr_matrix) -> np.ndarray:
-    """The cluster of each vertex: roots no two of which are neighbours, and their neighbours (Luby 1986).
+    """The cluster of each vertex: independent roots with their neighbours (Luby 1986).
 
     Clusters have the order of their roots.
     """
@@ -91,7 +92,7 @@ def gathered(beside: sp.csr_matrix) -> np.ndarray:
 
 
 def _greatest_beside(beside: sp.csr_matrix, values: np.ndarray) -> np.ndarray:
-    """The greatest of the values at each vertex's neighbours, 0 without any."""
+    """Maximum of the values at each vertex's neighbours, 0 without neighbours."""
     out = np.zeros(len(values), values.dtype)
     some = np.flatnonzero(np.diff(beside.indptr))
     if len(some):
@@ -100,6 +101,6 @@ def _greatest_beside(beside: sp.csr_matrix, values: np.ndarray) -> np.ndarray:
 
 
 def _by_owner(owner: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """The first place of each owner's items, and the items in the owners' order."""
+    """Start of each owner's items, and the items sorted by owner."""
     first = np.concatenate([[0], np.cumsum(np.bincount(owner, minlength=count))])
     return first, np.argsort(owner, kind="stable")

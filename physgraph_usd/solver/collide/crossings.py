@@ -1,4 +1,4 @@
-"""Edges that pass through faces: all of them, asked cluster by cluster."""
+"""All edges that pass through faces, searched by pairs of clusters."""
 
 # Warp's kernels are typed by values that only Warp reads.
 # pyright: reportArgumentType=false, reportIndexIssue=false, reportCallIssue=false, reportGeneralTypeIssues=false, reportAttributeAccessIssue=false
@@ -27,8 +27,8 @@ class Crossings:
     """Edges that pass through faces.
 
     Attributes:
-        edge: Shape (N,).
-        face: Shape (N,).
+        edge: Indices of the edges, shape (N,).
+        face: Indices of the faces, shape (N,).
     """
 
     edge: Int[Tensor, " crossings"]
@@ -36,7 +36,7 @@ class Crossings:
 
     @property
     def count(self) -> int:
-        """Number of such pairs."""
+        """Number of crossings."""
         return len(self.edge)
 
     @staticmethod
@@ -48,7 +48,7 @@ class Crossings:
 
 @wp.func
 def turns_left(x: wp.array(dtype=wp.vec3d), e: wp.vec2i, p: wp.int32, q: wp.int32):
-    """Whether the line from p to q passes an edge on its left; of two faces at a side just one has it on its left."""
+    """True if the line from p to q passes an edge on the edge's left; true for exactly one of two faces at a side."""
     low, high = wp.min(p, q), wp.max(p, q)
     left = volume(x[e[0]], x[e[1]], x[low], x[high]) >= wp.float64(0.0)
     return left == (p < q)
@@ -56,9 +56,9 @@ def turns_left(x: wp.array(dtype=wp.vec3d), e: wp.vec2i, p: wp.int32, q: wp.int3
 
 @wp.func
 def is_through(x: wp.array(dtype=wp.vec3d), e: wp.vec2i, t: wp.vec3i):
-    """Whether an edge passes through a triangle; an end in its plane does not, a side belongs to one of its faces.
+    """True if an edge passes through a triangle. An end in the plane does not; a side belongs to one of its faces.
 
-    What is in the plane but for the rounding of single precision is in it: parts of one flat face do not cross.
+    Points within single-precision rounding of the plane count as in the plane: parts of one flat face do not cross.
     """
     p, q, r, a, b = x[t[0]], x[t[1]], x[t[2]], x[e[0]], x[e[1]]
     near, far = volume(p, q, r, a), volume(p, q, r, b)
@@ -74,7 +74,7 @@ def is_through(x: wp.array(dtype=wp.vec3d), e: wp.vec2i, t: wp.vec3i):
 
 @wp.func
 def touches(parts: Topology, e: wp.vec2i, t: wp.vec3i):
-    """Whether an edge is sewn to a face."""
+    """True if an edge is sewn to a face."""
     for end in range(2):
         for corner in range(3):
             if is_one(parts, e[end], t[corner]):
@@ -93,7 +93,7 @@ def edges_through(
     j: wp.int32,
     count: wp.int32,
 ):
-    """Write the edges of a cluster that pass through faces of another, with these; the number of pairs so far."""
+    """Write the edges of a cluster that pass through faces of another cluster; returns the number of pairs so far."""
     for k in range(parts.first_edge[i], parts.first_edge[i + 1]):
         e = parts.edges[k]
         near, far = motion.start[e[0]], motion.start[e[1]]
@@ -116,7 +116,7 @@ def edges_through(
 def find_crossings(
     first: wp.int32, parts: Topology, clusters: wp.array(dtype=wp.vec2i), motion: Motion, boxes: Boxes, found: Found
 ):
-    """The edges of either of two clusters that pass through faces of the other, so far as there is room."""
+    """Edges of either of two clusters that pass through faces of the other cluster, up to the room."""
     n = first + wp.tid()
     i, j = clusters[n][0], clusters[n][1]
     if found.begin[n + 1] == found.begin[n]:
@@ -128,12 +128,12 @@ def find_crossings(
 
 
 def crossings(parts: Parts, x: Float[Tensor, "vertices 3"], *, detector: Detector | None = None) -> Crossings:
-    """Every edge that passes through a face which it shares no vertex with, nor is sewn to.
+    """All edges that pass through a face to which they are neither connected nor sewn.
 
     Args:
         parts: The parts.
         x: Positions [m].
-        detector: What has detected before with the same parts, or None.
+        detector: Collision detector of the same parts for reuse, or None.
     """
     numbers = (detector or Detector.once(parts)).still(find_crossings, x)
     edge, face = numbers.corners.long()[:, 0], numbers.corners.long()[:, 1]

@@ -1,7 +1,7 @@
-"""Collision detection of one level's cloth: what is near, what would touch on straight paths, and what crosses.
+"""Collision detection of one level's cloth: near pairs, impacts on straight paths, and crossings.
 
-A broad phase serves until cloth leaves the paths that it was found for, or a patch on which it relies is monotone no
-more; within it a list of near pairs serves while vertices hardly move.
+A broad phase is reused until cloth leaves the searched paths or a required patch is no longer monotone. Within a broad
+phase, a list of near pairs is reused while vertices hardly move.
 """
 
 # Warp's kernels are typed by values that only Warp reads.
@@ -24,31 +24,31 @@ from .narrow_phase import Pairs, Reach, find, find_pairs, of_list
 from .parts import Parts
 
 SLACK = 0.25
-"""How far vertices may leave the paths of a broad phase, in mean edges."""
+"""Distance that vertices may leave the paths of a broad phase, in mean edges."""
 LIST_RADIUS = 0.1
-"""How much nearer two clusters may come while a list of near pairs serves for moves, of each in its shortest edge; for
-forces half as much."""
+"""Approach of two clusters for which a list of near pairs stays valid for moves, as a fraction of each cluster's
+shortest edge; half as much for forces."""
 KNOWN = 4
-"""Positions of which it is known what they are in double precision."""
+"""Size of the cache of float64 copies of positions."""
 FEW = 0.25
-"""Part of the clusters up to which a move that no broad phase serves has one of its own, of those asked for alone."""
+"""Largest fraction of queried clusters for which a move outside the broad phase gets its own search of only these
+clusters."""
 SPARE = 1.05
-"""What is listed reaches so much farther than it need: distances are rounded."""
+"""Safety factor of the list radius, for rounded distances."""
 IMPACTS, NEAR = 4, 16
-"""Pairs of parts of two clusters that there is room for before they are counted: few meet on their way, many are
-near."""
+"""Room for pairs of parts per two clusters before the pairs are counted: few pairs impact, many are near."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Listed:
-    """Near pairs, while no two clusters come nearer by more than they may.
+    """List of near pairs, valid while no two clusters approach by more than allowed.
 
     Attributes:
-        found: The broad phase that they were found in.
-        x: Where vertices were when it was looked last [m], float64.
-        drift: How much nearer each pair of clusters may have come until then, since it was listed [m].
+        found: Broad phase of the list.
+        x: Positions at the last check [m], float64.
+        drift: Upper bound of each cluster pair's approach between listing and last check [m].
         pairs: The pairs of parts.
-        owner: The pair of clusters of each.
+        owner: The cluster pair of each pair of parts.
     """
 
     found: ClusterPairs
@@ -59,12 +59,12 @@ class _Listed:
 
     @cached_property
     def doubtful(self) -> Pairs:
-        """Pairs of parts of clusters that are not proved to stay apart on the paths."""
+        """Pairs of parts in clusters without a proof that they stay apart on the paths."""
         return self.pairs.where(~self.found.apart[self.owner])
 
 
 class _Places:
-    """Positions in double precision, as copies: known for the same tensor until that is written to."""
+    """Cache of float64 copies of positions, valid until the source tensor is written to."""
 
     def __init__(self) -> None:
         self._known: list[tuple[Tensor, int, Tensor]] = []
@@ -79,18 +79,18 @@ class _Places:
 
 
 class Detector:
-    """Detects for one level's cloth; what it remembers changes how long an answer takes, not which pairs it has."""
+    """Collision detector of one level's cloth. Its caches affect only the speed, never the set of pairs."""
 
     def __init__(
         self, parts: Parts, near: Reach | None = None, *, slack: float = SLACK, farther: float = LIST_RADIUS
     ) -> None:
-        """Begin with nothing found.
+        """Start with empty caches.
 
         Args:
-            parts: What may touch what.
-            near: How near is near, where that will be asked for.
-            slack: How far vertices may leave the paths of a broad phase before there is another, in mean edges.
-            farther: How much farther than what is near what is listed may be, of each vertex in its shortest edge.
+            parts: Table of vertex, edge and face pairs that may be in contact.
+            near: Search radii of near pairs, if needed.
+            slack: Distance that vertices may leave the paths of a broad phase, in mean edges.
+            farther: Margin of the list of near pairs, in each vertex's shortest edge.
         """
         self.parts, self.reach = parts, near
         nothing = torch.zeros_like(parts.shortest)
@@ -106,11 +106,11 @@ class Detector:
 
     @staticmethod
     def once(parts: Parts, near: Reach | None = None) -> Detector:
-        """One that is asked once: it looks no farther than it need."""
+        """A detector for a single query, without margins for later queries."""
         return Detector(parts, near, slack=0.0, farther=0.0)
 
     def near(self, x: Float[Tensor, "vertices 3"]) -> Pairs:
-        """All near pairs at x [m], and some that are a little farther."""
+        """All near pairs at x [m], and some pairs slightly farther apart."""
         assert self.reach is not None
         at = self._places.of(x)
         found, last, reach = self._broad(at, None), self._listed, self.reach
@@ -140,14 +140,14 @@ class Detector:
         asked: Bool[Tensor, " vertices"],
         tangle: Int[Tensor, " vertices"] | None = None,
     ) -> Pairs:
-        """Every pair of parts that would come too near on straight paths.
+        """All pairs of parts that would come too near on straight paths.
 
         Args:
             start: Positions [m].
-            end: Where the vertices go [m].
-            floor: Gap that they keep [m]; most of their distance where that is less.
-            asked: Only pairs with one of these vertices are asked.
-            tangle: The tangle that each vertex is in, int32, -1 where in none: pairs of one alone are not asked; or
+            end: End positions [m].
+            floor: Gap that pairs keep [m]; a pair that is already closer keeps most of its distance.
+            asked: Vertices of which each queried pair must contain at least one.
+            tangle: The tangle of each vertex, int32, -1 outside tangles; pairs inside a single tangle are skipped; or
                 None.
         """
         if _is_known_empty(asked):
@@ -171,9 +171,9 @@ class Detector:
         return self._narrow(found, found.pairs, motion, at, room=IMPACTS, kernel=kernel, asked=~found.apart)[0]
 
     def _broad(self, at: Tensor, to: Tensor | None, asked: Tensor | None = None) -> ClusterPairs:
-        """Pairs of clusters that serve for a move from some positions to others, or for positions.
+        """Pairs of clusters valid for a move or for positions.
 
-        Where only a few vertices are asked for, pairs without one of them may be missing.
+        If few vertices are queried, pairs without a queried vertex may be missing.
         """
         last = to if to is not None else at
         known = self._found is not None and ((to is None and last is self._served) or self._found.covers(at, to))
@@ -189,7 +189,7 @@ class Detector:
         return self._found
 
     def _slack_for(self, at: Tensor, to: Tensor | None) -> Tensor:
-        """How far vertices may leave the paths of a broad phase [m]: what goes far will go on, by up to an edge."""
+        """Path tolerance of a new broad phase [m]: vertices that move far will move on, by up to an edge."""
         return self._slack if to is None else self._slack + (to - at).norm(dim=1).clamp_max(self.parts.spacing)
 
     def _narrow(
@@ -203,7 +203,7 @@ class Detector:
         kernel: wp.Kernel = find_pairs,
         asked: Bool[Tensor, " clusters"] | None = None,
     ) -> tuple[Pairs, Int[Tensor, " pairs"]]:
-        """The pairs of parts in some of a broad phase's pairs of clusters, of those asked, and of which they are."""
+        """Pairs of parts among the queried cluster pairs of a broad phase, and the cluster pair of each."""
         if asked is not None and _is_known_empty(asked):
             return Pairs.none(at.device), found.pairs[:0, 0].long()
         active = argument(found.active)
@@ -215,5 +215,5 @@ class Detector:
 
 
 def _is_known_empty(asked: Tensor) -> bool:
-    """Whether nothing is asked, where that is known: on CUDA the answer would be waited for longer than it saves."""
+    """True if the query is known to be empty; on CUDA the check would wait longer than it saves."""
     return not asked.is_cuda and not bool(asked.any())

@@ -11,12 +11,12 @@ from ..mesh.kernels import KERNELS
 wp.set_module_options(KERNELS)
 
 FLAT = wp.constant(wp.float64(1.0e-20))
-"""Squared sine under which a triangle counts as its sides, and two edges as parallel."""
+"""Squared sine below which a triangle counts as its sides, and two edges as parallel."""
 
 
 @wp.func
 def along(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d):
-    """Where on the edge from a to b the point closest to p lies, in [0, 1]."""
+    """Parameter in [0, 1] of the point closest to p on the edge from a to b."""
     side = b - a
     length = wp.dot(side, side)
     if length <= wp.float64(0.0):
@@ -26,7 +26,7 @@ def along(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d):
 
 @wp.func
 def weights_on_triangle(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
-    """Weights of p and the corners in the way to p from the closest point of a triangle; they sum to 0."""
+    """Weights of p and the corners in the vector from a triangle's closest point to p; the weights sum to 0."""
     zero, one = wp.float64(0.0), wp.float64(1.0)
     first, second, way = b - a, c - a, p - a
     normal = wp.cross(first, second)
@@ -48,7 +48,7 @@ def weights_on_triangle(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
 
 @wp.func
 def weights_of_edges(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
-    """Weights of the ends in the shortest way from the edge c-d to the edge a-b; they sum to 0."""
+    """Weights of the ends in the shortest vector from the edge c-d to the edge a-b; the weights sum to 0."""
     zero, one = wp.float64(0.0), wp.float64(1.0)
     first, second, way = b - a, d - c, a - c
     aa, cc, ac = wp.dot(first, first), wp.dot(second, second), wp.dot(first, second)
@@ -82,7 +82,7 @@ def weights_of_edges(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
 
 @wp.func
 def weights_of(face: wp.bool, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
-    """Weights in the shortest way to the vertex a from the triangle b, c, d, or to the edge a-b from the edge c-d."""
+    """Weights in the shortest vector from triangle b, c, d to vertex a, or from edge c-d to edge a-b."""
     if face:
         return weights_on_triangle(a, b, c, d)
     return weights_of_edges(a, b, c, d)

@@ -1,9 +1,10 @@
-"""Where monotone patches of a level lie: the convex domains that they cover at rest.
+"""Domains of a level's monotone patches: the convex domains covered by the patches at rest.
 
-A patch is some clusters and those round them. Its domain is what is left of a plane when each edge of the patch's rim
-is cut off by a half-plane round the patch's middle: by the edge's own line where that leaves more, so straight and
-convex hems lie in the domain. That it is covered once is checked at one point: no rim lies in it, so all of it is
-covered as often. Faces that are steep in the plane do not belong to the patch.
+A patch consists of some clusters and the clusters around them. Its domain is the part of a plane that remains after
+each edge of the patch's rim is cut off by a half-plane around the patch's middle. The half-plane is bounded by the
+edge's own line if more remains, so straight and convex hems lie in the domain. Single cover is checked at one point: no
+rim lies in the domain, so every point is covered equally often. Faces that are steep to the plane do not belong to the
+patch.
 """
 
 # Warp's kernels are typed by values that only Warp reads.
@@ -23,23 +24,23 @@ from .topology import Topology
 wp.set_module_options(KERNELS)
 
 WIDE, SMALL = 3, 2
-"""Rings of clusters round a patch's own that belong to it: of wide patches, and of small ones that are looked at where
-these are not monotone."""
+"""Rings of clusters around a patch's own clusters: for wide patches, and for small patches, used where wide patches are
+not monotone."""
 PLANES, RIM = wp.constant(32), wp.constant(512)
-"""Most half-planes that bound a domain, and most edges of a patch's rim: a patch with more proves nothing."""
+"""Most half-planes of a domain, and most rim edges of a patch; a patch above a limit proves nothing."""
 STEEP = wp.constant(wp.float64(0.6))
-"""Least cosine at rest between a triangle and the plane that it is projected on."""
+"""Least cosine at rest between a triangle and its projection plane."""
 OWN_LINE = wp.constant(wp.float64(0.5))
-"""Least distance of an edge's line from the middle, over that of the edge, for the line to cut it off."""
+"""Least distance of an edge's line from the middle, over the edge's distance, for the line to bound the half-plane."""
 ON_LINE = wp.constant(wp.float64(1.0e-9))
-"""Distance from a half-plane's line within which a point lies on it, over the patch's width: rounding."""
+"""Distance from a half-plane's line below which a point lies on the line, over the patch's width: rounding."""
 CLOSE = wp.constant(wp.float64(1.0e-3))
-"""Distance of the rim from the middle, over the patch's width, under which there is no domain."""
+"""Distance of the rim from the middle, over the patch's width, below which there is no domain."""
 
 
 @wp.struct
 class Sheet:
-    """Faces by cluster: those across each one's sides, -1 at a hem, and the cluster of each; and those at a vertex."""
+    """Faces by cluster: neighbours across each side, -1 at a hem; the cluster of each face; faces at each vertex."""
 
     beside: wp.array(dtype=wp.vec3i)
     cluster: wp.array(dtype=wp.int32)
@@ -49,10 +50,14 @@ class Sheet:
 
 @wp.struct
 class Patches:
-    """Of each patch: its own clusters and all, its plane, the half-planes of its domain, and what lies there; the wide
-    and the small patch that each cluster is an own one of, and the wide one that each small one lies in, -1 for wide
-    ones; the least cosine between its faces and its plane; and of each cluster its centre and radius at rest. The own
-    clusters of the small patches are groups: those that lie in each domain as a whole, by number."""
+    """The monotone patches of a level: planes, domains, and clusters.
+
+    For each patch: its own clusters and all its clusters, its plane, the half-planes of its domain, the faces and
+    clusters in the domain, the wide patch that contains it (-1 for wide patches), and the least cosine between its
+    faces and its plane. For each cluster: the wide and the small patch with the cluster among its own, and the
+    cluster's centre and radius at rest. The own clusters of the small patches form groups; for each domain the groups
+    wholly inside are listed by index.
+    """
 
     wide: wp.array(dtype=wp.int32)
     small: wp.array(dtype=wp.int32)
@@ -87,7 +92,7 @@ def single(v: wp.vec3d):
 
 @wp.func
 def holds(members: wp.array(dtype=wp.int32), begin: wp.int32, end: wp.int32, wanted: wp.int32):
-    """Whether an ascending list holds a number."""
+    """True if an ascending list contains a number."""
     low, high = wp.int32(0) + begin, wp.int32(0) + end
     while low < high:
         half = (low + high) // 2
@@ -100,7 +105,7 @@ def holds(members: wp.array(dtype=wp.int32), begin: wp.int32, end: wp.int32, wan
 
 @wp.func
 def flat(patches: Patches, p: wp.int32, x: wp.vec3d):
-    """A point at rest in the patch's plane, from its middle."""
+    """A point at rest in the patch's plane, relative to the patch's middle."""
     offset = x - patches.middle[p]
     return wp.vec2d(wp.dot(offset, patches.across[p]), wp.dot(offset, patches.up[p]))
 
@@ -113,7 +118,7 @@ def turn(a: wp.vec2d, b: wp.vec2d):
 
 @wp.func
 def lies_within(a: wp.vec2d, b: wp.vec2d, c: wp.vec2d):
-    """How often a triangle covers the origin: 1, 0, or -1 where it is turned over."""
+    """Winding of a triangle around the origin: 1, 0, or -1 for a flipped triangle."""
     first, second, third = turn(a, b), turn(b, c), turn(c, a)
     zero = wp.float64(0.0)
     if first >= zero and second >= zero and third >= zero:
@@ -137,7 +142,7 @@ def area_of(parts: Topology, t: wp.vec3i):
 
 @wp.kernel
 def place_planes(first: wp.int32, parts: Topology, patches: Patches):
-    """The plane of each patch, that of its own clusters, and its middle: the centre of a face near theirs."""
+    """The plane of each patch, from its own clusters, and its middle: the centre of a face near their centre."""
     p = first + wp.tid()
     normal, mean, total = wp.vec3d(), wp.vec3d(), wp.float64(0.0)
     for n in range(patches.first_own[p], patches.first_own[p + 1]):
@@ -177,7 +182,7 @@ def nearest_on(a: wp.vec2d, b: wp.vec2d):
 
 @wp.func
 def is_cut_off(patches: Patches, p: wp.int32, count: wp.int32, width: wp.float64, edge: wp.vec4d):
-    """Whether one of a patch's half-planes leaves out an edge, but for what lies on its line."""
+    """True if a half-plane of a patch excludes an edge, with points on the half-plane's line included."""
     for m in range(count):
         plane = patches.planes[p * PLANES + m]
         least = plane[2] - ON_LINE * width
@@ -188,14 +193,14 @@ def is_cut_off(patches: Patches, p: wp.int32, count: wp.int32, width: wp.float64
 
 @wp.func
 def is_level(parts: Topology, patches: Patches, p: wp.int32, k: wp.int32):
-    """Whether a face at rest lies so along a patch's plane that it can be of the patch."""
+    """True if a face at rest is close enough to parallel to a patch's plane to belong to the patch."""
     area = area_of(parts, parts.faces[k])
     return wp.dot(area, wp.cross(patches.across[p], patches.up[p])) > STEEP * wp.length(area)
 
 
 @wp.func
 def is_of(parts: Topology, sheet: Sheet, patches: Patches, p: wp.int32, k: wp.int32):
-    """Whether a face is one of a patch."""
+    """True if a face belongs to a patch."""
     if k < 0:
         return False
     if not holds(patches.members, patches.first_member[p], patches.first_member[p + 1], sheet.cluster[k]):
@@ -205,7 +210,7 @@ def is_of(parts: Topology, sheet: Sheet, patches: Patches, p: wp.int32, k: wp.in
 
 @wp.func
 def line_of(a: wp.vec2d, b: wp.vec2d, at_hem: wp.bool):
-    """The half-plane that cuts off an edge, as its normal and height: by the edge's own line where that leaves more."""
+    """Normal and height of the half-plane that cuts off an edge, along the edge's own line if more remains."""
     near = nearest_on(a, b)
     height = wp.length(near)
     normal, length = near / height, wp.length(b - a)
@@ -228,7 +233,7 @@ def find_rims(
     count: wp.array(dtype=wp.int32),
     width: wp.array(dtype=wp.float64),
 ):
-    """The edges of each patch's rim and its half width; their count is 0 where its middle is not covered once."""
+    """Rim edges of each patch and its half width; the count is 0 if the middle is not covered exactly once."""
     p = first + wp.tid()
     edges, cover, far = wp.int32(0), wp.int32(0), wp.float64(0.0)
     count[p] = 0
@@ -268,7 +273,7 @@ def bound_domains(
     rims: wp.array(dtype=wp.int32),
     width: wp.array(dtype=wp.float64),
 ):
-    """The half-planes of each patch's domain; their count is 0 where it has none."""
+    """Half-planes of each patch's domain; the count is 0 without a domain."""
     p = first + wp.tid()
     patches.plane_count[p] = 0
     for count in range(PLANES):
@@ -290,7 +295,7 @@ def bound_domains(
 
 @wp.func
 def depth_in(patches: Patches, p: wp.int32, x: wp.vec2d):
-    """How far inside all half-planes of a patch's domain a point lies."""
+    """Depth of a point inside all half-planes of a patch's domain."""
     least = wp.float64(1.0e300)
     for m in range(patches.plane_count[p]):
         plane = patches.planes[p * PLANES + m]
@@ -300,7 +305,7 @@ def depth_in(patches: Patches, p: wp.int32, x: wp.vec2d):
 
 @wp.func
 def meets_domain(parts: Topology, patches: Patches, p: wp.int32, t: wp.vec3i):
-    """Whether no half-plane of a patch's domain leaves out a triangle."""
+    """True if no half-plane of a patch's domain excludes a triangle."""
     a, b, c = flat(patches, p, parts.rest[t[0]]), flat(patches, p, parts.rest[t[1]]), flat(patches, p, parts.rest[t[2]])
     for m in range(patches.plane_count[p]):
         plane = patches.planes[p * PLANES + m]
@@ -312,7 +317,7 @@ def meets_domain(parts: Topology, patches: Patches, p: wp.int32, t: wp.vec3i):
 
 @wp.func
 def has_face_at(parts: Topology, sheet: Sheet, patches: Patches, p: wp.int32, v: wp.int32):
-    """Whether a triangle of a patch that meets its domain has a vertex: on the other lip of a slit none has."""
+    """True if a vertex belongs to a patch triangle that meets the domain; false on the far lip of a slit."""
     for n in range(sheet.first_at[v], sheet.first_at[v + 1]):
         k = sheet.at[n]
         if is_of(parts, sheet, patches, p, k):
@@ -323,7 +328,7 @@ def has_face_at(parts: Topology, sheet: Sheet, patches: Patches, p: wp.int32, v:
 
 @wp.func
 def lies_in(parts: Topology, sheet: Sheet, patches: Patches, p: wp.int32, rounding: wp.float64, c: wp.int32):
-    """Whether all corners of a cluster lie in a patch's domain, as corners of triangles that meet it."""
+    """True if all corners of a cluster lie in a patch's domain, as corners of triangles that meet the domain."""
     for k in range(parts.first_corner[c], parts.first_corner[c + 1]):
         v = parts.corners[k]
         if depth_in(patches, p, flat(patches, p, parts.rest[v])) < -rounding:
@@ -355,7 +360,7 @@ def fill_domains(
     inside_count: wp.array(dtype=wp.int32),
     written: wp.bool,
 ):
-    """The faces that meet each domain, and the clusters that lie in it; counted, or written."""
+    """The faces that meet each domain and the clusters inside each domain; counted, or written."""
     p = first + wp.tid()
     faces, clusters, flattest = wp.int32(0), wp.int32(0), wp.float64(1.0)
     normal = wp.cross(patches.across[p], patches.up[p])
@@ -387,7 +392,7 @@ def fill_domains(
 
 @wp.kernel
 def enclose(first: wp.int32, parts: Topology, patches: Patches):
-    """A ball round each cluster at rest."""
+    """Bounding ball of each cluster at rest."""
     c = first + wp.tid()
     begin, end = parts.first_corner[c], parts.first_corner[c + 1]
     mean, most = wp.vec3d(), wp.float64(0.0)
@@ -401,11 +406,11 @@ def enclose(first: wp.int32, parts: Topology, patches: Patches):
 
 
 def domains_of(level: Level, parts: Topology, count: int) -> tuple[Patches, int, int]:
-    """The patches of a level, how many of them are wide, which come first, and how many there are.
+    """The patches of a level; the number of wide patches, which come first; and the number of all patches.
 
     Args:
         level: The level.
-        parts: Its parts by cluster.
+        parts: Parts of the level by cluster.
         count: Number of clusters.
     """
     touching = _touching(parts, count, level.vertex_count)
@@ -437,7 +442,7 @@ def domains_of(level: Level, parts: Topology, count: int) -> tuple[Patches, int,
 
 
 def _fill(table: Patches, level: Level, parts: Topology, size: int) -> None:
-    """Find the planes, the domains and what lies in them."""
+    """Find the planes, the domains, and the faces and clusters in the domains."""
     device, clusters = level.device, len(parts.first_face) - 1
     launched = {"device": device, "threads": level.threads, "least": LEAST_QUERIES}
     faces = parts.faces.numpy().reshape(-1, 3)
@@ -472,12 +477,12 @@ def _fill(table: Patches, level: Level, parts: Topology, size: int) -> None:
 
 
 def _array(values: np.ndarray, device: str, dtype: type = wp.int32) -> wp.array:
-    """Whole numbers as kernels read them."""
+    """Integers as a Warp array."""
     return wp.array(np.ascontiguousarray(values, np.int32), dtype=dtype, device=device)
 
 
 def _touching(parts: Topology, count: int, vertices: int) -> sp.csr_matrix:
-    """Which clusters have a corner in common, shape (C, C)."""
+    """Pairs of clusters with a common corner, shape (C, C)."""
     first, corners = parts.first_corner.numpy(), parts.corners.numpy()
     owner = np.repeat(np.arange(count), np.diff(first))
     has = sp.csr_matrix((np.ones(len(corners), np.float32), (owner, corners)), shape=(count, vertices))
@@ -496,7 +501,7 @@ def _grouped(touching: sp.csr_matrix) -> sp.csr_matrix:
 
 
 def _grown(groups: sp.csr_matrix, touching: sp.csr_matrix, rings: int) -> sp.csr_matrix:
-    """Groups and what lies some rings round them."""
+    """Groups grown by some rings."""
     for _ in range(rings):
         groups = sp.csr_matrix(groups @ touching)
         groups.data[:] = 1.0
@@ -504,7 +509,7 @@ def _grown(groups: sp.csr_matrix, touching: sp.csr_matrix, rings: int) -> sp.csr
 
 
 def _beside(faces: np.ndarray) -> np.ndarray:
-    """The face across each side, shape (T, 3): -1 where there is none, or more than one."""
+    """The face across each side, shape (T, 3); -1 if there is none or more than one."""
     sides = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2).astype(np.int64), axis=1)
     key = sides[:, 0] * (int(faces.max(initial=0)) + 1) + sides[:, 1]
     order = np.argsort(key, kind="stable")

@@ -1,4 +1,4 @@
-"""Which pairs a plane keeps apart on straight paths.
+"""Pairs kept apart by a plane on straight paths.
 
 Theorem. Let two sets of points A and B move on straight lines, all in the same time. If for one direction n
 
@@ -6,8 +6,8 @@ Theorem. Let two sets of points A and B move on straight lines, all in the same 
 
 at the start and at the end, then so at every time between, for n.(a - b) is linear in time.
 
-Asked of a vertex and a triangle, or of two edges, for three directions: the shortest way between them at the start,
-that at the end, and their mean.
+Tested for a vertex and a triangle, or for two edges, with three directions: the shortest vector between them at the
+start, the shortest vector at the end, and the mean of both.
 """
 
 # Warp's functions are typed by values that only Warp reads.
@@ -22,15 +22,15 @@ from .distance import weights_of
 wp.set_module_options(KERNELS)
 
 TIGHT = 0.9
-"""Part of its distance that a pair keeps which is nearer than the floor already, and of the way there that it goes."""
+"""Fraction of its distance kept by a pair already below the floor, and fraction of the safe path that is used."""
 
 LEAST = wp.constant(wp.float64(1.0 / 16.0))
-"""Least part of the way for which a plane is asked."""
+"""Least fraction of the path for which a plane is tried."""
 
 
 @wp.func
 def between(face: wp.bool, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
-    """The shortest way to the vertex a from the triangle b, c, d, or to the edge a-b from the edge c-d."""
+    """Shortest vector to the vertex a from the triangle b, c, d, or to the edge a-b from the edge c-d."""
     weight = weights_of(face, a, b, c, d)
     return weight[0] * a + weight[1] * b + weight[2] * c + weight[3] * d
 
@@ -43,7 +43,7 @@ def distance_of(face: wp.bool, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3
 
 @wp.func
 def gap_along(n: wp.vec3d, face: wp.bool, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
-    """How far the first part lies beyond the second along a direction; negative where their extents overlap."""
+    """Gap of the first part beyond the second along a direction; negative if their extents overlap."""
     p, q, r, s = wp.dot(n, a), wp.dot(n, b), wp.dot(n, c), wp.dot(n, d)
     if face:
         return p - wp.max(q, wp.max(r, s))
@@ -52,7 +52,7 @@ def gap_along(n: wp.vec3d, face: wp.bool, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d,
 
 @wp.func
 def kept_of(distance: wp.float64, floor: wp.float64):
-    """The gap that a pair of parts keeps: a floor, or most of its distance where that is less."""
+    """Gap kept by a pair of parts: the floor, or most of the pair's distance if less."""
     return wp.min(wp.float64(TIGHT) * distance, floor)
 
 
@@ -69,10 +69,10 @@ def part_kept(
     h: wp.vec3d,
     floor: wp.float64,
 ):
-    """Part of the straight ways from the corners a, b, c, d to e, f, g, h on which a plane keeps the parts apart.
+    """Fraction of the straight paths from the corners a, b, c, d to e, f, g, h on which a plane keeps the parts apart.
 
-    It is 1 where one keeps them all the way. Along the direction at the start the gap is a concave function of the part
-    gone, so up to the part returned it is as much as is kept.
+    The fraction is 1 if a plane does all the way. Along the start direction the gap is a concave function of the path
+    fraction, so the gap is kept up to the returned fraction.
     """
     one = wp.float64(1.0)
     way = between(face, a, b, c, d)
@@ -104,9 +104,9 @@ def impact_of(
     q: wp.vec3d,
     floor: wp.float64,
 ):
-    """Part of their ways u, v, p, q that the corners a, b, c, d can go, in (0, 1]; 1 where the parts touch already.
+    """Fraction of their paths u, v, p, q that the corners a, b, c, d can move, in (0, 1]; 1 if the parts touch already.
 
-    Where no plane keeps the parts apart all the way, it may turn: at halves of the way, quarters and so on.
+    If no plane keeps the parts apart all the way, the plane may change at halves of the path, quarters and so on.
     """
     one, zero = wp.float64(1.0), a - a
     # About their first corner: far from the origin differences lose no digits.

@@ -1,4 +1,4 @@
-"""Narrow phase: the pairs of parts of near clusters that are near, or that would touch on straight paths."""
+"""Narrow phase: pairs of parts of near clusters that are near, or that would touch on straight paths."""
 
 # Warp's kernels are typed by values that only Warp reads.
 # pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportIndexIssue=false, reportCallIssue=false, reportGeneralTypeIssues=false
@@ -23,13 +23,13 @@ from .topology import Topology
 wp.set_module_options(KERNELS)
 
 ROOM, MOST_ROOM = 2**19, 64
-"""Pairs of parts that there is room for in any case, shared by the pairs of clusters, and most of two clusters': those
-that have more are looked at twice."""
+"""Minimum room for pairs of parts, shared by the pairs of clusters, and most room for two clusters; cluster pairs with
+more are searched twice."""
 
 
 @wp.struct
 class Found:
-    """Where each pair of clusters writes its pairs of parts, how many it has, and what `Pairs` holds."""
+    """Output of a search: start and count of each cluster pair's pairs of parts, and the fields of `Pairs`."""
 
     begin: wp.array(dtype=wp.int32)
     count: wp.array(dtype=wp.int32)
@@ -40,15 +40,15 @@ class Found:
 
 @dataclass(frozen=True, eq=False)
 class Reach:
-    """How near what is near is.
+    """Search radii of near pairs.
 
     Attributes:
-        radius: Two parts are near within the sum of their radii, the greatest of their corners' [m], shape (V,),
+        radius: Two parts are near within the sum of their radii, the largest of their corners' radii [m], shape (V,),
             float64.
-        play: Those of one garment only within a part of their distance at rest and twice the least of these [m], shape
-            (V,).
-        half: That part. What lies in a patch whose m says that its parts keep more of it is left out whatever the play;
-            a great number leaves nothing out.
+        play: Parts of one garment are near only within `half` of their distance at rest plus twice the least play [m],
+            shape (V,).
+        half: Fraction of the distance at rest. Pairs proved by m of a patch to keep more are omitted at any play; a
+            large number omits none.
     """
 
     radius: Float[Tensor, " vertices"]
@@ -62,9 +62,9 @@ class Pairs:
 
     Attributes:
         corners: A vertex and the corners of a face, or the ends of two edges, shape (N, 4).
-        value: Of impacts the fraction of their paths that they may go, in (0, 1); of near pairs their distance over the
-            one asked for; shape (N,).
-        face: Whether it is a vertex and a face, shape (N,).
+        value: For impacts, the safe fraction of the paths, in (0, 1); for near pairs, the distance over the search
+            distance; shape (N,).
+        face: True for a vertex and a face, shape (N,).
     """
 
     corners: Int[Tensor, "pairs 4"]
@@ -77,14 +77,14 @@ class Pairs:
         return _room(0, device)
 
     def joined(self, other: Pairs) -> Pairs:
-        """These pairs and others."""
+        """Both lists of pairs."""
         if not len(self.value) or not len(other.value):
             return self if len(self.value) else other
         parts = ((getattr(self, name), getattr(other, name)) for name in ("corners", "value", "face"))
         return Pairs(*(torch.cat(each) for each in parts))
 
     def where(self, kept: Bool[Tensor, " pairs"] | Int[Tensor, " kept"]) -> Pairs:
-        """Some of these pairs."""
+        """The selected pairs."""
         if kept.dtype == torch.bool:  # Once for all three.
             kept = torch.nonzero(kept).squeeze(1)
         return Pairs(self.corners[kept], self.value[kept], self.face[kept])
@@ -92,7 +92,7 @@ class Pairs:
 
 @wp.func
 def has(t: wp.vec3i, v: wp.int32):
-    """Whether a triangle has a vertex."""
+    """True if a triangle contains a vertex."""
     return t[0] == v or t[1] == v or t[2] == v
 
 
@@ -108,13 +108,13 @@ def write(found: Found, i: wp.int32, count: wp.int32, corners: wp.vec4i, value: 
 
 @wp.func
 def is_one(parts: Topology, a: wp.int32, b: wp.int32):
-    """Whether two vertices are one, or sewn together."""
+    """True if two vertices are equal, or sewn together."""
     return parts.label[a] == parts.label[b]
 
 
 @wp.func
 def sum_of(face: wp.bool, a: wp.float64, b: wp.float64, c: wp.float64, d: wp.float64):
-    """The greatest value of a pair's first part and that of its second."""
+    """Largest value in a pair's first part plus the largest in the second part."""
     if face:
         return a + wp.max(b, wp.max(c, d))
     return wp.max(a, b) + wp.max(c, d)
@@ -122,7 +122,7 @@ def sum_of(face: wp.bool, a: wp.float64, b: wp.float64, c: wp.float64, d: wp.flo
 
 @wp.func
 def box_gap(face: wp.bool, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
-    """Greatest distance along an axis between the boxes of two parts."""
+    """Largest distance along an axis between the boxes of two parts."""
     low, high, other_low, other_high = a, a, wp.min(c, d), wp.max(c, d)
     if face:
         other_low, other_high = wp.min(b, other_low), wp.max(b, other_high)
@@ -145,7 +145,7 @@ def boxes_apart(
     h: wp.vec3d,
     floor: wp.float64,
 ):
-    """Whether along one axis the boxes of two parts are a floor apart, in one order, at the start and at the end."""
+    """True if the boxes of two parts are a floor apart along an axis, in equal order at the start and at the end."""
     low, high, other_low, other_high = a, a, wp.min(c, d), wp.max(c, d)
     to_low, to_high, other_to_low, other_to_high = e, e, wp.min(g, h), wp.max(g, h)
     if face:
@@ -179,7 +179,7 @@ def nearness(face: wp.bool, a: wp.int32, b: wp.int32, c: wp.int32, d: wp.int32, 
 
 @wp.func
 def is_asked(motion: Motion, a: wp.int32, b: wp.int32, c: wp.int32, d: wp.int32):
-    """Whether any vertex of a pair is asked for, and they are not all in one tangle."""
+    """True if a vertex of a pair is queried, and the vertices are not all in one tangle."""
     if not (motion.asked[a] or motion.asked[b] or motion.asked[c] or motion.asked[d]):
         return False
     tangle = motion.tangle[a]
@@ -197,9 +197,9 @@ def value_of(
     parts: Topology,
     motion: Motion,
 ):
-    """Part of their ways that a vertex and a face, or two edges, may go, or their distance over the one asked for.
+    """Safe fraction of the paths of a vertex and a face, or of two edges; or their distance over the search distance.
 
-    It is 1 where they are not to be asked.
+    The value is 1 for skipped pairs.
     """
     none = wp.float64(1.0)
     if is_one(parts, a, c) or is_one(parts, a, d) or is_one(parts, b, wp.where(face, a, c)):
@@ -228,7 +228,7 @@ def faces_met(
     j: wp.int32,
     count: wp.int32,
 ):
-    """Write the pairs of a cluster's vertices and another's faces; the number of pairs so far."""
+    """Write pairs of a cluster's vertices and another cluster's faces; returns the number of pairs so far."""
     reach = room_of(boxes, motion, i, j)
     for k in range(parts.first_vertex[i], parts.first_vertex[i + 1]):
         v = parts.vertices[k]
@@ -265,7 +265,7 @@ def edges_met(
     j: wp.int32,
     count: wp.int32,
 ):
-    """Write the pairs of the edges of two clusters, each once; the number of pairs so far."""
+    """Write pairs of the edges of two clusters, each once; returns the number of pairs so far."""
     reach = room_of(boxes, motion, i, j)
     for k in range(parts.first_edge[i], parts.first_edge[i + 1]):
         e = parts.edges[k]
@@ -302,7 +302,7 @@ def choose_clusters(
     boxes: Boxes,
     asked: wp.array(dtype=wp.bool),
 ):
-    """Of pairs of clusters that are asked, leave those in which a vertex is, and which do not pass one another by."""
+    """Keep the queried pairs of clusters that contain a queried vertex and do not pass by each other."""
     n = first + wp.tid()
     i, j = clusters[n][0], clusters[n][1]
     if not asked[n]:
@@ -317,7 +317,7 @@ def choose_clusters(
 def find_pairs(
     first: wp.int32, parts: Topology, clusters: wp.array(dtype=wp.vec2i), motion: Motion, boxes: Boxes, found: Found
 ):
-    """The pairs of each two clusters' vertices with faces and of edges with edges, so far as there is room."""
+    """Vertex-face and edge-edge pairs of each two clusters, up to the room."""
     n = first + wp.tid()
     i, j = clusters[n][0], clusters[n][1]
     if found.begin[n + 1] == found.begin[n]:
@@ -377,19 +377,19 @@ def find(
     room: int,
     asked: Bool[Tensor, " clusters"] | None = None,
 ) -> tuple[Pairs, Int[Tensor, " pairs"]]:
-    """The pairs of parts that a kernel with the parameters of `find_pairs` finds in pairs of clusters.
+    """The pairs of parts found by a kernel, with the parameters of `find_pairs`, in pairs of clusters.
 
     Args:
         parts: The parts.
         clusters: The pairs of clusters, int32.
         kernel: The kernel.
-        motion: What moves.
-        boxes: Boxes of the clusters that occur.
-        room: Pairs of parts of two clusters that there is room for at least before they are counted.
-        asked: Which pairs of clusters are asked; all where None.
+        motion: Positions, displacements and query of the vertices.
+        boxes: Boxes of the clusters in pairs.
+        room: Minimum room for pairs of parts per two clusters before the pairs are counted.
+        asked: Queried pairs of clusters; all if None.
 
     Returns:
-        The pairs, and which pair of clusters each is of.
+        The pairs, and the cluster pair of each.
     """
     device = clusters.device
     asked = torch.ones(len(clusters), dtype=torch.bool, device=device) if asked is None else asked.clone()
@@ -420,7 +420,7 @@ def find(
 def _packed(
     parts: Parts, found: Any, ends: Int[Tensor, " clusters"], *, size: int, room: int, total: int
 ) -> tuple[Pairs, Int[Tensor, " pairs"]]:
-    """What was found and had room, one after the other up to the ends that are given, and whose it is."""
+    """The pairs that had room, packed up to the given ends, and the cluster pair of each."""
     out, owner = _room(total, ends.device), torch.empty(total, dtype=torch.int64, device=ends.device)
     if total:
         arrays = (argument(out.corners, wp.vec4i), *(argument(each) for each in (out.value, out.face)))
@@ -440,7 +440,7 @@ def _write(
     count: Tensor,
     out: Pairs,
 ) -> Any:
-    """Count the pairs of each two clusters, and write those that there is room for; where that is."""
+    """Count the pairs of each two clusters, and write them up to the room; returns the output arrays."""
     found = Found()
     found.begin, found.count = wp.from_torch(begin), wp.from_torch(count)
     found.corners = wp.from_torch(out.corners, dtype=wp.vec4i)
@@ -451,7 +451,7 @@ def _write(
 
 
 def of_list(parts: Parts, pairs: Pairs, motion: Any) -> Pairs:
-    """Those of some pairs that would come too near on the paths of a motion."""
+    """Pairs of a list that would come too near on the paths of a motion."""
     if not len(pairs.value):
         return pairs
     value = torch.ones_like(pairs.value)
@@ -463,7 +463,7 @@ def of_list(parts: Parts, pairs: Pairs, motion: Any) -> Pairs:
 
 
 def _room(count: int, device: torch.device | str) -> Pairs:
-    """Room for some pairs."""
+    """Uninitialized pairs."""
     corners = torch.empty((count, 4), dtype=torch.int32, device=device)
     value = torch.empty(count, dtype=torch.float64, device=device)
     return Pairs(corners, value, torch.empty(count, dtype=torch.bool, device=device))

@@ -1,4 +1,4 @@
-"""Every pair of parts nearer than a distance, and the shortest way between the two."""
+"""All pairs of parts within a distance, and the shortest vector between the two parts."""
 
 # Warp's kernels are typed by values that only Warp reads.
 # pyright: reportArgumentType=false, reportIndexIssue=false
@@ -27,9 +27,10 @@ class NearPairs:
 
     Attributes:
         corners: A vertex and the corners of a face, or the ends of two edges, shape (N, 4), int32.
-        weight: Of the corners in the shortest way from the second part to the first; rows sum to 0, shape (N, 4).
-        way: That way [m], shape (N, 3).
-        face: Whether it is a vertex and a face, shape (N,).
+        weight: Weights of the corners in the shortest vector from the second part to the first; rows sum to 0, shape
+            (N, 4).
+        way: Shortest vector [m], shape (N, 3).
+        face: True for a vertex and a face, shape (N,).
     """
 
     corners: Int[Tensor, "pairs 4"]
@@ -38,7 +39,7 @@ class NearPairs:
     face: Bool[Tensor, " pairs"]
 
     def where(self, kept: Int[Tensor, " kept"]) -> NearPairs:
-        """Some of these pairs."""
+        """The selected pairs."""
         return NearPairs(self.corners[kept], self.weight[kept], self.way[kept], self.face[kept])
 
 
@@ -58,12 +59,12 @@ def _closest(
 def weights(
     x: Float[Tensor, "vertices 3"], corners: Int[Tensor, "pairs 4"], face: Bool[Tensor, " pairs"], *, threads: int = 1
 ) -> Float[Tensor, "pairs 4"]:
-    """Weights of corners in the shortest way from each pair's second part to its first, as in `NearPairs`.
+    """Weights of corners in the shortest vector from each pair's second part to its first, as in `NearPairs`.
 
     Args:
         x: Positions [m], float64.
         corners: A vertex and the corners of a face, or the ends of two edges, int32.
-        face: Whether it is a vertex and a face.
+        face: True for a vertex and a face.
         threads: Most threads on the CPU.
     """
     out = torch.zeros((len(face), 4), dtype=torch.float64, device=x.device)
@@ -76,13 +77,13 @@ def weights(
 def near_pairs(
     parts: Parts, x: Float[Tensor, "vertices 3"], near: Reach, *, detector: Detector | None = None
 ) -> NearPairs:
-    """Every vertex and face, and every two edges, that share no vertex and are as near as is asked for.
+    """All vertex-face and edge-edge pairs without a common vertex within the search distance.
 
     Args:
         parts: The parts.
         x: Positions [m].
-        near: How near; what is near at rest may come too where it is not as near as the radii say.
-        detector: What has detected before with the same parts and reach, or None.
+        near: Search radii; pairs near at rest may be included beyond the radii.
+        detector: Collision detector of the same parts and reach for reuse, or None.
     """
     at = x.double()
     pairs = (detector or Detector.once(parts, near)).near(x)

@@ -1,4 +1,4 @@
-"""The parts of a level's cloth: which can meet which, and which are one."""
+"""The parts of a level's cloth: pairs that may be in contact, and sewn vertices."""
 
 # Warp's structs are typed by values that only Warp reads.
 # pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false
@@ -23,12 +23,12 @@ class Parts:
     Attributes:
         level: The level.
         count: Number of clusters.
-        topology: What kernels read.
-        patches: Its monotone patches.
-        links: Vertices that hang together: the edges, and what is sewn, shape (N, 2), int64.
-        lengths: Of these at rest, 0 where sewn [m], shape (N,), float64.
+        topology: Warp struct of the topology.
+        patches: Monotone patches of the level.
+        links: Connected vertices: edges and sewn pairs, shape (N, 2), int64.
+        lengths: Lengths of the links at rest, 0 if sewn [m], shape (N,), float64.
         spacing: Mean length of the edges at rest [m].
-        shortest: The shortest edge at each vertex at rest [m], shape (V,), float64.
+        shortest: Shortest edge at each vertex at rest [m], shape (V,), float64.
     """
 
     def __init__(self, level: Level, meets: np.ndarray, label: Int[np.ndarray, " vertices"] | None = None) -> None:
@@ -36,8 +36,8 @@ class Parts:
 
         Args:
             level: The level.
-            meets: Which garments feel which, symmetric, shape (G, G), bool.
-            label: Vertices of one label are sewn together, or one; each its own where None, shape (V,).
+            meets: True for pairs of garments in contact, symmetric, shape (G, G), bool.
+            label: Vertices with equal labels are sewn together, or equal; None for no seams, shape (V,).
         """
         self.level = level
         edges, triangles = (each.cpu().numpy() for each in (level.edges, level.triangles))
@@ -67,12 +67,12 @@ class Parts:
         table.label = self._array(np.arange(level.vertex_count) if label is None else label)
 
     def least_of(self, values: Float[Tensor, " vertices"]) -> Float[Tensor, " clusters"]:
-        """The least of some values at the corners of each cluster."""
+        """Minimum of the values at the corners of each cluster."""
         out = torch.full((self.count,), torch.inf, dtype=values.dtype, device=values.device)
         return out.scatter_reduce(0, self._cluster, values[self._corner], "amin")
 
     def with_any(self, vertices: Bool[Tensor, " vertices"]) -> Bool[Tensor, " clusters"]:
-        """Which clusters have one of some vertices at a corner."""
+        """Mask of the clusters with a given vertex at a corner."""
         out = torch.zeros(self.count, dtype=torch.bool, device=vertices.device)
         out[self._cluster[vertices[self._corner]]] = True
         return out
@@ -82,14 +82,14 @@ class Parts:
 
 
 def _sewn(label: np.ndarray) -> np.ndarray:
-    """Each vertex that is not the first of its label, and that one, shape (N, 2)."""
+    """Each vertex that is not the first of its label, and the first vertex, shape (N, 2)."""
     first = np.unique(label, return_index=True)[1][np.unique(label, return_inverse=True)[1]]
     later = np.flatnonzero(first != np.arange(len(label)))
     return np.stack([later, first[later]], axis=1)
 
 
 def _corners(clusters: Clusters) -> tuple[np.ndarray, np.ndarray]:
-    """The first corner of each cluster, and the vertices of its parts, each once."""
+    """Start of each cluster's corners, and the distinct vertices of its parts."""
     owned = [
         np.stack([np.repeat(np.arange(clusters.count), np.diff(first.numpy())), vertex], axis=1)
         for width, (first, parts) in enumerate((clusters.vertices, clusters.edges[:2], clusters.faces[:2]), start=1)

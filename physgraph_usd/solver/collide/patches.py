@@ -37,17 +37,17 @@ from .topology import Topology
 wp.set_module_options(KERNELS)
 
 SAMPLED = wp.constant(4)
-"""Of so many triangles one is counted where Q is fitted: any Q is right, the best proves most."""
+"""Sampling stride of the triangles in the fit of Q: any Q is valid, the best Q proves most."""
 MARGIN = wp.constant(wp.float32(0.1))
-"""By how much m must be greater than what is relied on when it is found: by so much may each triangle's gradient
-change, by its Frobenius norm, before the patch is looked at again."""
+"""Margin of m over the required m when a proof is made, and the largest change of a triangle's gradient, by its
+Frobenius norm, before the patch is checked again."""
 NOTHING = wp.constant(wp.float32(-1.0))
-"""m of a patch of which nothing is known, and what is relied on of one that leaves nothing out."""
+"""m of an unmeasured patch, and the required m of a patch without proofs."""
 
 
 @wp.func
 def moved(start: wp.array(dtype=wp.vec3d), path: wp.array(dtype=wp.vec3d), v: wp.int32, time: wp.float64):
-    """Where a vertex is at a time of a move; where nothing moves the time is 0 and no path is read."""
+    """Position of a vertex at a time of a move; without motion the time is 0 and no path is read."""
     if time == wp.float64(0.0):
         return start[v]
     return start[v] + time * path[v]
@@ -65,7 +65,7 @@ def sides_of(t: wp.vec3i, start: wp.array(dtype=wp.vec3d), path: wp.array(dtype=
 def fitted(
     patches: Patches, p: wp.int32, start: wp.array(dtype=wp.vec3d), path: wp.array(dtype=wp.vec3d), time: wp.float64
 ):
-    """The isometry nearest to a patch's mean gradient at a time of a move; zero where that has none."""
+    """Isometry nearest to a patch's mean gradient at a time of a move; zero if the gradient has none."""
     g1, g2 = wp.vec3f(), wp.vec3f()
     for k in range(patches.first_face[p], patches.first_face[p + 1], SAMPLED):
         m = patches.inverse[k]
@@ -84,8 +84,10 @@ def fitted(
 
 @wp.func
 def has_changed(patches: Patches, p: wp.int32, change: wp.array(dtype=wp.float32), other: wp.array(dtype=wp.float32)):
-    """Whether a gradient in a patch has changed by more than the margin at one of two positions; in its plane it
-    changes by more than at rest, by one over the cosine."""
+    """True if a gradient in a patch has changed by more than the margin at one of two positions.
+
+    In the patch's plane the change is larger than at rest, by the inverse cosine.
+    """
     most = MARGIN * patches.flattest[p]
     for n in range(patches.first_member[p], patches.first_member[p + 1]):
         c = patches.members[n]
@@ -105,8 +107,10 @@ def least_of(
     worker: wp.int32,
     workers: wp.int32,
 ):
-    """m of a patch over a move in one worker's part of its faces, by Q fitted half way; `NOTHING` where it is less than
-    what is wanted."""
+    """m of a patch over a move in one worker's share of the faces.
+
+    Q is fitted half way. The result is `NOTHING` if m is less than the wanted m.
+    """
     q1, q2 = fitted(patches, p, start, path, wp.where(moves, wp.float64(0.5), wp.float64(0.0)))
     least = wp.float32(1.0)
     for k in range(patches.first_face[p] + worker, patches.first_face[p + 1], workers):
@@ -138,8 +142,10 @@ def measure_patches(
     wanted: wp.array(dtype=wp.bool),
     found: wp.array(dtype=wp.float32),
 ):
-    """m of some of the wanted patches over a move along straight paths, by each worker; of small ones only where that
-    of the wide one round them, which is known, is not enough in every case."""
+    """m of some wanted patches over a move along straight paths, by each worker.
+
+    Small patches are measured only if the known m of the surrounding wide patch is not enough in every case.
+    """
     place = (first + wp.tid()) + begin_at * workers
     p, worker = place // workers, place % workers
     if not wanted[p] or patches.first_face[p] == patches.first_face[p + 1]:
@@ -164,8 +170,10 @@ def find_lost(
     other: wp.array(dtype=wp.float32),
     lost: wp.array(dtype=wp.int32),
 ):
-    """Whether m of any patch is less than is relied on over a move; known where its gradients have changed little at
-    both ends."""
+    """Mark if m of any patch over a move is less than the required m.
+
+    Patches whose gradients have changed little at both ends pass without a measurement.
+    """
     place = first + wp.tid()
     p, worker = place // workers, place % workers
     if lost[0] > 0 or relied[p] == NOTHING:
@@ -186,8 +194,10 @@ def find_changes(
     lost: wp.array(dtype=wp.int32),
     change: wp.array(dtype=wp.float32),
 ):
-    """The greatest change of a gradient in each cluster from the nearer of two positions to a third, where it counts
-    still."""
+    """Largest change of a gradient in each cluster from the nearer of two positions to a third.
+
+    Skipped if the result is no longer needed.
+    """
     i = first + wp.tid()
     if lost[0] > 0:
         return
@@ -209,8 +219,11 @@ def change_of(t: wp.vec3i, r: wp.vec3f, before: wp.array(dtype=wp.vec3d), x: wp.
 
 @wp.kernel
 def measure_rest(first: wp.int32, parts: Topology, rest: wp.array(dtype=wp.vec3f)):
-    """Of each face at rest what turns sides into a gradient: one over its first side, and of its second side what lies
-    along that over its height, and one over the height."""
+    """Coefficients that turn the sides of each face into a gradient at rest.
+
+    Let b be the first side's length, and h and s the second side's components across and along the first side. The
+    coefficients are 1 / b, s / h and 1 / h.
+    """
     i = first + wp.tid()
     for k in range(parts.first_face[i], parts.first_face[i + 1]):
         t = parts.faces[k]
@@ -226,12 +239,12 @@ class MonotonePatches:
 
     Attributes:
         level: The level.
-        parts: Its parts by cluster.
-        clusters: Number of these.
-        table: What kernels read.
-        wide: Number of wide ones, which come first.
-        count: Number of all.
-        rest: As `measure_rest` gives it, of each face by cluster.
+        parts: Parts of the level by cluster.
+        clusters: Number of clusters.
+        table: Warp struct of the patches.
+        wide: Number of wide patches, which come first.
+        count: Number of patches.
+        rest: Result of `measure_rest` for each face by cluster.
     """
 
     level: Level
@@ -244,7 +257,7 @@ class MonotonePatches:
 
     @staticmethod
     def of(level: Level, parts: Topology, clusters: int) -> MonotonePatches:
-        """The patches of a level with so many clusters."""
+        """The patches of a level with a given number of clusters."""
         rest = wp.zeros(len(parts.faces), dtype=wp.vec3f, device=level.device)
         out = MonotonePatches(level, parts, clusters, *domains_of(level, parts, clusters), rest)
         out._launch(measure_rest, clusters, parts, rest)
@@ -259,14 +272,14 @@ class MonotonePatches:
         enough: float,
         around: Bool[Tensor, " clusters"] | None = None,
     ) -> Float[Tensor, " patches"]:
-        """m of each patch on the straight paths between positions [m], float64; -1 where it is not known.
+        """m of each patch on the straight paths between positions [m], float64; -1 if unknown.
 
         Args:
             start: Positions.
-            end: Where the vertices go; None where nothing moves.
-            least: What m must be more than.
-            enough: Of which distance at rest, at most, all that is nearer is to be left out: a part.
-            around: Only patches that some clusters are own ones of; all where None.
+            end: End positions; None without motion.
+            least: Exclusive lower limit of m.
+            enough: Largest fraction of the distance at rest within which all pairs must be omitted.
+            around: Only patches with some of these clusters as own clusters; all if None.
         """
         workers = workers_on(self.level.device)
         wanted = torch.full((self.count,), around is None, dtype=torch.bool, device=start.device)
@@ -289,12 +302,12 @@ class MonotonePatches:
         x: Float[Tensor, "vertices 3"],
         lost: Int[Tensor, " 1"],
     ) -> wp.array:
-        """The greatest change of a gradient in each cluster, from the nearer of two positions [m] to x [m], float64.
+        """Largest change of a gradient in each cluster, from the nearer of two positions [m] to x [m], float64.
 
         Args:
-            between: The two.
-            x: The third.
-            lost: Above 0 where it does not count any more.
+            between: The two reference positions.
+            x: Positions.
+            lost: Flag; above 0 the changes are not needed.
         """
         change = wp.empty(self.clusters, dtype=wp.float32, device=self.level.device)
         arrays = (*(_array(each) for each in (*between, x)), argument(lost), change)
@@ -310,25 +323,25 @@ class MonotonePatches:
         changes: tuple[wp.array, wp.array],
         lost: Int[Tensor, " 1"],
     ) -> None:
-        """See whether m of each patch is not less on other paths [m], float64, than is relied on.
+        """Check that m of each patch on other paths [m], float64, is at least the required m.
 
         Args:
-            relied: What is relied on; m was greater by `MARGIN` between two positions.
+            relied: Required m; m exceeded it by `MARGIN` between two positions.
             start: Positions.
-            end: Where the vertices go; None where nothing moves.
-            changes: What has changed in each cluster at both.
-            lost: Becomes 1 where it is less; nothing is looked at where it is that already.
+            end: End positions; None without motion.
+            changes: Changes in each cluster at both.
+            lost: Flag, set to 1 if m is less than required; the check is skipped if the flag is already set.
         """
         x, workers = _array(start), workers_on(self.level.device)
         inputs = (self.table, x, x if end is None else _array(end - start), end is not None, argument(relied))
         self._launch(find_lost, self.count * workers, workers, *inputs, *changes, argument(lost), least=LEAST_QUERIES)
 
     def _launch(self, kernel: wp.Kernel, size: int, *inputs: object, least: int = LEAST_PER_THREAD) -> None:
-        """Run a kernel over patches or clusters; another thread is worth it from so many items."""
+        """Run a kernel over patches or clusters; a further thread needs a minimum number of items."""
         launched = {"device": self.level.device, "threads": self.level.threads, "least": least}
         run(kernel, size, list(inputs), **launched)
 
 
 def _array(x: Tensor) -> Any:
-    """Positions as kernels read them."""
+    """Positions as a Warp array."""
     return argument(x.contiguous(), wp.vec3d)

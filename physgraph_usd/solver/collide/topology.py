@@ -1,4 +1,4 @@
-"""A level's vertices, edges and faces by cluster, as kernels read them."""
+"""Warp struct of a level's vertices, edges and faces by cluster."""
 
 # Warp's structs are typed by values that only Warp reads.
 # pyright: reportArgumentType=false
@@ -9,7 +9,7 @@ import warp as wp
 
 @wp.struct
 class Topology:
-    """What moves, by cluster; corners are all the vertices of a cluster's parts, each once."""
+    """Topology by cluster; `corners` are the distinct vertices of a cluster's parts."""
 
     first_corner: wp.array(dtype=wp.int32)
     corners: wp.array(dtype=wp.int32)

@@ -1,1 +1,1 @@
-"""Bodies that cloth rests on: closest points on moving meshes and on analytic shapes."""
+"""Bodies in contact with cloth: closest points on moving meshes and on analytic shapes."""

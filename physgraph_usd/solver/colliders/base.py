@@ -1,4 +1,4 @@
-"""What can be asked of a posed surface."""
+"""Interface of a posed surface."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ class Nearest:
     """The closest points of a surface.
 
     Attributes:
-        distance: Unsigned [m], infinite where nothing was in reach, shape (N,).
-        point: [m], shape (N, 3).
-        normal: Of the surface there, outward on closed surfaces, shape (N, 3).
-        side: 1 on the normals' side, -1 behind, 0 where a closed mesh has to be asked by `Surface.inside`, shape (N,).
-        rim: Whether it lies on the rim of an open surface, shape (N,).
-        face: Triangle that it lies on, -1 on primitives, shape (N,), int32.
+        distance: Unsigned distances [m], infinite if nothing was in reach, shape (N,).
+        point: Closest points [m], shape (N, 3).
+        normal: Normals of the surface at the closest points, outward on closed surfaces, shape (N, 3).
+        side: 1 on the normals' side, -1 behind, 0 if a closed mesh needs `Surface.inside`, shape (N,).
+        rim: True if the closest point is on the rim of an open surface, shape (N,).
+        face: Triangle of the closest point, -1 on primitives, shape (N,), int32.
     """
 
     distance: Float[Tensor, " points"]
@@ -31,11 +31,11 @@ class Nearest:
     face: Int[Tensor, " points"]
 
     def some(self, which: Int[Tensor, " some"]) -> Nearest:
-        """Those of some points."""
+        """The selected points."""
         return Nearest(**{each.name: getattr(self, each.name)[which] for each in fields(self)})
 
     def with_those(self, which: Int[Tensor, " some"], others: Nearest) -> Nearest:
-        """The same with others for some points."""
+        """A copy with some points replaced."""
         names = [each.name for each in fields(self)]
         return Nearest(**{name: getattr(self, name).index_put((which,), getattr(others, name)) for name in names})
 
@@ -45,11 +45,11 @@ class Surface(Protocol):
     """A posed surface.
 
     Attributes:
-        closed: Whether it has an inside.
-        fixed_side: Side of an open surface on which cloth belongs, 1 its normals' or -1; None where the start decides.
-        certain: Whether the side that `closest` gives is final, so that `inside` need not be asked.
-        origin: World position of the origin of the coordinates that it is asked in [m], shape (3,), float64.
-        bounds: Least and greatest corner [m], in its own coordinates, shape (2, 3), float64.
+        closed: True if the surface has an inside.
+        fixed_side: Allowed side of an open surface, 1 along the normals or -1; None if the start decides.
+        certain: True if the sides from `closest` are final, so that `inside` is not needed.
+        origin: World position of the origin of the surface's coordinates [m], shape (3,), float64.
+        bounds: Least and greatest corner [m], in the surface's coordinates, shape (2, 3), float64.
     """
 
     @property
@@ -72,19 +72,19 @@ class Surface(Protocol):
         ...
 
     def inside(self, x: Float[Tensor, "points 3"], *, parts: int = 1) -> Bool[Tensor, " points"]:
-        """Whether points are inside; nowhere for open surfaces.
+        """Mask of the points inside; all False for open surfaces.
 
         Args:
             x: Points.
-            parts: Of how many overlapping parts of the surface at once, at least.
+            parts: Least number of overlapping parts of the surface that contain a point.
         """
         ...
 
     def exit(self, x: Float[Tensor, "points 3"], found: Nearest) -> Nearest:
-        """The closest points through which points inside can leave: not those on faces buried in the same surface.
+        """The closest points through which inside points can leave, without faces buried in the surface.
 
         Args:
             x: Points inside.
-            found: What `closest` gave for them.
+            found: Result of `closest` for the points.
         """
         ...

@@ -1,4 +1,4 @@
-"""The side of an open mesh on which cloth belongs, by the mesh's winding number and where the coarse cloth is."""
+"""Allowed side of an open mesh, from the mesh's winding number at the coarse cloth."""
 
 from __future__ import annotations
 
@@ -9,19 +9,20 @@ import numpy as np
 from .orient import pieces_of
 
 ASKED = 64
-"""Vertices of a cage, spread over it, whose winding numbers stand for all: enough to tell a half from a quarter."""
+"""Number of cage vertices, spread over the cage, whose winding numbers stand for all: enough to tell a half from a
+quarter."""
 INSIDE = 0.5
 """Winding number from which a point is inside."""
 CLEAR = 0.75
-"""Fraction of a cage that lies on one side of a floor or wall: cloth that hangs over a wall has half on each."""
+"""Least fraction of a cage on one side of a floor or wall; cloth hanging over a wall has half on each side."""
 
 
 def choose_side(points: np.ndarray, triangles: np.ndarray, cages: Sequence[np.ndarray]) -> str:
-    """The side, one of `schema.SIDES`, for a mesh that is to be taken as it is.
+    """The side, one of `schema.SIDES`, for a mesh without an authored side.
 
-    "winding" for a mesh that has pieces with an inside, unless most of a cage lies inside: a coat round a shirt.
-    "front" or "back" for floors and walls: planes larger than the cloth, which lies on one side of them.
-    "auto" for others.
+    "winding" for a mesh with pieces that have an inside, unless most of a cage lies inside: a coat round a shirt.
+    "front" or "back" for floors and walls: planes larger than the cloth, with the cloth on one side. "auto" for all
+    remaining meshes.
 
     Args:
         points: Positions [m], shape (V, 3).
@@ -56,7 +57,7 @@ def winding_numbers(points: np.ndarray, triangles: np.ndarray, x: np.ndarray) ->
     Args:
         points: Positions [m], shape (V, 3).
         triangles: Corners, shape (T, 3).
-        x: Where [m], shape (N, 3).
+        x: Query points [m], shape (N, 3).
     """
     numbers = np.empty(len(x))
     for index, place in enumerate(x):

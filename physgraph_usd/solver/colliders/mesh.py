@@ -25,11 +25,11 @@ wp.set_module_options(KERNELS)
 Rim = tuple[np.ndarray, np.ndarray]
 """Rim edges and rim corners of open triangles, as `Pieces` has them."""
 LIFT = 1e-4
-"""How far above a vertex it is looked whether the surface is buried there, relative to the surface's size."""
+"""Height above a vertex at which the surface is tested for being buried, relative to the surface's size."""
 ON_EDGE = 1e-4
-"""Barycentric coordinate under which a point is on an edge."""
+"""Barycentric coordinate below which a point is on an edge."""
 TOGETHER = 100_000
-"""Most faces of which CUDA is asked together what their normals tell."""
+"""Most faces for which CUDA tests all normals in a single launch."""
 
 
 @wp.kernel
@@ -90,13 +90,13 @@ class MeshSurface:
     """The closed or the open pieces of one mesh.
 
     Attributes:
-        closed: Whether it has an inside.
-        fixed_side: Side of an open surface on which cloth belongs, 1 its normals' or -1; None where the start decides.
-        certain: Whether winding numbers give every side, also where the surface has holes.
-        origin: World position of its coordinates' origin [m], shape (3,), float64.
+        closed: True if the surface has an inside.
+        fixed_side: Allowed side of an open surface, 1 along the normals or -1; None if the start decides.
+        certain: True if winding numbers give every side, also for surfaces with holes.
+        origin: World position of the origin of the surface's coordinates [m], shape (3,), float64.
         bounds: Least and greatest corner [m], shape (2, 3), float64.
         triangles: Corners, shape (T, 3), int32.
-        edges: Their sides, each once, shape (E, 2), int32.
+        edges: Sides of the triangles, each once, shape (E, 2), int32.
     """
 
     def __init__(
@@ -114,10 +114,10 @@ class MeshSurface:
         Args:
             pose: Any pose.
             triangles: The pieces' triangles, shape (T, 3).
-            rim: Rim edges and rim corners of open pieces, or None for closed ones.
+            rim: Rim edges and rim corners of open pieces, or None for closed pieces.
             side: One of `sides.SIDES`.
             device: "cpu" or a CUDA device.
-            threads: Most threads that a query uses on the CPU.
+            threads: Most threads of a query on the CPU.
         """
         self.closed = rim is None
         self.fixed_side = None if self.closed else FIXED.get(side)
@@ -138,7 +138,7 @@ class MeshSurface:
         self._faces = Faces(self)
 
     def repose(self, pose: MeshPose) -> None:
-        """Move the surface to another pose of the same topology; turned alone, it passes through itself as before."""
+        """Move the surface to another pose of equal topology; a rigid motion keeps the known self-intersections."""
         wp.copy(self.mesh.points, wp.array(self._place(pose), dtype=wp.vec3f, device=self.device))
         self.mesh.refit()
         posed = pose.points[self._used]
@@ -147,7 +147,7 @@ class MeshSurface:
         self._faces = self._faces.turned() if rigid else Faces(self)
 
     def _place(self, pose: MeshPose) -> np.ndarray:
-        """Recentre a pose; vertices that no face uses are put on one that a face does."""
+        """Recentre a pose; vertices without a face are moved to the origin."""
         used = pose.points[self._used]
         used = np.where(np.isfinite(used), used, 0.0)
         self.origin = 0.5 * (used.min(axis=0) + used.max(axis=0))
@@ -159,9 +159,10 @@ class MeshSurface:
     def closest(self, x: Float[Tensor, "points 3"], reach: Float[Tensor, " points"]) -> Nearest:
         """The closest points within reach [m].
 
-        The side is the pseudonormal's (Baerentzen and Aanaes 2005). On a closed surface that is right unless the face
-        is buried in another part of the surface or passes through one, is at a hole, or two parts are equally near:
-        their normals make one that is neither's. There it is left to `inside`. A certain surface asks `inside` for all.
+        The side is the pseudonormal's (Baerentzen and Aanaes 2005). On a closed surface the side is correct unless the
+        face is buried in another part of the surface, passes through another part, or is at a hole, or two parts are
+        equally near: their normals add up to a wrong normal. In these cases the side is 0, and `inside` decides. A
+        certain surface uses `inside` for all points.
         """
         found = self._closest(self.mesh, x, reach)
         if self.certain:
@@ -186,9 +187,9 @@ class MeshSurface:
         return Nearest(distance.to(x), point.to(x), normal.to(x), side.to(x), rim, face)
 
     def inside(self, x: Float[Tensor, "points 3"], *, parts: int = 1) -> Bool[Tensor, " points"]:
-        """Whether points are inside so many parts at least; nowhere for open surfaces.
+        """Mask of the points inside at least `parts` parts; all False for open surfaces.
 
-        The generalised winding number (Barill et al. 2018) is that number, to the nearest whole one.
+        The number of parts is the generalised winding number (Barill et al. 2018), rounded.
         """
         side = torch.ones(len(x), dtype=torch.float32, device=x.device)
         if self.closed and len(x):
@@ -203,10 +204,10 @@ class MeshSurface:
         return side < 0
 
     def exit(self, x: Float[Tensor, "points 3"], found: Nearest) -> Nearest:
-        """The closest points on faces that lie bare; where body parts overlap, the nearest face may be deep inside.
+        """The closest points on exposed faces; where body parts overlap, the nearest face may be deep inside.
 
-        A face lies bare when none of its corners is inside the surface. Another part may still come through its middle:
-        what would land in that looks for a face that none comes through.
+        A face is exposed if none of its corners is inside the surface. Another part may still pierce the face's middle:
+        a point whose exit would be inside that part takes the closest unpierced face.
         """
         if not self.closed or not len(x):
             return found
@@ -219,7 +220,7 @@ class MeshSurface:
         return way.with_those(doubtful, self._closest_bare(x[doubtful], way.some(doubtful), whole=True))
 
     def _closest_bare(self, x: Tensor, known: Nearest, *, whole: bool) -> Nearest:
-        """The closest points on faces that lie bare, or do so as a whole; what is known where there are none."""
+        """The closest points on wholly exposed faces, or else on exposed faces; unchanged if there are none."""
         skin = self._faces.bare(whole)
         if skin is None:
             return known
@@ -233,7 +234,7 @@ class MeshSurface:
         run(kernel, count, [mesh.id, *inputs], **given)
 
     def _on_rim(self, face: Tensor, weight: Tensor) -> Bool[Tensor, " points"]:
-        """Whether closest points lie on a rim edge or a rim vertex."""
+        """Mask of the closest points on a rim edge or a rim vertex."""
         if self._rim is None:
             return torch.zeros(len(face), dtype=torch.bool, device=face.device)
         edges, corners = (each[face] for each in self._rim)
@@ -243,14 +244,13 @@ class MeshSurface:
 
 
 class Faces:
-    """What is known of a surface's faces in one pose: which are buried in it, pass through others, or lie bare.
+    """Cached properties of a surface's faces in one pose: buried, intersecting, or exposed.
 
-    Each vertex and each face is asked for once. The surface passes through itself as before while it only turns and
-    shifts.
+    Each vertex and each face is tested once. A rigid motion of the surface keeps its self-intersections.
     """
 
     def __init__(self, surface: MeshSurface) -> None:
-        """Know nothing yet."""
+        """Start with empty caches."""
         self._surface = surface
         self._asked: Tensor | None = None
         self._buried: Tensor | None = None
@@ -260,16 +260,16 @@ class Faces:
         self._skins: dict[bool, tuple[wp.Mesh, Tensor]] = {}
 
     def turned(self) -> Faces:
-        """What is still known of the surface in a pose to which it turned and shifted."""
+        """The properties that remain valid after a rigid motion."""
         other = Faces(self._surface)
         other._asked, other._buried = self._asked, self._buried
         other._overlaps, other._mute = self._overlaps, self._mute
         return other
 
     def is_mute(self, face: Tensor) -> Bool[Tensor, " points"]:
-        """Whether the normals of faces do not tell the side; each face is asked for once a pose.
+        """Mask of the faces with normals that do not give the side; each face is tested once a pose.
 
-        On CUDA all are asked for together, where they are not too many: that takes as long as asking for a few.
+        On CUDA all faces are tested at once, up to a limit: a test of a few takes as long.
         """
         if self._mute is None:
             every = torch.arange(len(self._surface.corners), dtype=torch.int32, device=face.device)
@@ -282,11 +282,11 @@ class Faces:
         return self._mute[face.long()] > 0
 
     def _tells_nothing(self, face: Tensor) -> Tensor:
-        """1 where a face's normal does not tell the side, else 0."""
+        """1 if a face's normal does not give the side, else 0."""
         return (self.is_buried(face) | self.is_unsure(face)).to(torch.int8)
 
     def is_buried(self, face: Tensor) -> Bool[Tensor, " points"]:
-        """Whether faces have a corner inside the surface; each corner is asked for once a pose."""
+        """Mask of the faces with a corner inside the surface; each corner is tested once a pose."""
         count = len(self._surface.mesh.points)
         if self._buried is None or self._asked is None:
             self._asked, self._buried = (torch.zeros(count, dtype=torch.bool, device=face.device) for _ in range(2))
@@ -299,7 +299,7 @@ class Faces:
         return self._buried[corners].any(dim=1)
 
     def is_unsure(self, face: Tensor) -> Bool[Tensor, " points"]:
-        """Whether faces pass through others or are at a hole; each face is asked for once a pose."""
+        """Mask of the faces at a hole or with self-intersections; each face is tested once a pose."""
         if self._overlaps is None:
             self._overlaps = torch.full((len(self._surface.corners),), -1, dtype=torch.int8, device=face.device)
         needed = torch.zeros(len(self._surface.corners), dtype=torch.bool, device=face.device)
@@ -311,9 +311,9 @@ class Faces:
         return self._overlaps[face.long()] > 0
 
     def _lifted_inside(self, vertices: Tensor) -> Bool[Tensor, " vertices"]:
-        """Whether points just above vertices are inside.
+        """Mask of the vertices with an inside point just above.
 
-        Where the surface has no hole, what sees the sky along its normal is outside, and takes no winding number.
+        On a surface without holes, a vertex whose normal ray meets no face is outside, without a winding number.
         """
         out = torch.zeros(len(vertices), dtype=torch.bool, device=vertices.device)
         if not len(vertices):
@@ -344,7 +344,7 @@ class Faces:
         return torch.nn.functional.normalize(normal, dim=1, eps=1e-30)
 
     def bare(self, whole: bool) -> tuple[wp.Mesh, Tensor] | None:
-        """The faces that lie bare, or that no other passes through besides, and their numbers; None without any."""
+        """Mesh and indices of the exposed faces, only of wholly exposed faces if ``whole``; None without any."""
         if whole not in self._skins:
             every = torch.arange(len(self._surface.corners), device=self._surface.device)
             hidden = self.is_buried(every)
@@ -357,17 +357,17 @@ class Faces:
 
 
 class MeshBody:
-    """One mesh collider over the shot: its surfaces, kept while the topology stays the same."""
+    """One mesh collider over the shot; its surfaces are kept while the topology is unchanged."""
 
     def __init__(self, *, side: str = "auto", device: str, threads: int) -> None:
-        """Remember where and how to build; ``side`` is one of `sides.SIDES`."""
+        """Store device, threads and ``side``, one of `sides.SIDES`."""
         self._side, self._device, self._threads = side, device, threads
         self._triangles: np.ndarray | None = None
         self._points = np.zeros((0, 3))
         self._surfaces: tuple[MeshSurface, ...] = ()
 
     def pose(self, pose: MeshPose) -> tuple[MeshSurface, ...]:
-        """The closed and the open part at one time code; those without faces are left out."""
+        """The closed and the open surface at one time code, without empty surfaces."""
         same = self._triangles is not None and (
             pose.triangles is self._triangles or np.array_equal(pose.triangles, self._triangles)
         )
@@ -393,7 +393,7 @@ class MeshBody:
 
 
 def _hierarchy(points: wp.array, triangles: np.ndarray, closed: bool) -> wp.Mesh:
-    """Warp's mesh; winding numbers only where there is an inside."""
+    """Warp mesh, with winding numbers only if the surface has an inside."""
     indices = wp.array(triangles.ravel(), dtype=wp.int32, device=points.device)
     return wp.Mesh(points=points, indices=indices, support_winding_number=closed)
 

@@ -1,7 +1,7 @@
-"""What of a mesh is closed, and which way its faces look, whatever the file says.
+"""Closed and open pieces of a mesh, with consistent orientation independent of the file.
 
-Vertices at one place are one (exporters split them at seams), the winding is made consistent from face to face, and
-each closed piece is turned so that its volume is positive.
+Vertices at equal positions are merged (exporters split vertices at seams), the winding is made consistent from face to
+face, and each closed piece is oriented to a positive volume.
 """
 
 from __future__ import annotations
@@ -13,27 +13,27 @@ from scipy import sparse
 from scipy.sparse import csgraph
 
 WELD = 1e-6
-"""Vertices closer than this are one, relative to the mesh's size."""
+"""Distance below which vertices are merged, relative to the mesh's size."""
 HOLES = 0.03
-"""Fraction of a piece's area that its openings may have for it to count as closed: the winding number closes them."""
+"""Largest fraction of openings in the area of a piece that counts as closed; the winding number closes the openings."""
 OPENINGS = 0.5
-"""The same for a piece that has an inside by its winding number alone: half a sphere is the limit, where the number is
+"""As `HOLES`, for a piece with an inside by its winding number alone. The limit is half a sphere, with winding number
 1/2 in the middle of the opening. A plane has an opening as large as itself, and no inside."""
 
 
 FIXED = {"front": 1.0, "back": -1.0}
-"""Side of an open piece's normals on which cloth belongs, by the word for it."""
+"""Allowed side of an open piece along its normals, by name."""
 
 
 @dataclass(frozen=True, eq=False)
 class Pieces:
-    """A mesh's sound faces.
+    """The valid faces of a mesh.
 
     Attributes:
         closed: Triangles of closed pieces, wound outward, shape (T, 3), int32.
-        open: Triangles of the others, wound consistently where they can be, shape (U, 3), int32.
-        rim: Whether the edge opposite each corner of an open triangle is on the rim, shape (U, 3).
-        rim_vertex: Whether each corner of an open triangle is on the rim, shape (U, 3).
+        open: Triangles of open pieces, wound consistently if orientable, shape (U, 3), int32.
+        rim: True if the edge opposite each corner of an open triangle is on the rim, shape (U, 3).
+        rim_vertex: True if a corner of an open triangle is on the rim, shape (U, 3).
     """
 
     closed: np.ndarray
@@ -43,16 +43,16 @@ class Pieces:
 
 
 def pieces_of(points: np.ndarray, triangles: np.ndarray, *, side: str = "auto") -> Pieces:
-    """Sort a mesh's triangles into closed and open pieces and turn them.
+    """Sort a mesh's triangles into closed and open pieces and orient the pieces.
 
     Args:
-        points: Positions [m], shape (V, 3); those that are not finite take their faces with them.
+        points: Positions [m], shape (V, 3); faces with non-finite positions are dropped.
         triangles: Corners, shape (T, 3).
         side: One of `schema.SIDES`: "winding" counts pieces with openings up to `OPENINGS` as closed, "start" none;
-            open pieces are left as they are wound for "front" and "back".
+            "front" and "back" keep the winding of open pieces.
 
     Returns:
-        The pieces. Corners are welded: they use the first vertex at each place.
+        The pieces. Corners are welded to the first vertex at each position.
     """
     first = _welded(points)
     faces = first[np.asarray(triangles, np.int64).reshape(-1, 3)]
@@ -86,7 +86,7 @@ def pieces_of(points: np.ndarray, triangles: np.ndarray, *, side: str = "auto") 
 
 
 def _welded(points: np.ndarray) -> np.ndarray:
-    """First vertex at each vertex's place, shape (V,)."""
+    """First vertex at each vertex's position, shape (V,)."""
     finite = np.asarray(np.isfinite(points).all(axis=1))
     if not finite.any():
         return np.arange(len(points))
@@ -98,7 +98,7 @@ def _welded(points: np.ndarray) -> np.ndarray:
 
 
 def _edges(faces: np.ndarray, vertex_count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Edge of each side (0-1, 1-2, 2-0) of each face, whether it runs upwards, and the faces at each edge."""
+    """Edge of each side (0-1, 1-2, 2-0) of each face, whether the side runs upwards, and the faces at each edge."""
     here, there = faces, np.roll(faces, -1, axis=1)
     keys = np.minimum(here, there) * vertex_count + np.maximum(here, there)
     _, edge, count = np.unique(keys, return_inverse=True, return_counts=True)
@@ -108,9 +108,10 @@ def _edges(faces: np.ndarray, vertex_count: int) -> tuple[np.ndarray, np.ndarray
 def _orientation(
     edge: np.ndarray, forward: np.ndarray, count: np.ndarray, *, faces: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Piece of each face, whether to turn it, and per piece whether it has two sides.
+    """Piece of each face, whether to flip the face, and per piece whether the piece is orientable.
 
-    Each face stands twice in a graph, as it is and turned; neighbours that agree link like to like, others crosswise.
+    Each face is two graph nodes, as wound and flipped. Neighbours with consistent winding link like to like,
+    inconsistent neighbours crosswise.
     """
     order = np.argsort(edge.ravel(), kind="stable")
     starts = np.concatenate([[0], np.cumsum(count)[:-1]])[count == 2]
@@ -130,9 +131,9 @@ def _orientation(
 def _openings(
     points: np.ndarray, faces: np.ndarray, edge: np.ndarray, *, count: np.ndarray, piece: np.ndarray
 ) -> np.ndarray:
-    """Per piece, the area that its openings have at most, as a fraction of its own.
+    """Upper bound of the area of each piece's openings, as a fraction of the piece's area.
 
-    No flat opening has more area than the circle of its rim's length.
+    No flat opening has more area than the circle with the rim's length.
     """
     corners = points[faces]
     area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)

@@ -1,7 +1,7 @@
-"""Which faces of a surface pass through others of it, as those of skinned bodies do in armpits and crotches.
+"""Self-intersecting faces of a surface, as in armpits and crotches of skinned bodies.
 
-A face whose corners are outside the surface and that passes through no other face lies bare as a whole: there the
-pseudonormal tells inside from outside for certain.
+A face with all corners outside the surface and without self-intersection is wholly exposed: its pseudonormal tells
+inside from outside for certain.
 """
 
 # Warp's kernels are typed by values that only Warp reads.
@@ -22,7 +22,7 @@ wp.set_module_options(KERNELS)
 
 @wp.func
 def _pierces(x: wp.array(dtype=wp.vec3f), t: wp.vec3i, u: wp.vec3i):
-    """Whether a side of triangle t that has no corner of triangle u passes through it."""
+    """True if a side of triangle t that shares no corner with triangle u passes through u."""
     found = bool(False)  # noqa: UP018 - a literal would be a constant to Warp
     for side in range(3):
         a, b = t[side], t[(side + 1) % 3]
@@ -57,11 +57,11 @@ def _overlap(
 
 
 def overlapping(mesh: wp.Mesh, faces: Int[Tensor, " faces"], *, threads: int = 1) -> Bool[Tensor, " faces"]:
-    """Whether faces of a mesh pass through others of it.
+    """Mask of the faces that pass through other faces of the mesh.
 
     Args:
         mesh: The mesh.
-        faces: Numbers of the faces asked about.
+        faces: Indices of the faces to test.
         threads: Most threads on the CPU.
     """
     out = torch.zeros(len(faces), dtype=torch.int32, device=faces.device)

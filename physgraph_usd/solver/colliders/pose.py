@@ -1,4 +1,4 @@
-"""What a collider is, and how it is posed at one time code; numpy only."""
+"""Colliders and their poses at one time code; numpy only."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from ..rigid import AT_REST, Rigid, best_motion
 
 KINDS = ("mesh", "sphere", "capsule", "cylinder", "cube", "plane")
 RIGID = 1e-6
-"""How far points may be from where a turn and a shift bring them, relative to their extent: float32's rounding."""
+"""Largest deviation of points from a rigid motion, relative to their extent: float32's rounding."""
 
 
 @dataclass(frozen=True)
 class Collider:
-    """What stays the same over the shot.
+    """Properties of a collider that are constant over the shot.
 
     Attributes:
-        path: Prim path, its name in reports.
+        path: Prim path, used as the name in reports.
         kind: One of `KINDS`.
-        offset: Distance kept from it [m], added to the garment's.
+        offset: Distance kept from the collider [m], added to the garment's offset.
         side: One of `SIDES`.
     """
 
@@ -36,19 +36,19 @@ class MeshPose:
 
     Attributes:
         points: Positions [m], world space, shape (V, 3), float64.
-        triangles: Corners, shape (T, 3), int32; the same array while the topology stays the same. Wound as authored;
-            for the sides "front" and "back" so that the front is where they are counterclockwise in the world.
+        triangles: Corners, shape (T, 3), int32; the array object is kept while the topology is unchanged. Wound as
+            authored; for the sides "front" and "back" counterclockwise in the world on the front.
     """
 
     points: np.ndarray
     triangles: np.ndarray
 
     def corners(self) -> np.ndarray:
-        """Points that hold all of it between them [m], shape (N, 3)."""
+        """Points whose convex hull contains the mesh [m], shape (N, 3)."""
         return self.points
 
     def equals(self, other: Pose) -> bool:
-        """Whether both are the same to the bit."""
+        """True if both poses are bitwise equal."""
         return (
             isinstance(other, MeshPose)
             and np.array_equal(self.triangles, other.triangles)
@@ -56,7 +56,7 @@ class MeshPose:
         )
 
     def moved(self, since: Pose, along: Rigid = AT_REST) -> float:
-        """How far any point is from where a motion takes another pose [m]; infinite where the two are not alike."""
+        """Largest distance of a point from its image of another pose under a motion [m]; infinite for unlike poses."""
         if not isinstance(since, MeshPose) or not np.array_equal(self.triangles, since.triangles):
             return np.inf
         return _farthest(self.points, along(since.points))
@@ -68,10 +68,10 @@ class ShapePose:
 
     Attributes:
         kind: "sphere", "capsule", "cylinder", "cube" or "plane".
-        turn: Rotation whose columns are the shape's axes in the world; the third is the axis of a capsule, a cylinder
-            and a plane (its outer normal), shape (3, 3), float64.
-        centre: [m], world space, shape (3,), float64.
-        size: Half sizes along its axes [m]: (r, r, r) of a sphere, (r, r, half height without caps) of a capsule or a
+        turn: Rotation whose columns are the shape's axes in the world; the third column is the axis of a capsule or a
+            cylinder, and the outer normal of a plane, shape (3, 3), float64.
+        centre: Centre [m], world space, shape (3,), float64.
+        size: Half sizes along the axes [m]: (r, r, r) of a sphere, (r, r, half height without caps) of a capsule or a
             cylinder, zero for a plane, shape (3,), float64.
     """
 
@@ -81,12 +81,12 @@ class ShapePose:
     size: np.ndarray
 
     def corners(self) -> np.ndarray:
-        """Points that hold all of it between them [m], shape (N, 3); the centre of a plane, which nothing holds."""
+        """Points whose convex hull contains the shape [m], shape (N, 3); for an unbounded plane its centre."""
         reach = self.size.sum()
         return self.centre + np.array([[-reach], [reach]])
 
     def equals(self, other: Pose) -> bool:
-        """Whether both are the same to the bit."""
+        """True if both poses are bitwise equal."""
         return (
             isinstance(other, ShapePose)
             and self.kind == other.kind
@@ -94,9 +94,9 @@ class ShapePose:
         )
 
     def moved(self, since: Pose, along: Rigid = AT_REST) -> float:
-        """How far its axes' ends are from where a motion takes another pose's [m]; infinite for other kinds.
+        """Largest distance of an axis end from its image of another pose [m]; infinite for unlike kinds.
 
-        A plane's ends lie at a metre.
+        The ends of a plane's axes lie at a metre.
         """
         if not isinstance(since, ShapePose) or self.kind != since.kind:
             return np.inf
@@ -108,7 +108,7 @@ Pose = MeshPose | ShapePose
 
 
 def _farthest(points: np.ndarray, others: np.ndarray) -> float:
-    """How far any point is from its other place [m], 0 without points; infinite where they are no places."""
+    """Largest distance of corresponding points [m], 0 without points; infinite for non-finite points."""
     if points.shape != others.shape:
         return np.inf
     far = float(np.linalg.norm(points - others, axis=1).max(initial=0.0))
@@ -116,10 +116,10 @@ def _farthest(points: np.ndarray, others: np.ndarray) -> float:
 
 
 def moved_rigidly(before: np.ndarray, after: np.ndarray) -> bool:
-    """Whether points were turned and shifted alone, by the best such move (Kabsch 1976).
+    """True if the points moved rigidly, by comparison with the best rigid motion (Kabsch 1976).
 
     Args:
         before: Positions [m], shape (V, 3), float64.
-        after: Positions of the same points [m].
+        after: Positions of the points after the motion [m].
     """
     return _farthest(after, best_motion(before, after)(before)) <= RIGID * np.ptp(before, axis=0).max()

@@ -18,7 +18,7 @@ class ShapeSurface:
         closed: True.
         fixed_side: None.
         certain: False.
-        origin: Its centre in the world [m], shape (3,), float64.
+        origin: World position of the centre [m], shape (3,), float64.
         bounds: Least and greatest corner [m], infinite for a plane, shape (2, 3), float64.
     """
 
@@ -43,7 +43,7 @@ class ShapeSurface:
         return np.stack([-half, half])
 
     def closest(self, x: Float[Tensor, "points 3"], reach: Float[Tensor, " points"]) -> Nearest:
-        """The closest points; at places with several, such as a sphere's centre, one of them."""
+        """The closest points; an arbitrary choice if there are several, as at a sphere's centre."""
         turn, size = self._turn.to(x), self._size.to(x)
         local = x @ turn
         signed, normal = _SHAPES[self._pose.kind](local, size)
@@ -55,13 +55,13 @@ class ShapeSurface:
         return Nearest(distance, point @ turn.T, normal @ turn.T, side, rim, face)
 
     def inside(self, x: Float[Tensor, "points 3"], *, parts: int = 1) -> Bool[Tensor, " points"]:
-        """Whether points are inside; a shape has one part."""
+        """Mask of the points inside; a shape has a single part."""
         if parts > 1:
             return torch.zeros_like(x[:, 0], dtype=torch.bool)
         return _SHAPES[self._pose.kind](x @ self._turn.to(x), self._size.to(x))[0] < 0
 
     def exit(self, x: Float[Tensor, "points 3"], found: Nearest) -> Nearest:
-        """The same closest points: nothing is buried in a convex shape."""
+        """The closest points, unchanged: a convex shape has no buried faces."""
         return found
 
 

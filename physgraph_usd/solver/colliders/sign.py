@@ -1,8 +1,8 @@
 """Signed distances of a whole garment with as few winding numbers as possible.
 
-If a and b lie on different sides, the segment between them meets the surface, so d(a) + d(b) <= |a - b|. Along edges
-that are shorter than the distances of their ends the sign cannot change: one winding number answers for all vertices
-that such edges join.
+If a and b lie on different sides, the segment between them meets the surface, so d(a) + d(b) <= |a - b|. Along an edge
+shorter than the sum of its ends' distances the sign cannot change. A single winding number therefore decides for all
+vertices connected by short edges.
 """
 
 # Warp's kernels are typed by values that only Warp reads.
@@ -26,18 +26,17 @@ from .base import Nearest, Surface
 wp.set_module_options(KERNELS)
 
 LEAST_REACH = 1e-3
-"""Distance within which closest points are always asked for [m]."""
+"""Least search distance of closest points [m]."""
 MARGIN, ROUNDING = 1.001, 1e-6
-"""Distances are float32: a segment counts as clear of the surface with so many times its length, and so many metres, to
-spare."""
+"""Factor on the length and margin [m] for a segment to count as clear of the surface: distances are float32."""
 
 
 def is_clear(distance: Float[Tensor, " segments"], length: Float[Tensor, " segments"]) -> Bool[Tensor, " segments"]:
-    """Whether segments are too short to pass through a surface.
+    """Mask of the segments too short to pass through a surface.
 
     Args:
-        distance: Distances of both ends to it together [m].
-        length: Their lengths [m].
+        distance: Sum of both ends' distances from the surface [m].
+        length: Lengths of the segments [m].
     """
     return distance > MARGIN * length + ROUNDING
 
@@ -87,16 +86,16 @@ def signed_distances(
     reach: float,
     least: Float[Tensor, " vertices"] | None = None,
 ) -> Float[Tensor, " vertices"]:
-    """Distances to a surface [m], negative inside closed ones and behind open ones with a fixed side.
+    """Distances to a surface [m], negative inside closed surfaces and behind open surfaces with a fixed side.
 
-    For points farther away than ``reach``, on either side, a lower bound.
+    Beyond ``reach``, on either side, the distance is a lower bound.
 
     Args:
         surface: The surface.
         x: Points in the surface's coordinates [m].
-        edges: Pairs of points that are near each other.
-        reach: Distance over which only the side is told [m].
-        least: Lower bounds that are known [m]; None without. Who is outside by them is not asked, and keeps them.
+        edges: Pairs of neighbouring points.
+        reach: Distance beyond which only the side is determined [m].
+        least: Known lower bounds [m], or None. Points outside by these bounds keep them without a query.
     """
     return signed_and_closest(surface, x, edges, reach=reach, least=least)[0]
 
@@ -109,9 +108,9 @@ def signed_and_closest(
     reach: float,
     least: Float[Tensor, " vertices"] | None = None,
 ) -> tuple[Float[Tensor, " vertices"], Nearest | None]:
-    """The same, and the closest points of those with negative distances; None where one of them was out of reach.
+    """Signed distances and the closest points of points with negative distances; None if one was out of reach.
 
-    Arguments are those of `signed_distances`.
+    Arguments are as for `signed_distances`.
     """
     if least is not None and bool((least > 0.0).all()):
         return least, None
@@ -137,11 +136,11 @@ def signed_and_closest(
 
 
 def behind(found: Nearest, side: Float[Tensor, " points"] | float) -> Bool[Tensor, " points"]:
-    """Which points are behind an open surface: on the other side than theirs, and not past its rim.
+    """Mask of the points behind an open surface: on the disallowed side, and not past the rim.
 
     Args:
-        found: Their closest points.
-        side: The side where they belong: 1 the normals', -1 the other, 0 undecided.
+        found: Closest points of the points.
+        side: Allowed side: 1 along the normals, -1 against, 0 undecided.
     """
     return (found.side * side < 0) & ~found.rim
 
@@ -151,8 +150,8 @@ def _sides(
 ) -> Float[Tensor, " near"]:
     """1 outside and -1 inside for vertices of one closed surface.
 
-    Taken from the closest points where they tell. Where that contradicts a neighbour that no surface divides it from,
-    as it does where a face is buried in part only, and where they do not tell, the winding number does.
+    Sides come from the closest points if these give a side. The winding number decides for all remaining vertices, and
+    where sides contradict a neighbour on a clear edge, as at partly buried faces.
     """
     side = torch.ones(len(x), dtype=x.dtype, device=x.device)
     side[near] = told
@@ -170,21 +169,21 @@ def _sides(
 
 
 def _contradicted(side: Tensor, x: Tensor, distance: Tensor, *, edges: Tensor) -> Bool[Tensor, " vertices"]:
-    """Vertices told to be on the other side of a neighbour that no surface divides them from."""
+    """Mask of the vertices with a side unlike a neighbour's on a clear edge."""
     out = torch.zeros(len(side), dtype=torch.bool, device=side.device)
     _ask_edges(_contradict, edges, x, distance, argument(side.to(torch.int8)), argument(out))
     return out
 
 
 def _clear_among(some: Tensor, x: Tensor, distance: Tensor, *, edges: Tensor) -> Int[Tensor, "edges 2"]:
-    """The edges between some vertices that no surface divides."""
+    """Edges between some vertices that cannot pass through the surface."""
     out = torch.zeros(len(edges), dtype=torch.bool, device=x.device)
     _ask_edges(_join, edges, x, distance, argument(some), argument(out))
     return edges[out].long()
 
 
 def _ask_edges(kernel: wp.Kernel, edges: Tensor, x: Tensor, distance: Tensor, *more: Any) -> None:
-    """Launch over edges; the kernel is told first where they are and how far their ends are from the surface."""
+    """Launch over edges; the kernel's first arguments are the edges, the points and the points' distances."""
     if not len(edges):
         return
     start_warp()  # Views of tensors do not start Warp by themselves.
@@ -194,7 +193,7 @@ def _ask_edges(kernel: wp.Kernel, edges: Tensor, x: Tensor, distance: Tensor, *m
 
 
 def _joined(which: Tensor, pairs: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Group of each of some vertices that pairs join, and the place of the first of each group."""
+    """Group of each vertex by connecting pairs, and the position of the first vertex of each group."""
     place = torch.zeros(count, dtype=torch.long, device=which.device)
     place[which] = torch.arange(len(which), device=which.device)
     label = joined_by(place[pairs].cpu().numpy(), len(which))

@@ -1,1 +1,1 @@
-"""Contact: who is near whom, the planes that stand for bodies and for cloth, and what crosses, before and after."""
+"""Contact: pairs that are near, contact planes of bodies and of cloth, and intersections before and after the solve."""

@@ -1,4 +1,4 @@
-"""Where what is in the way moves too: the ways nearest to those wanted on which no pair that was met comes nearer."""
+"""Least-squares correction of blocked displacements: the closest displacements by which no met pair comes too near."""
 
 # Warp's kernels are typed by values that only Warp reads.
 # pyright: reportArgumentType=false, reportIndexIssue=false
@@ -22,9 +22,9 @@ from ..mesh.threads import Launch, argument
 wp.set_module_options(KERNELS)
 
 COMES = 0.8
-"""Part by which a pair may come nearer of what the promise lets it; the rest is for what the passes leave."""
+"""Fraction of the approach allowed by the promise that a pair may use; the rest absorbs the residual of the passes."""
 PASSES = 16
-"""Passes over the pairs: what is left is cut back by the promise."""
+"""Jacobi passes over the pairs. `safe_move` shortens displacements that still violate a plane afterwards."""
 
 
 @wp.kernel
@@ -38,7 +38,7 @@ def _push_apart(
     way: wp.array(dtype=wp.vec3d),
     push: wp.array(dtype=wp.float64),
 ):
-    """The multiplier of each pair, from how much nearer its parts come on their ways."""
+    """Update each pair's multiplier from the approach of its parts."""
     n = first + wp.tid()
     nearer = wp.float64(0.0)
     for k in range(4):
@@ -58,7 +58,7 @@ def _add_pushes(
     wanted: wp.array(dtype=wp.vec3d),
     way: wp.array(dtype=wp.vec3d),
 ):
-    """The way of each vertex that its pairs leave it."""
+    """Add the pushes of its pairs to each vertex's wanted displacement."""
     v = first + wp.tid()
     total = wanted[v]
     for k in range(starts[v], starts[v + 1]):
@@ -69,13 +69,13 @@ def _add_pushes(
 
 @dataclass(frozen=True, eq=False)
 class Planes:
-    """What pairs must not pass on their ways: a linear inequality each.
+    """One linear inequality on the displacements for each pair: the parts may approach by at most `may` along `normal`.
 
     Attributes:
-        corners: Of each pair, shape (N, 4), int32.
-        weight: Of its corners in the way between its parts, shape (N, 4).
-        normal: Along that way, shape (N, 3).
-        may: How much nearer the parts may come along it [m], shape (N,).
+        corners: Vertices of each pair, shape (N, 4), int32.
+        weight: Weights of the vertices in the vector between the parts, shape (N, 4).
+        normal: Unit vectors between the parts, shape (N, 3).
+        may: Largest approach of the parts along the normal [m], shape (N,).
     """
 
     corners: Int[Tensor, "pairs 4"]
@@ -85,14 +85,14 @@ class Planes:
 
     @staticmethod
     def of(x: Tensor, ends: Tensor, met: Pairs, floor: float, *, corners: bool = False) -> Planes:
-        """Planes across the shortest ways between the parts of pairs, where they have come too near.
+        """Planes across the shortest vectors between the parts of pairs, at the time of impact.
 
         Args:
             x: Positions [m], float64, shape (V, 3).
-            ends: Where the vertices go [m], float64, shape (V, 3).
-            met: The pairs that come too near on that way.
-            floor: Gap that they keep [m]; most of their distance where that is less.
-            corners: Whether the two corners that are nearest at the ends are held, not the points that were nearest.
+            ends: Positions after the move [m], float64, shape (V, 3).
+            met: Pairs that come too near on the move.
+            floor: Gap that pairs keep [m]; a pair that is already closer keeps most of its distance.
+            corners: True holds the two corners that are nearest at the ends, False the closest points.
         """
         met = met.where(_distinct(met, len(x)))
         places, face = met.corners.long(), met.face.bool()
@@ -107,7 +107,7 @@ class Planes:
         return Planes(met.corners, weight, normal, gap - distance + may)
 
     def joined(self, other: Planes) -> Planes:
-        """These planes and others."""
+        """Both sets of planes."""
         pairs = ((getattr(self, each.name), getattr(other, each.name)) for each in fields(self))
         return Planes(*(torch.cat(pair) for pair in pairs))
 
@@ -115,16 +115,16 @@ class Planes:
 def along(
     way: Float[Tensor, "vertices 3"], planes: Planes, *, free: Bool[Tensor, "vertices 1"], threads: int = 1
 ) -> Float[Tensor, "vertices 3"]:
-    """The ways nearest to those wanted [m] on which no pair passes a plane.
+    """Displacements closest to the wanted displacements [m] that violate no plane.
 
-    What counts is how the two parts of a pair move against each other: layers that move together go on together. The
-    least squares under one linear inequality a pair are solved by Jacobi's method on the multipliers, each vertex
-    split among its pairs (Tonge et al. 2012).
+    Only the relative motion of a pair's two parts counts: layers that move together are not stopped. The least-squares
+    problem with one linear inequality per pair is solved by Jacobi's method on the multipliers, with each vertex split
+    among its pairs (Tonge et al. 2012).
 
     Args:
-        way: How far each vertex wants to go [m], float64.
-        planes: The planes of what is in the way.
-        free: Which vertices may go another way than they want.
+        way: Wanted displacement of each vertex [m], float64.
+        planes: Planes of the blocking pairs.
+        free: Vertices whose displacement may be changed.
         threads: Most threads on the CPU.
     """
     if not len(planes.may):
@@ -151,7 +151,7 @@ def along(
 
 
 def _between(at: Float[Tensor, "pairs 4 3"], face: Tensor) -> tuple[Float[Tensor, "pairs 4"], Float[Tensor, "pairs 3"]]:
-    """Weights of each pair's corners in the shortest way between its parts, and that way, by positions [m]."""
+    """Weights of each pair's corners in the shortest vector between its parts, and the vector, from positions [m]."""
     own = torch.arange(4 * len(at), dtype=torch.int32, device=at.device).reshape(-1, 4)
     weight = weights(at.reshape(-1, 3), own, face)
     return weight, (weight.unsqueeze(2) * at).sum(dim=1)
@@ -167,12 +167,12 @@ def _nearest(height: Float[Tensor, "pairs 4 1"], face: Bool[Tensor, " pairs"]) -
 
 
 def _distinct(met: Pairs, count: int) -> Int[Tensor, " pairs"]:
-    """Numbers of pairs, each once, in the order of their corners.
+    """Indices of distinct pairs, in the order of their corners.
 
-    Two sorts of whole numbers: `torch.unique` of rows compares them number by number, some ten times as slowly.
+    Two integer sorts, about ten times as fast as `torch.unique` of rows.
 
     Args:
-        met: The pairs.
+        met: Pairs, possibly repeated.
         count: Number of vertices.
     """
     a, b, c, d = met.corners.long().T
@@ -186,5 +186,5 @@ def _distinct(met: Pairs, count: int) -> Int[Tensor, " pairs"]:
 
 
 def _vectors(x: Tensor) -> Any:
-    """Vectors as kernels read them."""
+    """Vectors as a Warp argument."""
     return argument(x.contiguous(), wp.vec3d)

@@ -1,9 +1,8 @@
-"""Cages that start crossed, drawn apart before anything is solved: the smaller piece that a contour cuts off goes back.
+"""Untangling of cages that start with intersections: the smaller piece cut off by each contour moves back.
 
-Springs shorten a contour step by step and stop where the cloth between is stretched. Which piece is on the wrong side
-is known at once, the smaller one (Baraff, Witkin and Kass 2003): its vertices are laid as far above the other cloth as
-they were under it, but at most a gap, so a dent, a corner or half a sheet comes back whole, however deep it was. All
-pieces go at once.
+Springs shorten a contour step by step and stop when the cloth between is stretched. The smaller piece is taken to be on
+the wrong side (Baraff, Witkin and Kass 2003): its vertices are mirrored to the other side of the cloth they went
+through, by at most a gap. A dent, a corner or half a sheet comes back whole at any depth. All pieces move at once.
 """
 
 from __future__ import annotations
@@ -24,27 +23,27 @@ from ..mesh.topology import joined_by
 from .cloth_mesh import ClothMesh
 
 PASSES = 6
-"""Most times that pieces go back: one may uncover another contour."""
+"""Most passes that move pieces back: a pass may uncover another contour."""
 WIDER = (0.0, 0.25, 0.5)
-"""Least gaps that are tried, in mean edges: faces of curved cloth come through ones that lie closer than they sag."""
+"""Minimum gaps tried, in mean edges: faces of curved cloth intersect if the gap is smaller than their sag."""
 BESIDE = 2
-"""Rings round a piece that are its own cloth, which it cannot have gone through."""
+"""Rings around a piece that count as part of the piece, not as cloth it went through."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Through:
-    """Vertices of pieces that went through other cloth.
+    """Vertices of pieces that went through cloth.
 
     Attributes:
-        vertices: Their numbers, shape (N,), int64.
-        depth: From the closest point of that cloth to each [m], shape (N, 3).
+        vertices: Indices of the vertices, shape (N,), int64.
+        depth: Vector from the closest point of the penetrated cloth to each vertex [m], shape (N, 3).
     """
 
     vertices: Int[Tensor, " vertices"]
     depth: Float[Tensor, "vertices 3"]
 
     def back(self, x: Tensor, gap: float) -> Tensor:
-        """Positions in which they lie on the other side, as far as they were through, but at most a gap [m]."""
+        """Positions with the vertices on the far side of the cloth, as high as they were deep, at most the gap [m]."""
         out, length = x.clone(), self.depth.norm(dim=1, keepdim=True)
         beyond = length.clamp_max(gap) / length.clamp_min(1e-30)
         out[self.vertices] = x[self.vertices] - ((1.0 + beyond) * self.depth).to(x)
@@ -54,17 +53,18 @@ class _Through:
 def drawn_apart(
     mesh: ClothMesh, x: Float[Tensor, "vertices 3"], start: Crossings, *, gap: float, detector: Detector
 ) -> tuple[Float[Tensor, "vertices 3"], int]:
-    """Lay pieces that contours cut off back to their side, while fewer parts cross.
+    """Move cut-off pieces back to their side, as long as the number of crossings falls.
 
     Args:
         mesh: The cloth of one level.
         x: Positions [m].
-        start: What crosses there.
-        gap: Distance that they end from what they were behind [m], or a part of an edge where that crosses less.
-        detector: What detects this cloth.
+        start: Crossings at x.
+        gap: Largest final distance from the penetrated cloth [m]; replaced by a fraction of an edge if fewer parts
+            cross then.
+        detector: Collision detector of the cloth.
 
     Returns:
-        Positions [m], x itself where nothing gets better, and the number of crossings there.
+        Positions [m], x itself if nothing improves, and the number of crossings there.
     """
     best, first = (x, start), None
     for least in WIDER:
@@ -87,7 +87,7 @@ def drawn_apart(
 
 
 def _gone_through(mesh: ClothMesh, found: Crossings, x: Tensor) -> _Through:
-    """The vertices of the smallest pieces that every contour has one of, and how far they are through other cloth."""
+    """Vertices of the smallest piece at each contour, and their depths through the cloth."""
     piece, met = _chosen(mesh, found)
     count = met.shape[0]
     inside = torch.as_tensor(piece >= 0, device=x.device) & mesh.level.free[:, 0]
@@ -105,15 +105,15 @@ def _gone_through(mesh: ClothMesh, found: Crossings, x: Tensor) -> _Through:
 
 
 def pieces_of(mesh: ClothMesh, found: Crossings) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The pieces into which contours cut the cloth.
+    """Connected pieces into which contours cut the cloth.
 
     Args:
         mesh: The cloth.
-        found: What crosses.
+        found: Crossings.
 
     Returns:
-        The piece of each vertex, which pieces are cut off (smaller than the largest of what hangs together without
-        crossings), and their areas [m^2].
+        The piece of each vertex; True for pieces that are cut off (smaller than the largest piece of their connected
+        component of the uncut cloth); and the areas of the pieces [m^2].
     """
     count = mesh.level.vertex_count
     ends = mesh.parts.links.cpu().numpy()
@@ -128,10 +128,10 @@ def pieces_of(mesh: ClothMesh, found: Crossings) -> tuple[np.ndarray, np.ndarray
 
 
 def _chosen(mesh: ClothMesh, found: Crossings) -> tuple[Int[np.ndarray, " vertices"], sp.csr_matrix]:
-    """The smallest pieces that every contour has one of.
+    """The smallest piece at each contour.
 
     Returns:
-        The row of the piece that each vertex is in, -1 where in none, and the vertices that each piece met, shape
+        The row of each vertex's piece, -1 outside all chosen pieces, and the vertices that each piece crosses, shape
         (pieces, V).
     """
     piece, off, area = pieces_of(mesh, found)
@@ -158,7 +158,7 @@ def _chosen(mesh: ClothMesh, found: Crossings) -> tuple[Int[np.ndarray, " vertic
 
 
 def _grown(mesh: ClothMesh, some: sp.csr_matrix, rings: np.ndarray) -> sp.csr_matrix:
-    """Each row's vertices and those at most so many edges from them as the row has rings; ones, float32."""
+    """Each row's vertices grown by the row's number of rings; ones, float32."""
     grown = sp.csr_matrix(some > 0).astype(np.float32)
     for ring in range(int(rings.max(initial=0))):
         more = sp.diags((rings > ring).astype(np.float32)) @ grown @ mesh.beside
@@ -167,7 +167,7 @@ def _grown(mesh: ClothMesh, some: sp.csr_matrix, rings: np.ndarray) -> sp.csr_ma
 
 
 def _faces_of(mesh: ClothMesh, vertices: sp.csr_matrix) -> sp.csr_matrix:
-    """The faces all of whose corners are among each row's vertices, shape (rows, T)."""
+    """Faces with all corners among each row's vertices, shape (rows, T)."""
     triangles = mesh.level.triangles.cpu().numpy()
     columns = sp.csc_matrix(vertices.astype(np.float32))
     a, b, c = (columns[:, triangles[:, corner]] for corner in range(3))

@@ -1,9 +1,8 @@
-"""Contact of one group of garments with the bodies of one frame: who is near, and the planes they see.
+"""Contact of one group of garments with the bodies of one frame: near vertices and their contact planes.
 
-Closest points cost about as much as a force evaluation, so they are asked for seldom and for few vertices. Distances
-change no faster than vertices move: a vertex that was d away and has moved by m is at least d - m away, and only those
-for which that is less than the offset and the move expected of a round are asked again. The same bound tells which may
-have changed sides.
+A closest-point query costs about as much as a force evaluation, so queries are few. A vertex at distance d that has
+moved by m is still at least d - m away. Only vertices for which d - m is less than the offset plus the expected move of
+a round are queried again. The bound also tells which vertices may have changed sides.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ from .sight import Sight
 from .track import Track
 
 STALE = 0.1
-"""How far a vertex moves before the plane that it sees is found anew, in edge lengths."""
+"""Move of a vertex after which its contact plane is found anew, in edge lengths."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,9 +35,9 @@ class Touching:
     """A surface that a group may touch.
 
     Attributes:
-        path: Its collider's prim path.
+        path: Prim path of the collider.
         surface: The posed surface.
-        offset: Distance kept by each garment of the group [m]; minus infinity where it does not feel the surface.
+        offset: Distance kept by each garment of the group [m]; minus infinity if the garment ignores the surface.
     """
 
     path: str
@@ -48,14 +47,14 @@ class Touching:
 
 @dataclass(frozen=True, eq=False)
 class LevelBodies:
-    """One level's view of the bodies, a value: what learns more of the distances returns a new one.
+    """One level's view of the bodies. Immutable: methods that refine the distances return a new view.
 
     Attributes:
         level: The level.
-        tracks: What is known of the distances to each surface.
-        settings: How contact is solved, with k_c itself as its stiffness.
-        seam: What is sewn together, and stays so where bodies push; or None without seams.
-        sights: The planes that vertices saw last in each surface; empty before the first look.
+        tracks: Cached distances to each surface.
+        settings: Contact settings, with the stiffness in SI.
+        seam: Sewn vertices, kept together when bodies push; None without seams.
+        sights: Contact planes of the vertices last found on each surface; empty before the first look.
     """
 
     level: Level
@@ -65,7 +64,7 @@ class LevelBodies:
     sights: tuple[Sight, ...] = ()
 
     def seen(self, x: Float[Tensor, "vertices 3"]) -> tuple[LevelBodies, Contact | None]:
-        """The view from positions x [m], and the contact force near them, or None where nothing can touch."""
+        """The view from positions x [m], and the contact force there, or None if nothing can touch."""
         before = self.sights or [Sight.none(x)] * len(self.tracks)
         looks = [self._look(*each, x) for each in zip(self.tracks, before, strict=True)]
         tracks, sights = tuple(track for track, _ in looks), tuple(sight for _, sight in looks)
@@ -75,7 +74,7 @@ class LevelBodies:
         return replace(self, tracks=tracks, sights=sights), force
 
     def _look(self, track: Track, known: Sight, x: Tensor) -> tuple[Track, Sight]:
-        """What is seen of one body; planes of vertices that have hardly moved stay."""
+        """Contact planes on one body; vertices that have hardly moved keep their planes."""
         still = known.there & ((x - known.at).norm(dim=1) <= STALE * self.level.spacing)
         reach = track.offset + float(self.level.spacing.mean())
         asked = torch.where(still, torch.full_like(reach, -torch.inf), reach)
@@ -93,7 +92,7 @@ class LevelBodies:
         return track, sight
 
     def within(self, x: Float[Tensor, "vertices 3"]) -> tuple[Bool[Tensor, " vertices"], Bool[Tensor, " vertices"]]:
-        """Vertices inside closed bodies at x [m], and those of them that are pinched."""
+        """Masks of the vertices inside closed bodies at x [m] and of the pinched vertices among them."""
         inside, held = (torch.zeros_like(self.level.free[:, 0]) for _ in range(2))
         for track in self.tracks:
             at = x + track.shift
@@ -106,10 +105,10 @@ class LevelBodies:
         return inside, held
 
     def losing(self, x: Float[Tensor, "vertices 3"]) -> LevelBodies:
-        """The same, which leaves cloth that is between overlapping parts of a body at x [m] to itself while inside.
+        """View that does not push out cloth between overlapping parts of a body at x [m] while the cloth stays inside.
 
-        It is a patch of vertices whose closest faces are buried, some of them inside two parts at once. Pushed out, it
-        would fold through its neighbours, whose way out is on the other side.
+        Such cloth is a patch of vertices with buried closest faces, some of them inside two parts at once. Pushed out,
+        the patch would fold through its neighbours, which leave on the opposite side.
         """
         tracks = []
         for track in self.tracks:
@@ -119,7 +118,7 @@ class LevelBodies:
         return replace(self, tracks=tuple(tracks))
 
     def _patches(self, some: Tensor, seeds: Tensor) -> Bool[Tensor, " vertices"]:
-        """Of some vertices, by number, the connected patches that hold a seed."""
+        """Connected patches of the given vertices that contain a seed."""
         kept, wanted = (torch.zeros_like(self.level.free[:, 0]) for _ in range(2))
         kept[some], wanted[seeds] = True, True
         masks = (each.cpu().numpy() for each in (kept, wanted))
@@ -128,12 +127,12 @@ class LevelBodies:
 
 @dataclass(frozen=True, eq=False)
 class FrameBodies:
-    """A group's bodies in one frame.
+    """Bodies of a group in one frame.
 
     Attributes:
         touching: The surfaces.
-        tracks: What is known of the distances of the upsampled cage to each.
-        settings: How contact is solved, with k_c itself as its stiffness.
+        tracks: Cached distances from the upsampled cage to each surface.
+        settings: Contact settings, with the stiffness in SI.
     """
 
     touching: tuple[Touching, ...]
@@ -152,11 +151,11 @@ class FrameBodies:
         """Find the distances of the upsampled cage.
 
         Args:
-            levels: The group's levels.
+            levels: Levels of the group.
             touching: The surfaces.
             coarse: Cage positions [m], recentred.
             origin: World position of the group's origin [m], shape (3,).
-            settings: How contact is solved, with k_c itself as its stiffness.
+            settings: Contact settings, with the stiffness in SI.
         """
         finest = levels[-1]
         base = finest.base.apply(coarse)
@@ -175,7 +174,7 @@ class FrameBodies:
         return FrameBodies(tuple(touching), tuple(tracks), settings)
 
     def depths(self, finest: Level) -> list[tuple[float, str]]:
-        """For each garment of the finest level that is wholly in a body, how deep on the mean [m], and in which."""
+        """Mean depth [m] and body path of each garment of the finest level that is wholly inside a body."""
         found = [(0.0, "")] * len(finest.spans)
         for each, track in zip(self.touching, self.tracks, strict=True):
             for index, span in enumerate(finest.spans):
@@ -193,13 +192,13 @@ class FrameBodies:
         *,
         view: LevelBodies | None = None,
     ) -> dict[str, object]:
-        """What is in each body and what crosses it, before and after, as plain values.
+        """Penetrations and crossings of each body before and after the solve, as plain values.
 
         Args:
             finest: The finest level.
             base: The upsampled cage [m].
             x: The result [m].
-            view: Its level's view of the bodies; None where they were not felt.
+            view: The finest level's view of the bodies; None if the solve ignored the bodies.
         """
         bodies: dict[str, object] = {}
         for index, (each, track) in enumerate(zip(self.touching, self.tracks, strict=True)):
@@ -216,7 +215,7 @@ class FrameBodies:
         return {"bodies": bodies}
 
     def at(self, level: Level, finest: Level) -> LevelBodies:
-        """The view of one level; its vertices come first among each garment's finest ones."""
+        """The view of one level, whose vertices are the first of each garment's vertices in the finest level."""
         pairs = zip(level.spans, finest.spans, strict=True)
         places = [torch.arange(fine.start, fine.start + own.stop - own.start) for own, fine in pairs]
         which = torch.cat(places).to(level.rest.device)
@@ -232,7 +231,7 @@ class FrameBodies:
 
 
 def _start_sides(surface: Surface, cage: Float[Tensor, "coarse 3"], finest: Level) -> Float[Tensor, " vertices"]:
-    """The side on which the cage around each fine vertex lies: 1 or -1, 0 where it is undecided or has no meaning."""
+    """Side of the surface on which the cage around each fine vertex lies: 1 or -1; 0 if undecided or meaningless."""
     if surface.closed or surface.fixed_side is not None:
         return torch.full((finest.vertex_count,), surface.fixed_side or 0.0, dtype=cage.dtype, device=cage.device)
     found = surface.closest(cage, torch.full_like(cage[:, 0], float("inf")))

@@ -1,4 +1,4 @@
-"""Which bodies a garment can touch in a frame, and their surfaces, posed once a frame for all garments."""
+"""Broad phase: bodies that a garment can touch in a frame, and their surfaces, posed once a frame for all garments."""
 
 from __future__ import annotations
 
@@ -19,15 +19,16 @@ from ..strain import has_collapsed
 from .bodies import Touching
 
 REACH = 2.0
-"""How far the cloth is expected to leave its cage's bounds, in mean cage edges."""
+"""Expected distance of the cloth beyond the bounds of its cage, in mean cage edges."""
 AT_ONE_PLACE, COPY = 1e-4, 0.5
-"""A cage with so many of its points at points of another, in mean edges, is a copy of it: they do not touch."""
+"""Distance of coinciding points, in mean edges, and the fraction of coinciding points from which a cage is a copy of
+another cage. Copies do not touch."""
 NEVER = -float("inf")
-"""Offset of a garment from a surface that it does not feel."""
+"""Offset of a garment from a surface that the garment ignores."""
 
 
 class Parts:
-    """Which garments may touch one another in a frame."""
+    """Groups of garments that may touch one another in a frame."""
 
     def __init__(self, garments: Sequence[Garment], *, together: bool) -> None:
         """Measure the cages.
@@ -40,10 +41,10 @@ class Parts:
         self._edges = [mean_edge(garment) for garment in garments]
 
     def of(self, frames: Sequence[GarmentFrame]) -> list[tuple[int, ...]]:
-        """Numbers of the garments that are solved together, in order.
+        """Indices of the garments in each group that is solved together, in order.
 
-        Cages count as near where two of their vertices are closer than the cloth is expected to leave them by, with an
-        edge to spare, since a vertex may be near an edge's middle. A cage that has collapsed is near none.
+        Two cages are near if two of their vertices are closer than the expected distance of the cloth from its cage
+        plus an edge, because a vertex may be near the middle of an edge. A collapsed cage is near no cage.
         """
         count = len(frames)
         whole = [not has_collapsed(garment, own.points) for garment, own in zip(self._garments, frames, strict=True)]
@@ -62,11 +63,11 @@ class Parts:
         return [tuple(part) for part in parts.values()]
 
     def _reach(self, index: int, frame: GarmentFrame) -> float:
-        """A garment's part of the distance at which it counts as near another [m]."""
+        """A garment's share of the distance at which two garments are near [m]."""
         return 0.5 * frame.fabric.thickness + (0.5 * REACH + 1.0) * self._edges[index]
 
     def _boxes_meet(self, frames: Sequence[GarmentFrame]) -> Iterator[tuple[int, int]]:
-        """Pairs of cages whose bounds, grown by their reach, meet: in order of number, by a sweep along one axis."""
+        """Pairs of cages with overlapping bounds, grown by their reach, in order of index; sweep along one axis."""
         bounds = np.array([bounds_of(frame.points) for frame in frames]).reshape(-1, 2, 3)
         reach = np.array([self._reach(index, frame) for index, frame in enumerate(frames)])[:, None]
         low, high = bounds[:, 0] - reach, bounds[:, 1] + reach
@@ -85,7 +86,7 @@ class Parts:
         yield from sorted((int(a), int(b)) for a, b in found)
 
     def _close(self, a: int, b: int, frames: Sequence[GarmentFrame], trees: dict[int, cKDTree]) -> bool:
-        """Whether vertices of two cages are as near as their reach, and they are no copies."""
+        """True if vertices of two cages are within reach and the cages are not copies."""
         reach = self._reach(a, frames[a]) + self._reach(b, frames[b])
         for index in (a, b):
             points = frames[index].points
@@ -96,7 +97,7 @@ class Parts:
 
 
 def touch_one_another(a: Garment, b: Garment) -> bool:
-    """Whether two different garments feel one another at all."""
+    """True if two different garments may be in contact."""
     return b.path not in a.apart_from and a.path not in b.apart_from
 
 
@@ -104,11 +105,11 @@ class Bodies:
     """The colliders of a scene, posed lazily.
 
     Attributes:
-        colliders: Their identities.
+        colliders: Identities of the colliders.
     """
 
     def __init__(self, colliders: Sequence[Collider], *, device: str, threads: int) -> None:
-        """Prepare one body for each collider; nothing is built before something is near it."""
+        """Prepare a body for each collider; a body is built when a garment first comes near."""
         self.colliders = tuple(colliders)
         self._device, self._threads = device, threads
         self.forget()
@@ -117,11 +118,11 @@ class Bodies:
         self._bounds: dict[int, np.ndarray] = {}
 
     def forget(self) -> None:
-        """Build every body anew: hierarchies that are refitted answer ties by the poses that they were built on."""
+        """Build every body anew: a refitted hierarchy breaks ties by the pose of its first build."""
         self._meshes = [MeshBody(side=c.side, device=self._device, threads=self._threads) for c in self.colliders]
 
     def pose(self, poses: Sequence[Pose | None]) -> None:
-        """Take the poses of one frame, one entry a collider."""
+        """Take the poses of one frame, one for each collider."""
         self._poses, self._surfaces, self._bounds = poses, {}, {}
 
     def pose_of(self, index: int) -> Pose | None:
@@ -129,12 +130,12 @@ class Bodies:
         return self._poses[index] if index < len(self._poses) else None
 
     def near(self, garment: Garment, bounds: np.ndarray, margin: float) -> tuple[int, ...]:
-        """Numbers of the garment's colliders whose bounds meet given ones.
+        """Indices of the garment's colliders with bounds that meet the given bounds.
 
         Args:
             garment: The garment.
             bounds: Least and greatest corner [m], world space, shape (2, 3).
-            margin: How far apart they may be besides the collider's own offset [m].
+            margin: Largest distance between the bounds beyond the collider's own offset [m].
         """
         return tuple(index for index in garment.colliders if self._meets(index, bounds, margin))
 
@@ -156,8 +157,9 @@ class Bodies:
         """Posed surfaces of colliders.
 
         Args:
-            indices: Numbers of the colliders.
-            offsets: For each garment, the distance that it keeps from each of them [m]; None where it does not feel it.
+            indices: Indices of the colliders.
+            offsets: For each garment, the distance kept from each collider [m]; None if the garment ignores the
+                collider.
         """
         found = []
         for place, index in enumerate(indices):
@@ -180,7 +182,7 @@ class Bodies:
 
 
 def reach_of(garment: Garment, frame: GarmentFrame) -> float:
-    """How far from the cage's bounds a body counts as near [m]: its offset and the move expected of the cloth."""
+    """Distance from the cage's bounds within which a body is near [m]: offset plus expected move of the cloth."""
     return frame.offset + REACH * mean_edge(garment)
 
 
@@ -192,7 +194,7 @@ def mean_edge(garment: Garment) -> float:
 
 
 def bounds_of(points: np.ndarray) -> np.ndarray:
-    """Least and greatest corner, shape (2, 3); an empty box that meets nothing when there are no points."""
+    """Least and greatest corner, shape (2, 3); without points an empty box that meets nothing."""
     if not len(points):
         return np.stack([np.full(3, np.inf), np.full(3, -np.inf)])
     columns = np.ascontiguousarray(points.T)  # Over rows of three numpy is slow.

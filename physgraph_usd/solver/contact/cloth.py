@@ -1,7 +1,7 @@
-"""Contact of a group's cloth with itself: what is near, what crosses, and the force that keeps parts apart.
+"""Contact of a group's cloth with itself: near pairs, crossings, and the force that keeps parts apart.
 
-Penalty springs carry the load and promise nothing; `promise` does. They see all pairs of parts that are near, not the
-nearest alone: cloth that pushes with one part and is held by another would stay locked there.
+Penalty springs carry the load but guarantee nothing; `promise` does. The springs act on all near pairs, not only on the
+nearest: otherwise cloth that pushes at a place and is held at another would stay locked.
 """
 
 from __future__ import annotations
@@ -29,26 +29,26 @@ from .springs import HALF, MARGIN, ClothSprings
 from .tangles import Tangles, gaps_out
 
 TANGLED = 2
-"""Rings round what crosses to which nothing is promised but that no more crosses."""
+"""Rings around crossings within which cloth is promised only that the number of crossings does not grow."""
 OUT = 0.5
-"""How far crossing parts are moved past one another in a round, in mean edges."""
+"""Distance by which crossing parts move past one another in a round, in mean edges."""
 
 
 class ClothContact:
-    """What lasts over the shot: each level's mesh, built when first needed."""
+    """Cloth contact data of a whole shot: each level's mesh, built on first use."""
 
     def __init__(self, levels: Sequence[Level], garments: Sequence[Garment]) -> None:
-        """Note which garments feel which.
+        """Build the table of garments in mutual contact.
 
         Args:
-            levels: The group's levels, cage first.
+            levels: Levels of the group, cage first.
             garments: The garments.
         """
         self.meets = np.array([[_meet(a, b) for b in garments] for a in garments], dtype=bool)
         self._meshes: dict[int, tuple[bytes, ClothMesh]] = {}
 
     def mesh(self, level: Level, seam: Seam | None) -> ClothMesh:
-        """A level's mesh, sewn as given; the last one where that is sewn alike."""
+        """A level's mesh with the given seam; cached while the sewn pairs stay equal."""
         sewn = np.zeros((0, 2), np.int64) if seam is None else seam.pairs
         key, mesh = self._meshes.get(level.index, (b"", None))
         if mesh is None or key != sewn.tobytes():
@@ -58,7 +58,7 @@ class ClothContact:
 
 
 def _meet(a: Garment, b: Garment) -> bool:
-    """Whether two garments feel one another."""
+    """True if two garments are in contact; for a garment with itself, its self-contact setting."""
     if a is b:
         return a.self_contact
     return touch_one_another(a, b)
@@ -66,7 +66,7 @@ def _meet(a: Garment, b: Garment) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class _Looked:
-    """What crosses at positions, and how often these had been written to."""
+    """Crossings at positions, with the tensor's version counter when they were found."""
 
     x: Tensor
     version: int
@@ -79,8 +79,8 @@ class ClothView:
 
     Attributes:
         mesh: The level's mesh, sewn as in this frame.
-        keeps_sides: Whether nothing passes through anything: not by spheres, which are no promise.
-        came_near: Whether parts were near one another wherever `term` looked; None where it never did.
+        keeps_sides: True if moves are promised to add no crossings.
+        came_near: True if parts were near one another in any call of `term`; None before the first call.
     """
 
     def __init__(
@@ -96,12 +96,12 @@ class ClothView:
         """Take the frame.
 
         Args:
-            lasting: The group's cloth.
+            lasting: Cloth contact data of the shot.
             level: The level.
-            base: The upsampled cage [m]: distances that it has are not widened.
-            thickness: Of each garment [m].
-            settings: How contact is solved, in SI.
-            seam: What is sewn together, and stays so; or None without seams.
+            base: The upsampled cage [m]; distances between parts in the cage are not widened.
+            thickness: Thickness of each garment [m].
+            settings: Contact settings, in SI.
+            seam: Sewn vertices, which stay together; None without seams.
         """
         self.mesh, self.keeps_sides = lasting.mesh(level, seam), settings.cloth == "pairs"
         self._lasting, self._level, self._settings, self._thickness = lasting, level, settings, thickness
@@ -111,7 +111,7 @@ class ClothView:
 
     @property
     def parts(self) -> Parts:
-        """What may touch what, sewn as in this frame."""
+        """Table of vertex, edge and face pairs that may be in contact, sewn as in this frame."""
         return self.mesh.parts
 
     def closed(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
@@ -120,32 +120,32 @@ class ClothView:
 
     @property
     def gap(self) -> float:
-        """Distance at which cloth is laid over cloth [m]."""
+        """Distance left between cloth and cloth when pieces are moved back [m]."""
         return float(self._thickness.mean())
 
     @cached_property
     def detector(self) -> Detector:
-        """What detects in this frame."""
+        """Collision detector of this frame."""
         return Detector(self.parts, self.near)
 
     @cached_property
     def _springs(self) -> ClothSprings:
-        """What says which near parts have a spring."""
+        """Contact spring finder of this frame."""
         return ClothSprings(self._level, self._base, self._thickness, self._settings.cloth_stiffness)
 
     @cached_property
     def near(self) -> Reach:
-        """How near parts are that may push one another before they are looked for again."""
+        """Search distance for pairs that may push one another before the next search."""
         play = 0.5 * MARGIN * self._level.spacing.double()
         thickness = 0.5 * self._thickness.double()[self._level.vertex_garment.long()]
         return Reach(thickness + play, play, HALF)
 
     def crossings(self, x: Float[Tensor, "vertices 3"]) -> Crossings:
-        """What crosses at x [m]; the answer is kept for the same tensor, unless it was written to since."""
+        """Crossings at x [m]; cached for the same tensor until its version changes."""
         return self._look(x).crossings
 
     def _look(self, x: Tensor) -> _Looked:
-        """What is known of x, looked for where it is not known."""
+        """Cached crossings and tangles at x."""
         if self._looked is None or self._looked.x is not x or self._looked.version != x._version:
             found = crossings(self.parts, x, detector=self.detector)
             corners = self.mesh.corners_of(found)
@@ -154,19 +154,19 @@ class ClothView:
         return self._looked
 
     def tangles(self, x: Float[Tensor, "vertices 3"]) -> Tangles | None:
-        """What crosses at x [m] and what lies round it; None where nothing does."""
+        """Tangles at x [m]: crossings and the cloth around them; None without crossings."""
         return self._look(x).tangles
 
     def remember(self, x: Float[Tensor, "vertices 3"]) -> None:
-        """Take it that nothing crosses at x [m]: it was reached safely from where nothing did."""
+        """Record that x [m] has no crossings, as after a safe move from positions without crossings."""
         self._looked = _Looked(x, x._version, Crossings.none(x.device), None)
 
     def term(self, x: Float[Tensor, "vertices 3"], *, all_crossings: bool = False) -> SelfContact | None:
-        """The force between parts that are near one another, or None where no parts are; what crosses is drawn out.
+        """Contact force between near parts, with crossings drawn apart; None if no parts are near.
 
         Args:
             x: Positions [m].
-            all_crossings: Whether even tangles that are hopeless are drawn out.
+            all_crossings: True also draws hopeless tangles apart.
         """
         found, tangles = self.crossings(x), self.tangles(x)
         gaps = self._gaps(x, found, all_crossings=all_crossings)
@@ -178,7 +178,7 @@ class ClothView:
         return SelfContact(self._level, gaps) if len(gaps.corners) else None
 
     def _gaps(self, x: Tensor, found: Crossings, *, all_crossings: bool) -> PairConstraints:
-        """The springs between all parts that are near and do not cross."""
+        """Springs between all near parts that do not cross."""
         near = self._springs.find(x, self.detector.near(x))
         if found.count:
             corners, tangles = near.near.corners.long(), self.tangles(x)

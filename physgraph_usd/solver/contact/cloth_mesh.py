@@ -1,4 +1,4 @@
-"""One level's cloth as a mesh that may be sewn: what lies beside what, also across seams."""
+"""One level's cloth as a mesh with optional seams: adjacency of vertices, faces and edges, also across seams."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ class ClothMesh:
 
     Attributes:
         level: The level.
-        parts: What may touch what.
+        parts: Table of vertex, edge and face pairs that may be in contact.
         triangles: Corners of the faces, int64.
         beside: Adjacency of the vertices, also across seams, shape (V, V).
-        opposite: Vertices opposite each edge in the first two of its faces, -1 where there is none, shape (E, 2).
+        opposite: Vertices opposite each edge in its first two faces, -1 without a face, shape (E, 2).
     """
 
     def __init__(self, level: Level, meets: np.ndarray, sewn: Int[np.ndarray, "pairs 2"]) -> None:
-        """Gather what lies beside what.
+        """Build the adjacency.
 
         Args:
             level: The level.
-            meets: Which garments feel which, symmetric, shape (G, G), bool.
-            sewn: Pairs of vertices taken for one.
+            meets: True for pairs of garments in contact, symmetric, shape (G, G), bool.
+            sewn: Pairs of vertices merged by a seam.
         """
         edges, triangles, count = level.edges.cpu().numpy(), level.triangles.cpu().numpy(), level.vertex_count
         label = joined_by(sewn, count) if len(sewn) else None
@@ -47,14 +47,14 @@ class ClothMesh:
         self._degree = torch.as_tensor(np.maximum(degree, 1)).to(level.rest)
 
     def grown(self, vertices: Bool[Tensor, " vertices"], rings: int) -> Bool[Tensor, " vertices"]:
-        """Vertices at most some edges away from given ones."""
+        """The given vertices and all vertices at most `rings` edges away."""
         for _ in range(rings):
             given, vertices = vertices, vertices.clone()
             vertices[self._second[given[self._first]]] = True
         return vertices
 
     def mean_beside(self, values: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
-        """The mean of the neighbours' values at each vertex."""
+        """Mean of the neighbours' values at each vertex."""
         total = torch.zeros_like(values)
         total = total.index_put_((self._first,), values[self._second], accumulate=True)
         return total / self._degree.to(values).unsqueeze(1)
@@ -64,7 +64,7 @@ class ClothMesh:
         return torch.cat([self.level.edges[crossings.edge].long(), self.triangles[crossings.face]], dim=1)
 
     def crossed(self, crossings: Crossings) -> Bool[Tensor, " vertices"]:
-        """Vertices of what crosses."""
+        """Mask of the vertices of crossing edges and faces."""
         out = torch.zeros_like(self.level.free[:, 0])
         out[self.corners_of(crossings).reshape(-1)] = True
         return out
@@ -78,7 +78,7 @@ class ClothMesh:
 
 
 def _across(beside: sp.csr_matrix, label: np.ndarray | None) -> sp.csr_matrix:
-    """Adjacency in which what is beside one of several vertices of a label is beside all of them."""
+    """Adjacency in which sewn vertices share their neighbours."""
     if label is None:
         return beside
     count = len(label)
@@ -92,7 +92,7 @@ def _across(beside: sp.csr_matrix, label: np.ndarray | None) -> sp.csr_matrix:
 
 
 def _opposite(edges: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Vertices opposite each edge in the first two of its faces, shape (E, 2), -1 where there is none."""
+    """Vertices opposite each edge in its first two faces, shape (E, 2), -1 without a face."""
     edge = find_edges(edges, triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2))
     third = triangles[:, [2, 0, 1]].reshape(-1).astype(np.int64)
     out = np.full((len(edges), 2), -1, np.int64)

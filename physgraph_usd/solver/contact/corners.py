@@ -1,4 +1,4 @@
-"""Cloth lifted over a body's corners and ridges: faces that it comes through though all their vertices are outside."""
+"""Cloth lifted over corners and ridges of a body that pierce faces whose vertices are all outside."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from ..level import Level
 from .track import ON_SURFACE
 
 ORDER = 6
-"""Parts into which the sides of a face are cut where it is looked how deep it is."""
+"""Subdivisions of a face's sides for the points at which the depth is sampled."""
 SIDEWAYS = 0.5
-"""Cosine to a face's normal under which the way out of what comes through between its points is sideways."""
+"""Cosine to the face normal below which the way out between sample points counts as sideways."""
 LEAST_LIFT = 0.5
-"""Least move of that point, in clearances."""
+"""Minimum move of the deepest point, in clearances."""
 OVER = 1.25
-"""Its move over what would do if the way out did not turn: fewer goes."""
+"""Overshoot factor of the move, for fewer passes: the way out turns as the point moves."""
 
 
 def lift_over(
@@ -30,18 +30,18 @@ def lift_over(
     clearance: Float[Tensor, " vertices"],
     start: Float[Tensor, " vertices"],
 ) -> Float[Tensor, "vertices 3"]:
-    """How far to move vertices so that the deepest point of each of some faces comes out, or most of the way [m].
+    """Moves of vertices that bring the deepest point of each pierced face out, or most of the way [m].
 
-    The point is moved to its clearance, by the least move of the face's free corners; a corner of several faces takes
-    the longest of theirs.
+    The point moves to its clearance by the least-norm move of the face's free corners. A corner of several faces takes
+    the longest of the faces' moves.
 
     Args:
         surface: The surface.
         level: The level.
         x: Positions in the surface's coordinates [m].
-        triangles: The faces that the surface comes through.
+        triangles: Faces pierced by the surface.
         clearance: Distance to keep [m].
-        start: Side on which vertices belong, of open surfaces: 1 their normals', -1 the other, 0 undecided.
+        start: Allowed side of an open surface for each vertex: 1 along the normals, -1 against, 0 undecided.
 
     Returns:
         Moves [m].
@@ -72,7 +72,7 @@ def lift_over(
 
 
 def _up(corners: Float[Tensor, "triangles 3 3"], away: Float[Tensor, "triangles 3"]) -> Float[Tensor, "triangles 3"]:
-    """Unit ways out of what comes through a face between its points: of a needle not sideways, but past its tip."""
+    """Unit directions out of a surface that pierces a face between sample points: past a needle's tip, not sideways."""
     normal = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normal = torch.nn.functional.normalize(normal, dim=1, eps=1e-30)
     cosine = (normal * away).sum(dim=1, keepdim=True)
@@ -80,7 +80,7 @@ def _up(corners: Float[Tensor, "triangles 3 3"], away: Float[Tensor, "triangles 
 
 
 def _away(surface: Surface, points: Float[Tensor, "points 3"], start: Tensor) -> tuple[Tensor, Tensor]:
-    """Signed distances [m] and unit directions out of a closed surface, or to the side of an open one."""
+    """Signed distances [m] and unit directions out of a closed surface, or to the start side of an open surface."""
     found = surface.closest(points, torch.full_like(points[:, 0], float("inf")))
     open_side = torch.where(behind(found, start), -1.0, 1.0).to(found.side)
     side = found.side.clone() if surface.closed else open_side

@@ -1,4 +1,4 @@
-"""One frame's contact as the solve of a level sees it: bodies and cloth together."""
+"""One frame's contact for the solve of a level: bodies and cloth together."""
 
 from __future__ import annotations
 
@@ -29,24 +29,24 @@ from .repair import repaired_cage
 from .settings import ContactSettings
 
 FLOOR = 0.06
-"""Of the thickness: gaps under it shrink by a tenth a move at most."""
+"""Gap below which gaps shrink by at most a tenth a move, as a fraction of the thickness."""
 BLENDED = 4
-"""Rings round a tangle that does not come apart in which cloth goes over to where it was."""
+"""Rings around an unresolved tangle over which the cloth blends back to its start."""
 PUSHES = 4
-"""How often cloth is pushed out of bodies and moved there in turn."""
+"""Most rounds of pushing cloth out of bodies and moving it there safely."""
 Touch = Contact | SelfContact
-"""A term that stands for something near."""
+"""A contact force term."""
 
 
 @dataclass(frozen=True, eq=False)
 class LevelContact:
-    """One level's view of what it may touch.
+    """One level's contact with bodies and cloth.
 
     Attributes:
-        bodies: Its view of the bodies, or None when there are none.
-        cloth: Its view of the cloth, or None when cloth is not to touch cloth.
-        seam: What is sewn together, or None without seams.
-        promise: What moves cloth safely, or None where nothing keeps its side.
+        bodies: The level's view of the bodies, or None without bodies.
+        cloth: The level's view of the cloth, or None without cloth contact.
+        seam: Sewn vertices, or None without seams.
+        promise: Safe moves of the cloth, or None if cloth may cross cloth.
     """
 
     bodies: LevelBodies | None
@@ -62,7 +62,7 @@ class LevelContact:
         *,
         known: Preconditioner | None = None,
     ) -> Metric | HeldMetric:
-        """The metric of a level whose cloth is held by what touches at x [m]; a known one of it while that serves."""
+        """The level's metric with the contact stiffness at x [m]; the known metric while its stiffness suffices."""
         plain = plain if self.seam is None else plain.merged(self.seam.label)
         if not terms:
             return plain
@@ -73,20 +73,20 @@ class LevelContact:
         return last if last.serves(stiff) else HeldMetric(plain, torch.maximum(stiff, last.stiff))
 
     def crosses(self, x: Float[Tensor, "vertices 3"]) -> bool:
-        """Whether cloth crosses cloth at positions x [m], where it keeps its sides."""
+        """True if cloth crosses cloth at positions x [m] and the cloth has a promise."""
         return self.promise is not None and self.promise.view.crossings(x).count > 0
 
     def comes_apart(self, x: Float[Tensor, "vertices 3"], *, all_crossings: bool = False) -> bool:
-        """Whether anything that crosses there may come apart: not what is hopeless, unless all crossings are asked."""
+        """True if x has crossings in hopeful tangles; with `all_crossings`, in any tangle."""
         tangles = None if self.promise is None else self.promise.view.tangles(x)
         return tangles is not None and (all_crossings or not bool(tangles.hopeless.all()))
 
     def begun(self, x: Float[Tensor, "vertices 3"]) -> Placed:
-        """Where a level begins [m], seams closed: what crosses here, crossed in the input or at the level below."""
+        """Start positions of a level [m], seams closed. Crossings here come from the input or from the level below."""
         return Placed(self.closed(x))
 
     def laid_back(self, x: Placed) -> Placed:
-        """Positions in which pieces that went through cloth lie on their side again [m], where less crosses then."""
+        """Positions with cut-off pieces moved back to their side of the cloth [m], if fewer parts cross then."""
         if self.promise is None or not self.crosses(x):
             return x
         view = self.promise.view
@@ -94,7 +94,7 @@ class LevelContact:
         return x if out is x else Placed(self.closed(out))
 
     def without_hope(self, x: Placed, start: Placed) -> Placed:
-        """Positions x [m], back at the start where a tangle did not come apart, and on the way there beside it."""
+        """Positions x [m] with hopeless tangles moved back to the start, blended over the rings around the tangle."""
         tangles = None if self.promise is None else self.promise.view.tangles(x)
         if self.promise is None or tangles is None or not bool(tangles.hopeless.any()):
             return x
@@ -107,16 +107,16 @@ class LevelContact:
         return self.drawn(x, x + share.unsqueeze(1) * (start - x))
 
     def remember(self, x: Float[Tensor, "vertices 3"]) -> None:
-        """As `ClothView.remember`, where there is a promise."""
+        """As `ClothView.remember`, if there is a promise."""
         if self.promise is not None:
             self.promise.view.remember(x)
 
     def terms(
         self, x: Float[Tensor, "vertices 3"], *, all_crossings: bool = False
     ) -> tuple[LevelContact, tuple[Touch, ...]]:
-        """The view from positions x [m], and the forces of what is near them; none where nothing is.
+        """The view from positions x [m], and the contact forces there, empty without contact.
 
-        The rest is as for `ClothView.term`.
+        Other arguments are as for `ClothView.term`.
         """
         seen, body = (None, None) if self.bodies is None else self.bodies.seen(x)
         cloth = None if self.cloth is None else self.cloth.term(x, all_crossings=all_crossings)
@@ -127,17 +127,17 @@ class LevelContact:
         return x if self.seam is None else self.seam.closed(x)
 
     def moved(self, x: Placed, wanted: Float[Tensor, "vertices 3"]) -> Placed:
-        """Positions as near to wanted ones as is safe [m], seams closed."""
+        """Positions as close to the wanted positions as is safe [m], seams closed."""
         wanted = self.closed(wanted)
         return unhindered(wanted) if self.promise is None else self.promise.move(x, wanted)
 
     def drawn(self, x: Placed, wanted: Float[Tensor, "vertices 3"]) -> Placed:
-        """The same where tangles may come to cross more for a while."""
+        """As `moved`, but the number of crossings in a tangle may grow for a while."""
         wanted = self.closed(wanted)
         return unhindered(wanted) if self.promise is None else self.promise.draw(x, wanted)
 
     def out_of_bodies(self, x: Placed) -> tuple[Placed, int]:
-        """Positions moved safely out of bodies [m], x itself where none had to be, and the passes made."""
+        """Positions moved safely out of bodies [m], x itself if no vertex had to move, and the number of passes."""
         passes, bodies = 0, self.bodies
         for _ in range(PUSHES if bodies is not None else 0):
             assert bodies is not None
@@ -149,7 +149,7 @@ class LevelContact:
 
 
 class FrameContact:
-    """What a group may touch in one frame."""
+    """Contact of a group with bodies and cloth in one frame."""
 
     def __init__(
         self,
@@ -165,13 +165,13 @@ class FrameContact:
         """Take the frame.
 
         Args:
-            levels: The group's levels.
+            levels: Levels of the group.
             coarse: Cage positions [m], recentred.
-            bodies: The bodies, or None when there are none.
-            cloth: The group's cloth, or None when cloth is not to touch cloth.
-            thickness: Of each garment's cloth [m].
-            settings: How contact is solved, with k_c itself as its stiffness.
-            seams: The seam of each level, None without seams; () for none.
+            bodies: The bodies, or None without bodies.
+            cloth: The group's cloth, or None without cloth contact.
+            thickness: Thickness of each garment's cloth [m].
+            settings: Contact settings, with the stiffness in SI.
+            seams: The seam of each level, None for a level without seams; () for no seams at all.
         """
         self._levels, self._coarse, self._settings = tuple(levels), coarse, settings
         self._bodies, self._cloth, self._seams = bodies, cloth, seams
@@ -180,15 +180,15 @@ class FrameContact:
 
     @property
     def aim(self) -> Float[Tensor, "coarse 3"]:
-        """The cage that the fine cloth follows [m]: the input, but for what is between overlapping parts of a body.
+        """The cage followed by the fine cloth [m]: the input, repaired between overlapping parts of a body.
 
-        And but for a cage that crosses and comes clean: the guide would draw cloth through itself.
+        Crossings of the cage are removed if all of them can be: the guide would draw cloth through itself.
         """
         return self._aimed[0]
 
     @cached_property
     def _aimed(self) -> tuple[Float[Tensor, "coarse 3"], bool | None]:
-        """That cage, and whether the input crosses, where that was looked for."""
+        """The cage followed by the fine cloth, and True if the input has crossings, None if not searched."""
         cage, out, crosses = self._levels[0], self._coarse, None
         if self._cloth is None:
             return out, crosses
@@ -207,17 +207,17 @@ class FrameContact:
 
     @property
     def depths(self) -> list[tuple[float, str]]:
-        """As `FrameBodies.depths`; nothing without bodies."""
+        """As `FrameBodies.depths`; empty without bodies."""
         return [] if self._bodies is None else self._bodies.depths(self._levels[-1])
 
     @cached_property
     def crossed(self) -> bool:
-        """Whether the cage crosses itself."""
+        """True if the cage crosses itself."""
         cage, known = self._levels[0], self._aimed[1]
         return self.at(cage).crosses(cage.base.apply(self._coarse)) if known is None else known
 
     def at(self, level: Level) -> LevelContact:
-        """The view of one level, the same at each call; what is near goes by its rest shape, without ease."""
+        """The cached view of one level. Distances at rest use the rest shape without ease."""
         if level.index not in self._views:
             level = self._levels[level.index]
             bodies = None if self._bodies is None else self._bodies.at(level, self._levels[-1])
@@ -240,7 +240,7 @@ class FrameContact:
         """Move the solved cloth out of bodies.
 
         Returns:
-            Positions [m], x itself where nothing had to move; and what had to.
+            Positions [m], x itself if no vertex had to move; and the report of the moves.
         """
         moved: dict[str, object] = {}
         if self.aim is not self._coarse:
@@ -252,7 +252,7 @@ class FrameContact:
         return out, moved
 
     def measure(self, x: Float[Tensor, "vertices 3"]) -> tuple[dict[str, object], Bool[Tensor, " vertices"]]:
-        """What is in bodies and what crosses, before and after, as plain values, and vertices of cloth that crosses.
+        """Penetrations and crossings before and after, as plain values, and a mask of the vertices of crossing cloth.
 
         Args:
             x: The result [m].

@@ -1,4 +1,4 @@
-"""Contact per vertex, for heat maps: measured from positions alone, like `measure`."""
+"""Contact per vertex for heat maps, measured from positions alone, like `measure`."""
 
 # Warp's kernels are typed by values that only Warp reads.
 # pyright: reportArgumentType=false, reportAttributeAccessIssue=false
@@ -20,7 +20,7 @@ from .measure import depths
 wp.set_module_options(KERNELS)
 
 LAYERS = wp.constant(8)
-"""Most faces along an edge that are looked at."""
+"""Most faces found along an edge."""
 
 
 @wp.kernel
@@ -48,15 +48,15 @@ def _mark(
 def penetration_map(
     surfaces: Sequence[Surface], points: np.ndarray, edges: np.ndarray, *, device: str = "cpu"
 ) -> np.ndarray:
-    """How deep each vertex is in the deepest of some bodies [mm].
+    """Depth of each vertex in the deepest of some bodies [mm].
 
-    Inside closed bodies it is the way out; behind open ones whose side is fixed, the distance. Open ones whose side the
-    coarse cloth decides have no inside.
+    In a closed body the depth is the length of the way out; behind an open surface with a fixed side, the distance.
+    Open surfaces whose side comes from the cage have no inside.
 
     Args:
         surfaces: The posed bodies.
         points: World positions [m], shape (V, 3), float64.
-        edges: Pairs of vertices that are near each other, shape (E, 2).
+        edges: Pairs of neighbouring vertices, shape (E, 2).
         device: "cpu" or a CUDA device.
 
     Returns:
@@ -77,15 +77,15 @@ def penetration_map(
 def body_crossings(
     surfaces: Sequence[Surface], points: np.ndarray, edges: np.ndarray, *, triangles: np.ndarray, device: str = "cpu"
 ) -> np.ndarray:
-    """Which vertices are corners of an edge or a face of the cloth that crosses a body.
+    """Mask of the corners of cloth edges and faces that cross a body.
 
-    Of a primitive: of edges with one end inside.
+    A primitive marks the ends of edges with one end inside.
 
     Args:
         surfaces: The posed bodies.
         points: World positions [m], shape (V, 3), float64.
         edges: Edges of the cloth, shape (E, 2).
-        triangles: Its faces, shape (T, 3).
+        triangles: Faces of the cloth, shape (T, 3).
         device: "cpu" or a CUDA device.
 
     Returns:

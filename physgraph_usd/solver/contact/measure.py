@@ -23,26 +23,27 @@ from ..mesh.threads import LEAST_QUERIES, argument, run
 wp.set_module_options(KERNELS)
 
 DETOUR = 1.05
-"""The nearest face is buried where the way out is longer than this, over the distance to it."""
+"""Ratio of the way out to the closest distance above which the closest face counts as buried."""
 COVER = 0.6
-"""No point of a triangle is farther than this from its nearest corner, in longest sides (1 / sqrt(3), to spare)."""
+"""Upper bound of the distance from a point of a triangle to its nearest corner, in longest sides (1 / sqrt(3), plus a
+margin)."""
 DEEP = 1e-4
 """Depth from which a vertex counts as inside [m]."""
 
 
 @dataclass(frozen=True)
 class Penetration:
-    """How far a garment is in one surface.
+    """Penetration of a garment into one surface.
 
     Attributes:
-        inside: Free vertices deeper than `DEEP` in a closed surface, without those that are pinched.
-        percent: Their part of all free vertices.
+        inside: Number of free vertices deeper than `DEEP` in a closed surface, without pinched vertices.
+        percent: Percentage of all free vertices.
         deepest_mm: Depth of the deepest free vertex [mm].
-        pinned: Pinned vertices deeper than `DEEP`: they stay.
-        pinched: Free vertices inside whose cloth lies between overlapping parts of the body in the input, or that are
-            there now and farther from any way out than half a cage edge: they stay, out of sight; forced out, they
-            would fold through their neighbours.
-        crossings: Edges of the cloth through faces of the body, and edges of the body through faces of the cloth.
+        pinned: Number of pinned vertices deeper than `DEEP`; pinned vertices stay.
+        pinched: Number of free vertices inside whose cloth lies between overlapping parts of the body in the input, or
+            that are between such parts now and farther from any way out than half a cage edge. Pinched vertices stay,
+            out of sight; forced out, they would fold through their neighbours.
+        crossings: Number of cloth edges through faces of the body plus body edges through faces of the cloth.
     """
 
     inside: int
@@ -69,14 +70,14 @@ def penetration(
 
     Args:
         surface: The surface.
-        level: The level that x belongs to.
+        level: The level of x.
         x: Positions in the surface's coordinates [m].
-        signed: Signed distances at x, lower bounds where they are positive [m].
-        longest: Way out from between overlapping parts beyond which a vertex counts as pinched [m].
-        held: Vertices that count as pinched there however short the way out, or None.
-        lost: Vertices of cloth that lies between overlapping parts, or None.
-        inside: The closest points of vertices with negative distances, where they are known.
-        crossings: How many edges pass through faces, where that is known.
+        signed: Signed distances at x; lower bounds where positive [m].
+        longest: Way out from between overlapping parts above which a vertex counts as pinched [m].
+        held: Vertices that count as pinched between parts at any length of the way out, or None.
+        lost: Vertices of cloth between overlapping parts, or None.
+        inside: Closest points of the vertices with negative distances, if known.
+        crossings: Number of edges through faces, if known.
     """
     free = level.free[:, 0]
     depth, stays = depths(surface, x, signed, longest, held=held, lost=lost, inside=inside)
@@ -103,16 +104,16 @@ def depths(
     lost: Bool[Tensor, " vertices"] | None = None,
     inside: Nearest | None = None,
 ) -> tuple[Float[Tensor, " vertices"], Bool[Tensor, " vertices"]]:
-    """How far each vertex is from where it could leave a closed surface [m], 0 outside; and which are pinched.
+    """Length of the way out of a closed surface for each vertex [m], 0 outside, and a mask of the pinched vertices.
 
     Args:
         surface: The surface.
-        x: Positions in its coordinates [m].
-        signed: Signed distances at x, lower bounds where they are positive [m].
-        longest: Way out from between overlapping parts beyond which a vertex counts as pinched [m].
-        held: Vertices that count as pinched there however short the way out, or None.
-        lost: Vertices of cloth that lies between overlapping parts, or None.
-        inside: The closest points of vertices with negative distances, where they are known.
+        x: Positions in the surface's coordinates [m].
+        signed: Signed distances at x; lower bounds where positive [m].
+        longest: Way out from between overlapping parts above which a vertex counts as pinched [m].
+        held: Vertices that count as pinched between parts at any length of the way out, or None.
+        lost: Vertices of cloth between overlapping parts, or None.
+        inside: Closest points of the vertices with negative distances, if known.
     """
     depth, stays = torch.zeros_like(signed), torch.zeros_like(signed, dtype=torch.bool)
     within = torch.nonzero(signed < 0).squeeze(1) if surface.closed else depth.long()[:0]
@@ -134,16 +135,16 @@ def pinched(
     held: Bool[Tensor, " points"] | None = None,
     lost: Bool[Tensor, " points"] | None = None,
 ) -> Bool[Tensor, " points"]:
-    """Which points inside are between overlapping parts and too far from a way out, or held there.
+    """Mask of the inside points that lie between overlapping parts too far from a way out, or are held there.
 
     Args:
         surface: The surface.
-        x: Points inside it, in its coordinates [m].
-        found: The closest points.
-        way: The closest points on faces that lie bare.
+        x: Points inside the surface, in the surface's coordinates [m].
+        found: Closest points.
+        way: Closest points on exposed faces.
         longest: Longest way out [m].
-        held: Points that stay, however short the way out, if they are inside two parts at once; or None.
-        lost: Points of cloth that lies between overlapping parts: they stay, wherever they went from there; or None.
+        held: Points that stay at any length of the way out if they are inside two parts at once; or None.
+        lost: Points of cloth between overlapping parts, which stay wherever they have moved; or None.
     """
     detour = is_between(found, way)
     stays = (way.distance > longest) & detour
@@ -155,11 +156,11 @@ def pinched(
 
 
 def is_between(found: Nearest, way: Nearest) -> Bool[Tensor, " points"]:
-    """Which points inside a surface lie between parts of it that overlap: their closest face is inside it, too.
+    """Mask of the points between overlapping parts of a surface: their closest face is inside the surface, too.
 
     Args:
-        found: The closest points.
-        way: The closest points on faces that lie bare.
+        found: Closest points.
+        way: Closest points on exposed faces.
     """
     return way.distance > DETOUR * found.distance
 
@@ -187,34 +188,33 @@ def _pierce(
 
 @dataclass(frozen=True, eq=False)
 class Pierced:
-    """Cloth and body through one another.
+    """Intersections of cloth and body.
 
     Attributes:
         edges: Edges of the cloth that pass through the body.
-        triangles: Triangles of the cloth that edges of the body pass through, one for each such edge.
+        triangles: Triangles of the cloth pierced by edges of the body, once for each edge.
     """
 
     edges: Int[Tensor, " edges"]
     triangles: Int[Tensor, " triangles"]
 
     def __len__(self) -> int:
-        """Number of edges of either."""
+        """Number of piercing edges of cloth and body."""
         return len(self.edges) + len(self.triangles)
 
 
 def pierced(
     surface: Surface, level: Level, x: Float[Tensor, "vertices 3"], distance: Float[Tensor, " vertices"]
 ) -> Pierced:
-    """Edges that pass through a face: the cloth's through the body's and the body's through the cloth's.
+    """Cloth edges through faces of the body, and cloth triangles pierced by edges of the body.
 
-    Of a primitive, the cloth's edges with one end inside. Edges that are farther from the surface than they are long
-    are not looked at.
+    For a primitive: cloth edges with one end inside. Edges farther from the surface than their length are skipped.
 
     Args:
         surface: The surface.
         level: The level.
         x: Positions in the surface's coordinates [m].
-        distance: Unsigned distances at x, or lower bounds; infinite for cloth that does not feel the surface [m].
+        distance: Unsigned distances at x, or lower bounds; infinite for cloth that ignores the surface [m].
     """
     length = level.lengths(x)
     if not isinstance(surface, MeshSurface):
@@ -233,7 +233,7 @@ def pierced(
 def _through_cloth(
     surface: MeshSurface, level: Level, x: Tensor, feels: Bool[Tensor, " vertices"]
 ) -> Int[Tensor, " triangles"]:
-    """The cloth's triangles that the body's edges pass through, of the cloth that feels the body."""
+    """Cloth triangles pierced by edges of the body, for garments in contact with the body."""
     cloth = _Cloth.of(level, feels)
     cloth.move(x)
     edges = torch.as_tensor(surface.edges, device=x.device)
@@ -245,11 +245,11 @@ def _through_cloth(
 
 
 class _Cloth:
-    """The faces of some of a level's garments in a hierarchy, built once and refitted.
+    """Bounding volume hierarchy of some of a level's garments, built once and refitted.
 
     Attributes:
-        triangles: Their numbers in the level.
-        mesh: Warp's mesh of them.
+        triangles: Indices of the faces in the level.
+        mesh: Warp mesh of the faces.
     """
 
     _known: ClassVar[WeakKeyDictionary[Level, dict[tuple[int, ...], _Cloth]]] = WeakKeyDictionary()
@@ -266,7 +266,7 @@ class _Cloth:
 
     @classmethod
     def of(cls, level: Level, feels: Bool[Tensor, " vertices"]) -> _Cloth:
-        """The faces of the garments that have a vertex that feels."""
+        """The hierarchy of the garments with a vertex in contact with the body."""
         garments = tuple(index for index, span in enumerate(level.spans) if bool(feels[span].any()))
         known = cls._known.setdefault(level, {})
         if garments not in known:
@@ -282,14 +282,14 @@ class _Cloth:
 def _faces_met(
     mesh: wp.Mesh, edges: Tensor, points: Tensor, *, clear: Tensor, longest: Tensor, threads: int
 ) -> Int[Tensor, " edges"]:
-    """The first face of a mesh that each edge meets, -1 where it meets none or is too short to.
+    """The first face of a mesh met by each edge, -1 if none or if the edge is too short to reach the mesh.
 
     Args:
         mesh: The mesh.
         edges: End vertices, int32, shape (E, 2).
         points: Positions [m], float32, shape (V, 3).
-        clear: How far each vertex is from the mesh at least [m], shape (V,).
-        longest: What both ends are away together beyond which an edge cannot meet the mesh [m], shape (E,).
+        clear: Lower bound of each vertex's distance from the mesh [m], shape (V,).
+        longest: Sum of both ends' distances above which an edge cannot meet the mesh [m], shape (E,).
         threads: Most threads on the CPU.
     """
     face = torch.full((len(edges),), -1, dtype=torch.int32, device=points.device)

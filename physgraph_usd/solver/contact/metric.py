@@ -28,20 +28,20 @@ from ..integrate.base import Solver
 from ..integrate.metric import Metric
 
 SMOOTH, ROUGH = 0.1, 2.0
-"""Weights of the two answers."""
+"""Weights of the smooth and the rough part of P."""
 SHORT = 0.5
-"""Part of P that steps without a line search get."""
+"""Fraction of P used by steps without a line search."""
 MISSING = 0.9
-"""Part of the stiffness of what touches that a metric may lack before it is made anew. What it has too much does no
-harm: what touched once in a level's rounds touches again; and a new metric costs a factor and drops what was learned of
-the curvature."""
+"""Fraction of the contact stiffness that a metric may lack before a new metric is made. Excess stiffness does no harm:
+earlier contacts of a level's rounds recur. A new metric costs a factorization and discards the curvature learned so
+far."""
 
 
 class HeldMetric:
-    """A level's metric while something touches its cloth."""
+    """A level's metric with contact stiffness."""
 
     def __init__(self, plain: Metric, stiff: Float[Tensor, " vertices"]) -> None:
-        """Take up a stiffness.
+        """Add a contact stiffness.
 
         Args:
             plain: The level's metric.
@@ -55,7 +55,7 @@ class HeldMetric:
         self._last: tuple[Tensor, int, Tensor] | None = None
 
     def serves(self, stiff: Float[Tensor, " vertices"]) -> bool:
-        """Whether it holds enough of another stiffness [N/m]."""
+        """True if K contains enough of the given stiffness [N/m]."""
         return float((stiff - self.stiff).clamp_min(0.0).sum()) <= MISSING * float(stiff.sum())
 
     @property
@@ -64,13 +64,13 @@ class HeldMetric:
         return self._plain.diagonal + self.stiff.double()
 
     def solve(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
-        """P F [m]; zero where a vertex may not move, provided that the force is."""
+        """P F [m]; zero at pinned vertices, provided that the force is zero there."""
         held = self._held(force)
         self._last = force, force._version, held
         return (force * self._rough).add_(held, alpha=SMOOTH)
 
     def stiffened(self, stiffness: Float[Tensor, " vertices"]) -> Solver:
-        """P with max(K, stiffness - D) for K: the solve for cloth that is as stiff as that [N/m] where it is more."""
+        """P with max(K, stiffness - D) in place of K: the solve for cloth with at least the given stiffness [N/m]."""
         other = HeldMetric(self._plain, torch.maximum(self.stiff, stiffness - self._plain.diagonal.to(stiffness)))
 
         def solve(force: Tensor) -> Tensor:
@@ -81,7 +81,7 @@ class HeldMetric:
         return solve
 
     def held(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"] | None:
-        """R H0^-1 R F [m], by which the remaining move is judged, of the force solved for last; None of any other."""
+        """R H0^-1 R F [m], the measure of the remaining move, for the last solved force; None for any other force."""
         if self._last is None or self._last[0] is not force or self._last[1] != force._version:
             return None
         return self._last[2]

@@ -1,4 +1,4 @@
-"""Moves of one level's cloth in one frame that make nothing cross."""
+"""Moves of one level's cloth in one frame that add no crossings."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from .cloth import ClothView
 from .safe_move import ROUNDS, in_the_way, safe_move
 
 GOES = 3
-"""How often what is left of each way is gone. One go alone leaves shot 02 with crossings in frames 18 and 19."""
+"""Most tries of the remaining displacements. A single try leaves crossings in frames 18 and 19 of shot 02."""
 TRIES = 4
-"""How often tangles in which more crosses are held to the promise, before all are."""
+"""Most tries that hold only the worsened tangles to the promise, before all hopeful tangles are held."""
 
 
 class _MoveOptions(TypedDict):
-    """What `safe_move` takes besides positions and parts."""
+    """Options of `safe_move`."""
 
     floor: float
     tangle: Int[Tensor, " vertices"] | None
@@ -33,21 +33,21 @@ class _MoveOptions(TypedDict):
 
 @dataclass(frozen=True, eq=False)
 class Promise:
-    """Moves of one level's cloth in one frame that make nothing cross.
+    """Moves of one level's cloth in one frame that add no crossings.
 
     Attributes:
         view: The level's cloth.
-        floor: As `safe_move` takes it [m].
+        floor: Gap that pairs keep, as for `safe_move` [m].
     """
 
     view: ClothView
     floor: float
 
     def move(self, start: Placed, wanted: Float[Tensor, "vertices 3"]) -> Placed:
-        """Positions as near to what is wanted as is safe [m], ``wanted`` itself where nothing is in the way.
+        """Positions as close to the wanted positions as is safe [m], ``wanted`` itself if no pair blocks the move.
 
-        In a tangle, round what crosses at the start, cloth may pass through itself, so long as no more of it crosses
-        after that.
+        In a tangle of the start, cloth may pass through itself as long as the tangle's number of crossings does not
+        grow.
         """
         tangles = self.view.tangles(start)
         if tangles is None:
@@ -65,14 +65,14 @@ class Promise:
         return x
 
     def draw(self, start: Placed, wanted: Float[Tensor, "vertices 3"]) -> Placed:
-        """The same where tangles may come to cross more for a while."""
+        """As `move`, but the number of crossings in a tangle may grow for a while."""
         tangles = self.view.tangles(start)
         return self._go(start, wanted, None if tangles is None else tangles.label)
 
     def _go(self, start: Placed, aim: Tensor, tangle: Int[Tensor, " vertices"] | None) -> Placed:
-        """The same, with nothing promised to what is in a tangle against what is in the same.
+        """As `move`, without a promise for pairs inside one tangle.
 
-        What is left of the ways is gone again: vertices that were in the way may have moved on.
+        The remaining displacements are tried again: the blocking vertices may have moved on.
         """
         x = start
         for _ in range(GOES):
@@ -82,9 +82,9 @@ class Promise:
         return x
 
     def _go_once(self, start: Placed, aim: Tensor, tangle: Int[Tensor, " vertices"] | None) -> Placed:
-        """One go: vertices are projected onto the planes of the pairs that none keeps apart, and then cut short.
+        """A single try: vertices are projected onto the planes of the blocked pairs, and then shortened.
 
-        Only pairs of vertices whose ends have changed are asked again.
+        Only pairs of vertices with changed ends are checked again.
         """
         parts = self.view.parts
         options = _MoveOptions(floor=self.floor, tangle=tangle, detector=self.view.detector)
@@ -105,7 +105,7 @@ class Promise:
 
 
 def _corners(met: Pairs, others: Bool[Tensor, " vertices"]) -> Bool[Tensor, " vertices"]:
-    """The corners of pairs, and other vertices."""
+    """Mask of the corners of pairs and of other vertices."""
     asked = others.clone()
     asked[met.corners.long().reshape(-1)] = True
     return asked

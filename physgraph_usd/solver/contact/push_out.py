@@ -1,4 +1,4 @@
-"""The last projection: cloth that is under the least clearance to a body goes to it, and over what comes through it."""
+"""Final projection: moves cloth below the minimum clearance out to it, and lifts faces pierced by a body."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from .measure import DEEP
 from .track import Track
 
 LIFT = 2.0
-"""Farthest that cloth is lifted over what comes through its faces, in edge lengths: a spike would show more."""
+"""Largest lift of a pierced face, in edge lengths: a spike would be more visible."""
 STALLED = 6
-"""How often faces that a body comes through are moved in vain, once none more comes clear."""
+"""Most lifts without a drop in the number of pierced faces."""
 
 
 def projected(
     bodies: LevelBodies, x: Float[Tensor, "vertices 3"]
 ) -> tuple[LevelBodies, Float[Tensor, "vertices 3"], int]:
-    """Move free vertices that are under the least clearance to it, and farther where a body comes through a face.
+    """Move free vertices out to the minimum clearance, and farther if a body pierces a face.
 
     Args:
         bodies: The level's view of the bodies.
         x: Positions [m].
 
     Returns:
-        The view from there; positions [m], x itself when none had to move; and the passes that it took.
+        The view from the new positions; positions [m], x itself if no vertex had to move; and the number of passes.
     """
     level = bodies.level
     bodies, out, passes = pushed_out(bodies, x)
@@ -58,10 +58,10 @@ def projected(
 def pushed_out(
     bodies: LevelBodies, x: Float[Tensor, "vertices 3"]
 ) -> tuple[LevelBodies, Float[Tensor, "vertices 3"], int]:
-    """Push free vertices to the least clearance, body by body, wherever bodies come through faces.
+    """Push free vertices to the minimum clearance, body by body, without a check for pierced faces.
 
-    What bodies push to and fro until the passes end is moved by halves, and so to the middle between them. The rest is
-    as for `projected`.
+    Vertices that bodies push back and forth until the passes end move by half steps, to the middle between the bodies.
+    Arguments and results are as for `projected`.
     """
     out, passes, tracks = x, 0, list(bodies.tracks)
     for attempt in range(2 * bodies.settings.projections):
@@ -85,7 +85,7 @@ def pushed_out(
 
 
 def _pushes(bodies: LevelBodies, track: Track, x: Tensor) -> tuple[Track, Tensor, Tensor]:
-    """Vertices that are under their least clearance to a surface, and the ways to it."""
+    """Vertices below their minimum clearance to a surface, and the displacements to the clearance."""
     least = bodies.settings.clearance * track.offset
     track, vertex, normal, signed = track.refresh(x, least)
     lack = least[vertex] - signed
@@ -94,7 +94,7 @@ def _pushes(bodies: LevelBodies, track: Track, x: Tensor) -> tuple[Track, Tensor
 
 
 def _over_corners(bodies: LevelBodies, x: Tensor, faces: list[Tensor]) -> tuple[LevelBodies, Tensor]:
-    """Corners of the faces that each body comes through moved towards where it does not."""
+    """Positions with the corners of pierced faces moved out of each body."""
     out = x
     for track, own in zip(bodies.tracks, faces, strict=True):
         if len(own):
@@ -110,7 +110,7 @@ def _over_corners(bodies: LevelBodies, x: Tensor, faces: list[Tensor]) -> tuple[
 
 
 def _pierced_faces(bodies: LevelBodies, track: Track, x: Tensor) -> Tensor:
-    """Faces that a body comes through though none of their corners is left inside it."""
+    """Faces pierced by a body whose corners are all outside the body."""
     level, found = bodies.level, track.pierced(bodies.level, x)
     triangles, ends = level.triangles.long(), level.edges[found.edges].long()
     hit = torch.zeros(len(triangles), dtype=torch.bool, device=x.device)
@@ -130,7 +130,7 @@ def _pierced_faces(bodies: LevelBodies, track: Track, x: Tensor) -> Tensor:
 
 
 def _depth(bodies: LevelBodies, x: Tensor) -> tuple[LevelBodies, Tensor]:
-    """How deep each vertex is in the deepest body [m]."""
+    """Depth of each vertex in the deepest body [m]."""
     out, tracks = torch.zeros_like(x[:, 0]), []
     for each in bodies.tracks:
         track, vertex, _, signed = each.refresh(x, torch.zeros_like(out))
@@ -142,7 +142,7 @@ def _depth(bodies: LevelBodies, x: Tensor) -> tuple[LevelBodies, Tensor]:
 def no_farther(
     x: Float[Tensor, "vertices 3"], start: Float[Tensor, "vertices 3"], most: Float[Tensor, " vertices"]
 ) -> Float[Tensor, "vertices 3"]:
-    """Positions on the way from where each vertex started to x, no farther than most [m]; x itself where none is."""
+    """Positions with the displacement from the start limited to most [m]; x itself if none exceeds the limit."""
     way = x - start
     length = way.norm(dim=1)
     far = length > most
@@ -150,7 +150,7 @@ def no_farther(
 
 
 def moves(x: Float[Tensor, "vertices 3"], out: Float[Tensor, "vertices 3"], passes: int) -> dict[str, int | float]:
-    """How many vertices moved from x to other positions [m], how far at most [mm] and in how many passes."""
+    """Number of moved vertices, largest move [mm] and number of passes."""
     shifts = (out - x).norm(dim=1)
     far = 1e3 * float(shifts.max()) if len(shifts) else 0.0
     return {"vertices": int((shifts > 0).sum()), "largest_mm": round(far, 4), "passes": passes}

@@ -1,8 +1,8 @@
-"""The cage that the fine cloth follows where the input leaves it no room.
+"""Repair of the cage followed by the fine cloth, where overlapping body parts leave the cloth no room.
 
-Where parts of a skinned body overlap, the cage goes deep through both, and cloth that is pushed out of them tears.
-There, and there only, the solve follows a repaired cage: cloth between overlapping parts is drawn taut from where it
-goes in to where it comes out. The report's figures still count from the input.
+In overlaps of a skinned body the cage goes deep through both parts, and cloth pushed out of the parts tears. Only there
+the solve follows a repaired cage: cloth between overlapping parts is drawn taut from entry to exit. The report's
+figures are still measured from the input.
 """
 
 from __future__ import annotations
@@ -22,22 +22,22 @@ from .cloth_mesh import ClothMesh
 from .push_out import pushed_out
 
 FAIRINGS, PASSES = 3, 2
-"""How often drawn cloth is smoothed and pushed out in turn, and passes of the smoothing."""
+"""Rounds of smoothing and pushing out, and smoothing passes of a round."""
 
 
 def repaired_cage(
     cage: Level, x: Float[Tensor, "coarse 3"], *, bodies: LevelBodies, mesh: ClothMesh
 ) -> Float[Tensor, "coarse 3"]:
-    """The cage with cloth between overlapping parts of a body as a taut membrane, and what can leave it outside.
+    """The cage with the cloth between overlapping body parts as a taut membrane, pushed outside where possible.
 
     Args:
-        cage: The cage's level.
-        x: Its positions [m].
+        cage: Level of the cage.
+        x: Cage positions [m].
         bodies: The cage's view of the bodies.
-        mesh: The cage's faces.
+        mesh: Mesh of the cage.
 
     Returns:
-        Positions [m]; x itself where nothing is pinched.
+        Positions [m]; x itself if no vertex is pinched.
     """
     hidden = _hidden_between(cage, x, bodies, mesh)
     if not bool(hidden.any()):
@@ -50,7 +50,7 @@ def repaired_cage(
 
 
 def _hidden_between(level: Level, x: Tensor, bodies: LevelBodies, mesh: ClothMesh) -> Bool[Tensor, " vertices"]:
-    """Free vertices of patches inside bodies that are pinched between overlapping parts somewhere."""
+    """Free vertices of patches inside bodies that contain a vertex pinched between overlapping parts."""
     inside, held = bodies.within(x)
     held &= level.free[:, 0]
     if not bool(held.any()):
@@ -60,7 +60,7 @@ def _hidden_between(level: Level, x: Tensor, bodies: LevelBodies, mesh: ClothMes
 
 
 def _membrane(x: Tensor, where: Bool[Tensor, " vertices"], beside: sp.csr_matrix) -> Tensor:
-    """Each vertex of a region at the mean of its neighbours; the rest is held."""
+    """Positions with each vertex of a region at the mean of its neighbours; all other vertices are held."""
     inner, rest = (np.flatnonzero(each.cpu().numpy()) for each in (where, ~where))
     rows = sp.csr_matrix(sp.diags(np.asarray(beside.sum(axis=1)).ravel()) - beside)[inner]
     touched = np.unique(csgraph.connected_components(beside, directed=False)[1][rest])
@@ -73,7 +73,7 @@ def _membrane(x: Tensor, where: Bool[Tensor, " vertices"], beside: sp.csr_matrix
 
 
 def _smoothed(x: Tensor, where: Bool[Tensor, " vertices"], beside: sp.csr_matrix) -> Tensor:
-    """Half way to the mean of the neighbours, in some passes."""
+    """Positions moved half way to the mean of the neighbours, `PASSES` times."""
     which = np.flatnonzero(where.cpu().numpy())
     rows = beside[which]
     share = 1.0 / np.maximum(np.asarray(rows.sum(axis=1)), 1.0)

@@ -1,13 +1,13 @@
 """The promise: cloth that is apart never crosses.
 
-Theorem. Let every vertex-face and edge-edge pair of a mesh, but for pairs that share a vertex, have a positive distance
-at ``start``. Then it has at what `safe_move` returns, and nothing crosses there that did not at ``start``: a plane
-keeps each pair apart on the straight way between the two positions, just as they are rounded (`collide.impact`), so no
-pair can have changed sides. Neither what is wanted, how far it is, nor who wants it matters.
+Theorem. Let every vertex-face and edge-edge pair of a mesh, except pairs that share a vertex, have a positive distance
+at ``start``. Then every such pair has a positive distance at the result of `safe_move`, and the result has no crossings
+that ``start`` did not have: a plane keeps each pair apart on the straight path between the two positions, as rounded
+(`collide.impact`), so no pair can have changed sides. The theorem holds for any wanted positions.
 
-Exempt are pairs that touch at the start (distance 0), and pairs all of whose vertices are given as in one tangle. Where
-the start is in double precision and what is wanted in single, gaps under its rounding cannot be returned, and are not
-promised.
+Exempt are pairs that touch at the start (distance 0), and pairs with all vertices in a single given tangle. If the
+start is in double precision and the wanted positions in single, gaps below single precision's rounding cannot be
+returned, and are not promised.
 """
 
 from __future__ import annotations
@@ -25,21 +25,22 @@ from ..deadline import is_over
 from ..level import Placed
 
 ROUNDS = 4
-"""How often vertices that would come too near go less far; after that they stay where they start, so that it ends."""
+"""Most passes that shorten blocked displacements. Vertices still blocked afterwards stay at the start, so the passes
+end."""
 
 STRAINS, LEAST = 0.5, 0.01
-"""Part of its length that an edge changes by at most where vertices beside one another are cut, and a change of that
-which counts for nothing. Without it shot 02 needs twice the rounds (53 for 24 in frame 18) and keeps crossings."""
+"""Largest strain of an edge between vertices whose displacements are shortened, and the fraction of that change which
+is negligible. Without the limit shot 02 needs twice the rounds (53 for 24 in frame 18) and keeps crossings."""
 
 
 @dataclass(frozen=True, eq=False)
 class Moved:
-    """Where a move has come.
+    """Result of a move.
 
     Attributes:
         x: Positions [m], shape (V, 3).
-        share: How much of its way each vertex has gone, in [0, 1], shape (V,), float64.
-        met: Pairs that were in the way.
+        share: Fraction of its displacement that each vertex has moved, in [0, 1], shape (V,), float64.
+        met: Blocking pairs.
     """
 
     x: Placed
@@ -48,7 +49,7 @@ class Moved:
 
     @property
     def short(self) -> Bool[Tensor, " vertices"]:
-        """Vertices that have not come to where they were to go."""
+        """Mask of the vertices that did not reach their wanted position."""
         return self.share < 1.0
 
 
@@ -64,23 +65,22 @@ def safe_move(
 ) -> Moved:
     """Move vertices towards wanted positions as far as a plane keeps each pair of parts apart.
 
-    Corners of the pairs that no plane keeps apart go as far as the plane at the start lets them; then the pairs of what
-    has changed are asked again, until none is left. Layers that move together are not held up, since what counts is how
-    they move against each other.
+    Corners of blocked pairs move as far as the plane at the start allows. Pairs with changed vertices are then checked
+    again, until no pair is blocked. Only relative motion counts, so layers that move together are not stopped.
 
     Args:
-        start: Positions in which what is apart stays apart [m].
-        wanted: Where to go [m], of the same dtype.
-        parts: What may touch what.
-        floor: Gap that pairs keep [m]; most of their distance where that is less.
-        tangle: The tangle that each vertex is in, int32, -1 where in none: to what is in one nothing is promised
-            against what is in the same; or None.
-        detector: What has detected before with the same parts, or None.
-        asked: Vertices in all of whose pairs nothing is known of the way; pairs of others are known to be kept apart on
-            it. None where nothing is known.
+        start: Start positions, the reference of the promise [m].
+        wanted: Wanted positions [m], of the same dtype.
+        parts: Table of vertex, edge and face pairs that may be in contact.
+        floor: Gap that pairs keep [m]; a pair that is already closer keeps most of its distance.
+        tangle: The tangle of each vertex, int32, -1 outside tangles; pairs inside a single tangle have no promise. None
+            without tangles.
+        detector: Collision detector of the same parts for reuse, or None.
+        asked: Vertices whose pairs must be checked; pairs without such a vertex are known to be safe. None checks every
+            vertex that moves.
 
     Returns:
-        Positions, ``wanted`` itself where nothing is in the way, and how far vertices have come.
+        Positions, ``wanted`` itself if no pair is blocked, and the fraction that each vertex moved.
     """
     at = start.double()
     way = wanted.double() - at
@@ -104,7 +104,7 @@ def safe_move(
 
 
 def _spread(share: Tensor, way: Tensor, parts: Parts) -> Float[Tensor, " vertices"]:
-    """Smaller shares round vertices that are cut short, so that no edge is strained by more than `STRAINS`."""
+    """Fractions reduced around shortened vertices, so that no edge is strained by more than `STRAINS`."""
     length = way.norm(dim=1)
     late = length * (1.0 - share)
     first, second = parts.links.T
@@ -129,7 +129,7 @@ def in_the_way(
     detector: Detector | None = None,
     asked: Bool[Tensor, " vertices"] | None = None,
 ) -> Pairs:
-    """The pairs that no plane keeps apart on the straight way to what is wanted, all as for `safe_move`."""
+    """Pairs that no plane keeps apart on the straight path to the wanted positions; arguments as for `safe_move`."""
     detector = detector or Detector.once(parts)
     asked = (wanted.double() != start.double()).any(dim=1) if asked is None else asked
     return detector.impacts(start, wanted, floor=floor, asked=asked, tangle=tangle)

@@ -1,4 +1,4 @@
-"""How contact is solved."""
+"""Contact settings."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from ..level import Level
 
 @dataclass(frozen=True)
 class ContactSettings:
-    """How contact is solved.
+    """Contact settings.
 
     Attributes:
-        form: Against bodies: "quadratic" or "off".
-        cloth: Of cloth with cloth: "pairs" of points, faces and edges, or "off".
-        stiffness: k_c, in stretch stiffnesses over the square of the cage's mean edge.
-        cloth_stiffness: The same of pairs.
-        clearance: Part of the offset that the last projection leaves at least.
-        projections: Most passes of the last projection.
-        lifts: How often it moves faces outwards that a body comes through.
-        way_out: How far vertices that get between overlapping parts of a body are pushed out at most, in the cage's
-            mean edges. What the input has there stays.
-        measured: Whether what is off is measured all the same.
+        form: Contact with bodies: "quadratic" or "off".
+        cloth: Contact of cloth with cloth: "pairs" of points, faces and edges, or "off".
+        stiffness: k_c of bodies, in stretch stiffnesses over the square of the cage's mean edge.
+        cloth_stiffness: k_c of cloth pairs, in the same unit.
+        clearance: Fraction of the offset that the final projection leaves at least.
+        projections: Most passes of the final projection.
+        lifts: Most lifts of pierced faces in the final projection.
+        way_out: Longest push of vertices that get between overlapping parts of a body, in the cage's mean edges.
+            Vertices between such parts in the input stay.
+        measured: True measures contact even if it is off.
     """
 
     form: str = "quadratic"
@@ -36,11 +36,11 @@ class ContactSettings:
 
     @property
     def sees_bodies(self) -> bool:
-        """Whether bodies are looked for at all."""
+        """True if distances to bodies are needed."""
         return self.form != "off" or self.measured
 
     def to_measure(self) -> ContactSettings | None:
-        """Settings by which all is measured, where these leave out something that is to be; else None."""
+        """Settings that measure all contact, if these leave out contact to be measured; else None."""
         if not self.measured or (self.form != "off" and self.cloth != "off"):
             return None
         on = ContactSettings()
@@ -50,7 +50,7 @@ class ContactSettings:
         """Settings with stiffnesses in SI [N/m^3].
 
         Args:
-            cage: The cage.
+            cage: Level of the cage.
             stretch: Stretch stiffness of the cloth [N/m].
         """
         per_area = stretch / float(cage.spacing.mean()) ** 2

@@ -1,4 +1,4 @@
-"""The plane that each vertex sees in one body: through the closest point of it, facing the vertex."""
+"""Contact plane of each vertex on one body: through the closest point, facing the vertex."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from ..forces.contact import Planes
 
 @dataclass(frozen=True, eq=False)
 class Sight:
-    """The plane that each vertex sees in one body, at most one a vertex.
+    """Contact planes on one body, at most one a vertex.
 
     Attributes:
-        at: Where each vertex was when its plane was found [m], shape (V, 3).
-        there: Whether it sees one, shape (V,).
+        at: Position of each vertex when its plane was found [m], shape (V, 3).
+        there: True for vertices with a plane, shape (V,).
         normal: Unit normals, shape (V, 3).
         height: n . c [m], shape (V,).
         offset: Distance to keep [m], shape (V,).
@@ -36,7 +36,7 @@ class Sight:
         return Sight(x, zero > 0, torch.zeros_like(x), zero, zero.clone())
 
     def planes(self) -> Planes:
-        """The planes that are seen."""
+        """The planes of vertices with a plane."""
         which = torch.nonzero(self.there).squeeze(1)
         return Planes(which.to(torch.int32), self.normal[which], (self.height + self.offset)[which])
 
@@ -50,14 +50,14 @@ class Sight:
         signed: Float[Tensor, " near"],
         offset: Float[Tensor, " near"],
     ) -> Sight:
-        """What vertices see now.
+        """Planes updated at x.
 
         Args:
-            x: Where they are [m].
-            still: Which of them keep what they saw.
-            vertex: Which of the others are near the body.
-            normal: Unit normals of their closest planes.
-            signed: Distances to them [m].
+            x: Positions [m].
+            still: Vertices that keep their planes.
+            vertex: Vertices near the body, among the rest.
+            normal: Unit normals of the new planes.
+            signed: Distances to the new planes [m].
             offset: Distances to keep [m].
         """
         found = Sight.none(x)

@@ -1,12 +1,12 @@
-"""The springs between parts of cloth that are near one another, found in one pass over the pairs.
+"""Contact springs between near parts of the cloth, found in one pass over the pairs.
 
-A pair keeps an offset from one another, in metres:
+Each pair has an offset, the distance to keep, in metres:
 
     offset = min(thickness, HALF distance at rest, max(distance in the upsampled cage, LEAST thickness))
 
-and has a spring where it is nearer than that and `MARGIN` of an edge. Between garments the distance at rest says
-nothing. The stiffness is that of the cloth by the area for which the pair stands: the vertex's, or a third of the
-least of four.
+A pair has a spring if its distance is less than the offset plus `MARGIN` of an edge. Between garments the distance at
+rest is ignored. The stiffness is the cloth's times the area of the pair: the vertex's area, or a third of the least of
+the four corners' areas.
 """
 
 # Warp's kernels are typed by values that only Warp reads.
@@ -31,16 +31,16 @@ from ..mesh.threads import argument, run
 wp.set_module_options(KERNELS)
 
 HALF, MARGIN = 0.5, 0.1
-"""The part of their distance at rest that pairs of one garment keep at most, so that a flat sheet pushes nothing; and
-how much farther than the thickness pairs are asked for, in edges."""
+"""Largest offset of a pair in a garment as a fraction of its distance at rest, so that a flat sheet exerts no force;
+and the search distance beyond the thickness, in edges."""
 LEAST = 0.25
-"""Part of its thickness that cloth keeps from cloth, however near the input has the two."""
+"""Minimum offset as a fraction of the thickness, however close the parts are in the input."""
 _HALF, _MARGIN, _LEAST = (wp.constant(wp.float64(each)) for each in (HALF, MARGIN, LEAST))
 
 
 @wp.func
 def _apart(weight: wp.vec4d, c: wp.vec4i, x: wp.array(dtype=wp.vec3d)):
-    """From a pair's second point to its first."""
+    """Vector from a pair's second point to its first."""
     return weight[0] * x[c[0]] + weight[1] * x[c[1]] + weight[2] * x[c[2]] + weight[3] * x[c[3]]
 
 
@@ -81,23 +81,23 @@ def _find_springs(
 
 @dataclass(frozen=True, eq=False)
 class NearSprings:
-    """Near pairs and what each keeps.
+    """Near pairs and their offsets.
 
     Attributes:
         near: The pairs.
-        offset: The distance that each keeps [m], shape (N,).
+        offset: Distance that each pair keeps [m], shape (N,).
     """
 
     near: NearPairs
     offset: Float[Tensor, " pairs"]
 
     def where(self, kept: Bool[Tensor, " pairs"]) -> NearSprings:
-        """Some of them."""
+        """The selected springs."""
         return NearSprings(self.near.where(torch.nonzero(kept).squeeze(1)), self.offset[kept])
 
 
 class ClothSprings:
-    """What says which near parts of a level's cloth have a spring, in one frame."""
+    """Finder of the contact springs of a level's cloth in one frame."""
 
     def __init__(
         self, level: Level, base: Float[Tensor, "vertices 3"], thickness: Float[Tensor, " garments"], stiffness: float
@@ -106,9 +106,9 @@ class ClothSprings:
 
         Args:
             level: The level.
-            base: The upsampled cage [m]: distances that it has are not widened.
-            thickness: Of each garment [m].
-            stiffness: Of cloth against cloth by area [N/m^3].
+            base: The upsampled cage [m]; distances between parts in the cage are not widened.
+            thickness: Thickness of each garment [m].
+            stiffness: Contact stiffness of cloth with cloth by area [N/m^3].
         """
         self._level, self._stiffness = level, stiffness
         self._rest, self._base = level.rest.double().contiguous(), base.double().contiguous()
@@ -116,11 +116,11 @@ class ClothSprings:
         self._thickness, self._spacing = thickness.double().contiguous(), level.spacing.double().contiguous()
 
     def find(self, x: Float[Tensor, "vertices 3"], pairs: Pairs) -> NearSprings:
-        """The pairs that have a spring.
+        """Pairs that have a spring.
 
         Args:
             x: Positions [m].
-            pairs: At least those that are near there, each once.
+            pairs: Candidates, each once; must contain all near pairs at x.
         """
         count, device = len(pairs.face), x.device
         weight, way, offset = (
@@ -138,7 +138,7 @@ class ClothSprings:
         return NearSprings(near, offset[some].to(x))
 
     def constraints(self, springs: NearSprings) -> PairConstraints:
-        """Springs as the force reads them."""
+        """The springs as constraints of the contact force."""
         near = springs.near
         area = self._level.vertex_area[near.corners.long()]
         share = torch.where(near.face, area[:, 0], area.amin(dim=1) / 3.0)

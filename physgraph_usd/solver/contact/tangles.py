@@ -1,8 +1,8 @@
-"""Tangles: what crosses, with what lies round it, and the force that draws it apart by shortening its contours.
+"""Tangles: crossings with the cloth around them, and the force that untangles them by shortening the contours.
 
-Where an edge passes through a face, the two surfaces meet along a contour that runs from there into the faces at the
-edge. If the edge moves by d relative to the face, its point on the face moves by d - (N.d / N.E) E, and the contour
-grows shorter by G.d with
+Where an edge passes through a face, the two surfaces meet along a contour that runs from the crossing into the faces at
+the edge. If the edge moves by d relative to the face, the crossing moves on the face by d - (N.d / N.E) E, and the
+contour shortens by G.d with
 
     G = sum_F  R_F - (R_F.E / N.E) N
 
@@ -15,7 +15,7 @@ grows shorter by G.d with
 | F | a face at the edge |
 | R_F | unit direction of the contour, from the edge into F |
 
-Moved along G, contours shrink, whichever side is the right one. A straight contour from rim to rim does not.
+A move along G shortens contours, whichever side is correct. A straight contour from rim to rim does not shorten.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ from ..mesh.topology import joined_by
 from .cloth_mesh import ClothMesh
 
 HOPELESS = 100
-"""Crossings of one tangle of the cage, and twice as many at each finer level, from which it is hopeless: four tiers
-that lie within a part of an edge of one another (8,810 crossings) still have 1,900 after a hundred rounds, strained by
-0.6; tangles of less than this all come apart in a few."""
+"""Most crossings of a hopeful tangle of the cage; the limit doubles at each finer level. Four tiers within a fraction
+of an edge of one another (8,810 crossings) still have 1,900 after a hundred rounds, strained by 0.6; all tangles below
+the limit came apart in a few."""
 GRAZING = 0.2
-"""Least |N.E|: an edge that lies almost in the face would be sent far along the normal."""
+"""Least |N.E|: an edge almost parallel to the face would be moved far along the normal."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,10 +46,10 @@ class Tangles:
     """The tangles of one level's cloth.
 
     Attributes:
-        label: The tangle that each vertex is in, -1 where in none, shape (V,), int32.
-        before: How much crosses in each, shape (N,).
-        hopeless: In which so much crosses that no contour would shorten: they follow their cage as if nothing touched,
-            shape (N,), bool.
+        label: The tangle of each vertex, -1 outside tangles, shape (V,), int32.
+        before: Number of crossings of each tangle, shape (N,).
+        hopeless: True for tangles with too many crossings to shorten the contours; hopeless tangles follow the cage
+            without contact, shape (N,), bool.
     """
 
     label: Int[Tensor, " vertices"]
@@ -59,12 +59,12 @@ class Tangles:
 
     @staticmethod
     def find(mesh: ClothMesh, corners: Int[Tensor, "crossings 5"], *, rings: int) -> Tangles:
-        """What crosses, and what is within some rings of it; what hangs together there, or crosses, is one.
+        """Tangles: connected components of the crossings and the cloth within some rings of them.
 
         Args:
             mesh: The cloth.
-            corners: Vertices of each edge and face that cross.
-            rings: How far round that.
+            corners: Vertices of each crossing edge and face.
+            rings: Number of rings.
         """
         region = torch.zeros_like(mesh.level.free[:, 0])
         region[corners.reshape(-1)] = True
@@ -80,38 +80,38 @@ class Tangles:
         return Tangles(labels, before, before > HOPELESS << mesh.level.index, mesh)
 
     def worse(self, crossings: Crossings) -> Bool[Tensor, " vertices"]:
-        """Vertices of tangles, not hopeless ones, in which more crosses than before."""
+        """Mask of the vertices of hopeful tangles with more crossings than before."""
         of = self.label[self._mesh.corners_of(crossings)].amax(dim=1).long()
         counts = torch.bincount(of.clamp_min(0), minlength=len(self.before))
         return self._of((counts > self.before) & ~self.hopeless)
 
     @property
     def given_up(self) -> Bool[Tensor, " vertices"]:
-        """Vertices of hopeless tangles."""
+        """Mask of the vertices of hopeless tangles."""
         return self._of(self.hopeless)
 
     def hopeful(self, crossings: Crossings) -> Crossings:
-        """Those of the crossings that are in no hopeless tangle."""
+        """Crossings outside hopeless tangles."""
         kept = ~self.given_up[self._mesh.corners_of(crossings)].any(dim=1)
         return Crossings(crossings.edge[kept], crossings.face[kept])
 
     def _of(self, some: Bool[Tensor, " tangles"]) -> Bool[Tensor, " vertices"]:
-        """Vertices of some tangles."""
+        """Mask of the vertices of the selected tangles."""
         return some[self.label.clamp_min(0).long()] & (self.label >= 0)
 
 
 def ways_out(
     mesh: ClothMesh, crossings: Crossings, x: Float[Tensor, "vertices 3"]
 ) -> tuple[Float[Tensor, "crossings 3"], Float[Tensor, "crossings 4"]]:
-    """For each crossing the direction in which its edge should move, relative to its face, and where it is.
+    """Direction of each crossing's edge relative to its face that shortens the contour, and the crossing's coordinates.
 
     Args:
         mesh: The cloth.
-        crossings: What crosses.
+        crossings: Crossings at x.
         x: Positions [m].
 
     Returns:
-        Directions, at most of length 1, and the place: along the edge, then barycentric on the face.
+        Directions, of length at most 1, and coordinates: along the edge, then barycentric on the face.
     """
     ends, face = mesh.level.edges[crossings.edge].long(), mesh.triangles[crossings.face]
     a, b = x[ends[:, 0]], x[ends[:, 1]]
@@ -141,13 +141,13 @@ def ways_out(
 def gaps_out(
     mesh: ClothMesh, crossings: Crossings, x: Float[Tensor, "vertices 3"], *, step: float, stiffness: float
 ) -> PairConstraints:
-    """Planes that draw crossing edges out of their faces by a step at most.
+    """Constraints that draw crossing edges out of their faces by at most a step.
 
     Args:
         mesh: The cloth.
-        crossings: What crosses at x.
+        crossings: Crossings at x.
         x: Positions [m].
-        step: How far the edge and the face are moved apart [m].
+        step: Relative move of the edge and the face [m].
         stiffness: k_c [N/m^3].
     """
     level: Level = mesh.level
@@ -166,7 +166,7 @@ def gaps_out(
 
 
 def _barycentric(point: Tensor, p: Tensor, q: Tensor, r: Tensor) -> Float[Tensor, "points 3"]:
-    """Barycentric coordinates of points in triangles, clamped to them."""
+    """Barycentric coordinates of points in triangles, clamped to the triangles."""
     normal = torch.linalg.cross(q - p, r - p)
     whole = normal.square().sum(dim=1).clamp_min(1e-30)
     first = (torch.linalg.cross(r - q, point - q) * normal).sum(dim=1) / whole

@@ -1,6 +1,6 @@
-"""What is known of the distances between one level's cloth and one body, asked anew only where it may have changed.
+"""Cached distances between one level's cloth and one body, updated only where they may have changed.
 
-A value: what asks for more returns a new one, and asking the old one again gives the same answer.
+Immutable: an update returns a new track, and the old track still gives the same answers.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ ON_SURFACE = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """What is known of the distances between one level and one surface.
+    """Cached distances between one level and one surface.
 
     Attributes:
         surface: The surface.
         shift: From the group's coordinates to the surface's [m], shape (3,).
         offset: Distance to keep [m], shape (V,).
-        side: Start side of each vertex, of open surfaces, shape (V,); zeros for closed ones.
-        at: Positions at which distances were found [m], shape (V, 3).
-        known: Signed distances there, or lower bounds of positive ones [m], shape (V,).
-        longest: Longest way out from between overlapping parts that a vertex is sent [m].
-        lost: Vertices that lay between overlapping parts in the input, and stay while inside, shape (V,), or None.
-        inside: Closest points of the vertices with negative distances, as they were found first; or None.
+        side: Start side of each vertex for open surfaces, shape (V,); zeros for closed surfaces.
+        at: Positions of the cached distances [m], shape (V, 3).
+        known: Signed distances at `at`; for positive distances possibly lower bounds [m], shape (V,).
+        longest: Longest push of a vertex out from between overlapping parts [m].
+        lost: Vertices between overlapping parts in the input, which stay while inside, shape (V,), or None.
+        inside: First closest points of the vertices with negative distances; or None.
     """
 
     surface: Surface
@@ -46,7 +46,7 @@ class Track:
     inside: Nearest | None = None
 
     def pierced(self, level: Level, x: Tensor) -> Pierced:
-        """What goes through the body at x [m], and what it goes through."""
+        """Intersections of the cloth at x [m] with the body."""
         bound = (self.known.abs() - (x - self.at).norm(dim=1)).clamp_min(0.0)
         return pierced(self.surface, level, x + self.shift, bound)
 
@@ -55,11 +55,11 @@ class Track:
         return self.known - MARGIN * (x - self.at).norm(dim=1) - ROUNDING
 
     def refresh(self, x: Tensor, within: Tensor) -> tuple[Track, Tensor, Tensor, Tensor]:
-        """Find anew what may be nearer than a distance that each vertex has [m].
+        """Update vertices that may be nearer than a distance given for each vertex [m].
 
         Returns:
-            What is known then, numbers of those vertices, their unit normals away from the surface, and the signed
-            distances; without those that are pinched.
+            The new track; indices of the updated vertices, without pinched vertices; their unit normals away from the
+            surface; and their signed distances.
         """
         moved = (x - self.at).norm(dim=1)
         which = torch.nonzero(self.known - moved < within).squeeze(1)
@@ -88,7 +88,7 @@ class Track:
         return replace(self, at=at, known=known), which[kept], normal[kept], (distance * sign)[kept]
 
     def between(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Numbers of the vertices that are between overlapping parts of a closed surface at x [m]; which are in two."""
+        """Indices of vertices between overlapping parts of a closed surface at x [m]; mask of those in two parts."""
         still = torch.equal(x, self.at)
         moved = torch.zeros_like(self.known) if still else (x - self.at).norm(dim=1)
         which = torch.nonzero((self.known - moved < 0) & self.offset.isfinite()).squeeze(1)
@@ -104,18 +104,18 @@ class Track:
         return which[between], self.surface.inside(asked[between], parts=2)
 
     def _limit(self, which: Tensor, within: Tensor, moved: Tensor) -> Tensor:
-        """How far to look for the surface: what is farther away outside is known well enough by that bound."""
+        """Search distance of the closest-point query; for vertices farther outside the bound is enough."""
         limit = torch.maximum(within + self.longest, MARGIN * moved)
         everywhere = torch.full_like(limit, float("inf"))
         return everywhere if self.surface.certain else torch.where(self.known[which] < 0, everywhere, limit)
 
     def _outward(self, which: Tensor) -> Tensor:
-        """1 where a face's normal points away from the body, -1 where the start side is the other one."""
+        """1 if face normals point to the allowed side, -1 if the start side is behind them."""
         side = self.side[which]
         return torch.where(side < 0, side, torch.ones_like(side))
 
     def _signs(self, which: Tensor, found: Nearest, asked: Tensor, moved: Tensor) -> Tensor:
-        """1 outside, or on the start side of an open surface; -1 inside or behind it."""
+        """1 outside, or on the start side of an open surface; -1 inside, or behind an open surface."""
         if not self.surface.closed:
             return torch.where(behind(found, self.side[which]), -torch.ones_like(moved), torch.ones_like(moved))
         if self.surface.certain:
