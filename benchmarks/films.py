@@ -94,7 +94,8 @@ def film(name: str, shown: Shown, folder: Path, out: Path) -> None:
     times = fine.times(tuple(garments))
     fine.bake(times)
     sides = list(zip(times, smooth(name, fine, times), (fine.meshes(time) for time in times), strict=True))
-    counts = [sum(crossings(each[side], garments) for each in sides) for side in (1, 2)]
+    columns = ([left for _, left, _ in sides], [right for _, _, right in sides])
+    counts = [sum(crossings(side, garments) for side in column) for column in columns]
     seconds = statistics.median(sum(each["garments"][0]["milliseconds"].values()) for each in report.frames) / 1e3
     said = f"{len(times)} frames, {len(report.unsettled)} not settled, {seconds:.2f} s a frame"
     say(f"{name}: {said}, crossings {counts[0]:,} -> {counts[1]:,}")
