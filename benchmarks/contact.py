@@ -115,7 +115,7 @@ def warm_frames(device: str) -> None:
 def _turned(ball: MeshPose, index: int) -> MeshPose:
     """The ball turned about the vertical, a little farther each frame."""
     turn = trimesh.transformations.rotation_matrix(TRAVEL * index, [0.0, 1.0, 0.0])[:3, :3]
-    return MeshPose(ball.points @ np.asarray(turn).T, ball.triangles)
+    return MeshPose(ball.points @ turn.transpose(), ball.triangles)
 
 
 def _refiner(scene: Scene, form: str, cloth: str, *, device: str, temporal: str = "off") -> Refiner:
