@@ -193,7 +193,7 @@ class TestRefine:
         assert [said.index(heading) for heading in headings] == sorted(said.index(heading) for heading in headings)
         assert tuple(METHODS)[: len(INTEGRATORS)] == INTEGRATORS  # The lab registers more.
         letters = "".join(said.split())
-        assert ",".join(INTEGRATORS) + ".[default:auto]" in letters
+        assert ",".join(INTEGRATORS) + ".[default:physgraph]" in letters
         assert "Moststepsatthefinestlevel.[default:12;x>=0]" in letters
         assert "denim" in run("tag", "--help").output
 

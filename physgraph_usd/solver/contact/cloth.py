@@ -195,7 +195,7 @@ class ClothView:
         Positions that safe moves reached from a start without crossings have none and are not searched again.
 
         Args:
-            before: The upsampled cage [m]; None where the cage does not cross itself, and nothing is searched.
+            before: The upsampled cage [m]; None if it is known not to cross.
             x: The result [m].
         """
         found = self.crossings(x)

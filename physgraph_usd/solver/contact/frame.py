@@ -232,6 +232,13 @@ class FrameContact:
             self._views[level.index] = LevelContact(bodies, cloth, seam, promise)
         return self._views[level.index]
 
+    @property
+    def _is_clean(self) -> bool:
+        """Whether the upsampled cage is known not to cross: its triangles lie in those of a cage that does not."""
+        cage = self._levels[0]
+        has_quads = len(cage.membrane) > len(cage.triangles)
+        return not (has_quads or any(self._seams) or self.crossed)
+
     def _seam_at(self, level: Level) -> Seam | None:
         """The seam of a level."""
         return self._seams[level.index] if self._seams else None
@@ -264,7 +271,7 @@ class FrameContact:
         if self._bodies is not None:
             said |= self._bodies.measure(finest, base, x, view=view.bodies)
         if view.cloth is not None:
-            cloth, crossing = view.cloth.measure(view.closed(base) if self.crossed else None, x)
+            cloth, crossing = view.cloth.measure(None if self._is_clean else view.closed(base), x)
             near = view.cloth.came_near
             near = view.cloth.term(x) is not None if near is None else near
             said["cloth"] = {"near": near or any(each["crossings"] for each in cloth.values()), **cloth}

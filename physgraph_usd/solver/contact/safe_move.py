@@ -116,7 +116,10 @@ def _spread(share: Tensor, way: Tensor, parts: Parts) -> Float[Tensor, " vertice
         if is_over() or not bool((new > late + least).any()):
             break
         late = new
-    return torch.minimum(share, (1.0 - late / length.clamp_min(1e-300)).clamp_min(0.0))
+    out = torch.minimum(share, (1.0 - late / length.clamp_min(1e-300)).clamp_min(0.0))
+    sewn, partner = parts.links[parts.lengths == 0].T  # Seams stay closed to the last bit.
+    out = out.scatter_reduce(0, partner, out[sewn], "amin")
+    return out.scatter_reduce(0, sewn, out[partner], "amin")
 
 
 def in_the_way(
