@@ -67,9 +67,9 @@ def part_kept(
     f: wp.vec3d,
     g: wp.vec3d,
     h: wp.vec3d,
-    floor: wp.float64,
+    keep: wp.float64,
 ):
-    """Fraction of the straight paths from the corners a, b, c, d to e, f, g, h on which a plane keeps the parts apart.
+    """Fraction of the straight paths from the corners a, b, c, d to e, f, g, h on which a plane keeps a gap.
 
     The fraction is 1 if a plane does all the way. Along the start direction the gap is a concave function of the path
     fraction, so the gap is kept up to the returned fraction.
@@ -77,7 +77,6 @@ def part_kept(
     one = wp.float64(1.0)
     way = between(face, a, b, c, d)
     distance = wp.length(way)
-    keep = kept_of(distance, floor)
     first = way / distance
     gap = gap_along(first, face, e, f, g, h)
     if gap >= keep:
@@ -111,13 +110,15 @@ def impact_of(
     one, zero = wp.float64(1.0), a - a
     # About their first corner: far from the origin differences lose no digits.
     b, c, d, v, p, q = b - a, c - a, d - a, v - u, p - u, q - u
-    if distance_of(face, zero, b, c, d) <= wp.float64(0.0):
+    distance = distance_of(face, zero, b, c, d)
+    if distance <= wp.float64(0.0):
         return one
+    keep = kept_of(distance, floor)
     time, step = wp.float64(0.0), wp.float64(1.0)
     while time < one:
         end = time + step
         i, j, k = b + time * v, c + time * p, d + time * q
-        part = part_kept(face, zero, i, j, k, zero, b + end * v, c + end * p, d + end * q, floor)
+        part = part_kept(face, zero, i, j, k, zero, b + end * v, c + end * p, d + end * q, keep)
         if part == one:
             time = end
         elif step <= LEAST:

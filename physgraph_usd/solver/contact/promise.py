@@ -9,13 +9,12 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ..collide.detector import Detector
 from ..collide.narrow_phase import Pairs
 from ..deadline import is_over
 from ..level import Placed
 from .along import Planes, along
 from .cloth import ClothView
-from .safe_move import ROUNDS, in_the_way, safe_move
+from .safe_move import ROUNDS, safe_move
 
 GOES = 3
 """Most tries of the remaining displacements. A single try leaves crossings in frames 18 and 19 of shot 02."""
@@ -28,7 +27,6 @@ class _MoveOptions(TypedDict):
 
     floor: float
     tangle: Int[Tensor, " vertices"] | None
-    detector: Detector
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,22 +84,24 @@ class Promise:
 
         Only pairs of vertices with changed ends are checked again.
         """
-        parts = self.view.parts
-        options = _MoveOptions(floor=self.floor, tangle=tangle, detector=self.view.detector)
-        met = in_the_way(start, aim, parts, **options)
+        parts, detector = self.view.parts, self.view.detector
+        options = _MoveOptions(floor=self.floor, tangle=tangle)
+        moves = (aim != start).any(dim=1)
+        met = detector.impacts(start, aim, **options, asked=moves)
         if not len(met.value):
             return Placed(aim)
         at, ends = start.double(), aim
-        wanted, free = aim.double() - at, (aim != start).any(dim=1, keepdim=True) & parts.level.free
+        wanted, free = aim.double() - at, moves.unsqueeze(1) & parts.level.free
         planes = Planes.of(at, aim.double(), met, self.floor)
         for _ in range(ROUNDS):
             last, way = ends, along(wanted, planes, free=free, threads=parts.level.threads)
             ends = self.view.closed((at + way).to(aim))
-            met = in_the_way(start, ends, parts, **options, asked=_corners(met, (ends != last).any(dim=1)))
+            met = detector.impacts(start, ends, **options, asked=_corners(met, (ends != last).any(dim=1)))
             if not len(met.value):
                 return Placed(ends)
             planes = planes.joined(Planes.of(at, ends.double(), met, self.floor, corners=True))
-        return safe_move(start, ends, parts, **options, asked=_corners(met, torch.zeros_like(free[:, 0]))).x
+        asked = _corners(met, torch.zeros_like(moves))
+        return safe_move(start, ends, parts, **options, detector=detector, asked=asked).x
 
 
 def _corners(met: Pairs, others: Bool[Tensor, " vertices"]) -> Bool[Tensor, " vertices"]:

@@ -19,7 +19,6 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ..collide.detector import Detector
-from ..collide.narrow_phase import Pairs
 from ..collide.parts import Parts
 from ..deadline import is_over
 from ..level import Placed
@@ -40,12 +39,10 @@ class Moved:
     Attributes:
         x: Positions [m], shape (V, 3).
         share: Fraction of its displacement that each vertex has moved, in [0, 1], shape (V,), float64.
-        met: Blocking pairs.
     """
 
     x: Placed
     share: Float[Tensor, " vertices"]
-    met: Pairs
 
     @property
     def short(self) -> Bool[Tensor, " vertices"]:
@@ -87,12 +84,11 @@ def safe_move(
     share = torch.ones(len(way), dtype=torch.float64, device=way.device)
     x, asked = wanted, (way != 0).any(dim=1) if asked is None else asked
     detector = detector or Detector.once(parts)
-    met = Pairs.none(way.device)
     for attempt in range(len(way) + ROUNDS):
         more = detector.impacts(start, x, floor=floor, asked=asked, tangle=tangle)
         if not len(more.value):
             break
-        met, least = met.joined(more), torch.ones_like(share)
+        least = torch.ones_like(share)
         corner = more.corners.long().reshape(-1)
         least.scatter_reduce_(0, corner, more.value.repeat_interleave(4), "amin")
         shorter = share * least if attempt < ROUNDS else torch.where(least < 1.0, 0.0, share)
@@ -100,7 +96,7 @@ def safe_move(
         known, share = share, torch.zeros_like(share) if is_over() else _spread(shorter, way, parts)
         asked = share < known
         x = torch.where((share < 1.0).unsqueeze(1), (at + share.unsqueeze(1) * way).to(wanted), wanted)
-    return Moved(Placed(x), share, met)
+    return Moved(Placed(x), share)
 
 
 def _spread(share: Tensor, way: Tensor, parts: Parts) -> Float[Tensor, " vertices"]:
@@ -120,19 +116,3 @@ def _spread(share: Tensor, way: Tensor, parts: Parts) -> Float[Tensor, " vertice
     sewn, partner = parts.links[parts.lengths == 0].T  # Seams stay closed to the last bit.
     out = out.scatter_reduce(0, partner, out[sewn], "amin")
     return out.scatter_reduce(0, sewn, out[partner], "amin")
-
-
-def in_the_way(
-    start: Float[Tensor, "vertices 3"],
-    wanted: Float[Tensor, "vertices 3"],
-    parts: Parts,
-    *,
-    floor: float,
-    tangle: Int[Tensor, " vertices"] | None = None,
-    detector: Detector | None = None,
-    asked: Bool[Tensor, " vertices"] | None = None,
-) -> Pairs:
-    """Pairs that no plane keeps apart on the straight path to the wanted positions; arguments as for `safe_move`."""
-    detector = detector or Detector.once(parts)
-    asked = (wanted.double() != start.double()).any(dim=1) if asked is None else asked
-    return detector.impacts(start, wanted, floor=floor, asked=asked, tangle=tangle)

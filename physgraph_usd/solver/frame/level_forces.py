@@ -11,8 +11,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..fabric import Fabric
-from ..folds import raised_by
 from ..forces import body_terms, elastic_terms
 from ..forces.base import Force, ForceModule
 from ..forces.bending import Bending
@@ -37,7 +35,6 @@ class LevelForces:
         metric: The factorised rest Hessian of all terms.
         density: Areal density of each garment [kg/m^2].
         bends: Whether any cloth resists bending.
-        unresolved: Whether some garment's edges are too long for its folds, and its bending stiffness raised.
     """
 
     level: Level
@@ -46,7 +43,6 @@ class LevelForces:
     metric: Metric
     density: Float[Tensor, " garments"]
     bends: bool
-    unresolved: bool
 
     def without_facets(
         self, x: Float[Tensor, "vertices 3"], below: Float[Tensor, "coarse 3"], smooth: Stencil
@@ -75,12 +71,6 @@ class LevelForces:
         """The system of the level in any field, with the level's metric by default."""
         level, metric = self.level, self.metric if metric is None else metric
         return System(field, metric, free=level.free, spacing=level.spacing, level=level, lasting=lasting)
-
-    def remaining(self, coarse: Float[Tensor, "coarse 3"]) -> float:
-        """The remaining move of the upsampled cage, given by recentred positions [m], in edge lengths."""
-        system = self.system_in(self.module(coarse))
-        force = system.energy_and_force(self.level.base.apply(coarse))[1]
-        return system.remaining_move(system.apply_metric_inverse(force))
 
     def lasting_system(
         self,
@@ -152,17 +142,7 @@ def build_forces(
     metric = Metric(matrix, free=level.free, dtype=level.dtype)
     density = torch.tensor([fabric.density for fabric in fabrics], dtype=level.dtype, device=level.device)
     bends = any(fabric.bend > 0 for fabric in fabrics)
-    unresolved = _is_unresolved(level, garments, fabrics)
-    return LevelForces(level, terms, guide, metric, density, bends, unresolved)
-
-
-def _is_unresolved(level: Level, garments: Sequence[Garment], fabrics: Sequence[Fabric]) -> bool:
-    """Whether bending is raised at the mean edge of some garment."""
-    for span, garment, fabric in zip(level.spans, garments, fabrics, strict=True):
-        edge = float(level.spacing[span].mean()) if span.stop > span.start else 0.0
-        if garment.raises_bending and raised_by(fabric, edge) > 1.0:
-            return True
-    return False
+    return LevelForces(level, terms, guide, metric, density, bends)
 
 
 def blame(
