@@ -26,7 +26,7 @@ FILE = "chart.looks.{}.png"
 
 @dataclass(frozen=True)
 class Look:
-    """A picture.
+    """A picture of one method's cloth.
 
     Attributes:
         file: Its file.

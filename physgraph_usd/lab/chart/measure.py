@@ -75,7 +75,7 @@ def find_curves(names: Sequence[str] = ()) -> tuple[Curve, ...]:
 
 
 def budgets_of(growth: float) -> Iterator[int]:
-    """Numbers of steps: powers of two, every other where they grow by four; those between where by under two."""
+    """Step budgets: powers of two; every second power for a growth of 4 or more, intermediate ones for under 2."""
     for power in range(0, MOST_BUDGETS, 2 if growth >= 4.0 else 1):
         yield 2**power
         if growth < 2.0 and power:

@@ -92,7 +92,7 @@ class Reference:
         return replace(self, least=energy, by=by, apart=apart, energies=energies, points=())
 
     def __str__(self) -> str:
-        """Phi*, who found it, and how well it is known."""
+        """Phi*, the method that found Phi*, and the gap to the next best method."""
         other = "nobody else looked" if self.apart is None else f"the next best ends {self.apart:.2%} of the fall above"
         return f"Phi* {1e3 * self.least:.5g} mJ by {self.by}; {other}"
 

@@ -159,7 +159,7 @@ def figures(point: Point, *, touches: bool) -> list[str]:
 
 
 def changes(chart: Chart) -> list[Change]:
-    """Every part of the model that was measured, levels one by one."""
+    """Changes of the energy by each measured part of the model, and by each level."""
     fall = sum(each["start"] - each["least"] for each in chart.references)
     least = sum(each["least"] for each in chart.references)
     rows = [each for each in chart.terms if "failed" not in each]

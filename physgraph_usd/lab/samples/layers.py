@@ -29,7 +29,7 @@ def build() -> PlainStage:
 
 
 def _trousers(times: np.ndarray) -> PlainMesh:
-    """Trousers that widen towards the ankles, where they lag behind the legs."""
+    """Flared trousers; the hems lag behind the legs."""
     cells = Cells(40, 10, np.linspace(1.05, 0.835, 10), np.linspace(0.745, 0.115, 27))
     cage = trousers(cells, lambda height: GAPS[0] + 0.015 * ease((0.62 - height) / 0.35))
     late = 0.006 * ease((0.5 - cage.points[:, 1]) / 0.4)

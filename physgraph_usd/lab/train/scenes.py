@@ -161,7 +161,7 @@ def _fold(rng: np.random.Generator, frames: int) -> tuple[np.ndarray, np.ndarray
 
 
 def _free(rng: np.random.Generator, frames: int, most_vertices: int) -> Moving:
-    """A patch on its way from one pose towards another."""
+    """A patch that moves from a random pose towards a second one."""
     config = PatchConfig(levels=(1, 2), most_vertices=most_vertices, skinned=0.3, pulled=0.2)
     one = patch_of(config, rng)
     goal = posed(one.garment.rest, rng, config)

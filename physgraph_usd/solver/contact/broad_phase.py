@@ -28,7 +28,7 @@ NEVER = -float("inf")
 
 
 class Parts:
-    """Groups of garments that may touch one another in a frame."""
+    """Groups of garments in mutual contact in a frame."""
 
     def __init__(self, garments: Sequence[Garment], *, together: bool) -> None:
         """Measure the cages.

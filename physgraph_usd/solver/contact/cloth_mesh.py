@@ -78,7 +78,7 @@ class ClothMesh:
 
 
 def _across(beside: sp.csr_matrix, label: np.ndarray | None) -> sp.csr_matrix:
-    """Adjacency in which sewn vertices share their neighbours."""
+    """Vertex adjacency with shared neighbours of sewn vertices."""
     if label is None:
         return beside
     count = len(label)
