@@ -27,12 +27,6 @@ ALLOWED = {
     "contact/cloth.py ClothView.remember: _looked": "what the last frame found at those positions",
     "contact/metric.py HeldMetric.solve: _last": "of the force solved for last, and of no other",
     "contact/metric.py HeldMetric.stiffened: _last": "of the force solved for last, and of no other",
-    # What has been found and still serves: how long an answer takes depends on it, not which pairs it has.
-    "collide/detector.py Detector._broad: _found": "pairs of clusters, while nothing leaves their paths",
-    "collide/detector.py Detector._broad: _served": "the positions that it was asked for last",
-    "collide/detector.py Detector._narrow: _boxes": "of the positions asked for last",
-    "collide/detector.py Detector.near: _listed": "near pairs, while no clusters come nearer",
-    "collide/detector.py _Places.of: _known": "the last positions in double precision",
     # Functions of topology or of materials.
     "contact/cloth.py ClothContact.mesh: _meshes": "of a level and what is sewn there",
     "contact/measure.py _Cloth.of: _known": "of a level's triangles",

@@ -9,8 +9,8 @@ import torch
 from brute import Soup, crossings
 from folds import EDGE, levels_of, named, promise_of, square
 
-from physgraph_usd.solver.collide.narrow_phase import Pairs
 from physgraph_usd.solver.collide.near import weights
+from physgraph_usd.solver.collide.pairs import Pairs
 from physgraph_usd.solver.contact.along import COMES, Planes, along
 from physgraph_usd.solver.level import Placed
 

@@ -29,8 +29,8 @@ from folds import (
 from shots import refine
 
 from physgraph_usd.solver.collide.crossings import crossings
-from physgraph_usd.solver.collide.narrow_phase import Reach
 from physgraph_usd.solver.collide.near import near_pairs
+from physgraph_usd.solver.collide.pairs import Reach
 from physgraph_usd.solver.collide.parts import Parts
 from physgraph_usd.solver.contact.bodies import LevelBodies
 from physgraph_usd.solver.contact.push_out import projected, pushed_out

@@ -1,266 +1,265 @@
-"""Bounding boxes of clusters and of their parts while all vertices move along straight paths."""
+"""Boxes of clusters and of parts at the start and at the end of a move, compared eight at a time.
+
+Two sets of points that one axis separates at both ends, in equal order, are apart throughout a straight move: the
+theorem of `impact` with the axis as its direction. Positions alone are a move whose ends are equal.
+
+Boxes are stored in blocks of eight: twelve rows of low, high, low at the end and high at the end by axis, a lane for
+each part.
+"""
 
 # Warp's kernels are typed by values that only Warp reads.
-# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportIndexIssue=false, reportCallIssue=false, reportGeneralTypeIssues=false
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportIndexIssue=false, reportCallIssue=false, reportGeneralTypeIssues=false, reportReturnType=false
 from __future__ import annotations
 
 import functools
 from typing import Any
 
+import numpy as np
 import torch
 import warp as wp
 from torch import Tensor
 
 from ..mesh.kernels import KERNELS
-from .domains import single
-from .parts import Parts
-from .topology import Topology
+from ..mesh.piercing import ROUNDING
+from .topology import LANES, Topology
 
 wp.set_module_options(KERNELS)
 
+ROWS = 12
+"""Rows of a block of boxes."""
 FAR = wp.constant(wp.float64(1.0e30))
 """Corner of an empty box."""
-ROUNDING = wp.constant(wp.float64(2.4e-7))
-"""Widening of single-precision boxes, as a fraction of their corners' distance from the origin."""
+WIDER = wp.constant(wp.float64(1.000001))
+"""Factor on search distances, for their rounding to single precision."""
+MOVE, NEAR, CROSSING = (wp.constant(each) for each in range(3))
+"""Queries: parts that come too near on straight paths, near parts, and edges that pass through faces."""
+
+_OVERLAPPING = """
+    const float* a = (const float*)boxes.data + (part / 8) * 96 + part % 8;
+    const float* all = (const float*)others.data + block * 96;
+    unsigned long long mask = 0;
+    float low[3], high[3], to_low[3], to_high[3];
+    for (int axis = 0; axis < 3; ++axis) {
+        low[axis] = a[8 * axis] - room;
+        high[axis] = a[24 + 8 * axis] + room;
+        to_low[axis] = a[48 + 8 * axis] - room;
+        to_high[axis] = a[72 + 8 * axis] + room;
+    }
+#if defined(__CUDA_ARCH__)
+    for (int n = 0; n < count; ++n, all += 96)
+        for (int lane = 0; lane < 8; ++lane) {
+            bool apart = false;
+            for (int axis = 0; axis < 3; ++axis) {
+                const float* b = all + 8 * axis + lane;
+                apart |= b[0] > high[axis] && b[48] > to_high[axis];
+                apart |= b[24] < low[axis] && b[72] < to_low[axis];
+            }
+            if (!apart) mask |= 1ull << (8 * n + lane);
+        }
+#else
+    typedef float Floats __attribute__((vector_size(32), aligned(4)));
+    typedef int Ints __attribute__((vector_size(32)));
+    const Ints bits = {1, 2, 4, 8, 16, 32, 64, 128};
+    for (int n = 0; n < count; ++n, all += 96) {
+        Ints apart = {0, 0, 0, 0, 0, 0, 0, 0};
+        for (int axis = 0; axis < 3; ++axis) {
+            const Floats* b = (const Floats*)(all + 8 * axis);
+            apart |= (Ints)(b[0] > high[axis]) & (Ints)(b[6] > to_high[axis]);
+            apart |= (Ints)(b[3] < low[axis]) & (Ints)(b[9] < to_low[axis]);
+        }
+        mask |= (unsigned long long)__builtin_reduce_or(~apart & bits) << (8 * n);
+    }
+#endif
+    return mask;
+"""
+_LOWEST = """
+#if defined(__CUDA_ARCH__)
+    return __ffsll(mask) - 1;
+#else
+    return __builtin_ctzll(mask);
+#endif
+"""
 
 
 @wp.struct
-class Motion:
-    """Positions, displacements, queried vertices, gap to keep, and search radii without motion."""
+class Query:
+    """What is searched: the kind of query, positions at both ends, queried vertices, and distances.
 
+    Attributes:
+        kind: `MOVE`, `NEAR` or `CROSSING`.
+        start: Positions [m].
+        end: Positions at the end; those at the start without a move [m].
+        asked: Each pair contains a vertex for which this is True.
+        tangle: The tangle of each vertex, -1 outside tangles; pairs inside one tangle are no result.
+        floor: Gap to keep in a move [m].
+        radius: Search radius of near parts [m].
+        play: As for `Reach` [m].
+        half: As for `Reach`.
+    """
+
+    kind: wp.int32
     start: wp.array(dtype=wp.vec3d)
-    path: wp.array(dtype=wp.vec3d)
+    end: wp.array(dtype=wp.vec3d)
     asked: wp.array(dtype=wp.bool)
     tangle: wp.array(dtype=wp.int32)
     floor: wp.float64
-    is_still: wp.bool
     radius: wp.array(dtype=wp.float64)
     play: wp.array(dtype=wp.float64)
-    slack: wp.array(dtype=wp.float64)
     half: wp.float64
 
 
 @wp.struct
 class Boxes:
-    """Per cluster: start box, mean path, deviation from the path, search distance, boxes of edges and faces."""
+    """Blocks of boxes of clusters and of parts; by cluster the search distance, whether it is queried, and the box of
+    its whole paths, widened by the search distance."""
 
-    low: wp.array(dtype=wp.vec3d)
-    high: wp.array(dtype=wp.vec3d)
-    mean: wp.array(dtype=wp.vec3d)
-    spread: wp.array(dtype=wp.float64)
-    radius: wp.array(dtype=wp.float64)
-    asked: wp.array(dtype=wp.int32)
-    edge_low: wp.array(dtype=wp.vec3f)
-    edge_high: wp.array(dtype=wp.vec3f)
-    face_low: wp.array(dtype=wp.vec3f)
-    face_high: wp.array(dtype=wp.vec3f)
-
-
-@wp.struct
-class Swept:
-    """Per cluster: swept box, widened by search distance and path tolerance; and the search distance."""
-
+    clusters: wp.array(dtype=wp.float32)
+    parts: wp.array(dtype=wp.float32)
+    radius: wp.array(dtype=wp.float32)
+    asked: wp.array(dtype=wp.bool)
     low: wp.array(dtype=wp.vec3f)
     high: wp.array(dtype=wp.vec3f)
-    near: wp.array(dtype=wp.float64)
+
+
+@wp.func_native(_OVERLAPPING)
+def overlapping(
+    boxes: wp.array(dtype=wp.float32),
+    part: wp.int32,
+    others: wp.array(dtype=wp.float32),
+    block: wp.int32,
+    count: wp.int32,
+    room: wp.float32,
+) -> wp.uint64:
+    """Bits of the boxes in up to eight blocks that no axis keeps farther than a distance from a box, at both ends."""
+    ...
+
+
+@wp.func_native(_LOWEST)
+def lowest_bit(mask: wp.uint64) -> wp.int32:
+    """Position of the lowest bit of a mask that is not 0."""
+    ...
+
+
+@wp.func_native("return mask & (mask - 1);")
+def without_lowest(mask: wp.uint64) -> wp.uint64:
+    """A mask without its lowest bit."""
+    ...
 
 
 @wp.func
-def overlap(low: wp.vec3f, high: wp.vec3f, other_low: wp.vec3f, other_high: wp.vec3f):
-    """True if two boxes overlap. All six comparisons are made: a mispredicted branch costs more."""
-    first = wp.where(low[0] <= other_high[0], 1, 0) & wp.where(low[1] <= other_high[1], 1, 0)
-    second = wp.where(low[2] <= other_high[2], 1, 0) & wp.where(other_low[0] <= high[0], 1, 0)
-    third = wp.where(other_low[1] <= high[1], 1, 0) & wp.where(other_low[2] <= high[2], 1, 0)
-    return (first & second & third) == 1
+def lower(v: wp.float64):
+    """A number in single precision, rounded down."""
+    return wp.float32(v - ROUNDING * wp.abs(v))
 
 
 @wp.func
-def outside(low: wp.vec3d, high: wp.vec3d, other_low: wp.vec3d, other_high: wp.vec3d, reach: wp.float64):
-    """True if two boxes are farther apart than a reach along an axis."""
+def upper(v: wp.float64):
+    """A number in single precision, rounded up."""
+    return wp.float32(v + ROUNDING * wp.abs(v))
+
+
+@wp.func
+def put(
+    boxes: wp.array(dtype=wp.float32),
+    part: wp.int32,
+    low: wp.vec3d,
+    high: wp.vec3d,
+    to_low: wp.vec3d,
+    to_high: wp.vec3d,
+):
+    """Write a box into its lane."""
+    place = (part // LANES) * (ROWS * LANES) + part % LANES
     for axis in range(3):
-        if low[axis] > other_high[axis] + reach or other_low[axis] > high[axis] + reach:
-            return True
-    return False
-
-
-@wp.func
-def lowest_of(v: wp.vec3d):
-    """A corner in single precision, rounded down."""
-    return single(v - ROUNDING * wp.abs(v))
-
-
-@wp.func
-def highest_of(v: wp.vec3d):
-    """A corner in single precision, rounded up."""
-    return single(v + ROUNDING * wp.abs(v))
-
-
-@wp.func
-def room_of(boxes: Boxes, motion: Motion, i: wp.int32, j: wp.int32):
-    """Distance from which parts of two clusters are ignored: the search distance, or the gap to keep in a move."""
-    return boxes.radius[i] + boxes.radius[j] + motion.floor
-
-
-@wp.func
-def pass_by(boxes: Boxes, i: wp.int32, j: wp.int32, room: wp.float64):
-    """True if two clusters keep a distance on their paths, by the box swept by the first relative to the second."""
-    way = boxes.mean[i] - boxes.mean[j]
-    reach = room + boxes.spread[i] + boxes.spread[j]
-    low, high = boxes.low[i] + wp.min(way, wp.vec3d()), boxes.high[i] + wp.max(way, wp.vec3d())
-    if outside(low, high, boxes.low[j], boxes.high[j], reach):
-        return True
-    # Their middles on the segment that one goes, seen from the other, against the balls round them.
-    between = wp.float64(0.5) * (boxes.low[j] + boxes.high[j] - boxes.low[i] - boxes.high[i])
-    part = wp.clamp(
-        wp.dot(between, way) / wp.max(wp.dot(way, way), wp.float64(1.0e-300)), wp.float64(0.0), wp.float64(1.0)
-    )
-    sizes = wp.length(boxes.high[i] - boxes.low[i]) + wp.length(boxes.high[j] - boxes.low[j])
-    return wp.length(between - part * way) > wp.float64(0.5) * sizes + reach
+        boxes[place + LANES * axis] = lower(low[axis])
+        boxes[place + LANES * (3 + axis)] = upper(high[axis])
+        boxes[place + LANES * (6 + axis)] = lower(to_low[axis])
+        boxes[place + LANES * (9 + axis)] = upper(to_high[axis])
 
 
 @wp.kernel
-def sweep_boxes(first: wp.int32, parts: Topology, motion: Motion, swept: Swept):
-    """Box swept by each cluster, with each vertex anywhere on its path: some vertices may stop while others move on."""
+def bound_clusters(first: wp.int32, parts: Topology, query: Query, boxes: Boxes):
+    """Boxes and search distances of the clusters, and whether they are queried."""
     i = first + wp.tid()
-    low, high = wp.vec3d(FAR), wp.vec3d(-FAR)
-    reach, near = wp.float64(0.0), wp.float64(0.0)
+    low, high, to_low, to_high = wp.vec3d(FAR), wp.vec3d(-FAR), wp.vec3d(FAR), wp.vec3d(-FAR)
+    radius, asked = wp.float64(0.0), wp.int32(0)
     for k in range(parts.first_corner[i], parts.first_corner[i + 1]):
         v = parts.corners[k]
-        at = motion.start[v]
-        end = at + motion.path[v]
-        low, high = wp.min(low, wp.min(at, end)), wp.max(high, wp.max(at, end))
-        reach = wp.max(reach, motion.radius[v] + motion.slack[v])
-        near = wp.max(near, motion.radius[v])
-    widened = ROUNDING * wp.max(wp.abs(low), wp.abs(high)) + wp.vec3d(reach)
-    swept.low[i] = single(low - widened)
-    swept.high[i] = single(high + widened)
-    swept.near[i] = near
+        low, high = wp.min(low, query.start[v]), wp.max(high, query.start[v])
+        to_low, to_high = wp.min(to_low, query.end[v]), wp.max(to_high, query.end[v])
+        radius = wp.max(radius, query.radius[v])
+        if query.asked[v]:
+            asked = 1
+    put(boxes.clusters, i, low, high, to_low, to_high)
+    radius = WIDER * (radius + wp.float64(0.5) * query.floor)
+    boxes.radius[i] = wp.float32(radius)
+    boxes.asked[i] = asked == 1
+    low, high = wp.min(low, to_low) - wp.vec3d(radius), wp.max(high, to_high) + wp.vec3d(radius)
+    boxes.low[i] = wp.vec3f(lower(low[0]), lower(low[1]), lower(low[2]))
+    boxes.high[i] = wp.vec3f(upper(high[0]), upper(high[1]), upper(high[2]))
 
 
 @wp.func
-def mean_path(parts: Topology, path: wp.array(dtype=wp.vec3d), i: wp.int32):
-    """Mean path of a cluster's vertices, and the largest deviation of a vertex from it."""
-    total, most = wp.vec3d(), wp.float64(0.0)
-    begin, end = parts.first_corner[i], parts.first_corner[i + 1]
-    for k in range(begin, end):
-        total += path[parts.corners[k]]
-    mean = total / wp.float64(wp.max(end - begin, 1))
-    for k in range(begin, end):
-        most = wp.max(most, wp.length(path[parts.corners[k]] - mean))
-    return mean, most
+def put_part(boxes: Boxes, query: Query, k: wp.int32, c: wp.vec3i):
+    """Write the box of a part with the corners c."""
+    p, q, r = query.start[c[0]], query.start[c[1]], query.start[c[2]]
+    s, t, u = query.end[c[0]], query.end[c[1]], query.end[c[2]]
+    low, high = wp.min(p, wp.min(q, r)), wp.max(p, wp.max(q, r))
+    put(boxes.parts, k, low, high, wp.min(s, wp.min(t, u)), wp.max(s, wp.max(t, u)))
 
 
 @wp.kernel
-def bound_parts(first: wp.int32, parts: Topology, motion: Motion, active: wp.array(dtype=wp.int32), boxes: Boxes):
-    """Start boxes of some clusters, and of their edges and faces."""
-    i = active[first + wp.tid()]
-    lowest, highest = wp.vec3d(FAR), wp.vec3d(-FAR)
-    for k in range(parts.first_corner[i], parts.first_corner[i + 1]):
-        at = motion.start[parts.corners[k]]
-        lowest, highest = wp.min(lowest, at), wp.max(highest, at)
-    boxes.low[i] = lowest
-    boxes.high[i] = highest
-    for k in range(parts.first_edge[i], parts.first_edge[i + 1]):
-        a, b = motion.start[parts.edges[k][0]], motion.start[parts.edges[k][1]]
-        boxes.edge_low[k] = lowest_of(wp.min(a, b))
-        boxes.edge_high[k] = highest_of(wp.max(a, b))
-    for k in range(parts.first_face[i], parts.first_face[i + 1]):
-        t = parts.faces[k]
-        p, q, r = motion.start[t[0]], motion.start[t[1]], motion.start[t[2]]
-        boxes.face_low[k] = lowest_of(wp.min(p, wp.min(q, r)))
-        boxes.face_high[k] = highest_of(wp.max(p, wp.max(q, r)))
+def bound_parts(first: wp.int32, parts: Topology, query: Query, which: wp.array(dtype=wp.int32), boxes: Boxes):
+    """Boxes of the parts of some clusters."""
+    i = which[first + wp.tid()]
+    for kind in range(3):
+        row = kind * (parts.clusters + 1) + i
+        for k in range(LANES * parts.first[row], LANES * parts.first[row + 1]):
+            if parts.parts[k][0] >= 0:
+                put_part(boxes, query, k, parts.parts[k])
 
 
-@wp.kernel
-def average_paths(first: wp.int32, parts: Topology, motion: Motion, active: wp.array(dtype=wp.int32), boxes: Boxes):
-    """Mean path of some clusters, largest deviation of a vertex from it, search distance, and whether it is queried."""
-    i = active[first + wp.tid()]
-    asked, radius = wp.int32(0), wp.float64(0.0)
-    for k in range(parts.first_corner[i], parts.first_corner[i + 1]):
-        v = parts.corners[k]
-        radius = wp.max(radius, motion.radius[v] + motion.slack[v])
-        if motion.asked[v]:
-            asked = 1
-    mean, spread = mean_path(parts, motion.path, i)
-    boxes.mean[i] = mean
-    boxes.spread[i] = spread
-    boxes.radius[i] = radius
-    boxes.asked[i] = asked
-
-
-def room_for_swept(size: int, device: str) -> Any:
-    """Uninitialized boxes of whole paths."""
-    swept = Swept()
-    swept.low, swept.high = (wp.empty(size, dtype=wp.vec3f, device=device) for _ in range(2))
-    swept.near = wp.empty(size, dtype=wp.float64, device=device)
-    return swept
-
-
-def room_for_boxes(parts: Parts) -> Any:
-    """Uninitialized boxes."""
-    size, device = parts.count, parts.level.device
-    boxes = Boxes()
-    for name in ("low", "high", "mean"):
-        setattr(boxes, name, wp.empty(size, dtype=wp.vec3d, device=device))
-    boxes.spread, boxes.radius = (wp.empty(size, dtype=wp.float64, device=device) for _ in range(2))
-    boxes.asked = wp.empty(size, dtype=wp.int32, device=device)
-    for name, count in (("edge", len(parts.level.edges)), ("face", len(parts.level.triangles))):
-        for end in ("low", "high"):
-            setattr(boxes, f"{name}_{end}", wp.empty(count, dtype=wp.vec3f, device=device))
+def boxes_for(topology: Any, device: str) -> Any:
+    """Empty boxes of all clusters and parts."""
+    boxes, count = Boxes(), topology.clusters
+    block = np.repeat(np.float32(FAR) * np.repeat(np.float32([1, -1, 1, -1]), 3), LANES)
+    for name, size in (("clusters", -(-count // LANES)), ("parts", len(topology.parts) // LANES)):
+        setattr(boxes, name, wp.array(np.tile(block, size), dtype=wp.float32, device=device))
+    boxes.low, boxes.high = (wp.empty(count, dtype=wp.vec3f, device=device) for _ in range(2))
+    boxes.radius = wp.empty(count, dtype=wp.float32, device=device)
+    boxes.asked = wp.empty(count, dtype=wp.bool, device=device)
     return boxes
 
 
-class _Nothing:
-    """Default vertex arrays of a motion; kernels only read them.
-
-    Attributes:
-        all: True for each vertex.
-        tangle: -1 for each vertex.
-        zero: 0 for each vertex.
-    """
-
-    def __init__(self, count: int, device: torch.device) -> None:
-        """Fill the arrays."""
-        self.all = wp.from_torch(torch.ones(count, dtype=torch.bool, device=device))
-        self.tangle = wp.from_torch(torch.full((count,), -1, dtype=torch.int32, device=device))
-        self.zero = wp.from_torch(torch.zeros(count, dtype=torch.float64, device=device))
-
-    @staticmethod
-    @functools.lru_cache(maxsize=4)
-    def of(count: int, device: torch.device) -> _Nothing:
-        """Cached arrays for a number of vertices."""
-        return _Nothing(count, device)
+@functools.lru_cache(maxsize=16)
+def _filled(value: float, count: int, device: torch.device, dtype: torch.dtype) -> wp.array:
+    """A constant for each vertex, which kernels only read."""
+    return wp.from_torch(torch.full((count,), value, dtype=dtype, device=device))
 
 
-def motion_of(
+def query_of(
     start: Tensor,
-    path: Tensor,
+    end: Tensor | None = None,
     *,
+    kind: int = MOVE,
+    floor: float = 0.0,
     asked: Tensor | None = None,
     tangle: Tensor | None = None,
     radius: Tensor | None = None,
     play: Tensor | None = None,
-    slack: Tensor | None = None,
     half: float = 0.0,
 ) -> Any:
-    """Vertex data as a Warp struct; a radius makes it a query for near pairs.
-
-    Args:
-        start: Positions [m], float64, shape (V, 3).
-        path: Displacement of each vertex [m], float64, shape (V, 3).
-        asked: Vertices of which each queried pair must contain at least one; all if None, shape (V,).
-        tangle: The tangle of each vertex, int32, -1 outside tangles; or None.
-        radius: Search radius, as for `Reach` [m], or None.
-        play: As for `Reach` [m], or None.
-        slack: Position tolerance of each vertex [m], or None.
-        half: As for `Reach`.
-    """
-    motion, nothing = Motion(), _Nothing.of(len(start), start.device)
-    motion.start, motion.path = (wp.from_torch(each.contiguous(), dtype=wp.vec3d) for each in (start, path))
-    motion.asked = nothing.all if asked is None else wp.from_torch(asked.contiguous())
-    motion.tangle = nothing.tangle if tangle is None else wp.from_torch(tangle.contiguous())
-    motion.is_still, motion.half = radius is not None, half
-    motion.radius, motion.play, motion.slack = (
-        nothing.zero if each is None else wp.from_torch(each.contiguous()) for each in (radius, play, slack)
+    """A query as a Warp struct; its arguments are described there. Positions are float64 of shape (V, 3)."""
+    query = Query()
+    query.kind, query.floor, query.half = int(kind), floor, half
+    query.start = wp.from_torch(start.contiguous(), dtype=wp.vec3d)
+    query.end = query.start if end is None else wp.from_torch(end.contiguous(), dtype=wp.vec3d)
+    given = (
+        ("asked", asked, 1.0, torch.bool),
+        ("tangle", tangle, -1.0, torch.int32),
+        ("radius", radius, 0.0, torch.float64),
+        ("play", play, 0.0, torch.float64),
     )
-    return motion
+    for name, values, default, dtype in given:
+        array = _filled(default, len(start), start.device, dtype) if values is None else values.contiguous()
+        setattr(query, name, array if values is None else wp.from_torch(array))
+    return query

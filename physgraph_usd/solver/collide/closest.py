@@ -15,12 +15,24 @@ from ..level import Level
 from ..mesh.kernels import KERNELS
 from ..mesh.threads import LEAST_QUERIES, Launch
 from .distance import weights_on_triangle
-from .domains import holds
 
 wp.set_module_options(KERNELS)
 
 FAR = wp.constant(wp.float64(1.0e30))
 """Distance for an empty subset."""
+
+
+@wp.func
+def holds(members: wp.array(dtype=wp.int32), begin: wp.int32, end: wp.int32, wanted: wp.int32):
+    """True if an ascending list contains a number."""
+    low, high = wp.int32(0) + begin, wp.int32(0) + end
+    while low < high:
+        half = (low + high) // 2
+        if members[half] < wanted:
+            low = half + 1
+        else:
+            high = half
+    return low < end and members[low] == wanted
 
 
 @wp.kernel

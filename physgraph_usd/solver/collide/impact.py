@@ -93,23 +93,20 @@ def part_kept(
 @wp.func
 def impact_of(
     face: wp.bool,
-    a: wp.vec3d,
     b: wp.vec3d,
     c: wp.vec3d,
     d: wp.vec3d,
-    u: wp.vec3d,
     v: wp.vec3d,
     p: wp.vec3d,
     q: wp.vec3d,
     floor: wp.float64,
 ):
-    """Fraction of their paths u, v, p, q that the corners a, b, c, d can move, in (0, 1]; 1 if the parts touch already.
+    """Fraction of their paths v, p, q that the corners b, c, d can move, in (0, 1]; 1 if the parts touch already.
 
-    If no plane keeps the parts apart all the way, the plane may change at halves of the path, quarters and so on.
+    Positions and paths are relative to the first corner's: far from the origin differences lose no digits. If no plane
+    keeps the parts apart all the way, the plane may change at halves of the path, quarters and so on.
     """
-    one, zero = wp.float64(1.0), a - a
-    # About their first corner: far from the origin differences lose no digits.
-    b, c, d, v, p, q = b - a, c - a, d - a, v - u, p - u, q - u
+    one, zero = wp.float64(1.0), wp.vec3d()
     distance = distance_of(face, zero, b, c, d)
     if distance <= wp.float64(0.0):
         return one

@@ -13,10 +13,10 @@ from torch import Tensor
 
 from ..mesh.kernels import KERNELS
 from ..mesh.threads import argument, run
-from .detector import Detector
 from .distance import weights_of
-from .narrow_phase import Reach
+from .pairs import Reach
 from .parts import Parts
+from .search import near_parts
 
 wp.set_module_options(KERNELS)
 
@@ -74,19 +74,16 @@ def weights(
     return out
 
 
-def near_pairs(
-    parts: Parts, x: Float[Tensor, "vertices 3"], near: Reach, *, detector: Detector | None = None
-) -> NearPairs:
+def near_pairs(parts: Parts, x: Float[Tensor, "vertices 3"], near: Reach) -> NearPairs:
     """All vertex-face and edge-edge pairs without a common vertex within the search distance.
 
     Args:
         parts: The parts.
         x: Positions [m].
         near: Search radii; pairs near at rest may be included beyond the radii.
-        detector: Collision detector of the same parts and reach for reuse, or None.
     """
     at = x.double()
-    pairs = (detector or Detector.once(parts, near)).near(x)
+    pairs = near_parts(parts, x, near)
     weight, corners = weights(at, pairs.corners, pairs.face, threads=parts.level.threads), pairs.corners.long()
     way = (weight.unsqueeze(2) * at[corners]).sum(dim=1)
     radius = near.radius[corners]

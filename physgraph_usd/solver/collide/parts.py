@@ -1,20 +1,23 @@
-"""The parts of a level's cloth: pairs that may be in contact, and sewn vertices."""
+"""The parts of a level's cloth that may be in contact, and sewn vertices."""
 
 # Warp's structs are typed by values that only Warp reads.
-# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false
 from __future__ import annotations
+
+from functools import cached_property
 
 import numpy as np
 import torch
 import warp as wp
-from jaxtyping import Bool, Float, Int
-from torch import Tensor
+from jaxtyping import Int
 
 from ..level import Level
-from ..mesh.topology import adjacency, owned_sides
-from .clusters import Clusters
-from .patches import MonotonePatches
-from .topology import Topology
+from ..mesh.kernels import start_warp
+from .boxes import bound_clusters, boxes_for, query_of
+from .topology import topology_of
+
+SIZE = {"cpu": 24, "cuda": 8}
+"""Most vertices of a cluster: a thread compares two clusters, and CUDA has more threads."""
 
 
 class Parts:
@@ -22,13 +25,10 @@ class Parts:
 
     Attributes:
         level: The level.
-        count: Number of clusters.
-        topology: Warp struct of the topology.
-        patches: Monotone patches of the level.
+        topology: Warp struct of the parts by cluster.
         links: Connected vertices: edges and sewn pairs, shape (N, 2), int64.
         lengths: Lengths of the links at rest, 0 if sewn [m], shape (N,), float64.
-        spacing: Mean length of the edges at rest [m].
-        shortest: Shortest edge at each vertex at rest [m], shape (V,), float64.
+        boxes: Warp struct of boxes, written by each search.
     """
 
     def __init__(self, level: Level, meets: np.ndarray, label: Int[np.ndarray, " vertices"] | None = None) -> None:
@@ -39,46 +39,23 @@ class Parts:
             meets: True for pairs of garments in contact, symmetric, shape (G, G), bool.
             label: Vertices with equal labels are sewn together, or equal; None for no seams, shape (V,).
         """
+        start_warp()  # Views of tensors do not start Warp by themselves.
         self.level = level
-        edges, triangles = (each.cpu().numpy() for each in (level.edges, level.triangles))
-        clusters = Clusters(level, adjacency(edges, level.vertex_count), owned_sides(edges, triangles))
-        self.count = clusters.count
-        table = self.topology = Topology()
-        table.first_vertex, table.vertices = clusters.vertices
-        table.first_edge, table.edges, table.edge_number = clusters.edges
-        table.first_face, table.faces, table.face_number = clusters.faces
-        table.first_corner, table.corners = (self._array(each) for each in _corners(clusters))
-        self._corner = wp.to_torch(table.corners).long()
-        counts = wp.to_torch(table.first_corner).diff().long()
-        self._cluster = torch.arange(self.count, device=level.device).repeat_interleave(counts)
-        table.garment, table.garments = clusters.garment, len(meets)
-        table.meets = self._array(np.asarray(meets).ravel())
         sewn = np.zeros((0, 2), np.int64) if label is None else _sewn(label)
-        self.links = torch.as_tensor(np.concatenate([edges.astype(np.int64), sewn]), device=level.device)
-        shortest = torch.full_like(level.rest[:, 0].double(), torch.inf)
-        length = level.rest_length.double().repeat_interleave(2)
-        self.shortest = shortest.scatter_reduce(0, level.edges.long().reshape(-1), length, "amin")
+        edges = level.edges.cpu().numpy().astype(np.int64)
+        self.links = torch.as_tensor(np.concatenate([edges, sewn]), device=level.device)
         self.lengths = torch.cat([level.rest_length.double(), level.rest.new_zeros(len(sewn)).double()])
-        self.spacing = float(level.rest_length.double().mean()) if len(level.rest_length) else 0.0
-        table.owner = self._array(level.vertex_garment.cpu().numpy())
-        self._rest = level.rest.double().contiguous()
-        table.rest = wp.from_torch(self._rest, dtype=wp.vec3d)
-        self.patches = MonotonePatches.of(level, table, self.count)
-        table.label = self._array(np.arange(level.vertex_count) if label is None else label)
+        label = np.arange(level.vertex_count) if label is None else label
+        self.topology = topology_of(level, meets, label, size=SIZE[torch.device(level.device).type])
+        self.boxes = boxes_for(self.topology, level.device)
 
-    def least_of(self, values: Float[Tensor, " vertices"]) -> Float[Tensor, " clusters"]:
-        """Minimum of the values at the corners of each cluster."""
-        out = torch.full((self.count,), torch.inf, dtype=values.dtype, device=values.device)
-        return out.scatter_reduce(0, self._cluster, values[self._corner], "amin")
-
-    def with_any(self, vertices: Bool[Tensor, " vertices"]) -> Bool[Tensor, " clusters"]:
-        """Mask of the clusters with a given vertex at a corner."""
-        out = torch.zeros(self.count, dtype=torch.bool, device=vertices.device)
-        out[self._cluster[vertices[self._corner]]] = True
-        return out
-
-    def _array(self, values: np.ndarray) -> wp.array:
-        return wp.array(np.ascontiguousarray(values, dtype=np.int32), dtype=wp.int32, device=self.level.device)
+    @cached_property
+    def tree(self) -> wp.Bvh:
+        """Hierarchy of the clusters' boxes, built at rest, so that no search depends on earlier ones."""
+        at_rest = query_of(self.level.rest.double())
+        inputs = [0, self.topology, at_rest, self.boxes]
+        wp.launch(bound_clusters, dim=self.topology.clusters, inputs=inputs, device=self.level.device)
+        return wp.Bvh(self.boxes.low, self.boxes.high)
 
 
 def _sewn(label: np.ndarray) -> np.ndarray:
@@ -86,16 +63,3 @@ def _sewn(label: np.ndarray) -> np.ndarray:
     first = np.unique(label, return_index=True)[1][np.unique(label, return_inverse=True)[1]]
     later = np.flatnonzero(first != np.arange(len(label)))
     return np.stack([later, first[later]], axis=1)
-
-
-def _corners(clusters: Clusters) -> tuple[np.ndarray, np.ndarray]:
-    """Start of each cluster's corners, and the distinct vertices of its parts."""
-    owned = [
-        np.stack([np.repeat(np.arange(clusters.count), np.diff(first.numpy())), vertex], axis=1)
-        for width, (first, parts) in enumerate((clusters.vertices, clusters.edges[:2], clusters.faces[:2]), start=1)
-        for vertex in parts.numpy().reshape(-1, width).T
-    ]
-    cluster, vertex = np.concatenate(owned).T.astype(np.int64)
-    width = int(vertex.max(initial=0)) + 1
-    cluster, vertex = np.divmod(np.unique(cluster * width + vertex), width)  # Of rows it takes ten times as long.
-    return np.searchsorted(cluster, np.arange(clusters.count + 1)), vertex

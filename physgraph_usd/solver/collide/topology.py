@@ -1,29 +1,124 @@
-"""Warp struct of a level's vertices, edges and faces by cluster."""
+"""The parts of a level's cloth, its vertices, edges and faces, in clusters that are near one another at rest."""
 
 # Warp's structs are typed by values that only Warp reads.
-# pyright: reportArgumentType=false
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false
 from __future__ import annotations
 
+from typing import Any
+
+import numpy as np
 import warp as wp
+
+from ..level import Level
+from ..mesh.topology import owned_sides
+
+LANES = 8
+"""Parts compared at a time; the parts of one kind in a cluster fill whole blocks of as many."""
+VERTEX, EDGE, FACE = (wp.constant(each) for each in range(3))
+"""Kinds of parts."""
 
 
 @wp.struct
 class Topology:
-    """Topology by cluster; `corners` are the distinct vertices of a cluster's parts."""
+    """Parts by cluster, in blocks of `LANES`.
 
+    A cluster's parts of a kind are the blocks from `first[kind * (clusters + 1) + cluster]` to the next entry. A part
+    lists its corners, the last one repeated up to three; -1 fills incomplete blocks. Parts with a common corner in
+    `labels`, which is equal for vertices sewn together, share a vertex. `number` is a part's index in its level.
+    `first_corner` and `corners` are the distinct vertices of each cluster's parts. `meets` tells which garments
+    collide with which. By vertex: `owner` is the garment, `rest` the position at rest.
+    """
+
+    clusters: wp.int32
+    first: wp.array(dtype=wp.int32)
+    parts: wp.array(dtype=wp.vec3i)
+    labels: wp.array(dtype=wp.vec3i)
+    number: wp.array(dtype=wp.int32)
     first_corner: wp.array(dtype=wp.int32)
     corners: wp.array(dtype=wp.int32)
-    first_vertex: wp.array(dtype=wp.int32)
-    vertices: wp.array(dtype=wp.int32)
-    first_edge: wp.array(dtype=wp.int32)
-    edges: wp.array(dtype=wp.vec2i)
-    edge_number: wp.array(dtype=wp.int32)
-    first_face: wp.array(dtype=wp.int32)
-    faces: wp.array(dtype=wp.vec3i)
-    face_number: wp.array(dtype=wp.int32)
     garment: wp.array(dtype=wp.int32)
-    meets: wp.array(dtype=wp.int32)
     garments: wp.int32
-    label: wp.array(dtype=wp.int32)
+    meets: wp.array(dtype=wp.int32)
     owner: wp.array(dtype=wp.int32)
     rest: wp.array(dtype=wp.vec3d)
+
+
+def topology_of(level: Level, meets: np.ndarray, label: np.ndarray, *, size: int) -> Any:
+    """The parts of a level in clusters.
+
+    A face belongs to the cluster of its first corner, an edge to that of one of its faces.
+
+    Args:
+        level: The level.
+        meets: True for pairs of garments in contact, symmetric, shape (G, G), bool.
+        label: Vertices with equal labels are sewn together, or equal, shape (V,).
+        size: Most vertices of a cluster.
+    """
+    edges, faces = (each.cpu().numpy().astype(np.int64) for each in (level.edges, level.triangles))
+    garment, used = level.vertex_garment.cpu().numpy(), np.unique(faces)  # A vertex of no face is no cloth.
+    cluster = np.zeros(level.vertex_count, np.int64)
+    cluster[used] = halved(level.rest.double().cpu().numpy()[used], garment[used], size)
+    count = int(cluster[used].max(initial=-1)) + 1
+    of_face, of_edge, sides = cluster[faces[:, 0]], np.zeros(len(edges), np.int64), owned_sides(edges, faces)
+    of_edge[sides[sides >= 0]] = np.repeat(of_face, 3)[(sides >= 0).ravel()]
+    kinds = ((cluster[used], np.stack([used] * 3, axis=1)), (of_edge, edges[:, [0, 1, 1]]), (of_face, faces))
+    if not count:
+        kinds = tuple((of[:0], corners[:0]) for of, corners in kinds)
+    first, parts, number = zip(*(_blocks(of, corners, count) for of, corners in kinds), strict=True)
+    begin = np.cumsum([0, *(each[-1] for each in first)])
+    pairs = np.unique(np.concatenate([np.repeat(of, 3) * level.vertex_count + c.ravel() for of, c in kinds]))
+    table, device = Topology(), level.device
+
+    def array(values: np.ndarray, dtype: type = wp.int32) -> wp.array:
+        return wp.array(np.ascontiguousarray(values, dtype=np.int32), dtype=dtype, device=device)
+
+    table.clusters, table.garments = count, len(meets)
+    table.first = array(np.concatenate([each + at for each, at in zip(first, begin, strict=False)]))
+    corners = np.concatenate(parts)
+    table.parts, table.number = array(corners, wp.vec3i), array(np.concatenate(number))
+    table.labels = array(np.where(corners < 0, -1, label[corners]), wp.vec3i)
+    table.first_corner = array(np.searchsorted(pairs, np.arange(count + 1) * level.vertex_count))
+    table.corners = array(pairs % max(level.vertex_count, 1))
+    by_cluster = np.zeros(count, np.int32)
+    by_cluster[cluster[used]] = garment[used]
+    table.garment, table.owner = array(by_cluster), array(garment)
+    table.meets = array(np.asarray(meets).ravel())
+    table.rest = wp.array(level.rest.double().cpu().numpy(), dtype=wp.vec3d, device=device)
+    return table
+
+
+def halved(points: np.ndarray, group: np.ndarray, size: int) -> np.ndarray:
+    """The cluster of each point: each group is halved across its longest axis until no cluster is larger than a size.
+
+    Args:
+        points: Points, shape (N, 3).
+        group: Points of different groups share no cluster, shape (N,), not negative.
+        size: Most points of a cluster.
+
+    Returns:
+        Clusters from 0 in the order of the halves, so that neighbouring numbers are near one another, shape (N,).
+    """
+    cluster = group.astype(np.int64)
+    while len(points):
+        cluster, count = np.unique(cluster, return_inverse=True, return_counts=True)[1:]
+        if count.max() <= size:
+            break
+        order, first = np.argsort(cluster, kind="stable"), np.cumsum(count) - count
+        spread = np.maximum.reduceat(points[order], first) - np.minimum.reduceat(points[order], first)
+        order = np.lexsort((points[np.arange(len(points)), spread.argmax(axis=1)[cluster]], cluster))
+        later = np.zeros(len(points), bool)
+        later[order] = np.arange(len(points)) - first[cluster[order]] >= ((count + 1) // 2)[cluster[order]]
+        cluster = 2 * cluster + (later & (count > size)[cluster])
+    return cluster
+
+
+def _blocks(cluster: np.ndarray, corners: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """First block of each cluster, corners of the parts in blocks, and the parts' numbers; -1 fills the blocks."""
+    size = np.bincount(cluster, minlength=count)
+    first = np.concatenate([[0], np.cumsum((size + LANES - 1) // LANES)])
+    order = np.argsort(cluster, kind="stable")
+    owner = cluster[order]
+    place = LANES * first[owner] + np.arange(len(order)) - (np.cumsum(size) - size)[owner]
+    parts, number = np.full((LANES * first[-1], 3), -1), np.full(LANES * first[-1], -1)
+    parts[place], number[place] = corners[order], order
+    return first, parts, number

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 
 from ..mesh.kernels import KERNELS
-from ..mesh.piercing import passes_through
+from ..mesh.piercing import passes_through, wide
 from ..mesh.threads import LEAST_QUERIES, Launch
 
 wp.set_module_options(KERNELS)
@@ -22,12 +22,13 @@ wp.set_module_options(KERNELS)
 
 @wp.func
 def _pierces(x: wp.array(dtype=wp.vec3f), t: wp.vec3i, u: wp.vec3i):
-    """True if a side of triangle t that shares no corner with triangle u passes through u."""
+    """True if a side of triangle t that shares no corner's place with triangle u passes through u."""
     found = bool(False)  # noqa: UP018 - a literal would be a constant to Warp
+    p, q, r = wide(x[u[0]]), wide(x[u[1]]), wide(x[u[2]])
     for side in range(3):
-        a, b = t[side], t[(side + 1) % 3]
-        beside = a == u[0] or a == u[1] or a == u[2] or b == u[0] or b == u[1] or b == u[2]
-        if not beside and passes_through(x, wp.vec2i(a, b), u):
+        a, b = wide(x[t[side]]), wide(x[t[(side + 1) % 3]])
+        beside = a == p or a == q or a == r or b == p or b == q or b == r  # noqa: PLR1714 - Warp has no `in`
+        if not beside and passes_through(a, b, u, p, q, r):
             found = True
     return found
 

@@ -13,8 +13,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ..collide.impact import TIGHT
-from ..collide.narrow_phase import Pairs
 from ..collide.near import weights
+from ..collide.pairs import Pairs
 from ..mesh.kernels import KERNELS
 from ..mesh.stencil import incidence
 from ..mesh.threads import Launch, argument

@@ -17,7 +17,6 @@ from torch import Tensor
 
 from ..collide.closest import displacements_to
 from ..collide.crossings import Crossings, crossings
-from ..collide.detector import Detector
 from ..deadline import is_over
 from ..mesh.topology import joined_by
 from .cloth_mesh import ClothMesh
@@ -51,7 +50,7 @@ class _Through:
 
 
 def drawn_apart(
-    mesh: ClothMesh, x: Float[Tensor, "vertices 3"], start: Crossings, *, gap: float, detector: Detector
+    mesh: ClothMesh, x: Float[Tensor, "vertices 3"], start: Crossings, *, gap: float
 ) -> tuple[Float[Tensor, "vertices 3"], int]:
     """Move cut-off pieces back to their side, as long as the number of crossings falls.
 
@@ -61,7 +60,6 @@ def drawn_apart(
         start: Crossings at x.
         gap: Largest final distance from the penetrated cloth [m]; replaced by a fraction of an edge if fewer parts
             cross then.
-        detector: Collision detector of the cloth.
 
     Returns:
         Positions [m], x itself if nothing improves, and the number of crossings there.
@@ -75,7 +73,7 @@ def drawn_apart(
         at, found, through = x, start, first
         for _ in range(PASSES):
             moved = through.back(at, wide)
-            after = crossings(mesh.parts, moved, detector=detector)
+            after = crossings(mesh.parts, moved)
             if after.count >= found.count:
                 break
             at, found = moved, after

@@ -15,9 +15,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..collide.crossings import Crossings, crossings
-from ..collide.detector import Detector
-from ..collide.narrow_phase import Reach
+from ..collide.pairs import Reach
 from ..collide.parts import Parts
+from ..collide.search import near_parts
 from ..forces.seam import Seam
 from ..forces.self_contact import PairConstraints, SelfContact
 from ..level import Level
@@ -124,11 +124,6 @@ class ClothView:
         return float(self._thickness.mean())
 
     @cached_property
-    def detector(self) -> Detector:
-        """Collision detector of this frame."""
-        return Detector(self.parts, self.near)
-
-    @cached_property
     def _springs(self) -> ClothSprings:
         """Contact spring finder of this frame."""
         return ClothSprings(self._level, self._base, self._thickness, self._settings.cloth_stiffness)
@@ -147,7 +142,7 @@ class ClothView:
     def _look(self, x: Tensor) -> _Looked:
         """Cached crossings and tangles at x."""
         if self._looked is None or self._looked.x is not x or self._looked.version != x._version:
-            found = crossings(self.parts, x, detector=self.detector)
+            found = crossings(self.parts, x)
             corners = self.mesh.corners_of(found)
             tangles = Tangles.find(self.mesh, corners, rings=TANGLED) if found.count else None
             self._looked = _Looked(x, x._version, found, tangles)
@@ -179,7 +174,7 @@ class ClothView:
 
     def _gaps(self, x: Tensor, found: Crossings, *, all_crossings: bool) -> PairConstraints:
         """Springs between all near parts that do not cross."""
-        near = self._springs.find(x, self.detector.near(x))
+        near = self._springs.find(x, near_parts(self.parts, x, self.near))
         if found.count:
             corners, tangles = near.near.corners.long(), self.tangles(x)
             kept = ~self.mesh.crossed(found)[corners].any(dim=1)

@@ -11,7 +11,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..collide.crossings import crossings
-from ..collide.detector import Detector
 from ..deadline import is_over
 from ..forces.contact import Contact
 from ..forces.seam import Seam
@@ -90,7 +89,7 @@ class LevelContact:
         if self.promise is None or not self.crosses(x):
             return x
         view = self.promise.view
-        out = drawn_apart(view.mesh, x, view.crossings(x), gap=view.gap, detector=view.detector)[0]
+        out = drawn_apart(view.mesh, x, view.crossings(x), gap=view.gap)[0]
         return x if out is x else Placed(self.closed(out))
 
     def without_hope(self, x: Placed, start: Placed) -> Placed:
@@ -197,10 +196,9 @@ class FrameContact:
         if self._bodies is not None:
             out = repaired_cage(cage, out, bodies=self._bodies.at(cage, self._levels[-1]), mesh=mesh)
         if self._settings.cloth == "pairs":
-            detector = Detector(mesh.parts)
-            found = crossings(mesh.parts, out, detector=detector)
+            found = crossings(mesh.parts, out)
             gap = float(self._thickness.mean())
-            apart, left = drawn_apart(mesh, out, found, gap=gap, detector=detector)
+            apart, left = drawn_apart(mesh, out, found, gap=gap)
             crosses = found.count > 0 if out is self._coarse else None
             out = apart if found.count and not left else out
         return (out if seam is None or out is self._coarse else seam.closed(out)), crosses

@@ -9,7 +9,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ..collide.narrow_phase import Pairs
+from ..collide.pairs import Pairs
+from ..collide.search import impacts
 from ..deadline import is_over
 from ..level import Placed
 from .along import Planes, along
@@ -84,10 +85,10 @@ class Promise:
 
         Only pairs of vertices with changed ends are checked again.
         """
-        parts, detector = self.view.parts, self.view.detector
+        parts = self.view.parts
         options = _MoveOptions(floor=self.floor, tangle=tangle)
         moves = (aim != start).any(dim=1)
-        met = detector.impacts(start, aim, **options, asked=moves)
+        met = impacts(parts, start, aim, **options, asked=moves)
         if not len(met.value):
             return Placed(aim)
         at, ends = start.double(), aim
@@ -96,12 +97,12 @@ class Promise:
         for _ in range(ROUNDS):
             last, way = ends, along(wanted, planes, free=free, threads=parts.level.threads)
             ends = self.view.closed((at + way).to(aim))
-            met = detector.impacts(start, ends, **options, asked=_corners(met, (ends != last).any(dim=1)))
+            met = impacts(parts, start, ends, **options, asked=_corners(met, (ends != last).any(dim=1)))
             if not len(met.value):
                 return Placed(ends)
             planes = planes.joined(Planes.of(at, ends.double(), met, self.floor, corners=True))
         asked = _corners(met, torch.zeros_like(moves))
-        return safe_move(start, ends, parts, **options, detector=detector, asked=asked).x
+        return safe_move(start, ends, parts, **options, asked=asked).x
 
 
 def _corners(met: Pairs, others: Bool[Tensor, " vertices"]) -> Bool[Tensor, " vertices"]:

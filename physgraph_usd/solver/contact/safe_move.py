@@ -18,8 +18,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ..collide.detector import Detector
 from ..collide.parts import Parts
+from ..collide.search import impacts
 from ..deadline import is_over
 from ..level import Placed
 
@@ -57,7 +57,6 @@ def safe_move(
     *,
     floor: float,
     tangle: Int[Tensor, " vertices"] | None = None,
-    detector: Detector | None = None,
     asked: Bool[Tensor, " vertices"] | None = None,
 ) -> Moved:
     """Move vertices towards wanted positions as far as a plane keeps each pair of parts apart.
@@ -72,7 +71,6 @@ def safe_move(
         floor: Gap that pairs keep [m]; a pair that is already closer keeps most of its distance.
         tangle: The tangle of each vertex, int32, -1 outside tangles; pairs inside a single tangle have no promise. None
             without tangles.
-        detector: Collision detector of the same parts for reuse, or None.
         asked: Vertices whose pairs must be checked; pairs without such a vertex are known to be safe. None checks every
             vertex that moves.
 
@@ -83,9 +81,8 @@ def safe_move(
     way = wanted.double() - at
     share = torch.ones(len(way), dtype=torch.float64, device=way.device)
     x, asked = wanted, (way != 0).any(dim=1) if asked is None else asked
-    detector = detector or Detector.once(parts)
     for attempt in range(len(way) + ROUNDS):
-        more = detector.impacts(start, x, floor=floor, asked=asked, tangle=tangle)
+        more = impacts(parts, start, x, floor=floor, asked=asked, tangle=tangle)
         if not len(more.value):
             break
         least = torch.ones_like(share)

@@ -21,8 +21,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..collide.distance import weights_of
-from ..collide.narrow_phase import Pairs
 from ..collide.near import NearPairs
+from ..collide.pairs import Pairs
 from ..forces.self_contact import PairConstraints
 from ..level import Level
 from ..mesh.kernels import KERNELS

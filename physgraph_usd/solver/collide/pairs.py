@@ -1,0 +1,55 @@
+"""Pairs of parts: a vertex and a face, or two edges."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Reach:
+    """Search radii of near pairs.
+
+    Attributes:
+        radius: Two parts are near within the sum of their radii, the largest of their corners' radii [m], shape (V,),
+            float64.
+        play: Parts of one garment are near only within `half` of their distance at rest plus twice the least play [m],
+            shape (V,).
+        half: Fraction of the distance at rest; a large number omits no pair.
+    """
+
+    radius: Float[Tensor, " vertices"]
+    play: Float[Tensor, " vertices"]
+    half: float
+
+
+@dataclass(frozen=True, eq=False)
+class Pairs:
+    """Pairs of parts.
+
+    Attributes:
+        corners: A vertex and the corners of a face, or the ends of two edges, shape (N, 4).
+        value: For moves, the safe fraction of the paths, in (0, 1); for near pairs, the distance over the search
+            distance; shape (N,).
+        face: True for a vertex and a face, shape (N,).
+    """
+
+    corners: Int[Tensor, "pairs 4"]
+    value: Float[Tensor, " pairs"]
+    face: Bool[Tensor, " pairs"]
+
+    @staticmethod
+    def empty(count: int, device: torch.device | str) -> Pairs:
+        """Uninitialized pairs."""
+        corners = torch.empty((count, 4), dtype=torch.int32, device=device)
+        value = torch.empty(count, dtype=torch.float64, device=device)
+        return Pairs(corners, value, torch.empty(count, dtype=torch.bool, device=device))
+
+    def where(self, kept: Bool[Tensor, " pairs"] | Int[Tensor, " kept"]) -> Pairs:
+        """The selected pairs."""
+        if kept.dtype == torch.bool:  # Once for all three.
+            kept = torch.nonzero(kept).squeeze(1)
+        return Pairs(self.corners[kept], self.value[kept], self.face[kept])

@@ -1,0 +1,166 @@
+"""Search of a level's cloth: near pairs, pairs that come too near on straight paths, and crossings.
+
+Every search is complete and keeps nothing: boxes of all clusters at both ends of the move, pairs of clusters that no
+axis separates at both ends, and their parts in the same way.
+"""
+
+# Warp's kernels are typed by values that only Warp reads.
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportIndexIssue=false, reportCallIssue=false, reportGeneralTypeIssues=false
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+import warp as wp
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from ..mesh.kernels import KERNELS
+from ..mesh.threads import LEAST_PER_THREAD, LEAST_QUERIES, argument, run
+from .boxes import CROSSING, MOVE, NEAR, Boxes, bound_clusters, bound_parts, overlapping, query_of
+from .narrow_phase import Found, find_pairs
+from .pairs import Pairs, Reach
+from .parts import Parts
+from .topology import LANES, Topology
+
+wp.set_module_options(KERNELS)
+
+CLUSTERS = 32
+"""Room for pairs of clusters per cluster before these are counted."""
+PAIRS, LEAST, MOST = 2**19, 16, 64
+"""Room for pairs of parts, shared by pairs of clusters, and its bounds for each; what has no room is searched twice."""
+
+
+@wp.kernel
+def find_clusters(
+    first: wp.int32,
+    parts: Topology,
+    boxes: Boxes,
+    tree: wp.uint64,
+    room: wp.int32,
+    out: wp.array(dtype=wp.int32),
+    count: wp.array(dtype=wp.int32),
+):
+    """Clusters that no axis keeps away from each queried one at both ends, each pair once; counted without room too."""
+    i, j, n = first + wp.tid(), wp.int32(0), wp.int32(0)
+    if boxes.asked[i]:
+        around = wp.bvh_query_aabb(tree, boxes.low[i], boxes.high[i])
+        while wp.bvh_query_next(around, j):
+            if j < i and boxes.asked[j]:
+                continue
+            if parts.meets[parts.garment[i] * parts.garments + parts.garment[j]] == 0:
+                continue
+            room_of_both = boxes.radius[i] + boxes.radius[j]
+            near = overlapping(boxes.clusters, i, boxes.clusters, j // LANES, 1, room_of_both)
+            if (wp.int32(near) >> (j % LANES)) & 1 == 1:
+                if n < room:
+                    out[i * room + n] = j
+                n += 1
+    count[i] = n
+
+
+def near_parts(parts: Parts, x: Float[Tensor, "vertices 3"], reach: Reach) -> Pairs:
+    """All near pairs at x [m]."""
+    radius, play = reach.radius.double(), reach.play.double()
+    return _search(parts, query_of(x.double(), kind=NEAR, radius=radius, play=play, half=reach.half))
+
+
+def impacts(
+    parts: Parts,
+    start: Float[Tensor, "vertices 3"],
+    end: Float[Tensor, "vertices 3"],
+    *,
+    floor: float,
+    asked: Bool[Tensor, " vertices"],
+    tangle: Int[Tensor, " vertices"] | None = None,
+) -> Pairs:
+    """All pairs of parts that no plane keeps apart on straight paths (`impact`).
+
+    Args:
+        parts: The parts.
+        start: Positions [m].
+        end: End positions [m].
+        floor: Gap that pairs keep [m]; a pair that is already closer keeps most of its distance.
+        asked: Vertices of which each pair must contain at least one.
+        tangle: The tangle of each vertex, int32, -1 outside tangles; pairs inside a single tangle are skipped; or None.
+    """
+    if not bool(asked.any()):
+        return Pairs.empty(0, asked.device)
+    query = query_of(start.double(), end.double(), kind=MOVE, floor=floor, asked=asked, tangle=tangle)
+    return _search(parts, query)
+
+
+def piercing_edges(parts: Parts, x: Float[Tensor, "vertices 3"]) -> Int[Tensor, "crossings 2"]:
+    """Indices of each edge and face that cross at x [m], sorted."""
+    found = _search(parts, query_of(x.double(), kind=CROSSING)).corners[:, :2].long()
+    return found[torch.argsort(found[:, 0] * max(len(parts.level.triangles), 1) + found[:, 1])]
+
+
+def _search(parts: Parts, query: Any) -> Pairs:
+    """The pairs of parts of a query."""
+    if not parts.topology.clusters:
+        return Pairs.empty(0, parts.level.device)
+    tree = parts.tree
+    _launch(parts, bound_clusters, parts.topology.clusters, query, parts.boxes)
+    tree.refit()
+    clusters = _near_clusters(parts, tree)
+    if not len(clusters):
+        return Pairs.empty(0, clusters.device)
+    which = torch.zeros(parts.topology.clusters, dtype=torch.bool, device=clusters.device)
+    which[clusters.reshape(-1).long()] = True
+    active = torch.nonzero(which).squeeze(1).int()
+    _launch(parts, bound_parts, len(active), query, argument(active), parts.boxes)
+    return _pairs_of(parts, clusters, query)
+
+
+def _near_clusters(parts: Parts, tree: wp.Bvh) -> Int[Tensor, "pairs 2"]:
+    """Pairs of clusters that no axis separates at both ends, int32."""
+    size, room, device = parts.topology.clusters, CLUSTERS, parts.level.device
+    while True:
+        slots = torch.empty((size, room), dtype=torch.int32, device=device)
+        count = torch.empty(size, dtype=torch.int32, device=device)
+        inputs = [parts.boxes, tree.id, room, argument(slots.view(-1)), argument(count)]
+        _launch(parts, find_clusters, size, *inputs, least=LEAST_QUERIES)
+        most = int(count.max())
+        if most <= room:
+            break
+        room = most
+    first = torch.arange(size, dtype=torch.int32, device=device).repeat_interleave(count)
+    second = slots[torch.arange(room, device=device) < count.unsqueeze(1)]
+    return torch.stack([first, second], dim=1)
+
+
+def _pairs_of(parts: Parts, clusters: Int[Tensor, "clusters 2"], query: Any) -> Pairs:
+    """The pairs of parts in pairs of clusters; what has no room is searched again, now that it is counted."""
+    size, device = len(clusters), clusters.device
+    room = min(max(PAIRS // size, LEAST), MOST)
+    begin = torch.arange(size + 1, dtype=torch.int32, device=device) * room
+    found, count = _write(parts, clusters, query, begin)
+    kept = (torch.arange(room, device=device) < count.unsqueeze(1)) & (count <= room).unsqueeze(1)
+    found = found.where(kept.view(-1))
+    over = torch.nonzero(count > room).squeeze(1)
+    if not len(over):
+        return found
+    begin = torch.nn.functional.pad(count[over].cumsum(dim=0, dtype=torch.int32), (1, 0))
+    more, _ = _write(parts, clusters[over], query, begin)
+    return Pairs(*(torch.cat([getattr(found, n), getattr(more, n)]) for n in ("corners", "value", "face")))
+
+
+def _write(
+    parts: Parts, clusters: Int[Tensor, "clusters 2"], query: Any, begin: Int[Tensor, " bounds"]
+) -> tuple[Pairs, Int[Tensor, " clusters"]]:
+    """The pairs of parts of each two clusters from given places on, and their number."""
+    count = torch.zeros(len(clusters), dtype=torch.int32, device=clusters.device)
+    out, found = Pairs.empty(int(begin[-1]), clusters.device), Found()
+    found.begin, found.count = wp.from_torch(begin), wp.from_torch(count)
+    found.corners = wp.from_torch(out.corners, dtype=wp.vec4i)
+    found.value, found.face = wp.from_torch(out.value), wp.from_torch(out.face)
+    inputs = [argument(clusters.contiguous(), wp.vec2i), query, parts.boxes, found]
+    _launch(parts, find_pairs, len(clusters), *inputs, least=LEAST_QUERIES)
+    return out, count
+
+
+def _launch(parts: Parts, kernel: wp.Kernel, size: int, *inputs: object, least: int = LEAST_PER_THREAD) -> None:
+    """Run a kernel over clusters or pairs of clusters; a further thread needs a minimum number of items."""
+    launched = {"device": parts.level.device, "threads": parts.level.threads, "least": least}
+    run(kernel, size, [parts.topology, *inputs], **launched)

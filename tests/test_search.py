@@ -1,0 +1,200 @@
+"""Search of parts that touch on straight paths, judged by the IPC toolkit, which shares no code with it.
+
+Sheets, tubes and spirals follow random paths, from smooth ones to such on which much touches. The toolkit's detector
+says which parts touch, and each of these must be found.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from folds import named
+from meshes import grid
+
+from physgraph_usd.solver.collide.parts import Parts
+from physgraph_usd.solver.collide.search import impacts, piercing_edges
+from physgraph_usd.solver.level import Level, build_levels
+from physgraph_usd.solver.mesh.topology import PolygonMesh
+
+ipctk = pytest.importorskip("ipctk", reason="the IPC toolkit is not installed; it is in the extra `dev`")
+EDGE = 0.02
+ROOT = 1e-7
+"""Distance below which parts touch where they lie in one plane [m]; the toolkit counts a tenth of a millimetre."""
+Shape = Callable[[], tuple[np.ndarray, np.ndarray]]
+Pair = frozenset[frozenset[int]]
+
+
+def flat(columns: int = 14, rows: int = 8) -> tuple[np.ndarray, np.ndarray]:
+    """A rectangle: points [m], and triangles."""
+    mesh, points = grid(columns, rows, "triangles")
+    return EDGE * points, np.asarray(mesh.indices).reshape(-1, 3)
+
+
+def slit() -> tuple[np.ndarray, np.ndarray]:
+    """Cut open along a line that ends inside: the two lips lie at one place."""
+    points, faces = flat()
+    low, size = points.min(axis=0), np.ptp(points, axis=0)
+    row = np.unique(points[:, 1])[4]
+    on = (np.abs(points[:, 1] - row) < 1e-9) & ((points[:, 0] - low[0]) / size[0] < 0.6)
+    number = np.arange(len(points))
+    number[on] = len(points) + np.arange(on.sum())
+    above = points[faces].mean(axis=1)[:, 1] > row
+    return np.concatenate([points, points[on]]), np.where(above[:, None], number[faces], faces)
+
+
+def tube() -> tuple[np.ndarray, np.ndarray]:
+    """Round at rest, narrow."""
+    points, faces = flat()
+    turn = 2.0 * np.pi * (points[:, 0] - points[:, 0].min()) / (np.ptp(points[:, 0]) + EDGE)
+    radius = (np.ptp(points[:, 0]) + EDGE) / (2.0 * np.pi)
+    return np.stack([radius * np.cos(turn), points[:, 1], radius * np.sin(turn)], axis=1), faces
+
+
+def spiral() -> tuple[np.ndarray, np.ndarray]:
+    """Rolled up at rest, layer on layer."""
+    points, faces = flat(24, 5)
+    length = points[:, 0] - points[:, 0].min()
+    turn = np.sqrt(0.3**2 + 2.0 * length / (0.5 * EDGE)) - 0.3
+    radius = 0.5 * EDGE * (turn + 0.3)
+    return np.stack([radius * np.cos(turn), points[:, 1], radius * np.sin(turn)], axis=1), faces
+
+
+SHAPES: tuple[Shape, ...] = (flat, slit, tube, spiral)
+
+
+class Cloth:
+    """A mesh, its parts, and the toolkit's view of it."""
+
+    def __init__(self, shape: Shape) -> None:
+        self.rest, faces = shape()
+        mesh = PolygonMesh(np.full(len(faces), 3, np.int32), faces.ravel().astype(np.int32), len(self.rest))
+        self.level: Level = build_levels([named((mesh, self.rest), "Sheet")], [[]], dtype=torch.float64)[0]
+        self.parts = Parts(self.level, np.ones((1, 1), bool))
+        edges, triangles = (each.numpy().astype(np.int32) for each in (self.level.edges, self.level.triangles))
+        self.oracle = ipctk.CollisionMesh(np.asfortranarray(self.rest), edges, triangles)
+
+    def found(self, x: np.ndarray, end: np.ndarray, asked: np.ndarray | None = None) -> set[Pair]:
+        """Pairs of parts that the search finds on a move, of queried vertices alone where these are given."""
+        some = np.ones(len(x), bool) if asked is None else asked
+        given = [torch.as_tensor(each) for each in (x, end)]
+        pairs = impacts(self.parts, *given, floor=0.0, asked=torch.as_tensor(some))
+        split = np.where(pairs.face.numpy(), 1, 2)
+        listed = [
+            frozenset((frozenset(c[:k]), frozenset(c[k:])))
+            for c, k in zip(pairs.corners.tolist(), split.tolist(), strict=True)
+        ]
+        assert len(set(listed)) == len(listed)
+        return set(listed)
+
+    def missed(self, x: np.ndarray, end: np.ndarray, found: set[Pair]) -> set[Pair]:
+        """Pairs of parts that touch on a move according to the toolkit, and are not found."""
+        candidates, out = ipctk.Candidates(), set()
+        candidates.build(self.oracle, np.asfortranarray(x), np.asfortranarray(end))
+        for each in (*candidates.fv_candidates, *candidates.ee_candidates):
+            four = np.asarray(each.vertex_ids(self.oracle.edges, self.oracle.faces))
+            split = 1 if isinstance(each, ipctk.FaceVertexCandidate) else 2
+            pair = frozenset((frozenset(four[:split].tolist()), frozenset(four[split:].tolist())))
+            if pair not in found and each.ccd(x[four].ravel(), end[four].ravel())[0]:
+                if meet(x[four], end[four], is_face=split == 1):
+                    out.add(pair)
+        return out
+
+
+def meet(x: np.ndarray, end: np.ndarray, *, is_face: bool) -> bool:
+    """Whether two parts touch at a time when their four corners lie in one plane: a root of a cubic."""
+    times = np.linspace(0.0, 1.0, 4)
+    corners = x + times[:, None, None] * (end - x)
+    volume = np.linalg.det(corners[:, 1:] - corners[:, :1])
+    distance = ipctk.point_triangle_distance if is_face else ipctk.edge_edge_distance
+    roots = np.roots(np.polyfit(times, volume, 3))
+    times = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real >= 0.0) & (roots.real <= 1.0)]
+    return any(distance(*(x + time * (end - x))) < ROOT**2 for time in times)
+
+
+def placed(rest: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """The mesh bent by waves of all lengths, a little or much, and turned."""
+    x = rest.copy()
+    for _ in range(int(rng.integers(1, 5))):
+        way = rng.normal(size=3) / (EDGE * 10.0 ** rng.uniform(0.2, 1.2))
+        size = EDGE * 10.0 ** rng.uniform(-1.5, 0.7)
+        x = x + size * np.sin(rest @ way + rng.uniform(0.0, 6.3))[:, None] * rng.normal(size=3)
+    x = x + EDGE * 10.0 ** rng.uniform(-4.0, -0.7) * rng.normal(size=x.shape)
+    return x @ np.linalg.qr(rng.normal(size=(3, 3)))[0]
+
+
+def folded(x: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """One side of a plane through the mesh laid on the other, and through it."""
+    middle, normal = x[rng.integers(len(x))], np.linalg.qr(rng.normal(size=(3, 3)))[0][0]
+    beyond = np.maximum((x - middle) @ normal, 0.0)
+    return x - 2.0 * np.outer(beyond, normal) + 0.1 * EDGE * rng.normal(size=x.shape)
+
+
+def random_moves(cloth: Cloth, moves: int, seed: int) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Starts and ends of random moves [m]."""
+    rng, out = np.random.default_rng(seed), []
+    for _ in range(moves):
+        x = placed(cloth.rest, rng)
+        out.append((x, x + placed(0.3 * cloth.rest, rng) if rng.uniform() < 0.6 else folded(x, rng)))
+    return out
+
+
+def judged(shape: Shape, moves: int, seed: int) -> tuple[int, int]:
+    """Pairs found on random moves, and pairs that touch and are not found."""
+    cloth, total, lost = Cloth(shape), 0, 0
+    for x, end in random_moves(cloth, moves, seed):
+        found = cloth.found(x, end)
+        total, lost = total + len(found), lost + len(cloth.missed(x, end, found))
+    return total, lost
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_what_touches_is_found(shape: Shape):
+    total, lost = judged(shape, 12, seed=4)
+    assert total > 20
+    assert lost == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("shape", SHAPES)
+def test_what_touches_is_found_on_many_moves(shape: Shape):
+    total, lost = judged(shape, 100, seed=2)
+    assert total > 200
+    assert lost == 0
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_smooth_cloth_that_moves_far_has_nothing_in_its_way(shape: Shape):
+    """Turned by a sixth: neighbours are proved apart by the direction between them."""
+    cloth = Cloth(shape)
+    turn = np.array([[0.5, -(0.75**0.5), 0.0], [0.75**0.5, 0.5, 0.0], [0.0, 0.0, 1.0]])
+    assert len(cloth.found(cloth.rest, cloth.rest @ turn)) <= len(cloth.level.triangles)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_few_queried_vertices_give_their_own_pairs(shape: Shape):
+    cloth, rng, total = Cloth(shape), np.random.default_rng(8), 0
+    for x, end in random_moves(cloth, 20, seed=3):
+        asked = rng.uniform(size=len(x)) < 0.1
+        own = {pair for pair in cloth.found(x, end) if asked[list(frozenset().union(*pair))].any()}
+        assert cloth.found(x, end, asked) == own
+        total += len(own)
+    assert total > 20
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_a_search_depends_on_nothing_before_it(shape: Shape):
+    """In the order of pairs too, on several threads."""
+    cloth, others = Cloth(shape), Cloth(shape)
+    others.parts.level = replace(others.level, threads=3)
+    moves = [[torch.as_tensor(each) for each in move] for move in random_moves(cloth, 3, seed=6)]
+    for x, end in moves:
+        piercing_edges(others.parts, end)
+        impacts(others.parts, end, x, floor=0.1 * EDGE, asked=x[:, 0] > x[:, 0].mean())
+        given = {"floor": 0.0, "asked": torch.ones(len(x), dtype=torch.bool)}
+        first, again = impacts(cloth.parts, x, end, **given), impacts(others.parts, x, end, **given)
+        for name in ("corners", "value", "face"):
+            assert torch.equal(getattr(first, name), getattr(again, name))
