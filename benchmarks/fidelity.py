@@ -2,7 +2,6 @@
 
     python -m benchmarks.fidelity [--scenes curtain sleeve] [--fabrics silk] [--frames 20] [--jobs 2] [--save FOLDER]
     python -m benchmarks.fidelity --newton PYTHON [...]      PYTHON is one that has newton
-    python -m benchmarks.fidelity --twins [...]              two fine simulations, begun 0.1 mm apart
 
 Each scene is simulated once at the cage's resolution and once at two subdivisions. The first is the animation that is
 refined, as a shot is; the second is what a fine simulation of that fabric shows. Four scenes are simulated by the
@@ -30,7 +29,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from benchmarks.fidelity_stages import SCENES, Body, Stage
+from benchmarks.fidelity_stages import SCENES, Stage
 from benchmarks.loose_garment import lowpass, vertex_area
 from benchmarks.rows import say
 from physgraph_usd.shot.solve import prepare_device
@@ -66,10 +65,6 @@ PATCH = 0.1
 FOLDED = 0.5
 """Part of the cloth that counts as folding: the half with the densest folds, in both."""
 FABRICS = ("jersey", "silk", "denim")
-NOISE = 1e-4
-"""Standard deviation by which a twin begins off its places [m]."""
-PRESSURE = 1e6
-"""Stiffness of bodies that press cloth [N/m^3]: cloth pulled at 40 N/m round an arm of 4 cm sinks in by 1 mm."""
 
 
 def garment_of(stage: Stage, level: int, *, touches: bool = False) -> Garment:
@@ -87,69 +82,14 @@ def level_at(garment: Garment, subdivisions: int) -> Level:
     return build_levels([garment], refine_garments([garment], [subdivisions]))[-1]
 
 
-class Pressed:
-    """Penalty of cloth that is nearer to a stage's bodies than it may be, k/2 sum_v A_v max(0, gap - d_v)^2."""
-
-    name = "pressed"
-
-    def __init__(self, level: Level, bodies: Sequence[Body], *, gap: float = GarmentFrame.offset) -> None:
-        """Take a cloth's mesh, balls and capsules, the nearest of which is d away, and the gap that is kept [m]."""
-        self._weight, self._bodies, self._gap = PRESSURE * level.vertex_area, tuple(bodies), gap
-        self._poses = [body.pose(0.0) for body in bodies]
-
-    def pose(self, time: float) -> None:
-        """Take the bodies to a time [s]."""
-        self._poses[:] = [body.pose(time) for body in self._bodies]
-
-    def add_force(self, x: torch.Tensor, force: torch.Tensor) -> torch.Tensor:
-        """Add the force [N] in place and return the energy [J]."""
-        away = torch.stack([self._from(body, pose, x) for body, pose in zip(self._bodies, self._poses, strict=True)])
-        radii = torch.tensor([body.radius for body in self._bodies]).to(x)
-        nearest, which = (away.norm(dim=2) - radii[:, None]).min(dim=0)
-        lack = (self._gap - nearest).clamp_min(0.0)
-        away = away[which, torch.arange(len(x))]
-        force += (self._weight * lack / away.norm(dim=1).clamp_min(1e-9))[:, None] * away
-        return 0.5 * (self._weight * lack**2).sum(dtype=torch.float64)
-
-    def diagonal(self, x: torch.Tensor) -> torch.Tensor:
-        """A third of k A_v, as if all vertices were pressed [N/m]."""
-        return (self._weight / 3.0).to(x)
-
-    def rest_matrix(self) -> None:
-        """Nothing touches at rest."""
-
-    def _from(self, body: Body, pose: ShapePose, x: torch.Tensor) -> torch.Tensor:
-        """From a body's axis to each vertex [m], shape (V, 3)."""
-        axis, middle = (torch.as_tensor(each).to(x) for each in (pose.turn[:, 2], pose.centre))
-        along = ((x - middle) @ axis).clamp(-body.half, body.half)
-        return x - middle - along[:, None] * axis
-
-
-def simulated(
-    stage: Stage, fabric: Fabric, subdivisions: int, *, frames: int, touches: bool = False, noise: float = 0.0
-) -> Iterator[np.ndarray]:
-    """Positions of each frame [m], shape (V, 3), of a simulation at a number of subdivisions, from rest.
-
-    Args:
-        stage: The sheet.
-        fabric: Its fabric.
-        subdivisions: How many.
-        frames: How many.
-        touches: Whether bodies press it; cloth on cloth is left out.
-        noise: Standard deviation by which vertices begin off their places [m].
-    """
+def simulated(stage: Stage, fabric: Fabric, subdivisions: int, *, frames: int) -> Iterator[np.ndarray]:
+    """Positions of each frame [m], shape (V, 3), of a simulation without contact at a level, from rest."""
     level = level_at(garment_of(stage, subdivisions), subdivisions)
-    pressed = Pressed(level, stage.bodies)
-    terms = (
-        *elastic_terms(level, [fabric]),
-        *body_terms(level, [fabric], gravity=GRAVITY),
-    )
+    terms = (*elastic_terms(level, [fabric]), *body_terms(level, [fabric], gravity=GRAVITY))
     h = 1.0 / (RATE * INCREMENTS)
-    begun = level.from_coarse @ stage.rest
-    begun = begun + noise * np.random.default_rng(1).standard_normal(begun.shape)
-    x = torch.as_tensor(begun).to(level.rest)
+    x = torch.as_tensor(level.from_coarse @ stage.rest).to(level.rest)
     inertia = Tether(level, torch.tensor([fabric.density]), h**-2, x.clone())
-    terms = (*terms, inertia, *([pressed] if touches else ()))
+    terms = (*terms, inertia)
     module = ForceModule(terms)
     metric = Metric(module.rest_matrix(), free=level.free, dtype=level.dtype)
     velocity, free = torch.zeros_like(x), level.free
@@ -158,7 +98,6 @@ def simulated(
             time = (frame * INCREMENTS + increment + 1) * h
             moved = torch.as_tensor(level.from_coarse @ stage.motion(time)).to(x)
             inertia.aim(x + h * velocity, h**-2)
-            pressed.pose(time)
             start = torch.where(free, x + h * velocity, moved)
             system = System(ForceModule(terms), metric, free=free, spacing=level.spacing, level=level)
             after, _ = solve_level(system, QuasiNewton(), start, level=0, budget=Budget(STEPS, 1e-3))
@@ -358,30 +297,6 @@ def made(task: Task) -> tuple[str, Films]:
     return row_of(task, films), films
 
 
-def twin_row(task: Task) -> str:
-    """How far two fine simulations agree that differ by noise at the start: a refined cage cannot agree more."""
-    prepare_device("cpu")
-    torch.set_num_threads(1)
-    stage, fabric = SCENES[task.scene](), PRESETS[task.fabric]
-    level = level_at(garment_of(stage, task.subdivisions), task.subdivisions)
-    judge, late = Judge(level, level.from_coarse @ stage.flat), slice(task.frames // 2, None, 4)
-    one, other = (
-        list(simulated(stage, fabric, task.subdivisions, frames=task.frames, noise=noise))[late]
-        for noise in (0.0, NOISE)
-    )
-    angle, where = np.mean([judge.compared(x, y) for x, y in zip(one, other, strict=True)], 0)
-    ratio = np.mean([judge.curvature(x) for x in other]) / np.mean([judge.curvature(x) for x in one])
-    return f"| {task.scene} | {task.fabric} | {ratio:.2f} | {angle:.0f} | {where:.2f} |"
-
-
-def say_twins(tasks: Sequence[Task], *, jobs: int) -> None:
-    """Print the table of twins."""
-    say("| scene | fabric | curvature, second / first | angle, degrees | where |\n|---|---|---|---|---|")
-    with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
-        for row in pool.map(twin_row, tasks):
-            say(row)
-
-
 def heading() -> str:
     """The table's head."""
     ends = [f"{1e3 * a:g}-{1e3 * b:g} mm" for a, b in pairwise(BANDS)]
@@ -407,7 +322,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--newton", default="", metavar="PYTHON", help="Simulate by Newton, which this Python has.")
     parser.add_argument("--kept", type=Path, help="Folder of Newton's problems and results, which are used again.")
-    parser.add_argument("--twins", action="store_true", help="Compare fine simulations with one another.")
     parser.add_argument("--scenes", nargs="+", choices=list(SCENES))
     parser.add_argument("--fabrics", nargs="+", choices=sorted(PRESETS), default=list(FABRICS))
     parser.add_argument("--frames", type=int, default=20)
@@ -418,9 +332,6 @@ def main() -> None:
     scenes = given.scenes or (NEWTON if given.newton else OURS)
     options = given.frames, given.level, given.newton, given.kept
     tasks = [Task(scene, fabric, *options) for scene, fabric in product(scenes, given.fabrics)]
-    if given.twins:
-        say_twins(tasks, jobs=given.jobs)
-        return
     say_rows(tasks, jobs=given.jobs, save=given.save)
 
 

@@ -26,7 +26,7 @@ from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.usd.read.reader import open_shot
 
 from .contact_shots import REAL
-from .sleeve import say
+from .rows import say
 
 SAMPLES = ("sleeve", "skirt", "layers")
 HERE = Path(__file__).resolve().parents[1]

@@ -16,7 +16,7 @@ from pxr import UsdGeom, Vt
 from shots import run
 from stages import GARMENT_API, add_sheet, new_stage, save
 
-from benchmarks import trouble
+from docs import warnings_table
 from physgraph_usd.cli import main
 from physgraph_usd.shot.options import OPTIONS
 
@@ -128,8 +128,8 @@ def test_advice_names_what_there_is(name: str):
 
 
 def test_the_table_of_warnings_is_the_one_of_the_code():
-    page = trouble.PAGE.read_text("utf-8")
-    assert trouble.page_with_table(page) == page, "run python -m benchmarks.trouble"
+    page = warnings_table.PAGE.read_text("utf-8")
+    assert warnings_table.page_with_table(page) == page, "run python -m docs.warnings_table"
 
 
 def test_the_gallery_has_its_films_and_they_are_short():

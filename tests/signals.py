@@ -1,7 +1,7 @@
 """Signals at random moments of `refine`, `refine` of several shots, `stitch` and `tune`: when and how each run ends.
 
-    python -m benchmarks.signals            40 signals, some ten minutes
-    python -m benchmarks.signals --short    8 signals
+    python -m tests.signals            40 signals, some ten minutes
+    python -m tests.signals --short    8 signals
 
 Prints a line a signal and fails where a run goes on for longer than `MOST_SECONDS`, or than its longest frame where
 that is more, or ends with another code than a shell's for the signal.

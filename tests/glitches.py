@@ -1,31 +1,71 @@
-"""What one broken frame leaves behind: how far cloth is from a run without it, in the frames that follow.
-
-    python -m benchmarks.glitches [--level 2] [--after 6] [--only NAME]
-
-A sheet of 0.6 m lies over a ball, held or with folds that travel round it. In one frame the ball is scaled or shifted,
-or the cage turned inside out, put into one point or made a hundred times its size. Prints a row a glitch: the largest
-distance of a vertex from the run without it in each frame after the broken one [mm], the energy in the last of them
-over that of the clean run, and how the frame after the broken one started.
-"""
+"""Frames that break: a sheet over a ball, refined from frame to frame while one frame is scaled, shifted or turned."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any
 
-import click
 import numpy as np
+import trimesh
 
 from physgraph_usd.errors import PhysGraphError
 from physgraph_usd.shot.options import RefineOptions
-from physgraph_usd.shot.solve import prepare_device
-from physgraph_usd.solver.colliders.pose import MeshPose
+from physgraph_usd.solver.colliders.pose import Collider, MeshPose
 from physgraph_usd.solver.fabric import PRESETS
 from physgraph_usd.solver.frame.refiner import Refiner
-from physgraph_usd.solver.scene import Frame, GarmentFrame
+from physgraph_usd.solver.mesh.topology import PolygonMesh
+from physgraph_usd.solver.scene import Frame, Garment, GarmentFrame, Scene
 
-from .sheet_over_ball import SheetOverBall
+
+@dataclass(frozen=True)
+class SheetOverBall:
+    """The sheet and the ball.
+
+    Attributes:
+        side: Quads along an edge of the cage.
+        edge: Length of a quad [m].
+        radius: Of the ball, whose top is at the origin [m].
+    """
+
+    side: int
+    edge: float
+    radius: float
+
+    def scene(self, *, subdivisions: int) -> tuple[Scene, MeshPose]:
+        """The sheet, which feels the ball, and the ball with so many subdivisions of an icosahedron."""
+        ids = np.arange((self.side + 1) ** 2).reshape(self.side + 1, self.side + 1)
+        quads = np.stack([ids[:-1, :-1], ids[:-1, 1:], ids[1:, 1:], ids[1:, :-1]], axis=-1).reshape(-1, 4)
+        one = np.ones(ids.size)
+        mesh = PolygonMesh(np.full(len(quads), 4), quads.ravel(), ids.size)
+        garment = Garment("/Sheet", mesh, self._flat(), 2, False, one, one, one, one, 0.0 * one, colliders=(0,))
+        ball = trimesh.creation.icosphere(subdivisions=subdivisions, radius=self.radius)
+        points = np.asarray(ball.vertices) - np.array([0.0, self.radius, 0.0])
+        scene = Scene((garment,), np.array([0.0, -9.81, 0.0]), (), (Collider("/Ball", "mesh"),))
+        return scene, MeshPose(points, np.asarray(ball.faces, np.int32))
+
+    def draped(self, height: float, phase: float = 0.0) -> np.ndarray:
+        """The sheet bent over the ball and flared with folds outside it.
+
+        Args:
+            height: Of its middle above the ball [m].
+            phase: Angle by which the folds are turned [rad].
+
+        Returns:
+            Positions [m], shape (V, 3).
+        """
+        flat = self._flat()
+        radius, angle = np.hypot(flat[:, 0], flat[:, 2]), np.arctan2(flat[:, 2], flat[:, 0])
+        bend, beyond = np.minimum(radius / self.radius, 1.2), np.maximum(radius - 1.2 * self.radius, 0.0)
+        out = self.radius * np.sin(bend) + 0.3 * beyond * (1.0 + 0.2 * np.cos(9 * (angle - phase)))
+        down = self.radius * (np.cos(bend) - 1.0) - 0.9 * beyond
+        return np.stack([out * np.cos(angle), down + height, out * np.sin(angle)], axis=1)
+
+    def _flat(self) -> np.ndarray:
+        axis = self.edge * (np.arange(self.side + 1) - 0.5 * self.side)
+        x, z = np.meshgrid(axis, axis)
+        return np.stack([x, 0.0 * x, -z], axis=-1).reshape(-1, 3)
+
 
 BEFORE = 5
 """Clean frames before the broken one."""
@@ -67,30 +107,6 @@ GLITCHES: dict[str, Glitch] = {
 """What happens to the broken frame."""
 
 
-@click.command()
-@click.option("--level", default=2, show_default=True)
-@click.option("--after", default=6, show_default=True, help="Frames after the broken one.")
-@click.option("--only", "names", multiple=True, help="Only these glitches.")
-def main(level: int, after: int, names: Sequence[str]) -> None:
-    """Print the tables."""
-    prepare_device("cpu")
-    for travel, what in ((0.0, "held"), (0.03, "folds travel")):
-        clean = [*run(level, after, travel=travel)]
-        click.echo(
-            f"\n{what}: {len(clean[-1][0])} fine vertices\n\n| glitch | mm after 1, 2, ... frames | energy | start |"
-        )
-        click.echo("|---|---|---|---|")
-        for name, glitch in GLITCHES.items():
-            if names and not any(each in name for each in names):
-                continue
-            told = [*run(level, after, travel=travel, glitch=glitch)]
-            pairs = zip(told[BEFORE + 1 :], clean[BEFORE + 1 :], strict=True)
-            off = [1e3 * np.linalg.norm(a[0] - b[0], axis=1).max() for a, b in pairs]
-            energies = [sum(each[-1][1]["energy_joules"]["output"].values()) for each in (told, clean)]
-            far = ", ".join(f"{each:.2g}" for each in off)
-            click.echo(f"| {name} | {far} | {energies[0] / energies[1]:.3f} | {told[BEFORE + 1][1]['start']} |")
-
-
 def run(
     level: int, after: int, *, travel: float, glitch: Glitch | None = None, at: int = BEFORE, first: int = 0
 ) -> list[tuple[np.ndarray, dict[str, Any]]]:
@@ -122,7 +138,3 @@ def run(
         assert state.points[0] is not None
         told.append((state.points[0], dict(state.telemetry[0])))
     return told
-
-
-if __name__ == "__main__":
-    main()

@@ -1,4 +1,4 @@
-"""Writes the table of warnings into docs/trouble.md: `python -m benchmarks.trouble`."""
+"""Writes the table of warnings into docs/trouble.md: `python -m docs.warnings_table`."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from pathlib import Path
 
 from physgraph_usd.shot.warnings import advice_table
 
-PAGE = Path(__file__).resolve().parents[1] / "docs" / "trouble.md"
-START, END = "<!-- made by python -m benchmarks.trouble -->\n", "<!-- end -->\n"
+PAGE = Path(__file__).resolve().with_name("trouble.md")
+START, END = "<!-- made by python -m docs.warnings_table -->\n", "<!-- end -->\n"
 
 
 def page_with_table(page: str) -> str:
