@@ -45,7 +45,7 @@ def test_newton_simulates_a_sheet_that_falls_onto_a_ball():
     python = os.environ.get("PHYSGRAPH_NEWTON_PYTHON")
     if not python:
         pytest.skip("PHYSGRAPH_NEWTON_PYTHON does not name a Python that has newton")
-    frames = np.array(Task("ball", "silk", 10, 2, python).by_newton(0))
+    frames = np.array(Task("ball", "silk", 10, python).by_newton(0))
     middle = np.array([0.0, 0.0, -0.18])
     assert np.isfinite(frames).all()
     assert frames[-1][:, 2].min() < -0.15, "it falls"

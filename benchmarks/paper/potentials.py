@@ -1,7 +1,5 @@
 """The paper's potentials table on skinned garments on moving bodies, in the paper's constants and units.
 
-    python -m benchmarks.potentials [--long]
-
 The paper's shirt, poses and body are not free. In their place stand three samples, x16, in some poses each: a T-shirt
 moved as skinning moves it (`armpit`), a shirt on a walking body (`layers`) and a T-shirt by linear-blend skinning
 whose sleeves go deep into the body (`tshirt`). Fabric: k_s = 1e4 erg/cm^2, k_b = 10 erg, 0.0187 g/cm^2. What is solved
@@ -21,7 +19,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import torch
 
-from benchmarks.rows import Found, Row, run_alone, table, under
+from benchmarks.rows import Row, under
 from benchmarks.shots import distances, frames_of, opened, problem_of
 from physgraph_usd.lab.chart.problem import Problem, with_garments
 from physgraph_usd.lab.chart.reference import Reference, find_reference
@@ -95,46 +93,21 @@ class Sums:
         """The paper's total as a mean over the poses [erg]."""
         return ERG * sum(self.paper.values()) / self.poses
 
-    def cells(self) -> list[str]:
-        """The total and its terms, means over the poses [erg]."""
-        return [f"{self.erg:.2f}", *(f"{ERG * value / self.poses:.2f}" for value in self.paper.values())]
-
-    def contact(self) -> list[str]:
-        """Share of colliding vertices and number of those inside."""
-        return [f"{self.percent:.2f} %", f"{self.inside}"]
-
     @property
     def percent(self) -> float:
         """Share of colliding vertices [%]."""
         return 100.0 * self.colliding / self.vertices
 
 
-def measure(short: bool) -> Found:
-    """The tables of all samples, and what they come to."""
+def measure(short: bool) -> list[Row]:
+    """The rows of all samples."""
     rows: list[Row] = []
-    notes = []
     for name in POSES:
         sums, known = run(name, short)
         least = sum(each.least for each in known)
         fall = sums[INPUT].whole - least
-        gap = {each: 100 * (found.whole - least) / fall for each, found in sums.items()}
-        rows += figures(name, sums, gap)
-        head = [f"{name}, mean of {sums[INPUT].poses} [erg]", "potential", *TERMS, "gap", "within 2 mm", "inside"]
-        lines = [
-            [
-                each,
-                *found.cells(),
-                "" if each == OUTSIDE else f"{gap[each]:.1f} %",
-                f"{found.percent:.2f} %",
-                found.inside,
-            ]
-            for each, found in sums.items()
-        ]
-        notes += [
-            table(head, lines),
-            "\n".join(f"- {name}, {time:g}: {each}" for time, each in zip(POSES[name][1], known, strict=True)),
-        ]
-    return Found(rows, notes)
+        rows += figures(name, sums, {each: 100 * (found.whole - least) / fall for each, found in sums.items()})
+    return rows
 
 
 def figures(name: str, sums: dict[str, Sums], gap: dict[str, float]) -> list[Row]:
@@ -220,7 +193,3 @@ def hinge_areas(level: Level) -> torch.Tensor:
     """A third of the areas of each hinge's two triangles [m^2], shape (H,)."""
     _, first, second, _ = hinge_geometry(level.rest.numpy(), level.hinges.numpy())
     return torch.as_tensor((first + second) / 3.0)
-
-
-if __name__ == "__main__":
-    run_alone(measure)

@@ -1,14 +1,11 @@
 """What contact leaves on blocks, tori, cloth and several garments, as rows.
 
-    python -m benchmarks.contact_rows colliders|itself|several [--long]
-
 Frames in a row of the samples about contact; the figures are those of `benchmarks.contact_shots`, which has them all.
 Shape and energy are of the last of these frames, solved from cold, beside Loop subdivision of the same cage.
 """
 
 from __future__ import annotations
 
-import sys
 import tempfile
 from pathlib import Path
 
@@ -16,7 +13,7 @@ import numpy as np
 import torch
 
 from benchmarks.contact_shots import FORMS, SAMPLES, Sums, open_one, run
-from benchmarks.rows import Found, Row, run_alone, table, under
+from benchmarks.rows import Row, under
 from benchmarks.shots import frames_of, opened, problem_of
 from physgraph_usd.lab.chart.problem import COLD, Problem
 from physgraph_usd.solver.scene import Frame
@@ -26,47 +23,44 @@ FRAMES = {True: 2, False: 5}
 OBJECTS = ("block", "torus")
 ITSELF = ("hood", "armpit")
 SEVERAL = ("layers", "crossing")
-HEAD = ("sample", "inside", "%", "deepest [mm]", "body crossings", "cloth crossings", "of garments", "strain")
 
 
-def colliders(short: bool) -> Found:
+def colliders(short: bool) -> list[Row]:
     """The block and the torus: penetration, Loop's potential, and the shape."""
-    rows, lines = [], []
+    rows = []
     for name in OBJECTS:
         ours = run_of(name, short)
-        lines.append(described(name, ours))
         rows += [
             under(f"{name}: deepest vertex", ours.deepest, 0.5, unit=" mm"),
             under(f"{name}: vertices over 0.1 mm inside", ours.percent, 0.0, unit=" %", paper="correct results"),
             fewer(f"{name}: crossings of cloth and body", ours.body, 0),
             *beside_loop(name, short),
         ]
-    return Found(rows, [table(HEAD, lines)])
+    return rows
 
 
-def itself(short: bool) -> Found:
+def itself(short: bool) -> list[Row]:
     """Cloth that touches itself: no new crossings."""
     return crossings(ITSELF, short)
 
 
-def several(short: bool) -> Found:
+def several(short: bool) -> list[Row]:
     """Garments that touch one another: no new crossings."""
     return crossings(SEVERAL, short)
 
 
-def crossings(names: tuple[str, ...], short: bool) -> Found:
+def crossings(names: tuple[str, ...], short: bool) -> list[Row]:
     """Crossings of cloth and cloth in some samples."""
-    rows, lines = [], []
+    rows = []
     for name in names:
         ours = run_of(name, short)
-        lines.append(described(name, ours))
         rows.append(fewer(f"{name}: crossings of cloth and cloth", ours.cloth, ours.cloth[0]))
         if names is SEVERAL:
             rows.append(fewer(f"{name}: those of different garments", ours.between, ours.between[0]))
         rows.append(
             under(f"{name}: frames with more crossings than the input", ours.worse, 0, paper="no intersections")
         )
-    return Found(rows, [table(HEAD, lines)])
+    return rows
 
 
 def run_of(name: str, short: bool) -> Sums:
@@ -80,13 +74,6 @@ def run_of(name: str, short: bool) -> Sums:
 def level_of(name: str, short: bool) -> int:
     """Subdivisions: one where several garments would take long."""
     return 1 if short and name in SEVERAL else 2
-
-
-def described(name: str, sums: Sums) -> list[str]:
-    """The line of a sample."""
-    inside, crossings = sums.inside, (sums.body, sums.cloth, sums.between)
-    line = [name, f"{inside[0]} -> {inside[1]}", f"{sums.percent:.3f}", f"{sums.deepest:.2f}"]
-    return [*line, *(f"{before} -> {after}" for before, after in crossings), f"{sums.strain:.3f}"]
 
 
 def fewer(what: str, pair: tuple[int, int], most: int) -> Row:
@@ -121,8 +108,3 @@ def beside_loop(name: str, short: bool) -> list[Row]:
 def bending(problem: Problem, frame: Frame, points: tuple[np.ndarray, ...]) -> float:
     """Bending energy [J], which is the square of curvature."""
     return problem.judge(frame, points).energies["bending"]
-
-
-if __name__ == "__main__":
-    PARTS = {"colliders": colliders, "itself": itself, "several": several}
-    run_alone(PARTS[sys.argv.pop(1)])

@@ -1,7 +1,5 @@
 """The paper's skinning figure: what of a skinned shirt's faults is left after refinement.
 
-    python -m benchmarks.skinning_repair [--long]
-
 Two samples: `armpit`, a shirt pinched between side and hanging arm, and `tshirt`, by linear-blend skinning with one arm
 raised. "Before" is the input, upsampled. A face is turned over where its normal looks away from the mean normal of the
 faces around its corners, weighed by area; the elastic energy is that of springs and hinges in the sample's own fabric.
@@ -14,7 +12,7 @@ from dataclasses import asdict
 import numpy as np
 import torch
 
-from benchmarks.rows import Found, Row, run_alone, table
+from benchmarks.rows import Row
 from benchmarks.shots import frames_of, opened, problem_of
 from physgraph_usd.lab.chart.problem import COLD, Problem
 from physgraph_usd.solver.scene import Frame
@@ -34,7 +32,7 @@ MUST = {"turned": 0.0, "tangles": 0.0, "crossings": 0.0, "inside": 0.0}
 """What was to be left."""
 
 
-def measure(short: bool) -> Found:
+def measure(short: bool) -> list[Row]:
     """The rows of both shirts."""
     rows = []
     for name, time in POSES.items():
@@ -49,7 +47,7 @@ def measure(short: bool) -> Found:
             if key in MUST:
                 target, met = f"{MUST[key]:g}", after[key] <= MUST[key]
             rows.append(Row(f"{name}: {title}", ours, "artefact removed" if key == "turned" else "-", target, met))
-    return Found(rows, [table(["sample", "time code"], list(POSES.items())), f"Level {LEVEL[short]}."])
+    return rows
 
 
 def faults(problem: Problem, frame: Frame, points: np.ndarray) -> dict[str, float]:
@@ -77,7 +75,3 @@ def turned_over(points: np.ndarray, triangles: np.ndarray) -> int:
     for corner in triangles.T:
         np.add.at(around, corner, normal)
     return int(((around[triangles].sum(axis=1) * normal).sum(axis=1) < 0.0).sum())
-
-
-if __name__ == "__main__":
-    run_alone(measure)

@@ -1,7 +1,5 @@
 """The paper's figure of forces put in one after another, and each of ours left out.
 
-    python -m benchmarks.forces_ablation [--long]
-
 The shirt of the sample `armpit`, pinched between side and hanging arm: the upsampled input, then elastic forces and the
 tie to the input alone, then with the body, then with cloth on itself and gravity; then everything but one. Every result
 is judged by all forces. Crossings are edges through faces.
@@ -9,14 +7,13 @@ is judged by all forces. Crossings are edges through faces.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 import torch
 
-from benchmarks.rows import Found, Row, run_alone, table
+from benchmarks.rows import Row
 from benchmarks.shots import CORES, frames_of, opened, problem_of
 from physgraph_usd.lab.chart.problem import COLD, Judgement, Problem, with_garments
 from physgraph_usd.usd.read.reader import Shot
@@ -48,11 +45,10 @@ WITHOUT = {
     "all but the body": Forces(body=False),
     "all but self contact": Forces(cloth=False),
 }
-TERMS = ("stretch", "bending", "gravity", "guide", "contact", "self_contact")
 
 
-def measure(short: bool) -> Found:
-    """The rows, and the energies behind them."""
+def measure(short: bool) -> list[Row]:
+    """The rows."""
     shot = opened(SAMPLE, LEVEL[short])
     judge = problem_of(shot, torch.float64)
     [frame] = frames_of(shot, [TIME])
@@ -76,25 +72,12 @@ def measure(short: bool) -> Found:
         rows.append(
             Row(f"{name}: energy more than with all", f"{rise:.3g} mJ", "-", "above 0", bool(rise > 0.0)),
         )
-    head = [
-        "forces",
-        *(f"{term.replace('_', ' ')} [mJ]" for term in TERMS),
-        "crossings of cloth",
-        "of cloth and body",
-        "inside",
-    ]
-    return Found(rows, [table(head, [line(name, each) for name, each in found.items()])])
+    return rows
 
 
 def crossing(found: Judgement) -> int:
     """Crossings of cloth with cloth and with bodies."""
     return found.tangles + found.crossings
-
-
-def line(name: str, found: Judgement) -> Sequence[str]:
-    """One result's energies and contact."""
-    energies = [f"{1e3 * found.energies.get(term, 0.0):.3g}" for term in TERMS]
-    return [name, *energies, f"{found.tangles}", f"{found.crossings}", f"{found.inside}"]
 
 
 def solved(shot: Shot, forces: Forces) -> tuple[np.ndarray, ...]:
@@ -110,7 +93,3 @@ def solved(shot: Shot, forces: Forces) -> tuple[np.ndarray, ...]:
     )
     problem = Problem(scene, [garment.level for garment in scene.garments], device="cpu", threads=CORES)
     return problem.solve(frame, replace(COLD, contact=contact)).points
-
-
-if __name__ == "__main__":
-    run_alone(measure)

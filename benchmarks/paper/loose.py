@@ -1,7 +1,5 @@
 """The paper's loose garment against a converged solve: the flared skirt on turning hips.
 
-    python -m benchmarks.loose_garment [--long]
-
 Both are refined from one coarse frame by one potential; the paper compares with a simulation of other materials.
 Detail is what a result adds to the smoothly upsampled cage; its energy in a band of wavelengths is the area-weighted
 square of what two low-pass filters 1 / (1 + (k / k_c)^2) on the cloth leave between them. Cloth on cloth is left out:
@@ -10,17 +8,15 @@ the sample's coarse skirt crosses itself, and with it longer solves end in other
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
-import scipy.sparse as sp
 import torch
-from scipy.sparse.linalg import factorized
 from scipy.spatial import cKDTree
 
-from benchmarks.rows import Found, Row, run_alone, under
+from benchmarks.rows import Row, under
 from benchmarks.shots import frames_of, opened, problem_of
+from benchmarks.waves import lowpass, vertex_area
 from physgraph_usd.lab.chart.problem import COLD
 from physgraph_usd.lab.chart.reference import find_reference
 from physgraph_usd.solver.level import Level
@@ -30,7 +26,7 @@ BAND = (4.0, 10.0)
 """Wavelengths of the band, in mean fine edges."""
 
 
-def measure(short: bool) -> Found:
+def measure(short: bool) -> list[Row]:
     """The skirt's rows."""
     shot = opened("skirt", 2)
     single, double = problem_of(shot), problem_of(shot, torch.float64)
@@ -47,14 +43,13 @@ def measure(short: bool) -> Found:
     h = float(level.spacing.mean())
     bands = [band_energy(level, points - smooth) for points in (ours, least)]
     apart = chamfer(ours, least)
-    rows = [
+    return [
         under("gap of refine's default", gaps[0], 5.0, unit=" %"),
         Row("gap of Loop subdivision", f"{gaps[1]:.3g} %"),
         within("detail of 4 to 10 edges, over the converged solve's", bands[0] / bands[1], 0.25),
         Row("distance from the converged solve", f"{1e3 * apart:.2f} mm ({apart / h:.2f} edges)"),
         Row("distance of Loop subdivision from it", f"{1e3 * chamfer(smooth, least):.2f} mm"),
     ]
-    return Found(rows, [f"{len(ours):,} fine vertices, time code {TIME:g}. {known}."])
 
 
 def within(what: str, value: float, most: float) -> Row:
@@ -79,36 +74,3 @@ def band_energy(level: Level, field: np.ndarray, band: tuple[float, float] = BAN
     h = float(level.spacing.mean())
     short, long = (smoothed(field) for smoothed in lowpass(level, [each * h for each in band]))
     return float((vertex_area(level)[:, None] * (short - long) ** 2).sum())
-
-
-def lowpass(level: Level, waves: Sequence[float]) -> list[Callable[[np.ndarray], np.ndarray]]:
-    """Maps from a vector field on a mesh to the same without what is shorter than each of some wavelengths [m]."""
-    mass, stiffness = vertex_area(level), laplacian(level)
-
-    def one(wave: float) -> Callable[[np.ndarray], np.ndarray]:
-        solve = factorized(sp.csc_matrix(sp.diags(mass) + (wave / (2.0 * np.pi)) ** 2 * stiffness))
-        return lambda field: np.stack([solve(mass * column) for column in field.T], axis=1)
-
-    return [one(wave) for wave in waves]
-
-
-def vertex_area(level: Level) -> np.ndarray:
-    """Area of each vertex [m^2]."""
-    return np.maximum(level.vertex_area.double().cpu().numpy(), 1e-12)
-
-
-def laplacian(level: Level) -> sp.csr_matrix:
-    """The matrix of springs 2 a_e / l^2: the Laplacian of an equilateral mesh, times the areas."""
-    ends, length = level.springs.cpu().numpy(), level.spring_length.double().cpu().numpy()
-    weight = 2.0 * level.spring_area.double().cpu().numpy() / length**2
-    i, j = ends.T
-    count = level.vertex_count
-    off = sp.coo_matrix(
-        (np.concatenate([weight] * 2), (np.concatenate([i, j]), np.concatenate([j, i]))), (count, count)
-    )
-    graph = sp.csr_matrix(off)
-    return sp.csr_matrix(sp.diags(np.asarray(graph.sum(axis=1)).ravel()) - graph)
-
-
-if __name__ == "__main__":
-    run_alone(measure)

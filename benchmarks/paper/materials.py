@@ -1,13 +1,11 @@
 """The paper's material figure: one coarse frame in 4 x 4 stiffnesses of stretch and bending over two decades each.
 
-    python -m benchmarks.material_grid [--long]        writes docs/pictures/material_grid.png
-
-The sample `sleeve`, whose coarse tube is compressed by a fifth and twisted, without cloth on cloth, solved by the
-learned integrator: one file of weights in all sixteen. A cell's
-wavelength is where the spectrum of the detail's slope has its peak: the energies of `benchmarks.loose_garment` between
-neighbouring low-pass filters, over the square of their wavelength, a parabola through the logarithms of the highest
-three; an eighth of the tube at either rim does not count. Thin sheets under a given strain have wrinkles as long as
-(bending / stretch)^(1/4), or ^(1/2) where nothing but the strain chooses (Cerda and Mahadevan 2003).
+Draws docs/pictures/material_grid.png. The sample `sleeve`, whose coarse tube is compressed by a fifth and twisted,
+without cloth on cloth, solved by the learned integrator: one file of weights in all sixteen. A cell's wavelength is
+where the spectrum of the detail's slope has its peak: the energies of `loose.py` between neighbouring low-pass filters,
+over the square of their wavelength, a parabola through the logarithms of the highest three; an eighth of the tube at
+either rim does not count. Thin sheets under a given strain have wrinkles as long as (bending / stretch)^(1/4), or
+^(1/2) where nothing but the strain chooses (Cerda and Mahadevan 2003).
 """
 
 from __future__ import annotations
@@ -19,9 +17,9 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw
 
-from benchmarks.loose_garment import lowpass, vertex_area
-from benchmarks.rows import Found, Row, run_alone, table
+from benchmarks.rows import Row
 from benchmarks.shots import frames_of, opened, problem_of
+from benchmarks.waves import lowpass, vertex_area
 from physgraph_usd.lab.chart.problem import COLD, Problem, with_garments
 from physgraph_usd.shot.page.drawing import Surface, View, draw, fit_view
 from physgraph_usd.shot.page.preview import label
@@ -68,7 +66,7 @@ class Cell:
     points: np.ndarray
 
 
-def measure(short: bool, picture: Path = PICTURE) -> Found:
+def measure(short: bool, picture: Path = PICTURE) -> list[Row]:
     """The grid's rows and its picture."""
     shot = opened("sleeve", 2)
     problem = problem_of(shot)
@@ -83,7 +81,7 @@ def measure(short: bool, picture: Path = PICTURE) -> Found:
     ratios = [column[-1].wave / column[0].wave for column in columns]
     bend, stretch = exponents([cell for row in grid for cell in row])
     paint(grid, level.triangles.cpu().numpy(), picture)
-    rows = [
+    return [
         Row(
             "columns in which folds grow with every step of bending", f"{rising} of 4", "bigger folds", "4", rising == 4
         ),
@@ -91,10 +89,6 @@ def measure(short: bool, picture: Path = PICTURE) -> Found:
         Row("exponent of bending", f"{bend:.3f}", "-", f"{LAW[0]:g} to {LAW[1]:g}", LAW[0] <= bend <= LAW[1]),
         Row("exponent of stretch", f"{stretch:.3f}", "-", f"-{LAW[1]:g} to -{LAW[0]:g}", LAW[0] <= -stretch <= LAW[1]),
     ]
-    head = ["folds [mm]", *(f"stretch {stretch:.3g} N/m" for stretch in STRETCHES)]
-    lines = [[f"bending {row[0].bend:.2g} N m", *(f"{1e3 * cell.wave:.1f}" for cell in row)] for row in grid]
-    note = f"Fine edges are {1e3 * float(level.spacing.mean()):.1f} mm; the cage's are four times as long."
-    return Found(rows, [table(head, lines), note], f"pictures/{picture.name}")
 
 
 def fabrics() -> list[list[Fabric]]:
@@ -169,7 +163,3 @@ def drawn(points: np.ndarray, triangles: np.ndarray, view: View) -> np.ndarray:
     """One cell's pixels."""
     surface = Surface(points, triangles, np.tile(COLOR, (len(triangles), 1)))
     return draw([surface], view, size=PANEL, floor=float(points[:, 1].min()) - 0.02)
-
-
-if __name__ == "__main__":
-    run_alone(measure)
