@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ import torch
 from cloth import sheet
 from sheets import garment_of
 
-from benchmarks import step
+from benchmarks import step, versions
 from benchmarks.paper.__main__ import PARTS
 from benchmarks.paper.loose import band_energy, chamfer
 from benchmarks.paper.materials import Cell, exponents, peak
@@ -135,3 +136,17 @@ def test_a_flat_sheet_has_no_face_turned_over_and_a_flipped_corner_has():
 
 def test_sizes_are_the_papers_nearest():
     assert [step.size_of({"edges": edges}) for edges in (1008, 10208, 999_941)] == [1_000, 10_000, 1_000_000]
+
+
+def test_versions_count_garments_that_were_solved_together_once():
+    def entry(solve: float, crossings: int) -> dict[str, Any]:
+        body = {"after": {"crossings": 2}}
+        contact = {"bodies": {"/Body": body}, "cloth": {"after": {"crossings": crossings}}}
+        energy = {"output": {"stretch": 1.0, "bending": 0.5}}
+        return {"milliseconds": {"solve": solve}, "energy_joules": energy, "contact": contact}
+
+    groups = versions.groups_of({"garments": [entry(1.0, 3), entry(1.0, 3), entry(2.0, 0), {"start": "reused"}]})
+    assert [each["milliseconds"]["solve"] for each in groups] == [1.0, 2.0]
+    assert [sum(versions.crossings_of(each["contact"])) for each in groups] == [5, 2]
+    assert list(versions.crossings_of({"bodies": None, "cloth": None})) == []
+    assert versions.Cost(90.0, 0.3, 0).over(versions.Cost(100.0, 0.2, 0)) == "0.900, 1.5000"

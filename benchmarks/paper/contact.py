@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from benchmarks.contact_shots import FORMS, SAMPLES, Sums, open_one, run
+from benchmarks.contact_shots import SAMPLES, Sums, open_one, run
 from benchmarks.rows import Row, under
 from benchmarks.shots import frames_of, opened, problem_of
 from physgraph_usd.lab.chart.problem import COLD, Problem
@@ -68,7 +68,7 @@ def run_of(name: str, short: bool) -> Sums:
     with tempfile.TemporaryDirectory() as folder:
         shot, first = open_one(name, Path(folder), None)
         first = min(first, len(shot.scene.times) - FRAMES[short])
-        return run(shot, first, FRAMES[short], level=level_of(name, short), settings=FORMS["ours"])
+        return run(shot, first, FRAMES[short], level=level_of(name, short))
 
 
 def level_of(name: str, short: bool) -> int:
