@@ -193,6 +193,7 @@ CELLS = Path("build") / f"stability.{code_of(Path(physgraph_usd.__file__).parent
 def main(chosen: tuple[int, ...], short: bool, fresh: bool, out: Path) -> None:
     """Measure the cases S1 to S40 by method and write the table."""
     wp.config.log_level = wp.LOG_WARNING
+    wp.init()
     names = [name for name in METHODS if not (short and name == SLOW)]
     if fresh:
         CELLS.unlink(missing_ok=True)
