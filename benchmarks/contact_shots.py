@@ -1,11 +1,9 @@
 """What contact leaves in shots: vertices in bodies and crossings, before and after.
 
-    python -m benchmarks.contact_shots [--frames 5] [--whole] [--level 2] [--form ours] [--shot NAME]
-        [--way-out 3] [--device cuda] [FOLDER]
+    python -m benchmarks.contact_shots [--frames 5] [--whole] [--level 2] [--shot NAME] [FOLDER]
 
 Refines some frames in a row of each sample about contact and, where FOLDER holds real shots, of those with bodies.
-Prints a row a shot: the sums over frames and garments. With --way-out cloth between overlapping parts of a body is
-pushed out by so many cage edges, in place of half of one.
+Prints a row a shot: the sums over frames and garments.
 """
 
 from __future__ import annotations
@@ -13,7 +11,7 @@ from __future__ import annotations
 import tempfile
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,15 +22,11 @@ from benchmarks.crossing_count import crossing_count
 from benchmarks.rows import say
 from benchmarks.temporal import detail_of
 from physgraph_usd.lab.samples import write_sample
+from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.solve import prepare_device
-from physgraph_usd.solver.contact.settings import ContactSettings
 from physgraph_usd.solver.frame.refiner import Refiner
 from physgraph_usd.usd.read.reader import Shot, open_shot
 
-FORMS = {
-    "ours": ContactSettings(),
-    "elastic": ContactSettings(form="off", cloth="off"),
-}
 SAMPLES = {"block": 8, "torus": 16, "armpit": 12, "layers": 6, "hood": 9, "crossing": 1, "skirt": 20, "tshirt": 30}
 """Samples and the number of their first frame here."""
 REAL = {
@@ -114,39 +108,23 @@ def _plus(pair: tuple[int, int], before: int, after: int) -> tuple[int, int]:
 @click.option("--frames", default=5, show_default=True)
 @click.option("--whole", is_flag=True, help="All frames of each shot.")
 @click.option("--level", default=2, show_default=True)
-@click.option("--form", "forms", multiple=True, type=click.Choice(list(FORMS)), default=["ours"])
 @click.option("--shot", "shots", multiple=True, help="Only these.")
-@click.option("--way-out", default=ContactSettings().way_out, show_default=True)
-@click.option("--device", default="cpu", show_default=True)
-def main(
-    folder: Path | None,
-    frames: int,
-    whole: bool,
-    level: int,
-    forms: Sequence[str],
-    shots: Sequence[str],
-    way_out: float,
-    device: str,
-) -> None:
+def main(folder: Path | None, frames: int, whole: bool, level: int, shots: Sequence[str]) -> None:
     """Print the table."""
-    prepare_device(device)
+    prepare_device("cpu")
     say(f"{'all frames' if whole else f'{frames} frames in a row'}, level {level}; a -> b: before and after")
     say(
-        "| shot | form | vertices | inside | % | deepest mm | pinched | body crossings | cloth crossings | counted "
+        "| shot | vertices | inside | % | deepest mm | pinched | body crossings | cloth crossings | counted "
         "| garments | frames worse | jumps | strain p99 | s/frame |"
     )
-    say("|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|")
+    say("|---|---|---|---|---|---|---|---|---|---|---|---|---|---|")
     with tempfile.TemporaryDirectory() as place:
         for name in [*SAMPLES, *(REAL if folder else ())]:
             if shots and not any(each in name for each in shots):
                 continue
             shot, first = open_one(name, Path(place), folder)
             first, count = (0, len(shot.scene.times)) if whole else (first, frames)
-            for form in forms:
-                sums = run(
-                    shot, first, count, level=level, settings=replace(FORMS[form], way_out=way_out), device=device
-                )
-                say(_row(name, form, sums))
+            say(_row(name, run(shot, first, count, level=level)))
 
 
 def open_one(name: str, place: Path, folder: Path | None) -> tuple[Shot, int]:
@@ -157,21 +135,10 @@ def open_one(name: str, place: Path, folder: Path | None) -> tuple[Shot, int]:
     return open_shot(str(Path(folder or "") / name), garments=garments, colliders=colliders), first
 
 
-def run(shot: Shot, first: int, count: int, *, level: int, settings: ContactSettings, device: str = "cpu") -> Sums:
-    """Refine some frames in a row.
-
-    Args:
-        shot: The shot.
-        first: Number of the first frame.
-        count: Number of frames.
-        level: Subdivisions.
-        settings: How contact is solved.
-        device: Where to compute.
-    """
-    from physgraph_usd.shot.options import RefineOptions  # noqa: PLC0415
-
-    solve = replace(RefineOptions().solve_settings(), contact=settings)
-    refiner = Refiner(shot.scene, solve, levels=[level] * len(shot.scene.garments), device=device, threads=THREADS)
+def run(shot: Shot, first: int, count: int, *, level: int) -> Sums:
+    """Refine so many frames in a row, from the number of the first one, at a level."""
+    levels = [level] * len(shot.scene.garments)
+    refiner = Refiner(shot.scene, RefineOptions().solve_settings(), levels=levels, device="cpu", threads=THREADS)
     sums, spent, details = Sums(), list[float](), list[np.ndarray]()
     for time_code in shot.scene.times[first : first + count]:
         frame = shot.frame(time_code)
@@ -215,10 +182,10 @@ def groups_of(telemetry: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     return list({id(entry["levels"]): entry for entry in telemetry if "levels" in entry}.values())
 
 
-def _row(name: str, form: str, sums: Sums) -> str:
+def _row(name: str, sums: Sums) -> str:
     arrows = [f"{a} -> {b}" for a, b in (sums.inside, sums.body, sums.cloth, sums.between)]
     return (
-        f"| {Path(name).parts[0].split(chr(46))[0]} | {form} | {sums.vertices} | {arrows[0]} | {sums.percent:.3f} "
+        f"| {Path(name).parts[0].split(chr(46))[0]} | {sums.vertices} | {arrows[0]} | {sums.percent:.3f} "
         f"| {sums.deepest:.2f} | {sums.pinched} | {arrows[1]} | {arrows[2]} | {sums.counted} | {arrows[3]} "
         f"| {sums.worse} | {sums.jumps} | {sums.strain:.3f} | {sums.seconds:.2f} |"
     )

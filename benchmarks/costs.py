@@ -24,7 +24,7 @@ from physgraph_usd.shot.solve import prepare_device
 from physgraph_usd.usd.read.reader import open_shot
 
 from .contact_shots import REAL
-from .sleeve import say
+from .rows import say
 
 SAMPLES = {"dancer": 20, "skirt": 10, "tshirt": 10}
 """Samples and the number of their first frame here."""

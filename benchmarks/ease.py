@@ -23,8 +23,8 @@ from typing import Any
 import numpy as np
 import torch
 
+from benchmarks.drawing import Thing, still, upright
 from benchmarks.fidelity import Judge, garment_of, level_at, refined, simulated
-from benchmarks.fidelity_films import Thing, still, upright
 from benchmarks.fidelity_stages import SCENES
 from benchmarks.rows import say
 from benchmarks.shots import opened

@@ -1,27 +1,30 @@
-"""Milliseconds of one integration step against the number of edges, forces and metric solve included.
+"""Milliseconds of one integration step by number of springs, forces and metric solve included.
 
-    python -m benchmarks.step [--device cuda] [--most 1000000]
+    python -m benchmarks.step [--most 1000000]
+    python -m benchmarks.step --device cuda --json benchmarks/results/step_cuda.json      on a machine with a GPU
 
 A waved square sheet of triangles. Untrained networks of the sizes that ship: time does not depend on the weights.
 Medians: on CUDA of wall time, the device waited for after each step, the forces alone, quasi-Newton's and `physgraph`'s
-steps replayed as graphs of kernels; on the CPU of the time of all threads together. "Step by step" nothing is replayed.
-The paper reports 7.1, 9.7, 37.7 and 343 ms for its network at 1e3, 1e4, 1e5 and 1e6 springs on an RTX A6000, another
-GPU than yours. The last two columns are the least time that the layers' operations or bytes need at the peak rates of
---tflops and --gbytes; forces and metric are not in it.
+steps replayed as graphs of kernels; on the CPU of the time of all threads together. The paper's times are of its own
+network on an RTX A6000. The page of the paper's results reads the figures of a GPU from the file that the second form
+writes.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
+import math
 import statistics
 import time
-from collections.abc import Callable, Sequence
-from typing import cast
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 import torch
 
-from benchmarks.rows import say
+from benchmarks.rows import Row, say, under
 from physgraph_usd.lab.methods.paper_network import PaperConfig
 from physgraph_usd.shot.solve import prepare_device
 from physgraph_usd.solver.fabric import PRESETS
@@ -35,40 +38,82 @@ from physgraph_usd.solver.integrate.weights import integrator_of, random_network
 from physgraph_usd.solver.mesh.topology import PolygonMesh
 from physgraph_usd.solver.scene import Garment, GarmentFrame
 
-SIZES = (1_000, 10_000, 100_000, 1_000_000)
-SHIPPED = cast(PhysgraphConfig, shipped_network("physgraph").config)
-PAPER = PaperConfig()
+PAPER_MS = {1_000: (0.037, 7.13), 10_000: (0.042, 9.74), 100_000: (0.051, 37.74), 1_000_000: (0.078, 343.08)}
+"""The paper's forces and integrator by number of springs [ms]."""
+CUDA = Path("benchmarks/results/step_cuda.json")
+MOST = {True: (100_000, 1_000), False: (1_000_000, 10_000)}
+"""Most edges of ours and of the paper's network on a CPU, by whether the form is the short one."""
+OURS, THEIRS, CLASSIC = "physgraph", "physgraph-paper", "quasi-newton"
+SHIPPED = cast(PhysgraphConfig, shipped_network(OURS).config)
+METHOD: dict[str, Callable[[], Integrator]] = {
+    CLASSIC: QuasiNewton,
+    OURS: lambda: integrator_of(random_network(SHIPPED, seed=1, scale=0.01)),
+    THEIRS: lambda: integrator_of(random_network(PaperConfig(), seed=1, scale=0.01)),
+}
 WARM, REPEATS = 6, 15
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Print one row a size."""
+    """Print one row a size, and write them as JSON where that is asked."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", default="cpu")
-    parser.add_argument("--most", type=int, default=SIZES[-1], help="most edges")
-    parser.add_argument("--paper-most", type=int, default=SIZES[-1], help="most edges for the paper's network")
-    parser.add_argument("--tflops", type=float, default=0.1, help="peak rate of the layers [1e12/s]")
-    parser.add_argument("--gbytes", type=float, default=20.0, help="peak rate of memory [1e9/s]")
+    parser.add_argument("--most", type=int, default=max(PAPER_MS), help="most edges")
+    parser.add_argument("--paper-most", type=int, default=max(PAPER_MS), help="most edges for the paper's network")
+    parser.add_argument("--json", type=Path, default=None, help="file for the figures")
     given = parser.parse_args(arguments)
     prepare_device(given.device)
-    methods: dict[str, Callable[[], Integrator]] = {
-        "quasi-newton": QuasiNewton,
-        "quasi-newton, step by step": lambda: QuasiNewton(record=False),
-        "physgraph": lambda: integrator_of(random_network(SHIPPED, seed=1, scale=0.01)),
-        "physgraph-paper": lambda: integrator_of(random_network(PAPER, seed=1, scale=0.01)),
-    }
-    say("| edges | forces | metric solve | " + " | ".join(methods) + " | least, physgraph | least, physgraph-paper |")
-    say("|---|" + "---|" * (len(methods) + 4))
-    for size in (s for s in SIZES if s <= given.most):
-        system, x = sheet(size, given.device)
+    names = ["edges", "forces", "metric solve", *METHOD]
+    say("| " + " | ".join(names) + " | the paper |\n" + "|---" * (len(names) + 1) + "|")
+    lines = []
+    for line in timed(given.device, given.most, given.paper_most):
+        cells = ["-" if line[name] is None else f"{line[name]:,}" for name in names]
+        say("| " + " | ".join(cells) + f" | {PAPER_MS[size_of(line)][1]} |")
+        lines.append(line)
+    if given.json:
+        name = torch.cuda.get_device_name(given.device) if given.device.startswith("cuda") else "CPU"
+        known = {"device": name, "command": f"python -m benchmarks.step --device {given.device}", "rows": lines}
+        given.json.write_text(json.dumps(known, indent=1) + "\n", encoding="utf-8")
+
+
+def timed(device: str, most: int, paper_most: int) -> Iterator[dict[str, Any]]:
+    """Edges, and milliseconds of forces, a metric solve and a step of each method, by size; None is not measured."""
+    for size in (each for each in PAPER_MS if each <= most):
+        system, x = sheet(size, device)
+        assert system.level is not None
         force = system.energy_and_force(x)[1]
-        cells = [milliseconds(forces_of(system, x), given.device)]
-        cells.append(milliseconds(lambda s=system, f=force: s.apply_metric_inverse(f), given.device))
-        for name, build in methods.items():
-            late = name == "physgraph-paper" and size > given.paper_most
-            cells.append(float("nan") if late else stepped(build(), system, x, device=given.device))
-        cells += [least(size, config, given.tflops, rate=given.gbytes) for config in (SHIPPED, PAPER)]
-        say(f"| {len(system.level.edges) if system.level else 0} | " + " | ".join(f"{ms:.2f}" for ms in cells) + " |")
+        line: dict[str, Any] = {"edges": len(system.level.edges)}
+        line["forces"] = milliseconds(forces_of(system, x), device)
+        line["metric solve"] = milliseconds(lambda s=system, f=force: s.apply_metric_inverse(f), device)
+        for name, build in METHOD.items():
+            late = name == THEIRS and size > paper_most
+            line[name] = None if late else stepped(build(), system, x, device=device)
+        yield {name: value if value is None else round(value, 2) for name, value in line.items()}
+
+
+def measure(short: bool) -> list[Row]:
+    """The CPU's times beside the paper's, and those of a GPU where they are known."""
+    lines = list(timed("cpu", *MOST[short]))
+    rows = [under_paper(f"{name} on this CPU", line, name) for name in (CLASSIC, OURS) for line in lines]
+    if not CUDA.exists():
+        return [*rows, Row("forces and integrators on a GPU", "not measured", "as above", "as the paper", False)]
+    known = json.loads(CUDA.read_text(encoding="utf-8"))
+    for line in known["rows"]:
+        what = f"forces on {known['device']}, {line['edges']:,} springs"
+        rows.append(under(what, line["forces"], PAPER_MS[size_of(line)][0], unit=" ms"))
+        rows += [under_paper(f"{name} on {known['device']}", line, name) for name in METHOD]
+    return rows
+
+
+def under_paper(what: str, line: dict[str, Any], name: str) -> Row:
+    """A step beside the paper's."""
+    most, value = PAPER_MS[size_of(line)][1], line.get(name)
+    value = math.nan if value is None else value
+    return under(f"{what}, {line['edges']:,} springs", value, most, unit=" ms", paper=f"{most} ms")
+
+
+def size_of(line: dict[str, Any]) -> int:
+    """The paper's number of springs that a line stands for."""
+    return min(PAPER_MS, key=lambda size: abs(math.log(size / line["edges"])))
 
 
 def sheet(edges: int, device: str) -> tuple[System, torch.Tensor]:
@@ -127,20 +172,6 @@ def milliseconds(call: Callable[[], object], device: str) -> float:
             torch.cuda.synchronize()
         times.append(clock() - began)
     return 1e3 * statistics.median(times)
-
-
-def least(edges: int, config: PhysgraphConfig | PaperConfig, tflops: float, *, rate: float) -> float:
-    """The larger of the times that operations and bytes of the layers take [ms]."""
-    vertices = edges / 3.0
-    if isinstance(config, PhysgraphConfig):
-        count, w = len(config.vectors), config.width
-        operations = 2 * vertices * (count * (count + 1) / 2 * w + w * w + w * count)
-        moved = vertices * 4 * (3 * count + 4)
-    else:
-        w = config.latent
-        operations = 2 * config.rounds * (2 * edges * 5 * w * w + vertices * 4 * w * w)
-        moved = config.rounds * 4 * w * (2 * edges * 2 + vertices * 2)
-    return 1e3 * max(operations / (1e12 * tflops), moved / (1e9 * rate))
 
 
 if __name__ == "__main__":

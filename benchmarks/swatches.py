@@ -19,8 +19,8 @@ import numpy as np
 import torch
 from PIL import Image
 
+from benchmarks.drawing import Thing, drawn, framing, upright
 from benchmarks.fidelity import Judge, garment_of, level_at, simulated
-from benchmarks.fidelity_films import Thing, drawn, framing, upright
 from benchmarks.fidelity_stages import Stage, grid
 from benchmarks.rows import say
 from physgraph_usd.shot.solve import prepare_device

@@ -1,7 +1,6 @@
 """How still the detail is from frame to frame, and what stillness costs in energy.
 
     python -m benchmarks.temporal [SAMPLE...]
-    python -m benchmarks.temporal --rows [--long]        the page of results' figures
 
 The detail is the fine cloth minus the upsampled cage; its jerk is the RMS of its third difference over 24 frames, in
 mean fine edges. Energies are means over the frames, without the tether's own.
@@ -17,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.rows import Found, Row, run_alone, say, table, under
+from benchmarks.rows import Row, say, under
 from benchmarks.shots import CORES, opened
 from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.shot.options import RefineOptions
@@ -45,21 +44,18 @@ def main() -> None:
                 say(f"| {name} | {temporal} | {stiffness:g} | {jerk:.3f} | {energy:.5f} |")
 
 
-def rows(short: bool) -> Found:
+def rows(short: bool) -> list[Row]:
     """Jerk with what a frame takes over from the last one against each by itself; and equal frames."""
-    found, lines = [], []
+    found = []
     for name, garments, level in (("sleeve", (), 2), ("layers", ("*/Trousers",) if short else (), 1)):
         shot = opened(name, level, garments)
         runs = {each: measure(shot, each, 2000.0) for each in ("off", "tether")}
         ratio = runs["tether"][0] / runs["off"][0]
         paper = "mostly coherent"
         found.append(under(f"{name}: jerk of the detail over that of frames by themselves", ratio, 0.5, paper=paper))
-        lines += [[name, f"{level}", each, f"{jerk:.3f}", f"{energy:.5f}"] for each, (jerk, energy) in runs.items()]
     equal, every = frozen()
-    found.append(
-        Row("frozen: frames equal to the first, to the bit", f"{equal} of {every}", "-", "all", equal == every)
-    )
-    return Found(found, [table(["sample", "level", "temporal", "jerk [edges]", "energy [J]"], lines)])
+    what = "frozen: frames equal to the first, to the bit"
+    return [*found, Row(what, f"{equal} of {every}", "-", "all", equal == every)]
 
 
 def frozen() -> tuple[int, int]:
@@ -107,8 +103,4 @@ def mean_fine_edge(refiner: Refiner, index: int) -> float:
 
 
 if __name__ == "__main__":
-    if "--rows" in sys.argv:
-        sys.argv.remove("--rows")
-        run_alone(rows)
-    else:
-        main()
+    main()

@@ -19,9 +19,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from benchmarks.loose_garment import lowpass, vertex_area
 from benchmarks.rows import say
 from benchmarks.shots import opened
+from benchmarks.waves import lowpass, vertex_area
 from physgraph_usd.lab.samples import SAMPLES
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.solve import prepare_device

@@ -122,16 +122,12 @@ class Descent:
         energy: [J].
         milliseconds: Time of the steps: wall time on CUDA; on the CPU that of all threads together, which other work on
             the machine does not lengthen.
-        evaluations: Force evaluations.
         movers: Steps by who made them.
-        x: Positions [m].
     """
 
     energy: float
     milliseconds: float
-    evaluations: int
     movers: dict[str, int]
-    x: torch.Tensor
 
 
 def descend(
@@ -142,7 +138,7 @@ def descend(
     The upsampled cage is taken off its saddle first, as the solver does it; that is not counted either.
     """
     x = group.levels[-len(steps)].base.apply(coarse)
-    energy, spent, evaluations = math.inf, 0.0, 0
+    energy, spent = math.inf, 0.0
     movers: dict[str, int] = {}
     clock = time.perf_counter if x.is_cuda else time.process_time
     for level, system, count in zip(group.levels[-len(steps) :], systems[-len(steps) :], steps, strict=True):
@@ -156,19 +152,8 @@ def descend(
         if x.is_cuda:
             torch.cuda.synchronize()
         spent += clock() - began
-        evaluations += system.evaluations - before
         x, energy = carry.x, carry.energy
-    return Descent(energy, 1e3 * spent, evaluations, movers, x)
-
-
-def history(system: System, integrator: Integrator, x: torch.Tensor, steps: int) -> list[float]:
-    """Energies of so many steps at one level, the start first [J]."""
-    carry = integrator.start(system, x)
-    energies = [carry.energy]
-    for _ in range(steps):
-        carry = integrator.step(system, carry)
-        energies.append(carry.energy)
-    return energies
+    return Descent(energy, 1e3 * spent, movers)
 
 
 def opened_garment(name: str) -> tuple[Garment, np.ndarray, GarmentFrame] | None:

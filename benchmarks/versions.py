@@ -1,92 +1,125 @@
-"""Versions of the solver side by side: what warm frames and whole shots cost in each.
+"""Two or more checkouts side by side, in turns: time of a warm frame, energy and crossings, shot by shot.
 
-    python -m benchmarks.versions OTHER... [--shots FOLDER] [--shot NAME] [--frames N] [--level 2]
+    python -m benchmarks.versions OTHER... [--shot NAME]... [--folder SHOTS] [--frames 8] [--turns 1] [--level 2]
 
-Each OTHER is a checkout of another version in a folder of its own. Every shot is refined by each of them and by this
-one in turn, on one core, in a process of its own, by the command that a user gives. Prints a row a shot: of each
-version the median of its warm frames, solving and measuring, and all frames, in milliseconds of wall time as its report
-has them; the ratios of this version to each other; and how much crosses.
+Each OTHER is a checkout of another version. Every shot is refined by each of them and by this one in turn, on one core,
+in a process of its own, by the command that a user gives. Prints a row a shot: of each version the milliseconds of a
+warm frame on the wall as its report has them (prepared, solved and measured; the median over frames, the least over
+turns), the mean energy of warm frames without the tether's, and crossings of all frames with bodies and with cloth;
+then the time and the energy of this version over each other's.
 """
 
 from __future__ import annotations
 
 import json
 import os
-import re
 import statistics
 import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import click
 
-from physgraph_usd.lab.samples import write_sample
+from benchmarks.contact_shots import REAL
+from benchmarks.contact_shots import SAMPLES as TOUCHING
+from benchmarks.rows import say, table
+from physgraph_usd.lab.samples import SAMPLES, write_sample
 from physgraph_usd.usd.read.reader import open_shot
 
-from .contact_shots import REAL
-from .sleeve import say
-
-SAMPLES = ("sleeve", "skirt", "layers")
+CHOSEN = ("sleeve", "skirt", "layers")
+"""Samples where no shot is named; with a folder, its shots too."""
 HERE = Path(__file__).resolve().parents[1]
 
 
+@dataclass(frozen=True)
+class Cost:
+    """A shot by one version: milliseconds of a warm frame, its energy [J], and crossings of all frames."""
+
+    warm: float
+    energy: float
+    crossings: int
+
+    def __str__(self) -> str:
+        """A cell of the table."""
+        return f"{self.warm:,.0f} ms, {1e3 * self.energy:.4g} mJ, {self.crossings:,}"
+
+    def over(self, other: Cost) -> str:
+        """Ratios of time and energy."""
+        return f"{self.warm / other.warm:.3f}, {self.energy / other.energy:.4f}"
+
+
 @click.command()
-@click.argument("others", nargs=-1, type=click.Path(exists=True, file_okay=False, path_type=Path))
-@click.option("--shots", "folder", type=click.Path(path_type=Path), help="The real shots, which we may not ship.")
-@click.option("--shot", "names", multiple=True, help="Only these.")
-@click.option("--frames", default=0, help="So many frames of each, from where it is set in; 0 for whole shots.")
+@click.argument("others", nargs=-1, required=True, type=click.Path(exists=True, file_okay=False, path_type=Path))
+@click.option("--folder", type=click.Path(path_type=Path), help="The real shots, which we may not ship.")
+@click.option("--shot", "names", multiple=True, help="Only these: samples, or beginnings of real shots' names.")
+@click.option("--frames", default=8, show_default=True, help="Frames of each; 0 for whole shots.")
+@click.option("--turns", default=1, show_default=True, help="How often each version refines each shot.")
 @click.option("--level", default=2, show_default=True)
 @click.option("--core", default=0, show_default=True, help="The core that all run on.")
-def main(others: Sequence[Path], folder: Path | None, names: Sequence[str], frames: int, level: int, core: int) -> None:
+def main(others: Sequence[Path], folder: Path | None, names: Sequence[str], **numbers: int) -> None:
     """Print what each version takes for each shot."""
     trees = [*(other.resolve() for other in others), HERE]
-    say("| shot | " + " | ".join(f"{tree.name}: warm, whole, crossings" for tree in trees) + " | ratios |")
-    say("|---|" + "---|" * (len(trees) + 1))
+    head = [*(f"{tree.name}: warm frame, energy, crossings" for tree in trees), "time, energy over"]
+    say(table(["shot", *head], []))
     with tempfile.TemporaryDirectory() as made:
-        cases = {name: (write_sample(name, Path(made)), [], [], 0) for name in SAMPLES}
-        if folder is not None:
-            cases |= {name: (folder / name, *case) for name, case in REAL.items() if (folder / name).exists()}
-        for name, (file, garments, bodies, first) in cases.items():
-            if names and name not in names:
-                continue
-            given = [option for each in garments for option in ("--garment", each)]
-            given += [option for each in bodies for option in ("--collider", each)]
-            if frames:
-                times = open_shot(str(file), garments=garments, colliders=bodies).scene.times[first : first + frames]
-                given += ["--frames", f"{times[0]}:{times[-1]}"]
-            found = [taken(tree, [str(file), *given, "--level", str(level)], Path(made), core) for tree in trees]
-            ratios = (f"{found[-1][0] / each[0]:.2f}, {found[-1][1] / each[1]:.2f}" for each in found[:-1])
-            cells = (f"{warm:,.0f}, {whole:,.0f}, {crossings:,}" for warm, whole, crossings in found)
-            say(f"| {name} | {' | '.join(cells)} | {'; '.join(ratios)} |")
+        for name, given in shots(names, folder, Path(made), numbers["frames"]):
+            asked = [*given, "--level", str(numbers["level"])]
+            turns = range(numbers["turns"])
+            runs = [[taken(tree, asked, Path(made), numbers["core"]) for tree in trees] for _ in turns]
+            best = [min(each, key=lambda cost: cost.warm) for each in zip(*runs, strict=True)]
+            say(f"| {name} | {' | '.join(map(str, best))} | {'; '.join(best[-1].over(each) for each in best[:-1])} |")
 
 
-def taken(tree: Path, arguments: Sequence[str], made: Path, core: int) -> tuple[float, float, int]:
-    """Median milliseconds of a version's warm frames and those of all, and its crossings."""
+def shots(names: Sequence[str], folder: Path | None, made: Path, frames: int) -> Iterator[tuple[str, list[str]]]:
+    """Names of shots, and the arguments of `refine` for each."""
+    samples = [name for name in SAMPLES if name in (names or CHOSEN)]
+    cases = {name: (write_sample(name, made), [], [], TOUCHING.get(name, 0)) for name in samples}
+    for name, case in REAL.items() if folder is not None else ():
+        if folder is not None and (folder / name).exists() and (not names or name.startswith(tuple(names))):
+            cases[name] = (folder / name, *case)
+    for name, (file, garments, bodies, first) in cases.items():
+        given = [str(file), *(option for each in garments for option in ("--garment", each))]
+        given += [option for each in bodies for option in ("--collider", each)]
+        if frames:
+            times = open_shot(str(file), garments=garments, colliders=bodies).scene.times
+            chosen = times[max(min(first, len(times) - frames), 0) :][:frames]
+            given += ["--frames", f"{chosen[0]}:{chosen[-1]}"]
+        yield name, given
+
+
+def taken(tree: Path, arguments: Sequence[str], made: Path, core: int) -> Cost:
+    """Refine a shot by a version."""
     out = made / f"{tree.name}.usdc"
     command = ["taskset", "-c", str(core), sys.executable, "-m", "physgraph_usd", "refine", *arguments]
     command += ["-o", str(out), "--report", f"{out}.json", "--overwrite"]
-    path = os.pathsep.join([str(tree), os.environ.get("PYTHONPATH", "")])
-    environment = os.environ | {"PYTHONPATH": path, "OMP_NUM_THREADS": "1"}
+    environment = os.environ | {"PYTHONPATH": str(tree), "OMP_NUM_THREADS": "1"}
     done = subprocess.run(command, cwd=tree, env=environment, capture_output=True, text=True, check=False)
-    if done.returncode:
+    if done.returncode not in (0, 3):
         raise click.ClickException(f"{tree.name}: {done.stderr[-500:]}")
-    said = Path(f"{out}.json").read_text("utf-8")
-    each = [sum(phases.values()) for phases in milliseconds(json.loads(said)["frames"])]
-    crossings = sum(map(int, re.findall(r'"after": \{"crossings": (\d+)', said)))
-    return statistics.median(each[1:] or each), sum(each), crossings
+    report = json.loads(Path(f"{out}.json").read_text("utf-8"))
+    frames = [groups for frame in report["frames"] if (groups := groups_of(frame))]
+    warm = frames[1:] or frames
+    milliseconds = [sum(sum(each["milliseconds"].values()) for each in groups) for groups in warm]
+    energies = [sum(sum(each["energy_joules"]["output"].values()) for each in groups) for groups in warm]
+    crossings = sum(left for groups in frames for each in groups for left in crossings_of(each.get("contact") or {}))
+    return Cost(statistics.median(milliseconds), statistics.mean(energies), crossings)
 
 
-def milliseconds(node: object) -> Iterator[dict[str, float]]:
-    """The phases of every frame of a report, wherever its version has them."""
-    if isinstance(node, dict):
-        if isinstance(node.get("milliseconds"), dict):
-            yield node["milliseconds"]
-        node = list(node.values())
-    if isinstance(node, list):
-        for each in node:
-            yield from milliseconds(each)
+def groups_of(frame: dict[str, Any]) -> list[dict[str, Any]]:
+    """What a frame's report says of each group of garments that was solved; each garment of a group repeats it."""
+    solved = [each for each in frame["garments"] if each.get("energy_joules")]
+    return list({json.dumps([each["milliseconds"], each["energy_joules"]]): each for each in solved}.values())
+
+
+def crossings_of(contact: dict[str, Any]) -> Iterator[int]:
+    """Crossings that are left with each body and with cloth."""
+    cloth = contact.get("cloth")
+    for each in [*(contact.get("bodies") or {}).values(), *([cloth] if cloth else [])]:
+        yield each["after"]["crossings"]
 
 
 if __name__ == "__main__":

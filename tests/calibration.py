@@ -1,7 +1,7 @@
-"""Writes docs/notes/calibration.md: what the forces' constants turn out to be on each kind of mesh.
+"""Writes benchmarks/results/calibration.md: what the forces' constants turn out to be on each kind of mesh.
 
-Run ``python tests/calibration.py docs/notes/calibration.md`` in an environment where the package is installed; it takes
-about half a minute on two cores.
+Run ``python tests/calibration.py benchmarks/results/calibration.md`` in an environment where the package is installed;
+it takes about half a minute on two cores.
 """
 
 from __future__ import annotations
@@ -139,8 +139,8 @@ def chain_table() -> list[str]:
 PAGE = """# Calibration
 
 What a sheet of cloth shows to an experiment, over what was asked for, on four kinds of mesh. Written by
-`python tests/calibration.py docs/notes/calibration.md`; `tests/stability/test_forces_analytic.py` holds the figures in
-bounds.
+`python tests/calibration.py benchmarks/results/calibration.md`; `tests/stability/test_forces_analytic.py` holds the
+figures in bounds.
 
 The meshes: equilateral triangles; Delaunay triangles of a jittered lattice (quality over 0.4); squares that
 came to us as quads; squares that were triangulated before they came to us, all diagonals one way.

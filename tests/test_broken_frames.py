@@ -8,12 +8,11 @@ from time import perf_counter
 
 import numpy as np
 import pytest
+from glitches import GLITCHES, run
 from layers import world_metres
 from pxr import Usd
 from shots import CLOTH, EDGE, TIMES, cloth_shot, faults, fine, refine
 from stages import add_sheet, new_stage, save, vec3
-
-from benchmarks.glitches import GLITCHES, run
 
 AT, AFTER = 2, 5
 FAST = ("ball 10 cm higher", "cage inside out", "cage a hundred times its size")

@@ -10,14 +10,34 @@ import pytest
 from cloth import frame_of, refiner_of, sheet
 from sheets import garment_of
 
-from benchmarks.cold_frames import folds_on_cage
 from physgraph_usd.lab.methods import METHODS
 from physgraph_usd.shot.options import RefineOptions
+from physgraph_usd.solver.frame.group import Group
 from physgraph_usd.solver.frame.refiner import Refiner
+from physgraph_usd.solver.level import hinge_geometry
 from physgraph_usd.solver.scene import Scene
 from physgraph_usd.usd.read.reader import open_shot
 
 COLD = RefineOptions(temporal="off").solve_settings()
+UNSEEN = np.radians(1.0)
+"""Angle between triangles that nobody sees [rad]."""
+
+
+def folds_on_cage(group: Group, x: np.ndarray) -> float:
+    """RMS angle between triangles at fine edges that lie on edges of the cage, over that at all others.
+
+    Args:
+        group: The garments.
+        x: Their finest vertices [m], shape (V, 3).
+    """
+    level = group.levels[-1]
+    hinges = level.hinges.cpu().numpy()
+    support = abs(level.from_coarse).sign()
+    ends = support[hinges[:, 0]] + support[hinges[:, 1]]
+    on_cage = ends.getnnz(axis=1) <= 2
+    bent = hinge_geometry(x, hinges)[0] - level.rest_angle.double().cpu().numpy()
+    there, elsewhere = (float(np.sqrt((bent[each] ** 2).mean())) for each in (on_cage, ~on_cage))
+    return there / max(elsewhere, UNSEEN)
 
 
 @pytest.mark.parametrize("kind", ["triangles", "quads"])

@@ -204,7 +204,7 @@ def let_interrupt() -> None:
 @pytest.mark.slow
 def test_every_signal_at_any_moment_of_any_command_ends_it():
     """Must hold 4 in brief; all of it is the program itself."""
-    line = [sys.executable, "-m", "benchmarks.signals", "--short"]
+    line = [sys.executable, "-m", "tests.signals", "--short"]
     done = subprocess.run(line, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,13 +16,13 @@ import torch
 from cloth import sheet
 from sheets import garment_of
 
-from benchmarks import step_rows
-from benchmarks.loose_garment import band_energy, chamfer
-from benchmarks.material_grid import Cell, exponents, peak
-from benchmarks.results import PARTS, Journal, page, run
-from benchmarks.rows import Found, Part, Row, under
-from benchmarks.skinning_repair import turned_over
-from benchmarks.step_rows import PAPER_MS, parsed, size_of
+from benchmarks import step, versions
+from benchmarks.paper.__main__ import PARTS
+from benchmarks.paper.loose import band_energy, chamfer
+from benchmarks.paper.materials import Cell, exponents, peak
+from benchmarks.paper.page import Journal, Part, page, run
+from benchmarks.paper.skinning import turned_over
+from benchmarks.rows import Row, under
 from physgraph_usd.solver.level import Level, build_levels, refine_garments
 
 
@@ -35,11 +36,11 @@ def parts(calls: list[str]) -> list[Part]:
     """Two parts that say when they are measured."""
 
     def measured(name: str, met: bool | None) -> Part:
-        def measure(short: bool) -> Found:
+        def measure(short: bool) -> list[Row]:
             calls.append(f"{name} {short}")
-            return Found([Row(f"what of {name}", "1", "2", "at most 3", met)], [f"note of {name}"])
+            return [Row(f"what of {name}", "1", "2", "at most 3", met)]
 
-        return Part(name, f"Title of {name}", f"benchmarks.{name}", measure)
+        return Part(name, f"Title of {name}", measure)
 
     return [measured("one", True), measured("two", False)]
 
@@ -71,12 +72,12 @@ def test_figures_of_a_gpu_stand_beside_the_papers(tmp_path: Path, monkeypatch: p
     file = tmp_path / "cuda.json"
     line = {"edges": 10208, "forces": 0.04, "quasi-newton": 1.0, "physgraph": 2.0, "physgraph-paper": 20.0}
     file.write_text(json.dumps({"device": "a GPU", "command": "python -m benchmarks.step", "rows": [line]}))
-    monkeypatch.setattr(step_rows, "CUDA", file)
-    monkeypatch.setattr(step_rows, "timed", lambda options: [line])
-    rows = [row for row in step_rows.measure(True).rows if "a GPU" in row.what]
+    monkeypatch.setattr(step, "CUDA", file)
+    monkeypatch.setattr(step, "timed", lambda *given: [line])
+    rows = [row for row in step.measure(True) if "a GPU" in row.what]
     assert [row.met for row in rows] == [True, True, True, False]
-    monkeypatch.setattr(step_rows, "CUDA", tmp_path / "absent.json")
-    assert any(row.ours == "not measured" and row.met is False for row in step_rows.measure(True).rows)
+    monkeypatch.setattr(step, "CUDA", tmp_path / "absent.json")
+    assert any(row.ours == "not measured" and row.met is False for row in step.measure(True))
 
 
 def test_the_page_counts_what_is_met_and_shows_what_is_missed(tmp_path: Path):
@@ -85,17 +86,13 @@ def test_the_page_counts_what_is_met_and_shows_what_is_missed(tmp_path: Path):
     text = page(made, known, short=True)
     assert "**1 of 2 figures with a target meet it.**" in text
     assert "## Title of one" in text
-    assert "`python -m benchmarks.two`" in text
+    assert "`python -m benchmarks.paper --only two --short`" in text
     assert "| what of two | 2 | at most 3 | 1 | **missed** |" in text
-    assert "note of two" in text
-    assert "--long" in page(made, known, short=False)
-    brief = page(made, known, short=True, whole=False)
-    assert "| what of two | 2 | at most 3 | 1 | **missed** |" in brief
-    assert "note of two" not in brief
+    assert "--short" not in page(made, known, short=False)
 
 
-def test_every_part_has_its_name_and_command_once():
-    assert len({part.name for part in PARTS}) == len({part.command for part in PARTS}) == len(PARTS) == 11
+def test_every_part_has_its_name_once():
+    assert len({part.name for part in PARTS}) == len(PARTS) == 11
 
 
 def test_the_band_holds_waves_of_its_length_alone():
@@ -137,9 +134,19 @@ def test_a_flat_sheet_has_no_face_turned_over_and_a_flipped_corner_has():
     assert turned_over(folded, triangles) > 0
 
 
-def test_the_timing_table_is_read_as_it_is_printed():
-    text = "noise\n| edges | forces | physgraph |\n|---|---|---|\n| 1008 | 0.25 | nan |\n| 10208 | 0.86 | 2.07 |\n"
-    one, two = parsed(text)
-    assert one == {"edges": 1008, "forces": 0.25, "physgraph": None}
-    assert [size_of(line) for line in (one, two)] == [1_000, 10_000]
-    assert set(PAPER_MS) == {10**power for power in (3, 4, 5, 6)}
+def test_sizes_are_the_papers_nearest():
+    assert [step.size_of({"edges": edges}) for edges in (1008, 10208, 999_941)] == [1_000, 10_000, 1_000_000]
+
+
+def test_versions_count_garments_that_were_solved_together_once():
+    def entry(solve: float, crossings: int) -> dict[str, Any]:
+        body = {"after": {"crossings": 2}}
+        contact = {"bodies": {"/Body": body}, "cloth": {"after": {"crossings": crossings}}}
+        energy = {"output": {"stretch": 1.0, "bending": 0.5}}
+        return {"milliseconds": {"solve": solve}, "energy_joules": energy, "contact": contact}
+
+    groups = versions.groups_of({"garments": [entry(1.0, 3), entry(1.0, 3), entry(2.0, 0), {"start": "reused"}]})
+    assert [each["milliseconds"]["solve"] for each in groups] == [1.0, 2.0]
+    assert [sum(versions.crossings_of(each["contact"])) for each in groups] == [5, 2]
+    assert list(versions.crossings_of({"bodies": None, "cloth": None})) == []
+    assert versions.Cost(90.0, 0.3, 0).over(versions.Cost(100.0, 0.2, 0)) == "0.900, 1.5000"

@@ -1,6 +1,6 @@
 """Estimates a shot's cost from the cages alone: fine vertices, memory and layer size.
 
-``python -m benchmarks.estimate`` measures the constants. Memory and size are within a factor of 2.
+Memory and size are within a factor of 2 (`tests/test_estimate.py`).
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """How fine a garment must be: no more than its wrinkles, and whether it was fine enough.
 
 The buckling wavelength is 2 pi sqrt(D / (Y strain)), with the compression of the cage's edges, 90th percentile over
-a few frames. It is the shortest wave in which the cloth can fold; settled folds are longer (`benchmarks.levels`).
+a few frames. It is the shortest wave in which the cloth can fold; settled folds are longer (`folds.py`).
 A level resolves it when its mean edge is under a fifth of it, and carries nothing of it when two edges are longer. That
 is for the choice beforehand. Afterwards the folds show it: on too coarse a mesh wrinkles of its own size appear, and
 edges fold sharply.

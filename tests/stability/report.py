@@ -1,4 +1,4 @@
-"""``python -m tests.stability.report``: the cases S1 to S40 by method, as a table; writes docs/notes/stability.md.
+"""``python -m tests.stability.report``: the cases S1 to S40 by method; writes benchmarks/results/stability.md.
 
 A cell says whether the case passed and what was measured. Cases that no integrator decides have one figure for all.
 """
@@ -31,7 +31,7 @@ from benchmarks.rows import code_of
 from physgraph_usd.errors import PhysGraphError
 from physgraph_usd.lab.methods import METHODS
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "notes" / "stability.md"
+PAGE = Path(__file__).resolve().parents[2] / "benchmarks" / "results" / "stability.md"
 
 
 @dataclass(frozen=True)
@@ -193,6 +193,7 @@ CELLS = Path("build") / f"stability.{code_of(Path(physgraph_usd.__file__).parent
 def main(chosen: tuple[int, ...], short: bool, fresh: bool, out: Path) -> None:
     """Measure the cases S1 to S40 by method and write the table."""
     wp.config.log_level = wp.LOG_WARNING
+    wp.init()
     names = [name for name in METHODS if not (short and name == SLOW)]
     if fresh:
         CELLS.unlink(missing_ok=True)

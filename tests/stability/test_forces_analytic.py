@@ -1,6 +1,7 @@
 """S38: stretched, sheared, bent and hanging sheets against closed formulas, on every kind of mesh.
 
-The bounds are those of docs/notes/calibration.md: 5% where the mesh can do it, the true deviation where it cannot.
+The bounds are those of benchmarks/results/calibration.md: 5% where the mesh can do it, the true deviation where it
+cannot.
 """
 
 from __future__ import annotations

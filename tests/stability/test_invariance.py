@@ -108,7 +108,7 @@ def test_s7_the_same_cloth_at_another_size(scale: float, integrator: str):
     """Lengths by s; Y by 1, D by s^2, k_g by 1 / s^2, density by 1 / s: every term by s^2, so the shape is the same.
 
     In float64: float32's rounding differs with the scale, and forty steps of buckling make 0.002 edges of it. Newton's
-    inner loop, which stops at negative curvature, makes 0.1 edges even of that (docs/notes/stability.md, S7).
+    inner loop, which stops at negative curvature, makes 0.1 edges even of that (benchmarks/results/stability.md, S7).
     """
     mesh, rest = sheet(6, 4, EDGE)
     points = wave(rest)

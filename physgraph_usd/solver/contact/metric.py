@@ -14,8 +14,7 @@ H0 answers smooth moves well and rough ones as cloth at rest would. What touches
 from vertex to vertex, cloth that was pushed out. The diagonal answers those, so few steps get far.
 
 The network makes its steps whole, without a line search, and gets half of P. Of R H0^-1 R alone the guard rejects up
-to nine steps of ten (a sheet over a block), of half of P one in a hundred, and frames end lower in less time: table in
-docs/notes/learned.md.
+to nine steps of ten (a sheet over a block), of half of P one in a hundred, and frames end lower in less time.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ one up again:
 The factorisation is multifrontal (Duff and Reid 1983): the fronts of a depth are dense matrices of similar size,
 eliminated by a few calls of batched linear algebra in float64. Index tables are computed once per pattern; a matrix
 with different values takes milliseconds. No call adds twice to the same place, so equal matrices give equal factors.
-cuDSS 1.0 takes 1.7 ms for a solve at 330,000 vertices, this solver 0.7 ms (docs/notes/learned.md), and a graph captured
+cuDSS 1.0 takes 1.7 ms for a solve at 330,000 vertices, this solver 0.7 ms, and a graph captured
 around cuDSS stays empty, so steps could not be recorded.
 """
 

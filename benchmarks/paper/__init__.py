@@ -1,0 +1,1 @@
+"""The paper's results beside ours: a module a figure or table of the paper."""
