@@ -17,8 +17,7 @@ import numpy as np
 import pytest
 from shots import cloth_shot, command, faults, refine, run, sample_times
 
-from physgraph_usd.shot.frames import frames_folder
-from physgraph_usd.shot.lock import LOCK
+from physgraph_usd.shot.frames import LOCK, frames_folder
 from physgraph_usd.usd.write.atomic import HOST
 
 TIMES = tuple(float(t) for t in range(1, 41))
