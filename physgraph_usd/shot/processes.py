@@ -16,7 +16,7 @@ from functools import partial
 from typing import Any
 
 from ..errors import PhysGraphError, SolveError
-from ..interrupts import leave_if_asked, signals_noted
+from ..interrupts import exit_code_of, leave_if_asked, signals_noted
 
 POLL_SECONDS = 0.02
 PATIENCE_SECONDS = 10.0
@@ -102,7 +102,7 @@ def result_of(future: Future[Any], *, at: str = "") -> Any:
         raise answer
     if error is None:
         return answer
-    if not isinstance(error, Exception) or (isinstance(error, BrokenExecutor) and error.__cause__ is None):
+    if isinstance(error, BrokenExecutor) and error.__cause__ is None:
         remedy = "if memory ran out, use fewer --workers or a lower --level"
         raise SolveError(f"a worker process died{at}; {remedy}")
     traceback.print_exception(error)
@@ -133,9 +133,12 @@ def _begin() -> None:
 
 
 def _answer(function: Callable[..., Any], *args: Any) -> Any:
-    """Call a function in a worker process."""
-    with signals_noted(), memory_is_named():
-        answer = function(*args)
+    """Call a function in a worker process; a signal ends the process once the function has cleaned up."""
+    try:
+        with signals_noted(), memory_is_named():
+            answer = function(*args)
+    except SystemExit as error:
+        os._exit(exit_code_of(error) or 1)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)  # The parent would wait for the rest of a torn answer.
     return answer
 
