@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ from physgraph_usd import cli
 from physgraph_usd.errors import UsageError
 from physgraph_usd.shot import summary
 from physgraph_usd.shot.options import RefineOptions
-from physgraph_usd.shot.refine import refine_shot, refine_shots
+from physgraph_usd.shot.refine import refine_shot
 
 SMALL = ("--level", "0")
 
@@ -100,17 +99,6 @@ class TestSummary:
         assert rows_of(file)["s"]["state"] == "skipped"
         assert run(*line[:-4], "--summary", shot, "--overwrite").exit_code == 2
 
-    def test_an_interrupted_batch_says_what_was_not_begun(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        def interrupted(*_: object, **__: object):
-            raise KeyboardInterrupt
-
-        monkeypatch.setattr("physgraph_usd.shot.refine.refine_shots", interrupted)
-        shots = [cloth_shot(tmp_path / f"{name}.usda", times=(1.0,)) for name in "ab"]
-        run("refine", *shots, "-o", tmp_path, "--summary", tmp_path / "summary.json", *SMALL)
-        assert {row["state"] for row in rows_of(tmp_path / "summary.json").values()} == {"not done"}
-
     def test_crossings_of_garments_solved_together_count_once(self) -> None:
         from physgraph_usd.shot.report import RefineReport
 
@@ -130,14 +118,6 @@ class TestSkipExisting:
         report = refine_shot(tmp_path / "gone.usda", tmp_path / "o.usdc", RefineOptions(skip_existing=True))
         assert (report.skipped, report.exit_code, report.out) == (True, 0, tmp_path / "o.usdc")
         assert (tmp_path / "o.usdc").read_text() == "mine"
-
-    def test_no_process_is_started_for_it(self, tmp_path: Path) -> None:
-        (tmp_path / "o.usdc").write_text("mine")
-        jobs = [(tmp_path / "gone.usda", tmp_path / "o.usdc", RefineOptions(skip_existing=True))]
-        began = time.perf_counter()
-        (report,) = refine_shots(jobs, workers=1)
-        assert getattr(report, "skipped", False)
-        assert time.perf_counter() - began < 1.0
 
     def test_it_does_not_go_with_overwrite(self, tmp_path: Path) -> None:
         with pytest.raises(UsageError, match="choose one"):

@@ -10,11 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from frame_solvers import fails
+from frame_solvers import as_named
 from shots import cloth_shot, command, faults, refine
 
-from physgraph_usd.errors import GarmentError, PhysGraphError, SolveError, UsageError
+from physgraph_usd.errors import PhysGraphError, UsageError
 from physgraph_usd.shot.farm import connected
+from physgraph_usd.shot.processes import result_of
 
 distributed = pytest.importorskip("distributed", reason="needs Dask (extra farm)")
 TIMES = tuple(float(time) for time in range(1, 49))
@@ -82,18 +83,18 @@ def test_several_shots_each_in_chunks(cluster: Any, tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    ("kind", "error", "said"),
+    ("kind", "said"),
     [
-        ("garment", GarmentError, "</World/cloth> at time code 5: torn"),
-        ("bug", PhysGraphError, "unexpected ValueError on a worker: a bug"),
-        pytest.param("dies", SolveError, "perhaps for lack of memory", marks=pytest.mark.slow),
+        ("torn", "</World/cloth> at time code 5: torn"),
+        ("raises", "unexpected ValueError: a bug"),
+        pytest.param("dies", "unexpected KilledWorker: .*all those workers died", marks=pytest.mark.slow),
     ],
 )
-def test_what_ends_a_task_is_named(cluster: Any, kind: str, error: type[Exception], said: str):
+def test_what_ends_a_task_is_named(cluster: Any, kind: str, said: str):
     with connected(cluster.scheduler_address) as start:
-        with pytest.raises(error, match=said):
-            start(fails, kind).result()
-        assert start(fails, "").result() != os.getpid()
+        with pytest.raises(PhysGraphError, match=said):
+            result_of(start(as_named, kind))
+        assert result_of(start(as_named, "returns")) == "returns"
 
 
 @pytest.mark.parametrize(
@@ -104,22 +105,19 @@ def test_what_ends_a_task_is_named(cluster: Any, kind: str, error: type[Exceptio
     ],
 )
 def test_workers_of_another_version_or_checkout_are_refused(
-    cluster: Any, monkeypatch: pytest.MonkeyPatch, name: str, other: Any, said: str
+    cluster: Any, shot: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, other: Any, said: str
 ):
     monkeypatch.setattr(f"physgraph_usd.shot.farm.{name}", other)
-    with connected(cluster.scheduler_address) as start, pytest.raises(UsageError, match=said):
-        start(fails, "").result()
+    with pytest.raises(UsageError, match=said):
+        refine(shot, tmp_path / "fine.usdc", scheduler=cluster.scheduler_address)
 
 
-def test_workers_of_several_threads_are_refused():
-    with (
-        distributed.LocalCluster(
-            n_workers=1, threads_per_worker=2, processes=False, dashboard_address=":0", protocol="tcp", host="127.0.0.1"
-        ) as two,
-        connected(two.scheduler_address) as start,
-    ):
+def test_workers_of_several_threads_are_refused(shot: Path, tmp_path: Path):
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=2, processes=False, dashboard_address=":0", protocol="tcp", host="127.0.0.1"
+    ) as two:
         with pytest.raises(UsageError, match="has 2 threads; start each with --nthreads 1"):
-            start(fails, "").result()
+            refine(shot, tmp_path / "fine.usdc", scheduler=two.scheduler_address)
 
 
 def test_a_scheduler_that_is_not_there_is_named(shot: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -10,15 +10,16 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import psutil
 import pytest
 from shots import cloth_shot, command, faults, refine, run, sample_times
 
-from physgraph_usd.shot.frames import frames_folder
-from physgraph_usd.shot.lock import LOCK
+from physgraph_usd.shot.frames import LOCK, frames_folder
 from physgraph_usd.usd.write.atomic import HOST
 
 TIMES = tuple(float(t) for t in range(1, 41))
@@ -40,11 +41,16 @@ def whole(shot: Path) -> bytes:
     return out.read_bytes()
 
 
+def begun(*args: object, stderr: int = subprocess.DEVNULL, **options: Any) -> subprocess.Popen[str]:
+    """The command, started in a process of its own."""
+    line = [sys.executable, "-m", "physgraph_usd", *map(str, args)]
+    return subprocess.Popen(line, stdout=subprocess.DEVNULL, stderr=stderr, text=True, **options)
+
+
 @contextlib.contextmanager
-def running(shot: Path, out: Path, *extra: str) -> Iterator[subprocess.Popen[bytes]]:
+def running(shot: Path, out: Path, *extra: str, **options: Any) -> Iterator[subprocess.Popen[str]]:
     """A run that has begun to write, in a process group of its own."""
-    line = [sys.executable, "-m", "physgraph_usd", "refine", str(shot), "-o", str(out), *LINE, *extra]
-    process = subprocess.Popen(line, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
+    process = begun("refine", shot, "-o", out, *LINE, *extra, start_new_session=True, **options)
     try:
         limit = time.monotonic() + 60
         while process.poll() is None and len(finished(out)) < 3 and time.monotonic() < limit:
@@ -93,11 +99,10 @@ def test_a_killed_run_leaves_nothing_under_the_name_and_a_rerun_finishes(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(20))
-def test_killed_at_any_moment_from_start_to_end(shot: Path, whole: bytes, tmp_path: Path, seed: int):
+@pytest.mark.parametrize("seed", range(8))
+def test_killed_at_any_moment_from_start_to_end(shot: Path, tmp_path: Path, seed: int):
     out = tmp_path / "fine.usdc"
-    line = [sys.executable, "-m", "physgraph_usd", "refine", str(shot), "-o", str(out), *LINE]
-    process = subprocess.Popen(line, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    process = begun("refine", shot, "-o", out, *LINE)
     time.sleep(float(np.random.default_rng(seed).uniform(0.0, 6.0)))
     process.kill()
     process.wait()
@@ -106,6 +111,24 @@ def test_killed_at_any_moment_from_start_to_end(shot: Path, whole: bytes, tmp_pa
         assert faults(out, shot) == []
     else:
         assert command("refine", shot, "-o", out, *LINE, "--resume").returncode == 0
+
+
+def test_a_worker_that_is_killed_is_named_by_its_frame_and_costs_no_finished_one(shot: Path, whole: bytes):
+    """The worker may have either half of the shot; frames before its own are finished by the other one."""
+    out = shot.parent / "worker" / "fine.usdc"
+    out.parent.mkdir()
+    with running(shot, out, "--workers", "2", stderr=subprocess.PIPE) as process:
+        workers = [each for each in psutil.Process(process.pid).children() if "spawn_main" in " ".join(each.cmdline())]
+        assert len(workers) == 2
+        workers[0].kill()
+        error = process.communicate(timeout=60)[1]
+    assert process.returncode == 1, error
+    assert "error: a worker process died at time code" in error.splitlines()[-1]
+    assert "if memory ran out, use fewer --workers or a lower --level" in error.splitlines()[-1]
+    named = int(error.split("died at time code ")[1].split(";")[0])
+    assert {f"{k}.npz" for k in range(named - 1)} <= {file.name for file in finished(out)}
+    assert not out.exists()
+    finishes(shot, out, whole, "--resume")
 
 
 def says_interrupted(out: Path, report: Path, summary: Path, *, code: int, of: int) -> int:
@@ -148,30 +171,6 @@ def test_a_polite_signal_keeps_finished_frames_and_says_so(
         finishes(shot, out, whole, "--resume", "--workers", "2", "--report", str(report))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", range(40))
-def test_interrupted_at_any_moment_of_kernels_on_several_threads(
-    sample: Callable[[str], Path], tmp_path: Path, seed: int
-):
-    """No crash: threads end before what they work on is freed."""
-    rng = np.random.default_rng(seed)
-    number, workers = (signal.SIGTERM, signal.SIGINT)[seed % 2], "12"[seed // 2 % 2]
-    out, report, summary = tmp_path / "fine.usdc", tmp_path / "report.json", tmp_path / "summary.json"
-    line = ["refine", str(sample("sleeve")), "-o", str(out), "--report", str(report), "--summary", str(summary)]
-    process = subprocess.Popen([sys.executable, "-m", "physgraph_usd", *line, "--workers", workers])
-    try:
-        while process.poll() is None and not frames_folder(out).exists():
-            time.sleep(0.01)
-        time.sleep(float(rng.uniform(0.0, 6.0)))
-        process.send_signal(number)
-        code = process.wait(timeout=60)
-    finally:
-        process.kill()
-    if not out.exists():
-        assert code == 128 + number
-        says_interrupted(out, report, summary, code=code, of=24)
-
-
 IMPORT = """
 import signal
 from physgraph_usd.interrupts import at_end, importing, signals_noted
@@ -212,13 +211,12 @@ def test_every_signal_at_any_moment_of_any_command_ends_it():
 @pytest.mark.slow
 def test_closed_streams_cost_nothing(shot: Path, tmp_path: Path):
     out = tmp_path / "fine.usdc"
-    line = [sys.executable, "-m", "physgraph_usd", "refine", str(shot), "-o", str(out), "--frames", "1:3", "-v"]
 
     def close() -> None:
         for number in range(3):
             os.close(number)
 
-    assert subprocess.run(line, check=False, preexec_fn=close).returncode == 0
+    assert command("refine", shot, "-o", out, "--frames", "1:3", "-v", preexec_fn=close).returncode == 0
     assert faults(out, shot) == []
 
 
@@ -229,11 +227,11 @@ def test_a_second_run_leaves_the_frames_of_the_first_alone(shot: Path, whole: by
     with running(shot, out) as first:
         first.send_signal(signal.SIGSTOP)
         there = finished(out)
-        for more in ((), ("--overwrite",)):
-            second = run("refine", shot, "-o", out, *LINE, *more)
-            assert second.exit_code == 1, second.stderr
-            who = f"{out} is being made by process {first.pid} on {HOST}; wait for it, end it, or name another layer"
-            assert second.stderr.splitlines()[-1] == f"error: {who}"
+        second = run("refine", shot, "-o", out, *LINE, "--overwrite")
+        assert second.exit_code == 1, second.stderr
+        who = f"{out} is being made by process {first.pid} on {HOST}; wait for it, end it, or name another layer"
+        assert second.stderr.splitlines()[-1] == f"error: {who}"
+        assert "are kept" not in second.stderr
         assert there
         assert finished(out) == there
         first.send_signal(signal.SIGCONT)
@@ -275,8 +273,9 @@ def test_a_signal_leaves_no_empty_folder(shot: Path, tmp_path: Path, number: sig
     """Before the first frame, of several shots, into folders that were not there."""
     other = cloth_shot(tmp_path / "other.usdc")
     out = tmp_path / "new" / "out"
-    line = ["refine", str(shot), str(other), "-o", str(out), "--report", str(tmp_path / "new" / "reports"), *LINE]
-    process = subprocess.Popen([sys.executable, "-m", "physgraph_usd", *line, "--workers", workers])
+    summary = tmp_path / "summary.json"
+    more = ("--report", tmp_path / "new" / "reports", "--summary", summary, "--workers", workers)
+    process = begun("refine", shot, other, "-o", out, *LINE, *more)
     try:
         while process.poll() is None and not out.exists():
             time.sleep(0.002)
@@ -284,44 +283,26 @@ def test_a_signal_leaves_no_empty_folder(shot: Path, tmp_path: Path, number: sig
         assert process.wait(timeout=30) != 0
     finally:
         process.kill()
-    assert [file.name for file in tmp_path.iterdir()] == ["other.usdc"]
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["other.usdc", "summary.json"]
+    assert [row["state"] for row in json.loads(summary.read_text())["shots"]] == ["not done"] * 2
 
 
-def test_a_killed_run_with_workers_leaves_no_process_and_no_folder(
-    shot: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    (tmp_path / "scratch").mkdir()
-    monkeypatch.setenv("TMPDIR", str(tmp_path / "scratch"))
-    out = tmp_path / "fine.usdc"
-    with running(shot, out, "--workers", "2") as process:
-        time.sleep(1.0)
-        os.kill(process.pid, signal.SIGKILL)
+def test_a_killed_run_with_workers_leaves_no_process(shot: Path, tmp_path: Path):
+    with running(shot, tmp_path / "fine.usdc", "--workers", "2") as process:
+        workers = psutil.Process(process.pid).children()
+        process.kill()
         process.wait()
-        assert not out.exists()
-        limit = time.monotonic() + 30
-        while _alive(process.pid) and time.monotonic() < limit:
-            time.sleep(0.1)
-        assert not _alive(process.pid), "workers outlive the run"
-    assert not list((tmp_path / "scratch").glob("physgraph-*"))
-
-
-def _alive(group: int) -> bool:
-    """Whether a process group has members."""
-    try:
-        os.killpg(group, 0)
-    except ProcessLookupError:
-        return False
-    return True
+        assert not psutil.wait_procs(workers, timeout=30)[1], "workers outlive the run"
 
 
 @pytest.mark.parametrize(
     ("megabytes", "workers"),
-    [(0.005, "1"), (0.3, "1"), *(pytest.param(*each, marks=pytest.mark.slow) for each in ((0.005, "2"), (0.6, "1")))],
+    [(0.3, "1"), pytest.param(0.005, "2", marks=pytest.mark.slow)],
 )
 def test_a_full_disk_is_a_clear_error_and_costs_no_finished_frame(
     shot: Path, whole: bytes, tmp_path: Path, megabytes: float, workers: str
 ):
-    """Files may not grow beyond a limit, as on a disk that fills up early, in the middle and late."""
+    """Files may not grow beyond a limit, as on a disk that fills up in the middle, and early."""
     limit = int(megabytes * 1e6)
 
     def fill() -> None:
@@ -349,11 +330,9 @@ def test_pipes_that_nobody_reads_any_more_cost_nothing(shot: Path, tmp_path: Pat
     os.close(read)
     out = tmp_path / "fine.usdc"
     line = [sys.executable, "-m", "physgraph_usd", "refine", str(shot), "-o", str(out), "--frames", "1:3", "-v", *LINE]
-    try:
-        done = subprocess.run([*line, "--progress"], stdout=write, stderr=write, check=False, timeout=120)
-        assert done.returncode == 0
-    finally:
-        os.close(write)
+    done = subprocess.run([*line, "--progress"], stdout=write, stderr=write, check=False, timeout=120)
+    os.close(write)
+    assert done.returncode == 0
     assert faults(out, shot) == []
 
 

@@ -10,14 +10,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from cloth import rms
 from layers import open_over
 from pxr import Sdf, Usd, UsdGeom
 from shots import CLOTH, EDGE, cloth_shot, faults, fine, refine, run, sample_times
 from stages import add_sheet, new_stage, save, vec3
 
-from physgraph_usd.cli import main
 from physgraph_usd.errors import AbsentError, LayerError, PhysGraphError, UsageError
 from physgraph_usd.shot.frames import Finished, kept_for
 from physgraph_usd.shot.options import RefineOptions
@@ -112,20 +110,14 @@ class TestOneLayer:
         assert record["options"].pop("preroll") == 6
         assert record == one
 
-    def test_the_command_says_how_far_seams_move(self, runs: Runs, tmp_path: Path):
-        done = run("stitch", *runs.chunks, "-o", tmp_path / "joined.usdc")
+    def test_the_command_says_how_far_seams_move_and_reports_all_frames(self, runs: Runs, tmp_path: Path):
+        report = tmp_path / "report.json"
+        done = run("stitch", *runs.chunks, "-o", tmp_path / "joined.usdc", "--report", report)
         assert done.exit_code == 0, done.stderr
+        assert [frame["time"] for frame in json.loads(report.read_text())["frames"]] == list(TIMES)
         assert done.stdout.strip() == str(tmp_path / "joined.usdc")
         assert [line.partition(":")[0] for line in done.stderr.splitlines()] == ["seam at 9", "seam at 17"]
         assert faults(tmp_path / "joined.usdc", runs.shot) == []
-
-    def test_one_report_tells_of_all_frames(self, runs: Runs, tmp_path: Path):
-        report, seams = stitch(runs.chunks, tmp_path / "joined.usdc", report_to=tmp_path / "report.json")
-        assert [frame["time"] for frame in report.frames] == list(TIMES)
-        assert {seam.after for seam in seams} == {9.0, 17.0}
-        assert report.out == tmp_path / "joined.usdc"
-        told = json.loads((tmp_path / "report.json").read_text())
-        assert len(told["frames"]) == len(TIMES)
 
     @pytest.mark.parametrize("time", [12.0, 16.0])
     def test_a_damaged_frame_is_refused_by_name_and_no_chunk_is_touched(self, runs: Runs, tmp_path: Path, time: float):
@@ -158,9 +150,9 @@ def copied(runs: Runs, folder: Path) -> list[Path]:
 def test_the_old_name_of_the_option_works_and_no_help_shows_it(tmp_path: Path):
     shot, out = cloth_shot(tmp_path / "shot.usdc"), tmp_path / "chunk"
     line = ["refine", shot, "-o", out, "--frames", "3:4", "--run-up=1", "--steps", "1", "--level", "0"]
-    assert CliRunner().invoke(main, [str(word) for word in line]).exit_code == 0
+    assert run(*line).exit_code == 0
     assert {file.name for file in out.iterdir()} == {"run.json", "1.before2.npz", "2.npz", "3.npz"}
-    shown = CliRunner().invoke(main, ["refine", "--help"]).output
+    shown = run("refine", "--help").output
     assert "--preroll" in shown
     assert "run-up" not in shown
 
@@ -192,17 +184,6 @@ class TestRefused:
         (other,) = refine_chunks(runs.shot, tmp_path, SPANS[2:])
         with pytest.raises(UsageError, match=r"were made with other code; refine one anew"):
             stitch([*runs.chunks[:2], other], tmp_path / "joined.usdc")
-
-    def test_a_shot_that_was_edited_in_between(self, tmp_path: Path):
-        shot = cloth_shot(tmp_path / "shot.usdc")
-        chunks = refine_chunks(shot, tmp_path, [(1.0, 3.0)])
-        stage = Usd.Stage.Open(str(shot))
-        mesh = UsdGeom.Mesh(stage.GetPrimAtPath(CLOTH))
-        mesh.GetPointsAttr().Set(mesh.GetPointsAttr().Get(2.0), 3.0)
-        stage.Save()
-        chunks += refine_chunks(shot, tmp_path, [(4.0, 6.0)])
-        with pytest.raises(UsageError, match="were made with other files of the shot"):
-            stitch(chunks, tmp_path / "joined.usdc")
 
     def test_another_version_of_the_shot(self, tmp_path: Path):
         shot = cloth_shot(tmp_path / "shot.usdc")
@@ -384,7 +365,7 @@ class TestSeamsBeforeAllIsThere:
         _, (whole, *_) = stitch(runs.chunks, tmp_path / "joined.usdc")
         assert seam == whole
         line = ["stitch", *runs.chunks[:2], "--check-seams", "--seam-bound", 0.2 * seam.rms]
-        done = CliRunner().invoke(main, [str(word) for word in line])
+        done = run(*line)
         assert (done.exit_code, "is allowed: refine with --preroll" in done.stderr) == (1, True), done.stderr
         assert sorted(runs.chunks[0].parent.iterdir()) == there
 
@@ -404,11 +385,16 @@ class TestSeamsBeforeAllIsThere:
         assert [each.after for each in check_seams([tmp_path / "c"], of=tmp_path / "c" / "second", **of)] == [9.0]
 
 
-def test_warnings_of_usd_itself_stay_off_the_terminal(tmp_path: Path, capfd: pytest.CaptureFixture[str]):
+def test_a_shot_that_was_edited_between_two_chunks(tmp_path: Path, capfd: pytest.CaptureFixture[str]):
+    """Refused; and warnings of USD itself stay off the terminal."""
     shot = cloth_shot(tmp_path / "shot.usda", times=(1.0, 2.0, 3.0, 4.0))
+    chunks = refine_chunks(shot, tmp_path, [(1.0, 2.0)], preroll=2)
     layer = Sdf.Layer.FindOrOpen(str(shot))
     layer.subLayerPaths.append("gone.usda")
     layer.Save()
-    chunks = refine_chunks(shot, tmp_path, ((1.0, 2.0), (3.0, 4.0)), preroll=2)
-    stitch(chunks, tmp_path / "joined.usdc")
+    chunks += refine_chunks(shot, tmp_path, [(3.0, 4.0)], preroll=2)
+    with pytest.raises(UsageError, match="were made with other files of the shot"):
+        stitch(chunks, tmp_path / "joined.usdc")
+    again = refine_chunks(shot, tmp_path, [(1.0, 2.0)], preroll=2, overwrite=True)
+    stitch([*again, chunks[1]], tmp_path / "joined.usdc")
     assert "_ReportErrors" not in capfd.readouterr().err

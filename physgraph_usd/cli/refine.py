@@ -222,14 +222,12 @@ def _folder_of(layers: Sequence[Path], out: Path, *, dry_run: bool) -> Iterator[
     Finished frames that an interruption or an error left are named.
     """
     from ..shot.frames import kept_for
-    from ..shot.lock import is_held
 
     made = [] if out in layers or dry_run else [each for each in (out, *out.parents) if not each.exists()]
 
     def leave(_code: int = DONE) -> None:
         for frames in filter(None, map(kept_for, layers)):
-            if not is_held(frames.folder):
-                say(str(frames), err=True)
+            say(str(frames), err=True)
         for folder in made:
             with suppress(OSError):
                 folder.rmdir()

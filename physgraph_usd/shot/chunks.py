@@ -10,45 +10,25 @@ from __future__ import annotations
 
 import time as clock
 from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import Future
 from dataclasses import replace
 from itertools import pairwise
-from typing import Any, NoReturn, Protocol
+from typing import Any, NoReturn
 
 import numpy as np
 
 from ..errors import LayerError, SolveError
 from ..interrupts import leave_if_asked
 from .frames import Finished, Folders, FrameFolder, Lead, Outcome
-from .processes import POLL_SECONDS, Call, memory_is_named
+from .processes import POLL_SECONDS, Start, memory_is_named, result_of
 
 PREROLL = 6
 """Frames solved before a chunk if frames depend on their predecessors."""
 
+LATE_SECONDS = 60.0
+"""Longest time for a file to appear after its process has ended [s]: network file systems cache missing files."""
 Solver = Callable[[Sequence[float | None]], Iterator[Outcome]]
 """Solves time codes in order; must be picklable to run in several processes."""
-
-
-class Work(Protocol):
-    """A running function call in another process, such as `Call`."""
-
-    lag: float
-
-    @property
-    def ready(self) -> bool:
-        """Whether the call has returned, failed or died."""
-        ...
-
-    def result(self) -> Any:
-        """The function's result; raises the error if the call failed."""
-        ...
-
-    def ask_to_end(self) -> None:
-        """Ask the call to end; do not wait."""
-        ...
-
-    def end(self) -> None:
-        """End the call if still running."""
-        ...
 
 
 def chunks_of(missing: Sequence[int], workers: int) -> list[list[range]]:
@@ -101,7 +81,7 @@ def solve_in_chunks(
     workers: int,
     only: range | None = None,
     preroll: int = PREROLL,
-    start: Callable[..., Work] | None = None,
+    start: Start | None = None,
 ) -> Generator[Outcome, None, None]:
     """Solve all time codes except the kept ones, in this process or in several, and yield all in order.
 
@@ -109,12 +89,11 @@ def solve_in_chunks(
         solver: Solves time codes in order.
         times: The time codes.
         frames: Folder of the results; frames in ``frames.kept`` are read from the folder.
-        workers: Number of processes; 1 solves in this process.
+        workers: Number of chunks.
         only: Numbers of the time codes to solve; None for all.
         preroll: Frames solved before each chunk except the shot's first; yielded as the ``lead`` of the same frames of
             the previous chunk.
-        start: Replacement for `Call`: starts a function with its arguments in a new process. If given, a single chunk
-            also runs in a new process.
+        start: Starts a chunk in another process; None solves in this process.
 
     Raises:
         SolveError: A process died.
@@ -124,28 +103,22 @@ def solve_in_chunks(
     chunks = chunks_of([k for k in wanted if k not in frames.kept], workers)
     seams = seams_of(chunks, frames, preroll=preroll)
     solved: Iterator[int] = iter(())
-    calls: list[Work] = []
-    if len(chunks) < 2 and start is None:
+    owners: dict[int, Future[None]] = {}
+    if start is None:
         solved = _solve(solver, list(times), [part for chunk in chunks for part in chunk], frames, preroll)
     else:
-        calls = [(start or Call)(_work, solver, list(times), chunk, frames, preroll) for chunk in chunks]
-    owners = {k: call for chunk, call in zip(chunks, calls, strict=False) for part in chunk for k in part}
-    try:
-        for index in wanted:
-            time = times[index]
-            outcome = _collect(frames, index, time, owner=owners.get(index), solved=solved)
-            if index in seams:
-                seam, weight = seams[index]
-                lead = frames.read(index, time, seam=seam)
-                if lead is None and seam not in frames.kept:
-                    lead = _collect(frames, index, time, owner=owners.get(seam), solved=solved, seam=seam)
-                outcome = outcome if lead is None else replace(outcome, lead=Lead(lead, seam, weight))
-            yield outcome
-    finally:
-        for call in calls:
-            call.ask_to_end()
-        for call in calls:
-            call.end()
+        calls = [start(_work, solver, list(times), chunk, frames, preroll) for chunk in chunks]
+        owners = {k: call for chunk, call in zip(chunks, calls, strict=True) for part in chunk for k in part}
+    for index in wanted:
+        time = times[index]
+        outcome = _collect(frames, index, time, owner=owners.get(index), solved=solved)
+        if index in seams:
+            seam, weight = seams[index]
+            lead = frames.read(index, time, seam=seam)
+            if lead is None and seam not in frames.kept:
+                lead = _collect(frames, index, time, owner=owners.get(seam), solved=solved, seam=seam)
+            outcome = outcome if lead is None else replace(outcome, lead=Lead(lead, seam, weight))
+        yield outcome
 
 
 def finished_frames(
@@ -195,15 +168,15 @@ def _collect(
     index: int,
     time: float | None,
     *,
-    owner: Work | None,
+    owner: Future[None] | None,
     solved: Iterator[int],
     seam: int | None = None,
 ) -> Outcome:
     """Read a frame once its owner, or ``solved`` without an owner, has stored it; ``seam`` as in `FrameFolder.read`."""
-    ended: float | None = None
+    latest: float | None = None
     while True:
         leave_if_asked()
-        over = owner is not None and owner.ready
+        over = owner is not None and owner.done()
         outcome = frames.read(index, time, seam=seam)
         if outcome is not None:
             return outcome
@@ -212,9 +185,9 @@ def _collect(
                 _lost(time)
             continue
         if over:
-            owner.result()
-            ended = ended or clock.monotonic()
-            if clock.monotonic() - ended >= owner.lag:
+            result_of(owner, at="" if time is None else f" at time code {time:g}")
+            latest = latest or clock.monotonic() + LATE_SECONDS
+            if clock.monotonic() > latest:
                 _lost(time)
         clock.sleep(POLL_SECONDS)
 

@@ -7,25 +7,34 @@ the folder.
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import re
 import zipfile
 import zlib
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 import numpy as np
+from filelock import BaseFileLock, FileLock, Timeout
 
 from ..errors import LayerError, UsageError, counted
-from ..usd.write.atomic import make_file, temporary_path, write_text
-from .lock import LOCK, FolderLock
+from ..usd.write.atomic import HOST, check_no_link, make_file, temporary_path, write_text
 
 RUN = "run.json"
 """File with a record of everything the frames depend on."""
+LOCK = "run.lock"
+"""File locked by the run that writes the folder; holds the name of the run's process. The system unlocks the file when
+the process dies, and a file server when a machine dies."""
+LOCK_SECONDS = 1.0
+"""Longest wait for a run that is about to unlock the folder [s]."""
+_NO_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP)
+"""Errors of file systems without locks; a run works there unlocked."""
 CHUNK = "chunk"
 """Entry in a chunk's record: number of the first frame, and of the frame after the last."""
 _DONE, _FAILED = ".npz", ".failed.npz"
@@ -100,12 +109,30 @@ class Kept:
 
 
 def kept_for(out: Path) -> Kept | None:
-    """Finished frames beside a layer, or in an incomplete chunk's folder; None if no frame is finished."""
+    """Finished frames beside a layer, or in an incomplete chunk's folder; None without any, or while a run goes on."""
     folder = out if out.is_dir() else frames_folder(out)
     run = record_in(folder)
     first, stop = run.get(CHUNK) or (0, len(run.get("times", ())))
     count = len(whole_frames(folder))
-    return Kept(folder, count, stop - first) if count and not (CHUNK in run and count == stop - first) else None
+    if not count or (CHUNK in run and count == stop - first) or _is_locked(folder):
+        return None
+    return Kept(folder, count, stop - first)
+
+
+def _lock(folder: Path) -> BaseFileLock:
+    """The lock of a folder, not yet acquired."""
+    return FileLock(folder / LOCK, timeout=LOCK_SECONDS, thread_local=False, fallback_to_soft=False)
+
+
+def _is_locked(folder: Path) -> bool:
+    """Whether a running process holds the lock of a folder."""
+    if not (folder / LOCK).is_file():
+        return False
+    try:
+        with _lock(folder):
+            return False
+    except OSError as error:
+        return isinstance(error, Timeout)
 
 
 def record_in(folder: Path) -> dict[str, Any]:
@@ -221,16 +248,44 @@ class FrameFolder(Finished):
         self._keep, self._stays = keep, stays
         try:
             self._check_ours()
-            self._lock = FolderLock(folder, layer=folder.with_name(folder.name.removesuffix(_FRAMES)))
+            self._lock = self._locked()
             with ExitStack() as unless_taken:
-                unless_taken.callback(self._lock.release)
+                unless_taken.callback(self._release)
                 self._take(json.loads(json.dumps(run)), resume=resume, drop=drop)
                 unless_taken.pop_all()
         except OSError as error:
             raise LayerError(f"cannot write {folder}: {error.strerror}") from error
 
+    def _locked(self) -> BaseFileLock:
+        """Lock the folder; created if missing."""
+        self.folder.mkdir(exist_ok=True)
+        file, lock = self.folder / LOCK, _lock(self.folder)
+        check_no_link(file)
+        try:
+            lock.acquire()
+            with suppress(OSError):  # Windows refuses to write a locked file.
+                file.write_text(f"process {os.getpid()} on {HOST}", encoding="utf-8")
+        except Timeout as held:
+            who = "another run"
+            with suppress(OSError, ValueError):
+                who = file.read_text(encoding="utf-8") or who
+            layer = self.folder.with_name(self.folder.name.removesuffix(_FRAMES))
+            raise LayerError(f"{layer} is being made by {who}; wait for it, end it, or name another layer") from held
+        except OSError as error:
+            if error.errno not in _NO_LOCKS:
+                raise
+        return lock
+
+    def _release(self) -> None:
+        """Unlock the folder; remove the folder if empty."""
+        with suppress(OSError):  # Windows removes the file when it is unlocked.
+            (self.folder / LOCK).unlink()
+        self._lock.release()
+        with suppress(OSError):
+            self.folder.rmdir()
+
     def _take(self, wanted: dict[str, Any], *, resume: bool, drop: bool) -> None:
-        """Use or drop existing frames; failed frames are solved again."""
+        """Use or drop existing frames; frames that failed, or whose files a crash cut short, are solved again."""
         found = whole_frames(self.folder)
         different = self._differences(wanted) if found else []
         if different and (resume or not drop):
@@ -242,8 +297,9 @@ class FrameFolder(Finished):
             raise UsageError(f"{there}; go on by --resume, or drop them by --overwrite")
         self.kept = frozenset(found if resume else ())
         self.dropped = 0 if resume or different else len(found)
-        for file in self.folder.glob(f"*{_FAILED}"):
-            file.unlink()
+        for file in self.folder.glob(f"*{_DONE}"):
+            if file.name.endswith(_FAILED) or not zipfile.is_zipfile(file):
+                file.unlink()
         if not self.kept:
             self._clear()
         self._run = json.dumps(wanted, indent=2) + "\n"
@@ -263,7 +319,7 @@ class FrameFolder(Finished):
 
     def __getstate__(self) -> dict[str, Any]:
         """Store the absolute path, for processes with a different working directory."""
-        return self.__dict__ | {"folder": self.folder.absolute()}
+        return self.__dict__ | {"folder": self.folder.absolute(), "_lock": None}
 
     def write(self, index: int, outcome: Outcome, *, seam: int | None = None) -> None:
         """Write a frame's result; ``seam``: number of the frame whose pre-roll the result belongs to, or None.
@@ -308,7 +364,7 @@ class FrameFolder(Finished):
             if done or (kind and not (self._keep or self.kept)) or not whole_frames(self.folder):
                 self._clear()
         finally:
-            self._lock.release()
+            self._release()
 
 
 def _heat_of(data: Mapping[str, np.ndarray], index: int) -> dict[str, np.ndarray]:

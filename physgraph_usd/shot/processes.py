@@ -1,9 +1,8 @@
-"""Runs calls in separate processes; a dead process becomes an error naming the cause."""
+"""Runs calls in separate processes, by `concurrent.futures`: a process that dies costs its own call alone."""
 
 from __future__ import annotations
 
 import contextlib
-import logging
 import multiprocessing
 import os
 import re
@@ -12,99 +11,51 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Generator, Iterator, Sequence
-from multiprocessing.connection import Connection
-from types import TracebackType
+from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor, ThreadPoolExecutor, wait
+from functools import partial
 from typing import Any
 
 from ..errors import PhysGraphError, SolveError
-from ..interrupts import leave_if_asked, signals_noted
+from ..interrupts import exit_code_of, leave_if_asked, signals_noted
 
-LOG = logging.getLogger("physgraph_usd")
 POLL_SECONDS = 0.02
 PATIENCE_SECONDS = 10.0
-"""Time for a process to clean up after being asked to end, and for a stopped process before a warning [s]."""
+"""Time for a process to clean up after it was asked to end [s]."""
 _MEMORY = re.compile(r"out of memory|n.t allocate|to allocate|bad_alloc", re.IGNORECASE)
 
+Start = Callable[..., Future[Any]]
+"""Starts a function with arguments in another process; all of them and the result must be picklable."""
 
-class Call:
-    """A function running in a separate process; function, arguments and result must be picklable.
 
-    Attributes:
-        lag: Longest time for the call's files to appear after the call has ended [s].
+@contextlib.contextmanager
+def separate_processes(workers: int) -> Iterator[Start]:
+    """Start each call in a new process; calls still running at the end of the block are ended.
+
+    A pool of processes breaks as a whole when one of them dies, so each call has a pool of one.
+
+    Args:
+        workers: Most calls at a time; later calls wait.
     """
+    spawn, over = multiprocessing.get_context("spawn"), threading.Event()
+    pids: set[int] = set()
 
-    lag = 0.0
+    def call(function: Callable[..., Any], *args: Any) -> Any:
+        with ProcessPoolExecutor(1, spawn, initializer=_begin) as pool:
+            pids.add(pool.submit(os.getpid).result())
+            return None if over.is_set() else pool.submit(_answer, function, *args).result()
 
-    def __init__(self, function: Callable[..., Any], *args: Any) -> None:
-        """Start the process."""
-        context = multiprocessing.get_context("spawn")
-        self._here, there = context.Pipe(duplex=False)
-        self._process = context.Process(target=_answer, args=(there, function, args), daemon=True)
-        self._process.start()
-        there.close()
-        self._answer: tuple[Any, PhysGraphError | None] | None = None
-        self._stopped_since: float | None = None
-        self._has_warned = False
-
-    @property
-    def ready(self) -> bool:
-        """Whether the call has returned, failed or died; warns if the process is stopped."""
-        if self._answer is not None or self._here.poll():
-            return True
-        self._warn_if_stopped()
-        return False
-
-    def _warn_if_stopped(self) -> None:
-        """Warn once about a process stopped too long for a pause of the whole run."""
-        pid = self._process.pid
-        if self._has_warned or not self._is_stopped():
-            self._stopped_since = None
-            return
-        now = time.monotonic()
-        self._stopped_since = self._stopped_since or now
-        if now - self._stopped_since >= PATIENCE_SECONDS:
-            LOG.warning("the worker process %d is stopped and the run waits; kill -CONT %d lets it go on", *2 * (pid,))
-            self._has_warned = True
-
-    def _is_stopped(self) -> bool:
-        if not hasattr(os, "waitid") or self._process.pid is None:
-            return False
-        try:  # WNOWAIT leaves the process's end to multiprocessing.
-            return os.waitid(os.P_PID, self._process.pid, os.WSTOPPED | os.WNOHANG | os.WNOWAIT) is not None
-        except ChildProcessError:  # The process has ended.
-            return False
-
-    def result(self) -> Any:
-        """Wait for the function's result.
-
-        Raises:
-            PhysGraphError: Raised by the function; an unforeseen error is converted, with the traceback on stderr.
-            SolveError: The process died.
-        """
-        if self._answer is None:
-            try:
-                answer: tuple[Any, PhysGraphError | None] = self._here.recv()
-            except EOFError:
-                self._process.join()
-                answer = None, SolveError(_obituary(self._process.exitcode or 0))
-            self._answer = answer
-        value, error = self._answer
-        if error is not None:
-            raise error
-        return value
-
-    def ask_to_end(self) -> None:
-        """Ask the process to clean up and end; do not wait."""
-        self._process.terminate()
-        if self._is_stopped() and self._process.pid is not None:
-            os.kill(self._process.pid, signal.SIGCONT)
-
-    def end(self) -> None:
-        """End the process, with time to clean up."""
-        self.ask_to_end()
-        self._process.join(PATIENCE_SECONDS)
-        self._process.kill()
-        self._here.close()
+    with ThreadPoolExecutor(workers) as threads:
+        try:
+            yield partial(threads.submit, call)
+        finally:
+            over.set()
+            threads.shutdown(wait=False, cancel_futures=True)
+            running = [child for child in multiprocessing.active_children() if child.pid in pids]
+            for child in running:
+                child.terminate()
+            for child in running:
+                child.join(PATIENCE_SECONDS)
+                child.kill()
 
 
 def call_each(
@@ -120,24 +71,42 @@ def call_each(
     Returns:
         Per job the result, or the `PhysGraphError` raised.
     """
-    calls: list[Call] = []
-    try:
-        for index in range(len(jobs)):
-            while not (index < len(calls) and calls[index].ready):
-                leave_if_asked()
-                if len(calls) < len(jobs) and sum(not call.ready for call in calls) < workers:
-                    calls.append(Call(function, *jobs[len(calls)]))
-                else:
-                    time.sleep(POLL_SECONDS)
+    with separate_processes(workers) as start:
+        for future in [start(function, *job) for job in jobs]:
             try:
-                yield calls[index].result()
+                yield result_of(future)
             except PhysGraphError as error:
                 yield error
-    finally:
-        for call in calls:
-            call.ask_to_end()
-        for call in calls:
-            call.end()
+
+
+def result_of(future: Future[Any], *, at: str = "") -> Any:
+    """Wait for a call's result.
+
+    Args:
+        future: The call.
+        at: Work of the call at its end, for the message, such as " at time code 5".
+
+    Raises:
+        PhysGraphError: Raised or returned by the function; an unforeseen error is converted, with the traceback on
+            stderr.
+        SolveError: The process died, or a farm dropped the call.
+    """
+    while not future.done():
+        leave_if_asked()
+        wait([future], POLL_SECONDS)
+    if future.cancelled():
+        raise SolveError(f"a call was cancelled{at}: the farm's scheduler is gone, or dropped the call")
+    error = future.exception()
+    answer = future.result() if error is None else error
+    if isinstance(answer, PhysGraphError):
+        raise answer
+    if error is None:
+        return answer
+    if isinstance(error, BrokenExecutor) and error.__cause__ is None:
+        remedy = "if memory ran out, use fewer --workers or a lower --level"
+        raise SolveError(f"a worker process died{at}; {remedy}")
+    traceback.print_exception(error)
+    raise PhysGraphError(f"unexpected {type(error).__name__}: {error}") from error
 
 
 @contextlib.contextmanager
@@ -157,46 +126,28 @@ def memory_is_named() -> Iterator[None]:
         raise SolveError("out of memory; a lower --level or fewer --workers needs less") from error
 
 
-def _answer(there: Connection, function: Callable[..., Any], args: tuple[Any, ...]) -> None:
-    """Call the function and send the result; Ctrl-C is ignored here and handled by the parent process."""
+def _begin() -> None:
+    """Prepare a worker process: the parent handles Ctrl-C, and a worker ends with its parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_outlast_parent, daemon=True).start()
-    with signals_noted(), _Sent(there), memory_is_named():
-        there.send((function(*args), None))
+    threading.Thread(target=_end_with_parent, daemon=True).start()
 
 
-class _Sent:
-    """Sends errors raised inside the block; unforeseen errors as a `PhysGraphError`, with the traceback on stderr."""
-
-    def __init__(self, there: Connection) -> None:
-        self._there = there
-
-    def __enter__(self) -> None: ...
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> bool:
-        if not isinstance(error, Exception):
-            return False
-        if not isinstance(error, PhysGraphError):
-            traceback.print_exception(error)
-            error = PhysGraphError(f"unexpected {type(error).__name__}: {error}")
-        self._there.send((None, error))
-        return True
+def _answer(function: Callable[..., Any], *args: Any) -> Any:
+    """Call a function in a worker process; a signal ends the process once the function has cleaned up."""
+    try:
+        with signals_noted(), memory_is_named():
+            answer = function(*args)
+    except SystemExit as error:
+        os._exit(exit_code_of(error) or 1)
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # The parent would wait for the rest of a torn answer.
+    return answer
 
 
-def _outlast_parent() -> None:
+def _end_with_parent() -> None:
     """End this process when the parent process is gone, even if killed."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()
-        os.kill(os.getpid(), signal.SIGTERM)  # lets a layer being written clear up
+        os.kill(os.getpid(), signal.SIGTERM)  # Lets a layer being written clear up.
         time.sleep(PATIENCE_SECONDS)
         os._exit(1)
-
-
-def _obituary(code: int) -> str:
-    """How a process died, by its exit code."""
-    how = signal.Signals(-code).name if code < 0 else f"exit code {code}"
-    why = ", perhaps for lack of memory; use fewer --workers or a lower --level" if how == "SIGKILL" else ""
-    return f"a worker process died ({how}){why}"

@@ -6,7 +6,7 @@ import dataclasses
 import sys
 import time as clock
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack, closing, nullcontext
+from contextlib import AbstractContextManager, ExitStack, closing, nullcontext
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -32,6 +32,7 @@ from .frames import CHUNK, Folders, FrameFolder, Outcome, frames_folder
 from .joined import Both, Joint, SafeMover, joined
 from .notes import of_energy, of_folds, of_rest
 from .options import RefineOptions
+from .processes import Start, separate_processes
 from .report import LOG, RefineReport
 from .settled import unsettled_frames
 from .solve import Outcomes, ShotSolver
@@ -197,10 +198,16 @@ class Run:
             yield from self.solver(times)
             return
         self._warn_of_finished(frames, len(numbers))
-        with connected(options.scheduler) if options.scheduler else nullcontext() as farm:
-            chunks = {"workers": options.workers, "only": numbers, "preroll": self._preroll, "start": farm}
+        with self._processes() as start:
+            chunks = {"workers": options.workers, "only": numbers, "preroll": self._preroll, "start": start}
             with closing(solve_in_chunks(self.solver, times, frames, **chunks)) as solved:
                 yield from solved if self._is_chunk else joined(solved, mover, self.report.warn)
+
+    def _processes(self) -> AbstractContextManager[Start | None]:
+        """Starter of chunks: on a farm, in processes of this machine, or None to solve in this process."""
+        if self.options.scheduler:
+            return connected(self.options.scheduler)
+        return separate_processes(self.options.workers) if self.options.workers > 1 else nullcontext()
 
     def _warn_of_finished(self, frames: FrameFolder, count: int) -> None:
         """Warn if frames of an earlier run are used, or could have been."""
