@@ -19,7 +19,7 @@ from stages import add_sheet, new_stage
 from physgraph_usd.shot.refine import inspect_shot
 from physgraph_usd.shot.report import of_a_kind
 from physgraph_usd.shot.warnings import WARNINGS
-from physgraph_usd.solver.contact.broad_phase import Parts
+from physgraph_usd.solver.contact.broad_phase import TouchingGroups
 from physgraph_usd.solver.scene import Garment, GarmentFrame
 from physgraph_usd.usd.read.find import felt_by, find_colliders
 
@@ -85,18 +85,18 @@ def test_what_they_touch_is_looked_for_in_time_that_grows_with_their_number(
 
 def test_those_that_meet_are_looked_for_in_time_that_grows_with_their_number():
     given = {count: scattered(count, 10.0 * count) for count in (FEW, FACTOR * FEW)}
-    assert linear(lambda count: Parts(given[count][0], together=True).of(given[count][1]))
+    assert linear(lambda count: TouchingGroups(given[count][0], together=True).of(given[count][1]))
 
 
 @pytest.mark.parametrize("spread", [0.5, 2.0, 8.0])
 def test_those_that_meet_are_found_as_by_looking_at_every_pair(spread: float):
     garments, frames = scattered(40, spread)
-    found = Parts(garments, together=True).of(frames)
+    found = TouchingGroups(garments, together=True).of(frames)
     pairs = [
         (a, b)
         for a in range(40)
         for b in range(a + 1, 40)
-        if len(Parts([garments[a], garments[b]], together=True).of([frames[a], frames[b]])) == 1
+        if len(TouchingGroups([garments[a], garments[b]], together=True).of([frames[a], frames[b]])) == 1
     ]
     assert found == joined(40, pairs)
 

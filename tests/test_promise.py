@@ -11,7 +11,7 @@ from folds import EDGE, levels_of, named, promise_of, square
 
 from physgraph_usd.solver.collide.near import weights
 from physgraph_usd.solver.collide.pairs import Pairs
-from physgraph_usd.solver.contact.along import COMES, Planes, along
+from physgraph_usd.solver.contact.along import COMES, ApproachLimits, along
 from physgraph_usd.solver.level import Placed
 
 GAP = 0.2 * EDGE
@@ -61,7 +61,7 @@ class TestAlong:
 
     def test_no_pair_comes_nearer_than_it_may_and_together_they_go_as_far(self):
         x, way, pairs = self.scene()
-        out = along(way, Planes.of(x, x, pairs, FLOOR), free=torch.ones(8, 1, dtype=torch.bool))
+        out = along(way, ApproachLimits.of(x, x, pairs, FLOOR), free=torch.ones(8, 1, dtype=torch.bool))
         weight = weights(x, pairs.corners, pairs.face)
         nearer = -(weight * out[pairs.corners.long(), 1]).sum(dim=1)
         assert torch.allclose(nearer, torch.full_like(nearer, COMES * (0.1 - FLOOR)), atol=1e-6)
@@ -71,7 +71,7 @@ class TestAlong:
         x, way, pairs = self.scene()
         free = torch.ones(8, 1, dtype=torch.bool)
         free[0] = False
-        out = along(way, Planes.of(x, x, pairs, FLOOR), free=free)
+        out = along(way, ApproachLimits.of(x, x, pairs, FLOOR), free=free)
         assert torch.equal(out[0], way[0])
         weight = weights(x, pairs.corners, pairs.face)
         assert float(-(weight[0] * out[pairs.corners[0].long(), 1]).sum()) <= COMES * (0.1 - FLOOR) + 1e-6
@@ -85,14 +85,14 @@ class TestAlong:
         corners, free = torch.arange(4, dtype=torch.int32).reshape(1, 4), torch.ones(4, 1, dtype=torch.bool)
         met = Pairs(corners, torch.ones(1, dtype=torch.float64), torch.tensor([False]))
 
-        def gap(planes: Planes) -> float:
+        def gap(planes: ApproachLimits) -> float:
             end = x + along(way, planes, free=free)
             part = -end[0, 0] / (end[1, 0] - end[0, 0])
             return float(end[0, 1] + part * (end[1, 1] - end[0, 1]) - end[2:, 1].mean())
 
-        planes = Planes.of(x, x, met, FLOOR)
+        planes = ApproachLimits.of(x, x, met, FLOOR)
         assert gap(planes) < 0.0
         for _ in range(2):
             end = x + along(way, planes, free=free)
-            planes = planes.joined(Planes.of(x, end, replace(met, value=0.0 * met.value), FLOOR, corners=True))
+            planes = planes.joined(ApproachLimits.of(x, end, replace(met, value=0.0 * met.value), FLOOR, corners=True))
         assert gap(planes) > 0.0

@@ -16,7 +16,7 @@ from folds import named
 from meshes import grid
 
 from physgraph_usd.solver.collide.parts import Parts
-from physgraph_usd.solver.collide.search import impacts, piercing_edges
+from physgraph_usd.solver.collide.search import blocking_pairs, piercing_edges
 from physgraph_usd.solver.level import Level, build_levels
 from physgraph_usd.solver.mesh.topology import PolygonMesh
 
@@ -81,7 +81,7 @@ class Cloth:
         """Pairs of parts that the search finds on a move, of queried vertices alone where these are given."""
         some = np.ones(len(x), bool) if asked is None else asked
         given = [torch.as_tensor(each) for each in (x, end)]
-        pairs = impacts(self.parts, *given, floor=0.0, asked=torch.as_tensor(some))
+        pairs = blocking_pairs(self.parts, *given, floor=0.0, asked=torch.as_tensor(some))
         split = np.where(pairs.face.numpy(), 1, 2)
         listed = [
             frozenset((frozenset(c[:k]), frozenset(c[k:])))
@@ -193,8 +193,8 @@ def test_a_search_depends_on_nothing_before_it(shape: Shape):
     moves = [[torch.as_tensor(each) for each in move] for move in random_moves(cloth, 3, seed=6)]
     for x, end in moves:
         piercing_edges(others.parts, end)
-        impacts(others.parts, end, x, floor=0.1 * EDGE, asked=x[:, 0] > x[:, 0].mean())
+        blocking_pairs(others.parts, end, x, floor=0.1 * EDGE, asked=x[:, 0] > x[:, 0].mean())
         given = {"floor": 0.0, "asked": torch.ones(len(x), dtype=torch.bool)}
-        first, again = impacts(cloth.parts, x, end, **given), impacts(others.parts, x, end, **given)
+        first, again = blocking_pairs(cloth.parts, x, end, **given), blocking_pairs(others.parts, x, end, **given)
         for name in ("corners", "value", "face"):
             assert torch.equal(getattr(first, name), getattr(again, name))

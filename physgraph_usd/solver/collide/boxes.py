@@ -1,7 +1,7 @@
 """Boxes of clusters and of parts at the start and at the end of a move, compared eight at a time.
 
 Two sets of points that one axis separates at both ends, in equal order, are apart throughout a straight move: the
-theorem of `impact` with the axis as its direction. Positions alone are a move whose ends are equal.
+theorem of `separation` with the axis as its direction. Positions alone are a move whose ends are equal.
 
 Boxes are stored in blocks of eight: twelve rows of low, high, low at the end and high at the end by axis, a lane for
 each part.
@@ -122,7 +122,7 @@ class Boxes:
 
 
 @wp.func_native(_OVERLAPPING)
-def overlapping(
+def boxes_near(
     boxes: wp.array(dtype=wp.float32),
     part: wp.int32,
     others: wp.array(dtype=wp.float32),

@@ -8,8 +8,8 @@ import warp as wp
 
 from ..mesh.kernels import KERNELS
 from ..mesh.piercing import passes_through
-from .boxes import CROSSING, NEAR, Boxes, Query, lowest_bit, overlapping, without_lowest
-from .impact import distance_of, gap_along, impact_of
+from .boxes import CROSSING, NEAR, Boxes, Query, boxes_near, lowest_bit, without_lowest
+from .separation import distance_of, gap_along, safe_fraction
 from .topology import EDGE, FACE, LANES, VERTEX, Topology
 
 wp.set_module_options(KERNELS)
@@ -79,7 +79,7 @@ def value_of(face: wp.bool, c: wp.vec4i, parts: Topology, query: Query):
         return one
     if query.kind == NEAR:
         return nearness(face, c, parts, query, room)
-    return impact_of(face, b, d, f, v - b, p - d, q - f, query.floor)
+    return safe_fraction(face, b, d, f, v - b, p - d, q - f, query.floor)
 
 
 @wp.func
@@ -152,7 +152,7 @@ def search_kind(
     """Write pairs of a cluster's parts of one kind and another's of a second; returns the number of pairs so far."""
     room, size = boxes.radius[i] + boxes.radius[j], parts.clusters + 1
     for b in range(parts.first[first * size + i], parts.first[first * size + i + 1], ALL):
-        near = overlapping(boxes.clusters, j, boxes.parts, b, blocks_left(parts, first, i, b), room)
+        near = boxes_near(boxes.clusters, j, boxes.parts, b, blocks_left(parts, first, i, b), room)
         while near != wp.uint64(0):
             k = LANES * b + lowest_bit(near)
             near = without_lowest(near)
@@ -160,7 +160,7 @@ def search_kind(
             if not (boxes.asked[j] or query.asked[p[0]] or query.asked[p[1]] or query.asked[p[2]]):
                 continue
             for c in range(parts.first[second * size + j], parts.first[second * size + j + 1], ALL):
-                others = overlapping(boxes.parts, k, boxes.parts, c, blocks_left(parts, second, j, c), room)
+                others = boxes_near(boxes.parts, k, boxes.parts, c, blocks_left(parts, second, j, c), room)
                 while others != wp.uint64(0):
                     m = LANES * c + lowest_bit(others)
                     others = without_lowest(others)

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from ..mesh.kernels import KERNELS
 from ..mesh.threads import LEAST_PER_THREAD, LEAST_QUERIES, argument, run
-from .boxes import CROSSING, MOVE, NEAR, Boxes, bound_clusters, bound_parts, overlapping, query_of
+from .boxes import CROSSING, MOVE, NEAR, Boxes, bound_clusters, bound_parts, boxes_near, query_of
 from .narrow_phase import Found, find_pairs
 from .pairs import Pairs, Reach
 from .parts import Parts
@@ -51,7 +51,7 @@ def find_clusters(
             if parts.meets[parts.garment[i] * parts.garments + parts.garment[j]] == 0:
                 continue
             room_of_both = boxes.radius[i] + boxes.radius[j]
-            near = overlapping(boxes.clusters, i, boxes.clusters, j // LANES, 1, room_of_both)
+            near = boxes_near(boxes.clusters, i, boxes.clusters, j // LANES, 1, room_of_both)
             if (wp.int32(near) >> (j % LANES)) & 1 == 1:
                 if n < room:
                     out[i * room + n] = j
@@ -65,7 +65,7 @@ def near_parts(parts: Parts, x: Float[Tensor, "vertices 3"], reach: Reach) -> Pa
     return _search(parts, query_of(x.double(), kind=NEAR, radius=radius, play=play, half=reach.half))
 
 
-def impacts(
+def blocking_pairs(
     parts: Parts,
     start: Float[Tensor, "vertices 3"],
     end: Float[Tensor, "vertices 3"],
@@ -74,7 +74,7 @@ def impacts(
     asked: Bool[Tensor, " vertices"],
     tangle: Int[Tensor, " vertices"] | None = None,
 ) -> Pairs:
-    """All pairs of parts that no plane keeps apart on straight paths (`impact`).
+    """All pairs of parts that no plane keeps apart on straight paths (`separation`).
 
     Args:
         parts: The parts.

@@ -12,9 +12,9 @@ import warp as wp
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ..collide.impact import TIGHT
 from ..collide.near import weights
 from ..collide.pairs import Pairs
+from ..collide.separation import TIGHT
 from ..mesh.kernels import KERNELS
 from ..mesh.stencil import incidence
 from ..mesh.threads import Launch, argument
@@ -68,7 +68,7 @@ def _add_pushes(
 
 
 @dataclass(frozen=True, eq=False)
-class Planes:
+class ApproachLimits:
     """One linear inequality on the displacements for each pair: the parts may approach by at most `may` along `normal`.
 
     Attributes:
@@ -84,8 +84,8 @@ class Planes:
     may: Float[Tensor, " pairs"]
 
     @staticmethod
-    def of(x: Tensor, ends: Tensor, met: Pairs, floor: float, *, corners: bool = False) -> Planes:
-        """Planes across the shortest vectors between the parts of pairs, at the time of impact.
+    def of(x: Tensor, ends: Tensor, met: Pairs, floor: float, *, corners: bool = False) -> ApproachLimits:
+        """Limits along the shortest vectors between the parts of pairs, as far on the move as a plane keeps them apart.
 
         Args:
             x: Positions [m], float64, shape (V, 3).
@@ -104,16 +104,16 @@ class Planes:
             weight = _nearest(to @ normal.unsqueeze(2), face)
         gap = (weight * (at @ normal.unsqueeze(2)).squeeze(2)).sum(dim=1)
         may = COMES * (distance - (TIGHT * distance).clamp_max(floor))
-        return Planes(met.corners, weight, normal, gap - distance + may)
+        return ApproachLimits(met.corners, weight, normal, gap - distance + may)
 
-    def joined(self, other: Planes) -> Planes:
+    def joined(self, other: ApproachLimits) -> ApproachLimits:
         """Both sets of planes."""
         pairs = ((getattr(self, each.name), getattr(other, each.name)) for each in fields(self))
-        return Planes(*(torch.cat(pair) for pair in pairs))
+        return ApproachLimits(*(torch.cat(pair) for pair in pairs))
 
 
 def along(
-    way: Float[Tensor, "vertices 3"], planes: Planes, *, free: Bool[Tensor, "vertices 1"], threads: int = 1
+    way: Float[Tensor, "vertices 3"], planes: ApproachLimits, *, free: Bool[Tensor, "vertices 1"], threads: int = 1
 ) -> Float[Tensor, "vertices 3"]:
     """Displacements closest to the wanted displacements [m] that violate no plane.
 
@@ -123,7 +123,7 @@ def along(
 
     Args:
         way: Wanted displacement of each vertex [m], float64.
-        planes: Planes of the blocking pairs.
+        planes: ApproachLimits of the blocking pairs.
         free: Vertices whose displacement may be changed.
         threads: Most threads on the CPU.
     """

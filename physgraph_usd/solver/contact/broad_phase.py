@@ -27,7 +27,7 @@ NEVER = -float("inf")
 """Offset of a garment from a surface that the garment ignores."""
 
 
-class Parts:
+class TouchingGroups:
     """Groups of garments in mutual contact in a frame."""
 
     def __init__(self, garments: Sequence[Garment], *, together: bool) -> None:

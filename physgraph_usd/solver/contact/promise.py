@@ -10,10 +10,10 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ..collide.pairs import Pairs
-from ..collide.search import impacts
+from ..collide.search import blocking_pairs
 from ..deadline import is_over
 from ..level import Placed
-from .along import Planes, along
+from .along import ApproachLimits, along
 from .cloth import ClothView
 from .safe_move import ROUNDS, safe_move
 
@@ -88,19 +88,19 @@ class Promise:
         parts = self.view.parts
         options = _MoveOptions(floor=self.floor, tangle=tangle)
         moves = (aim != start).any(dim=1)
-        met = impacts(parts, start, aim, **options, asked=moves)
+        met = blocking_pairs(parts, start, aim, **options, asked=moves)
         if not len(met.value):
             return Placed(aim)
         at, ends = start.double(), aim
         wanted, free = aim.double() - at, moves.unsqueeze(1) & parts.level.free
-        planes = Planes.of(at, aim.double(), met, self.floor)
+        planes = ApproachLimits.of(at, aim.double(), met, self.floor)
         for _ in range(ROUNDS):
             last, way = ends, along(wanted, planes, free=free, threads=parts.level.threads)
             ends = self.view.closed((at + way).to(aim))
-            met = impacts(parts, start, ends, **options, asked=_corners(met, (ends != last).any(dim=1)))
+            met = blocking_pairs(parts, start, ends, **options, asked=_corners(met, (ends != last).any(dim=1)))
             if not len(met.value):
                 return Placed(ends)
-            planes = planes.joined(Planes.of(at, ends.double(), met, self.floor, corners=True))
+            planes = planes.joined(ApproachLimits.of(at, ends.double(), met, self.floor, corners=True))
         asked = _corners(met, torch.zeros_like(moves))
         return safe_move(start, ends, parts, **options, asked=asked).x
 

@@ -3,7 +3,7 @@
 Theorem. Let every vertex-face and edge-edge pair of a mesh, except pairs that share a vertex, have a positive distance
 at ``start``. Then every such pair has a positive distance at the result of `safe_move`, and the result has no crossings
 that ``start`` did not have: a plane keeps each pair apart on the straight path between the two positions, as rounded
-(`collide.impact`), so no pair can have changed sides. The theorem holds for any wanted positions.
+(`collide.separation`), so no pair can have changed sides. The theorem holds for any wanted positions.
 
 Exempt are pairs that touch at the start (distance 0), and pairs with all vertices in a single given tangle. If the
 start is in double precision and the wanted positions in single, gaps below single precision's rounding cannot be
@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ..collide.parts import Parts
-from ..collide.search import impacts
+from ..collide.search import blocking_pairs
 from ..deadline import is_over
 from ..level import Placed
 
@@ -82,7 +82,7 @@ def safe_move(
     share = torch.ones(len(way), dtype=torch.float64, device=way.device)
     x, asked = wanted, (way != 0).any(dim=1) if asked is None else asked
     for attempt in range(len(way) + ROUNDS):
-        more = impacts(parts, start, x, floor=floor, asked=asked, tangle=tangle)
+        more = blocking_pairs(parts, start, x, floor=floor, asked=asked, tangle=tangle)
         if not len(more.value):
             break
         least = torch.ones_like(share)

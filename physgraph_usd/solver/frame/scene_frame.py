@@ -11,7 +11,7 @@ import torch
 
 from ...errors import GarmentError, SolveError
 from ..contact.bodies import Touching
-from ..contact.broad_phase import Bodies, Parts, bounds_of, reach_of
+from ..contact.broad_phase import Bodies, TouchingGroups, bounds_of, reach_of
 from ..contact.heat import body_crossings, penetration_map
 from ..deadline import is_over
 from ..level import refine_garments
@@ -55,7 +55,7 @@ class SceneCloth:
         self.bodies = Bodies(scene.colliders, device=device, threads=threads)
         self._place, self._device = {"dtype": dtype, "device": device, "threads": threads}, device
         self._groups: dict[tuple[int, ...], Group] = {}
-        self._parts = {together: Parts(scene.garments, together=together) for together in (False, True)}
+        self._parts = {together: TouchingGroups(scene.garments, together=together) for together in (False, True)}
 
     def group(self, part: tuple[int, ...], settings: SolveSettings) -> Group:
         """The group of garments solved together, built on first use; levels and metrics are kept."""

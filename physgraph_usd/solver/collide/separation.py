@@ -91,7 +91,7 @@ def part_kept(
 
 
 @wp.func
-def impact_of(
+def safe_fraction(
     face: wp.bool,
     b: wp.vec3d,
     c: wp.vec3d,
