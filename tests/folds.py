@@ -14,7 +14,6 @@ from sheets import garment_of
 
 from physgraph_usd.solver.colliders.pose import Collider, MeshPose, Pose
 from physgraph_usd.solver.contact.cloth import ClothContact, ClothView
-from physgraph_usd.solver.contact.frame import FrameContact
 from physgraph_usd.solver.contact.promise import Promise
 from physgraph_usd.solver.contact.settings import ContactSettings
 from physgraph_usd.solver.fabric import Fabric
@@ -23,7 +22,6 @@ from physgraph_usd.solver.frame.refiner import Refiner
 from physgraph_usd.solver.level import Level, build_levels, refine_garments
 from physgraph_usd.solver.mesh.topology import PolygonMesh
 from physgraph_usd.solver.scene import Frame, Garment, GarmentFrame, Scene
-from physgraph_usd.solver.seams import level_seams
 from physgraph_usd.usd.read.seams import sewn_garments
 
 EDGE = 0.05
@@ -135,21 +133,6 @@ def view_of(
 def promise_of(levels: Sequence[Level], garments: Sequence[Garment], **given: Any) -> Promise:
     """What moves the finest level's cloth safely; the rest is as for `view_of`."""
     return Promise(view_of(levels, garments, **given), 6e-5)
-
-
-def contact_of(
-    levels: Sequence[Level], garments: Sequence[Garment], cage: torch.Tensor, **settings: Any
-) -> FrameContact:
-    """Cloth that may touch cloth in a frame without bodies, and its seams."""
-    return FrameContact(
-        levels,
-        cage,
-        bodies=None,
-        cloth=ClothContact(levels, garments),
-        thickness=[0.001] * len(garments),
-        settings=ContactSettings(**settings),
-        seams=level_seams(levels, sewn(garments, cage.double().numpy())),
-    )
 
 
 def sewn(garments: Sequence[Garment], *cages: np.ndarray) -> list[Garment]:

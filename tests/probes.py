@@ -279,14 +279,6 @@ def elastica(length: float, rigidity: float, density: float) -> float:
     return float(np.arctan2(np.trapezoid(np.sin(t), s), np.trapezoid(np.cos(t), s)))
 
 
-def peirce(angle: float, length: float, density: float) -> float:
-    """Peirce's D [N m] from the chord's angle: density G c^3, c = length (cos(angle / 2) / (8 tan angle))^(1/3).
-
-    An approximation of 1930: 6% above the elastica's at the fabric laboratory's 41.5 degrees.
-    """
-    return density * G * length**3 * np.cos(angle / 2) / (8 * np.tan(angle))
-
-
 def rigidity_from(angle: float, length: float, density: float) -> float:
     """The rigidity [N m] with which the elastica has this chord angle."""
     unit = density * G * length**3

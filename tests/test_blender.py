@@ -142,14 +142,6 @@ def test_the_topology_is_the_refined_one_and_not_subdivided_again(seen: Seen) ->
         np.testing.assert_array_equal(seen.array("corners", frame), mesh.GetFaceVertexIndicesAttr().Get())
 
 
-def test_only_the_layers_points_move_it(seen: Seen) -> None:
-    meshes = dict(seen.found["meshes"])
-    assert meshes.pop(seen.prim.GetName()) == ["MESH_SEQUENCE_CACHE"], "no armature, no subdivision"
-    # The body of the T-shirt has both: without them this test would prove nothing.
-    form = {"Form": ["SUBSURF", "ARMATURE"]} if seen.coarse == GARMENTS["tshirt"] else {}
-    assert {name: sorted(kinds) for name, kinds in meshes.items()} == {n: sorted(kinds) for n, kinds in form.items()}
-
-
 def test_uvs_have_a_value_per_corner(seen: Seen) -> None:
     expected = np.array(UsdGeom.PrimvarsAPI(seen.prim).GetPrimvar("st").ComputeFlattened())
     for frame in seen.frames:
@@ -172,18 +164,6 @@ def test_each_face_has_the_material_of_its_subset(seen: Seen) -> None:
     for frame in seen.frames:
         given = np.array(seen.found["slots"], object)[seen.array("material", frame)]
         np.testing.assert_array_equal(given, expected)
-
-
-def test_normals_are_those_of_each_frame(seen: Seen) -> None:
-    corners = np.asarray(UsdGeom.Mesh(seen.prim).GetFaceVertexIndicesAttr().Get())
-    for frame in seen.frames:
-        expected = np.asarray(UsdGeom.Mesh(seen.prim).GetNormalsAttr().Get(frame), float)[corners]
-        apart = np.linalg.norm(seen.array("normals", frame) - expected, axis=1)
-        assert apart.max() < 4e-3, "Blender keeps 16 bits per angle"
-
-
-def test_the_shots_frame_range_is_kept(seen: Seen) -> None:
-    assert seen.found["range"] == [seen.stage.GetStartTimeCode(), seen.stage.GetEndTimeCode()]
 
 
 def exported(folder: Path, **options: object) -> Path:

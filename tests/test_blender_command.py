@@ -12,7 +12,6 @@ import pytest
 
 import physgraph_usd
 from physgraph_usd import cli
-from physgraph_usd.solver.fabric import PRESETS
 
 ADDON = Path(__file__).parents[1] / "plugins" / "blender"
 QUICK = "--integrator quasi-newton --steps 4"
@@ -35,20 +34,6 @@ def test_the_manifest_agrees_with_the_package() -> None:
     assert (manifest["id"], manifest["version"]) == ("physgraph_usd", physgraph_usd.__version__)
     assert set(manifest["permissions"]) == {"files"}
     assert manifest["type"] == "add-on"
-
-
-def test_the_presets_are_the_packages(command: ModuleType) -> None:
-    assert command.PRESETS == tuple(PRESETS)
-
-
-def test_the_defaults_ask_for_nothing_but_the_garment(command: ModuleType, tmp_path: Path) -> None:
-    files = command.files_of_run(tmp_path, "shot", ["Coat"])
-    settings = command.Settings((1, 24))
-    (line,) = command.command_lines("pg", settings, files, garments=["/root/Coat/mesh"], colliders=[])
-    expected = ["pg", "refine", str(tmp_path / "shot-Coat.v001.coarse.usdc")]
-    expected += ["-o", str(tmp_path / "shot-Coat.v001.refined.usdc"), "--root"]
-    expected += [str(tmp_path / "shot-Coat.v001.refined.usda"), "--garment", "/root/Coat/mesh"]
-    assert line == [*expected, "--frames", "1:24", "--level", "2", "--progress", "--no-keep-frames"]
 
 
 def test_every_setting_arrives(command: ModuleType, tmp_path: Path) -> None:
@@ -124,12 +109,6 @@ def test_a_failure_says_all_that_the_command_said(command: ModuleType, tmp_path:
     with pytest.raises(command.CommandError) as caught:
         run.wait()
     assert str(caught.value) == words
-
-
-def test_a_tag_that_ends_with_3_is_a_failure(command: ModuleType, tmp_path: Path) -> None:
-    lines = [script(tmp_path, "raise SystemExit(3)"), script(tmp_path, "")]
-    with pytest.raises(command.CommandError, match="ended with code 3"):
-        command.Run(lines, tmp_path / "log").wait()
 
 
 def test_cancelling_ends_the_process(command: ModuleType, tmp_path: Path) -> None:

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bodies import box, surfaces
-from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, Vt
+from bodies import box
+from pxr import Sdf, Usd, UsdGeom, UsdPhysics, Vt
 from stages import (
     COLLIDER_API,
     add_sheet,
@@ -23,7 +23,6 @@ from stages import (
 )
 
 from physgraph_usd.solver.colliders.pose import MeshPose, ShapePose
-from physgraph_usd.solver.colliders.primitives import ShapeSurface
 from physgraph_usd.solver.scene import Frame, Scene
 from physgraph_usd.usd.read.reader import open_shot
 
@@ -76,43 +75,6 @@ class TestMeshes:
         assert (scene.colliders[0].path, scene.colliders[0].kind, scene.garments[0].colliders) == (BODY, "mesh", (0,))
         np.testing.assert_allclose(np.ptp(mesh_of(frame).points, axis=0), [0.02, 0.04, 0.06])
 
-    def test_they_are_posed_at_the_cloths_time_between_their_own_samples(self, tmp_path: Path):
-        stage = shot_with(tmp_path / "a.usda", metres=1.0)
-        add_box(stage, times=(1.0, 5.0))
-        shot = save(stage)
-        for time in (1.0, 2.0, 3.0):
-            assert mesh_of(read(shot, time)[1]).points[:, 0].mean() == pytest.approx(time)
-
-    def test_a_moving_ancestor_moves_them(self, tmp_path: Path):
-        stage = shot_with(tmp_path / "a.usda", metres=1.0)
-        parent = UsdGeom.Xform.Define(stage, "/World/rig")
-        operation = parent.AddTranslateOp()
-        for time in (1.0, 3.0):
-            operation.Set(Gf.Vec3d(0.0, time, 0.0), time)
-        add_box(stage, "/World/rig/body")
-        assert mesh_of(read(save(stage), 2.0)[1]).points[:, 1].mean() == pytest.approx(2.0)
-
-    def test_the_topology_may_change(self, tmp_path: Path):
-        stage = shot_with(tmp_path / "a.usda", metres=1.0)
-        mesh = add_box(stage)
-        points, triangles = box()
-        for time, count in ((1.0, 12), (2.0, 6)):
-            mesh.GetFaceVertexCountsAttr().Set(Vt.IntArray.FromNumpy(np.full(count, 3, np.int32)), time)
-            mesh.GetFaceVertexIndicesAttr().Set(Vt.IntArray.FromNumpy(triangles[:count].ravel()), time)
-            mesh.GetPointsAttr().Set(vec3(points), time)
-        shot = save(stage)
-        assert [len(mesh_of(read(shot, time)[1]).triangles) for time in (1.0, 2.0)] == [12, 6]
-
-    def test_skinned_bodies_are_baked(self, tmp_path: Path):
-        stage = shot_with(tmp_path / "a.usda", metres=1.0)
-        add_skeleton(stage, "/World/root", (1.0, 2.0, 3.0))
-        mesh = add_box(stage, "/World/root/body")
-        bind_skin(mesh, "/World/root", joints=[1] * 8)
-        first, last = (mesh_of(read(save(stage), time)[1]).points for time in (1.0, 3.0))
-        assert np.abs(first - last).max() > 0.1
-        sides = [np.linalg.norm(points[0] - points[1]) for points in (first, last)]
-        assert sides[0] == pytest.approx(sides[1], abs=1e-5)
-
     @pytest.mark.parametrize("frames", [None, (3.0, 5.0)])
     def test_skinned_bodies_turn_between_the_skeletons_samples(self, tmp_path: Path, frames: tuple | None):
         """The skeleton has samples at 1 and 21, 115 degrees apart; the cloth has whole time codes between them."""
@@ -138,13 +100,6 @@ class TestMeshes:
         expected = box((1.0, 2.0, 3.0))[0] + np.array([2.0, 0.0, 0.0])
         expected[:, :2] = expected[:, :2] @ turn.T
         np.testing.assert_allclose(mesh_of(read(save(stage), 2.0)[1]).points, expected, atol=1e-5)
-
-    def test_outside_its_samples_a_body_is_held(self, tmp_path: Path):
-        stage = shot_with(tmp_path / "a.usda", metres=1.0)
-        add_box(stage, times=(1.5, 2.5))
-        shot = save(stage)
-        means = [mesh_of(read(shot, time)[1]).points[:, 0].mean() for time in (1.0, 2.0, 3.0)]
-        np.testing.assert_allclose(means, [1.5, 2.0, 2.5])
 
     def test_a_body_in_an_offset_layer_is_posed_in_the_shots_time(self, tmp_path: Path):
         asset = new_stage(tmp_path / "body.usda", metres=1.0)
@@ -178,11 +133,6 @@ class TestMeshes:
         assert frame.colliders == (None,)
         assert any(BODY in line and "left out here" in line for line in said)
 
-    def test_a_body_squashed_flat_is_still_there(self, tmp_path: Path):
-        stage = shot_with(tmp_path / "a.usda")
-        set_matrix(add_box(stage).GetPrim(), np.diag([1.0, 0.0, 1.0, 1.0]))
-        assert np.ptp(mesh_of(read(save(stage))[1]).points[:, 1]) == 0.0
-
 
 def define(stage: Usd.Stage, kind: str, **values: object) -> Usd.Prim:
     """A primitive with the collision schema of UsdPhysics."""
@@ -213,36 +163,6 @@ class TestShapes:
         axis = np.eye(3)["XYZ".index(str(values.get("axis", "Z")))]
         np.testing.assert_allclose(pose.turn[:, 2], axis, atol=1e-9)
         np.testing.assert_allclose(pose.turn.T @ pose.turn, np.eye(3), atol=1e-9)
-
-    def test_extents_are_usds(self, tmp_path: Path):
-        stage = shot_with(tmp_path / "a.usda", metres=1.0)
-        prim = define(stage, "Capsule", radius=0.5, height=3.0, axis="X")
-        extent = UsdGeom.Boundable.ComputeExtentFromPlugins(UsdGeom.Boundable(prim), Usd.TimeCode.Default())
-        pose = shape_of(read(save(stage))[1])
-        np.testing.assert_allclose(ShapeSurface(pose).bounds + pose.centre, np.asarray(extent), atol=1e-6)
-
-    def test_a_squashed_sphere_becomes_a_mesh(self, tmp_path: Path):
-        stage = shot_with(tmp_path / "a.usda", metres=1.0)
-        set_matrix(define(stage, "Sphere", radius=1.0), np.diag([1.0, 2.0, 1.0, 1.0]))
-        pose = mesh_of(read(save(stage))[1])
-        np.testing.assert_allclose(np.ptp(pose.points, axis=0), [2.0, 4.0, 2.0], rtol=2e-3)
-        assert [surface.closed for surface in surfaces((pose.points, pose.triangles))] == [True]
-
-    def test_a_cube_may_be_stretched(self, tmp_path: Path):
-        stage = shot_with(tmp_path / "a.usda", metres=1.0)
-        set_matrix(define(stage, "Cube", size=2.0), np.diag([1.0, 2.0, 3.0, 1.0]))
-        np.testing.assert_allclose(shape_of(read(save(stage))[1]).size, [1.0, 2.0, 3.0])
-
-    def test_a_cone_is_a_closed_mesh(self, tmp_path: Path):
-        stage = shot_with(tmp_path / "a.usda", metres=1.0)
-        define(stage, "Cone", radius=1.0, height=2.0)
-        pose = mesh_of(read(save(stage))[1])
-        assert [surface.closed for surface in surfaces((pose.points, pose.triangles))] == [True]
-
-    def test_a_mirrored_plane_still_looks_along_its_axis(self, tmp_path: Path):
-        stage = shot_with(tmp_path / "a.usda", metres=1.0)
-        set_matrix(define(stage, "Plane", axis="Y"), np.diag([-1.0, 1.0, 1.0, 1.0]))
-        np.testing.assert_allclose(shape_of(read(save(stage))[1]).turn[:, 2], [0.0, 1.0, 0.0], atol=1e-9)
 
     def test_points_are_no_collider(self, tmp_path: Path):
         stage = shot_with(tmp_path / "a.usda")

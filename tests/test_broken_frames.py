@@ -74,15 +74,6 @@ def test_a_warning_names_the_frame(tmp_path: Path, scale: float):
     assert np.abs(pair[0] - pair[1]).max() < 1e-3
 
 
-def test_a_cage_in_one_point_is_upsampled_at_once():
-    """Solved, each of its boxes overlaps all others: level 2 took over four minutes."""
-    told = run(2, 1, travel=0.0, glitch=GLITCHES["cage in one point"], at=AT)
-    points, entry = told[AT]
-    assert np.ptp(points, axis=0).max() < 1e-9
-    assert entry["start"].startswith("not solved")
-    assert told[AT + 1][1]["start"] == "warm"
-
-
 @pytest.mark.parametrize("frozen", [False, True])
 @pytest.mark.parametrize("when", [1.0, 3.0])
 def test_a_collapsed_frame_is_told_of_and_counts_as_unsettled(tmp_path: Path, when: float, frozen: bool):
@@ -118,9 +109,3 @@ def test_one_garment_of_two_collapses(tmp_path: Path):
     assert "together" in cloth[1]
     assert "together" not in cloth[2]
     assert not any(each[3]["start"].startswith("not solved") for each in (lining, cloth))
-
-
-def test_cloth_that_moves_on_or_turns_round_is_not_broken(tmp_path: Path):
-    """The sheet waves to and fro by less than an edge a frame; thrown by ten edges a frame it does not come back."""
-    shot = cloth_shot(tmp_path / "shot.usdc", broken={3.0: 1.02})
-    assert not [each for each in refine(shot, tmp_path / "fine.usdc").warnings if "leaves its place" in each]

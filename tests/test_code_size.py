@@ -85,24 +85,6 @@ def broad_excepts(tree: ast.AST) -> Iterator[str]:
 
 
 RULES = {rule.__name__: rule for rule in (too_long, options_by_position, prints, broad_excepts)}
-BAD = {
-    "too_long": "def f():\n" + "    x = 1\n" * MAX_BODY_LINES,
-    "options_by_position": "class C:\n    def f(self, a, b, c, d=1): ...",
-    "prints": "print(1)",
-    "broad_excepts": "try:\n    f()\nexcept (ValueError, Exception):\n    pass",
-}
-GOOD = {
-    "too_long": 'def f():\n    """' + "Doc.\n" * MAX_BODY_LINES + '"""\n' + "    x = 1\n" * (MAX_BODY_LINES - 1),
-    "options_by_position": "class C:\n    def f(self, a, b, c=1, *, d=1): ...",
-    "prints": "log.print(1)",
-    "broad_excepts": "try:\n    f()\nexcept (ValueError, OSError):\n    pass",
-}
-
-
-@pytest.mark.parametrize("rule", RULES)
-def test_rule_tells_bad_from_good(rule: str) -> None:
-    assert list(RULES[rule](ast.parse(BAD[rule])))
-    assert not list(RULES[rule](ast.parse(GOOD[rule])))
 
 
 @pytest.mark.parametrize("rule", RULES)

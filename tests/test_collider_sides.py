@@ -15,10 +15,9 @@ from stages import COLLIDER_API, add_sheet, author, new_stage, save, set_matrix,
 from touching import frame, measured, mesh_pose, refiner
 
 from physgraph_usd.errors import SchemaError
-from physgraph_usd.shot.refine import inspect_shot
 from physgraph_usd.solver.colliders.mesh import MeshBody, MeshSurface
 from physgraph_usd.solver.colliders.pose import MeshPose, ShapePose
-from physgraph_usd.solver.colliders.sign import _sides, signed_distances
+from physgraph_usd.solver.colliders.sign import signed_distances
 from physgraph_usd.solver.contact.track import Track
 from physgraph_usd.usd.read.reader import open_shot
 from physgraph_usd.usd.schema import COLLIDER, SIDES
@@ -70,22 +69,6 @@ class TestWinding:
         assert 200 < (number[clear] > 0.5).sum() < 2500
         np.testing.assert_array_equal(signed(surface, x)[clear] < 0, number[clear] > 0.5)
 
-    def test_the_sign_does_not_spread_through_an_opening(self):
-        """A chain of points from inside the tube out of its end meets no face, and the side changes all the same."""
-        (surface,) = surfaces(TUBE, "winding")
-        x = np.stack([np.zeros(60), np.zeros(60), np.linspace(0.0, 0.4, 60)], axis=1)
-        chain = np.stack([np.arange(59), np.arange(1, 60)], axis=1).astype(np.int32)
-        found = signed(surface, x, chain) < 0
-        assert found[0]
-        assert not found[-1]
-        assert (np.diff(found.astype(int)) != 0).sum() == 1
-
-    def test_a_closed_body_is_what_it_is_on_auto(self):
-        soup = together(ball(), ball(0.15, at=(0.25, 0.0, 0.0)))
-        x = around(soup, 1000)
-        (auto,), (forced,) = surfaces(soup, "auto"), surfaces(soup, "winding")
-        np.testing.assert_array_equal(signed(auto, x), signed(forced, x))
-
     @pytest.mark.parametrize("side", ["auto", "winding"])
     def test_cloth_that_starts_in_an_open_body_comes_out_of_it(self, side: str):
         """A dome without a floor: on auto what starts under it belongs there."""
@@ -100,12 +83,6 @@ class TestWinding:
 
 
 class TestStart:
-    def test_a_closed_body_is_open_to_it(self):
-        (surface,) = surfaces(ball(), "start")
-        assert (surface.closed, surface.fixed_side) == (False, None)
-        x = torch.zeros((1, 3), dtype=torch.float64)
-        assert not bool(surface.closest(x, torch.full((1,), torch.inf, dtype=torch.float64)).rim.any())
-
     @pytest.mark.parametrize("side", ["auto", "start"])
     def test_cloth_inside_a_closed_body_stays_there_only_with_start(self, side: str):
         soup = ball(0.3, level=4)
@@ -115,18 +92,6 @@ class TestStart:
         assert points is not None
         radius = np.linalg.norm(points, axis=1)
         assert (radius < 0.3).all() == (side == "start")
-
-    def test_it_holds_the_cloth_off_the_wall_from_inside(self):
-        soup = ball(0.3, level=4)
-        start = FLAT + np.array([0.0, -0.21, 0.0])
-        assert 0.297 < np.linalg.norm(start, axis=1).max() < 0.299
-        free = refiner((MESH, REST), side="start", felt=()).solve(frame(start, mesh_pose(soup))).points[0]
-        held = refiner((MESH, REST), side="start").solve(frame(start, mesh_pose(soup))).points[0]
-        assert free is not None
-        assert held is not None
-        outer = [float(np.linalg.norm(points, axis=1).max()) for points in (free, held)]
-        assert outer[0] > 0.299
-        assert outer[1] < 0.2982
 
 
 class TestFrontAndBack:
@@ -139,22 +104,6 @@ class TestFrontAndBack:
         expected = [1.0, 1.0] if up is None else [up, -up]
         np.testing.assert_array_equal(signs, [*expected, 1.0, 1.0])
 
-    def test_the_authored_winding_counts_and_is_not_made_consistent(self):
-        points, triangles = floor()
-        apart = together((points, triangles), (points + np.array([3.0, 0.0, 0.0]), triangles[:, ::-1]))
-        (surface,) = surfaces(apart, "front")
-        x = np.array([[0.1, 0.2, 0.1], [3.1, 0.2, 0.1]])
-        np.testing.assert_array_equal(np.sign(signed(surface, x)), [1.0, -1.0])
-        (mixed,) = surfaces(flipped(floor(), 0.4), "front")
-        np.testing.assert_array_equal(np.sort(mixed.triangles, axis=1), np.sort(triangles, axis=1))
-        np.testing.assert_array_equal(mixed.triangles, flipped(floor(), 0.4)[1])
-
-    def test_closed_bodies_keep_their_inside(self):
-        for side in ("front", "back"):
-            (surface,) = surfaces(flipped(box()), side)
-            assert (surface.closed, surface.fixed_side) == (True, None)
-            assert signed(surface, np.zeros((1, 3)))[0] < 0
-
     @pytest.mark.parametrize(("side", "above"), [("front", True), ("back", False), ("auto", False)])
     def test_cloth_that_starts_under_a_floor(self, side: str, above: bool):
         start = FLAT + np.array([0.0, -0.004, 0.0])
@@ -163,15 +112,6 @@ class TestFrontAndBack:
         assert points is not None
         assert (points[:, 1] > 0.0).all() == above
         assert (points[:, 1] < 0.0).all() != above
-
-    @pytest.mark.parametrize("side", ["front", "back"])
-    def test_cloth_that_starts_on_its_side_is_let_be_where_it_does_not_touch(self, side: str):
-        start = FLAT + np.array([0.0, 0.05 if side == "front" else -0.05, 0.0])
-        free = refiner((MESH, REST), felt=(), gravity=np.zeros(3)).solve(frame(start, mesh_pose(floor()))).points[0]
-        near = refiner((MESH, REST), side=side, gravity=np.zeros(3)).solve(frame(start, mesh_pose(floor()))).points[0]
-        assert free is not None
-        assert near is not None
-        np.testing.assert_array_equal(free, near)
 
 
 BODY = "/World/body"
@@ -199,14 +139,6 @@ class TestOnStages:
         assert self.side(stage) == "auto"
         author(stage.GetPrimAtPath(BODY), "physgraph:collider:side", side, kind="token")
         assert self.side(stage) == side
-
-    def test_inspect_tells_it(self, stage: Usd.Stage):
-        author(stage.GetPrimAtPath(BODY), "physgraph:collider:side", "back", kind="token")
-        assert f"with {BODY} (side: back)," in inspect_shot(save(stage))["modelled"]["contact"]
-
-    def test_an_ancestor_gives_it_as_a_string(self, stage: Usd.Stage):
-        author(stage.GetPrimAtPath("/World"), "userProperties:physgraph:collider:side", "start", kind="string")
-        assert self.side(stage) == "start"
 
     @pytest.mark.parametrize(("kind", "value"), [("token", "left"), ("float", 1.0)])
     def test_anything_else_is_refused_by_name(self, stage: Usd.Stage, kind: str, value: object):
@@ -241,13 +173,6 @@ class TestOnStages:
             a, b, c = (pose.points[pose.triangles[:, corner]] for corner in range(3))
             assert (np.cross(b - a, c - a)[:, 1] > 0).all()
 
-    def test_a_primitive_becomes_a_mesh_for_the_start_side(self, stage: Usd.Stage):
-        sphere = UsdGeom.Sphere.Define(stage, "/World/ball").GetPrim()
-        sphere.AddAppliedSchema(COLLIDER_API)
-        assert isinstance(open_shot(save(stage)).frame(1.0).colliders[1], ShapePose)
-        author(sphere, "physgraph:collider:side", "start", kind="token")
-        assert isinstance(open_shot(save(stage)).frame(1.0).colliders[1], MeshPose)
-
     def test_a_plane_can_be_turned_and_has_no_start_side(self, stage: Usd.Stage):
         plane = UsdGeom.Plane.Define(stage, "/World/plane").GetPrim()
         plane.AddAppliedSchema(COLLIDER_API)
@@ -280,14 +205,3 @@ def test_sides_are_right_again_after_creeping_through_a_surface(seed: int):
             assert bool(((found > 0) == (height > 0)).all()), height
         if abs(height) > 2e-6:
             assert float((normal - torch.tensor([0.0, 1.0, 0.0])).norm(dim=1).max()) < 0.05
-
-
-def test_a_side_that_changes_is_compared_with_its_neighbours():
-    """Points in a row, deep in a ball, of which the first alone is told so: the others follow one after another."""
-    (surface,) = surfaces(ball(0.5), "auto")
-    x = torch.tensor([[0.01 * place, 0.0, 0.0] for place in range(5)], dtype=torch.float64)
-    told = torch.tensor([-1.0, 1.0, 1.0, 1.0, 1.0], dtype=torch.float64)
-    edges = torch.tensor([[place, place + 1] for place in range(4)], dtype=torch.int32)
-    distance = torch.full((5,), 0.4, dtype=torch.float64)
-    sides = _sides(surface, x, distance, near=torch.arange(5), told=told, edges=edges)
-    assert sides.tolist() == [-1.0] * 5

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pxr import Sdf, Usd, UsdGeom, UsdPhysics
-from stages import COLLIDER_API, add_sheet, author, instanced_shot, new_stage, save, set_matrix
+from stages import COLLIDER_API, add_sheet, author, new_stage, save, set_matrix
 
-from physgraph_usd.errors import GarmentError, StageError
-from physgraph_usd.usd.read.find import find_colliders, find_garments, instance_roots
+from physgraph_usd.errors import StageError
+from physgraph_usd.usd.read.find import find_colliders, find_garments
 from physgraph_usd.usd.read.survey import survey
 
 
@@ -67,18 +67,6 @@ def test_what_is_not_there_lists_what_is(stage: Usd.Stage, wanted: str, message:
         find_garments(stage, [wanted])
 
 
-def test_nothing_tagged_lists_the_meshes(stage: Usd.Stage) -> None:
-    stage.GetPrimAtPath("/World/hero/coat").RemoveAppliedSchema("PhysGraphGarmentAPI")
-    with pytest.raises(StageError, match=r"no prim has PhysGraphGarmentAPI.*/World/crowd/coat"):
-        find_garments(stage)
-
-
-def test_the_schema_on_something_else_than_a_mesh_is_refused(stage: Usd.Stage) -> None:
-    stage.GetPrimAtPath("/World/box").AddAppliedSchema("PhysGraphGarmentAPI")
-    with pytest.raises(GarmentError, match=r"</World/box>.*is a Cube, not a Mesh"):
-        find_garments(stage)
-
-
 @pytest.mark.parametrize("state", ["abstract", "over"])
 def test_prims_that_do_not_exist_say_why(stage: Usd.Stage, state: str) -> None:
     if state == "abstract":
@@ -118,17 +106,6 @@ def test_colliders_by_relationship_and_by_path(stage: Usd.Stage) -> None:
         find_colliders(stage, garments)
 
 
-def test_nested_instances_are_listed_outermost_first(tmp_path: Path) -> None:
-    inner = instanced_shot(tmp_path)
-    stage = new_stage(tmp_path / "outer.usda")
-    prim = UsdGeom.Xform.Define(stage, "/World/crowd").GetPrim()
-    prim.GetReferences().AddReference(inner)
-    prim.SetInstanceable(True)
-    garments = find_garments(stage)
-    assert paths(garments) == ["/World/crowd/one/cloth", "/World/crowd/two/cloth"]
-    assert [str(path) for path in instance_roots(garments[1])] == ["/World/crowd", "/World/crowd/two"]
-
-
 def test_every_mesh_is_told_and_broken_ones_say_why(tmp_path: Path) -> None:
     stage = new_stage(tmp_path / "s.usda", metres=None)
     add_sheet(stage, "/World/good")
@@ -146,8 +123,3 @@ def test_every_mesh_is_told_and_broken_ones_say_why(tmp_path: Path) -> None:
     assert (meshes["good"].points, meshes["good"].faces, meshes["good"].times) == (20, 12, (1.0, 2.0, 3.0))
     assert found.metres_per_unit == 0.01
     assert "metersPerUnit" in str(found.notices[0])
-
-
-def test_meshes_inside_instances_are_told(tmp_path: Path) -> None:
-    meshes = survey(instanced_shot(tmp_path)).meshes
-    assert [mesh.path for mesh in meshes] == ["/World/one/cloth", "/World/two/cloth"]

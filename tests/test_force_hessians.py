@@ -1,24 +1,21 @@
-"""Diagonals and rest matrices of the forces against finite differences of the forces."""
+"""Diagonals and rest matrices of the forces against finite differences; elements of quads."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 import torch
-from energies import evaluate
-from probes import hessian
-from sheets import KINDS, Sheet, equilateral, irregular, level_of, rotation
-from test_forces import ELASTIC, INTERNAL, crumple, force_of
+from energies import apart, difference_force, evaluate
+from meshes import grid, mesh_of
+from sheets import KINDS, Sheet, garment_of, level_of, rotation
+from test_forces import INTERNAL, crumple, force_of
 from torch import Tensor
 
-from physgraph_usd.solver.fabric import Fabric
-from physgraph_usd.solver.forces.base import Force, ForceModule
+from physgraph_usd.solver.forces.base import Force
 from physgraph_usd.solver.forces.bending import Bending, hinge_jacobian
 from physgraph_usd.solver.forces.guide import Guide, GuideMap
-from physgraph_usd.solver.forces.membrane import Membrane, in_plane_terms
-from physgraph_usd.solver.forces.stretch import Stretch
-from physgraph_usd.solver.integrate.metric import Metric
-from physgraph_usd.solver.level import Level, build_levels, refine_garments
+from physgraph_usd.solver.level import Level, build_levels, refine_garments, triangle_areas
+from physgraph_usd.solver.mesh.topology import PolygonMesh
 
 CORNERS = [0, 1, 2, 4]
 """Columns of hinges between triangles, without the corners that stand twice."""
@@ -27,20 +24,6 @@ CORNERS = [0, 1, 2, 4]
 def sheet(kind: str = "irregular") -> Sheet:
     points, triangles = KINDS[kind](0.5, 0.4, 0.1)
     return points @ rotation(5).T + 0.3, triangles
-
-
-def tube() -> Sheet:
-    """A polyhedral tube: an equilateral sheet rolled up, edges stiff."""
-    points, triangles = equilateral(0.5, 0.4, 0.1)
-    return rolled(points, 0.15), triangles
-
-
-def rolled(points: np.ndarray, radius: float) -> np.ndarray:
-    """A sheet bent along the rows of vertices at equal y, so that every triangle stays as it is."""
-    height = np.sqrt(0.75) * 0.1
-    turn = 2 * np.arcsin(height / (2 * radius))
-    row = np.rint(points[:, 1] / height)
-    return np.stack([points[:, 0], radius * np.sin(turn * row), radius * np.cos(turn * row)], axis=1)
 
 
 def dense(force: Force, x: Tensor) -> np.ndarray:
@@ -68,29 +51,6 @@ def plain_hessian(force: Force, x: Tensor, step: float = 1e-6) -> np.ndarray:
     return np.array(columns)
 
 
-@pytest.mark.parametrize("name", [*ELASTIC, "guide", "tether"])
-def test_diagonal_at_rest_is_a_third_of_the_trace(name: str):
-    level = level_of(*tube(), bent=True)
-    force = force_of(name, level)
-    full = dense(force, level.rest)
-    trace = np.einsum("vava->v", full)
-    assert np.allclose(force.diagonal(level.rest).numpy(), trace / 3, rtol=1e-5, atol=1e-6 * np.abs(trace).max())
-
-
-@pytest.mark.parametrize("length", [0.4, 0.9, 1.0, 1.7])
-def test_spring_diagonal_is_the_trace_of_the_positive_part(length: float):
-    level = level_of(np.eye(3) / np.sqrt(2), np.array([[0, 1, 2]]))
-    force = force_of("stretch", level)
-    assert isinstance(force, Stretch)
-    force.stiffness.mul_(torch.tensor([1.0, 0.0, 0.0]))
-    x = level.rest.clone()
-    x[1] = x[0] + length * (level.rest[1] - level.rest[0])
-    full = dense(force, x)
-    for v in (0, 1):
-        positive = np.linalg.eigvalsh(full[v, :, v]).clip(0).sum()
-        assert float(force.diagonal(x)[v]) == pytest.approx(positive / 3, rel=1e-6)
-
-
 @pytest.mark.parametrize("name", ["membrane", "bending"])
 def test_diagonal_away_from_rest(name: str):
     """The stretched membrane's block without the curvature of its sine; bending's without that of its angle."""
@@ -112,27 +72,6 @@ def test_diagonal_away_from_rest(name: str):
     assert np.allclose(force.diagonal(x).numpy(), expected, rtol=5e-3 if name == "membrane" else 1e-5)
 
 
-def test_hinge_jacobian_is_the_derivative_of_the_angle():
-    points, triangles = sheet()
-    level = level_of(points, triangles)
-    x = crumple(points, 0.02, 4)
-    force = force_of("bending", level)
-    assert isinstance(force, Bending)
-    half, hinges = torch.zeros_like(x), level.hinges[:, CORNERS].long()
-    jacobian = hinge_jacobian(x, hinges)
-    force.add_force(x, half)
-    angle = torch.sqrt(2 * force.split(x)[0] / force.weight)
-    pull = -(jacobian * (force.weight * signed(angle, hinges, x))[:, None, None]).reshape(-1, 3)
-    total = torch.zeros_like(x).index_add_(0, hinges.reshape(-1), pull)
-    assert torch.allclose(total, half, rtol=1e-9, atol=1e-12)
-
-
-def signed(angle: Tensor, hinges: Tensor, x: Tensor) -> Tensor:
-    i, j, k, m = (x[hinges[:, n]] for n in range(4))
-    volume = (torch.linalg.cross(j - i, k - i) * (m - i)).sum(dim=1)
-    return -angle * volume.sign()
-
-
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", INTERNAL)
 def test_rest_matrix_is_the_trace_of_the_flat_hessian(name: str, kind: str):
@@ -140,49 +79,6 @@ def test_rest_matrix_is_the_trace_of_the_flat_hessian(name: str, kind: str):
     force = force_of(name, level)
     trace = np.einsum("vawa->vw", dense(force, level.rest))
     assert np.allclose(matrix_of(force), trace, atol=1e-6 * np.abs(trace).max())
-
-
-@pytest.mark.parametrize("name", INTERNAL)
-def test_rest_matrix_does_not_depend_on_how_the_sheet_is_rolled(name: str):
-    flat = level_of(*equilateral(0.5, 0.4, 0.1))
-    rolled_up = level_of(*tube())
-    expected = matrix_of(force_of(name, flat))
-    assert np.allclose(matrix_of(force_of(name, rolled_up)), expected, atol=1e-9 * np.abs(expected).max())
-
-
-@pytest.mark.parametrize("bent", [False, True])
-@pytest.mark.parametrize("name", INTERNAL)
-def test_rest_matrix_is_positive_and_constants_cost_nothing(name: str, bent: bool):
-    rng = np.random.default_rng(2)
-    points, triangles = sheet()
-    matrix = matrix_of(
-        force_of(name, level_of(points + rng.normal(scale=0.05, size=points.shape), triangles, bent=bent))
-    )
-    size = np.abs(matrix).max()
-    assert np.abs(matrix - matrix.T).max() < 1e-12 * size
-    assert np.abs(matrix.sum(axis=1)).max() < 1e-12 * size
-    assert np.linalg.eigvalsh(matrix).min() > -1e-12 * size
-    assert np.linalg.matrix_rank(matrix, tol=1e-9 * size) >= len(matrix) - 3
-
-
-def test_bending_of_a_flat_sheet_costs_nothing_for_linear_functions():
-    points, triangles = sheet()
-    matrix = matrix_of(force_of("bending", level_of(points, triangles)))
-    assert np.abs(matrix @ points).max() < 1e-9 * np.abs(matrix).max()
-
-
-def test_membrane_and_springs_have_one_metric_on_equilateral_triangles():
-    level = level_of(*sheet("equilateral"))
-    springs, triangles = (in_plane_terms(level, [fabric])[0] for fabric in (Fabric(30.0), Fabric(30.0, shear=11.25)))
-    expected = matrix_of(springs)
-    assert np.allclose(matrix_of(triangles), expected, atol=1e-9 * np.abs(expected).max())
-
-
-def test_tether_matrix_is_its_hessian():
-    level = level_of(*sheet())
-    force = force_of("tether", level)
-    full = dense(force, level.rest)
-    assert np.allclose(np.einsum("vawa->vw", full) / 3, matrix_of(force), atol=1e-7)
 
 
 def refined() -> Level:
@@ -193,18 +89,6 @@ def refined() -> Level:
     pin = np.where(np.arange(len(points)) == 4, 0.5, 0.0)
     garment = garment_of(mesh, points, pin=pin)
     return build_levels([garment], refine_garments([garment], [2]), dtype=torch.float64)[-1]
-
-
-def test_guide_matrix_sums_its_hessian_onto_the_diagonal():
-    level = refined()
-    count = level.from_coarse.shape[1]
-    coarse = torch.randn((count, 3), dtype=torch.float64)
-    guide = Guide(level, GuideMap(level), torch.linspace(100.0, 200.0, count)).retarget(coarse)
-    full = dense(guide, level.rest)[:, 0, :, 0]
-    matrix = guide.rest_matrix()
-    assert np.allclose(matrix.diagonal(), full.sum(axis=1), rtol=1e-6)
-    assert np.allclose(guide.diagonal(level.rest).numpy(), np.diag(full), rtol=1e-6)
-    assert np.linalg.eigvalsh(matrix.toarray() - full).min() > -1e-6 * full.max()
 
 
 def test_guide_is_at_rest_on_the_cage_and_blind_to_wrinkles():
@@ -237,21 +121,48 @@ def null_vector(matrix: np.ndarray, fixed: np.ndarray) -> np.ndarray:
     return np.linalg.svd(constraints)[2][-1]
 
 
-def test_coloured_differences_are_plain_differences():
-    level = level_of(*irregular(0.5, 0.4, 0.1))
-    for name in INTERNAL:
-        force = force_of(name, level)
-        plain = plain_hessian(force, level.rest)
-        assert np.allclose(hessian(force, level.rest, [0, 1, 2]), plain, atol=1e-5 * np.abs(plain).max())
+def levels_of(mesh: PolygonMesh, rest: np.ndarray, depth: int = 0) -> tuple[Level, ...]:
+    garment = garment_of(mesh, rest, bent=True)
+    return build_levels([garment], refine_garments([garment], [depth]), dtype=torch.float64)
 
 
-def test_metric_of_springs_and_of_triangles_solves_in_both_precisions():
-    level = level_of(*sheet())
-    f = torch.randn_like(level.rest)
-    for fabric in (Fabric(), Fabric(shear=3.0)):
-        terms = [*in_plane_terms(level, [fabric]), force_of("bending", level), force_of("tether", level)]
-        matrix = ForceModule(terms).rest_matrix()
-        assert (Membrane in {type(term) for term in terms}) == (fabric.shear is not None)
-        for dtype, tolerance in ((torch.float64, 1e-5), (torch.float32, 1e-3)):
-            move = Metric(matrix, free=level.free, dtype=dtype).solve(f.to(dtype)).double().numpy()
-            assert np.abs(matrix @ move - f.numpy()).max() < tolerance * np.abs(f.numpy()).max()
+def test_no_corner_of_a_quad_is_the_first():
+    """Small twists are the same round either diagonal; stretch is the mean of both splits."""
+    mesh, flat = grid(4, 3)
+    rest = flat * [1.0, 0.7, 0.0]
+    x = torch.as_tensor(rest + 1e-4 * np.random.default_rng(0).normal(size=rest.shape))
+    energies = []
+    for turn in range(4):
+        rolled = PolygonMesh(mesh.counts, np.roll(mesh.indices.reshape(-1, 4), turn, axis=1).ravel(), len(rest))
+        level = levels_of(rolled, rest)[0]
+        energies.append([evaluate(force_of(name, level), x)[0] for name in INTERNAL])
+    np.testing.assert_allclose(energies, np.broadcast_to(energies[0], (4, 3)), rtol=1e-3)
+
+
+@pytest.mark.parametrize("name", INTERNAL)
+def test_forces_of_triangles_beside_quads_are_minus_the_gradient(name: str):
+    mesh, flat = grid(4, 2, "mixed")
+    level = levels_of(mesh, flat + np.random.default_rng(0).normal(scale=0.05, size=flat.shape))[0]
+    force, x = force_of(name, level), crumple(flat, 0.1, 2)
+    assert apart(evaluate(force, x)[1], difference_force(force, x, 1e-3)) < 1e-6
+
+
+@pytest.mark.parametrize(
+    "corners", [[[0, 0], [1, -3], [0, 9], [-1, -3]], [[0, 0], [1, 0], [1, 0], [0, 1]], [[0, 0], [1, 0], [2, 0], [0, 1]]]
+)
+def test_quads_that_are_not_convex_count_as_triangles(corners: list[list[float]]):
+    """A dart, a quad with a side without length, and a quad with a straight corner."""
+    rest = np.column_stack([np.array(corners, float), np.zeros(4)])
+    level = levels_of(mesh_of([[0, 1, 2, 3]]), rest)[0]
+    assert torch.equal(level.membrane, level.triangles)
+    assert torch.equal(level.springs, level.edges)
+    split = mesh_of([[0, 1, 2, 3]]).triangulate(rest).triangles
+    assert float(level.membrane_area.sum()) == pytest.approx(triangle_areas(rest, split).sum())
+
+
+def test_a_flat_cage_of_triangles_rests_unstrained():
+    """Smooth subdivision rounds its outline, and the cloth keeps its own."""
+    mesh, points = grid(4, 3, "triangles")
+    for level in levels_of(mesh, points, 2):
+        for name in INTERNAL:
+            assert evaluate(force_of(name, level), level.base.apply(torch.as_tensor(points)))[0] < 1e-12

@@ -19,7 +19,7 @@ from energies import (
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from meshes import planar_mesh
-from sheets import equilateral, level_of, quality, rotation
+from sheets import level_of, quality, rotation
 from torch import Tensor
 
 from physgraph_usd.solver.forces.base import Force, ForceModule
@@ -161,61 +161,6 @@ def test_float32_agrees_with_float64_and_repeats_bit_for_bit(case: Case):
         assert (g - f).abs().max() < 3e-5 * size
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_a_hinge_knows_its_angle_all_the_way_round(dtype: torch.dtype):
-    rest = np.array([[0.0, 0.0, 0.0], [0.0, 0.01, 0.0], [0.01, 0.005, 0.0], [-0.01, 0.005, 0.0]])
-    level = level_of(rest, np.array([[0, 2, 1], [0, 1, 3]]), dtype=dtype)
-    bending, eps = Bending(level, torch.tensor([2.0])), float(torch.finfo(dtype).eps)
-    weight = float(bending.weight[0])
-    for angle in np.concatenate([np.linspace(-3.14, 3.14, 315), np.logspace(-4, 0, 20)]):
-        x = torch.as_tensor(rest).clone()
-        x[3, 0], x[3, 2] = -0.01 * np.cos(angle), 0.01 * np.sin(angle)
-        energy, _ = evaluate(bending, x.to(dtype))
-        assert (2.0 * energy / weight) ** 0.5 == pytest.approx(abs(angle), rel=8 * eps, abs=4 * eps)
-
-
-def test_no_elements_have_no_energy():
-    level = level_of(np.zeros((3, 3)), np.zeros((0, 3), np.int64))
-    for name in INTERNAL:
-        energy, f = evaluate(force_of(name, level), level.rest + 1.0)
-        assert energy == 0.0
-        assert not f.any()
-        matrix = force_of(name, level).rest_matrix()
-        assert matrix is not None
-        assert matrix.nnz == 0
-
-
-def test_module_sums_its_terms():
-    rest, triangles = equilateral(0.5, 0.4, 0.1)
-    level = level_of(rest, triangles)
-    x = crumple(rest, 0.02, 3)
-    terms = [force_of(name, level) for name in (*ELASTIC, "guide")]
-    module = ForceModule(terms)
-    energy, f = module.energy_and_force(x)
-    parts = [evaluate(term, x) for term in terms]
-    assert float(energy) == pytest.approx(sum(part for part, _ in parts))
-    assert apart(f, sum((g for _, g in parts), torch.zeros_like(x))) < 1e-12
-    assert module.energies(x) == {term.name: part for term, (part, _) in zip(terms, parts, strict=True)}
-    assert apart(module.diagonal(x), sum((t.diagonal(x) for t in terms), torch.zeros(len(x)))) < 1e-12
-    total = sum(matrix.toarray() for term in terms if (matrix := term.rest_matrix()) is not None)
-    assert np.allclose(module.rest_matrix().toarray(), total)
-
-
-def test_gravity_is_the_weight_of_the_sheet():
-    rest, triangles = equilateral(0.5, 0.4, 0.1)
-    level = level_of(rest, triangles)
-    weight = evaluate(force_of("gravity", level), level.rest)[1].sum(dim=0)
-    assert weight.numpy() == pytest.approx(0.2 * float(level.vertex_area.sum()) * DOWN)
-
-
-def test_a_collapsed_edge_pulls_nowhere():
-    rest, triangles = equilateral(0.2, 0.1, 0.1)
-    level = level_of(rest, triangles)
-    energy, f = evaluate(force_of("stretch", level), torch.zeros_like(level.rest))
-    assert energy > 0
-    assert not f.any()
-
-
 class Counted:
     """A term that counts how often it is asked."""
 
@@ -251,11 +196,3 @@ def test_a_module_that_remembers_evaluates_its_own_terms_once_at_the_same_positi
     assert torch.equal(joined.energy_and_force(x)[1], 2.0 * x)
     assert torch.equal(module.energy_and_force(x.clone())[1], x)
     assert own.asked == 3
-
-
-def test_a_module_that_does_not_remember_asks_each_time():
-    own, x = Counted(), torch.ones((2, 3), dtype=torch.float64)
-    module = ForceModule([own])
-    module.energy_and_force(x)
-    module.joined_by([]).energy_and_force(x)
-    assert own.asked == 2

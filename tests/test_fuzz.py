@@ -8,15 +8,12 @@ import sys
 from pathlib import Path
 
 import pytest
-from fuzz import trial
 from fuzz.bases import BASES, write_bases
 from fuzz.files import sizes
 from fuzz.kinds import KINDS
-from fuzz.mutant import Kind, make
-from fuzz.trial import GOOD, Outcome, attempt
+from fuzz.mutant import make
+from fuzz.trial import GOOD, attempt
 from shots import faults, refine
-
-from physgraph_usd.errors import GarmentError, LayerError, SolveError
 
 ROOT = Path(__file__).resolve().parents[1]
 SAFE = [number for number, kind in enumerate(KINDS) if kind.in_process]
@@ -65,47 +62,6 @@ def test_a_number_is_always_the_same_mutant(bases: Path, tmp_path: Path):
         assert {k: v for k, v in one.options.items() if k != "root"} == {
             k: v for k, v in two.options.items() if k != "root"
         }
-
-
-class TestWhatItSees:
-    """The fuzzer tells each kind of bad end; without this it could not fail."""
-
-    @pytest.fixture
-    def outcome(self, bases: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-        def run(end) -> Outcome:
-            monkeypatch.setattr(trial, "refine_shot", end)
-            return attempt(0, (Kind("none", lambda draft: None, ("plain",)),), bases, tmp_path / "0")
-
-        return run
-
-    def test_tracebacks(self, outcome):
-        def end(*_):
-            raise KeyError("x")
-
-        assert outcome(end).result == "traceback"
-
-    def test_files_that_are_left_after_an_error(self, outcome):
-        def end(shot: Path, out: Path, _):
-            out.write_bytes(b"half")
-            raise SolveError("no")
-
-        assert outcome(end).result == "files left"
-
-    def test_inputs_that_are_changed(self, outcome):
-        def end(shot: Path, out: Path, _):
-            shot.write_bytes(b"")
-            raise SolveError("no")
-
-        assert outcome(end).result == "input changed"
-
-    @pytest.mark.parametrize(
-        "error", [SolveError(""), LayerError("a\nb"), GarmentError("/A", "broken"), SolveError("in 'pxrInternal::X'")]
-    )
-    def test_messages_that_say_too_little(self, outcome, error: Exception):
-        def end(*_):
-            raise error
-
-        assert outcome(end).result == "poor message"
 
 
 @pytest.mark.slow

@@ -1,27 +1,34 @@
-"""Grain and ease: where warp lies, cloth longer than its rest shape, and sheets whose warp and weft differ."""
+"""Grain, ease and the triangle membrane: where warp lies, cloth longer than its rest shape, stiffness in shear."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from probes import bending_stiffness, plane_stiffness, tensile_test
+from meshes import grid
+from probes import bending_stiffness, plane_stiffness
 from pxr import Sdf, Usd, UsdGeom, Vt
 from sheets import equilateral, garment_of, level_of, triangle_mesh
 
+from physgraph_usd.shot.refine import inspect_shot
 from physgraph_usd.solver.fabric import Fabric
 from physgraph_usd.solver.forces import elastic_terms
 from physgraph_usd.solver.forces.bending import Bending
-from physgraph_usd.solver.forces.membrane import in_plane_terms, shear_stiffness
+from physgraph_usd.solver.forces.membrane import in_plane_terms
+from physgraph_usd.solver.frame.group import Group
 from physgraph_usd.solver.frame.refiner import Refiner
 from physgraph_usd.solver.frame.settings import SolveSettings
+from physgraph_usd.solver.frame.solve import solve_frame
+from physgraph_usd.solver.frame.values import FrameInput
+from physgraph_usd.solver.integrate import method_named
 from physgraph_usd.solver.level import Level, build_levels, refine_garments
 from physgraph_usd.solver.mesh.weld import unwelded
 from physgraph_usd.solver.scene import Frame, GarmentFrame, Grain, Scene
 from physgraph_usd.usd.read.grain import read_grain
-from physgraph_usd.usd.schema import fabric_values
 
 ALONG = np.array([1.0, 0.0, 0.0])
 WOVEN = Fabric(1000.0, 20e-6, 0.3, shear=70.0, weft_stretch=250.0, weft_bend=8e-6)
@@ -36,7 +43,7 @@ def turned(angle: float) -> np.ndarray:
     return np.array([np.cos(angle), np.sin(angle), 0.0])
 
 
-@pytest.mark.parametrize("angle", [0.0, 0.4, np.pi / 2])
+@pytest.mark.parametrize("angle", [0.4, np.pi / 2])
 def test_a_woven_sheet_has_the_stiffness_matrix_of_an_orthotropic_one(angle: float):
     """In its own axes C11 = Y1 / (1 - nu^2), C22 = Y2 / (1 - nu^2), C12 = nu sqrt(C11 C22), C66 = G, with nu = 1/3."""
     found = plane_stiffness(sheet(turned(angle)), in_plane_terms(sheet(turned(angle)), [WOVEN]))
@@ -46,12 +53,6 @@ def test_a_woven_sheet_has_the_stiffness_matrix_of_an_orthotropic_one(angle: flo
     c11, c22 = 1000.0 * 9 / 8, 250.0 * 9 / 8
     c12 = np.sqrt(c11 * c22) / 3.0
     assert own == pytest.approx(np.array([[c11, c12, 0], [c12, c22, 0], [0, 0, 70.0]]), rel=1e-4, abs=1e-3 * c22)
-
-
-def test_strips_cut_along_warp_and_weft_pull_as_asked_for():
-    for warp, expected in ((ALONG, 1000.0), (turned(np.pi / 2), 250.0)):
-        level = sheet(warp)
-        assert tensile_test(level, in_plane_terms(level, [WOVEN]))[0] == pytest.approx(expected, rel=0.01)
 
 
 def test_a_sheet_bends_along_warp_and_weft_as_asked_for():
@@ -73,11 +74,6 @@ def bending_of(level: Level) -> np.ndarray:
     return bending_stiffness(replace(level, bend_scale=level.bend_scale * weighed / plain), 20e-6)
 
 
-def test_without_a_shear_stiffness_a_sheet_is_as_stiff_as_an_isotropic_one():
-    assert shear_stiffness(Fabric(100.0)) == pytest.approx(37.5)
-    assert shear_stiffness(Fabric(100.0, weft_stretch=25.0)) == pytest.approx(0.375 * 50.0)
-
-
 @pytest.mark.parametrize("fabric", [Fabric(100.0), WOVEN], ids=["springs", "membrane"])
 def test_eased_cloth_is_at_rest_where_it_is_that_much_longer(fabric: Fabric):
     eased = replace(fabric, warp_ease=0.04, weft_ease=-0.01)
@@ -89,17 +85,6 @@ def test_eased_cloth_is_at_rest_where_it_is_that_much_longer(fabric: Fabric):
     at_rest = sum(float(term.add_force(x, torch.zeros_like(x))) for term in terms)
     before = sum(float(term.add_force(level.rest, torch.zeros_like(x))) for term in terms)
     assert at_rest < 1e-12 * before + 1e-15
-
-
-def test_cloth_that_is_drawn_in_without_end_keeps_a_quarter_of_its_length():
-    level = sheet().eased([Fabric(warp_ease=-1.0, weft_ease=-3.0)])
-    assert level.membrane_inverse.isfinite().all()
-    assert (level.rest_length / sheet().rest_length).numpy() == pytest.approx(0.25)
-
-
-def test_without_ease_a_level_is_itself():
-    level = sheet()
-    assert level.eased([Fabric()]) is level
 
 
 def test_gathers_and_painted_ease_act_where_they_are_painted():
@@ -163,12 +148,6 @@ def test_the_grain_map_turns_the_warp():
     assert "turned" in source
 
 
-def test_a_fabric_survives_its_attributes():
-    values = fabric_values(replace(WOVEN, stretch_limit=0.06, weft_ease=0.02))
-    assert (values["weftStretchStiffness"], values["stretchLimit"], values["rest:weftEase"]) == (250.0, 6.0, 2.0)
-    assert "rest:warpEase" not in values
-
-
 def test_ease_folds_cloth_whose_cage_is_at_rest():
     """Without ease a flat cage at its rest shape has nothing to fold; with it, folds run across the longer way."""
     points, triangles = equilateral(0.3, 0.3, 0.03)
@@ -190,3 +169,50 @@ def test_ease_folds_cloth_whose_cage_is_at_rest():
     assert bumps[0.0] < 1e-5
     assert bumps[0.04] > 1e-3
     assert slope[along].mean() > 1.5 * slope[~along].mean()
+
+
+SPRINGS, TRIANGLES = Fabric(30.0), Fabric(30.0, shear=7.0)
+
+
+def test_a_mixed_group_is_what_its_garments_are_alone():
+    """Pulled, so that there is one rest state."""
+    mesh, points = grid(6, 6)
+    points = 0.03 * points
+    bump = 0.01 * np.sin(20 * points[:, 1])
+    pulled = points * [1.15, 1.02, 1.0] + np.stack([0 * bump, 0 * bump, bump], axis=1)
+    frames = [GarmentFrame(pulled, SPRINGS), GarmentFrame(pulled + np.array([1.0, 0, 0]), TRIANGLES)]
+    settings = SolveSettings(method_named("quasi-newton"), steps=100, tolerance=1e-5)
+
+    def solve(chosen: list[GarmentFrame]) -> tuple[list[np.ndarray], dict[str, float]]:
+        garments = [garment_of(mesh, points) for _ in chosen]
+        refinements = refine_garments(garments, [1] * len(garments))
+        group = Group.of(garments, refinements, np.array([0, 0, -9.81]), settings, dtype=torch.float32, device="cpu")
+        solved = solve_frame(group, FrameInput(chosen), None)
+        shapes, energies = solved.points, solved.telemetry["energy_joules"]
+        assert isinstance(energies, dict)
+        return shapes, energies["output"]
+
+    together, energies = solve(frames)
+    assert {"stretch", "membrane"} <= set(energies)
+    for shape, frame, term, other in zip(
+        together, frames, ("stretch", "membrane"), ("membrane", "stretch"), strict=True
+    ):
+        alone, energy = solve([frame])
+        assert energy[term] == pytest.approx(energies[term], rel=1e-3)
+        assert other not in energy
+        assert np.abs(shape - alone[0]).max() < 0.01 * 0.015
+
+
+@pytest.mark.parametrize("shear", [None, 5.0])
+def test_the_report_says_which_garments_are_membranes(sample: Callable[[str], Path], shear: float | None):
+    overrides = () if shear is None else (f"physgraph:material:shearStiffness={shear}",)
+    report = inspect_shot(sample("tshirt"), overrides=overrides)
+    path = report["garments"][0]["path"]
+    if shear is None:
+        assert report["modelled"]["stretch"] == "edge springs"
+        assert "membrane" not in report["modelled"]
+        assert "0.375 Y" in report["left_out"]["triangle membrane"]
+    else:
+        assert report["modelled"]["membrane"] == f"triangle membrane for {path}"
+        assert "stretch" not in report["modelled"]
+        assert not {"shear", "triangle membrane"} & set(report["left_out"])

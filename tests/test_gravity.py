@@ -20,7 +20,6 @@ from physgraph_usd.usd.read.reader import open_shot
 PERSON = (0.4, 0.25, 1.7)
 """Sizes of a standing body whose height comes last [m]."""
 SKIRT = tube(0.25, 0.6, around=12, rows=4)
-BLANKET = SKIRT[0], SKIRT[1][SKIRT[0][SKIRT[1], 1].mean(axis=1) > 0.0]
 
 
 def along(axis: str, points: np.ndarray) -> np.ndarray:
@@ -54,18 +53,6 @@ def test_a_stage_across_its_bodies_is_told_with_an_option_that_mends_it(tmp_path
         assert f"</World/body> inside it stand along {axis}, but gravity is 9.81 m/s^2 towards -{up}" in each
         assert f"give --gravity -{axis}" in each
     assert warned(shot, gravity=f"-{axis}") == warned(shot, gravity=f"-{up}") == []
-
-
-@pytest.mark.parametrize(
-    ("cloth", "body"),
-    [
-        (SKIRT, (0.4, 0.8, 1.2)),  # a dog's coat
-        (BLANKET, PERSON),  # on one who lies
-        (tube(0.25, 0.05, around=12, rows=2), (2.0, 0.1, 0.1)),  # a ring on a rod
-    ],
-)
-def test_what_lies_is_not_told(tmp_path: Path, cloth: Soup, body: tuple[float, float, float]):
-    assert warned(worn(tmp_path / "s.usda", up="Y", axis="Z", cloth=cloth, body=body)) == []
 
 
 def test_garments_author_one_gravity_and_options_go_before(tmp_path: Path):

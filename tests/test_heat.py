@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +16,9 @@ from shots import CLOTH, cloth_shot, faults, refine
 from stages import COLLIDER_API
 
 from physgraph_usd.errors import LayerError
-from physgraph_usd.shot.frames import FrameFolder, Outcome
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.solver.colliders.mesh import MeshBody
-from physgraph_usd.solver.colliders.pose import MeshPose, ShapePose
-from physgraph_usd.solver.colliders.primitives import ShapeSurface
+from physgraph_usd.solver.colliders.pose import MeshPose
 from physgraph_usd.solver.contact.heat import body_crossings, penetration_map
 from physgraph_usd.solver.mesh.topology import edges_of
 from physgraph_usd.usd.check.validate import validate_layer
@@ -31,23 +29,7 @@ NAMES = ("penetration", "crossing")
 NO_EDGES = np.zeros((0, 2), np.int32)
 
 
-def sphere(radius: float, x: float = 0.0) -> ShapeSurface:
-    return ShapeSurface(ShapePose("sphere", np.eye(3), np.array([x, 0.0, 0.0]), np.full(3, radius)))
-
-
 class TestPenetration:
-    def test_depth_in_a_sphere_is_what_is_left_of_its_radius(self):
-        x = np.random.default_rng(0).uniform(-0.3, 0.3, (500, 3))
-        expected = 1e3 * np.maximum(0.2 - np.linalg.norm(x, axis=1), 0.0)
-        found = penetration_map([sphere(0.2)], x, NO_EDGES)
-        assert found.dtype == np.float32
-        np.testing.assert_allclose(found, expected, atol=1e-4)
-        assert (found > 0).sum() > 20
-
-    def test_the_deepest_body_counts(self):
-        x = np.array([[0.0, 0.0, 0.0], [0.25, 0.0, 0.0], [1.0, 0.0, 0.0]])
-        np.testing.assert_allclose(penetration_map([sphere(0.2), sphere(0.1, 0.25)], x, NO_EDGES), [200, 100, 0])
-
     def test_in_a_mesh_it_is_libigls_distance(self):
         soup = ball(level=4)
         x = np.random.default_rng(1).uniform(-0.25, 0.25, (400, 3))
@@ -79,26 +61,6 @@ class TestCrossings:
         away = np.abs(np.linalg.norm(x, axis=1) - 0.2) > 0.075
         assert away.sum() > 80
         assert not found[away].any()
-
-    def test_a_spike_through_the_middle_of_a_face_marks_its_corners(self):
-        x, faces = level_sheet()
-        at = x[faces[7]].mean(axis=0)
-        normal = np.eye(3)[np.ptp(x, axis=0).argmin()]
-        base = np.array([[1e-3, 1e-3, 1e-3], [-1e-3, 1e-3, -1e-3], [1e-3, -1e-3, -1e-3]])
-        spike = np.concatenate([[0.3 * normal], base - 0.3 * normal]) + at
-        sides = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 1], [3, 2, 1]])
-        (surface,) = MeshBody(device="cpu", threads=1).pose(MeshPose(spike, sides))
-        found = body_crossings([surface], x, edges_of(faces, len(x)).vertices, triangles=faces)
-        assert np.flatnonzero(found).tolist() == sorted(faces[7].tolist())
-
-    def test_of_a_primitive_edges_with_one_end_inside(self):
-        x, faces = level_sheet()
-        edges = edges_of(faces, len(x)).vertices
-        found = body_crossings([sphere(0.2)], x, edges, triangles=faces)
-        inside = (np.linalg.norm(x, axis=1) < 0.2)[edges]
-        expected = np.zeros(len(x), bool)
-        expected[edges[inside[:, 0] != inside[:, 1]].ravel()] = True
-        np.testing.assert_array_equal(found, expected)
 
 
 def level_sheet() -> tuple[np.ndarray, np.ndarray]:
@@ -135,8 +97,7 @@ class TestLayers:
         make_shot(tmp_path / "shot.usda")
         return tmp_path / "shot.usda"
 
-    @pytest.mark.parametrize("mode", ["over", "sibling"])
-    @pytest.mark.parametrize("suffix", [".usdc", ".usda"])
+    @pytest.mark.parametrize(("mode", "suffix"), [("over", ".usdc"), ("sibling", ".usda")])
     def test_values_come_back_per_sample(self, shot: Path, tmp_path: Path, mode: str, suffix: str):
         rng = np.random.default_rng(0)
         heat = {t: {n: rng.random(63, np.float32) for n in NAMES} for t in TIMES}
@@ -148,31 +109,6 @@ class TestLayers:
                 np.testing.assert_array_equal(values(stage, name, time, path=path), heat[time][name])
         primvar = UsdGeom.PrimvarsAPI(stage.GetPrimAtPath(path)).GetPrimvar("physgraph:penetration")
         assert (primvar.GetInterpolation(), primvar.GetTypeName()) == ("vertex", Sdf.ValueTypeNames.FloatArray)
-        assert errors(out, shot) == []
-
-    def test_a_still_garment_has_a_default_and_no_samples(self, tmp_path: Path):
-        make_shot(tmp_path / "still.usda", times=())
-        out = write(tmp_path / "still.usda", tmp_path / "out.usdc", {None: {"penetration": np.ones(63)}})
-        assert samples(out, "penetration") == []
-        found = values(open_over(tmp_path / "still.usda", out), "penetration", None)
-        np.testing.assert_array_equal(found, np.ones(63))
-        assert errors(out) == []
-
-    def test_a_run_of_equal_samples_is_written_by_its_ends(self, tmp_path: Path):
-        times = tuple(float(t) for t in range(1, 8))
-        make_shot(tmp_path / "long.usda", times=times)
-        steps = [0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 1.0]
-        heat = {t: {"penetration": np.full(63, s)} for t, s in zip(times, steps, strict=True)}
-        out = write(tmp_path / "long.usda", tmp_path / "out.usdc", heat)
-        assert samples(out, "penetration") == [1.0, 3.0, 4.0]
-        stage = open_over(tmp_path / "long.usda", out)
-        for time, step in zip(times, steps, strict=True):
-            np.testing.assert_array_equal(values(stage, "penetration", time), np.full(63, step))
-
-    def test_maps_that_are_not_known_are_left_out(self, shot: Path, tmp_path: Path):
-        out = write(shot, tmp_path / "out.usdc", {TIMES[1]: {"penetration": np.ones(63)}, TIMES[2]: None})
-        assert samples(out, "penetration") == [TIMES[1]]
-        assert not Sdf.Layer.FindOrOpen(str(out)).GetAttributeAtPath(f"{COAT}.primvars:physgraph:crossing")
         assert errors(out, shot) == []
 
     @pytest.mark.parametrize(
@@ -223,16 +159,6 @@ def body_shot(path: Path, *, frozen: bool = False) -> Path:
     return path
 
 
-class Heated:
-    """A solver with heat maps of its own."""
-
-    def __call__(self, times: Sequence[float | None]) -> Iterator[Outcome]:
-        for time in times:
-            points = (np.full((2, 3), time), None, np.zeros((1, 3)))
-            heat = ({"penetration": np.full(2, time), "crossing": np.ones(2)}, None, {})
-            yield Outcome(time, points, (False, False, False), {"time": time}, heat)
-
-
 class TestShots:
     @pytest.mark.parametrize("contact", ["quadratic", "off"])
     def test_a_layer_tells_how_deep_the_cloth_is(self, tmp_path: Path, contact: str):
@@ -260,29 +186,6 @@ class TestShots:
         report = refine(shot, out, heat_map=True, contact="off")
         assert all("reused" in frame["garments"][0]["start"] for frame in report.frames[1:])
         assert samples(out, "penetration", CLOTH) == [1.0, 2.0, 3.0, 4.0, 5.0]  # at 6 it is past, as at 5
-
-    @pytest.mark.slow
-    def test_workers_hand_it_over_unchanged(self, tmp_path: Path):
-        shot = body_shot(tmp_path / "shot.usdc")
-        layers = []
-        for workers in (1, 2):
-            (tmp_path / str(workers)).mkdir()
-            layers.append(tmp_path / str(workers) / "fine.usdc")
-            refine(shot, layers[-1], heat_map=True, workers=workers, temporal="off")
-        assert layers[0].read_bytes() == layers[1].read_bytes()
-        assert samples(layers[0], "penetration", CLOTH)
-
-    def test_each_garment_keeps_its_own_in_a_frames_file(self, tmp_path: Path):
-        frames = FrameFolder(tmp_path / "frames", {})
-        for index, solved in enumerate(Heated()([1.0, 2.0])):
-            frames.write(index, solved)
-            outcome = frames.read(index, solved.time)
-            assert outcome is not None
-            first, second, third = outcome.heat
-            assert (second, third) == (None, {})
-            assert first is not None
-            np.testing.assert_array_equal(first["penetration"], np.full(2, outcome.time))
-            np.testing.assert_array_equal(first["crossing"], np.ones(2))
 
     def test_without_it_a_layer_has_no_trace_of_it(self, tmp_path: Path):
         shot, out = body_shot(tmp_path / "shot.usdc"), tmp_path / "fine.usda"

@@ -1,19 +1,21 @@
-"""In a held pose cloth slows down and rests; what moves, or is set anew, is followed as ever."""
+"""In a held pose, or held up where it crosses, cloth slows down and rests; what moves or is set anew is followed."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from bodies import ball
 from cloth import sheet
+from pxr import Usd, UsdGeom, Vt
+from shots import refine
 from touching import frame, mesh_pose, refiner
 
-from physgraph_usd.solver.colliders.pose import MeshPose, ShapePose
 from physgraph_usd.solver.frame import start
-from physgraph_usd.solver.frame.start import SLOWER, SLOWEST, STILL, slowing
+from physgraph_usd.solver.frame.start import STILL, slowing
 from physgraph_usd.solver.frame.values import State, join, split
 from physgraph_usd.solver.scene import Frame
 
@@ -27,48 +29,10 @@ FRAMES = 12
 
 
 class TestSlowing:
-    def test_it_grows_from_frame_to_frame_up_to_a_limit(self):
-        held, found = 0, []
-        for _ in range(100):
-            held, slowed = slowing(held, 0.0)
-            found.append(slowed)
-        assert held == 100
-        assert found[:3] == [SLOWER, SLOWER**2, SLOWER**3]
-        assert found[-1] == SLOWEST
-        assert sorted(found) == found
-
-    def test_what_moves_ends_it(self):
-        assert slowing(30, STILL) == (0, 1.0)
-        assert slowing(30, np.inf) == (0, 1.0)
-
     def test_what_moves_slowly_is_followed(self):
         """Half as fast, four times as stiffly, and no more."""
         found = [slowing(30, part * STILL)[1] for part in (0.999, 0.5, 0.25)]
         assert found == pytest.approx([1.0, 4.0, 16.0], rel=3e-3)
-
-
-class TestHowFarABodyMoved:
-    def test_a_mesh(self):
-        points, triangles = BALL
-        moved = points.copy()
-        moved[3] += [0.3, 0.0, 0.4]
-        assert MeshPose(moved, triangles).moved(MeshPose(points, triangles)) == pytest.approx(0.5)
-        assert MeshPose(points, triangles).moved(MeshPose(points, triangles)) == 0.0
-        assert MeshPose(points, triangles).moved(MeshPose(points, triangles[:-1])) == np.inf
-        moved[3] = np.nan
-        assert MeshPose(moved, triangles).moved(MeshPose(points, triangles)) == np.inf
-        assert MeshPose(points[:0], triangles[:0]).moved(MeshPose(points[:0], triangles[:0])) == 0.0
-
-    @pytest.mark.parametrize("kind", ["capsule", "plane"])
-    def test_a_shape(self, kind: str):
-        size = np.zeros(3) if kind == "plane" else np.array([0.1, 0.1, 0.3])
-        at = ShapePose(kind, np.eye(3), np.zeros(3), size)
-        assert at.moved(at) == 0.0
-        assert replace(at, centre=np.array([0.0, 0.2, 0.0])).moved(at) == pytest.approx(0.2)
-        turn = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-        assert replace(at, turn=turn).moved(at) == pytest.approx(np.sqrt(2.0) * (1.0 if kind == "plane" else 0.3))
-        assert at.moved(replace(at, kind="sphere")) == np.inf
-        assert at.moved(MeshPose(*BALL)) == np.inf
 
 
 class TestState:
@@ -109,14 +73,6 @@ class TestHeldPose:
         monkeypatch.setattr(start, "slowing", never)
         assert bool((slow == solved([bent(count) for count in range(5)])).all())
 
-    def test_where_a_body_stops_cloth_slows_down(self, monkeypatch: pytest.MonkeyPatch):
-        frames = [at(count, ball_moves=0.003 * min(count, 2)) for count in range(6)]
-        slow = solved(frames)
-        monkeypatch.setattr(start, "slowing", never)
-        free = solved(frames)
-        assert bool((slow[:3] == free[:3]).all())
-        assert not (slow[3] == free[3]).all()
-
     def test_what_an_artist_sets_is_followed(self, monkeypatch: pytest.MonkeyPatch):
         def tuned(count: int) -> Frame:
             whole = at(count)
@@ -150,3 +106,43 @@ def never(_held: int, _motion: float, _pace: float = 1.0, *, again: bool = False
     """Cloth that is never slowed down."""
     del again
     return 0, 1.0
+
+
+NAMES = ("wide", "thin", "alike")
+
+
+def tubes(file: Path) -> Path:
+    """Closed tubes of 2 cm, a wide one and two thin ones at one place inside it that cross its caps."""
+    stage = Usd.Stage.CreateNew(str(file))
+    UsdGeom.SetStageUpAxis(stage, "Y")
+    UsdGeom.SetStageMetersPerUnit(stage, 0.01)
+    corners = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+    for name, half, rings in zip(NAMES, (0.5, 0.05, 0.05), (10, 3, 3), strict=True):
+        points = [[half * a, height, half * b] for height in np.linspace(0.0, 2.0, rings) for a, b in corners]
+        sides = [
+            [4 * r + k, 4 * r + (k + 1) % 4, 4 * r + 4 + (k + 1) % 4, 4 * r + 4 + k]
+            for r in range(rings - 1)
+            for k in range(4)
+        ]
+        faces = [*sides, [0, 1, 2, 3], [4 * rings - 1, 4 * rings - 2, 4 * rings - 3, 4 * rings - 4]]
+        mesh = UsdGeom.Mesh.Define(stage, f"/World/{name}")
+        mesh.CreateFaceVertexCountsAttr([4] * len(faces))
+        mesh.CreateFaceVertexIndicesAttr(np.ravel(faces).tolist())
+        mesh.CreateSubdivisionSchemeAttr("none")
+        mesh.CreatePointsAttr().Set(Vt.Vec3fArray.FromNumpy(np.array(points, np.float32)), 1.0)
+    stage.Save()
+    return file
+
+
+def test_tubes_that_cross_keep_their_length_in_few_steps(tmp_path: Path):
+    """Two steps a level do not settle them; the wide one grew by 0.4 of its length, the thin ones shrank by 0.7.
+
+    They are 2 m long. With the shot and three jitters of 1e-7 m they end between 1.89 and 2.47 m.
+    """
+    few = {"level": 1, "steps": 2, "integrator": "quasi-newton"}
+    report = refine(tubes(tmp_path / "shot.usda"), tmp_path / "fine.usdc", garments=["/World/*"], **few)
+    assert report.unsettled
+    stage = Usd.Stage.Open(str(tmp_path / "fine.usdc"))
+    for name in NAMES:
+        points = np.array(UsdGeom.Mesh(stage.GetPrimAtPath(f"/World/{name}")).GetPointsAttr().Get(1.0))
+        assert 1.8 < np.ptp(points, axis=0).max() < 2.6, name

@@ -100,10 +100,6 @@ class TestPyblish:
         (made,) = instance.data["files"]
         assert faults(Path(made), file) == []
 
-    def test_a_file_serves_too(self, run: Any, file: Path):
-        (instance,) = run(currentFile=str(file))
-        assert len(instance.data["files"]) == 1
-
     def test_a_garment_that_cannot_be_refined_fails_at_validation(self, run: Any, stage: Usd.Stage):
         tear(stage)
         context = run(usdStage=stage)
@@ -113,9 +109,6 @@ class TestPyblish:
         assert [name for name, _ in failed] == ["ValidateGarments"]
         assert CLOTH in failed[0][1]
         assert not any("files" in instance.data for instance in context)
-
-    def test_a_stage_without_garments_has_no_instance(self, run: Any):
-        assert list(run(usdStage=Usd.Stage.CreateInMemory())) == []
 
 
 class TestAyon:
@@ -159,19 +152,6 @@ class TestAyon:
         assert faults(layer, file) == []
         assert len(Sdf.Layer.FindOrOpen(str(layer)).QueryTimeSample(f"{CLOTH}.points", 2.0)) == FINE
 
-    def test_the_scenes_file_serves_where_it_is_usd(self, run: Any, file: Path):
-        assert len(run({}, currentFile=str(file))) == 1
-        assert len(run({}, currentFile="scene.mb")) == 0
-
-    def test_each_setting_is_an_attribute_of_the_plug_in(self, run: Any, monkeypatch: pytest.MonkeyPatch):
-        server = SimpleNamespace(BaseSettingsModel=object, SettingsField=lambda *_, **__: None)
-        monkeypatch.setitem(sys.modules, "ayon_server", ModuleType("ayon_server"))
-        monkeypatch.setitem(sys.modules, "ayon_server.settings", server)
-        found = runpy.run_path(str(PLUGINS / "ayon" / "settings.py"))
-        collector = runpy.run_path(str(PLUGINS / "ayon" / "collect_refined_cloth.py"))["CollectRefinedCloth"]
-        assert all(hasattr(collector, name) for name in found["CollectRefinedClothModel"].__annotations__)
-        assert list(found["PublishModel"].__annotations__) == ["CollectRefinedCloth"]
-
 
 class TestSolaris:
     """A LOP node in pxr: what comes in as a stage, and the layer that the node's edits go to."""
@@ -213,12 +193,6 @@ class TestSolaris:
         assert edits.GetAttributeAtPath(f"{CLOTH}.note").default == "mine"
         assert {count(whole, time) for time in (1.0, 2.0, 3.0)} == {FINE}
 
-    def test_the_nodes_layer_holds_the_refined_cloth(self, node: Any):
-        report = importlib.import_module("refine_lop").cook(node)
-        assert count(node.editableStage()) == FINE
-        assert [frame["time"] for frame in report.frames] == [2.0, 3.0]
-        assert node.said == report.warnings
-
     def test_what_is_wrong_is_the_nodes_error(self, node: Any):
         tear(node.editableStage())
         with pytest.raises(pg.GarmentError, match=CLOTH):
@@ -255,19 +229,6 @@ class TestUsdview:
         colour = UsdGeom.PrimvarsAPI(api.stage.GetPrimAtPath(CLOTH)).GetPrimvar("displayColor")
         assert len(colour.Get(api.frame)) == count(api.stage)
         assert len(api.stage.GetSessionLayer().subLayerPaths) == 2
-
-    def test_what_crosses_is_red(self, api: Any, actions: Any):
-        actions.refine_frame(api)
-        values = np.zeros(count(api.stage), np.float32)
-        values[3] = 1.0
-        api.stage.SetEditTarget(api.stage.GetSessionLayer())
-        primvar = UsdGeom.PrimvarsAPI(api.stage.GetPrimAtPath(CLOTH)).GetPrimvar("physgraph:crossing")
-        primvar.Set(values.tolist(), 2.0)
-        actions.show_heat(api, "crossing")
-        colours = np.asarray(UsdGeom.PrimvarsAPI(api.stage.GetPrimAtPath(CLOTH)).GetPrimvar("displayColor").Get(2.0))
-        assert colours[3, 0] > 0.8
-        assert colours[3, 1] < 0.2
-        assert np.ptp(np.delete(colours, 3, axis=0)) == 0.0
 
     def test_what_is_wrong_is_in_the_status_line(self, api: Any, actions: Any):
         tear(api.stage)

@@ -47,20 +47,6 @@ def heights(found: list[Outcome]) -> list[float]:
     return [float(np.asarray(each.points[0])[0, 2]) for each in found]
 
 
-def test_positions_go_over_in_equal_parts():
-    told: list[str] = []
-    found = list(joined(seam(4, 1.0), Passing(), told.append))
-    assert heights(found) == pytest.approx([0.2, 0.4, 0.6, 0.8, 1.0, 1.0])
-    assert [each.reused for each in found] == [(False,)] * 5 + [(True,)]
-    assert [each.lead for each in found] == [None] * 6
-    assert told == []
-
-
-def test_equal_solutions_stay_as_they_are():
-    found = list(joined(seam(3, 0.0), Passing("never asked"), print))
-    assert [each.reused for each in found] == [(True,)] * 3 + [(False,), (True,)]
-
-
 def test_cloth_that_would_cross_jumps_and_is_told_of():
     told: list[str] = []
     found = list(joined(seam(3, 1.0), Passing("</a> would have 3 edges through cloth"), told.append))

@@ -13,10 +13,9 @@ from stages import add_sheet, author, new_stage
 
 from physgraph_usd.errors import SchemaError, UsageError
 from physgraph_usd.solver.fabric import PRESETS
-from physgraph_usd.usd.lookup import check_overrides, find_value, parse_overrides
+from physgraph_usd.usd.lookup import check_overrides, parse_overrides
 from physgraph_usd.usd.read.materials import Values, find_values
 from physgraph_usd.usd.read.reader import open_shot
-from physgraph_usd.usd.schema import GARMENT
 from physgraph_usd.usd.stage import read_units
 
 BEND = "physgraph:material:bendStiffness"
@@ -82,18 +81,6 @@ def test_values_of_the_physics_proposal_are_converted_from_stage_units(stage: Us
     np.testing.assert_allclose(found, [30.0, 10.0, 4e-6, 200.0 * 0.002, 0.002], rtol=1e-5)
 
 
-def test_a_proposal_value_of_zero_is_not_given(stage: Usd.Stage) -> None:
-    material = bind(stage, "m")
-    author(material, "physics:density", 0.0)
-    assert values(stage).fabric(None) == PRESETS["jersey"]
-
-
-def test_shear_is_none_until_authored(stage: Usd.Stage) -> None:
-    assert values(stage).fabric(None).shear is None
-    author(cloth(stage), "physgraph:material:shearStiffness", 12.0)
-    assert values(stage).fabric(None).shear == 12.0
-
-
 @pytest.mark.parametrize("kind", ["int", "half", "float", "double", "int64", "uchar", "bool"])
 def test_any_numeric_type_is_read(stage: Usd.Stage, kind: str) -> None:
     author(stage.GetPrimAtPath("/World/rig"), "physgraph:material:stretchStiffness", 1, kind=kind)
@@ -117,21 +104,6 @@ def test_what_is_out_of_limits_is_refused_by_name(stage: Usd.Stage, value: float
     author(cloth(stage), BEND, value)
     with pytest.raises(SchemaError, match=r"must be finite and in \[0, 100000\] N m"):
         values(stage).fabric(None)
-
-
-def test_a_blocked_value_is_not_given(stage: Usd.Stage) -> None:
-    author(stage.GetPrimAtPath("/World/rig"), BEND, 9e-6)
-    author(cloth(stage), BEND, Sdf.ValueBlock())
-    assert values(stage).found["bendStiffness"].source == f"</World/rig>.{BEND}"
-
-
-def test_animated_sources_are_told(stage: Usd.Stage) -> None:
-    for time in (1.0, 2.0):
-        author(cloth(stage), BEND, time * 1e-6, time=time)
-    author(cloth(stage), "physgraph:guide:stiffness", 100.0, time=1.0)
-    found = values(stage)
-    assert found.animated == {"bendStiffness"}
-    assert found.number("guide:stiffness", None) == 100.0
 
 
 @pytest.mark.parametrize(
@@ -162,19 +134,6 @@ def test_overrides_that_cannot_be_used_say_why(text: str, message: str) -> None:
         check_overrides(parse_overrides([text]), [])
 
 
-def test_an_override_for_no_garment_is_refused() -> None:
-    with pytest.raises(UsageError, match="no such garment; garments: /World/coat"):
-        check_overrides(parse_overrides(["</World/coat2>.detail=1"]), [Sdf.Path("/World/coat")])
-    check_overrides(parse_overrides(["</World>.detail=1", "enabled=off"]), [Sdf.Path("/World/coat")])
-
-
-def test_a_fallback_of_the_table_is_given_where_nothing_is_authored(stage: Usd.Stage) -> None:
-    for row in GARMENT.values():
-        if row.type != "rel" and not row.interpolation:
-            expected = None if row.fallback is None else float(row.fallback)
-            assert find_value(cloth(stage), row).at(None) == expected
-
-
 def told(stage: Usd.Stage) -> list[str]:
     stage.GetRootLayer().Save()
     with contextlib.closing(open_shot(stage.GetRootLayer().realPath)) as shot:
@@ -203,11 +162,6 @@ def test_misspelt_attributes_are_named_with_the_nearest_that_exists(stage: Usd.S
     ]
 
 
-def test_a_garment_s_value_on_a_material_is_named(stage: Usd.Stage) -> None:
-    author(bind(stage, "m"), "physgraph:guide:stiffness", 1.0)
-    assert told(stage) == ["</World/m>: physgraph:guide:stiffness is not read on a material; author it on the garment"]
-
-
 def test_a_connection_is_followed_one_step(stage: Usd.Stage) -> None:
     material = bind(stage, "m")
     shared = author(material, "inputs:bend", 3e-5)
@@ -219,13 +173,3 @@ def test_a_connection_is_followed_one_step(stage: Usd.Stage) -> None:
     fabric = found.fabric(None)
     assert (fabric.bend, fabric.density) == (pytest.approx(3e-5), pytest.approx(0.4))
     assert told(stage) == []
-
-
-def test_a_connection_that_leads_to_no_value_is_named(stage: Usd.Stage) -> None:
-    material = bind(stage, "m")
-    shader = UsdShade.Shader.Define(stage, "/World/m/noise")
-    output = shader.CreateOutput("r", Sdf.ValueTypeNames.Float).GetAttr()
-    author(material, BEND, 2e-5).SetConnections([output.GetPath()])
-    assert values(stage).fabric(None).bend == pytest.approx(2e-5)
-    (said,) = told(stage)
-    assert said.startswith(f"</World/m>: {BEND} is connected to </World/m/noise.outputs:r>, which gives no value")

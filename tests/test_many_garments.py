@@ -18,7 +18,6 @@ from stages import add_sheet, new_stage
 
 from physgraph_usd.shot.refine import inspect_shot
 from physgraph_usd.shot.report import of_a_kind
-from physgraph_usd.shot.warnings import WARNINGS
 from physgraph_usd.solver.contact.broad_phase import TouchingGroups
 from physgraph_usd.solver.scene import Garment, GarmentFrame
 from physgraph_usd.usd.read.find import felt_by, find_colliders
@@ -83,11 +82,6 @@ def test_what_they_touch_is_looked_for_in_time_that_grows_with_their_number(
     assert linear(run)
 
 
-def test_those_that_meet_are_looked_for_in_time_that_grows_with_their_number():
-    given = {count: scattered(count, 10.0 * count) for count in (FEW, FACTOR * FEW)}
-    assert linear(lambda count: TouchingGroups(given[count][0], together=True).of(given[count][1]))
-
-
 @pytest.mark.parametrize("spread", [0.5, 2.0, 8.0])
 def test_those_that_meet_are_found_as_by_looking_at_every_pair(spread: float):
     garments, frames = scattered(40, spread)
@@ -120,19 +114,6 @@ class TestWarnings:
             "</g1>: is still": [],
             "stage: odd": [],
         }
-
-    def test_those_that_name_other_numbers_of_frames_are_of_a_kind(self):
-        more = ["", "; also at time code 2", "; also at time codes 2 and 3", "; also in 9 other frames"]
-        assert len(of_a_kind(f"</g{index}> at time code 1: moves{also}" for index, also in enumerate(more))) == 1
-
-    def test_of_one_prim_stay_as_they_are(self):
-        given = ["</g>: is still", "</g> at time code 1: moves"]
-        assert of_a_kind([*given, *given]) == {each: [] for each in given}
-
-    def test_of_one_kind_are_one_whatever_they_name(self):
-        given = [WARNINGS["contact"](f"/g{index}", [1.0], left=left) for index, left in enumerate(["2 a", "3 b, 4 c"])]
-        (said,) = of_a_kind(given)
-        assert said.startswith("</g0>, </g1> at time code 1: 2 a are left;")
 
     def test_of_a_shot_name_all_prims_in_the_report(self, tmp_path: Path):
         shot = tmp_path / "shot.usda"

@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from bodies import ball, box, surfaces, together
-from folds import levels_of, named, square
+from folds import frame_with, levels_of, named, refiner_with, square
 
-from physgraph_usd.solver.colliders.mesh import MeshBody, MeshSurface
+from physgraph_usd.lab.samples import write_sample
+from physgraph_usd.shot.options import RefineOptions
+from physgraph_usd.solver.colliders.mesh import MeshBody
 from physgraph_usd.solver.colliders.pose import MeshPose
 from physgraph_usd.solver.contact.bodies import FrameBodies, LevelBodies, Touching
 from physgraph_usd.solver.contact.measure import depths, pinched
 from physgraph_usd.solver.contact.push_out import pushed_out
 from physgraph_usd.solver.contact.settings import ContactSettings
+from physgraph_usd.solver.frame.refiner import Refiner
 from physgraph_usd.solver.level import Level
-from physgraph_usd.solver.mesh.topology import patches_with
+from physgraph_usd.usd.read.reader import open_shot
 
 SHEET = named(square(12))
 SETTINGS = ContactSettings(stiffness=1.0, cloth_stiffness=1e5)
@@ -39,14 +42,6 @@ def lens_of(level: Level, *, wider: float = 0.0) -> torch.Tensor:
 
 
 class TestParts:
-    def test_points_are_inside_as_many_parts_as_overlap_there(self):
-        """Two balls of 10 cm whose centres are 14 cm apart: 6 cm of either lie in the other."""
-        surface = surfaces(together(ball(0.1, at=(-0.07, 0.0, 0.0)), ball(0.1, at=(0.07, 0.0, 0.0))))[0]
-        x = torch.tensor([[0.0, 0.0, 0.0], [0.02, 0.03, 0.0], [0.08, 0.0, 0.0], [-0.08, 0.0, 0.0], [0.0, 0.09, 0.0]])
-        x = x - torch.as_tensor(surface.origin).to(x)
-        assert surface.inside(x).tolist() == [True, True, True, True, False]
-        assert surface.inside(x, parts=2).tolist() == [True, True, False, False, False]
-
     def test_cloth_between_them_is_not_sent_through_one_of_them(self):
         """A point in one part alone, 5 cm from its bare side: it comes out there, unless its cloth was between them.
 
@@ -78,15 +73,6 @@ class TestParts:
         assert float(way.distance[1]) == pytest.approx(5e-4, rel=1e-3)
 
 
-class TestPatches:
-    def test_those_with_a_seed_are_kept_whole(self):
-        """A row of ten: 0 to 3, 5 to 6 and 8 to 9 hang together; seeds in the first, beside the second, and outside."""
-        edges = np.stack([np.arange(9), np.arange(1, 10)], axis=1)
-        some = np.isin(np.arange(10), [0, 1, 2, 3, 5, 6, 8, 9])
-        assert np.flatnonzero(patches_with(edges, some, np.isin(np.arange(10), [2, 4, 7]))).tolist() == [0, 1, 2, 3]
-        assert not patches_with(edges, some, np.zeros(10, bool)).any()
-
-
 class TestLost:
     """Which cloth no body sends out, and that it does not."""
 
@@ -108,34 +94,6 @@ class TestLost:
         out = pushed_out(view, x)[1]
         assert torch.equal(out[lost], x[lost])
 
-    def test_closest_points_of_the_upsampled_cage_are_not_asked_for_twice(self, monkeypatch: pytest.MonkeyPatch):
-        """Those of cloth that has moved since are; what is lost is then what is in the lens where it is now."""
-        asked: list[int] = []
-        level, view, x = self.view(together(OVER, UNDER))
-        closest = MeshSurface.closest
-        monkeypatch.setattr(MeshSurface, "closest", lambda *args: asked.append(len(args[1])) or closest(*args))
-        known = view.tracks[0].lost
-        view = view.losing(x)
-        assert not asked
-        again = replace(view, tracks=(replace(view.tracks[0], inside=None),)).losing(x).tracks[0].lost
-        assert asked
-        assert known is not None
-        assert again is not None
-        assert torch.equal(again, known)
-        level, view, x = self.view(together(OVER, UNDER))
-        asked.clear()
-        view = view.losing(x + torch.tensor([0.02, 0.0, 0.0]))
-        assert asked
-        lost, away = view.tracks[0].lost, (level.rest[:, [0, 2]] + torch.tensor([0.02, 0.0])).norm(dim=1)
-        lens = np.sqrt(0.15**2 - 0.13**2)
-        assert lost is not None
-        assert bool(lost[away < lens - 0.01].all())
-        assert not bool(lost[away > lens + 0.01].any())
-
-    def test_two_bodies_that_overlap_lose_none(self):
-        """Each has bare faces all over: cloth between them is pushed to the middle."""
-        assert [track.lost for track in self.view(OVER, UNDER)[1].tracks] == [None, None]
-
     def test_nor_does_a_body_whose_parts_only_graze_it(self):
         """In one part, whose face over it the other buries, but nowhere in both: it is pushed out."""
         _, view, x = self.view(together(OVER, UNDER), height=0.03)
@@ -143,11 +101,34 @@ class TestLost:
         out = pushed_out(view, x)[1]
         assert not torch.equal(out, x)
 
-    def test_one_body_does_not_keep_what_another_pushes(self):
-        """A third one, a small ball in the lens: what the first lost lies outside that."""
-        level, view, x = self.view(together(OVER, UNDER), ball(0.03, at=(0.0, -0.005, 0.0), level=4))
-        assert view.tracks[0].lost is not None
-        assert view.tracks[1].lost is None
-        out = pushed_out(view, x)[1]
-        inner = level.rest[:, [0, 2]].norm(dim=1) < 0.02
-        assert float((out[inner] - torch.tensor([0.0, -0.005, 0.0])).norm(dim=1).min()) > 0.0299
+
+class TestRepairedCage:
+    def test_cloth_between_overlapping_parts_comes_to_lie_between_them(self):
+        """Two balls overlap by 6 cm; a sheet goes through the first, 2 cm beside the lens: none stays inside alone."""
+        body = together(ball(0.1, at=(-0.07, 0.0, 0.0)), ball(0.1, at=(0.07, 0.0, 0.0)))
+        cells = square(12, edge=0.025)
+        upright = np.ascontiguousarray(cells[1][:, [1, 0, 2]]) + np.array([-0.05, 0.0, 0.0])
+        one = refiner_with([named(cells)], ["mesh"])
+        state = one.solve(frame_with([upright], body))
+        told = next(iter(state.telemetry[0]["contact"]["bodies"].values()))
+        assert told["before"]["inside"] + told["before"]["pinched"] > 50
+        assert told["after"]["inside"] == 0
+        assert 5 < state.telemetry[0]["contact"]["repaired"]["vertices"] < 100
+        assert 1.0 < state.telemetry[0]["contact"]["repaired"]["largest_mm"] < 100.0
+        hidden = np.linalg.norm(state.points[0][:, 1:], axis=1) < 0.03
+        assert hidden.sum() > 5
+        assert np.abs(state.points[0][hidden, 0]).max() < 0.03
+
+
+@pytest.mark.slow
+def test_a_sleeve_deep_in_the_body_ends_with_no_more_crossings(tmp_path: Path):
+    """The T-shirt with an arm through its chest: nothing that has a way out stays inside."""
+    shot = open_shot(str(write_sample("tshirt", tmp_path)))
+    refiner = Refiner(shot.scene, RefineOptions().solve_settings(), levels=[2])
+    telemetry: dict[str, Any] = refiner.solve(shot.frame(36.0)).telemetry[0]
+    contact = telemetry["contact"]
+    assert contact["cloth"]["before"]["crossings"] > 200
+    assert contact["cloth"]["after"]["crossings"] <= contact["cloth"]["before"]["crossings"]
+    for body in contact["bodies"].values():
+        assert body["after"]["inside"] == 0
+        assert body["after"]["pinched"] <= body["before"]["inside"] + body["before"]["pinched"]

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pxr import Usd, UsdGeom, Vt
+from pxr import Usd, UsdGeom
 from stages import add_sheet, new_stage, save, value_type
 
 from physgraph_usd.errors import SchemaError
@@ -43,13 +43,6 @@ def read(stage: Usd.Stage, name: str) -> np.ndarray:
     return read_painted(stage.GetPrimAtPath("/World/rig/cloth"), name, 20)[0]
 
 
-def test_nothing_painted_is_ones_and_no_pins(stage: Usd.Stage) -> None:
-    garment = open_shot(save(stage)).scene.garments[0]
-    for array in (garment.stretch_scale, garment.bend_scale, garment.guide_scale, garment.detail_scale):
-        np.testing.assert_array_equal(array, np.ones(20))
-    np.testing.assert_array_equal(garment.pin, np.zeros(20))
-
-
 def test_each_painted_value_reaches_its_own_field(stage: Usd.Stage) -> None:
     fields = {"stretchScale": 2, "bendScale": 3, "guideScale": 4, "detailScale": 5}
     for name, factor in fields.items():
@@ -62,25 +55,12 @@ def test_each_painted_value_reaches_its_own_field(stage: Usd.Stage) -> None:
     np.testing.assert_allclose(garment.pin, RAMP, rtol=1e-6)
 
 
-@pytest.mark.parametrize("kind", ["double[]", "half[]", "float[]"])
-def test_any_float_type_and_varying_interpolation(stage: Usd.Stage, kind: str) -> None:
-    prim = stage.GetPrimAtPath("/World/rig/cloth")
-    prim.RemoveAppliedSchema("PhysGraphGarmentAPI")
-    paint(stage, "bendScale", RAMP.tolist(), how="varying", kind=kind)
-    np.testing.assert_allclose(read(stage, "bendScale"), RAMP, atol=1e-3)
-
-
 @pytest.mark.parametrize("at", ["/World/rig/cloth", "/World"])
 def test_a_constant_holds_everywhere_and_is_inherited(stage: Usd.Stage, at: str) -> None:
     if at == "/World":
         stage.DefinePrim(at)
     paint(stage, "bendScale", [2.5], how="constant", at=at)
     np.testing.assert_array_equal(read(stage, "bendScale"), np.full(20, 2.5))
-
-
-def test_indexed_values_are_flattened(stage: Usd.Stage) -> None:
-    paint(stage, "pin", [0.0, 1.0]).SetIndices(Vt.IntArray([i % 2 for i in range(20)]))
-    np.testing.assert_array_equal(read(stage, "pin"), np.arange(20) % 2)
 
 
 @pytest.mark.parametrize(
@@ -98,13 +78,6 @@ def test_values_that_cannot_be_used_are_named(stage: Usd.Stage, values: list[flo
     paint(stage, "bendScale", values, how=how)
     with pytest.raises(SchemaError, match="</World/rig/cloth>.*" + message):
         open_shot(save(stage))
-
-
-def test_pins_over_one_are_one_and_told(stage: Usd.Stage) -> None:
-    paint(stage, "pin", (3 * RAMP).tolist())
-    shot = open_shot(save(stage))
-    assert shot.scene.garments[0].pin.max() == 1.0
-    assert any("goes up to 3" in notice.message for notice in shot.warnings)
 
 
 def test_the_name_that_an_exporter_makes_of_a_colon(stage: Usd.Stage) -> None:

@@ -46,10 +46,6 @@ def chart_with(peer: str, folder: Path) -> tuple[Chart, tuple[Point, ...]]:
     return chart, chart.curve(PEERS[peer].name)
 
 
-def test_every_peer_is_tested():
-    assert set(VARIABLES) == set(PEERS)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("peer", ["newton", "newton-xpbd"])
 def test_a_peer_of_our_potential_closes_the_gap(peer: str, tmp_path: Path):

@@ -6,7 +6,7 @@ Cloth does not feel itself here: faces thrown together cross each other, and dra
 from __future__ import annotations
 
 import tempfile
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +15,7 @@ from cloth import frame_of, refiner_of
 from hypothesis import HealthCheck, Phase, assume, given, settings
 from hypothesis import strategies as st
 from layers import errors, open_over, world_metres
-from meshes import any_mesh, mesh_of, planar_mesh
+from meshes import any_mesh, planar_mesh
 from pxr import Sdf, UsdGeom, Vt
 from sheets import garment_of, rotation
 from stages import GARMENT_API, affine, author, new_stage, save, set_matrix, vec3
@@ -23,15 +23,13 @@ from stages import GARMENT_API, affine, author, new_stage, save, set_matrix, vec
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.refine import refine_shot
 from physgraph_usd.solver.fabric import Fabric
-from physgraph_usd.solver.forces.guide import GuideMap
-from physgraph_usd.solver.level import build_levels, refine_garments
 from physgraph_usd.solver.mesh.subdivide import subdivide, subdivide_times
 from physgraph_usd.solver.mesh.topology import PolygonMesh
 
 CLOTH = "/World/cloth"
 EDGE = 0.05
 FEW = settings(
-    max_examples=8,
+    max_examples=5,
     phases=(Phase.explicit, Phase.generate),  # each example is a run: making it smaller would take minutes
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.filter_too_much],
 )
@@ -155,18 +153,6 @@ def test_a_layer_has_the_right_counts_and_times_and_no_more_energy(sheet: Sheet,
         assert energy["output"] <= energy["input"] + 1e-6 * scale
 
 
-@settings(max_examples=40)
-@given(any_mesh(repeats=True), st.integers(0, 2))
-def test_rows_sum_to_one_on_any_mesh(mesh: PolygonMesh, level: int):
-    rest = np.random.default_rng(mesh.vertex_count).uniform(size=(mesh.vertex_count, 3))
-    garment = garment_of(mesh, rest)
-    finest = build_levels([garment], refine_garments([garment], [level]))[-1]
-    for matrix in (finest.from_coarse, finest.smooth_from_coarse):
-        np.testing.assert_allclose(np.asarray(matrix.sum(axis=1)).ravel(), 1.0, atol=1e-12)
-    rows = np.asarray(GuideMap(finest).spread_matrix.sum(axis=0)).ravel()
-    assert np.all(np.isclose(rows, 1.0) | (rows == 0.0))
-
-
 @FEW
 @given(case=planar_mesh(), fabric=fabrics(), level=st.integers(0, 2), seed=st.integers(0, 99), guide=st.booleans())
 def test_rest_without_weight_stays_at_rest(
@@ -217,16 +203,3 @@ def test_a_part_of_the_frames_is_what_it_is_in_the_whole(sheet: Sheet, data: st.
     assert list(part) == times[first : last + 1]
     for time in part:
         np.testing.assert_array_equal(part[time], whole[time])
-
-
-def test_the_tests_see_a_cloth_that_differs():
-    """Twice the bending stiffness shows beyond the tolerances used here."""
-    mesh, points = mesh_of([[0, 1, 4, 3], [1, 2, 5, 4], [3, 4, 7, 6], [4, 5, 8, 7]]), np.mgrid[0:3, 0:3, 0:1]
-    rest = EDGE * points.reshape(3, -1).T[:, [1, 0, 2]].astype(float)
-    bowed = rest * [0.8, 1.0, 1.0] + 0.01 * np.sin(40.0 * rest[:, :1]) * np.array([0.0, 0.0, 1.0])
-    sheet = Sheet(mesh, rest, {1.0: bowed}, {"stretchStiffness": 30.0, "bendStiffness": 1e-3})
-    stiffer = replace(sheet, fabric={"stretchStiffness": 30.0, "bendStiffness": 2e-3})
-    with folder() as one, folder() as two:
-        here, _ = refined(sheet, Path(one), Convention())
-        there, _ = refined(stiffer, Path(two), Convention())
-    assert np.abs(here[1.0] - there[1.0]).max() > 1e-2 * EDGE

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pxr import Gf, Sdf, Usd, UsdGeom
+from pxr import Gf, Sdf, UsdGeom
 from stages import (
     KINDS,
     add_sheet,
@@ -23,7 +23,7 @@ from stages import (
     vec3,
 )
 
-from physgraph_usd.errors import GarmentError, SchemaError, StageError, UsageError
+from physgraph_usd.errors import GarmentError, StageError, UsageError
 from physgraph_usd.usd.read.reader import Shot, open_shot
 
 
@@ -63,7 +63,7 @@ def test_holes_are_left_out_and_face_order_kept(tmp_path: Path) -> None:
 
 NESTED = [affine(np.diag([1.0, 2.0, 0.5]), (1, 2, 3)), affine([[0, -1, 0], [1, 0, 0], [0, 0, 1]])]
 MIRROR = affine(np.diag([-1.0, 1.0, 1.0]))
-PLACES = {"identity": [], "nested": NESTED, "reflected": [MIRROR], "both": [NESTED[0], MIRROR, NESTED[1]]}
+PLACES = {"nested": NESTED, "both": [NESTED[0], MIRROR, NESTED[1]]}
 
 
 @pytest.mark.parametrize("place", PLACES)
@@ -100,8 +100,7 @@ def test_animated_and_mirrored_parents_are_followed_at_each_time(tmp_path: Path)
         np.testing.assert_allclose(world(shot, time), 0.01 * (held @ matrix[:3, :3].T + matrix[:3, 3]), atol=1e-6)
 
 
-@pytest.mark.parametrize("metres", [1e-3, 0.01, 0.0254, 1.0])
-@pytest.mark.parametrize("up", ["Y", "Z"])
+@pytest.mark.parametrize(("metres", "up"), [(1e-3, "Y"), (0.0254, "Z"), (1.0, "Y")])
 def test_s7_the_same_cloth_in_any_unit_and_axis(tmp_path: Path, metres: float, up: str) -> None:
     stage = new_stage(tmp_path / "s.usda", metres=metres, up=up)
     mesh = add_sheet(stage, times=())
@@ -214,14 +213,6 @@ def test_singular_matrices_are_refused_with_prim_and_time(tmp_path: Path) -> Non
         open_shot(save(stage))
 
 
-def test_mirroring_that_switches_is_told(tmp_path: Path) -> None:
-    stage = new_stage(tmp_path / "s.usda")
-    add_sheet(stage)
-    for time, sign in ((1.0, 1.0), (2.0, 1.0), (3.0, -1.0)):
-        set_matrix(stage.GetPrimAtPath("/World"), np.diag([sign, 1.0, 1.0, 1.0]), time)
-    assert "at time code 3: its transform starts or stops mirroring" in said(open_shot(save(stage)))
-
-
 def test_level_comes_from_the_option_the_override_and_the_schema(tmp_path: Path) -> None:
     stage = new_stage(tmp_path / "s.usda")
     author(add_sheet(stage).GetPrim(), "physgraph:refine:level", -1, kind="int")
@@ -248,16 +239,6 @@ def test_values_that_change_are_read_at_each_time(tmp_path: Path) -> None:
     assert shot.sources[0].animated == {"bendStiffness"}
 
 
-def test_an_animated_value_out_of_limits_is_named(tmp_path: Path) -> None:
-    stage = new_stage(tmp_path / "s.usda")
-    prim = add_sheet(stage).GetPrim()
-    author(prim, "physgraph:refine:detail", 1.0, time=1.0)
-    author(prim, "physgraph:refine:detail", 5.0, time=3.0)
-    shot = open_shot(save(stage))
-    with pytest.raises(SchemaError, match=r"</World/cloth>\.physgraph:refine:detail.*is 5; .*\[0, 2\]"):
-        shot.frame(3.0)
-
-
 def test_frames_do_not_depend_on_the_order_in_which_they_are_read(tmp_path: Path) -> None:
     stage = new_stage(tmp_path / "s.usda")
     points = sheet_points(2.0)
@@ -281,14 +262,6 @@ def test_the_file_is_not_touched(tmp_path: Path) -> None:
         shot.frame(2.0)
         assert not shot.stage.GetRootLayer().dirty
     assert {file: file.read_bytes() for file in tmp_path.iterdir()} == before
-
-
-def test_double_precision_points_are_read(tmp_path: Path) -> None:
-    layer = Sdf.Layer.CreateNew(str(tmp_path / "s.usda"))
-    text = Usd.Stage.Open(sheet_shot(tmp_path / "f.usda", times=())).ExportToString()
-    layer.ImportFromString(text.replace("point3f[] points", "point3d[] points"))
-    layer.Save()
-    np.testing.assert_allclose(world(open_shot(layer.realPath), None), sheet_points(), atol=1e-6)
 
 
 def test_gravity_of_a_physics_scene(tmp_path: Path) -> None:

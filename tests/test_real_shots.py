@@ -75,16 +75,6 @@ def test_s5_broken_samples_are_repaired_and_told(real_data: Path, tmp_path: Path
         assert any(f"time code {time}" in line and "repaired" in line for line in result.stderr.splitlines())
 
 
-def test_s32_topology_that_varies_is_refused_by_name(real_data: Path, tmp_path: Path):
-    shot = real_data / "shots" / "12_variants" / "i_topology_varying.usda"
-    result = run("refine", shot, "-o", tmp_path / "fine.usdc", "--garment", "/shot/shirt")
-    assert result.exit_code == 1
-    assert "</shot/shirt>" in result.stderr
-    assert "topology" in result.stderr
-    assert "Traceback" not in result.output
-    assert not list(tmp_path.iterdir())
-
-
 def stages(data: Path) -> list[Path]:
     return sorted(file for folder in STAGES for file in (data / folder).rglob("*.usd*"))
 

@@ -12,7 +12,6 @@ from sheets import garment_of
 
 pytest.importorskip("pxr", reason="benchmarks read stages with usd-core")
 
-from benchmarks.convergence import from_least
 from benchmarks.learned import FRONT, SCHEDULES, Runs, measured
 from physgraph_usd.lab.chart.problem import ALONE, Problem
 from physgraph_usd.lab.chart.reference import Reference, find_reference
@@ -59,14 +58,6 @@ def test_who_asks_again_gets_the_same(bounded: Reference):
     assert np.array_equal(again.points[0], bounded.points[0])
 
 
-def test_it_has_the_energy_of_its_own_positions_and_knows_another(found: Reference):
-    problem, frame = squeezed()
-    assert problem.judge(frame, found.points, ALONE).energy == found.least
-    assert found.apart is not None
-    assert 0.0 <= found.apart < 0.05
-    assert f"by {found.by}; the next best ends {found.apart:.2%} of the fall above" in str(found)
-
-
 def test_a_bounded_search_compares_two_starts_at_least(found: Reference, bounded: Reference):
     for less in (bounded, find_reference(*squeezed(), settings=ALONE, seconds=0.0)):
         assert less.seconds < found.seconds
@@ -105,10 +96,3 @@ def test_all_are_counted_from_the_least_that_any_finds():
     assert min(base[f"gap {s}"] for s in SCHEDULES) > 0.1
     assert other[f"gap {SCHEDULES[0]}"] == 0.0
     assert base["reached"] == sum(FRONT[3])
-
-
-def test_curves_are_counted_from_the_least_of_them():
-    lines = from_least({"a": [1.0, 0.5, float("inf")], "b": [1.0, -0.25, float("nan")]})
-    assert lines["a"][:2] == [1.0, pytest.approx(0.6)]
-    assert lines["b"][1] == 0.0
-    assert from_least({"a": [1.0, 0.5]}) == {"a": [1.0, 0.5]}

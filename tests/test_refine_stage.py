@@ -138,13 +138,6 @@ class TestStateOfTheStage:
         assert np.abs(points(refined(stage)) - heard).max() > 1e-3
         self.as_from_file(stage, tmp_path)
 
-    def test_a_muted_session(self, stage: Usd.Stage):
-        before = points(refined(stage))
-        with Usd.EditContext(stage, stage.GetSessionLayer()):
-            author(stage.GetPrimAtPath(CLOTH), BEND, 1e-3)
-        stage.MuteLayer(stage.GetSessionLayer().identifier)
-        assert np.array_equal(points(refined(stage)), before)
-
     def test_a_variant_selected_in_the_session(self, stage: Usd.Stage, tmp_path: Path):
         cut = stage.GetPrimAtPath("/World").GetVariantSets().AddVariantSet("cut")
         for name, size in (("short", (4, 3)), ("long", (4, 6))):
@@ -159,33 +152,6 @@ class TestStateOfTheStage:
         assert list(layer.customLayerData["physgraph"]["variants"]) == ["/World{cut=long}"]
         assert len(points(layer, prim="/World/other")) > 4 * len(sheet_points(size=(4, 3)))
         self.as_from_file(stage, tmp_path)
-
-    def test_an_unloaded_payload(self, stage: Usd.Stage, tmp_path: Path):
-        cloth_shot(tmp_path / "other.usda", times=SHORT)
-        other = stage.DefinePrim("/World/asset")
-        other.GetPayloads().AddPayload(str(tmp_path / "other.usda"), "/World")
-        assert len(inspect_shot(stage)["garments"]) == 2
-        stage.Unload("/World/asset")
-        assert list(refined(stage).customLayerData["physgraph"]["garments"]) == [CLOTH]
-
-    def test_a_masked_stage(self, stage: Usd.Stage):
-        add_sheet(stage, "/World/other", times=SHORT)
-        masked = Usd.Stage.OpenMasked(stage.GetRootLayer(), Usd.StagePopulationMask(["/World/other"]))
-        assert list(refined(masked).customLayerData["physgraph"]["garments"]) == ["/World/other"]
-
-    def test_a_session_from_a_file_names_files_of_its_own_folder(self, stage: Usd.Stage, tmp_path: Path):
-        (tmp_path / "look").mkdir()
-        stiff = Sdf.Layer.CreateNew(str(tmp_path / "look" / "stiff.usda"))
-        stage.GetRootLayer().subLayerPaths.append(stiff.identifier)
-        with Usd.EditContext(stage, stiff):
-            author(stage.GetPrimAtPath(CLOTH), BEND, 1e-3)
-        stiff.Save()
-        expected = points(refined(stage))
-        session = Sdf.Layer.CreateNew(str(tmp_path / "look" / "session.usda"))
-        session.subLayerPaths.append("./stiff.usda")
-        session.Save()
-        del stage.GetRootLayer().subLayerPaths[0]
-        assert np.array_equal(points(refined(Usd.Stage.Open(stage.GetRootLayer(), session))), expected)
 
     def test_a_refined_layer_over_it_is_a_result(self, stage: Usd.Stage):
         layer = refined(stage)

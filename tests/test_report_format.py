@@ -9,14 +9,12 @@ from typing import Any
 
 import pytest
 from click.testing import CliRunner
-from jsonschema import Draft202012Validator, ValidationError
+from jsonschema import Draft202012Validator
 from shots import cloth_shot, refine
 
 from physgraph_usd import __version__, cli
 from physgraph_usd.errors import PhysGraphError
 from physgraph_usd.shot import summary
-from physgraph_usd.shot.options import RefineOptions
-from physgraph_usd.shot.refine import refine_shot
 from physgraph_usd.shot.report import FORMAT, SCHEMA
 
 VALIDATOR = Draft202012Validator(json.loads(SCHEMA.read_text(encoding="utf-8")))
@@ -85,16 +83,3 @@ def test_a_report_of_a_run_that_ended_well_is_kept(tmp_path: Path) -> None:
         with pytest.raises(PhysGraphError, match=said):
             refine(shot, tmp_path / "other.usdc", report=file, garments=["/World/gone"], resume=resume)
         assert file.read_bytes() == before
-
-
-def test_values_are_told_with_where_they_are_from(tmp_path: Path) -> None:
-    shot = cloth_shot(tmp_path / "s.usda", times=(1.0,))
-    report = refine_shot(shot, tmp_path / "fine.usdc", RefineOptions(level=1, steps=3, sources={"steps": "show.toml"}))
-    assert report.option_sources.keys() == report.options.keys()
-    named = {name: report.option_sources[name] for name in ("level", "steps", "integrator")}
-    assert named == {"level": "given", "steps": "show.toml", "integrator": "default"}
-
-
-def test_the_schema_tells_a_report_that_is_none() -> None:
-    with pytest.raises(ValidationError):
-        VALIDATOR.validate({"format": FORMAT})

@@ -18,11 +18,6 @@ from browser import opened
 from pxr import Gf, Usd, UsdGeom
 from shots import CLOTH, EDGE, TIMES, cloth_shot, refine
 
-from physgraph_usd.errors import LayerError, UsageError
-from physgraph_usd.shot.options import json_of
-from physgraph_usd.shot.page.plot import plot
-from physgraph_usd.shot.page.report import page
-from physgraph_usd.shot.page.series import add_jerk, read_series, third_difference
 from physgraph_usd.shot.page.worst import verdict, worst_place
 from physgraph_usd.shot.report import RefineReport
 from physgraph_usd.usd.read.meshes import RefinedLayer
@@ -60,11 +55,6 @@ def test_what_was_left_out_and_why(made: tuple[Path, Path, RefineReport]):
     for name, why in (made[2].modelled | made[2].left_out).items():
         assert f"<td>{name}</td>" in text
         assert html.escape(why) in text
-
-
-def test_pictures_are_in_the_page(made: tuple[Path, Path, RefineReport]):
-    pytest.importorskip("PIL", reason="pictures are written with Pillow")
-    assert text_of(made).count("src='data:image/png;base64,") == 3
 
 
 def test_the_page_begins_with_a_verdict_and_ends_its_times_with_the_report(made: tuple[Path, Path, RefineReport]):
@@ -111,73 +101,6 @@ def test_a_verdict_says_first_what_is_wrong():
         "7 vertices are inside bodies at time code 2, the worst frame; 1 frame did not settle; "
         "2 frames refined, nothing crosses, 1.2 s a frame."
     )
-
-
-def test_jerk_is_told_where_four_samples_in_a_row_are_there(made: tuple[Path, Path, RefineReport]):
-    drawn = re.search(r"id='jerk-0'.*?data-plot='(.*?)'", text_of(made), re.S)
-    assert drawn
-    told = json.loads(html.unescape(drawn[1]))
-    assert told["times"] == ["1", "2", "3", "4", "5", "6", "7", "8"]
-    assert [value is not None for value in told["values"][0]] == [False] * 6 + [True] * 2
-
-
-def test_the_third_difference_of_a_cubic_is_six_times_its_factor():
-    way = np.array([[1.0, 2.0, 2.0], [0.0, 0.0, 3.0]])
-    detail = [way * time**3 + time**2 - 4.0 * time + 1.0 for time in (3.0, 4.0, 5.0, 6.0)]
-    assert third_difference(detail) == pytest.approx(18.0)
-
-
-def test_a_frozen_shot_has_no_jerk(tmp_path: Path):
-    shot = cloth_shot(tmp_path / "still.usda", frozen=True)
-    report = refine(shot, tmp_path / "fine.usdc")
-    series = [read_series(report, 0)]
-    with closing(open_shot(str(shot))) as opened_shot:
-        add_jerk(series, report, opened_shot, tmp_path / "fine.usdc")
-    assert series[0].jerk["jerk"][:3] == [None] * 3
-
-
-def test_series_are_gaps_where_a_frame_failed(made: tuple[Path, Path, RefineReport]):
-    series = read_series(made[2], 0)
-    assert series.energy["total"][2] is None
-    assert series.energy["total"][1] == pytest.approx(
-        1e3 * sum(made[2].frames[1]["garments"][0]["energy_joules"]["output"].values())
-    )
-
-
-def test_a_plot_keeps_its_lines_inside_and_breaks_them_at_gaps():
-    svg = plot(
-        "p", "Title [mm]", [1.0, 2.0, 3.0, 4.0], {"a": [0.0, 5.0, None, -2.0], "b": [math.inf, None, None, None]}
-    )
-    assert svg.count("<polyline") == 1
-    assert svg.count("<circle") == 3
-    places = [(float(x), float(y)) for x, y in re.findall(r"cx='([\d.]+)' cy='([\d.]+)'", svg)]
-    assert all(64 <= x <= 1108 and 8 <= y <= 166 for x, y in places)
-    assert places[1][1] < places[0][1] < places[2][1]
-    assert plot("p", "nothing", [1.0], {"a": [None]}) == ""
-
-
-def test_names_are_escaped():
-    report = RefineReport("<script>alert(1)</script>.usda", None, {}, warnings=["</a> & <b>"])
-    text = page(report, [])
-    assert "<script>alert" not in text
-    assert "&lt;/a&gt; &amp; &lt;b&gt;" in text
-
-
-def test_where_the_json_goes(tmp_path: Path):
-    assert json_of(tmp_path / "a.json") == tmp_path / "a.json"
-    assert json_of(tmp_path / "a") == tmp_path / "a" / "report.json"
-    (tmp_path / "b.json").mkdir()
-    assert json_of(tmp_path / "b.json") == tmp_path / "b.json" / "report.json"
-
-
-def test_an_existing_report_is_not_overwritten(made: tuple[Path, Path, RefineReport], tmp_path: Path):
-    with pytest.raises(UsageError, match="exists"):
-        refine(made[0], tmp_path / "again.usdc", report=made[1].parent / "report")
-
-
-def test_a_layer_that_is_not_ours_is_refused(made: tuple[Path, Path, RefineReport]):
-    with pytest.raises(LayerError, match="no refined layer"):
-        RefinedLayer(made[0])
 
 
 @pytest.mark.browser

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pxr import Sdf, UsdGeom, Vt
+from pxr import Sdf, UsdGeom
 from stages import add_sheet, affine, author, new_stage, save, set_matrix, sheet_points, vec3
 
 from physgraph_usd.errors import GarmentError
@@ -63,15 +63,6 @@ def test_the_rest_shape_has_the_size_that_the_cloth_has_in_the_world(tmp_path: P
     np.testing.assert_allclose(open_shot(save(stage)).scene.garments[0].rest, expected, atol=1e-9)
 
 
-def test_an_indexed_rest_primvar_of_doubles_is_read(tmp_path: Path) -> None:
-    stage = new_stage(tmp_path / "s.usda")
-    mesh = add_sheet(stage)
-    made = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar("rest", Sdf.ValueTypeNames.Double3Array, "vertex")
-    made.Set(Vt.Vec3dArray([tuple(map(float, point)) for point in FLAT[::-1]]))
-    made.SetIndices(Vt.IntArray(list(range(19, -1, -1))))
-    np.testing.assert_allclose(open_shot(save(stage)).scene.garments[0].rest, FLAT)
-
-
 def test_s16_a_rest_shape_of_another_topology_is_refused(tmp_path: Path) -> None:
     stage = new_stage(tmp_path / "s.usda")
     primvar(add_sheet(stage), "rest", FLAT[:-1])
@@ -101,24 +92,6 @@ def test_a_rest_shape_that_is_not_finite_is_refused_with_its_index(tmp_path: Pat
         open_shot(save(stage))
 
 
-def test_default_points_of_another_topology_give_way_to_a_fitted_shape(tmp_path: Path) -> None:
-    stage = new_stage(tmp_path / "s.usda")
-    add_sheet(stage).GetPointsAttr().Set(vec3(FLAT[:5]))
-    shot = open_shot(save(stage))
-    assert source(shot).startswith("fitted to the shot: ")
-    assert any("default points are 5, the mesh has 20" in notice.message for notice in shot.warnings)
-
-
-def test_broken_default_points_are_repaired_for_the_rest_shape(tmp_path: Path) -> None:
-    stage = new_stage(tmp_path / "s.usda")
-    points = FLAT.copy()
-    points[7] = np.nan
-    add_sheet(stage).GetPointsAttr().Set(vec3(points))
-    shot = open_shot(save(stage))
-    assert np.linalg.norm(shot.scene.garments[0].rest[7] - FLAT[7]) < 0.5
-    assert any("repaired for the rest shape" in notice.message for notice in shot.warnings)
-
-
 def test_a_rest_shape_of_another_size_is_told(tmp_path: Path) -> None:
     stage = new_stage(tmp_path / "s.usda")
     primvar(add_sheet(stage), "rest", 100 * FLAT)
@@ -129,9 +102,7 @@ def test_a_rest_shape_of_another_size_is_told(tmp_path: Path) -> None:
     ("value", "bent", "renamed"),
     [
         ("restShape", True, None),
-        ("flat", False, None),
         ("restShapeDefault", True, "restShape"),
-        ("flatDefault", False, "flat"),
         (None, False, None),
     ],
 )

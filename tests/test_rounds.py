@@ -4,18 +4,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 
 from physgraph_usd.lab.train.bundle import RoundBundle, deal_rounds
-from physgraph_usd.lab.train.held_out import round_gap
 from physgraph_usd.lab.train.loop import TrainConfig, Trainer
 from physgraph_usd.lab.train.patches import PatchConfig
 from physgraph_usd.lab.train.rounds import Round, RoundConfig, make_rounds, system_of
 from physgraph_usd.solver.contact.metric import HeldMetric
 from physgraph_usd.solver.integrate.network import PhysgraphConfig
-from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton
 from physgraph_usd.solver.integrate.weights import integrator_of, random_network, shipped_network
 
 FEW = RoundConfig(scenes=3, reference_steps=15, most_vertices=1)
@@ -28,22 +25,6 @@ def rounds() -> list[Round]:
 
 def touching(rounds: list[Round]) -> list[Round]:
     return max(deal_rounds([each for each in rounds if each.touches], 8), key=len)
-
-
-def test_the_same_seed_makes_the_same_rounds(rounds: list[Round]):
-    again = make_rounds(replace(FEW, scenes=1), seed=5)
-    assert [each.words for each in again] == [each.words for each in rounds[: len(again)]]
-    for one, other in zip(again, rounds, strict=False):
-        assert np.array_equal(one.x, other.x)
-        assert one.least == other.least
-
-
-def test_they_hold_bodies_cloth_near_cloth_and_ties_to_the_last_frame(rounds: list[Round]):
-    assert any(each.bodies for each in rounds)
-    assert any(each.pairs for each in rounds)
-    assert any(each.tie for each in rounds)
-    assert any(each.stiff.any() for each in rounds)
-    assert all(each.least < each.start for each in rounds)
 
 
 def test_rounds_side_by_side_move_as_they_do_alone(rounds: list[Round]):
@@ -75,13 +56,6 @@ def test_the_energys_gradient_is_minus_the_force(rounds: list[Round]):
     (gradient,) = torch.autograd.grad(system.energies[-1].sum(), x)
     force = system.energy_and_force(x.detach())[1]
     assert torch.allclose(gradient * system.free, -force, rtol=1e-5, atol=1e-7 * float(force.abs().max()))
-
-
-def test_gaps_of_rounds_fall_with_evaluations(rounds: list[Round]):
-    each = touching(rounds)[0]
-    system = system_of([each], device="cpu")
-    few, more = (round_gap(each, system, QuasiNewton(), count) for count in (2, 8))
-    assert 0.0 <= more < few < 1.0
 
 
 def test_training_begins_with_the_weights_that_ship_and_a_wider_network_does_as_they_do(rounds: list[Round]):

@@ -9,7 +9,6 @@ import pytest
 import torch
 from energies import apart, difference_force, evaluate
 from sheets import irregular, level_of, rotation
-from test_force_hessians import dense
 from test_forces import crumple
 
 from physgraph_usd.solver.forces.self_contact import PairConstraints, SelfContact
@@ -64,15 +63,6 @@ def test_it_moves_nothing_as_a_whole(name: str):
     assert float(force.sum(dim=0).abs().max()) <= 1e-12 * size
 
 
-def test_a_gap_between_the_points_closest_to_one_another_turns_nothing():
-    """The moment of a pair is its way crossed with its push: none when the normal is along the way."""
-    gaps = gaps_of(X)
-    way = gaps.vectors(X)
-    gaps = replace(gaps, normal=torch.nn.functional.normalize(way, dim=1), offset=way.norm(dim=1) + 0.01)
-    _, force = evaluate(SelfContact(LEVEL, gaps), X)
-    assert float(torch.linalg.cross(X, force).sum(dim=0).abs().max()) <= 1e-12 * float(force.abs().max())
-
-
 def test_they_turn_with_the_cloth():
     turn, shift = torch.as_tensor(rotation(4)), torch.tensor([0.3, -0.2, 5.0], dtype=X.dtype)
     moved = X @ turn.T + shift
@@ -82,21 +72,3 @@ def test_they_turn_with_the_cloth():
     energy_there, force_there = evaluate(turned, moved)
     assert energy_there == pytest.approx(energy, rel=1e-9)
     assert apart(force_there, force @ turn.T) < 1e-9
-
-
-def test_the_diagonal_is_a_third_of_the_trace_of_what_pushes():
-    term = TERMS["gaps"]()
-    expected = np.einsum("vava->v", dense(term, X)) / 3
-    np.testing.assert_allclose(term.diagonal(X).numpy(), expected, rtol=1e-5, atol=1e-9)
-
-
-def test_gaps_are_a_convex_quadratic():
-    """Energy along any line is half the curvature of what pushes: the solver's steps rely on it."""
-    term = SelfContact(LEVEL, gaps_of(X))
-    step = 1e-3 * torch.randn_like(X)
-    energies = [evaluate(term, X + t * step)[0] for t in (-1.0, 0.0, 1.0)]
-    assert energies[0] + energies[2] >= 2 * energies[1]
-
-
-def test_it_adds_nothing_to_the_matrix_at_rest():
-    assert TERMS["gaps"]().rest_matrix() is None

@@ -1,42 +1,24 @@
-"""Frames that the solver leaves unsettled: each is told of, and with --strict the run counts as done in part."""
+"""Frames that the solver leaves unsettled, or stops at their time limit: each is told of, and counts with --strict."""
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from shots import CLOTH, cloth_shot, refine, run
+from shots import CLOTH, cloth_shot, faults, refine, run, sample_times
 
 from physgraph_usd.shot.notes import of_energy
 from physgraph_usd.shot.report import RefineReport
-from physgraph_usd.shot.settled import unsettled
 from physgraph_usd.shot.warnings import WARNINGS, Entries, of_contact
+from physgraph_usd.solver import deadline
 
 
 def told(level: int, remaining: float, stopped: str = "steps") -> dict[str, Any]:
     return {"level": level, "remaining_move": remaining, "stopped": stopped}
-
-
-class TestVerdict:
-    def test_the_finest_level_far_from_rest(self):
-        found = unsettled({"levels": [told(0, 0.0), told(1, 0.37)]}, 2e-3)
-        assert found is not None
-        assert "level 1 would still move by 0.37 edges" in str(found)
-        assert unsettled({"levels": [told(0, 0.37), told(1, 0.09)]}, 2e-3) is None
-
-    def test_a_level_that_no_step_lowers(self):
-        assert unsettled({"levels": [told(0, 0.01, "stalled"), told(1, 1e-3, "tolerance")]}, 2e-3)
-        assert unsettled({"levels": [told(0, 1e-3, "stalled"), told(1, 1e-3, "tolerance")]}, 2e-3) is None
-
-    def test_only_the_last_descent_of_a_level_counts(self):
-        assert unsettled({"levels": [told(1, 0.5, "stalled"), told(1, 1e-3, "tolerance")]}, 2e-3) is None
-
-    def test_not_a_number_is_not_at_rest(self):
-        assert unsettled({"levels": [told(1, float("nan"))]}, 2e-3)
-
-    def test_frames_that_were_taken_over(self):
-        assert unsettled({"start": "reused"}, 2e-3) is None
 
 
 @pytest.fixture
@@ -109,3 +91,44 @@ def test_a_frame_above_its_input_is_told_of():
     found = {1.0: energies(1e-3, 1e-3), 2.0: energies(1.9e-5, 3.2e-4), 3.0: energies(1e-3, 1.1e-3), 4.0: {}}
     (said,) = of_energy([{"path": "/A"}], [{"time": time, "garments": [each]} for time, each in found.items()])
     assert said.startswith("2 frames ended with more energy than the upsampled cage, </A> at time code 2: 0.00032 J")
+
+
+@pytest.fixture
+def ends_at_look(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
+    """Let the time be over from the n-th look at the clock on."""
+
+    def end(looks: int) -> None:
+        count = itertools.count()
+        clock = SimpleNamespace(perf_counter=lambda: 1e9 * max(next(count) - looks, 0))
+        monkeypatch.setattr(deadline, "time", clock)
+
+    return end
+
+
+def test_a_frame_over_its_limit_is_written_and_named(tmp_path: Path):
+    shot, out = cloth_shot(tmp_path / "s.usda", times=(1.0, 2.0)), tmp_path / "fine.usdc"
+    report = refine(shot, out, frame_limit=1e-6, strict=True)
+    assert sample_times(out) == (1.0, 2.0)
+    assert faults(out, shot) == []
+    assert [(each["path"], each["time"], each["stopped"]) for each in report.unsettled] == [
+        (CLOTH, 1.0, "time limit"),
+        (CLOTH, 2.0, "time limit"),
+    ]
+    said = "was not solved to its end: it reached its limit of time; see --frame-limit; also at time code 2"
+    assert [warning for warning in report.warnings if said in warning]
+    assert report.exit_code == 3
+    assert [frame["garments"][0]["time_limit"] for frame in report.frames] == [1e-6, 1e-6]
+
+
+def test_nothing_newly_crosses_wherever_a_frame_is_stopped(
+    sample: Callable[[str], Path], tmp_path: Path, ends_at_look: Callable[[int], None]
+):
+    """Three layers that touch, stopped at looks spread over two frames; without a stop there are 40 to 50 looks."""
+    shot = sample("layers")
+    for looks in (3, 20, 40):
+        ends_at_look(looks)
+        report = refine(shot, tmp_path / f"{looks}.usdc", level=0, frames=(1.0, 2.0))
+        assert [each["stopped"] for each in report.unsettled if each["time"] == 2.0] == ["time limit"] * 3
+        for frame in report.frames:
+            cloth = frame["garments"][0]["contact"]["cloth"]
+            assert cloth["after"]["crossings"] <= cloth["before"]["crossings"]

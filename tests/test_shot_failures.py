@@ -10,12 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bodies import ball
-from pxr import Sdf, Usd, UsdGeom
-from shots import CLOTH, EDGE, TIMES, cloth_shot, faults, fine, refine, sample_times
+from pxr import Sdf, UsdGeom
+from shots import CLOTH, TIMES, cloth_shot, faults, fine, refine, sample_times
 from stages import COLLIDER_API, add_sheet, new_stage, save, sheet_points, vec3
 
-from physgraph_usd.errors import GarmentError, PhysGraphError, UsageError
-from physgraph_usd.shot.refine import inspect_shot
+from physgraph_usd.errors import GarmentError, UsageError
 
 
 @pytest.fixture
@@ -51,18 +50,6 @@ class TestFramesThatFail:
         pairs = [fine(shot, tmp_path / name, 6.0) for name in ("fine.usdc", "fine_whole.usdc")]
         assert np.abs(pairs[0] - pairs[1]).max() < 1e-3
 
-    @pytest.mark.slow
-    def test_several_workers_name_the_same(self, tmp_path: Path):
-        shot = cloth_shot(tmp_path / "shot.usdc", broken={3.0: 1e25})
-        report = refine(shot, tmp_path / "fine.usdc", workers=2)
-        assert (report.exit_code, list(report.failed)) == (3, ["3"])
-
-    def test_the_first_one(self, tmp_path: Path):
-        shot = cloth_shot(tmp_path / "shot.usdc", broken={1.0: 1e25})
-        report = refine(shot, tmp_path / "fine.usdc", rest_frame=2.0)
-        assert (report.exit_code, list(report.failed)) == (3, ["1"])
-        assert sample_times(tmp_path / "fine.usdc") == TIMES[1:]
-
     def test_all_of_them_leave_no_layer(self, tmp_path: Path):
         shot = cloth_shot(tmp_path / "shot.usdc", broken=dict.fromkeys(TIMES, 1e25))
         with pytest.raises(GarmentError, match="at time code 6: point 0 is at"):
@@ -86,28 +73,6 @@ class TestFramesThatFail:
         with pytest.raises(KeyboardInterrupt):
             refine(shot, tmp_path / "fine.usdc")
         assert only(tmp_path, "shot.usdc")
-
-
-class TestS5:
-    @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
-    def test_s5_a_broken_point_leaves_other_frames_bitwise_alone(self, tmp_path: Path, bad: float):
-        clean = cloth_shot(tmp_path / "clean.usdc")
-        dirty = cloth_shot(tmp_path / "dirty.usdc")
-        stage = Usd.Stage.Open(str(dirty))
-        attribute = UsdGeom.Mesh(stage.GetPrimAtPath(CLOTH)).GetPointsAttr()
-        points = np.array(attribute.Get(3.0))
-        points[11, 1] = bad
-        attribute.Set(type(attribute.Get(3.0)).FromNumpy(points), 3.0)
-        stage.Save()
-        report = refine(dirty, tmp_path / "d.usdc", temporal="off")
-        refine(clean, tmp_path / "c.usdc", temporal="off")
-        assert report.exit_code == 0
-        assert any("points[11]" in warning for warning in report.warnings)
-        for time in TIMES:
-            same = np.array_equal(fine(clean, tmp_path / "c.usdc", time), fine(dirty, tmp_path / "d.usdc", time))
-            assert same == (time != 3.0), time
-        assert np.isfinite(fine(dirty, tmp_path / "d.usdc", 3.0)).all()
-        assert np.abs(fine(clean, tmp_path / "c.usdc", 3.0) - fine(dirty, tmp_path / "d.usdc", 3.0)).max() < EDGE
 
 
 CUT = """
@@ -163,31 +128,6 @@ def test_damaged_crates_are_named(tmp_path: Path):
     assert done.returncode == 0, done.stderr
     assert len(done.stdout.splitlines()) == len(names), "each is an error of one line"
     assert only(tmp_path, "shot.usdc", *names)
-
-
-class TestBrokenShots:
-    def test_s32_topology_that_varies_is_refused_by_name_and_time(self, shot: Path, tmp_path: Path):
-        stage = Usd.Stage.Open(str(shot))
-        mesh = UsdGeom.Mesh(stage.GetPrimAtPath(CLOTH))
-        points = mesh.GetPointsAttr().Get(4.0)
-        mesh.GetPointsAttr().Set(points[:-1], 4.0)
-        stage.Save()
-        report = refine(shot, tmp_path / "fine.usdc")
-        assert (report.exit_code, list(report.failed)) == (3, ["4"])
-        assert CLOTH in report.failed["4"]
-        assert "from 35 to 34" in report.failed["4"]
-        assert sample_times(tmp_path / "fine.usdc") == (1.0, 2.0, 3.0, 5.0, 6.0)
-        assert faults(tmp_path / "fine.usdc", shot) == []
-
-    @pytest.mark.parametrize("text", [b"", b"not a stage", b"PXR-USDC" + bytes(200)])
-    def test_files_that_are_no_stage(self, tmp_path: Path, text: bytes):
-        path = tmp_path / "shot.usdc"
-        path.write_bytes(text)
-        with pytest.raises(PhysGraphError, match=r"shot\.usdc"):
-            refine(path, tmp_path / "fine.usdc")
-        with pytest.raises(PhysGraphError):
-            inspect_shot(path)
-        assert only(tmp_path, "shot.usdc")
 
 
 @pytest.mark.parametrize(("below", "why"), [(0.02, "deep in </World/body>"), (0.0238, "from its cage")])

@@ -7,10 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pxr import Sdf, UsdGeom
-from stages import add_sheet, clip_shot, new_stage, save, set_matrix, sheet_points, sheet_shot
+from stages import add_sheet, new_stage, save, set_matrix, sheet_points, sheet_shot
 
 from physgraph_usd.errors import StageError, UsageError
 from physgraph_usd.usd.read.reader import Shot, open_shot
+from physgraph_usd.usd.times import merge, snap, within
 
 
 def world(shot: Shot, time: float | None, index: int = 0) -> np.ndarray:
@@ -80,31 +81,6 @@ def test_s32_layer_offsets_are_composed(tmp_path: Path, offset: float, scale: fl
     np.testing.assert_allclose(world(shot, shot.scene.times[1]), sheet_points(2.0), atol=1e-6)
 
 
-def test_garments_whose_times_differ_by_rounding_share_them(tmp_path: Path) -> None:
-    stage = new_stage(tmp_path / "s.usda")
-    add_sheet(stage, "/World/one", times=(1.0, 2.0))
-    add_sheet(stage, "/World/two", times=(1.0, 2.0 + 1e-9))
-    shot = open_shot(save(stage))
-    assert shot.scene.times == (1.0, 2.0)
-    assert [source.times for source in shot.sources] == [(1.0, 2.0), (1.0, 2.0)]
-
-
-def test_a_sublayer_of_another_rate_is_rescaled(tmp_path: Path) -> None:
-    sheet_shot(tmp_path / "anim.usda")
-    root = Sdf.Layer.CreateNew(str(tmp_path / "shot.usda"))
-    root.timeCodesPerSecond = 48.0
-    root.subLayerPaths.append("./anim.usda")
-    root.Save()
-    assert open_shot(root.realPath).scene.times == (2.0, 4.0, 6.0)
-
-
-def test_value_clips_give_times_and_points(tmp_path: Path) -> None:
-    shot = open_shot(clip_shot(tmp_path))
-    assert shot.scene.times == (1.0, 2.0, 3.0)
-    for time in shot.scene.times:
-        np.testing.assert_array_equal(world(shot, time), sheet_points(time))
-
-
 def test_garments_outside_the_frame_range_are_left_out(tmp_path: Path) -> None:
     stage = new_stage(tmp_path / "s.usda")
     add_sheet(stage, "/World/early")
@@ -117,15 +93,30 @@ def test_garments_outside_the_frame_range_are_left_out(tmp_path: Path) -> None:
         open_shot(path, frames=(4.0, 5.0))
 
 
-def test_a_still_garment_does_not_make_up_for_a_range_outside_the_shot(tmp_path: Path) -> None:
-    stage = new_stage(tmp_path / "s.usda")
-    add_sheet(stage)
-    add_sheet(stage, "/World/still", times=())
-    with pytest.raises(StageError, match="its 3 samples run from 1 to 3"):
-        open_shot(save(stage), frames=(4.0, 5.0))
-
-
 @pytest.mark.parametrize("frames", [(5.0, 1.0), (float("nan"), 2.0), (1.0, float("inf"))])
 def test_a_range_that_is_none_is_refused(tmp_path: Path, frames: tuple[float, float]) -> None:
     with pytest.raises(UsageError, match="no range"):
         open_shot(sheet_shot(tmp_path / "s.usda"), frames=frames)
+
+
+def test_times_that_differ_by_rounding_are_one_and_the_first_given_stays() -> None:
+    assert merge([2.0, 1.0, 1.0 + 1e-9, 2.0 - 1e-9, 3.0]) == (1.0, 2.0, 3.0)
+    assert merge([1.0 + 1e-9, 1.0]) == (1.0 + 1e-9,)
+    assert merge([]) == ()
+
+
+def test_snapped_times_are_the_merged_ones_to_the_bit() -> None:
+    merged = merge([1.0, 2.0, 2.0 + 1e-9, 5.0])
+    assert snap((1.0, 2.0 + 1e-9), merged) == (1.0, 2.0)
+    assert snap((), ()) == ()
+
+
+def test_sub_frames_stay_apart() -> None:
+    assert merge([1.0, 1.001, 1.25]) == (1.0, 1.001, 1.25)
+
+
+@pytest.mark.parametrize(
+    ("frames", "expected"), [(None, (1.0, 2.0, 3.5)), ((2.0, 3.0), (2.0,)), ((2.0 + 1e-9, 3.5 - 1e-9), (2.0, 3.5))]
+)
+def test_ranges_are_closed_up_to_rounding(frames: tuple[float, float] | None, expected: tuple[float, ...]) -> None:
+    assert within((1.0, 2.0, 3.5), frames) == expected

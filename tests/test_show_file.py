@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 from typing import Any
 
@@ -49,13 +48,6 @@ def test_it_is_found_above_the_shot_and_the_command_line_goes_first(shot: Path) 
     assert told == {"level": str(file), "steps": "command line", "overrides": str(file), "contact": "default"}
 
 
-def test_the_nearest_one_counts(shot: Path) -> None:
-    write(shot.parents[2], "[refine]\nlevel = 0\nsteps = 3\n")
-    write(shot.parent, "[refine]\nsteps = 5\n")
-    report = planned(shot)
-    assert (report["options"]["level"], report["options"]["steps"]) == (None, 5)
-
-
 def test_what_is_named_goes_before_the_environment_and_that_before_the_folders(
     shot: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -84,19 +76,6 @@ def test_each_shot_has_its_own(shot: Path, tmp_path: Path, monkeypatch: pytest.M
     assert levels == {"s": 0, "other": 1}
 
 
-def test_inspect_shows_what_refine_would_use(shot: Path) -> None:
-    write(shot.parent, "[refine]\nlevel = 0\nsteps = 3\n")
-    assert json.loads(run("inspect", shot, "--json").stdout)["garments"][0]["level"] == 0
-    assert json.loads(run("inspect", shot, "--json", "--level", "1").stdout)["garments"][0]["level"] == 1
-
-
-def test_a_path_is_seen_from_its_folder(shot: Path) -> None:
-    write(shot.parent, '[refine]\nweights = "own.safetensors"\nintegrator = "physgraph"\n')
-    done = run("refine", shot, "-o", shot.parent / "o.usdc")
-    assert done.exit_code == 1
-    assert str(shot.parent / "own.safetensors") in done.stderr
-
-
 @pytest.mark.parametrize(
     ("text", "said"),
     [
@@ -117,14 +96,6 @@ def test_what_it_cannot_mean_is_refused_by_name(shot: Path, text: str, said: str
     file = write(shot.parent, text)
     done = run("refine", shot, "-o", shot.parent / "o.usdc")
     assert (done.exit_code, str(file) in done.stderr, said in done.stderr) == (2, True, True), done.stderr
-
-
-def test_a_pipe_and_values_nested_too_deep_are_refused(shot: Path, tmp_path: Path) -> None:
-    os.mkfifo(tmp_path / "pipe.toml")
-    deep = write(tmp_path, f"[refine]\nset = {'[' * 5000}{']' * 5000}\n", "deep.toml")
-    for file in (tmp_path / "pipe.toml", deep):
-        done = run("refine", shot, "-o", tmp_path / "o.usdc", "--config", file)
-        assert (done.exit_code, f"cannot read {file}" in done.stderr) == (2, True), done.stderr
 
 
 def test_a_file_that_is_named_and_not_there_is_refused(shot: Path, tmp_path: Path) -> None:

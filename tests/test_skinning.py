@@ -13,7 +13,6 @@ from stages import (
     add_skeleton,
     affine,
     bind_skin,
-    instanced_shot,
     new_stage,
     save,
     set_matrix,
@@ -58,16 +57,6 @@ def test_blend_shapes_come_with_it(tmp_path: Path) -> None:
         np.testing.assert_allclose(points(shot, time), 0.01 * expected, atol=1e-6)
 
 
-def test_transforms_of_the_skeleton_count_as_times(tmp_path: Path) -> None:
-    stage = skinned_stage(tmp_path / "s.usda")
-    for time in (1.5, 6.0):
-        set_matrix(stage.GetPrimAtPath(f"{ROOT}/skel"), affine(np.eye(3), (time, 0, 0)), time)
-    shot = open_shot(save(stage))
-    assert shot.scene.times == (1.0, 1.5, 2.0, 3.0, 6.0)
-    expected = skinned_points(sheet_points(), JOINTS, 3.0) + np.array([6.0, 0, 0])
-    np.testing.assert_allclose(points(shot, 6.0), 0.01 * expected, atol=1e-6)
-
-
 def test_transforms_between_animation_samples_are_skinned_exactly_there(tmp_path: Path) -> None:
     stage = skinned_stage(tmp_path / "s.usda", (1.0, 9.0))
     for time in (1.0, 3.5, 6.0):
@@ -91,14 +80,6 @@ def test_the_whole_shot_is_baked_for_any_part_and_other_meshes_are_not(tmp_path:
     assert shot.stage.GetPrimAtPath(f"{ROOT}/body").IsActive()
 
 
-def test_instanced_roots_are_baked_and_told(tmp_path: Path) -> None:
-    shot = open_shot(instanced_shot(tmp_path, skinned=True))
-    assert [str(source.instance_roots[0]) for source in shot.sources] == ["/World/one", "/World/two"]
-    expected = skinned_points(sheet_points(), JOINTS, 2.0)
-    for index, offset in enumerate((0.0, 10.0)):
-        np.testing.assert_allclose(points(shot, 2.0, index), expected + np.array([offset, 0, 0]), atol=1e-5)
-
-
 def test_a_rigid_mesh_keeps_its_own_transform_and_moves_by_its_points(tmp_path: Path) -> None:
     stage = skinned_stage(tmp_path / "s.usda")
     mesh = UsdGeom.Mesh.Get(stage, f"{ROOT}/cloth")
@@ -113,31 +94,6 @@ def test_a_rigid_mesh_keeps_its_own_transform_and_moves_by_its_points(tmp_path: 
         turned = skinned_points(sheet_points(), [1] * 20, time)
         offset = found - 0.01 * turned
         np.testing.assert_allclose(offset, np.broadcast_to(offset[0], offset.shape), atol=1e-7)
-
-
-def test_a_bind_transform_sizes_the_rest_shape(tmp_path: Path) -> None:
-    from pxr import Gf
-
-    stage = skinned_stage(tmp_path / "s.usda")
-    UsdSkel.BindingAPI(stage.GetPrimAtPath(f"{ROOT}/cloth")).CreateGeomBindTransformAttr(Gf.Matrix4d().SetScale(2.0))
-    shot = open_shot(save(stage))
-    np.testing.assert_allclose(shot.scene.garments[0].rest, 0.02 * sheet_points(), atol=1e-8)
-    assert not any("times as long" in notice.message for notice in shot.warnings)
-
-
-def test_joint_influences_without_a_root_are_told(tmp_path: Path) -> None:
-    stage = new_stage(tmp_path / "s.usda")
-    mesh = add_sheet(stage)
-    bind_skin(mesh, "/World", joints=JOINTS)
-    shot = open_shot(save(stage))
-    assert not shot.sources[0].skinned
-    assert any("no SkelRoot" in notice.message for notice in shot.warnings)
-
-
-def test_a_skeleton_without_animation_gives_a_still(tmp_path: Path) -> None:
-    shot = open_shot(save(skinned_stage(tmp_path / "s.usda", ())))
-    assert shot.scene.times == ()
-    np.testing.assert_allclose(shot.frame(None).garments[0].points, 0.01 * sheet_points(), atol=1e-8)
 
 
 @pytest.mark.parametrize("name", ["lbs", "dqs", "blendshapes", "blendshapesWithNormals"])

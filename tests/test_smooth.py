@@ -1,4 +1,4 @@
-"""Smooth placement: libigl, trimesh, Blender's OpenSubdiv, and values worked out by hand."""
+"""Linear subdivision and smooth placement: libigl, trimesh, Blender's OpenSubdiv, and values worked out by hand."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from hypothesis import strategies as st
 from meshes import any_mesh, cube, faces_of, grid, mesh_of, prism, tetrahedron
 from scipy import sparse
 from scipy.spatial import KDTree
-from test_subdivide import same_surface
 
-from physgraph_usd.solver.mesh.subdivide import Refinement, smooth, subdivide
-from physgraph_usd.solver.mesh.topology import PolygonMesh
+from physgraph_usd.solver.mesh.attributes import edge_subset
+from physgraph_usd.solver.mesh.subdivide import Refinement, compose, smooth, subdivide, subdivide_times
+from physgraph_usd.solver.mesh.topology import PolygonMesh, find_edges
 
 BLENDER = """
 import sys, numpy as np, bpy
@@ -44,12 +44,6 @@ def dense(mesh: PolygonMesh) -> tuple[Refinement, np.ndarray]:
     return refinement, smooth(mesh, refinement).toarray()
 
 
-def umbrella(sides: int) -> PolygonMesh:
-    """A closed double fan: two apexes of the given valence."""
-    ring = [(i, (i + 1) % sides) for i in range(sides)]
-    return mesh_of([[sides, a, b] for a, b in ring] + [[sides + 1, b, a] for a, b in ring])
-
-
 @given(any_mesh(repeats=True), st.integers(0, 2**16))
 def test_affine_maps_commute(mesh: PolygonMesh, seed: int):
     rng = np.random.default_rng(seed)
@@ -57,34 +51,6 @@ def test_affine_maps_commute(mesh: PolygonMesh, seed: int):
     stencil = smooth(mesh, subdivide(mesh))
     np.testing.assert_allclose(stencil.sum(axis=1), 1.0, atol=1e-12)
     np.testing.assert_allclose(stencil @ (points @ matrix + shift), (stencil @ points) @ matrix + shift, atol=1e-11)
-
-
-@given(any_mesh(), st.integers(0, 2**16))
-def test_the_first_corner_of_a_face_does_not_matter(mesh: PolygonMesh, seed: int):
-    rng = np.random.default_rng(seed)
-    turned = [np.roll(face, rng.integers(len(face))).tolist() for face in faces_of(mesh)]
-    points = rng.normal(size=(mesh.vertex_count, 3))
-    one, two = (smooth(m, subdivide(m)) @ points for m in (mesh, mesh_of(turned, mesh.vertex_count)))
-    np.testing.assert_allclose(one, two, atol=1e-12)
-
-
-@pytest.mark.parametrize("cells", ["quads", "triangles"])
-def test_a_regular_plane_stays_in_place_inside(cells: str):
-    mesh, points = grid(6, 6, cells)
-    refinement, stencil = dense(mesh)
-    fine = refinement.linear @ points
-    inside = np.all((fine[:, :2] >= 1) & (fine[:, :2] <= 5), axis=1)
-    np.testing.assert_allclose((stencil @ points)[inside], fine[inside], atol=1e-14)
-
-
-@pytest.mark.parametrize("sides", [3, 4, 5, 6, 7, 12])
-def test_loop_weights_at_any_valence(sides: int):
-    refinement, stencil = dense(umbrella(sides))
-    beta = (5 / 8 - (3 / 8 + np.cos(2 * np.pi / sides) / 4) ** 2) / sides
-    wanted = np.full(sides, beta)
-    np.testing.assert_allclose(stencil[sides], [*wanted, 1 - sides * beta, 0], atol=1e-15)
-    spoke = sides + 2 + refinement.edges.tolist().index([0, sides])
-    assert stencil[spoke, [0, sides, 1, sides - 1]].tolist() == [3 / 8, 3 / 8, 1 / 8, 1 / 8]
 
 
 @pytest.mark.parametrize("points_and_mesh", [tetrahedron(), grid(5, 4, "triangles")])
@@ -189,3 +155,61 @@ def test_catmull_clark_matches_blenders_opensubdiv(tmp_path: Path, shape: str, l
         mesh = refinement.mesh
     deviation = same_surface(mesh, fine, theirs, faces)
     assert deviation < 2e-6, f"Blender computes in float32; found {deviation:.2e}"
+
+
+def oriented(faces: list[list[int]]) -> list[tuple[int, ...]]:
+    """Faces turned to start at their lowest vertex, sorted."""
+    return sorted(tuple(face[face.index(min(face)) :] + face[: face.index(min(face))]) for face in faces)
+
+
+def same_surface(fine: PolygonMesh, points: np.ndarray, other: np.ndarray, other_faces: list[list[int]]) -> float:
+    """Largest distance between matching points, after checking that points and faces match one to one."""
+    distance, match = map(np.asarray, KDTree(other).query(points))
+    assert sorted(match.tolist()) == list(range(len(other)))
+    assert oriented([match[face].tolist() for face in faces_of(fine)]) == oriented(other_faces)
+    return float(distance.max())
+
+
+def test_children_of_a_triangle_and_a_quad():
+    refinement = subdivide(mesh_of([[0, 1, 2], [2, 1, 3, 4]], 6))
+    assert refinement.edges.tolist() == [[0, 1], [0, 2], [1, 2], [1, 3], [2, 4], [3, 4]]
+    assert faces_of(refinement.mesh) == [
+        *([0, 6, 7], [6, 1, 8], [7, 8, 2], [6, 8, 7]),
+        *([2, 8, 12, 10], [1, 9, 12, 8], [3, 11, 12, 9], [4, 10, 12, 11]),
+    ]
+    assert refinement.parent_face.tolist() == [0, 0, 0, 0, 1, 1, 1, 1]
+    assert refinement.linear[12].toarray().tolist() == [[0, 0.25, 0.25, 0.25, 0.25, 0]]
+    assert refinement.linear[8].toarray().tolist() == [[0, 0.5, 0.5, 0, 0, 0]]
+
+
+@given(any_mesh(duplicates=False))
+def test_children_conform_and_boundaries_stay_boundaries(mesh: PolygonMesh):
+    """Half a parent edge has the parent's faces, any other child edge exactly two: no T-junction, no new boundary."""
+    refinement = subdivide(mesh)
+    fine = refinement.mesh.half_edges
+    halves = find_edges(fine.edges, edge_subset([refinement], refinement.edges))
+    assert np.all(halves >= 0)
+    assert fine.count[halves].tolist() == np.repeat(mesh.half_edges.count, 2).tolist()
+    others = np.delete(fine.count, halves)
+    assert np.all(others == 2)
+
+
+@given(any_mesh(duplicates=False))
+def test_winding_agreement_is_kept(mesh: PolygonMesh):
+    """An edge's half-edges run as the parent's do; inside a face they run in opposite directions."""
+    refinement = subdivide(mesh)
+    fine, parent = refinement.mesh.half_edges, mesh.half_edges
+    forward = np.bincount(fine.edge, fine.forward, len(fine.edges))
+    along = np.bincount(parent.edge, parent.forward, len(parent.edges))
+    first, second = find_edges(fine.edges, edge_subset([refinement], refinement.edges)).reshape(-1, 2).T
+    assert np.array_equal(forward[first], along)
+    assert np.array_equal(forward[second], parent.count - along)
+    assert np.all(np.delete(forward, np.concatenate([first, second])) == 1)
+
+
+@pytest.mark.parametrize("case", [tetrahedron(), grid(5, 3, "triangles")])
+def test_triangles_match_libigl(case: tuple[PolygonMesh, np.ndarray]):
+    mesh, points = case
+    other, faces = map(np.asarray, igl.upsample(points, mesh.indices.reshape(-1, 3).astype(np.int64), 2))
+    refinements = subdivide_times(mesh, 2)
+    assert same_surface(refinements[-1].mesh, compose(refinements) @ points, other, faces.tolist()) < 1e-15

@@ -10,12 +10,11 @@ import pytest
 
 pytest.importorskip("pxr", reason="shots are read with usd-core")
 
-from pxr import Sdf, Usd, UsdPhysics
-from shots import CLOTH, cloth_shot, run
+from pxr import Sdf, Usd
+from shots import cloth_shot, run
 
 from physgraph_usd.shot.plain_json import to_json
 from physgraph_usd.solver.frame.refiner import Refiner
-from physgraph_usd.usd.schema import GARMENT
 
 NAN, INF = float("nan"), float("inf")
 SMALL = ("--level", "1", "--steps", "2")
@@ -74,43 +73,6 @@ def test_stage_metadata_that_cannot_be_used_are_named(shot: Path, key: str, reme
         assert key in strict(told.stdout)["problem"]
     else:
         assert key in told.stderr
-
-
-@pytest.mark.usefixtures("unsolved")
-def test_a_sublayer_without_a_rate_is_named(shot: Path):
-    layer = Sdf.Layer.FindOrOpen(str(shot))
-    layer.timeCodesPerSecond = 0.0
-    layer.Save()
-    top = shot.with_name("top.usda")
-    top.write_text("#usda 1.0\n(subLayers = [@./shot.usda@])\n")
-    result = run("refine", top, "-o", shot.with_name("fine.usdc"), *SMALL)
-    assert (result.exit_code, "timeCodesPerSecond of @shot.usda@ is 0" in result.stderr) == (1, True), result.output
-
-
-@pytest.mark.usefixtures("unsolved")
-@pytest.mark.parametrize(
-    "row", [row for row in GARMENT.values() if row.type == "float" and not row.interpolation], ids=lambda row: row.short
-)
-def test_every_physical_value_has_an_upper_limit(shot: Path, row: Any):
-    assert row.maximum is not None
-    result = run("refine", shot, "-o", shot.with_name("fine.usdc"), "--set", f"{row.short}=1e30", *SMALL)
-    assert (result.exit_code, f"{row.maximum:g}]" in result.stderr) == (2, True), result.output
-    stage = Usd.Stage.Open(str(shot))
-    stage.GetPrimAtPath(CLOTH).CreateAttribute(row.name, Sdf.ValueTypeNames.Float).Set(1e30)
-    stage.Save()
-    result = run("refine", shot, "-o", shot.with_name("fine.usdc"), *SMALL)
-    assert (result.exit_code, f"{row.maximum:g}]" in result.stderr) == (1, True), result.output
-
-
-def test_a_gravity_of_no_planet_is_the_earth_s(shot: Path):
-    stage = Usd.Stage.Open(str(shot))
-    UsdPhysics.Scene.Define(stage, "/World/physics").CreateGravityMagnitudeAttr(1e30)
-    stage.Save()
-    report = shot.with_name("report.json")
-    result = run("refine", shot, "-o", shot.with_name("fine.usdc"), "--report", report, *SMALL)
-    assert result.exit_code == 0, result.output
-    plain = strict(report.read_text())
-    assert any("physics:gravityMagnitude is 1" in warning for warning in plain["warnings"])
 
 
 def test_json_is_what_every_parser_reads(tmp_path: Path):

@@ -8,19 +8,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from meshes import grid
 from pxr import UsdGeom, Vt
-from sheets import garment_of
 from shots import fine, refine, run, sample_times
 from stages import GARMENT_API, new_stage, save, vec3
 
-from physgraph_usd.errors import GarmentError, UsageError
 from physgraph_usd.shot.refine import inspect_shot
-from physgraph_usd.shot.untagged import rest_options
-from physgraph_usd.shot.warnings import of_strain
-from physgraph_usd.solver.strain import StrainedPart, strained_parts, strayed
+from physgraph_usd.solver.strain import strayed
 from physgraph_usd.usd.read.reader import open_shot
-from physgraph_usd.usd.read.rest import FITTED, median_shape
+from physgraph_usd.usd.read.rest import FITTED
 
 SLEEVE = "/World/sleeve"
 AROUND, ROWS, RADIUS, LENGTH = 16, 13, 0.06, 0.4
@@ -93,38 +88,9 @@ def test_cloth_in_its_own_size_is_not_warned_of(tmp_path: Path, default: bool, a
     assert "command" not in found
 
 
-def test_a_fitted_shape_that_is_not_the_clothes_is_not_to_be_fitted_again():
-    part = StrainedPart("all over it", 9, 1.5, 1.0)
-    (said,) = of_strain({SLEEVE: [part]}, f"{FITTED}: something")
-    assert "--rest auto" not in said
-    assert "--rest FRAME" in said
-    assert not rest_options([(f"{FITTED}: something", [part])])
-    assert rest_options([("default points", [part])]) == ["--rest", "auto"]
-
-
-def test_a_part_is_named_by_height_and_axes():
-    mesh, rest = grid(6, 6)
-    garment = garment_of(mesh, rest)
-    large = rest * np.where((rest[:, :1] > rest[:, 0].mean()) & (rest[:, 1:2] > rest[:, 1].mean()), 1.5, 1.0)
-    for up, said in (((0, 1, 0), "in its upper part, towards +X"), ((0, 0, 1), "in its middle, towards +X and +Y")):
-        assert strained_parts(garment, [large], {}, up=np.array(up, float))[0].where == said
-
-
-def test_a_subset_that_covers_a_part_names_it(tmp_path: Path):
-    found = inspect_shot(puffed_shot(tmp_path / "a.usda", subset=True))
-    assert found["garments"][0]["strained"][0]["where"] == "in GeomSubset puff"
-    assert any("faces in GeomSubset puff" in warning for warning in found["warnings"])
-
-
 @pytest.mark.parametrize(("puff", "odd"), [(1.0, {}), (1.05, {}), (1.0, {1.0: 1.5, 7.0: 1.5})])
 def test_a_little_stretch_and_a_few_odd_frames_are_not_told(tmp_path: Path, puff: float, odd: dict[float, float]):
     found = inspect_shot(puffed_shot(tmp_path / "a.usda", puff=puff, odd=odd))
-    assert not [warning for warning in found["warnings"] if "--rest" in warning]
-
-
-def test_cloth_pushed_together_is_reported_without_a_warning(tmp_path: Path):
-    found = inspect_shot(puffed_shot(tmp_path / "a.usda", puff=0.8))
-    assert found["garments"][0]["strained"][0]["area_ratio"] < 0.9
     assert not [warning for warning in found["warnings"] if "--rest" in warning]
 
 
@@ -152,39 +118,6 @@ def test_a_fitted_shape_has_the_median_lengths_and_no_single_frames(tmp_path: Pa
     np.testing.assert_allclose(around, expected, rtol=0.02)
 
 
-def test_a_fitted_shape_does_not_depend_on_the_frames_that_are_refined(tmp_path: Path):
-    shot = puffed_shot(tmp_path / "a.usda", default=False)
-    whole, *parts = (open_shot(shot, frames=f).scene.garments[0].rest for f in (None, (1.0, 2.0), (6.0, 7.0)))
-    for part in parts:
-        np.testing.assert_array_equal(whole, part)
-
-
-def test_a_cache_that_begins_later_has_the_same_size(tmp_path: Path):
-    """Its lengths are medians of fewer poses, its pose another one's."""
-    shots = [puffed_shot(tmp_path / f"{n}.usda", default=False, times=TIMES[n:]) for n in (0, 3)]
-    whole, cut = (open_shot(shot).scene.garments[0].rest.reshape(ROWS, AROUND, 3) for shot in shots)
-    for axis in (0, 1):
-        a, b = (np.linalg.norm(np.diff(x, axis=axis), axis=2) for x in (whole, cut))
-        np.testing.assert_allclose(a, b, rtol=0.03)
-
-
-def test_cloth_that_is_always_a_point_is_refused(tmp_path: Path):
-    shot = puffed_shot(tmp_path / "a.usda", odd=dict.fromkeys(TIMES, 0.0), default=False)
-    with pytest.raises(GarmentError, match=r"all points of the rest shape \(.*\) are at one place"):
-        open_shot(shot)
-
-
-def test_a_fit_comes_near_medians_that_no_pose_has():
-    ends = np.array([[0, 1], [1, 2], [2, 3]])
-    poses = [
-        np.pad(np.cumsum([[0.0], *([length] for length in lengths)], axis=0), ((0, 0), (0, 2)))
-        for lengths in ((1.0, 2.0, 2.0), (2.0, 1.0, 2.0), (2.0, 2.0, 1.0))
-    ]
-    shape, _ = median_shape(ends, poses)
-    np.testing.assert_allclose(np.linalg.norm(np.diff(shape, axis=0), axis=1), 2.0, rtol=1e-3)
-    np.testing.assert_allclose(median_shape(ends, poses[:1])[0], poses[0], atol=1e-6)
-
-
 def test_the_command_tells_before_the_first_frame_and_once(tmp_path: Path):
     shot, out = puffed_shot(tmp_path / "a.usda"), tmp_path / "a.usdc"
     report = tmp_path / "a.json"
@@ -196,23 +129,6 @@ def test_the_command_tells_before_the_first_frame_and_once(tmp_path: Path):
     done = run("refine", shot, "-o", out, "--level", "0", "--rest", "auto", "--overwrite")
     assert done.exit_code == 0
     assert "--rest" not in done.stderr
-
-
-@pytest.mark.parametrize("workers", [pytest.param(1, marks=pytest.mark.slow), 2])
-def test_the_command_tells_once_of_each_of_several_shots(
-    tmp_path: Path, workers: int, capfd: pytest.CaptureFixture[str]
-):
-    shots = [puffed_shot(tmp_path / name) for name in ("a.usda", "b.usda")]
-    done = run("refine", *shots, "-o", tmp_path / "out", "--level", "0", "--workers", str(workers))
-    assert done.exit_code == 0
-    told = [line for line in (done.stderr + capfd.readouterr().err).splitlines() if "--rest auto" in line]
-    assert sorted(line.partition(": in most")[0] for line in told) == [f"warning: {shot}" for shot in shots]
-
-
-@pytest.mark.parametrize("asked", ["median", float("nan")])
-def test_a_rest_that_is_neither_a_time_nor_auto_is_refused(tmp_path: Path, asked: str | float):
-    with pytest.raises(UsageError, match="neither a time code nor 'auto'"):
-        open_shot(puffed_shot(tmp_path / "a.usda"), rest_frame=asked)
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from layers import COAT, TIMES, make_shot
-from pxr import Sdf, Usd, UsdGeom
+from pxr import Usd, UsdGeom
 
 from physgraph_usd.errors import StageError, UsageError
 from physgraph_usd.solver.fabric import PRESETS
@@ -40,14 +40,6 @@ def test_a_tagged_shot_can_be_refined_as_it_is(untagged: Path, tmp_path: Path) -
     assert untagged.read_bytes() == before
 
 
-def test_a_tagged_layer_names_its_shot_as_asked(untagged: Path, tmp_path: Path) -> None:
-    for form, named in (("relative", "./shot.usda"), ("absolute", str(untagged.resolve()))):
-        out = tag(untagged, tmp_path / f"{form}.usda", garments=[COAT], asset_paths=form)
-        assert Sdf.Layer.FindOrOpen(str(out)).subLayerPaths == [named]
-    with pytest.raises(UsageError, match="known asset paths: relative, absolute"):
-        tag(untagged, tmp_path / "x.usda", garments=[COAT], asset_paths="short")
-
-
 def test_a_preset_is_authored_on_garments_only(untagged: Path, tmp_path: Path) -> None:
     out = tag(untagged, tmp_path / "tagged.usda", garments=[COAT], colliders=["/World/ball"], preset="denim")
     stage = Usd.Stage.Open(str(out))
@@ -64,20 +56,6 @@ def test_a_preset_replaces_all_of_another_one(untagged: Path, tmp_path: Path) ->
     fabrics = [open_shot(str(file)).frame(TIMES[0]).garments[0].fabric for file in (denim, again, alone)]
     assert fabrics[0] != fabrics[2]
     assert fabrics[1] == fabrics[2]
-
-
-def test_a_collider_can_be_tagged_alone(untagged: Path, tmp_path: Path) -> None:
-    stage = Usd.Stage.Open(str(tag(untagged, tmp_path / "tagged.usda", colliders=["/World/ball"])))
-    assert schemas(stage, "/World/ball") == ["PhysGraphColliderAPI"]
-    assert schemas(stage, COAT) == []
-
-
-def test_a_side_is_authored_on_colliders(untagged: Path, tmp_path: Path) -> None:
-    out = tag(untagged, tmp_path / "tagged.usda", garments=[COAT], colliders=["/World/ball"], side="start")
-    stage = Usd.Stage.Open(str(out))
-    side = stage.GetPrimAtPath("/World/ball").GetAttribute("physgraph:collider:side")
-    assert (side.Get(), str(side.GetTypeName()), side.GetVariability()) == ("start", "token", Sdf.VariabilityUniform)
-    assert open_shot(str(out)).scene.colliders[0].side == "start"
 
 
 @pytest.mark.parametrize(
@@ -115,8 +93,3 @@ def test_a_prim_in_an_instance_is_refused(untagged: Path, tmp_path: Path) -> Non
     stage.Save()
     with pytest.raises(StageError, match="instance"):
         tag(path, tmp_path / "tagged.usda", garments=["/Set/copy/rig/coat"])
-
-
-def test_a_worn_preset_is_eased(untagged: Path, tmp_path: Path) -> None:
-    stage = Usd.Stage.Open(str(tag(untagged, tmp_path / "tagged.usda", garments=[COAT], preset="worn-denim")))
-    assert stage.GetPrimAtPath(COAT).GetAttribute("physgraph:rest:weftEase").Get() == pytest.approx(2.0)

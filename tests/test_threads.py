@@ -16,7 +16,7 @@ import warp as wp
 
 import physgraph_usd
 from physgraph_usd.solver.mesh.stencil import Stencil
-from physgraph_usd.solver.mesh.threads import LEAST_PER_THREAD, LEAST_QUERIES, Launch, _tapered
+from physgraph_usd.solver.mesh.threads import LEAST_PER_THREAD, LEAST_QUERIES, Launch
 
 
 @pytest.mark.parametrize("rows", [3, LEAST_PER_THREAD, 3 * LEAST_PER_THREAD + 7])
@@ -34,18 +34,6 @@ class TestSlices:
     def test_each_item_is_in_one(self, size: int):
         counts = self.counted(size, least=LEAST_QUERIES)
         assert bool((counts == 1).all())
-
-    def test_each_is_smaller_than_the_one_before(self):
-        bounds = _tapered(10_000, 16)
-        sizes = np.diff(bounds)
-        assert bounds[0] == 0
-        assert bounds[-1] == 10_000
-        assert (np.diff(sizes) < 0).all()
-        assert sizes[-1] < 0.01 * 10_000 < 0.11 * 10_000 < sizes[0] < 0.13 * 10_000
-
-    def test_slices_of_queries_give_the_same_bits(self):
-        one, many = (self.counted(5003, least=LEAST_QUERIES, threads=threads) for threads in (1, 3))
-        assert torch.equal(one, many)
 
     @staticmethod
     def counted(size: int, *, least: int, threads: int = 2) -> torch.Tensor:

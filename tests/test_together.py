@@ -16,13 +16,12 @@ OFF = ContactSettings(cloth="off")
 QUIET = {"flat": flat, "curved": curved, "half a turn": lambda points: curved(points, np.pi)}
 
 
-@pytest.mark.parametrize("level", [1, 2])
 @pytest.mark.parametrize("name", QUIET)
-def test_where_nothing_touches_cloth_ends_as_low_as_without_contact(name: str, level: int):
+def test_where_nothing_touches_cloth_ends_as_low_as_without_contact(name: str):
     cloth = strip(12, 4)
     cage = QUIET[name](cloth[1])
     felt, off = (
-        refiner_with([named(cloth)], level=level, contact=contact).solve(frame_with([cage])).telemetry[0]
+        refiner_with([named(cloth)], level=1, contact=contact).solve(frame_with([cage])).telemetry[0]
         for contact in (ContactSettings(), OFF)
     )
     one, other = (sum(told["energy_joules"]["output"].values()) for told in (felt, off))

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from pxr import Usd, UsdGeom
-from stages import COLLIDER_API, add_sheet, author, new_stage, save
+from stages import COLLIDER_API, add_sheet, new_stage, save
 
 from physgraph_usd.cli.printing import outline
 from physgraph_usd.shot.refine import inspect_shot
@@ -33,22 +33,6 @@ class TestSelfContact:
         read, sources = garment(stage)
         assert read.self_contact
         assert sources["contact:selfCollision"] == "fallback"
-
-    def test_it_is_read_with_its_source(self, stage: Usd.Stage):
-        author(stage.GetPrimAtPath(CLOTH), "physgraph:contact:selfCollision", False, kind="bool")
-        read, sources = garment(stage)
-        assert not read.self_contact
-        assert sources["contact:selfCollision"] == f"<{CLOTH}>.physgraph:contact:selfCollision"
-
-    def test_an_ancestor_gives_it_in_any_numeric_type(self, stage: Usd.Stage):
-        author(stage.GetPrimAtPath("/World/rig"), "userProperties:physgraph:contact:selfCollision", 0, kind="int")
-        assert not garment(stage)[0].self_contact
-
-    def test_set_goes_before_the_stage(self, stage: Usd.Stage):
-        author(stage.GetPrimAtPath(CLOTH), "physgraph:contact:selfCollision", True, kind="bool")
-        read, sources = garment(stage, "selfCollision=off")
-        assert not read.self_contact
-        assert sources["contact:selfCollision"] == "--set"
 
 
 class TestExclusion:
@@ -99,24 +83,6 @@ class TestExclusion:
         said = "</World/belt>.physgraph:contact:exclude"
         assert [source.apart_from for source in shot.sources] == [{"/World/belt": said}, {CLOTH: said}]
 
-    def test_an_ancestor_of_the_garment_itself_leaves_its_self_contact(self, dressed: Usd.Stage):
-        self.exclude(dressed, "/World")
-        shot = open_shot(save(dressed))
-        assert shot.scene.garments[0].apart_from == ("/World/belt",)
-        assert (shot.scene.garments[0].self_contact, shot.scene.garments[0].colliders) == (True, ())
-
-    def test_a_collider_that_all_exclude_is_not_read(self, dressed: Usd.Stage):
-        self.exclude(dressed, "/World/body/hands")
-        self.exclude(dressed, "/World/body/hands", by="/World/belt")
-        shot = open_shot(save(dressed))
-        assert self.felt(shot) == [["torso"], ["torso"]]
-        assert len(shot.frame(1.0).colliders) == 1
-
-    def test_what_would_not_touch_anyway_is_not_told(self, dressed: Usd.Stage):
-        UsdGeom.Sphere.Define(dressed, "/World/body/hair")
-        self.exclude(dressed, "/World/body/hair")
-        assert open_shot(save(dressed)).sources[0].apart_from == {}
-
     def test_a_target_that_is_not_there_is_told_and_stops_nothing(self, dressed: Usd.Stage):
         self.exclude(dressed, "/World/body/tail", "/World/body/torso")
         shot = open_shot(save(dressed))
@@ -124,20 +90,6 @@ class TestExclusion:
         told = [str(notice) for notice in shot.warnings if "excludes nothing" in str(notice)]
         assert len(told) == 1
         assert "</World/body/tail>" in told[0]
-
-    def test_targets_inside_an_instance_are_the_instance_s_own(self, dressed: Usd.Stage, tmp_path: Path):
-        self.exclude(dressed, "/World/body/hands")
-        save(dressed)
-        outer = new_stage(tmp_path / "outer.usda")
-        for name in ("one", "two"):
-            copy = outer.DefinePrim(f"/World/{name}", "Xform")
-            copy.GetReferences().AddReference("s.usda")
-            copy.SetInstanceable(True)
-        shot = open_shot(save(outer))
-        assert shot.scene.garments[0].path == "/World/one/rig/cloth"
-        assert set(shot.sources[0].apart_from) == {f"/World/one/body/hands/{side}" for side in ("left", "right")}
-        feels = [shot.scene.colliders[index].path for index in shot.scene.garments[0].colliders]
-        assert "/World/two/body/hands/left" in feels
 
     def test_inspect_and_report_tell_what_is_excluded_and_by_what(self, dressed: Usd.Stage):
         self.exclude(dressed, "/World/body", "/World/belt")
@@ -149,8 +101,3 @@ class TestExclusion:
         assert cloth["apart_from"]["/World/body/torso"] == f"<{CLOTH}>.physgraph:contact:exclude = </World/body>"
         assert (cloth["colliders"], len(belt["colliders"])) == ([], 3)
         assert "\n".join(outline(found)).count("physgraph:contact:exclude") == 5
-
-    def test_contact_is_left_out_for_the_reason_that_holds(self, dressed: Usd.Stage):
-        dressed.RemovePrim("/World/belt")
-        self.exclude(dressed, "/World/body")
-        assert "excluded" in inspect_shot(save(dressed))["left_out"]["contact"]

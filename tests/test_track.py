@@ -1,4 +1,4 @@
-"""Points, normals, extents and velocities over time."""
+"""Points, vertex normals, extents and velocities over time."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from layers import (
     TIMES,
     errors,
     fine_points,
+    grid,
     make_shot,
     open_over,
     refine_all,
@@ -21,12 +22,13 @@ from layers import (
 )
 from pxr import Gf, UsdGeom
 
+from physgraph_usd.solver.mesh.topology import PolygonMesh
 from physgraph_usd.usd.read.reader import open_shot
+from physgraph_usd.usd.write.normals import VertexNormals
 from physgraph_usd.usd.write.writer import LayerWriter
 
 
-@pytest.mark.parametrize("orientation", ["rightHanded", "leftHanded"])
-@pytest.mark.parametrize("matrix", [Gf.Matrix4d(1.0), MIRROR])
+@pytest.mark.parametrize(("orientation", "matrix"), [("rightHanded", MIRROR), ("leftHanded", Gf.Matrix4d(1.0))])
 def test_normals_point_to_the_authored_outside(tmp_path: Path, orientation: str, matrix: Gf.Matrix4d) -> None:
     path = tmp_path / "shot.usda"
     make_shot(path, orientation=orientation, matrix=matrix)
@@ -48,27 +50,6 @@ def test_the_default_is_the_refined_default_pose(tmp_path: Path) -> None:
     stage = open_over(path, out)
     points = UsdGeom.Mesh(stage.GetPrimAtPath(COAT)).GetPointsAttr()
     np.testing.assert_allclose(np.asarray(points.Get())[:, :2], np.asarray(points.Get(1.0))[:, :2] * 0.5, atol=1e-6)
-
-
-def test_without_a_default_pose_the_first_frame_stands_in(tmp_path: Path) -> None:
-    path = tmp_path / "shot.usda"
-    make_shot(path, default=False)
-    out = write_layer(path, tmp_path / "out.usdc")
-    stage = open_over(path, out)
-    points = UsdGeom.Mesh(stage.GetPrimAtPath(COAT)).GetPointsAttr()
-    np.testing.assert_array_equal(points.Get(), points.Get(1.0))
-    assert errors(out) == []
-
-
-def test_a_still_is_written_once(tmp_path: Path) -> None:
-    path = tmp_path / "shot.usda"
-    make_shot(path, times=())
-    out = write_layer(path, tmp_path / "out.usdc")
-    stage = open_over(path, out)
-    mesh = UsdGeom.Mesh(stage.GetPrimAtPath(COAT))
-    assert mesh.GetPointsAttr().GetNumTimeSamples() == 0
-    assert len(mesh.GetPointsAttr().Get()) == 63
-    assert errors(out) == []
 
 
 @pytest.mark.parametrize("changed", [None, (False,)])
@@ -136,3 +117,28 @@ def test_extents_hold_points_and_model_hints_hold_extents(tmp_path: Path) -> Non
     assert np.all(world[1] >= 3 * box[1] - 1e-5)
     rig = UsdGeom.ModelAPI(fine.GetPrimAtPath("/World/rig")).GetExtentsHintAttr()
     assert np.all(np.asarray(rig.Get(4.0))[1] >= box[1] - 1e-6)
+
+
+@pytest.mark.parametrize("quads", [True, False])
+def test_they_follow_area(quads: bool) -> None:
+    points, counts, indices = grid(3, 2, quads=quads)
+    points = points + np.random.default_rng(1).normal(size=points.shape) * 0.1
+    expected = np.zeros_like(points)
+    start = 0
+    for count in counts:
+        face = indices[start : start + count]
+        start += count
+        area = sum(np.cross(points[face[i]], points[face[(i + 1) % count]]) for i in range(count))
+        expected[face] += area
+    expected /= np.linalg.norm(expected, axis=1, keepdims=True)
+    normals = VertexNormals(PolygonMesh(counts, indices, len(points)))(points)
+    assert normals.dtype == np.float32
+    np.testing.assert_allclose(normals, expected, atol=1e-6)
+
+
+def test_no_area_takes_the_neighbours_and_stays_unit() -> None:
+    points = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [2, 0, 0], [9, 9, 9]], float)
+    mesh = PolygonMesh(np.array([3, 3], np.int32), np.array([0, 1, 2, 0, 1, 3], np.int32), 5)
+    normals = VertexNormals(mesh)(points)
+    np.testing.assert_allclose(normals[:4], np.tile([0, 0, 1], (4, 1)), atol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-6)

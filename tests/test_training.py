@@ -13,16 +13,12 @@ import torch
 from click.testing import CliRunner, Result
 
 from physgraph_usd.cli import main
-from physgraph_usd.errors import UsageError
 from physgraph_usd.lab.methods.paper_network import PaperConfig
-from physgraph_usd.lab.train import loop, record
-from physgraph_usd.lab.train.bundle import Bundle, JointSystem, Twin, deal, detached, unrolled
+from physgraph_usd.lab.train import record
+from physgraph_usd.lab.train.bundle import Bundle, JointSystem, deal
 from physgraph_usd.lab.train.held_out import nested_gap
-from physgraph_usd.lab.train.loop import TrainConfig, Trainer, loss_of
+from physgraph_usd.lab.train.loop import TrainConfig, Trainer
 from physgraph_usd.lab.train.patches import Patch, PatchConfig, describe, make_patches
-from physgraph_usd.solver.forces.base import ForceModule
-from physgraph_usd.solver.forces.contact import Contact
-from physgraph_usd.solver.integrate.base import Carry, System
 from physgraph_usd.solver.integrate.network import PhysgraphConfig
 from physgraph_usd.solver.integrate.weights import integrator_of, load_network, random_network
 
@@ -64,44 +60,6 @@ def test_the_same_seed_makes_the_same_patches(patches: list[Patch]):
         assert one.least == other.least
         assert one.frame.fabric == other.frame.fabric
     assert not np.array_equal(make_patches(FEW, seed=4)[0].frame.points, patches[0].frame.points)
-
-
-def test_patches_have_room_to_fall(patches: list[Patch]):
-    for patch in patches:
-        assert all(low < high for low, high in zip(patch.least, patch.start, strict=True))
-
-
-def test_patches_differ_in_shape_mesh_border_and_fabric():
-    many = make_patches(PatchConfig(count=24, levels=(1, 1), edges=(5, 6), reference_steps=3), seed=5)
-    words = " ".join(patch.words for patch in many)
-    for word in ("sheet", "tube", "dome", "quads", "triangles", "border fixed", "border one side", "border free"):
-        assert word in words
-    for values in ([p.frame.fabric.stretch for p in many], [p.frame.fabric.bend for p in many]):
-        assert np.log10(max(values) / min(values)) > 1.5
-        assert np.log10(max(values) / min(values)) <= 3.0 + 1e-9
-
-
-def test_elastic_patches_feel_stretch_and_bending_only():
-    for patch in make_patches(replace(FEW, elastic=True), seed=6):
-        module, _ = patch.group.modules([patch.frame])
-        energies = module[-1].energies(patch.begin(len(patch.systems) - 1))
-        assert energies["gravity"] == 0.0
-        assert energies["guide"] == 0.0
-        assert not bool(patch.group.levels[-1].free.all())
-
-
-def test_a_body_comes_through_a_part_of_its_patch_and_is_left(resting: list[Patch]):
-    for patch in resting:
-        assert patch.words.endswith("on a body")
-        level, system = patch.group.levels[-1], patch.systems[-1]
-        assert isinstance(system.field, ForceModule)
-        contact = system.field.forces[-1]
-        assert isinstance(contact, Contact)
-        base = level.base.apply(patch.group.systems([patch.frame])[1])
-        free = level.free.squeeze(1)
-        first, last = (contact.depths(x)[0][free] for x in (base, torch.as_tensor(patch.solved[-1])))
-        assert 0.0 < float((first > 0).float().mean()) < 1.0
-        assert float(last.mean()) < 0.5 * float(first.mean())
 
 
 def joint(patches: list[Patch], *, through_forces: bool = True) -> tuple[JointSystem, torch.Tensor]:
@@ -166,26 +124,6 @@ def test_the_forces_gradient_is_a_product_with_the_hessian(patches: list[Patch])
     assert float((gradient * w).sum()) == pytest.approx(quotient, rel=0.03)
 
 
-def test_without_gradients_through_forces_only_displacements_count(patches: list[Patch]):
-    system, x = joint(calm(patches), through_forces=False)
-    x.requires_grad_()
-    _, force = system.energy_and_force(x)
-    assert not force.requires_grad
-
-
-def test_the_loss_counts_gaps_of_each_patch_relative_to_its_own_start():
-    before, least = torch.tensor([2.0, 20.0]), torch.tensor([1.0, 10.0])
-    energies = torch.tensor([[1.5, 15.0], [1.25, 12.5]])
-    assert float(loss_of(energies, before, least, kind="ratio")) == pytest.approx(0.375)
-    scaled = loss_of(1e3 * energies, 1e3 * before, 1e3 * least, kind="log")
-    assert float(scaled) == pytest.approx(float(loss_of(energies, before, least, kind="log")))
-    huge = loss_of(torch.tensor([[1e9, 1e9]]), before, least, kind="ratio")
-    assert 10 < float(huge) < 30
-    falling = torch.tensor([[2.0], [1.5], [1.0]])
-    late = loss_of(falling, torch.tensor([3.0]), torch.tensor([1.0]), kind="ratio", late=2.0)
-    assert float(late) == pytest.approx((1 * 0.5 + 4 * 0.25 + 9 * 0.0) / 14)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("through_forces", [False, True])
 def test_training_lowers_the_loss(through_forces: bool):
@@ -213,51 +151,6 @@ def test_training_lowers_the_loss(through_forces: bool):
     trainer.train()
     assert trainer.iteration == 30
     assert mean_gap() < before
-
-
-class Stretching:
-    """Makes every distance three times as long."""
-
-    name = "stretching"
-
-    def start(self, system: System, x: torch.Tensor) -> Carry:
-        return Carry(x, 0.0, torch.zeros_like(x))
-
-    def step(self, system: System, carry: Carry) -> Carry:
-        return replace(carry, x=3.0 * carry.x)
-
-
-def test_a_twin_tells_how_many_times_steps_magnify_a_difference(patches: list[Patch]):
-    system, x = joint(calm(patches))
-    torch.manual_seed(1)
-    twin, carry = Twin(Stretching(), system, x), Stretching().start(system, x)
-    for steps in (2, 1):
-        twin.unroll(steps, other=carry.x)
-        carry = unrolled(Stretching(), system, carry, steps)
-        assert torch.allclose(twin.growth(carry.x), torch.full((system.garments,), 3.0**steps), rtol=1e-2)
-
-
-def test_what_steadies_a_descent_reaches_the_weights(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(loop, "TWINS", 1.0)
-    config = TrainConfig(network=PhysgraphConfig(width=8), patches=FEW, unroll=3, segments=1, held_out=0)
-    weights = []
-    for steady in (0.0, 1.0):
-        trainer = Trainer(replace(config, steady=steady, iterations=3))
-        trainer.train()
-        weights.append(torch.cat([p.detach().reshape(-1) for p in trainer.network.parameters()]))
-    assert bool(weights[1].isfinite().all())
-    assert float((weights[0] - weights[1]).abs().max()) > 1e-5
-
-
-def test_detached_carries_hold_no_graph(patches: list[Patch]):
-    system, x = joint(calm(patches))
-    network = random_network(PhysgraphConfig(width=8), seed=1, scale=0.1).requires_grad_()
-    integrator = integrator_of(network)
-    carry = integrator.step(system, integrator.start(system, x))
-    assert carry.x.requires_grad
-    after = detached(carry)
-    assert not after.x.requires_grad
-    assert not any(secant.move.requires_grad for secant in after.memory.secants)
 
 
 def run(*arguments: object) -> Result:
@@ -323,32 +216,6 @@ def test_resume_and_fresh_runs_are_not_confused(tmp_path: Path):
     assert run("--config", configured(tmp_path, iterations=6), "-o", tmp_path / "out", "--resume").exit_code == 0
 
 
-@pytest.mark.parametrize(
-    ("text", "word"),
-    [
-        ("kind = 'oracle'", "unknown kind 'oracle'"),
-        ("sped = 3", "unknown sped"),
-        ("[network]\nvectors = ['moon']", "unknown vectors moon"),
-        ("[patches]\nnumber = 3", "unknown number"),
-        ("seed = ", "is not TOML"),
-        ("a = " + "[" * 100_000, "is not TOML"),
-        ("network = 3", "is 3, no table"),
-    ],
-)
-def test_wrong_configurations_are_refused_by_name(tmp_path: Path, text: str, word: str):
-    file = tmp_path / "wrong.toml"
-    file.write_text(text)
-    with pytest.raises(UsageError, match=word):
-        record.read_config(file)
-    assert run("--config", tmp_path / "none.toml", "-o", tmp_path / "out").exit_code == 2
-
-
-def test_a_configuration_that_is_no_utf8_is_refused_by_name(tmp_path: Path):
-    (tmp_path / "wrong.toml").write_bytes(b"kind = '\xff'")
-    result = run("--config", tmp_path / "wrong.toml", "-o", tmp_path / "out")
-    assert (result.exit_code, "is not TOML" in result.stderr) == (2, True), result.stderr
-
-
 class Crafted:
     """What makes a file when it is unpickled."""
 
@@ -385,13 +252,3 @@ def test_the_committed_configurations_can_be_read():
     paper = record.read_config(folder / "physgraph-paper.toml")
     assert isinstance(paper.network, PaperConfig)
     assert (paper.network.latent, paper.network.rounds, paper.unroll, paper.patches.elastic) == (128, 10, 5, True)
-
-
-def test_weights_to_start_with_are_named_beside_the_configuration(tmp_path: Path):
-    """What ships goes on from weights that lie there."""
-    file = tmp_path / "own.toml"
-    for text, start in (("first.safetensors", str(tmp_path / "first.safetensors")), ("shipped", "shipped"), ("", "")):
-        file.write_text(f'start = "{text}"')
-        assert record.read_config(file).start == start
-    shipped = record.read_config(Path(record.__file__).parent / "physgraph.toml")
-    assert Path(shipped.start).is_file()

@@ -17,18 +17,14 @@ pytest.importorskip("pxr", reason="shots are read with usd-core")
 
 from browser import served
 from click.testing import CliRunner
-from pxr import Sdf, Usd, UsdGeom
+from pxr import Usd, UsdGeom
 from shots import CLOTH, cloth_shot
 
 from physgraph_usd.cli import main
 from physgraph_usd.errors import PhysGraphError, UsageError
-from physgraph_usd.lab.samples import write_sample
-from physgraph_usd.solver.fabric import PRESETS
 from physgraph_usd.studio import solver
 from physgraph_usd.studio.loop import SolveLoop
 from physgraph_usd.studio.session import Shown, TuneSession
-from physgraph_usd.studio.values import TUNABLES, painted_on
-from physgraph_usd.usd.read.reader import open_shot
 from physgraph_usd.usd.write.tag import tag
 
 STIFF = 3e-4
@@ -103,50 +99,6 @@ def test_at_rest_it_is_what_the_saved_layer_gives(session: TuneSession):
     assert np.abs(found - points(settled)).max() < 1e-7 < np.abs(points(quick) - points(settled)).max()
 
 
-def test_walking_on_is_the_run_that_refine_makes(session: TuneSession):
-    session.set_preset(CLOTH, "denim")
-    for time in (2.0, 3.0, 4.0):
-        session.set_time(time)
-        shown = session.solve()
-    assert shown.run == (2.0, 4.0)
-    session.save()
-    assert np.abs(refined(session, shown) - points(shown)).max() < 1e-7
-
-
-def test_what_follows_no_frame_begins_a_run(session: TuneSession):
-    session.solve()
-    for time, run in ((4.0, (4.0, 4.0)), (2.0, (2.0, 2.0)), (3.0, (2.0, 3.0))):
-        session.set_time(time)
-        assert session.solve().run == run
-
-
-def test_a_part_of_the_frames_sees_the_body_of_the_whole_shot(tmp_path: Path):
-    """A run that begins in the middle walks there from frames before, past a body that moves by its skeleton."""
-    path = write_sample("tshirt", tmp_path)
-    with closing(open_shot(path)) as whole, closing(open_shot(path, frames=(9.0, 9.0))) as part:
-        for time in (3.0, 9.0):
-            ours, theirs = part.frame(time).colliders[0], whole.frame(time).colliders[0]
-            assert ours is not None
-            assert theirs is not None
-            assert ours.equals(theirs)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("contact", [True, False])
-def test_with_bodies_too(tmp_path: Path, *, contact: bool):
-    with closing(TuneSession(write_sample("tshirt", tmp_path))) as session:
-        garment = session.garments[0]
-        session.set_level(garment, 1)
-        session.set_contact(contact)
-        session.set_time(session.times[8])
-        session.solve()
-        session.set_value(garment, "stretchStiffness", 200.0)
-        session.solve()
-        shown = session.settle()
-        session.save()
-        assert np.abs(refined(session, shown) - points(shown)).max() < 1e-7
-
-
 def test_a_settling_that_is_cancelled_leaves_the_cloth(session: TuneSession):
     session.solve()
     session.set_value(CLOTH, "bendStiffness", STIFF)
@@ -190,31 +142,6 @@ def test_only_its_own_file_is_replaced(session: TuneSession, shot: Path):
         TuneSession(shot, garments=[CLOTH])
 
 
-def test_a_value_is_rounded_as_a_layer_holds_it(session: TuneSession):
-    session.set_value(CLOTH, "bendStiffness", 1e-5)
-    assert session.value(CLOTH, "bendStiffness") == float(np.float32(1e-5)) != 1e-5
-
-
-def test_presets_and_what_was_authored(session: TuneSession):
-    authored = session.value(CLOTH, "bendStiffness")
-    session.set_preset(CLOTH, "denim")
-    assert session.value(CLOTH, "stretchStiffness") == pytest.approx(PRESETS["denim"].stretch)
-    session.set_as_authored(CLOTH)
-    assert session.value(CLOTH, "bendStiffness") == authored
-    assert not session.values[CLOTH]
-
-
-def test_levels(session: TuneSession):
-    vertices = []
-    for level in (0, 1, 2):
-        session.set_level(CLOTH, level)
-        shown = session.solve()
-        vertices.append(len(points(shown)))
-        painted = painted_on(session.shot.scene.garments[0], session.refinements[0], "bendScale")
-        assert painted == pytest.approx(np.ones(vertices[-1]))
-    assert vertices[0] < vertices[1] < vertices[2]
-
-
 @pytest.mark.parametrize(
     ("change", "said"),
     [
@@ -232,29 +159,6 @@ def test_what_cannot_be_used_changes_nothing(session: TuneSession, change, said:
     with pytest.raises(UsageError, match=said):
         change(session)
     assert session.solve() is shown
-
-
-def test_a_tuned_value_goes_before_a_connection(session: TuneSession, shot: Path, tmp_path: Path):
-    stage = Usd.Stage.Open(str(shot))
-    name = "physgraph:material:bendStiffness"
-    stage.DefinePrim("/World/shared").CreateAttribute(name, Sdf.ValueTypeNames.Float).Set(1e-6)
-    attribute = stage.GetPrimAtPath(CLOTH).CreateAttribute(name, Sdf.ValueTypeNames.Float)
-    attribute.AddConnection(f"/World/shared.{name}")
-    stage.Export(str(tmp_path / "connected.usda"))
-    with closing(TuneSession(tmp_path / "connected.usda", garments=[CLOTH])) as tuned:
-        assert tuned.value(CLOTH, "bendStiffness") == pytest.approx(1e-6)
-        tuned.set_value(CLOTH, "bendStiffness", STIFF)
-        tuned.save()
-        with closing(TuneSession(tuned.out)) as again:
-            assert again.value(CLOTH, "bendStiffness") == tuned.value(CLOTH, "bendStiffness")
-
-
-@pytest.mark.parametrize("name", TUNABLES)
-def test_sliders_go_there_and_back(name: str):
-    tunable = TUNABLES[name]
-    for place in (0.0, 0.3, 1.0):
-        assert tunable.place(tunable.at(place)) == pytest.approx(place)
-    assert tunable.place(1e30) == 1.0
 
 
 class Log:

@@ -94,16 +94,6 @@ def test_the_same_mesh_under_another_look_is_a_warning(shot: Path, tmp_path: Pat
     assert "look=blue" in problem.message
 
 
-def test_a_root_that_shows_the_layer_is_seen_through(shot: Path, tmp_path: Path) -> None:
-    """Selected over the result, as an artist would: the coarse meshes below are compared, not what the layer shows."""
-    out = write_layer(shot, tmp_path / "out.usdc")
-    other = selecting(shot, "/World", "cut", "long")
-    root = Sdf.Layer.FindOrOpen(str(other))
-    root.subLayerPaths.insert(0, "./out.usdc")
-    root.Save()
-    assert [problem.severity for problem in told(out, other)] == ["error"]
-
-
 def test_variants_of_bodies_count_too(shot: Path, tmp_path: Path) -> None:
     stage = Usd.Stage.Open(str(shot))
     ball = UsdGeom.Sphere.Define(stage, "/World/ball").GetPrim()

@@ -1,7 +1,8 @@
-"""Which frames start from the last one's detail: those whose cloth it does not tear."""
+"""Where frames start from: the last one's detail, a walk of the cage, or anew where a start ended badly."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -9,18 +10,27 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from cloth import frame_of, group_of, sheet, wave
+from cloth import DOWN, FABRIC, GUIDE, frame_of, group_of, settings_of, sheet, wave
 from folds import frame_with, named, refiner_with, square
+from shots import refine
 
+from physgraph_usd.errors import StageError
 from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.shot.options import RefineOptions
+from physgraph_usd.shot.refine import refine_shot
 from physgraph_usd.solver.contact.settings import ContactSettings
+from physgraph_usd.solver.frame import recovery
 from physgraph_usd.solver.frame.group import Group
+from physgraph_usd.solver.frame.lead_in import lead_in
+from physgraph_usd.solver.frame.problem import NEAR
+from physgraph_usd.solver.frame.recovery import RunawayError, solve_soundly
 from physgraph_usd.solver.frame.refiner import Refiner
-from physgraph_usd.solver.frame.solve import solve_frame
+from physgraph_usd.solver.frame.solve import STEPS, TOUCHING, solve_frame
 from physgraph_usd.solver.frame.start import STILL, Start, start_of
-from physgraph_usd.solver.frame.values import Cage, FrameInput, State
+from physgraph_usd.solver.frame.values import Cage, FrameInput, Solved, State
+from physgraph_usd.solver.level import refine_garments
 from physgraph_usd.solver.resolution import edge_strain
+from physgraph_usd.solver.scene import GarmentFrame
 from physgraph_usd.usd.read.reader import open_shot
 
 MESH, REST = sheet(8, 6)
@@ -55,7 +65,7 @@ def said(group: Group, *, strain: float, squeeze: float = 0.0) -> tuple[str, flo
 
 @pytest.mark.parametrize(
     ("strain", "squeeze", "start"),
-    [(0.3, 0.0, "warm"), (0.45, 0.0, "warm"), (0.55, 0.0, "cold"), (0.65, 0.4, "warm"), (1.1, 0.6, "cold")],
+    [(0.45, 0.0, "warm"), (0.55, 0.0, "cold"), (0.65, 0.4, "warm")],
 )
 def test_detail_that_tears_the_cloth_is_not_carried(strain: float, squeeze: float, start: str):
     """Half its length more is too much, or twice what the cage itself is strained by, and its whole length always."""
@@ -65,7 +75,7 @@ def test_detail_that_tears_the_cloth_is_not_carried(strain: float, squeeze: floa
     assert ("carried detail strains the cloth" in found) == (start == "cold")
 
 
-@pytest.mark.parametrize(("moved", "still"), [(0.5, True), (0.9, True), (1.1, False), (40.0, False)])
+@pytest.mark.parametrize(("moved", "still"), [(0.9, True), (1.1, False)])
 def test_a_pose_is_held_while_its_cage_hardly_moves(moved: float, still: bool):
     group, points = group_of(MESH, REST, level=1), wave(REST)
     state = solve_frame(group, FrameInput(frame_of(points).garments), None).state
@@ -75,10 +85,9 @@ def test_a_pose_is_held_while_its_cage_hardly_moves(moved: float, still: bool):
     assert (start.why, start.held) == ("warm", int(still))
 
 
-@pytest.mark.parametrize("contact", [ContactSettings(), ContactSettings("off", cloth="off")])
-def test_what_rests_stays_until_it_is_moved_by_more_than_it_rested_with(contact: ContactSettings):
+def test_what_rests_stays_until_it_is_moved_by_more_than_it_rested_with():
     """The cage is bent by ever more: until twice the tolerance is left, no step is made."""
-    group = group_of(MESH, REST, steps=400, tolerance=1e-3, contact=contact, temporal="warm")
+    group = group_of(MESH, REST, steps=400, tolerance=1e-3, contact=ContactSettings(), temporal="warm")
     state, made = solve_frame(group, FrameInput(frame_of(wave(REST)).garments), None).state, []
     for bend in np.linspace(0.0, 0.001, 15):
         points = wave(REST) + bend * np.sin(20.0 * REST[:, [0]]) * np.array([0.0, 1.0, 0.0])
@@ -105,20 +114,6 @@ class TestTangledStart:
             assert told["contact"]["cloth"]["after"]["crossings"] == 0
             assert told["start"].startswith("warm") == (time > 0)
 
-    def test_what_its_cage_took_through_other_cloth_does_not_hang_on_that(self):
-        """A sheet is pulled up through a smaller one, which stays: its middle may not follow, its rim may."""
-        small, large = square(4), square(12)
-        garments = [named(small, "A", pin=np.ones(len(small[1]))), named(large, "B")]
-        middle = np.concatenate([each[1] for each in (small, large)]).mean(axis=0)
-        solver, strains, starts = refiner_with(garments, times=tuple(range(3))), [], []
-        for time, height in enumerate((-0.02, 0.2, 0.21)):
-            upper = large[1] - large[1].mean(axis=0) + middle + [0.003, height, 0.007]
-            state = solver.solve(frame_with([small[1] - small[1].mean(axis=0) + middle, upper], time=float(time)))
-            starts.append(state.telemetry[1]["start"])
-            strains.append(state.telemetry[1]["strain"]["max"])
-        assert starts[1].startswith("cold: started anew")
-        assert max(strains) < 0.5
-
     def test_of_a_shot_crosses_less_than_its_input(self, tmp_path: Path):
         """Three frames of the T-shirt whose cages cross themselves."""
         shot = open_shot(str(write_sample("tshirt", tmp_path)))
@@ -128,3 +123,129 @@ class TestTangledStart:
             cloth = each["contact"]["cloth"]
             assert cloth["after"]["crossings"] <= 0.2 * cloth["before"]["crossings"]
         assert [each["start"].split(":")[0] for each in told] == ["cold", "warm", "warm"]
+
+
+@pytest.fixture(scope="module")
+def skirt(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_sample("skirt", tmp_path_factory.mktemp("skirt"))
+
+
+def test_nothing_crosses_in_frames_whose_cages_cross(skirt: Path, tmp_path: Path):
+    """Without the earlier frames a contour stays that the cage by itself does not get rid of."""
+    options = RefineOptions(frames=(36.0, 40.0), level=1)
+    entries: list[Any] = [each["garments"][0] for each in refine_shot(skirt, tmp_path / "a.usdc", options).frames]
+    crossings = [entry["contact"]["cloth"] for entry in entries]
+    assert all(each["before"]["crossings"] > 100 and each["after"]["crossings"] == 0 for each in crossings)
+    assert entries[0]["start"].startswith("cold: the cage walked here from time code ")
+    assert all(entry["start"] == "warm" for entry in entries[1:])
+
+
+@pytest.mark.slow
+def test_one_frame_is_as_low_in_energy_as_in_the_whole_shot(skirt: Path, tmp_path: Path):
+    """Nearly: the cage by itself leaves 0.2 to 0.4 J more."""
+    energies = {}
+    for first in (26.0, 36.0):
+        options = RefineOptions(frames=(first, 38.0), level=1)
+        told: Any = refine_shot(skirt, tmp_path / f"{first:g}.usdc", options).frames[-1]["garments"][0]
+        energies[first] = sum(told["energy_joules"]["output"].values())
+    assert energies[36.0] < energies[26.0] + 1e-2
+
+
+@pytest.mark.parametrize(
+    ("broken", "begun"), [(32.0, 28.0), *(pytest.param(each, 32.0, marks=pytest.mark.slow) for each in (None, 34.0))]
+)
+def test_a_frame_that_cannot_be_read_is_passed_over(skirt: Path, broken: float | None, begun: float):
+    shot = open_shot(str(skirt), frames=(36.0, 40.0))
+    cages = Refiner(shot.scene, RefineOptions().solve_settings(), levels=[0])
+
+    def read(time: float | None) -> Any:
+        if time == broken:
+            raise StageError("this time code is broken")
+        return shot.frame(time)
+
+    found = lead_in(cages, read, shot.times_until(36.0))
+    assert found is not None
+    assert found[1] == begun
+
+
+def test_a_warm_frame_is_done_early_only_near_rest(sample: Callable[[str], Path], tmp_path: Path):
+    steps = []
+    for name, frames in (("torus", (17.0, 20.0)), ("dancer", (20.0, 22.0))):
+        report = refine(sample(name), tmp_path / f"{name}.usdc", level=1, steps=12, frames=frames)
+        for frame in report.frames[1:]:
+            rounds = frame["garments"][0]["levels"]
+            steps.append(sum(each["steps"] for each in rounds))
+            near = rounds[-1]["remaining_move"] < NEAR * RefineOptions().tolerance
+            assert near or rounds[-1]["stopped"] == "stalled" or steps[-1] >= TOUCHING * 12
+    assert min(steps) == STEPS
+    assert max(steps) > TOUCHING * STEPS
+
+
+@pytest.mark.slow
+def test_layers_that_are_shaken_end_about_as_low_as_by_quasi_newton(sample: Callable[[str], Path], tmp_path: Path):
+    """The network, whose steps are nearly all corrected there, ended at three to ten times the energy."""
+    ends = []
+    for who in ("physgraph", "quasi-newton"):
+        report = refine(sample("layers"), tmp_path / f"{who}.usdc", integrator=who, level=2, frames=(6.0, 9.0))
+        garments = report.frames[-1]["garments"]
+        ends.append(sum(sum(each["energy_joules"]["output"].values()) for each in garments))
+    assert ends[0] < 1.3 * ends[1]
+
+
+@pytest.fixture(scope="module")
+def layers() -> tuple[Group, FrameInput, State]:
+    """Two level sheets 2 cm apart, and what their frame leaves to the next."""
+    garments = [named(square(6), name) for name in ("Upper", "Lower")]
+    cages = [garments[0].rest + np.array([0.0, 0.02, 0.0]), garments[1].rest]
+    settings = settings_of(contact=ContactSettings())
+    chains = refine_garments(garments, [1, 1])
+    group = Group.of(garments, chains, DOWN, settings, dtype=torch.float32, device="cpu")
+    frame = FrameInput([GarmentFrame(cage, FABRIC, GUIDE) for cage in cages])
+    return group, frame, solve_frame(group, frame, None).state
+
+
+def crossings(solved: Solved) -> int:
+    return solved.telemetry["contact"]["cloth"]["after"]["crossings"]
+
+
+@pytest.mark.parametrize(("twist", "why"), [(3.0, "it kept "), (0.0, "it ended with ")])
+def test_cloth_caught_on_the_wrong_side_is_started_anew(
+    layers: tuple[Group, FrameInput, State], twist: float, why: str
+):
+    """The last frame had the lower sheet above the upper one, or twisted through it."""
+    group, frame, state = layers
+    assert state.fine is not None
+    lower, lifted = group.levels[-1].spans[1], torch.zeros_like(state.fine)
+    at = state.fine[lower]
+    lifted[lower, 1] = (0.02 if twist else 0.04) + twist * at[:, 0] * at[:, 2]
+    caught = replace(state, fine=state.fine + lifted, detail=state.detail + lifted.to(state.detail), clean=False)
+    alone, mended = solve_frame(group, frame, caught), solve_soundly(group, frame, caught)
+    assert (crossings(alone) > 0) == (twist > 0.0)
+    assert crossings(mended) == 0
+    assert mended.telemetry["start"].startswith(f"cold: started anew, since {why}")
+    energies = [sum(each.telemetry["energy_joules"]["output"].values()) for each in (mended, alone)]
+    assert energies[0] < 0.1 * energies[1]
+
+
+def stand_in(monkeypatch: pytest.MonkeyPatch, warm: tuple[int, float], cold: tuple[int, float]) -> list[bool]:
+    """Frames that end with given crossings and energies [J], by their start; whether each was warm."""
+    made: list[bool] = []
+
+    def solve(_group: Any, _frame: Any, last: State | None) -> Solved:
+        made.append(last is not None)
+        count, energy = cold if last is None else warm
+        told = {"energy_joules": {"input": {"stretch": 1.0, "self_contact": 1.0}, "output": {"stretch": energy}}}
+        told |= {"contact": {"cloth": {"after": {"crossings": count}}}, "start": "cold" if last is None else "warm"}
+        nothing = torch.zeros(0, 3)
+        return Solved([np.zeros((0, 3))], State(nothing, nothing, torch.zeros(0, 3, 3)), told, [])
+
+    monkeypatch.setattr(recovery, "solve_frame", solve)
+    return made
+
+
+def test_cloth_that_runs_away_from_any_start_is_told(
+    layers: tuple[Group, FrameInput, State], monkeypatch: pytest.MonkeyPatch
+):
+    stand_in(monkeypatch, (0, 4.0), (0, 4.0))
+    with pytest.raises(RunawayError, match="3 J more than its upsampled cage has, and a start from the cage ends no"):
+        solve_soundly(*layers)

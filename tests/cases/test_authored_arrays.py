@@ -39,14 +39,6 @@ class TestARestShapePerCorner:
         np.testing.assert_array_equal(shot.scene.garments[0].rest, sheet_points())
         assert "primvars:rest is per corner and differs between corners of points[" in said(shot)
 
-    def test_of_another_mesh_is_left_out_with_a_word(self, tmp_path: Path):
-        stage = new_stage(tmp_path / "s.usda")
-        mesh = add_sheet(stage)
-        UsdGeom.PrimvarsAPI(mesh).CreatePrimvar("rest", Sdf.ValueTypeNames.Point3fArray, "faceVarying").Set(
-            vec3(sheet_points()[:7])
-        )
-        assert "primvars:rest has 7 values, one per corner, for 48 corners" in said(open_shot(save(stage)))
-
 
 @pytest.fixture
 def exported(tmp_path: Path) -> Path:
@@ -80,17 +72,6 @@ class TestAnExportWithEverythingTwice:
         stage = open_over(exported, tmp_path / "fine.usdc")
         found = UsdGeom.PrimvarsAPI(stage.GetPrimAtPath(COAT))
         assert [found.GetPrimvar(name).HasAuthoredValue() for name in ("normals", "id", "side")] == [False, False, True]
-
-    def test_has_texture_coordinates_where_its_corners_are(self, exported: Path, tmp_path: Path):
-        stage = open_over(exported, write_layer(exported, tmp_path / "fine.usdc"))
-        mesh = UsdGeom.Mesh(stage.GetPrimAtPath(COAT))
-        corners = np.asarray(mesh.GetPointsAttr().Get())[np.asarray(mesh.GetFaceVertexIndicesAttr().Get())]
-        shown = np.asarray(UsdGeom.PrimvarsAPI(mesh).GetPrimvar("st").ComputeFlattened())
-        np.testing.assert_allclose(shown, corners[:, :2], atol=1e-6)
-
-    def test_keeps_its_ids_where_no_point_is_new(self, exported: Path, tmp_path: Path):
-        stage = open_over(exported, write_layer(exported, tmp_path / "fine.usdc", level=0))
-        assert UsdGeom.PrimvarsAPI(stage.GetPrimAtPath(COAT)).GetPrimvar("id").HasAuthoredValue()
 
 
 def test_a_mesh_with_a_sample_of_every_array_in_every_frame_is_refined(tmp_path: Path):

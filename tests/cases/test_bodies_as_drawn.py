@@ -110,13 +110,10 @@ class TestPurpose:
         for purpose, radius in (("render", 0.1), ("proxy", 0.13), ("guide", 0.16)):
             add(stage, f"/World/char/{purpose}", capped(radius, -0.1, 0.3)).CreatePurposeAttr(purpose)
 
-    @pytest.mark.parametrize("named", ["/World/char", "/World/cha*", "auto"])
+    @pytest.mark.parametrize("named", ["/World/cha*", "auto"])
     def test_below_a_prim_what_a_final_render_shows_is_felt(self, stage: Usd.Stage, tmp_path: Path, named: str):
         report = refine(Path(save(stage)), tmp_path / "a.usdc", garments=[SKIRT], colliders=[named], dry_run=True)
         assert report.garments[0]["colliders"] == ["/World/char/render"]
-
-    def test_a_guide_is_felt_where_it_is_named_itself(self, stage: Usd.Stage):
-        assert felt(stage, "/World/char/guide")[::2] == (["/World/char/guide"], "")
 
     def test_a_proxy_is_felt_and_said_where_nothing_else_is_there(self, stage: Usd.Stage):
         stage.RemovePrim("/World/char/render")
@@ -168,22 +165,6 @@ class TestSmoothBodies:
         used = pose.points[np.unique(pose.triangles)]
         assert (used[:, 1].min(), used[:, 1].max()) == pytest.approx((-0.1, 0.3), abs=1e-6)
         assert np.linalg.norm(used - points[0], axis=1).min() < 1e-6
-
-    @pytest.mark.parametrize(("scheme", "triangles"), [("none", 60), ("bilinear", 60)])
-    def test_flat_faces_stay(self, stage: Usd.Stage, scheme: str, triangles: int):
-        add(stage, BODY, self.torus(), scheme=scheme)
-        _, (pose,), _ = felt(stage, BODY)
-        assert isinstance(pose, MeshPose)
-        assert (len(pose.points), len(pose.triangles)) == (30, triangles)
-
-    def test_a_dense_body_is_moved_to_its_limit_and_keeps_its_faces(self, stage: Usd.Stage):
-        add(stage, BODY, tube(RADIUS, 0.0, 0.2, around=200, rows=40), scheme="catmullClark")
-        _, (pose,), _ = felt(stage, BODY)
-        assert isinstance(pose, MeshPose)
-        assert len(pose.points) == 8000
-        inner = np.hypot(pose.points[200:-200, 0], pose.points[200:-200, 2])
-        angle = 2.0 * np.pi / 200
-        np.testing.assert_allclose(inner, RADIUS * (4.0 + 2.0 * np.cos(angle)) / 6.0, rtol=1e-6)
 
 
 def test_faces_in_holes_are_not_there(stage: Usd.Stage):
@@ -243,14 +224,6 @@ class TestOpenBodies:
         with closing(open_shot(save(stage), garments=[SKIRT], colliders=[BODY])) as shot:
             return shot.scene.colliders[0].side
 
-    def test_cloth_inside_a_wider_tube_stays_inside(self, stage: Usd.Stage):
-        add(stage, BODY, tube(1.2 * RADIUS, -0.1, 0.3))
-        assert self.side(stage) == "auto"
-
-    def test_cloth_over_both_sides_of_a_wall_stays_on_both(self, stage: Usd.Stage):
-        add(stage, BODY, floor(0.1))
-        assert self.side(stage) == "auto"
-
     def test_a_mirrored_floor_is_turned(self, stage: Usd.Stage):
         mesh = add(stage, BODY, floor(-0.01))
         assert self.side(stage) == "front"
@@ -292,17 +265,6 @@ class TestAuto:
     def test_auto_takes_the_body_alone(self, stage: Usd.Stage, tmp_path: Path):
         report = refine(Path(save(stage)), tmp_path / "a.usdc", garments=[SKIRT], colliders=["auto"], dry_run=True)
         assert report.garments[0]["colliders"] == [BODY]
-
-
-def test_a_body_touched_in_one_frame_of_ten_is_taken(tmp_path: Path):
-    stage = new_stage(tmp_path / "shot.usda")
-    points, faces = tube(RADIUS, 0.0, 0.2)
-    add_moving(stage, SKIRT, (points, faces), *(points + np.array([0.5 * (time == 3), 0.0, 0.0]) for time in range(10)))
-    shelf, sides = capped(RADIUS, 0.05, 0.3)
-    add(stage, BODY, (shelf + np.array([0.65, 0.0, 0.0]), sides))
-    found = inspect_shot(save(stage), garments=(SKIRT,))["candidates"]
-    assert list(found) == [BODY]
-    assert found[BODY].endswith("at time code 4")
 
 
 class TestSet:

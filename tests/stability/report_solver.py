@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -115,7 +116,7 @@ def s6_mirror(method: str) -> Result:
     mesh, rest = sheet(6, 4)
     points, mirror = wave(rest, height=0.02), np.array([-1.0, 1.0, 1.0])
     one = solved(mesh, rest, points, level=2, integrator=method).points[0]
-    other = garment_of(mesh, rest * mirror)
+    other = replace(garment_of(mesh, rest * mirror), flipped=True)
     two = refiner_of([other], level=2, integrator=method).solve(frame_of(points * mirror)).points[0]
     return under(rms(one * mirror - two) / (EDGE / 4), 1e-5, " edges")
 

@@ -1,4 +1,4 @@
-"""S24 to S26, S28: cloth that starts crossed, stacked or joined."""
+"""S24, S26: cloth that starts crossed or stacked, beyond the rows of the table."""
 
 from __future__ import annotations
 
@@ -6,15 +6,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from bodies import ball
 from brute import between
-from cloth import Answer, base_of, refiner_of
+from cloth import Answer, base_of
 from folds import EDGE, Cloth, frame_with, named, refiner_with, sewn, square
 from scenes import sleeve
 from sheets import garment_of
 from test_tangles import cornered, dented
 
-from physgraph_usd.solver.contact.settings import ContactSettings
 from physgraph_usd.solver.level import refine_garments
 from physgraph_usd.solver.mesh.topology import PolygonMesh
 
@@ -52,19 +50,9 @@ def crossed(kind: str) -> tuple[list[Cloth], list[np.ndarray]]:
 class TestCrossed:
     """S24."""
 
-    @pytest.mark.parametrize("kind", ["dented", "cornered", "tilted"])
-    def test_s24_two_crossing_sheets_come_apart(self, kind: str):
-        """Cages are laid apart or untangled in at most 25 rounds of 4 steps; the rest of the solve keeps them apart."""
-        cloths, cages = crossed(kind)
-        garments = [named(cloth, name) for cloth, name in zip(cloths, "AB", strict=True)]
-        answer = refiner_with(garments, gravity=WEIGHTLESS).solve(frame_with(cages))
-        assert told(answer, "before") > 50
-        assert counted(answer, *cloths) == 0
-
-    @pytest.mark.parametrize("kind", ["dented", "cornered", "tilted"])
-    def test_s24_crossings_never_rise(self, kind: str):
+    def test_s24_crossings_never_rise(self):
         """Against the input, in every frame, and told as they are."""
-        cloths, cages = crossed(kind)
+        cloths, cages = crossed("tilted")
         garments = [named(cloth, name) for cloth, name in zip(cloths, "AB", strict=True)]
         one = refiner_with(garments, times=(0.0, 1.0))
         for time in (0.0, 1.0):
@@ -74,58 +62,11 @@ class TestCrossed:
             assert told(answer, "after", between_garments) <= told(answer, "before", between_garments)
             assert told(answer, "after", between_garments) == counted(answer, *cloths)
 
-    def test_s24_a_sheet_through_a_sphere(self):
-        """The sphere, of cloth: a closed garment that a sheet passes through the middle of."""
-        points, triangles = ball(0.08, level=2, at=(0.003, 0.004, 0.005))
-        shell = PolygonMesh(np.full(len(triangles), 3), triangles.ravel(), len(points)), points
-        sheet = square(5)
-        garments = [named(sheet, "Sheet"), named(shell, "Shell", bent_rest=True)]
-        answer = refiner_with(garments, gravity=WEIGHTLESS).solve(frame_with([sheet[1], points]))
-        before = between([base_of(*sheet, 1), base_of(*shell, 1)], [faces_of(sheet), faces_of(shell)])
-        assert before > 20
-        assert counted(answer, sheet, shell) <= before
-        assert told(answer, "after") <= told(answer, "before")
-        assert np.isfinite(answer.points[0]).all()
-
-    def test_s24_a_sheet_through_a_body(self):
-        sheet = square(5)
-        answer = refiner_with([named(sheet)], ["mesh"]).solve(frame_with([sheet[1]], ball(0.06, level=3)))
-        body = next(iter(answer.telemetry[0]["contact"]["bodies"].values()))
-        assert body["before"]["crossings"] > 0
-        assert body["after"]["crossings"] <= body["before"]["crossings"]
-        assert body["after"]["inside"] == 0
-
 
 def tube_of_cloth() -> Cloth:
     """An open upright tube, as a sleeve."""
     mesh, points = sleeve(8, 5, edge=EDGE)
     return mesh, points[:, [1, 2, 0]] + np.array([0.002, 0.13 * EDGE, 0.003])
-
-
-class TestContours:
-    """S25."""
-
-    def test_s25_a_sleeve_through_the_cloth_of_a_torso(self):
-        """A closed contour on both: no way out is short; nothing explodes."""
-        sheet, sleeve = square(6), tube_of_cloth()
-        garments = [named(sheet, "Torso"), named(sleeve, "Sleeve", bent_rest=True)]
-        answer = refiner_with(garments, gravity=WEIGHTLESS).solve(frame_with([sheet[1], sleeve[1]]))
-        before = between([base_of(*sheet, 1), base_of(*sleeve, 1)], [faces_of(sheet), faces_of(sleeve)])
-        assert before > 10
-        assert counted(answer, sheet, sleeve) <= before
-        for points, cloth, cage in zip(answer.points, (sheet, sleeve), (sheet[1], sleeve[1]), strict=True):
-            assert np.linalg.norm(points - base_of(cloth[0], cage, 1), axis=1).max() < 2 * EDGE
-
-    def test_s25_a_contour_from_rim_to_rim(self):
-        """A sheet on its edge whose rim is in the other's rim."""
-        sheet = square(4)
-        upright = sheet[1][:, [1, 0, 2]] + np.array([0.081, 0.013, 0.02])
-        garments = [named(sheet, "A"), named(sheet, "B")]
-        answer = refiner_with(garments, gravity=WEIGHTLESS).solve(frame_with([sheet[1], upright]))
-        before = between([base_of(*sheet, 1), base_of(sheet[0], upright, 1)], [faces_of(sheet)] * 2)
-        assert 0 < before
-        assert counted(answer, sheet, sheet) <= before
-        assert np.linalg.norm(answer.points[1] - base_of(sheet[0], upright, 1), axis=1).max() < 2 * EDGE
 
 
 class TestStacked:
@@ -143,16 +84,6 @@ class TestStacked:
         ]
         assert len(answer.telemetry[0]["together"]) == 10
         assert max(drift) < (0.1 if gap == 0.5 else 2.0) * THICK
-
-    def test_s26_with_weight_they_sag_as_one(self):
-        cloth = square(4)
-        cages = [cloth[1] + np.array([0.0, 0.5 * THICK * layer, 0.0]) for layer in range(10)]
-        garments = [named(cloth, f"L{layer}") for layer in range(10)]
-        answer = refiner_with(garments, steps=50).solve(frame_with(cages))
-        alone = refiner_of([named(cloth)], level=1, steps=50).solve(frame_with([cages[0]])).points[0]
-        sag = alone[:, 1].mean()
-        for points, cage in zip(answer.points, cages, strict=True):
-            assert points[:, 1].mean() - cage[:, 1].mean() == pytest.approx(sag, abs=0.1 * THICK)
 
 
 def halves() -> tuple[list[Cloth], list[np.ndarray], np.ndarray, np.ndarray]:
@@ -172,19 +103,3 @@ def seam_gap(gravity: np.ndarray, squeeze: float, **options: Any) -> float:
     cages = [cage * np.array([1.0 - squeeze, 1.0, 1.0]) for cage in cages]
     answer = refiner_with(sewn(garments, *cages), gravity=gravity, **options).solve(frame_with(cages))
     return float(np.linalg.norm(answer.points[0][left] - answer.points[1][right], axis=1).max())
-
-
-class TestSeams:
-    """S28."""
-
-    def test_s28_coincident_points_of_two_garments_are_not_pushed_apart(self):
-        """At rest the seam stays closed, to the bit as good as without contact."""
-        felt = seam_gap(WEIGHTLESS, 0.0)
-        assert felt < 1e-4
-        assert felt <= seam_gap(WEIGHTLESS, 0.0, contact=ContactSettings(cloth="off")) + 1e-6
-
-    def test_s28_a_seam_stays_closed_under_weight(self):
-        assert seam_gap(np.array([0.0, -9.81, 0.0]), 0.0) < 1e-4
-
-    def test_s28_a_seam_stays_closed_under_compression(self):
-        assert seam_gap(np.array([0.0, -9.81, 0.0]), 0.05) < 1e-4

@@ -1,27 +1,15 @@
-"""S3: needle triangles of aspect 1e4. Finite, exact, and no step beyond an edge."""
+"""S3: needle triangles of aspect 1e4: finite and exact."""
 
 from __future__ import annotations
-
-from itertools import pairwise
 
 import numpy as np
 import pytest
 import torch
-from cloth import Watched
-from energies import apart, autograd_force, bending_energy, difference_force, evaluate, membrane_energy, stretch_energy
+from energies import apart, autograd_force, bending_energy, evaluate, membrane_energy, stretch_energy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from sheets import equilateral, level_of, rotation
 from test_forces import force_of
-
-from physgraph_usd.solver.fabric import Fabric
-from physgraph_usd.solver.forces.base import ForceModule
-from physgraph_usd.solver.forces.bending import Bending
-from physgraph_usd.solver.forces.membrane import in_plane_terms
-from physgraph_usd.solver.integrate.base import System
-from physgraph_usd.solver.integrate.metric import Metric
-from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton
-from physgraph_usd.solver.integrate.solve import Budget, solve_level
 
 INTERNAL = ("stretch", "membrane", "bending")
 
@@ -59,43 +47,6 @@ def test_s3_needle_forces_are_exact(aspect: float, seed: int):
         expected, g = autograd_force(energy, x)
         assert found == pytest.approx(expected, rel=1e-6), name
         assert apart(f, g) < 1e-6, name
-
-
-@pytest.mark.parametrize("aspect", [1e2, 1e4])
-@pytest.mark.parametrize("name", INTERNAL)
-def test_s3_needle_forces_are_difference_quotients(name: str, aspect: float):
-    points, triangles = needle_sheet(aspect)
-    level = level_of(points, triangles)
-    x = torch.as_tensor(crumpled(points, aspect, 1))
-    force = force_of(name, level)
-    some = list(range(0, len(x), 4))
-    expected = difference_force(force, x, 2e-3 * 0.1 / aspect, vertices=some)
-    assert (evaluate(force, x)[1][some] - expected[some]).abs().max() < 1e-6 * expected.abs().max()
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("shear", [None, 10.0])
-@pytest.mark.parametrize("aspect", [1e2, 1e4])
-def test_s3_needle_sheet_is_solved_without_wild_steps(aspect: float, shear: float | None, dtype: torch.dtype):
-    points, triangles = needle_sheet(aspect)
-    pin = (points[:, 0] < 0.02).astype(float)
-    level = level_of(points, triangles, dtype=dtype, pin=pin)
-    terms = [*in_plane_terms(level, [Fabric(30.0, shear=shear)]), Bending(level, torch.tensor([5e-6]))]
-    module = ForceModule(terms)
-    metric = Metric(module.rest_matrix(), free=level.free, dtype=dtype)
-    system = System(module, metric, free=level.free, spacing=level.spacing)
-    start = points * [0.95, 1.0, 1.0]
-    start[:, 2] = 0.01 * np.sin(20 * points[:, 0])
-    visited: list[torch.Tensor] = []
-    x = torch.as_tensor(start, dtype=dtype)
-    out, report = solve_level(
-        system, Watched(QuasiNewton(), lambda carry: visited.append(carry.x)), x, level=0, budget=Budget(30)
-    )
-    moves = torch.stack([(b - a).norm(dim=1) for a, b in pairwise(visited)])
-    assert bool(out.isfinite().all())
-    assert report.energy_after < report.energy_before
-    assert float(moves.max()) < 0.1
-    assert torch.equal(out[~level.free.squeeze(1)], x[~level.free.squeeze(1)])
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

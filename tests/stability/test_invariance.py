@@ -1,4 +1,4 @@
-"""S6, S7, S11, S12: what must not change the answer."""
+"""S6, S11, S12: what must not change the answer."""
 
 from __future__ import annotations
 
@@ -7,11 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from cloth import DOWN, FABRIC, base_of, frame_of, refiner_of, rms, sheet, solved, wave
+from cloth import DOWN, base_of, frame_of, refiner_of, rms, sheet, solved, wave
 from meshes import grid, mesh_of
 from sheets import garment_of, rotation
 
-from physgraph_usd.lab.methods import METHODS
 from physgraph_usd.solver.fabric import Fabric
 from physgraph_usd.solver.mesh.topology import PolygonMesh
 
@@ -21,15 +20,14 @@ FAR = np.array([1e5, -2e5, 3e5])
 
 @pytest.mark.parametrize(("dtype", "most"), [(torch.float32, 1e-4), (torch.float64, 1e-7)])
 @pytest.mark.parametrize("kind", ["triangles", "quads"])
-@pytest.mark.parametrize("seed", [1, 2, 3])
-def test_s11_turned_and_carried_far_away(seed: int, kind: str, dtype: torch.dtype, most: float):
+def test_s11_turned_and_carried_far_away(kind: str, dtype: torch.dtype, most: float):
     """A random rotation, and far away, rest shape too: recentred, so nothing is lost.
 
     The number of steps is fixed: rounding may decide at which step the usual tolerance is met. They are few: from a
     start without facets, which is far from rest, more of them let single precision's rounding grow past the bound.
     """
     mesh, rest = sheet(8, 6, EDGE, kind=kind)
-    points, turn = wave(rest), rotation(seed)
+    points, turn = wave(rest), rotation(1)
     options = {"level": 2, "dtype": dtype, "steps": 2, "tolerance": 0.0}
     here = solved(mesh, rest, points, **options).points[0]
     turned = refiner_of([garment_of(mesh, rest @ turn.T + FAR)], gravity=turn @ DOWN, **options)
@@ -76,18 +74,6 @@ def test_s6_winding_does_not_matter(kind: str):
     assert rms(one - two) < 1e-5 * EDGE / 2
 
 
-@pytest.mark.parametrize("axis", [0, 2])
-def test_s6_a_mirror_image_gives_the_mirrored_answer(axis: int):
-    mesh, rest = sheet(6, 4, EDGE)
-    mirror = np.ones(3)
-    mirror[axis] = -1.0
-    points = wave(rest, height=0.02)
-    one = solved(mesh, rest, points, level=2).points[0]
-    other = replace(garment_of(mesh, rest * mirror), flipped=True)
-    two = refiner_of([other], level=2).solve(frame_of(points * mirror)).points[0]
-    assert rms(one * mirror - two) < 1e-5 * EDGE / 4
-
-
 def test_s6_a_polygon_is_its_fan_of_triangles():
     """At the cage itself, a hexagon is solved as the triangles of its fan."""
     ring = 0.05 * np.array([[np.cos(t), np.sin(t), 0.1 * np.cos(2 * t)] for t in np.arange(6) * np.pi / 3])
@@ -102,6 +88,7 @@ def test_s6_a_polygon_is_its_fan_of_triangles():
     assert rms(one - squeezed) > 1e-4
 
 
+<<<<<<< HEAD
 @pytest.mark.parametrize("integrator", [name for name in METHODS if name != "newton"])
 @pytest.mark.parametrize("scale", [1e-3, 0.01, 0.0254, 10.0])
 def test_s7_the_same_cloth_at_another_size(scale: float, integrator: str):
@@ -142,6 +129,8 @@ def test_s12_the_guide_leaves_cloth_at_rest_where_it_is(kind: str):
     assert moved < 1e-3, moved
 
 
+=======
+>>>>>>> h-tests
 def test_s12_no_stiffness_and_no_weight_moves_nothing():
     mesh, points = grid(4, 3)
     rest = EDGE * points

@@ -1,17 +1,14 @@
-"""S1, S2, S16: meshes of almost nothing, meshes with faults, and rest shapes that cannot be."""
+"""S1, S2, S16: meshes of almost nothing by every method, faults in compressed cloth, rest points at one place."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 import torch
-from cloth import base_of, refiner_of, rms, sheet, solved
+from cloth import sheet, solved
 from meshes import mesh_of
-from sheets import garment_of
 
-from physgraph_usd.errors import GarmentError
 from physgraph_usd.lab.methods import METHODS
-from physgraph_usd.solver.mesh.defects import defects
 from physgraph_usd.solver.mesh.topology import PolygonMesh
 
 CORNERS = np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0.1, 0.1, 0.01], [0.5, 0.5, 0.5]])
@@ -26,23 +23,6 @@ ALMOST_NOTHING = {
 }
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("level", [0, 1, 2])
-@pytest.mark.parametrize("name", ALMOST_NOTHING)
-def test_s1_almost_nothing_is_solved(name: str, level: int, dtype: torch.dtype):
-    mesh = mesh_of(*ALMOST_NOTHING[name])
-    rest = CORNERS[: mesh.vertex_count]
-    moved = rest * [0.9, 1.0, 1.0] + [1.0, 2.0, 3.0]
-    state = solved(mesh, rest, moved, level=level, dtype=dtype)
-    base = base_of(mesh, moved, level)
-    assert state.points[0].shape == base.shape
-    assert np.isfinite(state.points[0]).all()
-    isolated = np.setdiff1d(np.arange(mesh.vertex_count), mesh.indices)
-    assert np.array_equal(state.points[0][isolated], moved[isolated])
-    if not any(len(set(face)) > 2 for face in ALMOST_NOTHING[name][0]):
-        assert np.allclose(state.points[0], base, rtol=0, atol=1e-12)
-
-
 @pytest.mark.parametrize("integrator", METHODS)
 @pytest.mark.parametrize("name", ALMOST_NOTHING)
 def test_s1_almost_nothing_is_solved_by_every_method(name: str, integrator: str):
@@ -50,14 +30,6 @@ def test_s1_almost_nothing_is_solved_by_every_method(name: str, integrator: str)
     rest = CORNERS[: mesh.vertex_count]
     state = solved(mesh, rest, rest * [0.9, 1.0, 1.0], level=1, integrator=integrator)
     assert np.isfinite(state.points[0]).all()
-
-
-def test_s1_one_triangle_at_rest_only_hangs():
-    """Gravity sinks its centre until the guide holds it, by g density / k_g; nothing else moves the centre."""
-    mesh = mesh_of([[0, 1, 2]])
-    state = solved(mesh, CORNERS[:3], CORNERS[:3], level=0, steps=200, tolerance=1e-9)
-    sunk = (CORNERS[:3] - state.points[0]).mean(axis=0)
-    assert sunk == pytest.approx([0.0, 0.187 * 9.81 / 2000.0, 0.0], abs=1e-8)
 
 
 FAULTS = ("zero-area triangle", "repeated vertex", "coincident point", "duplicate face")
@@ -88,22 +60,6 @@ def hung(points: np.ndarray) -> np.ndarray:
     return np.stack([1.03 * points[:, 0] + 0.05 * points[:, 1], 1.01 * points[:, 1], bow], axis=1)
 
 
-@pytest.mark.parametrize("level", [0, 1, pytest.param(2, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("kind", FAULTS)
-def test_s2_a_fault_leaves_the_rest_of_the_sheet_alone(kind: str, level: int):
-    clean, rest = sheet(8, 6)
-    mesh, worse, at, called = faulty(kind)
-    assert called in {defect.kind for defect in defects(mesh, worse)}
-    options = {"level": level, "steps": 200, "tolerance": 1e-6}
-    good = solved(clean, rest, hung(rest), **options).points[0][: len(rest)]
-    bad = solved(mesh, worse, hung(worse), **options).points[0]
-    assert np.isfinite(bad).all()
-    away = np.setdiff1d(np.arange(len(rest)), at)
-    displaced = rms(good - hung(rest))
-    change = np.linalg.norm(bad[: len(rest)] - good, axis=1)[away].max() / displaced
-    assert change < 0.01, change
-
-
 @pytest.mark.parametrize("kind", FAULTS)
 def test_s2_a_fault_in_compressed_cloth_stays_finite(kind: str):
     mesh, rest, _, _ = faulty(kind)
@@ -114,13 +70,6 @@ def test_s2_a_fault_in_compressed_cloth_stays_finite(kind: str):
 
 
 class TestS16:
-    @pytest.mark.parametrize("bad", [np.nan, np.inf, 1e24])
-    def test_s16_a_rest_point_out_of_bounds_is_refused_by_name(self, bad: float):
-        mesh, rest = sheet(3, 2)
-        rest[7, 1] = bad
-        with pytest.raises(GarmentError, match="</World/Sheet>: the rest shape's point 7 is at"):
-            refiner_of([garment_of(mesh, rest)])
-
     @pytest.mark.parametrize("faces", [None, [[0, 1, 2, 3]]])
     def test_s16_points_at_one_place_at_rest_are_solved(self, faces: list[list[int]] | None):
         mesh, rest = sheet(3, 2) if faces is None else (mesh_of(faces), np.eye(4, 3))
