@@ -88,49 +88,6 @@ def test_s6_a_polygon_is_its_fan_of_triangles():
     assert rms(one - squeezed) > 1e-4
 
 
-<<<<<<< HEAD
-@pytest.mark.parametrize("integrator", [name for name in METHODS if name != "newton"])
-@pytest.mark.parametrize("scale", [1e-3, 0.01, 0.0254, 10.0])
-def test_s7_the_same_cloth_at_another_size(scale: float, integrator: str):
-    """Lengths by s; Y by 1, D by s^2, k_g by 1 / s^2, density by 1 / s: every term by s^2, so the shape is the same.
-
-    In float64: float32's rounding differs with the scale, and forty steps of buckling make 0.002 edges of it. Newton's
-    inner loop, which stops at negative curvature, makes 0.1 edges even of that (benchmarks/results/stability.md, S7).
-    """
-    mesh, rest = sheet(6, 4, EDGE)
-    points = wave(rest)
-    options = {"level": 2, "dtype": torch.float64, "integrator": integrator}
-    one = solved(mesh, rest, points, **options).points[0]
-    fabric = Fabric(30.0, 4.7e-6 * scale**2, 0.187 / scale, FABRIC.thickness * scale)
-    frame = frame_of(scale * points, fabric=fabric, guide=2000.0 / scale**2)
-    two = refiner_of([garment_of(mesh, scale * rest)], **options).solve(frame).points[0]
-    assert rms(two / scale - one) < 1e-6 * EDGE / 4
-
-
-def displaced_at_rest(kind: str, dtype: torch.dtype, *, guide: float) -> float:
-    """Largest move of a resting, weightless sheet, placed anywhere, in fine edge lengths."""
-    mesh, rest = sheet(8, 6, EDGE, kind=kind)
-    placed = rest @ rotation(4).T + [3.0, -2.0, 5.0]
-    refiner = refiner_of([garment_of(mesh, rest)], level=2, gravity=np.zeros(3), dtype=dtype)
-    out = refiner.solve(frame_of(placed, guide=guide)).points[0]
-    return float(np.abs(out - base_of(mesh, placed, 2)).max() / (EDGE / 4))
-
-
-@pytest.mark.parametrize(("dtype", "most"), [(torch.float32, 1e-5), (torch.float64, 1e-12)])
-@pytest.mark.parametrize("kind", ["triangles", "quads"])
-def test_s12_no_force_no_displacement(kind: str, dtype: torch.dtype, most: float):
-    moved = displaced_at_rest(kind, dtype, guide=0.0)
-    assert moved < most, moved
-
-
-@pytest.mark.parametrize("kind", ["triangles", "quads"])
-def test_s12_the_guide_leaves_cloth_at_rest_where_it_is(kind: str):
-    moved = displaced_at_rest(kind, torch.float64, guide=2000.0)
-    assert moved < 1e-3, moved
-
-
-=======
->>>>>>> h-tests
 def test_s12_no_stiffness_and_no_weight_moves_nothing():
     mesh, points = grid(4, 3)
     rest = EDGE * points
