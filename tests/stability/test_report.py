@@ -34,7 +34,7 @@ def test_a_cell_that_is_known_is_not_measured_again(tmp_path: Path):
 
 
 BEYOND = {
-    20: "rounding decides how much of what starts past the middle of a body stays inside: none to nine vertices of 1,089",
+    20: "rounding decides how much of what starts past a body's middle stays inside: none to nine vertices of 1,089",
     33: "rounding grows where cloth buckles",
     39: "waves of two and three edges are not told of",
 }
