@@ -12,6 +12,10 @@ from cloth import DOWN, FABRIC, GUIDE, Solver, settings_of
 from meshes import grid
 from sheets import garment_of
 
+from physgraph_usd.solver.collide.distance import weights
+from physgraph_usd.solver.collide.pairs import NearPairs, Reach
+from physgraph_usd.solver.collide.parts import Parts
+from physgraph_usd.solver.collide.search import near_parts
 from physgraph_usd.solver.colliders.pose import Collider, MeshPose, Pose
 from physgraph_usd.solver.contact.cloth import ClothContact, ClothView
 from physgraph_usd.solver.contact.promise import Promise
@@ -170,3 +174,14 @@ def frame_with(
     """Several garments and bodies, or soups of triangles, at one time code."""
     bodies = tuple(MeshPose(*pose) if isinstance(pose, tuple) else pose for pose in poses)
     return Frame(time, tuple(GarmentFrame(cage, fabric, guide, offset=offset) for cage in cages), bodies)
+
+
+def near_pairs(parts: Parts, x: torch.Tensor, near: Reach) -> NearPairs:
+    """The pairs found near one another, with their shortest vectors, without those that only rest distances let in."""
+    at, pairs = x.double(), near_parts(parts, x, near)
+    weight, corners = weights(at, pairs.corners, pairs.face), pairs.corners.long()
+    way, radius = (weight.unsqueeze(2) * at[corners]).sum(dim=1), near.radius[corners]
+    of_face = radius[:, 0] + radius[:, 1:].amax(dim=1)
+    of_edges = radius[:, :2].amax(dim=1) + radius[:, 2:].amax(dim=1)
+    kept = torch.nonzero(way.norm(dim=1) < torch.where(pairs.face, of_face, of_edges)).squeeze(1)
+    return NearPairs(pairs.corners[kept], weight[kept].to(x), way[kept].to(x), pairs.face[kept])

@@ -9,7 +9,7 @@ import torch
 from brute import Soup, crossings
 from folds import EDGE, levels_of, named, promise_of, square
 
-from physgraph_usd.solver.collide.near import weights
+from physgraph_usd.solver.collide.distance import weights
 from physgraph_usd.solver.collide.pairs import Pairs
 from physgraph_usd.solver.contact.along import COMES, ApproachLimits, along
 from physgraph_usd.solver.level import Placed

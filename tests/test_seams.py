@@ -19,6 +19,7 @@ from folds import (
     frame_with,
     levels_of,
     named,
+    near_pairs,
     promise_of,
     refiner_with,
     sewn,
@@ -29,7 +30,6 @@ from folds import (
 from shots import refine
 
 from physgraph_usd.solver.collide.crossings import crossings
-from physgraph_usd.solver.collide.near import near_pairs
 from physgraph_usd.solver.collide.pairs import Reach
 from physgraph_usd.solver.collide.parts import Parts
 from physgraph_usd.solver.contact.bodies import LevelBodies

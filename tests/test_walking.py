@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 import torch
 from brute import Soup, between_edges, crossings, on_segments, on_triangles
-from folds import SHAPES, folded, frame_with, levels_of, named, placed, refiner_with, square, strip
+from folds import SHAPES, folded, frame_with, levels_of, named, near_pairs, placed, refiner_with, square, strip
 from meshes import grid
 
-from physgraph_usd.solver.collide.near import near_pairs
 from physgraph_usd.solver.collide.pairs import Reach
 from physgraph_usd.solver.collide.parts import Parts
 from physgraph_usd.solver.level import Level

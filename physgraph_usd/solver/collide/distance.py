@@ -4,9 +4,13 @@
 # pyright: reportArgumentType=false, reportIndexIssue=false
 from __future__ import annotations
 
+import torch
 import warp as wp
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
 
 from ..mesh.kernels import KERNELS
+from ..mesh.threads import argument, run
 
 wp.set_module_options(KERNELS)
 
@@ -86,3 +90,34 @@ def weights_of(face: wp.bool, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d
     if face:
         return weights_on_triangle(a, b, c, d)
     return weights_of_edges(a, b, c, d)
+
+
+@wp.kernel
+def _closest(
+    first: wp.int32,
+    x: wp.array(dtype=wp.vec3d),
+    corners: wp.array(dtype=wp.vec4i),
+    face: wp.array(dtype=wp.bool),
+    weight: wp.array(dtype=wp.vec4d),
+):
+    i = first + wp.tid()
+    c = corners[i]
+    weight[i] = weights_of(face[i], x[c[0]], x[c[1]], x[c[2]], x[c[3]])
+
+
+def weights(
+    x: Float[Tensor, "vertices 3"], corners: Int[Tensor, "pairs 4"], face: Bool[Tensor, " pairs"], *, threads: int = 1
+) -> Float[Tensor, "pairs 4"]:
+    """Weights of corners in the shortest vector from each pair's second part to its first, as in `NearPairs`.
+
+    Args:
+        x: Positions [m], float64.
+        corners: A vertex and the corners of a face, or the ends of two edges, int32.
+        face: True for a vertex and a face.
+        threads: Most threads on the CPU.
+    """
+    out = torch.zeros((len(face), 4), dtype=torch.float64, device=x.device)
+    inputs = [argument(x.contiguous(), wp.vec3d), argument(corners, wp.vec4i)]
+    inputs += [argument(face), argument(out, wp.vec4d)]
+    run(_closest, len(out), inputs, device=str(x.device), threads=threads)
+    return out

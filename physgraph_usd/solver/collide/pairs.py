@@ -53,3 +53,25 @@ class Pairs:
         if kept.dtype == torch.bool:  # Once for all three.
             kept = torch.nonzero(kept).squeeze(1)
         return Pairs(self.corners[kept], self.value[kept], self.face[kept])
+
+
+@dataclass(frozen=True, eq=False)
+class NearPairs:
+    """Pairs of parts near one another.
+
+    Attributes:
+        corners: A vertex and the corners of a face, or the ends of two edges, shape (N, 4), int32.
+        weight: Weights of the corners in the shortest vector from the second part to the first; rows sum to 0, shape
+            (N, 4).
+        way: Shortest vector [m], shape (N, 3).
+        face: True for a vertex and a face, shape (N,).
+    """
+
+    corners: Int[Tensor, "pairs 4"]
+    weight: Float[Tensor, "pairs 4"]
+    way: Float[Tensor, "pairs 3"]
+    face: Bool[Tensor, " pairs"]
+
+    def where(self, kept: Int[Tensor, " kept"]) -> NearPairs:
+        """The selected pairs."""
+        return NearPairs(self.corners[kept], self.weight[kept], self.way[kept], self.face[kept])

@@ -12,7 +12,7 @@ import warp as wp
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ..collide.near import weights
+from ..collide.distance import weights
 from ..collide.pairs import Pairs
 from ..collide.separation import TIGHT
 from ..mesh.kernels import KERNELS

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import scipy.sparse as sp
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 from torch import Tensor
 
 from ..collide.crossings import Crossings
@@ -43,8 +43,6 @@ class ClothMesh:
         self._first, self._second = (
             torch.as_tensor(each.astype(np.int64)).to(level.device) for each in (first, second)
         )
-        degree = np.bincount(first, minlength=count)
-        self._degree = torch.as_tensor(np.maximum(degree, 1)).to(level.rest)
 
     def grown(self, vertices: Bool[Tensor, " vertices"], rings: int) -> Bool[Tensor, " vertices"]:
         """The given vertices and all vertices at most `rings` edges away."""
@@ -52,12 +50,6 @@ class ClothMesh:
             given, vertices = vertices, vertices.clone()
             vertices[self._second[given[self._first]]] = True
         return vertices
-
-    def mean_beside(self, values: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
-        """Mean of the neighbours' values at each vertex."""
-        total = torch.zeros_like(values)
-        total = total.index_put_((self._first,), values[self._second], accumulate=True)
-        return total / self._degree.to(values).unsqueeze(1)
 
     def corners_of(self, crossings: Crossings) -> Int[Tensor, "crossings 5"]:
         """Vertices of the edge and of the face of each crossing."""

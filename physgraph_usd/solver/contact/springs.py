@@ -21,8 +21,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..collide.distance import weights_of
-from ..collide.near import NearPairs
-from ..collide.pairs import Pairs
+from ..collide.pairs import NearPairs, Pairs
 from ..forces.self_contact import PairConstraints
 from ..level import Level
 from ..mesh.kernels import KERNELS

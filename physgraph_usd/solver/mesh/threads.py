@@ -25,14 +25,6 @@ SLICES, LEAST_SLICE = 8, 32
 """Slices per thread for such items, and their least average size: some items cost a hundred times as much as average,
 so free threads take the next slice, and slices shrink to shorten the wait for the last."""
 
-WORKERS = 16
-"""Threads sharing an item of many elements on CUDA, because few items leave most of the device idle."""
-
-
-def workers_on(device: str) -> int:
-    """Number of threads sharing an item of many elements."""
-    return 1 if device == "cpu" else WORKERS
-
 
 class Launch:
     """A kernel over items 0 to size - 1; the kernel's first parameter is the first item of a slice."""

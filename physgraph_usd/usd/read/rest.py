@@ -132,12 +132,6 @@ def read_rest(
     return _checked(prim, edges, replace(rest, notices=(*odd, *rest.notices)), first=first)
 
 
-def has_rest(prim: Usd.Prim, baked: Sdf.Layer) -> bool:
-    """Whether a rest shape is authored on a mesh prim; ``baked`` as for `read_rest`."""
-    authored = (prim.GetAttribute(name) for name in _AUTHORED)
-    return any(each and each.HasAuthoredValue() for each in authored) or _default_points(prim, baked) is not None
-
-
 def _from_default(prim: Usd.Prim, edges: np.ndarray, points: np.ndarray, *, first: np.ndarray) -> Rest:
     """Rest shape of the points' default value [m], repaired from the first sample."""
     if np.isfinite(points).all():
