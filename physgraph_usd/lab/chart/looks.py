@@ -20,18 +20,18 @@ from .words import percent
 COLOUR = (0.20, 0.33, 0.52)
 SIZE = (420, 460)
 NEAR = 1.5
-"""Factor by which the gap of a picture may differ from the one that it stands for."""
+"""Largest ratio between the energy gap of a drawn method and the wanted gap."""
 FILE = "chart.looks.{}.png"
 
 
 @dataclass(frozen=True)
 class Look:
-    """A picture of one method's cloth.
+    """A picture of cloth refined by one method.
 
     Attributes:
-        file: Its file.
-        gap: The gap that it shows.
-        words: What it shows.
+        file: Name of the picture's file.
+        gap: Energy gap of the cloth, (Phi - Phi*) / (Phi0 - Phi*).
+        words: Caption.
     """
 
     file: Path
@@ -71,7 +71,7 @@ def draw_looks(chart: Chart, problem: Problem, frame: Frame, best: Sequence[np.n
 
 
 def looks_of(chart: Chart, folder: Path) -> list[Look]:
-    """The pictures that there are, the roughest first."""
+    """Existing pictures of a chart, by falling energy gap."""
     found = []
     for name, gap in (("100", 1.0), *((f"{100 * gap:g}", gap) for gap in GAPS), ("0", 0.0)):
         file, point = folder / FILE.format(name), nearest(chart, gap)
@@ -92,7 +92,7 @@ def nearest(chart: Chart, gap: float) -> Point | None:
 
 
 def caption(look: Look) -> str:
-    """Its gap and what it shows."""
+    """Caption of a picture: its energy gap and its method."""
     left = "0%" if look.gap == 0.0 else percent(look.gap, digits=2)
     return f"{left} above the best known: {look.words}" if 0.0 < look.gap < 1.0 else f"{left}: {look.words}"
 

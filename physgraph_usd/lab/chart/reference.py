@@ -101,7 +101,7 @@ class Solutions:
     """The positions of each frame's reference, in files beside the chart's rows: a chart that goes on has them, too."""
 
     def __init__(self, folder: Path, *, fresh: bool) -> None:
-        """Take those of a folder, or drop them where ``fresh`` is set."""
+        """Read the positions stored in a folder; ``fresh`` deletes them instead."""
         self._folder = folder
         self._known: dict[float | None, tuple[np.ndarray, ...]] = {}
         for file in folder.glob(SOLUTION.format("*")) if fresh else ():

@@ -110,8 +110,16 @@ class Query:
 
 @wp.struct
 class Boxes:
-    """Blocks of boxes of clusters and of parts; by cluster the search distance, whether it is queried, and the box of
-    its whole paths, widened by the search distance."""
+    """Boxes of one search.
+
+    Attributes:
+        clusters: Boxes of the clusters, in blocks [m].
+        parts: Boxes of the parts, in blocks [m].
+        radius: Search distance of each cluster [m].
+        asked: True for clusters with a queried vertex.
+        low: Least corner of each cluster's paths, less the search distance [m].
+        high: Greatest corner of each cluster's paths, plus the search distance [m].
+    """
 
     clusters: wp.array(dtype=wp.float32)
     parts: wp.array(dtype=wp.float32)

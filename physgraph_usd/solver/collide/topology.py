@@ -13,7 +13,7 @@ from ..level import Level
 from ..mesh.topology import owned_sides
 
 LANES = 8
-"""Parts compared at a time; the parts of one kind in a cluster fill whole blocks of as many."""
+"""Parts in a block, compared at a time; native code in `boxes` is written for eight."""
 VERTEX, EDGE, FACE = (wp.constant(each) for each in range(3))
 """Kinds of parts."""
 

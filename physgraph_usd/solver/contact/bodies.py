@@ -74,7 +74,7 @@ class LevelBodies:
         return replace(self, tracks=tracks, sights=sights), force
 
     def _look(self, track: Track, known: Sight, x: Tensor) -> tuple[Track, Sight]:
-        """Contact planes on one body; vertices that have hardly moved keep their planes."""
+        """Distances and contact planes of one body at x [m]; planes are kept for moves of up to `STALE` edges."""
         still = known.there & ((x - known.at).norm(dim=1) <= STALE * self.level.spacing)
         reach = track.offset + float(self.level.spacing.mean())
         asked = torch.where(still, torch.full_like(reach, -torch.inf), reach)

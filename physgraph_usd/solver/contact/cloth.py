@@ -130,7 +130,7 @@ class ClothView:
 
     @cached_property
     def near(self) -> Reach:
-        """Search distance for pairs that may push one another before the next search."""
+        """Search radii of contact springs: half the thickness, and half of `MARGIN` edges, a vertex [m]."""
         play = 0.5 * MARGIN * self._level.spacing.double()
         thickness = 0.5 * self._thickness.double()[self._level.vertex_garment.long()]
         return Reach(thickness + play, play, HALF)

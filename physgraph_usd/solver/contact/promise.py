@@ -1,4 +1,4 @@
-"""Moves of one level's cloth in one frame that add no crossings."""
+"""Moves of cloth towards wanted positions that add no crossings, for one level and frame."""
 
 from __future__ import annotations
 
