@@ -87,10 +87,12 @@ class Query:
 
     Attributes:
         kind: `MOVE`, `NEAR` or `CROSSING`.
+        clusters: Number of clusters searched: those of the cloth, or all.
         start: Positions [m].
         end: Positions at the end; those at the start without a move [m].
         asked: Each pair contains a vertex for which this is True.
         tangle: The tangle of each vertex, -1 outside tangles; pairs inside one tangle are no result.
+        inside: True for cloth vertices inside a body; their pairs with bodies are no result.
         floor: Gap to keep in a move [m].
         radius: Search radius of near parts [m].
         play: As for `Reach` [m].
@@ -98,10 +100,12 @@ class Query:
     """
 
     kind: wp.int32
+    clusters: wp.int32
     start: wp.array(dtype=wp.vec3d)
     end: wp.array(dtype=wp.vec3d)
     asked: wp.array(dtype=wp.bool)
     tangle: wp.array(dtype=wp.int32)
+    inside: wp.array(dtype=wp.bool)
     floor: wp.float64
     radius: wp.array(dtype=wp.float64)
     play: wp.array(dtype=wp.float64)
@@ -252,6 +256,7 @@ def query_of(
     floor: float = 0.0,
     asked: Tensor | None = None,
     tangle: Tensor | None = None,
+    inside: Tensor | None = None,
     radius: Tensor | None = None,
     play: Tensor | None = None,
     half: float = 0.0,
@@ -264,6 +269,7 @@ def query_of(
     given = (
         ("asked", asked, 1.0, torch.bool),
         ("tangle", tangle, -1.0, torch.int32),
+        ("inside", inside, 0.0, torch.bool),
         ("radius", radius, 0.0, torch.float64),
         ("play", play, 0.0, torch.float64),
     )

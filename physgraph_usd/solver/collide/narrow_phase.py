@@ -50,10 +50,12 @@ def nearness(face: wp.bool, c: wp.vec4i, parts: Topology, query: Query, within: 
 
 
 @wp.func
-def is_asked(query: Query, c: wp.vec4i):
-    """True if a vertex of a pair is queried, and the vertices are not all in one tangle."""
+def is_asked(parts: Topology, query: Query, c: wp.vec4i):
+    """True if a vertex of a pair is queried; not for cloth in one tangle, nor for cloth inside a body and the body."""
     if not (query.asked[c[0]] or query.asked[c[1]] or query.asked[c[2]] or query.asked[c[3]]):
         return False
+    if parts.owner[c[0]] >= parts.cloths or parts.owner[c[3]] >= parts.cloths:
+        return not (query.inside[c[0]] or query.inside[c[1]] or query.inside[c[2]] or query.inside[c[3]])
     tangle = query.tangle[c[0]]
     in_one = query.tangle[c[1]] == tangle and query.tangle[c[2]] == tangle and query.tangle[c[3]] == tangle
     return tangle < 0 or not in_one
@@ -66,7 +68,7 @@ def value_of(face: wp.bool, c: wp.vec4i, parts: Topology, query: Query):
     The value is 1 for pairs that are no result. Most are apart along the line through their middles already.
     """
     one, zero = wp.float64(1.0), wp.vec3d()
-    if not is_asked(query, c):
+    if not is_asked(parts, query, c):
         return one
     at, to = query.start[c[0]], query.end[c[0]]
     b, d, f = query.start[c[1]] - at, query.start[c[2]] - at, query.start[c[3]] - at

@@ -4,6 +4,7 @@
 # pyright: reportArgumentType=false, reportAttributeAccessIssue=false
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
 
 import numpy as np
@@ -11,6 +12,7 @@ import torch
 import warp as wp
 from jaxtyping import Int
 
+from ..colliders.base import Solid
 from ..level import Level
 from ..mesh.kernels import start_warp
 from .boxes import bound_clusters, boxes_for, query_of
@@ -29,15 +31,25 @@ class Parts:
         links: Connected vertices: edges and sewn pairs, shape (N, 2), int64.
         lengths: Lengths of the links at rest, 0 if sewn [m], shape (N,), float64.
         boxes: Warp struct of boxes, written by each search.
+        faces: Number of faces, of the cloth and of bodies.
+        starts: Number of the first edge and of the first face of each body, after those of the cloth and the bodies
+            before.
     """
 
-    def __init__(self, level: Level, meets: np.ndarray, label: Int[np.ndarray, " vertices"] | None = None) -> None:
+    def __init__(
+        self,
+        level: Level,
+        meets: np.ndarray,
+        label: Int[np.ndarray, " vertices"] | None = None,
+        solids: Sequence[Solid] = (),
+    ) -> None:
         """Gather the clusters.
 
         Args:
             level: The level.
-            meets: True for pairs of garments in contact, symmetric, shape (G, G), bool.
+            meets: True for pairs in contact of garments, then bodies, symmetric, shape (G + B, G + B), bool.
             label: Vertices with equal labels are sewn together, or equal; None for no seams, shape (V,).
+            solids: Bodies, whose vertices follow the cloth's in all positions.
         """
         start_warp()  # Views of tensors do not start Warp by themselves.
         self.level = level
@@ -46,13 +58,17 @@ class Parts:
         self.links = torch.as_tensor(np.concatenate([edges, sewn]), device=level.device)
         self.lengths = torch.cat([level.rest_length.double(), level.rest.new_zeros(len(sewn)).double()])
         label = np.arange(level.vertex_count) if label is None else label
-        self.topology = topology_of(level, meets, label, size=SIZE[torch.device(level.device).type])
+        size = SIZE[torch.device(level.device).type]
+        self.topology = topology_of(level, meets, label, size=size, solids=solids)
+        edges = np.cumsum([len(level.edges), *(len(each.edges) for each in solids)])
+        faces = np.cumsum([len(level.triangles), *(len(each.faces) for each in solids)])
+        self.faces, self.starts = int(faces[-1]), (edges[:-1].tolist(), faces[:-1].tolist())
         self.boxes = boxes_for(self.topology, level.device)
 
     @cached_property
     def tree(self) -> wp.Bvh:
-        """Hierarchy of the clusters' boxes, built at rest, so that no search depends on earlier ones."""
-        at_rest = query_of(self.level.rest.double())
+        """Hierarchy of the clusters' boxes, built at rest."""
+        at_rest = query_of(wp.to_torch(self.topology.rest))
         inputs = [0, self.topology, at_rest, self.boxes]
         wp.launch(bound_clusters, dim=self.topology.clusters, inputs=inputs, device=self.level.device)
         return wp.Bvh(self.boxes.low, self.boxes.high)

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from ..mesh.kernels import KERNELS
 from ..mesh.threads import LEAST_PER_THREAD, LEAST_QUERIES, argument, run
-from .boxes import CROSSING, MOVE, NEAR, Boxes, bound_clusters, bound_parts, boxes_near, query_of
+from .boxes import CROSSING, MOVE, NEAR, Boxes, Query, bound_clusters, bound_parts, boxes_near, query_of
 from .narrow_phase import Found, find_pairs
 from .pairs import Pairs, Reach
 from .parts import Parts
@@ -35,6 +35,7 @@ PAIRS, LEAST, MOST = 2**19, 16, 64
 def find_clusters(
     first: wp.int32,
     parts: Topology,
+    query: Query,
     boxes: Boxes,
     tree: wp.uint64,
     room: wp.int32,
@@ -46,7 +47,7 @@ def find_clusters(
     if boxes.asked[i]:
         around = wp.bvh_query_aabb(tree, boxes.low[i], boxes.high[i])
         while wp.bvh_query_next(around, j):
-            if j < i and boxes.asked[j]:
+            if j >= query.clusters or (j < i and boxes.asked[j]):
                 continue
             if parts.meets[parts.garment[i] * parts.garments + parts.garment[j]] == 0:
                 continue
@@ -59,10 +60,20 @@ def find_clusters(
     count[i] = n
 
 
-def near_parts(parts: Parts, x: Float[Tensor, "vertices 3"], reach: Reach) -> Pairs:
-    """All near pairs at x [m]."""
-    radius, play = reach.radius.double(), reach.play.double()
-    return _search(parts, query_of(x.double(), kind=NEAR, radius=radius, play=play, half=reach.half))
+def near_parts(
+    parts: Parts,
+    x: Float[Tensor, "vertices 3"],
+    reach: Reach,
+    *,
+    inside: Bool[Tensor, " vertices"] | None = None,
+) -> Pairs:
+    """All near pairs that contain cloth at x [m], but not of cloth inside a body with bodies.
+
+    Arguments are as for `blocking_pairs`. Positions of the cloth alone give pairs of the cloth alone, in all searches.
+    """
+    asked = torch.arange(len(x), device=x.device) < parts.level.vertex_count
+    given = {"radius": reach.radius.double(), "play": reach.play.double(), "half": reach.half}
+    return _search(parts, query_of(x.double(), kind=NEAR, asked=asked, inside=inside, **given))
 
 
 def blocking_pairs(
@@ -73,6 +84,7 @@ def blocking_pairs(
     floor: float,
     asked: Bool[Tensor, " vertices"],
     tangle: Int[Tensor, " vertices"] | None = None,
+    inside: Bool[Tensor, " vertices"] | None = None,
 ) -> Pairs:
     """All pairs of parts that no plane keeps apart on straight paths (`separation`).
 
@@ -83,27 +95,32 @@ def blocking_pairs(
         floor: Gap that pairs keep [m]; a pair that is already closer keeps most of its distance.
         asked: Vertices of which each pair must contain at least one.
         tangle: The tangle of each vertex, int32, -1 outside tangles; pairs inside a single tangle are skipped; or None.
+        inside: Cloth vertices inside a body, whose pairs with bodies are skipped; or None.
     """
     if not bool(asked.any()):
         return Pairs.empty(0, asked.device)
-    query = query_of(start.double(), end.double(), kind=MOVE, floor=floor, asked=asked, tangle=tangle)
+    given = {"floor": floor, "asked": asked, "tangle": tangle, "inside": inside}
+    query = query_of(start.double(), end.double(), kind=MOVE, **given)
     return _search(parts, query)
 
 
 def piercing_edges(parts: Parts, x: Float[Tensor, "vertices 3"]) -> Int[Tensor, "crossings 2"]:
     """Indices of each edge and face that cross at x [m], sorted."""
-    found = _search(parts, query_of(x.double(), kind=CROSSING)).corners[:, :2].long()
-    return found[torch.argsort(found[:, 0] * max(len(parts.level.triangles), 1) + found[:, 1])]
+    asked = torch.arange(len(x), device=x.device) < parts.level.vertex_count
+    found = _search(parts, query_of(x.double(), kind=CROSSING, asked=asked)).corners[:, :2].long()
+    return found[torch.argsort(found[:, 0] * (parts.faces) + found[:, 1])]
 
 
 def _search(parts: Parts, query: Any) -> Pairs:
     """The pairs of parts of a query."""
-    if not parts.topology.clusters:
+    table = parts.topology
+    query.clusters = table.clusters if len(query.start) > parts.level.vertex_count else table.cloth_clusters
+    if not query.clusters:
         return Pairs.empty(0, parts.level.device)
     tree = parts.tree
-    _launch(parts, bound_clusters, parts.topology.clusters, query, parts.boxes)
+    _launch(parts, bound_clusters, query.clusters, query, parts.boxes)
     tree.refit()
-    clusters = _near_clusters(parts, tree)
+    clusters = _near_clusters(parts, query, tree)
     if not len(clusters):
         return Pairs.empty(0, clusters.device)
     which = torch.zeros(parts.topology.clusters, dtype=torch.bool, device=clusters.device)
@@ -113,13 +130,13 @@ def _search(parts: Parts, query: Any) -> Pairs:
     return _pairs_of(parts, clusters, query)
 
 
-def _near_clusters(parts: Parts, tree: wp.Bvh) -> Int[Tensor, "pairs 2"]:
+def _near_clusters(parts: Parts, query: Any, tree: wp.Bvh) -> Int[Tensor, "pairs 2"]:
     """Pairs of clusters that no axis separates at both ends, int32."""
-    size, room, device = parts.topology.clusters, CLUSTERS, parts.level.device
+    size, room, device = query.clusters, CLUSTERS, parts.level.device
     while True:
         slots = torch.empty((size, room), dtype=torch.int32, device=device)
         count = torch.empty(size, dtype=torch.int32, device=device)
-        inputs = [parts.boxes, tree.id, room, argument(slots.view(-1)), argument(count)]
+        inputs = [query, parts.boxes, tree.id, room, argument(slots.view(-1)), argument(count)]
         _launch(parts, find_clusters, size, *inputs, least=LEAST_QUERIES)
         most = int(count.max())
         if most <= room:
@@ -127,7 +144,8 @@ def _near_clusters(parts: Parts, tree: wp.Bvh) -> Int[Tensor, "pairs 2"]:
         room = most
     first = torch.arange(size, dtype=torch.int32, device=device).repeat_interleave(count)
     second = slots[torch.arange(room, device=device) < count.unsqueeze(1)]
-    return torch.stack([first, second], dim=1)
+    order = torch.argsort(first.long() * size + second)  # Not the tree's, which the pose decides in which it was built.
+    return torch.stack([first[order], second[order]], dim=1)
 
 
 def _pairs_of(parts: Parts, clusters: Int[Tensor, "clusters 2"], query: Any) -> Pairs:

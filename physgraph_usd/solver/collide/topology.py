@@ -4,11 +4,13 @@
 # pyright: reportArgumentType=false, reportAttributeAccessIssue=false
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import warp as wp
 
+from ..colliders.base import Solid
 from ..level import Level
 from ..mesh.topology import owned_sides
 
@@ -26,10 +28,12 @@ class Topology:
     lists its corners, the last one repeated up to three; -1 fills incomplete blocks. Parts with a common corner in
     `labels`, which is equal for vertices sewn together, share a vertex. `number` is a part's index in its level.
     `first_corner` and `corners` are the distinct vertices of each cluster's parts. `meets` tells which garments
-    collide with which. By vertex: `owner` is the garment, `rest` the position at rest.
+    collide with which. By vertex: `owner` is the garment, `rest` the position at rest. Bodies follow the `cloths`
+    garments as further garments, and their clusters the `cloth_clusters`.
     """
 
     clusters: wp.int32
+    cloth_clusters: wp.int32
     first: wp.array(dtype=wp.int32)
     parts: wp.array(dtype=wp.vec3i)
     labels: wp.array(dtype=wp.vec3i)
@@ -38,26 +42,36 @@ class Topology:
     corners: wp.array(dtype=wp.int32)
     garment: wp.array(dtype=wp.int32)
     garments: wp.int32
+    cloths: wp.int32
     meets: wp.array(dtype=wp.int32)
     owner: wp.array(dtype=wp.int32)
     rest: wp.array(dtype=wp.vec3d)
 
 
-def topology_of(level: Level, meets: np.ndarray, label: np.ndarray, *, size: int) -> Any:
-    """The parts of a level in clusters.
+def topology_of(
+    level: Level, meets: np.ndarray, label: np.ndarray, *, size: int, solids: Sequence[Solid] = ()
+) -> Any:
+    """The parts of a level and of bodies in clusters.
 
     A face belongs to the cluster of its first corner, an edge to that of one of its faces.
 
     Args:
         level: The level.
-        meets: True for pairs of garments in contact, symmetric, shape (G, G), bool.
-        label: Vertices with equal labels are sewn together, or equal, shape (V,).
+        meets: True for pairs in contact of garments, then bodies, symmetric, shape (G + B, G + B), bool.
+        label: Cloth vertices with equal labels are sewn together, or equal, shape (V,).
         size: Most vertices of a cluster.
+        solids: The bodies.
     """
     edges, faces = (each.cpu().numpy().astype(np.int64) for each in (level.edges, level.triangles))
-    garment, used = level.vertex_garment.cpu().numpy(), np.unique(faces)  # A vertex of no face is no cloth.
-    cluster = np.zeros(level.vertex_count, np.int64)
-    cluster[used] = halved(level.rest.double().cpu().numpy()[used], garment[used], size)
+    garment, rest, cloths = level.vertex_garment.cpu().numpy(), level.rest.double().cpu().numpy(), len(level.spans)
+    for number, solid in enumerate(solids):
+        edges, faces = np.concatenate([edges, solid.edges + len(rest)]), np.concatenate([faces, solid.faces + len(rest)])
+        garment = np.concatenate([garment, np.full(len(solid.points), cloths + number)])
+        label = np.concatenate([label, np.arange(len(rest), len(rest) + len(solid.points))])
+        rest = np.concatenate([rest, solid.points])
+    vertices, used = len(rest), np.unique(faces)  # A vertex of no face is no cloth.
+    cluster = np.zeros(vertices, np.int64)
+    cluster[used] = halved(rest[used], garment[used], size)
     count = int(cluster[used].max(initial=-1)) + 1
     of_face, of_edge, sides = cluster[faces[:, 0]], np.zeros(len(edges), np.int64), owned_sides(edges, faces)
     of_edge[sides[sides >= 0]] = np.repeat(of_face, 3)[(sides >= 0).ravel()]
@@ -66,24 +80,25 @@ def topology_of(level: Level, meets: np.ndarray, label: np.ndarray, *, size: int
         kinds = tuple((of[:0], corners[:0]) for of, corners in kinds)
     first, parts, number = zip(*(_blocks(of, corners, count) for of, corners in kinds), strict=True)
     begin = np.cumsum([0, *(each[-1] for each in first)])
-    pairs = np.unique(np.concatenate([np.repeat(of, 3) * level.vertex_count + c.ravel() for of, c in kinds]))
+    pairs = np.unique(np.concatenate([np.repeat(of, 3) * vertices + c.ravel() for of, c in kinds]))
     table, device = Topology(), level.device
 
     def array(values: np.ndarray, dtype: type = wp.int32) -> wp.array:
         return wp.array(np.ascontiguousarray(values, dtype=np.int32), dtype=dtype, device=device)
 
-    table.clusters, table.garments = count, len(meets)
+    table.clusters, table.garments, table.cloths = count, len(meets), cloths
+    table.cloth_clusters = int(cluster[used][garment[used] < cloths].max(initial=-1)) + 1
     table.first = array(np.concatenate([each + at for each, at in zip(first, begin, strict=False)]))
     corners = np.concatenate(parts)
     table.parts, table.number = array(corners, wp.vec3i), array(np.concatenate(number))
     table.labels = array(np.where(corners < 0, -1, label[corners]), wp.vec3i)
-    table.first_corner = array(np.searchsorted(pairs, np.arange(count + 1) * level.vertex_count))
-    table.corners = array(pairs % max(level.vertex_count, 1))
+    table.first_corner = array(np.searchsorted(pairs, np.arange(count + 1) * vertices))
+    table.corners = array(pairs % max(vertices, 1))
     by_cluster = np.zeros(count, np.int32)
     by_cluster[cluster[used]] = garment[used]
     table.garment, table.owner = array(by_cluster), array(garment)
     table.meets = array(np.asarray(meets).ravel())
-    table.rest = wp.array(level.rest.double().cpu().numpy(), dtype=wp.vec3d, device=device)
+    table.rest = wp.array(rest, dtype=wp.vec3d, device=device)
     return table
 
 

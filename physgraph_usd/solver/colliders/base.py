@@ -9,6 +9,30 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from .pose import Pose
+
+
+@dataclass(frozen=True, eq=False)
+class Solid:
+    """The triangles of a body.
+
+    Attributes:
+        points: Positions in any pose [m], shape (B, 3), float64; every point is a corner.
+        edges: Sides of the triangles, each once, shape (E, 2), int64.
+        faces: Corners of the triangles, shape (T, 3), int64.
+    """
+
+    points: np.ndarray
+    edges: np.ndarray
+    faces: np.ndarray
+
+    @staticmethod
+    def of(points: np.ndarray, faces: np.ndarray) -> Solid:
+        """Triangles with their sides."""
+        faces = faces.astype(np.int64)
+        sides = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+        return Solid(points, np.unique(sides, axis=0), faces)
+
 
 @dataclass(frozen=True, eq=False)
 class Nearest:
@@ -50,6 +74,8 @@ class Surface(Protocol):
         certain: True if the sides from `closest` are final, so that `inside` is not needed.
         origin: World position of the origin of the surface's coordinates [m], shape (3,), float64.
         bounds: Least and greatest corner [m], in the surface's coordinates, shape (2, 3), float64.
+        solid: The surface's triangles, in any pose; primitives are divided into triangles.
+        world: World positions of the triangles' corners [m], shape (B, 3), float64.
     """
 
     @property
@@ -66,6 +92,16 @@ class Surface(Protocol):
 
     @property
     def bounds(self) -> np.ndarray: ...  # noqa: D102
+
+    @property
+    def solid(self) -> Solid: ...  # noqa: D102
+
+    @property
+    def world(self) -> np.ndarray: ...  # noqa: D102
+
+    def placed(self, pose: Pose) -> np.ndarray | None:
+        """World positions of the corners in another pose [m]; None if the pose is of another shape."""
+        ...
 
     def closest(self, x: Float[Tensor, "points 3"], reach: Float[Tensor, " points"]) -> Nearest:
         """The closest points within reach [m]."""

@@ -15,10 +15,10 @@ from torch import Tensor
 
 from ..mesh.kernels import KERNELS
 from ..mesh.threads import LEAST_QUERIES, argument, run
-from .base import Nearest
+from .base import Nearest, Solid
 from .orient import FIXED, Pieces, pieces_of
 from .overlap import overlapping
-from .pose import MeshPose, moved_rigidly
+from .pose import MeshPose, Pose, moved_rigidly
 
 wp.set_module_options(KERNELS)
 
@@ -97,6 +97,8 @@ class MeshSurface:
         bounds: Least and greatest corner [m], shape (2, 3), float64.
         triangles: Corners, shape (T, 3), int32.
         edges: Sides of the triangles, each once, shape (E, 2), int32.
+        solid: The triangles, numbered without unused vertices.
+        world: World positions of the solid's corners [m], shape (B, 3), float64.
     """
 
     def __init__(
@@ -126,7 +128,8 @@ class MeshSurface:
         sides = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
         self.edges, shared = np.unique(sides, axis=0, return_counts=True)
         self.device, self.threads = device, threads
-        self._used = np.unique(triangles)
+        self._used, compact = np.unique(triangles, return_inverse=True)
+        self.solid = Solid.of(pose.points[self._used], compact.reshape(-1, 3))
         self._rim = None if rim is None else [torch.as_tensor(each, device=device) for each in rim]
         self.corners = torch.as_tensor(triangles, device=device).long()
         # At a hole or where more than two faces meet a pseudonormal says nothing.
@@ -149,12 +152,19 @@ class MeshSurface:
     def _place(self, pose: MeshPose) -> np.ndarray:
         """Recentre a pose; vertices without a face are moved to the origin."""
         used = pose.points[self._used]
-        used = np.where(np.isfinite(used), used, 0.0)
+        used = self.world = np.where(np.isfinite(used), used, 0.0)
         self.origin = 0.5 * (used.min(axis=0) + used.max(axis=0))
         local = np.zeros((len(pose.points), 3), np.float32)
         local[self._used] = used - self.origin
         self.bounds = np.stack([used.min(axis=0), used.max(axis=0)]) - self.origin
         return local
+
+    def placed(self, pose: Pose) -> np.ndarray | None:
+        """World positions of the corners in another pose [m]; None if the pose is of another shape."""
+        if not isinstance(pose, MeshPose) or len(pose.points) != len(self.mesh.points):
+            return None
+        points = pose.points[self._used]
+        return points if np.isfinite(points).all() else None
 
     def closest(self, x: Float[Tensor, "points 3"], reach: Float[Tensor, " points"]) -> Nearest:
         """The closest points within reach [m].

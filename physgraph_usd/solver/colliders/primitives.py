@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from trimesh import creation
 
-from .base import Nearest
-from .pose import ShapePose
+from .base import Nearest, Solid
+from .pose import Pose, ShapePose
+
+AROUND = 64
+"""Triangles around a capsule or a cylinder: between them a round surface is a thousandth of its radius higher."""
+WIDE = 1e3
+"""Half size of the square that stands for a plane [m]."""
 
 
 class ShapeSurface:
@@ -32,6 +40,22 @@ class ShapeSurface:
         self._turn = torch.as_tensor(pose.turn, device=device)
         self._size = torch.as_tensor(pose.size, device=device)
         self.origin = pose.centre
+
+    @property
+    def solid(self) -> Solid:
+        """The shape divided into triangles, about its centre."""
+        return _solid(self._pose.kind, *map(float, self._pose.size))
+
+    @property
+    def world(self) -> np.ndarray:
+        """World positions of the solid's corners [m], shape (B, 3), float64."""
+        return self.solid.points @ self._pose.turn.T + self._pose.centre
+
+    def placed(self, pose: Pose) -> np.ndarray | None:
+        """World positions of the corners in another pose [m]; None if the pose is of another shape."""
+        if not isinstance(pose, ShapePose) or pose.kind != self._pose.kind:
+            return None
+        return _solid(pose.kind, *map(float, pose.size)).points @ pose.turn.T + pose.centre
 
     @property
     def bounds(self) -> np.ndarray:
@@ -122,6 +146,22 @@ def _corner(out: Tensor, sign: Tensor) -> tuple[Tensor, Tensor]:
         outside.unsqueeze(1), beyond / length.clamp_min(torch.finfo(out.dtype).tiny).unsqueeze(1), nearest_face
     )
     return torch.where(outside, length, out.max(dim=1).values), direction * sign
+
+
+@functools.lru_cache(maxsize=64)
+def _solid(kind: str, x: float, y: float, z: float) -> Solid:
+    """A shape of given half sizes [m] divided into triangles."""
+    if kind == "plane":
+        square = WIDE * np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
+        return Solid.of(square, np.array([[0, 1, 2], [0, 2, 3]]))
+    made = {
+        "sphere": lambda: creation.icosphere(subdivisions=4, radius=x),
+        "capsule": lambda: creation.capsule(height=2.0 * z, radius=x, count=(AROUND, AROUND)),
+        "cylinder": lambda: creation.cylinder(radius=x, height=2.0 * z, sections=AROUND),
+        "cube": lambda: creation.box(extents=(2.0 * x, 2.0 * y, 2.0 * z)),
+    }[kind]()
+    points = made.vertices - (made.bounds.mean(axis=0) if kind == "capsule" else 0.0)
+    return Solid.of(np.asarray(points), np.asarray(made.faces))
 
 
 _SHAPES = {"sphere": _sphere, "capsule": _capsule, "cylinder": _cylinder, "cube": _cube, "plane": _plane}

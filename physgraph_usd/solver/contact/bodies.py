@@ -1,8 +1,11 @@
-"""Contact of one group of garments with the bodies of one frame: near vertices and their contact planes.
+"""Bodies near a group of garments in one frame, and cloth that is inside them.
 
-A closest-point query costs about as much as a force evaluation, so queries are few. A vertex at distance d that has
-moved by m is still at least d - m away. Only vertices for which d - m is less than the offset plus the expected move of
-a round are queried again. The bound also tells which vertices may have changed sides.
+Bodies are triangles beside the cloth's in all searches (`collide`): cloth outside is kept there by pairs of parts, as
+from other cloth. Cloth that is inside a body at the start has no such pairs with bodies. It is pulled out by the
+shortest way to the body's exposed faces.
+
+What is inside is found without distances: the edges that pass through a body cut the cloth into pieces, and each piece
+is inside or outside as a whole.
 """
 
 from __future__ import annotations
@@ -12,22 +15,22 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ..colliders.base import Surface
-from ..colliders.sign import signed_and_closest, signed_distances
-from ..forces.contact import Contact
-from ..forces.seam import Seam
+from ..colliders.base import Nearest, Solid, Surface
+from ..colliders.sign import behind
+from ..collide.crossings import Pierced
+from ..forces.self_contact import PairConstraints
 from ..level import Level
-from ..mesh.topology import patches_with
-from .measure import depths, penetration
+from ..mesh.topology import joined_by, patches_with
+from .measure import Penetration, is_between, penetration, pinched
 from .settings import ContactSettings
-from .sight import Sight
-from .track import Track
 
-STALE = 0.1
-"""Move of a vertex after which its contact plane is found anew, in edge lengths."""
+ASKED = 8
+"""Most vertices of a piece of cloth whose sides are found; the majority decides."""
+ON_SURFACE = 1e-6
+"""Distance below which the direction to the closest point is rounding, and the face's normal is taken [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,91 +41,13 @@ class Touching:
         path: Prim path of the collider.
         surface: The posed surface.
         offset: Distance kept by each garment of the group [m]; minus infinity if the garment ignores the surface.
+        before: World positions of the surface's corners in the start frame [m], shape (B, 3), float64; None if unknown.
     """
 
     path: str
     surface: Surface
     offset: tuple[float, ...]
-
-
-@dataclass(frozen=True, eq=False)
-class LevelBodies:
-    """One level's view of the bodies. Immutable: methods that refine the distances return a new view.
-
-    Attributes:
-        level: The level.
-        tracks: Cached distances to each surface.
-        settings: Contact settings, with the stiffness in SI.
-        seam: Sewn vertices, kept together when bodies push; None without seams.
-        sights: Contact planes of the vertices last found on each surface; empty before the first look.
-    """
-
-    level: Level
-    tracks: tuple[Track, ...]
-    settings: ContactSettings
-    seam: Seam | None = None
-    sights: tuple[Sight, ...] = ()
-
-    def seen(self, x: Float[Tensor, "vertices 3"]) -> tuple[LevelBodies, Contact | None]:
-        """The view from positions x [m], and the contact force there, or None if nothing can touch."""
-        before = self.sights or [Sight.none(x)] * len(self.tracks)
-        looks = [self._look(*each, x) for each in zip(self.tracks, before, strict=True)]
-        tracks, sights = tuple(track for track, _ in looks), tuple(sight for _, sight in looks)
-        planes = [sight.planes() for sight in sights]
-        there = any(len(each.vertex) for each in planes)
-        force = Contact(self.level, planes, self.settings.stiffness) if there else None
-        return replace(self, tracks=tracks, sights=sights), force
-
-    def _look(self, track: Track, known: Sight, x: Tensor) -> tuple[Track, Sight]:
-        """Distances and contact planes of one body at x [m]; planes are kept for moves of up to `STALE` edges."""
-        still = known.there & ((x - known.at).norm(dim=1) <= STALE * self.level.spacing)
-        reach = track.offset + float(self.level.spacing.mean())
-        asked = torch.where(still, torch.full_like(reach, -torch.inf), reach)
-        track, vertex, normal, signed = track.refresh(x, asked)
-        near = torch.nonzero(signed < reach[vertex]).squeeze(1)
-        vertex, normal, signed = vertex[near], normal[near], signed[near]
-        sight = known.renewed(
-            x,
-            still,
-            vertex=vertex,
-            normal=normal,
-            signed=signed,
-            offset=track.offset[vertex],
-        )
-        return track, sight
-
-    def within(self, x: Float[Tensor, "vertices 3"]) -> tuple[Bool[Tensor, " vertices"], Bool[Tensor, " vertices"]]:
-        """Masks of the vertices inside closed bodies at x [m] and of the pinched vertices among them."""
-        inside, held = (torch.zeros_like(self.level.free[:, 0]) for _ in range(2))
-        for track in self.tracks:
-            at = x + track.shift
-            asked, reach = (track.surface, at, self.level.edges), float(self.level.spacing.mean())
-            signed = track.known if torch.equal(x, track.at) else signed_distances(*asked, reach=reach)
-            signed = torch.where(track.offset.isfinite(), signed, signed.abs())
-            depth, pinned = depths(track.surface, at, signed, track.longest)
-            inside |= depth > 0
-            held |= pinned
-        return inside, held
-
-    def losing(self, x: Float[Tensor, "vertices 3"]) -> LevelBodies:
-        """View that does not push out cloth between overlapping parts of a body at x [m] while the cloth stays inside.
-
-        Such cloth is a patch of vertices with buried closest faces, some of them inside two parts at once. Pushed out,
-        the patch would fold through its neighbours, which leave on the opposite side.
-        """
-        tracks = []
-        for track in self.tracks:
-            between, in_two = track.between(x)
-            lost = self._patches(between, between[in_two]) if bool(in_two.any()) else None
-            tracks.append(replace(track, lost=lost))
-        return replace(self, tracks=tuple(tracks))
-
-    def _patches(self, some: Tensor, seeds: Tensor) -> Bool[Tensor, " vertices"]:
-        """Connected patches of the given vertices that contain a seed."""
-        kept, wanted = (torch.zeros_like(self.level.free[:, 0]) for _ in range(2))
-        kept[some], wanted[seeds] = True, True
-        masks = (each.cpu().numpy() for each in (kept, wanted))
-        return torch.as_tensor(patches_with(self.level.edges.cpu().numpy(), *masks), device=kept.device)
+    before: np.ndarray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,109 +56,286 @@ class FrameBodies:
 
     Attributes:
         touching: The surfaces.
-        tracks: Cached distances from the upsampled cage to each surface.
+        shifts: From the group's coordinates to each surface's [m], shape (3,).
+        points: Corners of all surfaces in the group's coordinates [m], shape (B, 3), float64.
+        before: Corners in the start frame [m], shape (B, 3); None if unknown.
+        longest: Longest way out from between overlapping parts of a body [m].
         settings: Contact settings, with the stiffness in SI.
+        sides: Allowed side of each open surface for each cage vertex, shape (C,); zeros if undecided or meaningless.
     """
 
     touching: tuple[Touching, ...]
-    tracks: tuple[Track, ...]
+    shifts: tuple[Float[Tensor, "3"], ...]
+    points: Float[Tensor, "corners 3"]
+    before: Float[Tensor, "corners 3"] | None
+    longest: float
     settings: ContactSettings
+    sides: tuple[Float[Tensor, " coarse"], ...]
 
     @staticmethod
     def begin(
-        levels: Sequence[Level],
+        cage: Level,
         touching: Sequence[Touching],
         coarse: Float[Tensor, "coarse 3"],
         *,
         origin: np.ndarray,
         settings: ContactSettings,
     ) -> FrameBodies:
-        """Find the distances of the upsampled cage.
+        """Place the bodies.
 
         Args:
-            levels: Levels of the group.
+            cage: Level of the cage.
             touching: The surfaces.
             coarse: Cage positions [m], recentred.
             origin: World position of the group's origin [m], shape (3,).
             settings: Contact settings, with the stiffness in SI.
         """
-        finest = levels[-1]
-        base = finest.base.apply(coarse)
-        tracks = []
-        for each in touching:
-            shift = torch.as_tensor(origin - each.surface.origin).to(base)
-            offset = torch.as_tensor(each.offset).to(base)[finest.vertex_garment.long()]
-            reach = float(offset.max()) + float(levels[0].spacing.mean())
-            known, closest = signed_and_closest(each.surface, base + shift, finest.edges, reach=reach)
-            feels = offset.isfinite()
-            known = torch.where(feels, known, torch.full_like(known, float("inf")))
-            closest = closest if bool(feels.all()) else None
-            side = _start_sides(each.surface, coarse + shift, finest)
-            longest = settings.way_out * float(levels[0].spacing.mean())
-            tracks.append(Track(each.surface, shift, offset, side, base, known, longest, inside=closest))
-        return FrameBodies(tuple(touching), tuple(tracks), settings)
+        shifts = tuple(torch.as_tensor(origin - each.surface.origin).to(coarse) for each in touching)
+        known = [each.before for each in touching if each.before is not None]
+        points, before = (
+            torch.as_tensor(np.concatenate(each) - origin, dtype=torch.float64, device=coarse.device)
+            for each in ([each.surface.world for each in touching], known or [np.zeros((0, 3))])
+        )
+        sides = tuple(_start_sides(each.surface, coarse + shift) for each, shift in zip(touching, shifts, strict=True))
+        longest = settings.way_out * float(cage.spacing.mean())
+        whole = len(known) == len(touching)
+        return FrameBodies(tuple(touching), shifts, points, before if whole else None, longest, settings, sides)
 
-    def depths(self, finest: Level) -> list[tuple[float, str]]:
-        """Mean depth [m] and body path of each garment of the finest level that is wholly inside a body."""
-        found = [(0.0, "")] * len(finest.spans)
-        for each, track in zip(self.touching, self.tracks, strict=True):
-            for index, span in enumerate(finest.spans):
-                if each.surface.closed and span.stop > span.start and bool((track.known[span] < 0).all()):
-                    x = track.at[span] + track.shift
-                    near = each.surface.closest(x, torch.full_like(x[:, 0], float("inf")))
-                    found[index] = max(found[index], (float(near.distance.mean()), each.path))
+    @property
+    def solids(self) -> tuple[Solid, ...]:
+        """The triangles of the surfaces."""
+        return tuple(each.surface.solid for each in self.touching)
+
+    @property
+    def offsets(self) -> np.ndarray:
+        """Distance kept by each garment from each body [m]; minus infinity for bodies it ignores, shape (G, B)."""
+        return np.array([each.offset for each in self.touching]).T
+
+
+@dataclass(frozen=True, eq=False)
+class LevelBodies:
+    """One level's view of the bodies.
+
+    Attributes:
+        level: The level.
+        frame: The bodies.
+        pieces: Piece of each vertex of the uncut cloth, shape (V,).
+    """
+
+    level: Level
+    frame: FrameBodies
+    pieces: Int[np.ndarray, " vertices"]
+    lost: tuple[Bool[Tensor, " vertices"], ...] | None = None
+
+    def inside(self, x: Float[Tensor, "vertices 3"], pierced: Pierced) -> Bool[Tensor, "bodies vertices"]:
+        """Whether each vertex is inside each body: in a closed surface, or behind an open one.
+
+        Args:
+            x: Positions [m].
+            pierced: Crossings of cloth and bodies there.
+        """
+        edges, bodies = pierced.edge, pierced.body
+        out = [self._inside(index, x, edges[bodies == index]) for index in range(len(self.frame.touching))]
+        return torch.stack(out) if out else self.level.free.T[:0]
+
+    def _inside(self, index: int, x: Tensor, cut: Tensor) -> Bool[Tensor, " vertices"]:
+        surface, out = self.frame.touching[index].surface, torch.zeros_like(self.level.free[:, 0])
+        decided = surface.closed or surface.fixed_side is not None
+        feels = self._feels(index)
+        if not bool(feels.any()) or not (decided or len(cut)):
+            return out
+        piece = self.pieces
+        if len(cut):
+            kept = np.ones(len(self.level.edges), bool)
+            kept[cut.cpu().numpy()] = False
+            piece = joined_by(self.level.edges.cpu().numpy()[kept], self.level.vertex_count)
+        asked, owner = _spread(piece)
+        which = torch.as_tensor(asked, device=x.device)
+        wrong = self._behind(index, x[which], which).cpu().numpy()
+        votes = np.bincount(owner, np.where(wrong, 1.0, -1.0), int(piece.max()) + 1)
+        return torch.as_tensor(votes[piece] > 0, device=x.device) & feels
+
+    def _feels(self, index: int) -> Bool[Tensor, " vertices"]:
+        """Mask of the vertices of garments that do not ignore a body."""
+        offset = torch.tensor(self.frame.touching[index].offset, device=self.level.rest.device)
+        return offset.isfinite()[self.level.vertex_garment.long()]
+
+    def _behind(self, index: int, x: Tensor, which: Tensor) -> Bool[Tensor, " points"]:
+        """Mask of the points x of some vertices that are inside a body or behind it."""
+        surface, at = self.frame.touching[index].surface, x + self.frame.shifts[index]
+        if surface.closed:
+            return surface.inside(at)
+        found = surface.closest(at, torch.full_like(at[:, 0], float("inf")))
+        return behind(found, self.side(index)[which])
+
+    def side(self, index: int) -> Float[Tensor, " vertices"]:
+        """Allowed side of an open surface for each vertex: 1 or -1; 0 if undecided or closed."""
+        side = self.frame.sides[index]
+        return self.level.base.apply(side.unsqueeze(1).expand(-1, 3).contiguous())[:, 0].sign()
+
+    def ways_out(
+        self, index: int, x: Float[Tensor, "vertices 3"], inside: Bool[Tensor, " vertices"]
+    ) -> tuple[Int[Tensor, " some"], Float[Tensor, "some 3"], Float[Tensor, " some"], Bool[Tensor, " some"]]:
+        """Shortest ways out of a body for the vertices inside.
+
+        Args:
+            index: Number of the body.
+            x: Positions [m].
+            inside: The vertices inside.
+
+        Returns:
+            The vertices; unit directions out; depths [m]; and a mask of pinched vertices, which stay.
+        """
+        which = torch.nonzero(inside).squeeze(1)
+        surface, at = self.frame.touching[index].surface, x[which] + self.frame.shifts[index]
+        found = surface.closest(at, torch.full_like(at[:, 0], float("inf")))
+        way = surface.exit(at, found) if surface.closed else found
+        lost = None if self.lost is None else self.lost[index][which]
+        stays = ~way.distance.isfinite()
+        if surface.closed:
+            stays |= pinched(found, way, longest=self.frame.longest, lost=lost)
+        outward = way.normal if surface.closed else way.normal * self.side(index)[which].unsqueeze(1)
+        direct = (way.point - at) / way.distance.clamp_min(ON_SURFACE).unsqueeze(1)
+        normal = torch.where((way.distance > ON_SURFACE).unsqueeze(1), direct, outward)
+        return which, torch.nn.functional.normalize(normal, dim=1, eps=1e-30), way.distance, stays
+
+    def pulls(self, x: Float[Tensor, "vertices 3"], inside: Bool[Tensor, "bodies vertices"]) -> PairConstraints | None:
+        """Constraints that pull vertices out to their offsets; None if none is inside."""
+        found = []
+        for index, own in enumerate(inside):
+            if not bool(own.any()):
+                continue
+            which, normal, depth, stays = self.ways_out(index, x, own)
+            free = torch.nonzero(~stays).squeeze(1)
+            which, normal, depth = which[free], normal[free], depth[free]
+            corners = which.unsqueeze(1).expand(-1, 4).to(torch.int32).contiguous()
+            weight = torch.zeros_like(x[:1, :1]).repeat(len(which), 4)
+            weight[:, 0] = 1.0
+            goal = (normal * x[which]).sum(dim=1) + depth + self.offset(index)[which]
+            stiffness = self.frame.settings.stiffness * self.level.vertex_area[which]
+            found.append(PairConstraints(corners, weight, normal.contiguous(), goal, stiffness))
+        return None if not found else found[0] if len(found) == 1 else _joined(found)
+
+    def offset(self, index: int) -> Float[Tensor, " vertices"]:
+        """Distance that each vertex keeps from a body [m]."""
+        offset = torch.tensor(self.frame.touching[index].offset, dtype=self.level.dtype, device=self.level.rest.device)
+        return offset[self.level.vertex_garment.long()]
+
+    def pushed_out(
+        self, x: Float[Tensor, "vertices 3"], inside: Bool[Tensor, "bodies vertices"]
+    ) -> tuple[Float[Tensor, "vertices 3"], int]:
+        """Positions with free vertices moved out of bodies to the clearance [m], body by body; and the passes.
+
+        Vertices that bodies push back and forth move by half steps at last, to the middle between the bodies.
+        """
+        out, most = x, self.frame.settings.projections
+        for attempt in range(2 * most):
+            share, moved = (0.5 if attempt >= most else 1.0), torch.zeros_like(x)
+            for index, own in enumerate(inside):
+                asked = own if not attempt else own & self._still_inside(index, out, own)
+                which, normal, depth, stays = self.ways_out(index, out, asked & self.level.free[:, 0])
+                push = depth + self.frame.settings.clearance * self.offset(index)[which]
+                moved[which] += share * torch.where(stays, torch.zeros_like(push), push).unsqueeze(1) * normal
+            if float(moved.abs().max()) < 1e-7:
+                return out, attempt
+            out = out + moved
+        return out, 2 * most
+
+    def _still_inside(self, index: int, x: Tensor, some: Tensor) -> Bool[Tensor, " vertices"]:
+        """Mask of those of some vertices that are inside a body, each asked for itself."""
+        out, which = torch.zeros_like(some), torch.nonzero(some).squeeze(1)
+        if len(which):
+            out[which] = self._behind(index, x[which], which)
+        return out
+
+    def losing(self, x: Float[Tensor, "vertices 3"], inside: Bool[Tensor, "bodies vertices"]) -> LevelBodies:
+        """View that does not push out cloth between overlapping parts of a body at x [m] while the cloth stays inside.
+
+        Such cloth is a patch of vertices with buried closest faces, some of them inside two parts at once. Pushed out,
+        the patch would fold through its neighbours, which leave on the opposite side.
+        """
+        lost = tuple(self._between(index, x, own) for index, own in enumerate(inside))
+        return replace(self, lost=lost)
+
+    def _between(self, index: int, x: Tensor, inside: Tensor) -> Bool[Tensor, " vertices"]:
+        surface, which = self.frame.touching[index].surface, torch.nonzero(inside).squeeze(1)
+        some, seeds = torch.zeros_like(inside), torch.zeros_like(inside)
+        if not len(which) or not surface.closed:
+            return some
+        at = x[which] + self.frame.shifts[index]
+        found = surface.closest(at, torch.full_like(at[:, 0], float("inf")))
+        between = torch.nonzero(is_between(found, surface.exit(at, found))).squeeze(1)
+        some[which[between]] = True
+        seeds[which[between[surface.inside(at[between], parts=2)]]] = True
+        masks = (each.cpu().numpy() for each in (some, seeds))
+        return torch.as_tensor(patches_with(self.level.edges.cpu().numpy(), *masks), device=x.device)
+
+
+    def depths(
+        self, x: Float[Tensor, "vertices 3"], inside: Bool[Tensor, "bodies vertices"] | None
+    ) -> list[tuple[float, str]]:
+        """Mean depth [m] and body path of each garment that is wholly inside a closed body at x [m]."""
+        found = [(0.0, "")] * len(self.level.spans)
+        for index, own in enumerate(() if inside is None else inside):
+            each = self.frame.touching[index]
+            for place, span in enumerate(self.level.spans):
+                if each.surface.closed and span.stop > span.start and bool(own[span].all()):
+                    at = x[span] + self.frame.shifts[index]
+                    near = each.surface.closest(at, torch.full_like(at[:, 0], float("inf")))
+                    found[place] = max(found[place], (float(near.distance.mean()), each.path))
         return found
 
-    def measure(
+    def measured(
         self,
-        finest: Level,
-        base: Float[Tensor, "vertices 3"],
-        x: Float[Tensor, "vertices 3"],
-        *,
-        view: LevelBodies | None = None,
+        before: tuple[Tensor, Tensor | None, Pierced | None],
+        after: tuple[Tensor, Tensor | None, Pierced | None],
     ) -> dict[str, object]:
         """Penetrations and crossings of each body before and after the solve, as plain values.
 
         Args:
-            finest: The finest level.
-            base: The upsampled cage [m].
-            x: The result [m].
-            view: The finest level's view of the bodies; None if the solve ignored the bodies.
+            before: Positions of the upsampled cage [m], the vertices inside each body, and crossings with bodies; None
+                for none.
+            after: The same of the result.
         """
         bodies: dict[str, object] = {}
-        for index, (each, track) in enumerate(zip(self.touching, self.tracks, strict=True)):
-            surface, at, last = each.surface, x + track.shift, track if view is None else view.tracks[index]
-            # What was farther outside a closed surface than it moved since still is; of an open one it may be behind.
-            least = last.least(x) if surface.closed else None
-            signed = signed_distances(surface, at, finest.edges, reach=float(finest.spacing.max()), least=least)
-            signed = torch.where(track.offset.isfinite(), signed, torch.full_like(signed, float("inf")))
-            longest = track.longest
-            before = penetration(surface, finest, base + track.shift, track.known, longest=longest, inside=track.inside)
-            after = penetration(surface, finest, at, signed, longest=longest, lost=last.lost)
-            name = each.path if surface.closed else f"{each.path} (open part)"
-            bodies[name] = {"before": asdict(before), "after": asdict(after)}
-        return {"bodies": bodies}
+        for index, each in enumerate(self.frame.touching):
+            name = each.path if each.surface.closed else f"{each.path} (open part)"
+            lost = None if self.lost is None else self.lost[index]
+            bodies[name] = {
+                side: asdict(self._penetration(index, *given, lost=known))
+                for side, given, known in (("before", before, None), ("after", after, lost))
+            }
+        return bodies
 
-    def at(self, level: Level, finest: Level) -> LevelBodies:
-        """The view of one level, whose vertices are the first of each garment's vertices in the finest level."""
-        pairs = zip(level.spans, finest.spans, strict=True)
-        places = [torch.arange(fine.start, fine.start + own.stop - own.start) for own, fine in pairs]
-        which = torch.cat(places).to(level.rest.device)
-        tracks = [
-            replace(
-                t,
-                inside=t.inside if level is finest else None,
-                **{name: getattr(t, name)[which] for name in ("offset", "side", "at", "known")},
-            )
-            for t in self.tracks
-        ]
-        return LevelBodies(level, tuple(tracks), self.settings)
+    def _penetration(
+        self, index: int, x: Tensor, inside: Tensor | None, pierced: Pierced | None, *, lost: Tensor | None
+    ) -> Penetration:
+        own = torch.zeros_like(self.level.free[:, 0]) if inside is None else inside[index]
+        count, at = 0 if pierced is None else int(pierced.counts[index]), x + self.frame.shifts[index]
+        known = {"longest": self.frame.longest, "lost": lost, "crossings": count}
+        return penetration(self.frame.touching[index].surface, self.level, at, own, **known)
 
 
-def _start_sides(surface: Surface, cage: Float[Tensor, "coarse 3"], finest: Level) -> Float[Tensor, " vertices"]:
-    """Side of the surface on which the cage around each fine vertex lies: 1 or -1; 0 if undecided or meaningless."""
+def _joined(found: Sequence[PairConstraints]) -> PairConstraints:
+    out = found[0]
+    for each in found[1:]:
+        out = out.with_more(each)
+    return out
+
+
+def _spread(piece: Int[np.ndarray, " vertices"]) -> tuple[np.ndarray, np.ndarray]:
+    """Up to `ASKED` vertices of each piece, evenly spaced in their order, and the piece of each."""
+    order = np.argsort(piece, kind="stable")
+    size = np.bincount(piece)
+    first, step = np.cumsum(size) - size, np.maximum(size // ASKED, 1)
+    place = np.arange(len(piece)) - first[piece[order]]
+    taken = (place % step[piece[order]] == 0) & (place // step[piece[order]] < ASKED)
+    return order[taken], piece[order[taken]]
+
+
+def _start_sides(surface: Surface, cage: Float[Tensor, "coarse 3"]) -> Float[Tensor, " coarse"]:
+    """Side of the surface on which each cage vertex lies, 1 or -1; 0 past the rim, and for closed surfaces."""
     if surface.closed or surface.fixed_side is not None:
-        return torch.full((finest.vertex_count,), surface.fixed_side or 0.0, dtype=cage.dtype, device=cage.device)
-    found = surface.closest(cage, torch.full_like(cage[:, 0], float("inf")))
-    side = torch.where(found.rim, torch.zeros_like(found.side), found.side)
-    return finest.base.apply(side.unsqueeze(1).expand(-1, 3).contiguous())[:, 0].sign()
+        return torch.full_like(cage[:, 0], surface.fixed_side or 0.0)
+    found: Nearest = surface.closest(cage, torch.full_like(cage[:, 0], float("inf")))
+    return torch.where(found.rim, torch.zeros_like(found.side), found.side)

@@ -14,6 +14,7 @@ from ..colliders.base import Surface
 from ..colliders.mesh import MeshBody
 from ..colliders.pose import Collider, MeshPose, Pose, ShapePose
 from ..colliders.primitives import ShapeSurface
+from ..rigid import AT_REST, Rigid
 from ..scene import Garment, GarmentFrame
 from ..strain import has_collapsed
 from .bodies import Touching
@@ -153,11 +154,19 @@ class Bodies:
             return bool(lowest <= pose.centre @ normal + grow)
         return bool((bounds[0] - grow <= high).all() and (low <= bounds[1] + grow).all())
 
-    def touching(self, indices: Sequence[int], offsets: Sequence[Sequence[float | None]]) -> tuple[Touching, ...]:
+    def touching(
+        self,
+        indices: Sequence[int],
+        offsets: Sequence[Sequence[float | None]],
+        before: Sequence[Pose | None] = (),
+        motion: Rigid = AT_REST,
+    ) -> tuple[Touching, ...]:
         """Posed surfaces of colliders.
 
         Args:
             indices: Indices of the colliders.
+            before: Poses of all colliders in the start frame; () if unknown.
+            motion: Motion of the start frame since.
             offsets: For each garment, the distance kept from each collider [m]; None if the garment ignores the
                 collider.
         """
@@ -166,7 +175,11 @@ class Bodies:
             collider = self.colliders[index]
             own = (each[place] for each in offsets)
             offset = tuple(NEVER if each is None else each + collider.offset for each in own)
-            found += [Touching(collider.path, surface, offset) for surface in self._posed(index)]
+            known = before[index] if before else None
+            for surface in self._posed(index):
+                placed = None if known is None else surface.placed(known)
+                placed = None if placed is None else motion(placed)
+                found.append(Touching(collider.path, surface, offset, placed))
         return tuple(found)
 
     def _posed(self, index: int) -> tuple[Surface, ...]:

@@ -1,4 +1,4 @@
-"""Contact of a group's cloth with itself: near pairs, crossings, and the force that keeps parts apart.
+"""Contact of a group's cloth with itself and with bodies: near pairs, crossings, and the force that keeps parts apart.
 
 Penalty springs carry the load but guarantee nothing; `promise` does. The springs act on all near pairs, not only on the
 nearest: otherwise cloth that pushes at a place and is held at another would stay locked.
@@ -11,10 +11,12 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ..collide.crossings import Crossings, crossings
+from ..colliders.base import Solid
+from ..collide.crossings import Crossings, Pierced, all_crossings, crossings
 from ..collide.pairs import Reach
 from ..collide.parts import Parts
 from ..collide.search import near_parts
@@ -22,20 +24,23 @@ from ..forces.seam import Seam
 from ..forces.self_contact import PairConstraints, SelfContact
 from ..level import Level
 from ..scene import Garment
+from .bodies import FrameBodies, LevelBodies
 from .broad_phase import touch_one_another
 from .cloth_mesh import ClothMesh
 from .settings import ContactSettings
-from .springs import HALF, MARGIN, ClothSprings
+from .springs import HALF, MARGIN, ClothSprings, NearSprings
 from .tangles import Tangles, gaps_out
 
 TANGLED = 2
 """Rings around crossings within which cloth is promised only that the number of crossings does not grow."""
+BESIDE = 1
+"""Rings around crossings with a body within which cloth may pass through it."""
 OUT = 0.5
 """Distance by which crossing parts move past one another in a round, in mean edges."""
 
 
 class ClothContact:
-    """Cloth contact data of a whole shot: each level's mesh, built on first use."""
+    """Contact data of a whole shot: each level's mesh, built on first use."""
 
     def __init__(self, levels: Sequence[Level], garments: Sequence[Garment]) -> None:
         """Build the table of garments in mutual contact.
@@ -45,15 +50,29 @@ class ClothContact:
             garments: The garments.
         """
         self.meets = np.array([[_meet(a, b) for b in garments] for a in garments], dtype=bool)
-        self._meshes: dict[int, tuple[bytes, ClothMesh]] = {}
+        self._meshes: dict[int, tuple[tuple[object, ...], ClothMesh]] = {}
 
-    def mesh(self, level: Level, seam: Seam | None) -> ClothMesh:
-        """A level's mesh with the given seam; cached while the sewn pairs stay equal."""
+    def mesh(self, level: Level, seam: Seam | None, bodies: FrameBodies | None, *, itself: bool) -> ClothMesh:
+        """A level's mesh with the given seam and bodies; cached while these stay equal.
+
+        Args:
+            level: The level.
+            seam: Sewn vertices; None without seams.
+            bodies: The bodies of the frame, or None.
+            itself: False for cloth that is in contact with bodies only.
+        """
         sewn = np.zeros((0, 2), np.int64) if seam is None else seam.pairs
-        key, mesh = self._meshes.get(level.index, (b"", None))
-        if mesh is None or key != sewn.tobytes():
-            mesh = ClothMesh(level, self.meets, sewn)
-            self._meshes[level.index] = sewn.tobytes(), mesh
+        solids: tuple[Solid, ...] = () if bodies is None else bodies.solids
+        meets = self.meets if itself else np.zeros_like(self.meets)
+        if bodies is not None:
+            feels = np.isfinite(bodies.offsets)
+            none = np.zeros((len(solids), len(solids)), bool)
+            meets = np.block([[meets, feels], [feels.T, none]])
+        key = (sewn.tobytes(), meets.tobytes(), *map(id, solids))
+        known, mesh = self._meshes.get(level.index, ((), None))
+        if mesh is None or key != known:
+            mesh = ClothMesh(level, meets, sewn, solids)
+            self._meshes[level.index] = key, mesh
         return mesh
 
 
@@ -72,14 +91,17 @@ class _Looked:
     version: int
     crossings: Crossings
     tangles: Tangles | None
+    pierced: Pierced | None = None
+    inside: Tensor | None = None
 
 
 class ClothView:
-    """One level's cloth in one frame.
+    """One level's cloth and the bodies near it in one frame.
 
     Attributes:
         mesh: The level's mesh, sewn as in this frame.
-        keeps_sides: True if moves are promised to add no crossings.
+        frame: The bodies of the frame, or None.
+        keeps_sides: True if moves are promised to add no crossings of cloth with cloth.
         came_near: True if parts were near one another in any call of `term`; None before the first call.
     """
 
@@ -91,23 +113,40 @@ class ClothView:
         base: Float[Tensor, "vertices 3"],
         thickness: Float[Tensor, " garments"],
         settings: ContactSettings,
+        bodies: FrameBodies | None = None,
         seam: Seam | None = None,
     ) -> None:
         """Take the frame.
 
         Args:
-            lasting: Cloth contact data of the shot.
+            lasting: Contact data of the shot.
             level: The level.
             base: The upsampled cage [m]; distances between parts in the cage are not widened.
             thickness: Thickness of each garment [m].
             settings: Contact settings, in SI.
+            bodies: The bodies of the frame, or None.
             seam: Sewn vertices, which stay together; None without seams.
         """
-        self.mesh, self.keeps_sides = lasting.mesh(level, seam), settings.cloth == "pairs"
-        self._lasting, self._level, self._settings, self._thickness = lasting, level, settings, thickness
-        self._base, self._seam = base, seam
+        self.keeps_sides = settings.cloth == "pairs" and bool(lasting.meets.any())
+        self.mesh = lasting.mesh(level, seam, bodies, itself=self.keeps_sides)
+        self._level, self._settings, self._thickness = level, settings, thickness
+        self._base, self._seam, self.frame = base, seam, bodies
         self._looked: _Looked | None = None
         self.came_near: bool | None = None
+
+    @cached_property
+    def bodies(self) -> LevelBodies | None:
+        """The level's view of the bodies; cloth between overlapping parts of a body in the cage stays there."""
+        if self.frame is None:
+            return None
+        bodies = LevelBodies(self._level, self.frame, self.mesh.pieces)
+        inside = self._at_base.inside
+        return bodies if inside is None else bodies.losing(self._base, inside)
+
+    @cached_property
+    def _at_base(self) -> _Looked:
+        """Crossings, tangles and vertices inside bodies of the upsampled cage that is followed."""
+        return self._found(self._base)
 
     @property
     def parts(self) -> Parts:
@@ -124,79 +163,166 @@ class ClothView:
         return float(self._thickness.mean())
 
     @cached_property
+    def corners(self) -> Float[Tensor, "corners 3"]:
+        """Positions of the bodies' corners in this frame [m], float64."""
+        none = self._base.new_zeros((0, 3)).double()
+        return none if self.frame is None else self.frame.points
+
+    def with_bodies(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "all 3"]:
+        """Positions of the cloth and of the bodies' corners [m], float64."""
+        return torch.cat([x.double(), self.corners])
+
+    @cached_property
+    def _owner(self) -> Tensor:
+        """Garment of each vertex, then number of each body's corners as further garments."""
+        sizes = [len(each.points) for each in (() if self.frame is None else self.frame.solids)]
+        bodies = torch.arange(len(sizes)).repeat_interleave(torch.tensor(sizes, dtype=torch.int64))
+        own = self._level.vertex_garment.long()
+        return torch.cat([own, bodies.to(own) + len(self._level.spans)])
+
+    @cached_property
+    def _keep(self) -> Tensor:
+        """Distance kept by two garments, or by a garment and a body [m]."""
+        count = len(self._level.spans)
+        mean = 0.5 * (self._thickness.unsqueeze(0) + self._thickness.unsqueeze(1))
+        if self.frame is None:
+            return mean
+        offsets = torch.as_tensor(self.frame.offsets).to(mean)
+        out = mean.new_zeros((count + offsets.shape[1],) * 2)
+        out[:count, :count], out[:count, count:], out[count:, :count] = mean, offsets, offsets.T
+        return out
+
+    @cached_property
     def _springs(self) -> ClothSprings:
         """Contact spring finder of this frame."""
-        return ClothSprings(self._level, self._base, self._thickness, self._settings.cloth_stiffness)
+        return ClothSprings(self.mesh, self._base, self.corners, self._owner, self._keep)
 
     @cached_property
     def near(self) -> Reach:
-        """Search radii of contact springs: half the thickness, and half of `MARGIN` edges, a vertex [m]."""
+        """Search radii of contact springs: half the distance kept, and half of `MARGIN` edges, a vertex [m]."""
         play = 0.5 * MARGIN * self._level.spacing.double()
-        thickness = 0.5 * self._thickness.double()[self._level.vertex_garment.long()]
-        return Reach(thickness + play, play, HALF)
+        thickness = 0.5 * self._thickness.double()
+        radius = thickness[self._level.vertex_garment.long()] + play
+        if self.frame is not None:
+            beyond = self._keep[: len(thickness), len(thickness) :].double() - thickness.unsqueeze(1)
+            of_body = beyond.amax(dim=0).clamp_min(0.0) + play.max()
+            radius = torch.cat([radius, of_body[self._owner[len(play) :] - len(thickness)]])
+            play = torch.nn.functional.pad(play, (0, len(radius) - len(play)))
+        return Reach(radius, play, HALF)
 
     def crossings(self, x: Float[Tensor, "vertices 3"]) -> Crossings:
         """Crossings at x [m]; cached for the same tensor until its version changes."""
         return self._look(x).crossings
 
+    def inside(self, x: Float[Tensor, "vertices 3"]) -> Bool[Tensor, "bodies vertices"] | None:
+        """The vertices inside each body at x [m]; None if none is."""
+        return self._look(x).inside
+
     def _look(self, x: Tensor) -> _Looked:
-        """Cached crossings and tangles at x."""
+        """Cached crossings, tangles and vertices inside bodies at x."""
         if self._looked is None or self._looked.x is not x or self._looked.version != x._version:
-            found = crossings(self.parts, x)
-            corners = self.mesh.corners_of(found)
-            tangles = Tangles.find(self.mesh, corners, rings=TANGLED) if found.count else None
-            self._looked = _Looked(x, x._version, found, tangles)
+            self._looked = self._found(x)
         return self._looked
+
+    def _found(self, x: Tensor) -> _Looked:
+        """Crossings, tangles and vertices inside bodies at x."""
+        bodies = None if self.frame is None else LevelBodies(self._level, self.frame, self.mesh.pieces)
+        pierced = inside = None
+        if bodies is None:
+            found = crossings(self.parts, x)
+        else:
+            found, pierced = all_crossings(self.parts, self.with_bodies(x))
+            inside = bodies.inside(x, pierced)
+            inside = inside if bool(inside.any()) else None
+        tangles = Tangles.find(self.mesh, self.mesh.corners_of(found), rings=TANGLED) if found.count else None
+        return _Looked(x, x._version, found, tangles, pierced, inside)
 
     def tangles(self, x: Float[Tensor, "vertices 3"]) -> Tangles | None:
         """Tangles at x [m]: crossings and the cloth around them; None without crossings."""
         return self._look(x).tangles
 
+    def exempt(self, x: Float[Tensor, "vertices 3"]) -> Bool[Tensor, " all"] | None:
+        """Mask of the cloth inside or through a body at x [m], False for the bodies' corners; None if none is."""
+        looked = self._look(x)
+        if looked.pierced is None or (looked.inside is None and not looked.pierced.count):
+            return None
+        some = self.mesh.grown(self.mesh.crossed(looked.pierced.crossings), BESIDE)
+        return self.padded(some if looked.inside is None else some | looked.inside.any(dim=0))
+
+    def padded(self, some: Bool[Tensor, " vertices"] | None) -> Bool[Tensor, " all"] | None:
+        """A mask of vertices with False for the bodies' corners."""
+        return None if some is None else torch.nn.functional.pad(some, (0, len(self.corners)))
+
+    def is_clean(self, x: Float[Tensor, "vertices 3"]) -> bool:
+        """Whether nothing crosses at x [m], neither cloth nor bodies."""
+        looked = self._look(x)
+        return looked.tangles is None and looked.inside is None and not (looked.pierced and looked.pierced.count)
+
     def remember(self, x: Float[Tensor, "vertices 3"]) -> None:
-        """Record that x [m] has no crossings, as after a safe move from positions without crossings."""
+        """Record that nothing crosses at x [m], as after a safe move from positions where nothing does."""
         self._looked = _Looked(x, x._version, Crossings.none(x.device), None)
 
-    def term(self, x: Float[Tensor, "vertices 3"], *, all_crossings: bool = False) -> SelfContact | None:
-        """Contact force between near parts, with crossings drawn apart; None if no parts are near.
+    def terms(self, x: Float[Tensor, "vertices 3"], *, all_crossings: bool = False) -> tuple[SelfContact, ...]:
+        """Contact forces with bodies and between near cloth, with crossings drawn apart; without those that are none.
 
         Args:
             x: Positions [m].
             all_crossings: True also draws hopeless tangles apart.
         """
-        found, tangles = self.crossings(x), self.tangles(x)
-        gaps = self._gaps(x, found, all_crossings=all_crossings)
+        looked = self._look(x)
+        inside = self.exempt(x)
+        at = self.with_bodies(x)
+        near = self._springs.find(at, near_parts(self.parts, at, self.near, inside=inside))
+        with_body = near.near.corners.amax(dim=1) >= self._level.vertex_count
+        pushes = self._springs.constraints(near.where(with_body), at, self._settings.stiffness)
+        if looked.inside is not None and self.bodies is not None:
+            pulls = self.bodies.pulls(x, looked.inside)
+            pushes = pushes if pulls is None else pushes.with_more(pulls)
+        if looked.pierced is not None and looked.pierced.count:
+            given = {"step": OUT * float(self._level.spacing.mean()), "stiffness": self._settings.stiffness}
+            pushes = pushes.with_more(gaps_out(self.mesh, looked.pierced.crossings, at, **given))
+        gaps = self._gaps(x, near.where(~with_body), at, all_crossings=all_crossings)
+        found, tangles = looked.crossings, looked.tangles
         found = found if tangles is None or all_crossings else tangles.hopeful(found)
         if found.count:
             step, stiffness = OUT * float(self._level.spacing.mean()), self._settings.cloth_stiffness
             gaps = gaps.with_more(gaps_out(self.mesh, found, x, step=step, stiffness=stiffness))
         self.came_near = bool(self.came_near) or len(gaps.corners) > 0
-        return SelfContact(self._level, gaps) if len(gaps.corners) else None
+        named = (("contact", pushes), ("self_contact", gaps))
+        return tuple(SelfContact(self._level, each, name) for name, each in named if len(each.corners))
 
-    def _gaps(self, x: Tensor, found: Crossings, *, all_crossings: bool) -> PairConstraints:
-        """Springs between all near parts that do not cross."""
-        near = self._springs.find(x, near_parts(self.parts, x, self.near))
+    def _gaps(self, x: Tensor, near: NearSprings, at: Tensor, *, all_crossings: bool) -> PairConstraints:
+        """Springs between all near parts of the cloth that do not cross."""
+        found = self.crossings(x)
         if found.count:
             corners, tangles = near.near.corners.long(), self.tangles(x)
             kept = ~self.mesh.crossed(found)[corners].any(dim=1)
             kept &= tangles is None or all_crossings or ~tangles.given_up[corners].all(dim=1)
             near = near.where(kept)
-        return self._springs.constraints(near)
+        return self._springs.constraints(near, at, self._settings.cloth_stiffness)
 
     def measure(
-        self, before: Float[Tensor, "vertices 3"] | None, x: Float[Tensor, "vertices 3"]
-    ) -> tuple[dict[str, dict[str, int]], Bool[Tensor, " vertices"]]:
-        """Crossings before and after, as plain values, and the vertices of those after.
+        self, before: Float[Tensor, "vertices 3"], x: Float[Tensor, "vertices 3"]
+    ) -> tuple[dict[str, object], Bool[Tensor, " vertices"]]:
+        """Penetrations and crossings before and after, as plain values, and the vertices of crossing cloth after.
 
         Positions that safe moves reached from a start without crossings have none and are not searched again.
 
         Args:
-            before: The upsampled cage [m]; None if it is known not to cross.
+            before: The upsampled cage [m].
             x: The result [m].
         """
-        found = self.crossings(x)
-        first = Crossings.none(x.device) if before is None else crossings(self.parts, before)
-        said = {
-            name: {"crossings": each.count, "between_garments": int(np.triu(self.mesh.between(each), 1).sum())}
-            for name, each in (("before", first), ("after", found))
-        }
-        return said, self.mesh.crossed(found)
+        first, last = self._at_base if torch.equal(before, self._base) else self._found(before), self._look(x)
+        said: dict[str, object] = {}
+        if self.bodies is not None and self.frame is not None:
+            sides = ((before, first), (x, last))
+            given = [(at, looked.inside, looked.pierced) for at, looked in sides]
+            said["bodies"] = self.bodies.measured(*given)
+        if self.keeps_sides:
+            crossed = {
+                name: {"crossings": each.count, "between_garments": int(np.triu(self.mesh.between(each), 1).sum())}
+                for name, each in ((name, looked.crossings) for name, looked in (("before", first), ("after", last)))
+            }
+            near = bool(self.came_near) or any(each["crossings"] for each in crossed.values())
+            said["cloth"] = {"near": near, **crossed}
+        return said, self.mesh.crossed(last.crossings)

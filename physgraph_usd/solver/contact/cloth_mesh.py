@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import scipy.sparse as sp
 import torch
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from ..colliders.base import Solid
 from ..collide.crossings import Crossings
 from ..collide.parts import Parts
+from ..forces.self_contact import PairConstraints
 from ..level import Level
 from ..mesh.topology import adjacency, find_edges, joined_by
 
@@ -19,26 +23,38 @@ class ClothMesh:
 
     Attributes:
         level: The level.
+        edges: Ends of the edges of the cloth, then of the bodies, int64.
         parts: Table of vertex, edge and face pairs that may be in contact.
-        triangles: Corners of the faces, int64.
+        triangles: Corners of the faces of the cloth, then of the bodies, int64.
+        pieces: Connected piece of each vertex, shape (V,).
         beside: Adjacency of the vertices, also across seams, shape (V, V).
-        opposite: Vertices opposite each edge in its first two faces, -1 without a face, shape (E, 2).
+        opposite: Vertices opposite each of all edges in its first two faces, -1 without a face, shape (E, 2).
     """
 
-    def __init__(self, level: Level, meets: np.ndarray, sewn: Int[np.ndarray, "pairs 2"]) -> None:
+    def __init__(
+        self, level: Level, meets: np.ndarray, sewn: Int[np.ndarray, "pairs 2"], solids: Sequence[Solid] = ()
+    ) -> None:
         """Build the adjacency.
 
         Args:
             level: The level.
-            meets: True for pairs of garments in contact, symmetric, shape (G, G), bool.
+            meets: True for pairs in contact of garments, then bodies, symmetric, shape (G + B, G + B), bool.
             sewn: Pairs of vertices merged by a seam.
+            solids: The bodies.
         """
         edges, triangles, count = level.edges.cpu().numpy(), level.triangles.cpu().numpy(), level.vertex_count
         label = joined_by(sewn, count) if len(sewn) else None
-        self.level, self.triangles, self._garments = level, level.triangles.long(), len(level.spans)
-        self.parts = Parts(level, meets, label)
+        self.level, self._garments = level, len(level.spans)
+        self.parts, self._solids = Parts(level, meets, label, solids), solids
+        self.pieces = joined_by(edges, count)
         self.beside = _across(adjacency(edges, count), label)
-        self.opposite = torch.as_tensor(_opposite(edges, triangles), device=level.device)
+        start = count
+        for solid in solids:
+            edges, triangles = (np.concatenate(each) for each in ((edges, solid.edges + start), (triangles, solid.faces + start)))
+            start += len(solid.points)
+        self.edges, self.triangles, self.opposite = (
+            torch.as_tensor(each, device=level.device).long() for each in (edges, triangles, _opposite(edges, triangles))
+        )
         first, second = self.beside.nonzero()
         self._first, self._second = (
             torch.as_tensor(each.astype(np.int64)).to(level.device) for each in (first, second)
@@ -53,13 +69,38 @@ class ClothMesh:
 
     def corners_of(self, crossings: Crossings) -> Int[Tensor, "crossings 5"]:
         """Vertices of the edge and of the face of each crossing."""
-        return torch.cat([self.level.edges[crossings.edge].long(), self.triangles[crossings.face]], dim=1)
+        return torch.cat([self.edges[crossings.edge], self.triangles[crossings.face]], dim=1)
 
     def crossed(self, crossings: Crossings) -> Bool[Tensor, " vertices"]:
-        """Mask of the vertices of crossing edges and faces."""
-        out = torch.zeros_like(self.level.free[:, 0])
-        out[self.corners_of(crossings).reshape(-1)] = True
+        """Mask of the vertices of the cloth's crossing edges and faces."""
+        out, corners = torch.zeros_like(self.level.free[:, 0]), self.corners_of(crossings).reshape(-1)
+        out[corners[corners < len(out)]] = True
         return out
+
+    def areas(self, corners: Int[Tensor, "pairs 4"]) -> Float[Tensor, " pairs"]:
+        """Area that stands for each pair [m^2]: the first vertex's, or the least of the corners' in the cloth."""
+        area, count = self.level.vertex_area, self.level.vertex_count
+        all_of = torch.where(corners < count, area[corners.clamp_max(count - 1)], torch.inf)
+        return torch.where(corners[:, 0] < count, all_of[:, 0], all_of.amin(dim=1))
+
+    def anchored(
+        self,
+        corners: Int[Tensor, "pairs 4"],
+        weight: Float[Tensor, "pairs 4"],
+        normal: Float[Tensor, "pairs 3"],
+        offset: Float[Tensor, " pairs"],
+        stiffness: Float[Tensor, " pairs"],
+        x: Float[Tensor, "all 3"],
+    ) -> PairConstraints:
+        """Constraints of the cloth's corners, in which bodies' corners are constant at x [m]; the rest is theirs."""
+        count = self.level.vertex_count
+        if len(x) > count:
+            fixed = corners >= count
+            still = torch.where(fixed, weight, torch.zeros_like(weight))
+            offset = offset - (normal * (still.unsqueeze(2) * x[corners.long()]).sum(dim=1)).sum(dim=1)
+            weight, corners = weight - still, torch.where(fixed, corners.amin(dim=1, keepdim=True), corners)
+        given = (each.to(self.level.rest).contiguous() for each in (weight, normal, offset, stiffness))
+        return PairConstraints(corners.contiguous(), *given)
 
     def between(self, crossings: Crossings) -> np.ndarray:
         """Number of crossings between garments, the lower number first, shape (G, G)."""

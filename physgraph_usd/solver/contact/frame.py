@@ -3,27 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ..collide.crossings import crossings
+from ..collide.crossings import Crossings, all_crossings, crossings
 from ..deadline import is_over
-from ..forces.contact import Contact
 from ..forces.seam import Seam
 from ..forces.self_contact import SelfContact
 from ..integrate.base import Preconditioner
 from ..integrate.metric import Metric
-from ..level import Level, Placed, unhindered
+from ..level import Level, Placed
 from .apart import drawn_apart
 from .bodies import FrameBodies, LevelBodies
 from .cloth import ClothContact, ClothView
+from .cloth_mesh import ClothMesh
 from .metric import HeldMetric
-from .promise import Promise
-from .push_out import moves, projected
+from .promise import Before, Promise
 from .repair import repaired_cage
 from .settings import ContactSettings
 
@@ -33,7 +32,7 @@ BLENDED = 4
 """Rings around an unresolved tangle over which the cloth blends back to its start."""
 PUSHES = 4
 """Most rounds of pushing cloth out of bodies and moving it there safely."""
-Touch = Contact | SelfContact
+Touch = SelfContact
 """A contact force term."""
 
 
@@ -42,16 +41,14 @@ class LevelContact:
     """One level's contact with bodies and cloth.
 
     Attributes:
-        bodies: The level's view of the bodies, or None without bodies.
-        cloth: The level's view of the cloth, or None without cloth contact.
+        cloth: The level's view of the cloth and the bodies.
         seam: Sewn vertices, or None without seams.
-        promise: Safe moves of the cloth, or None if cloth may cross cloth.
+        promise: Safe moves of the cloth.
     """
 
-    bodies: LevelBodies | None
-    cloth: ClothView | None
-    seam: Seam | None = None
-    promise: Promise | None = None
+    cloth: ClothView
+    seam: Seam | None
+    promise: Promise
 
     def metric(
         self,
@@ -72,12 +69,12 @@ class LevelContact:
         return last if last.serves(stiff) else HeldMetric(plain, torch.maximum(stiff, last.stiff))
 
     def crosses(self, x: Float[Tensor, "vertices 3"]) -> bool:
-        """True if cloth crosses cloth at positions x [m] and the cloth has a promise."""
-        return self.promise is not None and self.promise.view.crossings(x).count > 0
+        """True if cloth crosses cloth at positions x [m]."""
+        return self.cloth.crossings(x).count > 0
 
     def comes_apart(self, x: Float[Tensor, "vertices 3"], *, all_crossings: bool = False) -> bool:
         """True if x has crossings in hopeful tangles; with `all_crossings`, in any tangle."""
-        tangles = None if self.promise is None else self.promise.view.tangles(x)
+        tangles = self.cloth.tangles(x)
         return tangles is not None and (all_crossings or not bool(tangles.hopeless.all()))
 
     def begun(self, x: Float[Tensor, "vertices 3"]) -> Placed:
@@ -86,18 +83,18 @@ class LevelContact:
 
     def laid_back(self, x: Placed) -> Placed:
         """Positions with cut-off pieces moved back to their side of the cloth [m], if fewer parts cross then."""
-        if self.promise is None or not self.crosses(x):
+        if not self.crosses(x):
             return x
-        view = self.promise.view
+        view = self.cloth
         out = drawn_apart(view.mesh, x, view.crossings(x), gap=view.gap)[0]
         return x if out is x else Placed(self.closed(out))
 
     def without_hope(self, x: Placed, start: Placed) -> Placed:
         """Positions x [m] with hopeless tangles moved back to the start, blended over the rings around the tangle."""
-        tangles = None if self.promise is None else self.promise.view.tangles(x)
-        if self.promise is None or tangles is None or not bool(tangles.hopeless.any()):
+        tangles = self.cloth.tangles(x)
+        if tangles is None or not bool(tangles.hopeless.any()):
             return x
-        mesh, back = self.promise.view.mesh, tangles.given_up
+        mesh, back = self.cloth.mesh, tangles.given_up
         share = back.to(x)
         for ring in range(BLENDED):
             wider = mesh.grown(back, 1)
@@ -106,43 +103,40 @@ class LevelContact:
         return self.drawn(x, x + share.unsqueeze(1) * (start - x))
 
     def remember(self, x: Float[Tensor, "vertices 3"]) -> None:
-        """As `ClothView.remember`, if there is a promise."""
-        if self.promise is not None:
-            self.promise.view.remember(x)
+        """As `ClothView.remember`."""
+        self.cloth.remember(x)
 
-    def terms(
-        self, x: Float[Tensor, "vertices 3"], *, all_crossings: bool = False
-    ) -> tuple[LevelContact, tuple[Touch, ...]]:
-        """The view from positions x [m], and the contact forces there, empty without contact.
-
-        Other arguments are as for `ClothView.term`.
-        """
-        seen, body = (None, None) if self.bodies is None else self.bodies.seen(x)
-        cloth = None if self.cloth is None else self.cloth.term(x, all_crossings=all_crossings)
-        return replace(self, bodies=seen), tuple(term for term in (body, cloth) if term is not None)
+    def terms(self, x: Float[Tensor, "vertices 3"], *, all_crossings: bool = False) -> tuple[Touch, ...]:
+        """As `ClothView.terms`."""
+        return self.cloth.terms(x, all_crossings=all_crossings)
 
     def closed(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
         """Positions with their seams closed [m]."""
         return x if self.seam is None else self.seam.closed(x)
 
-    def moved(self, x: Placed, wanted: Float[Tensor, "vertices 3"]) -> Placed:
-        """Positions as close to the wanted positions as is safe [m], seams closed."""
-        wanted = self.closed(wanted)
-        return unhindered(wanted) if self.promise is None else self.promise.move(x, wanted)
+    def moved(self, x: Placed, wanted: Float[Tensor, "vertices 3"], since: Before | None = None) -> Placed:
+        """Positions as close to the wanted positions as is safe [m], seams closed; `since` is as for `Promise.move`."""
+        return self.promise.move(x, self.closed(wanted), since)
+
+    def since(self, inside: Bool[Tensor, " vertices"] | None) -> Before | None:
+        """The bodies in the start frame, with a mask of the cloth inside one there; None if unknown."""
+        frame = self.cloth.frame
+        return None if frame is None or frame.before is None else Before(frame.before, inside)
 
     def drawn(self, x: Placed, wanted: Float[Tensor, "vertices 3"]) -> Placed:
         """As `moved`, but the number of crossings in a tangle may grow for a while."""
-        wanted = self.closed(wanted)
-        return unhindered(wanted) if self.promise is None else self.promise.draw(x, wanted)
+        return self.promise.draw(x, self.closed(wanted))
 
     def out_of_bodies(self, x: Placed) -> tuple[Placed, int]:
         """Positions moved safely out of bodies [m], x itself if no vertex had to move, and the number of passes."""
-        passes, bodies = 0, self.bodies
+        passes, bodies = 0, self.cloth.bodies
         for _ in range(PUSHES if bodies is not None else 0):
-            assert bodies is not None
-            bodies, out, more = projected(bodies, x)
+            inside = self.cloth.inside(x)
+            if inside is None or bodies is None or is_over():
+                break
+            out, more = bodies.pushed_out(x, inside)
             start, x, passes = x, self.moved(x, out), passes + more
-            if out is start or x is out or is_over():
+            if torch.equal(start, x):
                 break
         return x, passes
 
@@ -156,7 +150,7 @@ class FrameContact:
         coarse: Float[Tensor, "coarse 3"],
         *,
         bodies: FrameBodies | None,
-        cloth: ClothContact | None,
+        cloth: ClothContact,
         thickness: Sequence[float],
         settings: ContactSettings,
         seams: Sequence[Seam | None] = (),
@@ -167,7 +161,7 @@ class FrameContact:
             levels: Levels of the group.
             coarse: Cage positions [m], recentred.
             bodies: The bodies, or None without bodies.
-            cloth: The group's cloth, or None without cloth contact.
+            cloth: The group's cloth.
             thickness: Thickness of each garment's cloth [m].
             settings: Contact settings, with the stiffness in SI.
             seams: The seam of each level, None for a level without seams; () for no seams at all.
@@ -186,56 +180,51 @@ class FrameContact:
         return self._aimed[0]
 
     @cached_property
+    def _cage(self) -> tuple[ClothMesh, Crossings, LevelBodies | None, Tensor | None]:
+        """Mesh of the cage, its crossings, its view of the bodies, and its vertices inside each of them."""
+        cage, bodies = self._levels[0], self._bodies
+        mesh = self._cloth.mesh(cage, self._seam_at(cage), bodies, itself=self._settings.cloth == "pairs")
+        if bodies is None:
+            return mesh, crossings(mesh.parts, self._coarse), None, None
+        found, pierced = all_crossings(mesh.parts, torch.cat([self._coarse.double(), bodies.points]))
+        view = LevelBodies(cage, bodies, mesh.pieces)
+        inside = view.inside(self._coarse, pierced)
+        return mesh, found, view, inside if bool(inside.any()) else None
+
+    @cached_property
     def _aimed(self) -> tuple[Float[Tensor, "coarse 3"], bool | None]:
-        """The cage followed by the fine cloth, and True if the input has crossings, None if not searched."""
-        cage, out, crosses = self._levels[0], self._coarse, None
-        if self._cloth is None:
-            return out, crosses
-        seam = self._seam_at(cage)
-        mesh = self._cloth.mesh(cage, seam)
-        if self._bodies is not None:
-            out = repaired_cage(cage, out, bodies=self._bodies.at(cage, self._levels[-1]), mesh=mesh)
-        if self._settings.cloth == "pairs":
-            found = crossings(mesh.parts, out)
-            gap = float(self._thickness.mean())
-            apart, left = drawn_apart(mesh, out, found, gap=gap)
-            crosses = found.count > 0 if out is self._coarse else None
-            out = apart if found.count and not left else out
+        """The cage followed by the fine cloth, and True if the input has crossings."""
+        cage, out, seam = self._levels[0], self._coarse, self._seam_at(self._levels[0])
+        mesh, found, bodies, inside = self._cage
+        if bodies is not None and inside is not None:
+            out = repaired_cage(cage, out, bodies=bodies, inside=inside, mesh=mesh)
+        crosses = found.count > 0
+        found = found if out is self._coarse else crossings(mesh.parts, out)
+        apart, left = drawn_apart(mesh, out, found, gap=float(self._thickness.mean()))
+        out = apart if found.count and not left else out
         return (out if seam is None or out is self._coarse else seam.closed(out)), crosses
 
     @property
     def depths(self) -> list[tuple[float, str]]:
-        """As `FrameBodies.depths`; empty without bodies."""
-        return [] if self._bodies is None else self._bodies.depths(self._levels[-1])
+        """As `LevelBodies.depths` of the cage; empty without bodies."""
+        _, _, bodies, inside = self._cage
+        return [] if bodies is None else bodies.depths(self._coarse, inside)
 
-    @cached_property
+    @property
     def crossed(self) -> bool:
         """True if the cage crosses itself."""
-        cage, known = self._levels[0], self._aimed[1]
-        return self.at(cage).crosses(cage.base.apply(self._coarse)) if known is None else known
+        return bool(self._aimed[1])
 
     def at(self, level: Level) -> LevelContact:
         """The cached view of one level. Distances at rest use the rest shape without ease."""
         if level.index not in self._views:
             level = self._levels[level.index]
-            bodies = None if self._bodies is None else self._bodies.at(level, self._levels[-1])
-            base = level.base.apply(self.aim)
-            seam = self._seam_at(level)
-            bodies = None if bodies is None else replace(bodies.losing(base), seam=seam)
-            cloth = promise = None
-            if self._cloth is not None:
-                own = {"base": base, "thickness": self._thickness, "settings": self._settings, "seam": seam}
-                cloth = ClothView(self._cloth, level, **own)
-                promise = Promise(cloth, FLOOR * float(self._thickness.min())) if cloth.keeps_sides else None
-            self._views[level.index] = LevelContact(bodies, cloth, seam, promise)
+            seam, base = self._seam_at(level), level.base.apply(self.aim)
+            own = {"base": base, "thickness": self._thickness, "settings": self._settings, "seam": seam}
+            cloth = ClothView(self._cloth, level, bodies=self._bodies, **own)
+            promise = Promise(cloth, FLOOR * float(self._thickness.min()))
+            self._views[level.index] = LevelContact(cloth, seam, promise)
         return self._views[level.index]
-
-    @property
-    def _is_clean(self) -> bool:
-        """Whether the upsampled cage is known not to cross: its triangles lie in those of a cage that does not."""
-        cage = self._levels[0]
-        has_quads = len(cage.membrane) > len(cage.triangles)
-        return not (has_quads or any(self._seams) or self.crossed)
 
     def _seam_at(self, level: Level) -> Seam | None:
         """The seam of a level."""
@@ -253,7 +242,9 @@ class FrameContact:
             moved["repaired"] = {"vertices": int((shift > 0).sum()), "largest_mm": round(1e3 * float(shift.max()), 4)}
         out, passes = self.at(self._levels[-1]).out_of_bodies(x)
         if self._bodies is not None:
-            moved["projected"] = moves(x, out, passes)
+            shifts = (out - x).norm(dim=1)
+            far = round(1e3 * float(shifts.max()), 4) if len(shifts) else 0.0
+            moved["projected"] = {"vertices": int((shifts > 0).sum()), "largest_mm": far, "passes": passes}
         return out, moved
 
     def measure(self, x: Float[Tensor, "vertices 3"]) -> tuple[dict[str, object], Bool[Tensor, " vertices"]]:
@@ -262,15 +253,5 @@ class FrameContact:
         Args:
             x: The result [m].
         """
-        finest = self._levels[-1]
-        view, crossing = self.at(finest), torch.zeros_like(finest.free[:, 0])
-        base = finest.base.apply(self._coarse)
-        said: dict[str, object] = {}
-        if self._bodies is not None:
-            said |= self._bodies.measure(finest, base, x, view=view.bodies)
-        if view.cloth is not None:
-            cloth, crossing = view.cloth.measure(None if self._is_clean else view.closed(base), x)
-            near = view.cloth.came_near
-            near = view.cloth.term(x) is not None if near is None else near
-            said["cloth"] = {"near": near or any(each["crossings"] for each in cloth.values()), **cloth}
-        return said, crossing
+        view = self.at(self._levels[-1])
+        return view.cloth.measure(view.closed(self._levels[-1].base.apply(self._coarse)), x)

@@ -69,7 +69,7 @@ def penetration_map(
             continue
         x = torch.as_tensor(points - surface.origin, dtype=torch.float64, device=device)
         signed = signed_distances(surface, x, pairs, reach=0.0)
-        depth = depths(surface, x, signed, float("inf"))[0] if surface.closed else (-signed).clamp_min(0.0)
+        depth = depths(surface, x, signed < 0, float("inf"))[0] if surface.closed else (-signed).clamp_min(0.0)
         deepest = torch.maximum(deepest, depth)
     return (1e3 * deepest).to(torch.float32).cpu().numpy()
 

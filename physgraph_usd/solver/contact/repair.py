@@ -19,14 +19,18 @@ from ..level import Level
 from ..mesh.topology import patches_with
 from .bodies import LevelBodies
 from .cloth_mesh import ClothMesh
-from .push_out import pushed_out
 
 FAIRINGS, PASSES = 3, 2
 """Rounds of smoothing and pushing out, and smoothing passes of a round."""
 
 
 def repaired_cage(
-    cage: Level, x: Float[Tensor, "coarse 3"], *, bodies: LevelBodies, mesh: ClothMesh
+    cage: Level,
+    x: Float[Tensor, "coarse 3"],
+    *,
+    bodies: LevelBodies,
+    inside: Bool[Tensor, "bodies coarse"],
+    mesh: ClothMesh,
 ) -> Float[Tensor, "coarse 3"]:
     """The cage with the cloth between overlapping body parts as a taut membrane, pushed outside where possible.
 
@@ -34,29 +38,26 @@ def repaired_cage(
         cage: Level of the cage.
         x: Cage positions [m].
         bodies: The cage's view of the bodies.
+        inside: The vertices inside each body.
         mesh: Mesh of the cage.
 
     Returns:
         Positions [m]; x itself if no vertex is pinched.
     """
-    hidden = _hidden_between(cage, x, bodies, mesh)
-    if not bool(hidden.any()):
+    held = torch.zeros_like(cage.free[:, 0])
+    for index, own in enumerate(inside):
+        which, _, _, stays = bodies.ways_out(index, x, own)
+        held[which] |= stays
+    held &= cage.free[:, 0]
+    if not bool(held.any()):
         return x
+    some, seeds = ((each & cage.free[:, 0]).cpu().numpy() for each in (inside.any(dim=0), held))
+    hidden = torch.as_tensor(patches_with(np.stack(mesh.beside.nonzero(), axis=1), some, seeds), device=held.device)
     around = mesh.grown(hidden, 1) & cage.free[:, 0]
     out = _membrane(x, hidden, mesh.beside)
     for _ in range(FAIRINGS):
-        out = pushed_out(bodies, _smoothed(out, around, mesh.beside))[1]
+        out = bodies.pushed_out(_smoothed(out, around, mesh.beside), inside)[0]
     return out
-
-
-def _hidden_between(level: Level, x: Tensor, bodies: LevelBodies, mesh: ClothMesh) -> Bool[Tensor, " vertices"]:
-    """Free vertices of patches inside bodies that contain a vertex pinched between overlapping parts."""
-    inside, held = bodies.within(x)
-    held &= level.free[:, 0]
-    if not bool(held.any()):
-        return held
-    some, seeds = ((each & level.free[:, 0]).cpu().numpy() for each in (inside, held))
-    return torch.as_tensor(patches_with(np.stack(mesh.beside.nonzero(), axis=1), some, seeds), device=held.device)
 
 
 def _membrane(x: Tensor, where: Bool[Tensor, " vertices"], beside: sp.csr_matrix) -> Tensor:

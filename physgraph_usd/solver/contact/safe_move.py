@@ -57,7 +57,9 @@ def safe_move(
     *,
     floor: float,
     tangle: Int[Tensor, " vertices"] | None = None,
+    inside: Bool[Tensor, " vertices"] | None = None,
     asked: Bool[Tensor, " vertices"] | None = None,
+    dtype: torch.dtype | None = None,
 ) -> Moved:
     """Move vertices towards wanted positions as far as a plane keeps each pair of parts apart.
 
@@ -71,8 +73,10 @@ def safe_move(
         floor: Gap that pairs keep [m]; a pair that is already closer keeps most of its distance.
         tangle: The tangle of each vertex, int32, -1 outside tangles; pairs inside a single tangle have no promise. None
             without tangles.
+        inside: Cloth inside a body; its pairs with bodies have no promise. None for none.
         asked: Vertices whose pairs must be checked; pairs without such a vertex are known to be safe. None checks every
             vertex that moves.
+        dtype: Type to which positions of the cloth are rounded; None for the type of the wanted positions.
 
     Returns:
         Positions, ``wanted`` itself if no pair is blocked, and the fraction that each vertex moved.
@@ -81,8 +85,10 @@ def safe_move(
     way = wanted.double() - at
     share = torch.ones(len(way), dtype=torch.float64, device=way.device)
     x, asked = wanted, (way != 0).any(dim=1) if asked is None else asked
+    given = {"floor": floor, "tangle": tangle, "inside": inside}
+    cloth, dtype = torch.arange(len(way), device=way.device) < parts.level.vertex_count, dtype or wanted.dtype
     for attempt in range(len(way) + ROUNDS):
-        more = blocking_pairs(parts, start, x, floor=floor, asked=asked, tangle=tangle)
+        more = blocking_pairs(parts, start, x, asked=asked, **given)
         if not len(more.value):
             break
         least = torch.ones_like(share)
@@ -90,9 +96,11 @@ def safe_move(
         least.scatter_reduce_(0, corner, more.value.repeat_interleave(4), "amin")
         shorter = share * least if attempt < ROUNDS else torch.where(least < 1.0, 0.0, share)
         # Once time is over all stays where it is.
-        known, share = share, torch.zeros_like(share) if is_over() else _spread(shorter, way, parts)
+        less = torch.zeros_like(share) if is_over() else _spread(shorter, way, parts)
+        known, share = share, torch.where(cloth, less, share)  # Bodies go their way.
         asked = share < known
-        x = torch.where((share < 1.0).unsqueeze(1), (at + share.unsqueeze(1) * way).to(wanted), wanted)
+        moved = (at + share.unsqueeze(1) * way).to(dtype).to(wanted)
+        x = torch.where((share < 1.0).unsqueeze(1), moved, wanted)
     return Moved(Placed(x), share)
 
 

@@ -5,8 +5,8 @@ Each pair has an offset, the distance to keep, in metres:
     offset = min(thickness, HALF distance at rest, max(distance in the upsampled cage, LEAST thickness))
 
 A pair has a spring if its distance is less than the offset plus `MARGIN` of an edge. Between garments the distance at
-rest is ignored. The stiffness is the cloth's times the area of the pair: the vertex's area, or a third of the least of
-the four corners' areas.
+rest is ignored. A body keeps its own offset. The stiffness is given by area, times the area of the pair: the vertex's
+area, or a third of the least of the cloth corners' areas.
 """
 
 # Warp's kernels are typed by values that only Warp reads.
@@ -17,15 +17,15 @@ from dataclasses import dataclass
 
 import torch
 import warp as wp
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ..collide.distance import weights_of
 from ..collide.pairs import NearPairs, Pairs
 from ..forces.self_contact import PairConstraints
-from ..level import Level
 from ..mesh.kernels import KERNELS
 from ..mesh.threads import argument, run
+from .cloth_mesh import ClothMesh
 
 wp.set_module_options(KERNELS)
 
@@ -50,7 +50,9 @@ def _find_springs(
     rest: wp.array(dtype=wp.vec3d),
     base: wp.array(dtype=wp.vec3d),
     garment: wp.array(dtype=wp.int32),
-    thickness: wp.array(dtype=wp.float64),
+    keep: wp.array(dtype=wp.float64),
+    garments: wp.int32,
+    cloths: wp.int32,
     spacing: wp.array(dtype=wp.float64),
     corners: wp.array(dtype=wp.vec4i),
     face: wp.array(dtype=wp.bool),
@@ -65,11 +67,14 @@ def _find_springs(
     between = _apart(w, c, x)
     distance = wp.length(between)
     edge = wp.min(wp.min(spacing[c[0]], spacing[c[1]]), wp.min(spacing[c[2]], spacing[c[3]]))
-    thick = wp.float64(0.5) * (thickness[garment[c[0]]] + thickness[garment[c[3]]])
+    first_owner, last_owner = garment[c[0]], garment[c[3]]
+    thick = keep[first_owner * garments + last_owner]
     near = distance < thick + _MARGIN * edge
     if near:
-        keeps = wp.min(thick, wp.max(wp.length(_apart(w, c, base)), _LEAST * thick))
-        if garment[c[0]] == garment[c[3]]:
+        keeps = thick
+        if first_owner < cloths and last_owner < cloths:
+            keeps = wp.min(thick, wp.max(wp.length(_apart(w, c, base)), _LEAST * thick))
+        if first_owner == last_owner:
             keeps = wp.min(keeps, _HALF * wp.length(_apart(w, c, rest)))
         near = distance < keeps + _MARGIN * edge
         weight[i] = w
@@ -96,29 +101,37 @@ class NearSprings:
 
 
 class ClothSprings:
-    """Finder of the contact springs of a level's cloth in one frame."""
+    """Finder of the contact springs of a level's cloth with itself and with bodies in one frame."""
 
     def __init__(
-        self, level: Level, base: Float[Tensor, "vertices 3"], thickness: Float[Tensor, " garments"], stiffness: float
+        self,
+        mesh: ClothMesh,
+        base: Float[Tensor, "vertices 3"],
+        bodies: Float[Tensor, "corners 3"],
+        owner: Int[Tensor, " all"],
+        keep: Float[Tensor, "garments garments"],
     ) -> None:
         """Take the frame.
 
         Args:
-            level: The level.
+            mesh: The level's mesh.
             base: The upsampled cage [m]; distances between parts in the cage are not widened.
-            thickness: Thickness of each garment [m].
-            stiffness: Contact stiffness of cloth with cloth by area [N/m^3].
+            bodies: Positions of the bodies' corners [m].
+            owner: Garment of each vertex; bodies follow as further garments.
+            keep: Distance kept by two garments, or a garment and a body [m].
         """
-        self._level, self._stiffness = level, stiffness
-        self._rest, self._base = level.rest.double().contiguous(), base.double().contiguous()
-        self._garment = level.vertex_garment.to(torch.int32).contiguous()
-        self._thickness, self._spacing = thickness.double().contiguous(), level.spacing.double().contiguous()
+        level = mesh.level
+        self._mesh, self._cloths, self._owner = mesh, len(level.spans), owner.to(torch.int32).contiguous()
+        self._area = level.vertex_area.double()
+        self._rest, self._base = (torch.cat([each.double(), bodies]) for each in (level.rest, base))
+        self._keep = keep.double().contiguous()
+        self._spacing = torch.nn.functional.pad(level.spacing.double(), (0, len(bodies)), value=torch.inf)
 
-    def find(self, x: Float[Tensor, "vertices 3"], pairs: Pairs) -> NearSprings:
+    def find(self, x: Float[Tensor, "all 3"], pairs: Pairs) -> NearSprings:
         """Pairs that have a spring.
 
         Args:
-            x: Positions [m].
+            x: Positions of cloth and bodies [m], float64.
             pairs: Candidates, each once; must contain all near pairs at x.
         """
         count, device = len(pairs.face), x.device
@@ -126,20 +139,27 @@ class ClothSprings:
             torch.empty(shape, dtype=torch.float64, device=device) for shape in ((count, 4), (count, 3), (count,))
         )
         kept = torch.empty(count, dtype=torch.bool, device=device)
-        at = x.double().contiguous()
-        inputs: list[object] = [argument(each, wp.vec3d) for each in (at, self._rest, self._base)]
-        inputs += [argument(each) for each in (self._garment, self._thickness, self._spacing)]
+        inputs: list[object] = [argument(each, wp.vec3d) for each in (x.contiguous(), self._rest, self._base)]
+        inputs += [argument(self._owner), argument(self._keep.view(-1)), len(self._keep), self._cloths]
+        inputs += [argument(self._spacing)]
         inputs += [argument(pairs.corners, wp.vec4i), argument(pairs.face)]
         inputs += [argument(weight, wp.vec4d), argument(way, wp.vec3d), argument(offset), argument(kept)]
-        run(_find_springs, count, inputs, device=str(device), threads=self._level.threads)
+        run(_find_springs, count, inputs, device=str(device), threads=self._mesh.level.threads)
         some = torch.nonzero(kept).squeeze(1)  # Once for all that follows.
-        near = NearPairs(pairs.corners[some], weight[some].to(x), way[some].to(x), pairs.face[some])
-        return NearSprings(near, offset[some].to(x))
+        near = NearPairs(pairs.corners[some], weight[some], way[some], pairs.face[some])
+        return NearSprings(near, offset[some])
 
-    def constraints(self, springs: NearSprings) -> PairConstraints:
-        """The springs as constraints of the contact force."""
-        near = springs.near
-        area = self._level.vertex_area[near.corners.long()]
-        share = torch.where(near.face, area[:, 0], area.amin(dim=1) / 3.0)
-        normal = torch.nn.functional.normalize(near.way, dim=1, eps=1e-30).contiguous()
-        return PairConstraints(near.corners, near.weight, normal, springs.offset.contiguous(), self._stiffness * share)
+    def constraints(self, springs: NearSprings, x: Float[Tensor, "all 3"], stiffness: float) -> PairConstraints:
+        """The springs as constraints of the contact force; a body's part of a pair is constant.
+
+        Args:
+            springs: The springs.
+            x: Positions of cloth and bodies [m], float64.
+            stiffness: Stiffness by area [N/m^3].
+        """
+        near, count = springs.near, self._mesh.level.vertex_count
+        normal = torch.nn.functional.normalize(near.way, dim=1, eps=1e-300)
+        corners = near.corners.long()
+        least = torch.where(corners < count, self._area[corners.clamp_max(count - 1)], torch.inf)
+        share = torch.where(near.face & (corners[:, 0] < count), least[:, 0], least.amin(dim=1) / 3.0)
+        return self._mesh.anchored(near.corners, near.weight, normal, springs.offset, stiffness * share, x)

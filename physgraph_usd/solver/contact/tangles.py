@@ -29,7 +29,6 @@ from torch import Tensor
 
 from ..collide.crossings import Crossings
 from ..forces.self_contact import PairConstraints
-from ..level import Level
 from ..mesh.topology import joined_by
 from .cloth_mesh import ClothMesh
 
@@ -113,7 +112,7 @@ def ways_out(
     Returns:
         Directions, of length at most 1, and coordinates: along the edge, then barycentric on the face.
     """
-    ends, face = mesh.level.edges[crossings.edge].long(), mesh.triangles[crossings.face]
+    ends, face = mesh.edges[crossings.edge], mesh.triangles[crossings.face]
     a, b = x[ends[:, 0]], x[ends[:, 1]]
     p, q, r = (x[face[:, i]] for i in range(3))
     along = torch.nn.functional.normalize(b - a, dim=1, eps=1e-30)
@@ -146,23 +145,20 @@ def gaps_out(
     Args:
         mesh: The cloth.
         crossings: Crossings at x.
-        x: Positions [m].
+        x: Positions of cloth, and of the bodies' corners if some of the crossings are with bodies [m].
         step: Relative move of the edge and the face [m].
         stiffness: k_c [N/m^3].
     """
-    level: Level = mesh.level
     way, place = ways_out(mesh, crossings, x)
-    ends, face = level.edges[crossings.edge].long(), mesh.triangles[crossings.face]
+    ends, face = mesh.edges[crossings.edge], mesh.triangles[crossings.face]
     corners = torch.cat([torch.cat([ends[:, i : i + 1], face], dim=1) for i in range(2)])
     share = torch.cat([1.0 - place[:, 0], place[:, 0]])
     weight = torch.cat([torch.ones_like(place[:, :1]), -place[:, 1:]], dim=1).repeat(2, 1)
     length = way.norm(dim=1).repeat(2)
     normal = torch.nn.functional.normalize(way, dim=1, eps=1e-30).repeat(2, 1)
     here = (normal * (weight.unsqueeze(2) * x[corners]).sum(dim=1)).sum(dim=1)
-    strength = stiffness * share * level.vertex_area[corners[:, 0]]
-    return PairConstraints(
-        corners.to(torch.int32).contiguous(), weight.contiguous(), normal, here + step * length, strength
-    )
+    strength = stiffness * share * mesh.areas(corners)
+    return mesh.anchored(corners.to(torch.int32), weight, normal, here + step * length, strength, x)
 
 
 def _barycentric(point: Tensor, p: Tensor, q: Tensor, r: Tensor) -> Float[Tensor, "points 3"]:

@@ -35,9 +35,9 @@ class PairConstraints:
 
     Attributes:
         corners: Vertices of each pair, shape (N, 4), int32.
-        weight: Weights of the vertices, shape (N, 4); each row sums to 0.
+        weight: Weights of the vertices, shape (N, 4); each row sums to 0, but where one of the points is constant.
         normal: From the second point to the first, unit, shape (N, 3).
-        offset: Distance kept [m], shape (N,).
+        offset: Distance kept, more by the height of a constant point along the normal [m], shape (N,).
         stiffness: [N/m], shape (N,).
     """
 
@@ -96,13 +96,12 @@ class SelfContact:
 
     Attributes:
         gaps: The pairs.
+        name: Name of the term in reports.
     """
 
-    name = "self_contact"
-
-    def __init__(self, level: Level, gaps: PairConstraints) -> None:
+    def __init__(self, level: Level, gaps: PairConstraints, name: str = "self_contact") -> None:
         """Take the pairs."""
-        self.gaps, self._level = gaps, level
+        self.gaps, self.name, self._level = gaps, name, level
         along = [(gaps.weight[:, i : i + 1] * gaps.normal).contiguous() for i in range(4)]
         self._elements = Elements(_KEEP_APART, gaps.corners, [*along, gaps.offset, gaps.stiffness], level=level)
 

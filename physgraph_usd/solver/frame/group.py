@@ -152,15 +152,15 @@ class Group:
         """
         settings = settings or self.settings.contact
         touching = frame.touching if settings.form != "off" else ()
-        cloth = self.cloth if settings.cloth != "off" and self.cloth.meets.any() else None
-        if not len(self.levels[0].triangles) or not (cloth or touching or any(self.seams)):
+        itself = settings.cloth != "off" and self.cloth.meets.any()
+        if not len(self.levels[0].triangles) or not (itself or touching or any(self.seams)):
             return None
         fabrics = [each.fabric for each in frame.garments]
         settings = settings.scaled(self.levels[0], stretch=max(each.stretch for each in fabrics))
         place = {"origin": cage.origin, "settings": settings}
-        bodies = FrameBodies.begin(self.levels, touching, cage.points, **place) if touching else None
+        bodies = FrameBodies.begin(self.levels[0], touching, cage.points, **place) if touching else None
         cloths = {"thickness": [each.thickness for each in fabrics], "settings": settings, "seams": self.seams}
-        return FrameContact(self.levels, cage.points, bodies=bodies, cloth=cloth, **cloths)
+        return FrameContact(self.levels, cage.points, bodies=bodies, cloth=self.cloth, **cloths)
 
     def upsampled(self, frames: Sequence[GarmentFrame]) -> list[np.ndarray]:
         """World positions of each garment [m] on its cage's smooth surface, unsolved."""
@@ -175,7 +175,7 @@ class Group:
         """Energy of each term [J] at the garments' world positions [m], with contact detected again."""
         module, contact, origin = self.potential(frames, touching)
         x = self.tensor(np.concatenate(points) - origin)
-        touched = () if contact is None else contact.at(self.levels[-1]).terms(x)[1]
+        touched = () if contact is None else contact.at(self.levels[-1]).terms(x)
         return ForceModule((*module.forces, *touched)).energies(x)
 
     def moved_safely(

@@ -98,6 +98,13 @@ class Origin:
             farthest = max(farthest, bodies_moved(last, frame.colliders, near, along=self.motion))
         return farthest
 
+    @property
+    def colliders(self) -> Sequence[Pose | None]:
+        """Poses of all bodies in the start frame; () without one frame that all garments start from."""
+        known = [each for each in self.frames if each is not None]
+        one = self.state is not None and len(known) == len(self.frames) and len({each.time for each in known}) == 1
+        return known[0].colliders if one else ()
+
     def elapsed(self, time: float | None, seconds: float) -> list[float]:
         """Time from each garment's start frame to a time code [s]; 0 without either.
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..contact.frame import FrameContact, LevelContact, Touch
@@ -101,6 +101,7 @@ class Problem:
         start: Start of the cloth.
         walked: Cages advanced from an earlier frame [m], for a cold start; or None.
         before: Fine positions in the last frame [m], float64; None without a last frame.
+        inside: Mask of the vertices inside a body in the last frame; None if none was.
         tether: Stiffness of the tie to the start [1/s^2]; None without tie.
         creases: Crease memory of the cloth; None for a cold start, or without creases.
     """
@@ -115,6 +116,7 @@ class Problem:
     start: Start
     walked: Float[Tensor, "coarse 3"] | None
     before: Placed | None
+    inside: Bool[Tensor, " vertices"] | None
     tether: float | None
     creases: Creases | None = None
 
@@ -133,7 +135,9 @@ class Problem:
         """The finest vertices with the last frame's detail, moved from their last positions as far as allowed [m]."""
         view, warm = self.view(self.finest), self.start.detailed
         assert warm is not None
-        return warm if view is None or self.before is None else view.moved(self.before, warm)
+        if view is None or self.before is None:
+            return warm
+        return view.moved(self.before, warm, view.since(self.inside))
 
     @property
     def finest(self) -> int:
@@ -230,6 +234,7 @@ def begin(group: Group, frame: FrameInput, last: State | None) -> Problem:
         start=start,
         walked=None if frame.walked is None else group.tensor(frame.walked - cage.origin),
         before=before,
+        inside=None if last is None else last.inside,
         tether=start.slowed * settings.tether if settings.temporal == "tether" else None,
         creases=None if start.detailed is None else creases,
     )

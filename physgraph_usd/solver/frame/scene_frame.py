@@ -16,10 +16,11 @@ from ..contact.heat import body_crossings, penetration_map
 from ..deadline import is_over
 from ..level import refine_garments
 from ..mesh.topology import edges_of
+from ..rigid import AT_REST
 from ..scene import Frame, GarmentFrame, Scene, out_of_bounds
 from ..strain import has_collapsed, size_left, strayed
 from .group import Group
-from .history import Memory, SolvedFrame, is_same, jumped_from, origin_of
+from .history import Memory, Origin, SolvedFrame, is_same, jumped_from, origin_of
 from .recovery import RunawayError, solve_soundly
 from .settings import SolveSettings
 from .values import FrameInput, split
@@ -100,13 +101,18 @@ class SceneCloth:
         return found
 
     def touching(
-        self, part: Sequence[int], frames: Sequence[GarmentFrame], near: Sequence[int]
+        self,
+        part: Sequence[int],
+        frames: Sequence[GarmentFrame],
+        near: Sequence[int],
+        origin: Origin | None = None,
     ) -> tuple[Touching, ...]:
-        """Surfaces of bodies, and the distance kept from each by each garment."""
+        """Surfaces of bodies, and the distance kept from each by each garment; with their places in the start frame."""
         felt = [self.scene.garments[index].colliders for index in part]
         pairs = zip(felt, frames, strict=True)
         offsets = [[frame.offset if body in bodies else None for body in near] for bodies, frame in pairs]
-        return self.bodies.touching(near, offsets)
+        known = () if origin is None else origin.colliders
+        return self.bodies.touching(near, offsets, known, AT_REST if origin is None else origin.motion)
 
     def heat(self, index: int, points: np.ndarray, crossing: np.ndarray | None) -> dict[str, np.ndarray]:
         """Depth of a garment inside bodies with overlapping bounds, pushing or not, and crossings of cloth.
@@ -220,7 +226,7 @@ class SceneFrame:
         cage = None if origin.state is not None else self._cage_walked(part)
         elapsed = origin.elapsed(self.frame.time, self.cloth.scene.seconds)
         while True:
-            touching = self.cloth.touching(part, frames, near)
+            touching = self.cloth.touching(part, frames, near, origin)
             moved = origin.moved(part, self.frame, near, self.cloth.scene.gravity)
             walked = None if cage is None else cage[0]
             given = FrameInput(frames, self.frame.time, touching, moved, walked=walked, elapsed=elapsed)

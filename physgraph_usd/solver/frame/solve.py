@@ -99,11 +99,11 @@ def solve_one_level(
     x, reports = _untangle(problem, view, view.begun(x))
     if smoothing is not None:
         x = view.moved(x, x + smoothing) if level.index else x
-        view, terms = view.terms(x)
+        terms = view.terms(x)
         x = view.moved(x, leave_saddle(problem.system(view, terms, x), level, x, outward=problem.outward))
     carry, last, terms, made, touched, integrator = None, None, (), 0, False, problem.integrator
     while not made or made < _most_steps(problem.budget, reports[-1], touched=touched):
-        view, terms = view.terms(x)
+        terms = view.terms(x)
         touched = touched or bool(terms)
         system = problem.system(view, terms, x, last=last)
         resume = carry if last is not None and system.has_same_metric(last) else None
@@ -136,7 +136,7 @@ def _untangle(problem: LevelProblem, view: LevelContact, x: Placed) -> tuple[Pla
     while len(reports) < (UNTANGLINGS if cold else WARM_UNTANGLINGS):
         if is_over() or not view.comes_apart(x, all_crossings=cold):
             break
-        view, terms = view.terms(x, all_crossings=cold)
+        terms = view.terms(x, all_crossings=cold)
         system = problem.system(view, terms, x)
         wanted, report = solve_level(system, problem.untangler, x, level=level.index, budget=short)
         x = view.drawn(x, wanted) if cold else view.moved(x, wanted)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..contact.bodies import Touching
@@ -63,7 +63,8 @@ class State:
         frames: Cage frames, columns are tangent, bitangent, normal, shape (C, 3, 3).
         held: Number of frames of a held pose.
         fine: Fine positions [m], world space, float64, to continue from; None before the first solve.
-        clean: Whether nothing crosses among the garments solved together.
+        clean: Whether nothing crosses, neither garments solved together nor bodies.
+        inside: Mask of the vertices inside a body, shape (V,); None if none is.
         bent: Remembered bends of the finest hinges of each garment [rad], shape (H,), None for a garment without
             memory; () if no garment has creases.
         creeps: Whether creases still change, so that equal input gives a different frame.
@@ -77,6 +78,7 @@ class State:
     held: int = 0
     fine: Float[Tensor, "vertices 3"] | None = None
     clean: bool = False
+    inside: Bool[Tensor, " vertices"] | None = None
     bent: tuple[Tensor | None, ...] = ()
     creeps: bool = False
     failures: int = 0
@@ -129,8 +131,12 @@ def join(parts: Sequence[State]) -> State:
     clean = all(part.clean for part in parts)
     creeps = any(part.creeps for part in parts)
     bent = tuple(each for part in parts for each in part.bent or (None,)) if any(part.bent for part in parts) else ()
+    inside = None
+    if any(part.inside is not None for part in parts):
+        masks = [(part, torch.zeros(len(part.detail), dtype=torch.bool, device=part.detail.device)) for part in parts]
+        inside = torch.cat([none if part.inside is None else part.inside for part, none in masks])
     failures, wait = (max(getattr(part, name) for part in parts) for name in ("failures", "wait"))
-    kept = {"fine": walked, "clean": clean, "bent": bent, "creeps": creeps, "failures": failures, "wait": wait}
+    kept = {"inside": inside, "fine": walked, "clean": clean, "bent": bent, "creeps": creeps, "failures": failures, "wait": wait}
     return State(*whole, held=min(part.held for part in parts), **kept)
 
 
@@ -149,6 +155,7 @@ def split(state: State, coarse: Sequence[slice], fine: Sequence[slice]) -> list[
             detail=state.detail[f],
             frames=state.frames[c],
             fine=None if state.fine is None else state.fine[f],
+            inside=None if state.inside is None else state.inside[f],
             bent=state.bent[place : place + 1],
         )
         for place, (c, f) in enumerate(zip(coarse, fine, strict=True))
