@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import cast
 
 import numpy as np
 import torch
@@ -95,6 +96,11 @@ class _Looked:
     inside: Tensor | None = None
 
 
+def _clean(x: Tensor) -> _Looked:
+    """Positions at which nothing crosses."""
+    return _Looked(x, x._version, Crossings.none(x.device), None)
+
+
 class ClothView:
     """One level's cloth and the bodies near it in one frame.
 
@@ -115,6 +121,7 @@ class ClothView:
         settings: ContactSettings,
         bodies: FrameBodies | None = None,
         seam: Seam | None = None,
+        is_clean: bool = False,
     ) -> None:
         """Take the frame.
 
@@ -126,12 +133,13 @@ class ClothView:
             settings: Contact settings, in SI.
             bodies: The bodies of the frame, or None.
             seam: Sewn vertices, which stay together; None without seams.
+            is_clean: Whether the upsampled cage is known to cross nothing.
         """
         self.keeps_sides = settings.cloth == "pairs" and bool(lasting.meets.any())
         self.mesh = lasting.mesh(level, seam, bodies, itself=self.keeps_sides)
         self._level, self._settings, self._thickness = level, settings, thickness
         self._base, self._seam, self.frame = base, seam, bodies
-        self._looked: _Looked | None = None
+        self._base_is_clean, self._looked = is_clean, cast("_Looked | None", None)
         self.came_near: bool | None = None
 
     @cached_property
@@ -146,7 +154,7 @@ class ClothView:
     @cached_property
     def _at_base(self) -> _Looked:
         """Crossings, tangles and vertices inside bodies of the upsampled cage that is followed."""
-        return self._found(self._base)
+        return _clean(self._base) if self._base_is_clean else self._found(self._base)
 
     @property
     def parts(self) -> Parts:
@@ -260,7 +268,7 @@ class ClothView:
 
     def remember(self, x: Float[Tensor, "vertices 3"]) -> None:
         """Record that nothing crosses at x [m], as after a safe move from positions where nothing does."""
-        self._looked = _Looked(x, x._version, Crossings.none(x.device), None)
+        self._looked = _clean(x)
 
     def terms(self, x: Float[Tensor, "vertices 3"], *, all_crossings: bool = False) -> tuple[SelfContact, ...]:
         """Contact forces with bodies and between near cloth, with crossings drawn apart; without those that are none.

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ..collide.crossings import Crossings, all_crossings, crossings
+from ..collide.crossings import Crossings, Pierced, all_crossings, crossings
 from ..deadline import is_over
 from ..forces.seam import Seam
 from ..forces.self_contact import SelfContact
@@ -129,12 +129,12 @@ class LevelContact:
 
     def out_of_bodies(self, x: Placed) -> tuple[Placed, int]:
         """Positions moved safely out of bodies [m], x itself if no vertex had to move, and the number of passes."""
-        passes, bodies = 0, self.cloth.bodies
-        for _ in range(PUSHES if bodies is not None else 0):
+        passes = 0
+        for _ in range(PUSHES):
             inside = self.cloth.inside(x)
-            if inside is None or bodies is None or is_over():
+            if inside is None or self.cloth.bodies is None or is_over():
                 break
-            out, more = bodies.pushed_out(x, inside)
+            out, more = self.cloth.bodies.pushed_out(x, inside)
             start, x, passes = x, self.moved(x, out), passes + more
             if torch.equal(start, x):
                 break
@@ -180,22 +180,22 @@ class FrameContact:
         return self._aimed[0]
 
     @cached_property
-    def _cage(self) -> tuple[ClothMesh, Crossings, LevelBodies | None, Tensor | None]:
-        """Mesh of the cage, its crossings, its view of the bodies, and its vertices inside each of them."""
+    def _cage(self) -> tuple[ClothMesh, Crossings, LevelBodies | None, Pierced | None, Tensor | None]:
+        """Mesh of the cage, its crossings, its view of the bodies, crossings with them, and its vertices inside each."""
         cage, bodies = self._levels[0], self._bodies
         mesh = self._cloth.mesh(cage, self._seam_at(cage), bodies, itself=self._settings.cloth == "pairs")
         if bodies is None:
-            return mesh, crossings(mesh.parts, self._coarse), None, None
+            return mesh, crossings(mesh.parts, self._coarse), None, None, None
         found, pierced = all_crossings(mesh.parts, torch.cat([self._coarse.double(), bodies.points]))
         view = LevelBodies(cage, bodies, mesh.pieces)
         inside = view.inside(self._coarse, pierced)
-        return mesh, found, view, inside if bool(inside.any()) else None
+        return mesh, found, view, pierced, inside if bool(inside.any()) else None
 
     @cached_property
     def _aimed(self) -> tuple[Float[Tensor, "coarse 3"], bool | None]:
         """The cage followed by the fine cloth, and True if the input has crossings."""
         cage, out, seam = self._levels[0], self._coarse, self._seam_at(self._levels[0])
-        mesh, found, bodies, inside = self._cage
+        mesh, found, bodies, _, inside = self._cage
         if bodies is not None and inside is not None:
             out = repaired_cage(cage, out, bodies=bodies, inside=inside, mesh=mesh)
         crosses = found.count > 0
@@ -207,7 +207,7 @@ class FrameContact:
     @property
     def depths(self) -> list[tuple[float, str]]:
         """As `LevelBodies.depths` of the cage; empty without bodies."""
-        _, _, bodies, inside = self._cage
+        _, _, bodies, _, inside = self._cage
         return [] if bodies is None else bodies.depths(self._coarse, inside)
 
     @property
@@ -221,10 +221,17 @@ class FrameContact:
             level = self._levels[level.index]
             seam, base = self._seam_at(level), level.base.apply(self.aim)
             own = {"base": base, "thickness": self._thickness, "settings": self._settings, "seam": seam}
-            cloth = ClothView(self._cloth, level, bodies=self._bodies, **own)
+            cloth = ClothView(self._cloth, level, bodies=self._bodies, is_clean=self._is_clean, **own)
             promise = Promise(cloth, FLOOR * float(self._thickness.min()))
             self._views[level.index] = LevelContact(cloth, seam, promise)
         return self._views[level.index]
+
+    @property
+    def _is_clean(self) -> bool:
+        """Whether the upsampled cage is known to cross nothing: its triangles lie in those of a cage that does not."""
+        cage, (_, found, _, pierced, inside) = self._levels[0], self._cage
+        has_quads = len(cage.membrane) > len(cage.triangles)
+        return not (has_quads or any(self._seams) or found.count or (pierced and pierced.count) or inside is not None)
 
     def _seam_at(self, level: Level) -> Seam | None:
         """The seam of a level."""

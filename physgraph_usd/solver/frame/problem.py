@@ -21,7 +21,7 @@ from ..level import Level, Placed
 from .creases import Creases, creases_of
 from .group import Group
 from .level_forces import LevelForces
-from .start import Start, start_of
+from .start import Start, start_of, torn
 from .values import Cage, FrameInput, State
 
 NEAR = 10.0
@@ -223,7 +223,7 @@ def begin(group: Group, frame: FrameInput, last: State | None) -> Problem:
     contact = group.contact(frame, cage)
     if contact is not None and last is not None and last.clean and before is not None:
         contact.at(group.levels[-1]).remember(before)
-    return Problem(
+    problem = Problem(
         began,
         group,
         frame,
@@ -238,3 +238,5 @@ def begin(group: Group, frame: FrameInput, last: State | None) -> Problem:
         tether=start.slowed * settings.tether if settings.temporal == "tether" else None,
         creases=None if start.detailed is None else creases,
     )
+    why = torn(forces[-1].level, problem.carried, cage.points) if problem.warm else ""
+    return replace(problem, start=Start(why), creases=None) if why else problem

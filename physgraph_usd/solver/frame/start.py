@@ -15,9 +15,9 @@ from .from_cage import MovingFrames
 from .settings import Reset
 from .values import Cage, State
 
-WORTH, LEAST_STRAIN, MOST_STRAIN = 2.0, 0.5, 1.0
-"""Limits of the 99th percentile of edge strain with carried detail. A frame starts cold above the first, relative to
-the upsampled cage's, if also above the second, and always above the third: a crumpled cage tears carried detail."""
+WORTH, LEAST_STRAIN = 2.0, 0.5
+"""Limits of the 99th percentile of edge strain with carried detail, relative to the upsampled cage's and absolute. Above
+both a frame starts cold: a crumpled cage tears carried detail."""
 STILL = 0.02
 """Largest motion of cage and bodies between samples, in mean cage edges, for a held pose: slow settling is visible in a
 held pose, so the cloth is slowed down."""
@@ -58,7 +58,7 @@ def start_of(
     moved: float = np.inf,
     pace: float = 1.0,
 ) -> Start:
-    """Carry the last frame's detail along, unless the cage jumped or carried detail would tear the cloth.
+    """Carry the last frame's detail along, unless the cage jumped.
 
     Args:
         state: State left by the last frame, or None for a cold start.
@@ -75,16 +75,26 @@ def start_of(
     detailed, motion, turn = frames.predict(shifted, cage.points)
     if motion > reset.move or turn > reset.turn:
         return Start(f"cold: the cage moved {motion:.3g} edges and turned {np.degrees(turn):.3g} degrees")
-    base = finest.base.apply(cage.points)
-    detailed = torch.where(finest.free, detailed, base)
-    carried, plain = (edge_strain(finest, x)["p99"] for x in (detailed, base))
-    if carried > min(max(WORTH * plain, LEAST_STRAIN), MOST_STRAIN):
-        return Start(f"cold: carried detail strains the cloth by {carried:.3g}, the upsampled cage by {plain:.3g}")
+    detailed = torch.where(finest.free, detailed, finest.base.apply(cage.points))
     moves = (cage.points - shifted.coarse).norm(dim=1)
     farthest = max(float(moves.max()) if len(moves) else 0.0, moved) / frames.edge
     held, slowed = slowing(state.held, farthest, pace)
     why = f"at rest: the pose has been held for {held} frames" if slowed >= SLOWEST else "warm"
     return Start(why, detailed, held, slowed)
+
+
+def torn(finest: Level, carried: Float[Tensor, "vertices 3"], cage: Float[Tensor, "coarse 3"]) -> str:
+    """Reason for a cold start in place of carried positions that would tear the cloth; empty if they would not.
+
+    Args:
+        finest: The finest level.
+        carried: Positions with the last frame's detail, moved there safely [m].
+        cage: Cage positions [m].
+    """
+    strain, plain = (edge_strain(finest, x)["p99"] for x in (carried, finest.base.apply(cage)))
+    if strain <= max(WORTH * plain, LEAST_STRAIN):
+        return ""
+    return f"cold: carried detail strains the cloth by {strain:.3g}, the upsampled cage by {plain:.3g}"
 
 
 def slowing(held: int, motion: float, pace: float = 1.0) -> tuple[int, float]:
