@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from .parts import Parts
@@ -53,20 +53,22 @@ class Pierced:
 
     Attributes:
         crossings: Edges of cloth or bodies and faces of bodies or cloth.
-        edge: Indices of the cloth's edges that pass through bodies, once for each face met, shape (N,).
         body: Number of the body of each, shape (N,).
-        counts: Number of crossings with each body, of its own edges through cloth too, shape (B,).
+        own: True for edges of the cloth, shape (N,).
     """
 
     crossings: Crossings
-    edge: Int[Tensor, " cut"]
-    body: Int[Tensor, " cut"]
-    counts: Int[Tensor, " bodies"]
+    body: Int[Tensor, " crossings"]
+    own: Bool[Tensor, " crossings"]
 
     @property
     def count(self) -> int:
         """Number of crossings."""
-        return int(self.counts.sum())
+        return self.crossings.count
+
+    def cut(self, body: int) -> Int[Tensor, " cut"]:
+        """Indices of the cloth's edges that pass through a body, once for each face met."""
+        return self.crossings.edge[self.own & (self.body == body)]
 
 
 def all_crossings(parts: Parts, x: Float[Tensor, "all 3"]) -> tuple[Crossings, Pierced]:
@@ -79,9 +81,7 @@ def all_crossings(parts: Parts, x: Float[Tensor, "all 3"]) -> tuple[Crossings, P
     edge, face = piercing_edges(parts, x).T.contiguous()
     edges, faces = (torch.tensor(each, device=x.device) for each in parts.starts)
     of_edge, of_face = torch.bucketize(edge, edges, right=True), torch.bucketize(face, faces, right=True)
-    own = (of_edge == 0) & (of_face == 0)
-    through = (of_edge == 0) & (of_face > 0)
-    body = torch.maximum(of_edge, of_face)
-    counts = torch.bincount(body, minlength=len(edges) + 1)[1:]
-    with_body = Crossings(edge[~own], face[~own])
-    return Crossings(edge[own], face[own]), Pierced(with_body, edge[through], of_face[through] - 1, counts)
+    with_body = (of_edge > 0) | (of_face > 0)
+    own, body = (of_edge == 0)[with_body], torch.maximum(of_edge, of_face)[with_body] - 1
+    pierced = Pierced(Crossings(edge[with_body], face[with_body]), body, own)
+    return Crossings(edge[~with_body], face[~with_body]), pierced

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import reduce
 
 import numpy as np
 import torch
@@ -24,6 +25,7 @@ from ..collide.crossings import Pierced
 from ..forces.self_contact import PairConstraints
 from ..level import Level
 from ..mesh.topology import joined_by, patches_with
+from .along import ApproachLimits, along
 from .measure import Penetration, is_between, penetration, pinched
 from .settings import ContactSettings
 
@@ -134,8 +136,7 @@ class LevelBodies:
             x: Positions [m].
             pierced: Crossings of cloth and bodies there.
         """
-        edges, bodies = pierced.edge, pierced.body
-        out = [self._inside(index, x, edges[bodies == index]) for index in range(len(self.frame.touching))]
+        out = [self._inside(index, x, pierced.cut(index)) for index in range(len(self.frame.touching))]
         return torch.stack(out) if out else self.level.free.T[:0]
 
     def _inside(self, index: int, x: Tensor, cut: Tensor) -> Bool[Tensor, " vertices"]:
@@ -174,47 +175,93 @@ class LevelBodies:
         return self.level.base.apply(side.unsqueeze(1).expand(-1, 3).contiguous())[:, 0].sign()
 
     def ways_out(
-        self, index: int, x: Float[Tensor, "vertices 3"], inside: Bool[Tensor, " vertices"]
-    ) -> tuple[Int[Tensor, " some"], Float[Tensor, "some 3"], Float[Tensor, " some"], Bool[Tensor, " some"]]:
-        """Shortest ways out of a body for the vertices inside.
+        self, index: int, x: Float[Tensor, "points 3"], side: Float[Tensor, " points"]
+    ) -> tuple[Float[Tensor, "points 3"], Float[Tensor, " points"], Bool[Tensor, " points"]]:
+        """Shortest ways out of a body from points inside.
 
         Args:
             index: Number of the body.
-            x: Positions [m].
-            inside: The vertices inside.
+            x: The points [m].
+            side: Allowed side of an open surface for each point, as for `side`.
 
         Returns:
-            The vertices; unit directions out; depths [m]; and a mask of pinched vertices, which stay.
+            Unit directions out, depths [m], and a mask of pinched points, which stay.
         """
-        which = torch.nonzero(inside).squeeze(1)
-        surface, at = self.frame.touching[index].surface, x[which] + self.frame.shifts[index]
+        surface, at = self.frame.touching[index].surface, x + self.frame.shifts[index]
         found = surface.closest(at, torch.full_like(at[:, 0], float("inf")))
         way = surface.exit(at, found) if surface.closed else found
-        lost = None if self.lost is None else self.lost[index][which]
         stays = ~way.distance.isfinite()
         if surface.closed:
-            stays |= pinched(found, way, longest=self.frame.longest, lost=lost)
-        outward = way.normal if surface.closed else way.normal * self.side(index)[which].unsqueeze(1)
+            stays |= pinched(found, way, longest=self.frame.longest)
+        outward = way.normal if surface.closed else way.normal * side.unsqueeze(1)
         direct = (way.point - at) / way.distance.clamp_min(ON_SURFACE).unsqueeze(1)
         normal = torch.where((way.distance > ON_SURFACE).unsqueeze(1), direct, outward)
-        return which, torch.nn.functional.normalize(normal, dim=1, eps=1e-30), way.distance, stays
+        return torch.nn.functional.normalize(normal, dim=1, eps=1e-30), way.distance, stays
 
-    def pulls(self, x: Float[Tensor, "vertices 3"], inside: Bool[Tensor, "bodies vertices"]) -> PairConstraints | None:
-        """Constraints that pull vertices out to their offsets; None if none is inside."""
+    def _vertices_out(
+        self, index: int, x: Tensor, inside: Tensor
+    ) -> tuple[Int[Tensor, " some"], Float[Tensor, "some 3"], Float[Tensor, " some"]]:
+        """The vertices inside a body that do not stay there, their ways out and depths [m]."""
+        which = torch.nonzero(inside).squeeze(1)
+        normal, depth, stays = self.ways_out(index, x[which], self.side(index)[which])
+        if self.lost is not None:
+            stays |= self.lost[index][which]
+        kept = torch.nonzero(~stays).squeeze(1)
+        return which[kept], normal[kept], depth[kept]
+
+    def pinched(
+        self, x: Float[Tensor, "vertices 3"], inside: Bool[Tensor, "bodies vertices"]
+    ) -> Bool[Tensor, " vertices"]:
+        """Mask of the vertices inside bodies that stay there."""
+        out = inside.any(dim=0)
+        for index, own in enumerate(inside):
+            out[self._vertices_out(index, x, own)[0]] = False
+        return out
+
+    def pulls(
+        self,
+        x: Float[Tensor, "vertices 3"],
+        inside: Bool[Tensor, "bodies vertices"],
+        chords: Chords | None = None,
+        *,
+        share: float = 1.0,
+    ) -> PairConstraints:
+        """Constraints that pull cloth inside bodies out to its offsets.
+
+        Args:
+            x: Positions [m].
+            inside: The vertices inside each body.
+            chords: Places inside on edges and faces whose corners are outside; None for none.
+            share: Fraction of the offsets.
+        """
         found = []
         for index, own in enumerate(inside):
-            if not bool(own.any()):
-                continue
-            which, normal, depth, stays = self.ways_out(index, x, own)
-            free = torch.nonzero(~stays).squeeze(1)
-            which, normal, depth = which[free], normal[free], depth[free]
-            corners = which.unsqueeze(1).expand(-1, 4).to(torch.int32).contiguous()
+            which, normal, depth = self._vertices_out(index, x, own)
+            corners = which.unsqueeze(1).expand(-1, 4)
             weight = torch.zeros_like(x[:1, :1]).repeat(len(which), 4)
             weight[:, 0] = 1.0
-            goal = (normal * x[which]).sum(dim=1) + depth + self.offset(index)[which]
-            stiffness = self.frame.settings.stiffness * self.level.vertex_area[which]
-            found.append(PairConstraints(corners, weight, normal.contiguous(), goal, stiffness))
-        return None if not found else found[0] if len(found) == 1 else _joined(found)
+            found.append((index, corners, weight, normal, depth))
+            if chords is None:
+                continue
+            some = torch.nonzero(chords.body == index).squeeze(1)
+            corners, weight = chords.corners[some], chords.weight[some]
+            at, side = (weight.unsqueeze(2) * x[corners]).sum(dim=1), self.side(index)[corners[:, 0]]
+            within = torch.nonzero(self._behind(index, at, corners[:, 0])).squeeze(1)
+            normal, depth, stays = self.ways_out(index, at[within], side[within])
+            within, normal, depth = within[~stays], normal[~stays], depth[~stays]
+            found.append((index, corners[within], weight[within], normal, depth))
+        made = [self._pull(x, *each, share=share) for each in found]
+        return reduce(PairConstraints.with_more, made)
+
+    def _pull(
+        self, x: Tensor, index: int, corners: Tensor, weight: Tensor, normal: Tensor, depth: Tensor, *, share: float
+    ) -> PairConstraints:
+        """Constraints that move points of the cloth along their ways out [m]."""
+        at = (weight.unsqueeze(2) * x[corners]).sum(dim=1)
+        goal = (normal * at).sum(dim=1) + depth + share * self.offset(index)[corners[:, 0]]
+        stiffness = self.frame.settings.stiffness * self.level.vertex_area[corners].amin(dim=1)
+        whole = (each.contiguous() for each in (weight, normal, goal, stiffness))
+        return PairConstraints(corners.to(torch.int32).contiguous(), *whole)
 
     def offset(self, index: int) -> Float[Tensor, " vertices"]:
         """Distance that each vertex keeps from a body [m]."""
@@ -222,31 +269,14 @@ class LevelBodies:
         return offset[self.level.vertex_garment.long()]
 
     def pushed_out(
-        self, x: Float[Tensor, "vertices 3"], inside: Bool[Tensor, "bodies vertices"]
-    ) -> tuple[Float[Tensor, "vertices 3"], int]:
-        """Positions with free vertices moved out of bodies to the clearance [m], body by body; and the passes.
-
-        Vertices that bodies push back and forth move by half steps at last, to the middle between the bodies.
-        """
-        out, most = x, self.frame.settings.projections
-        for attempt in range(2 * most):
-            share, moved = (0.5 if attempt >= most else 1.0), torch.zeros_like(x)
-            for index, own in enumerate(inside):
-                asked = own if not attempt else own & self._still_inside(index, out, own)
-                which, normal, depth, stays = self.ways_out(index, out, asked & self.level.free[:, 0])
-                push = depth + self.frame.settings.clearance * self.offset(index)[which]
-                moved[which] += share * torch.where(stays, torch.zeros_like(push), push).unsqueeze(1) * normal
-            if float(moved.abs().max()) < 1e-7:
-                return out, attempt
-            out = out + moved
-        return out, 2 * most
-
-    def _still_inside(self, index: int, x: Tensor, some: Tensor) -> Bool[Tensor, " vertices"]:
-        """Mask of those of some vertices that are inside a body, each asked for itself."""
-        out, which = torch.zeros_like(some), torch.nonzero(some).squeeze(1)
-        if len(which):
-            out[which] = self._behind(index, x[which], which)
-        return out
+        self, x: Float[Tensor, "vertices 3"], inside: Bool[Tensor, "bodies vertices"], chords: Chords | None = None
+    ) -> Float[Tensor, "vertices 3"]:
+        """Positions with cloth inside bodies moved out to the clearance [m]; arguments are as for `pulls`."""
+        out = self.pulls(x, inside, chords, share=self.frame.settings.clearance)
+        lack = out.penetration(x).double()
+        limits = ApproachLimits(out.corners, out.weight.double(), out.normal.double(), -lack)
+        free, threads = self.level.free, self.level.threads
+        return x + along(torch.zeros_like(x, dtype=torch.float64), limits, free=free, threads=threads).to(x)
 
     def losing(self, x: Float[Tensor, "vertices 3"], inside: Bool[Tensor, "bodies vertices"]) -> LevelBodies:
         """View that does not push out cloth between overlapping parts of a body at x [m] while the cloth stays inside.
@@ -311,16 +341,24 @@ class LevelBodies:
         self, index: int, x: Tensor, inside: Tensor | None, pierced: Pierced | None, *, lost: Tensor | None
     ) -> Penetration:
         own = torch.zeros_like(self.level.free[:, 0]) if inside is None else inside[index]
-        count, at = 0 if pierced is None else int(pierced.counts[index]), x + self.frame.shifts[index]
+        count, at = 0 if pierced is None else int((pierced.body == index).sum()), x + self.frame.shifts[index]
         known = {"longest": self.frame.longest, "lost": lost, "crossings": count}
         return penetration(self.frame.touching[index].surface, self.level, at, own, **known)
 
 
-def _joined(found: Sequence[PairConstraints]) -> PairConstraints:
-    out = found[0]
-    for each in found[1:]:
-        out = out.with_more(each)
-    return out
+@dataclass(frozen=True, eq=False)
+class Chords:
+    """Places inside bodies on edges and faces whose corners are outside: the middles of where they are pierced.
+
+    Attributes:
+        body: Number of the body, shape (N,).
+        corners: Vertices of the edge or face, the first one repeated, shape (N, 4).
+        weight: Weights of the vertices in the place, shape (N, 4).
+    """
+
+    body: Int[Tensor, " chords"]
+    corners: Int[Tensor, "chords 4"]
+    weight: Float[Tensor, "chords 4"]
 
 
 def _spread(piece: Int[np.ndarray, " vertices"]) -> tuple[np.ndarray, np.ndarray]:

@@ -25,12 +25,12 @@ from ..forces.seam import Seam
 from ..forces.self_contact import PairConstraints, SelfContact
 from ..level import Level
 from ..scene import Garment
-from .bodies import FrameBodies, LevelBodies
+from .bodies import Chords, FrameBodies, LevelBodies
 from .broad_phase import touch_one_another
 from .cloth_mesh import ClothMesh
 from .settings import ContactSettings
 from .springs import HALF, MARGIN, ClothSprings, NearSprings
-from .tangles import Tangles, gaps_out
+from .tangles import Tangles, chords_of, gaps_out
 
 TANGLED = 2
 """Rings around crossings within which cloth is promised only that the number of crossings does not grow."""
@@ -257,6 +257,24 @@ class ClothView:
         some = self.mesh.grown(self.mesh.crossed(looked.pierced.crossings), BESIDE)
         return self.padded(some if looked.inside is None else some | looked.inside.any(dim=0))
 
+    def in_bodies(self, x: Float[Tensor, "vertices 3"]) -> int:
+        """Number of vertices inside bodies, and of crossings with bodies, at x [m]."""
+        looked = self._look(x)
+        inside = 0 if looked.inside is None else int(looked.inside.sum())
+        return inside + (0 if looked.pierced is None else looked.pierced.count)
+
+    def _within(self, x: Tensor) -> tuple[Tensor, Chords]:
+        """The vertices inside each body, and the places inside on edges and faces whose corners are outside."""
+        looked, bodies = self._look(x), self.bodies
+        assert bodies is not None and looked.pierced is not None
+        none = torch.zeros((len(bodies.frame.touching), len(x)), dtype=torch.bool, device=x.device)
+        inside = none if looked.inside is None else looked.inside
+        return inside, chords_of(self.mesh, looked.pierced, self.with_bodies(x), inside)
+
+    def pushed_out(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
+        """As `LevelBodies.pushed_out`; x itself if no cloth is inside or through a body."""
+        return x if self.bodies is None or not self.in_bodies(x) else self.bodies.pushed_out(x, *self._within(x))
+
     def padded(self, some: Bool[Tensor, " vertices"] | None) -> Bool[Tensor, " all"] | None:
         """A mask of vertices with False for the bodies' corners."""
         return None if some is None else torch.nn.functional.pad(some, (0, len(self.corners)))
@@ -283,12 +301,8 @@ class ClothView:
         near = self._springs.find(at, near_parts(self.parts, at, self.near, inside=inside))
         with_body = near.near.corners.amax(dim=1) >= self._level.vertex_count
         pushes = self._springs.constraints(near.where(with_body), at, self._settings.stiffness)
-        if looked.inside is not None and self.bodies is not None:
-            pulls = self.bodies.pulls(x, looked.inside)
-            pushes = pushes if pulls is None else pushes.with_more(pulls)
-        if looked.pierced is not None and looked.pierced.count:
-            given = {"step": OUT * float(self._level.spacing.mean()), "stiffness": self._settings.stiffness}
-            pushes = pushes.with_more(gaps_out(self.mesh, looked.pierced.crossings, at, **given))
+        if self.in_bodies(x) and self.bodies is not None:
+            pushes = pushes.with_more(self.bodies.pulls(x, *self._within(x)))
         gaps = self._gaps(x, near.where(~with_body), at, all_crossings=all_crossings)
         found, tangles = looked.crossings, looked.tangles
         found = found if tangles is None or all_crossings else tangles.hopeful(found)

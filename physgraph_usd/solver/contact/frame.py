@@ -30,8 +30,6 @@ FLOOR = 0.06
 """Gap below which gaps shrink by at most a tenth a move, as a fraction of the thickness."""
 BLENDED = 4
 """Rings around an unresolved tangle over which the cloth blends back to its start."""
-PUSHES = 4
-"""Most rounds of pushing cloth out of bodies and moving it there safely."""
 Touch = SelfContact
 """A contact force term."""
 
@@ -128,16 +126,17 @@ class LevelContact:
         return self.promise.draw(x, self.closed(wanted))
 
     def out_of_bodies(self, x: Placed) -> tuple[Placed, int]:
-        """Positions moved safely out of bodies [m], x itself if no vertex had to move, and the number of passes."""
-        passes = 0
-        for _ in range(PUSHES):
-            inside = self.cloth.inside(x)
-            if inside is None or self.cloth.bodies is None or is_over():
+        """Positions moved safely out of bodies [m], x itself if no cloth had to move, and the number of passes.
+
+        A pass that leaves as much cloth in bodies is undone and ends them.
+        """
+        passes, left = 0, self.cloth.in_bodies(x)
+        while left and not is_over():
+            out = self.moved(x, self.cloth.pushed_out(x))
+            now = self.cloth.in_bodies(out)
+            if now >= left:
                 break
-            out, more = self.cloth.bodies.pushed_out(x, inside)
-            start, x, passes = x, self.moved(x, out), passes + more
-            if torch.equal(start, x):
-                break
+            x, left, passes = out, now, passes + 1
         return x, passes
 
 

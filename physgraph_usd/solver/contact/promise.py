@@ -97,31 +97,56 @@ class Promise:
         changed ends are checked again.
         """
         view, count = self.view, len(aim)
-        parts, end = view.parts, view.with_bodies(aim)
         begin = view.with_bodies(start) if since is None else torch.cat([start.double(), since.corners])
         label = None if tangle is None else torch.nn.functional.pad(tangle, (0, len(view.corners)), value=-1)
         inside = view.exempt(start) if since is None else view.padded(since.inside)
         options = _Options(floor=self.floor, tangle=label, inside=inside)
+        end = view.with_bodies(aim)
+        x, proved = self._on(begin, end, options, aim.dtype, halve=since is not None)
+        return Placed(aim if x is end else x[:count].to(aim)), proved
+
+    def _on(
+        self, begin: Tensor, end: Tensor, options: _Options, dtype: torch.dtype, *, halve: bool
+    ) -> tuple[Tensor, bool]:
+        """Positions after a move of cloth and bodies, and whether all pairs with bodies are proved apart.
+
+        Args:
+            begin: Positions of cloth and bodies [m], float64.
+            end: Wanted positions [m]; those of bodies are reached.
+            options: Options of the search.
+            dtype: Type to which positions of the cloth are rounded.
+            halve: Whether a move that is not proved is made in two halves: planes may turn once more.
+        """
+        view, parts, count = self.view, self.view.parts, self.view.parts.level.vertex_count
         moves = (end != begin).any(dim=1)
         met = blocking_pairs(parts, begin, end, **options, asked=moves)
         if not len(met.value):
-            return Placed(aim), True
-        ends, wanted, free = end, end - begin, torch.nn.functional.pad(moves[:count].unsqueeze(1) & parts.level.free, (0, 0, 0, len(end) - count))
+            return end, True
+        stand = not bool(moves[count:].any())
+        free = parts.level.free & moves[:count].unsqueeze(1) if stand else parts.level.free
+        free = torch.nn.functional.pad(free, (0, 0, 0, len(end) - count))
+        ends, wanted = end, end - begin
         planes = ApproachLimits.of(begin, ends, met, self.floor)
         for _ in range(ROUNDS):
             last, gone = ends, along(wanted, planes, free=free, threads=parts.level.threads)
-            cloth = view.closed((begin + gone)[:count].to(aim))
+            cloth = view.closed((begin + gone)[:count].to(dtype))
             ends = torch.cat([cloth.double(), end[count:]])
             met = blocking_pairs(parts, begin, ends, **options, asked=_corners(met, (ends != last).any(dim=1)))
             if not len(met.value):
-                return Placed(cloth), True
+                return ends, True
             planes = planes.joined(ApproachLimits.of(begin, ends, met, self.floor, corners=True))
-        stand = not bool(moves[count:].any())
+        if halve:
+            middle = 0.5 * (begin + end)
+            middle[:count] = view.closed(middle[:count].to(dtype)).double()
+            middle, first = self._on(begin, middle, options, dtype, halve=False)
+            ends, second = self._on(middle, end, options, dtype, halve=False)
+            return ends, first and second
         if not stand:  # Cloth that stays behind a body that moves on would be in the body.
+            options = _Options(**options)
             options["inside"] = torch.arange(len(moves), device=moves.device) < count
         asked = _corners(met, torch.zeros_like(moves))
-        moved = safe_move(begin, ends, parts, **options, asked=asked, dtype=aim.dtype)
-        return Placed(moved.x[:count].to(aim)), stand
+        moved = safe_move(begin, ends, parts, **options, asked=asked, dtype=dtype)
+        return moved.x, stand
 
 
 def _corners(met: Pairs, others: Bool[Tensor, " vertices"]) -> Bool[Tensor, " vertices"]:

@@ -44,11 +44,7 @@ def repaired_cage(
     Returns:
         Positions [m]; x itself if no vertex is pinched.
     """
-    held = torch.zeros_like(cage.free[:, 0])
-    for index, own in enumerate(inside):
-        which, _, _, stays = bodies.ways_out(index, x, own)
-        held[which] |= stays
-    held &= cage.free[:, 0]
+    held = bodies.pinched(x, inside) & cage.free[:, 0]
     if not bool(held.any()):
         return x
     some, seeds = ((each & cage.free[:, 0]).cpu().numpy() for each in (inside.any(dim=0), held))
@@ -56,7 +52,7 @@ def repaired_cage(
     around = mesh.grown(hidden, 1) & cage.free[:, 0]
     out = _membrane(x, hidden, mesh.beside)
     for _ in range(FAIRINGS):
-        out = bodies.pushed_out(_smoothed(out, around, mesh.beside), inside)[0]
+        out = bodies.pushed_out(_smoothed(out, around, mesh.beside), inside)
     return out
 
 

@@ -27,9 +27,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ..collide.crossings import Crossings
+from ..collide.crossings import Crossings, Pierced
 from ..forces.self_contact import PairConstraints
 from ..mesh.topology import joined_by
+from .bodies import Chords
 from .cloth_mesh import ClothMesh
 
 HOPELESS = 100
@@ -159,6 +160,35 @@ def gaps_out(
     here = (normal * (weight.unsqueeze(2) * x[corners]).sum(dim=1)).sum(dim=1)
     strength = stiffness * share * mesh.areas(corners)
     return mesh.anchored(corners.to(torch.int32), weight, normal, here + step * length, strength, x)
+
+
+def chords_of(
+    mesh: ClothMesh, pierced: Pierced, x: Float[Tensor, "all 3"], inside: Bool[Tensor, "bodies vertices"]
+) -> Chords:
+    """The middle of the crossings of each edge and face of the cloth whose corners are outside a body.
+
+    Args:
+        mesh: The cloth and the bodies.
+        pierced: Crossings of cloth and bodies at x.
+        x: Positions of cloth and bodies [m].
+        inside: The vertices inside each body.
+    """
+    _, place = ways_out(mesh, pierced.crossings, x)
+    edge, face = mesh.edges[pierced.crossings.edge], mesh.triangles[pierced.crossings.face]
+    own = pierced.own.unsqueeze(1)
+    corners = torch.where(own, edge[:, [0, 1, 0, 0]], face[:, [0, 1, 2, 0]])
+    along = torch.nn.functional.pad(torch.stack([1.0 - place[:, 0], place[:, 0]], dim=1), (0, 2))
+    weight = torch.where(own, along, torch.nn.functional.pad(place[:, 1:], (0, 1)))
+    number = torch.where(pierced.own, pierced.crossings.edge, pierced.crossings.face + len(mesh.edges))
+    key = number * len(inside) + pierced.body
+    keys, row = torch.unique(key, return_inverse=True)
+    mean = torch.zeros((len(keys), 4), dtype=weight.dtype, device=x.device)
+    mean = mean.index_put_((row,), weight, accumulate=True)
+    mean = mean / mean.sum(dim=1, keepdim=True)
+    first = torch.full_like(keys, len(key)).scatter_reduce(0, row, torch.arange(len(key), device=x.device), "amin")
+    body, corners = pierced.body[first], corners[first]
+    outside = ~inside[body.unsqueeze(1), corners].any(dim=1)
+    return Chords(body[outside], corners[outside], mean[outside].to(mesh.level.rest))
 
 
 def _barycentric(point: Tensor, p: Tensor, q: Tensor, r: Tensor) -> Float[Tensor, "points 3"]:

@@ -63,10 +63,10 @@ def solve_frame(group: Group, frame: FrameInput, last: State | None) -> Solved:
         broken = blame(group.garments, problem.forces[-1], problem.cage.points, error=error, at=frame.at)
         raise SolveError(broken) from error
     assert x is not None
-    left = state_left(problem, x)
-    shown, finish = scaled(problem, x), dict[str, object]()
+    finish = dict[str, object]()
     if problem.contact is not None:
-        shown, finish = problem.contact.finish(shown)
+        x, finish = problem.contact.finish(x)
+    left, shown = state_left(problem, x), scaled(problem, x)
     solved = time.perf_counter()
     telemetry = telemetry_of(problem, shown, module, reports=reports)
     contact, crossing = measured(problem, shown)
