@@ -371,6 +371,7 @@ def main() -> None:
     parser.add_argument("--kept", type=Path, help="Folder of Newton's problems and results, which are used again.")
     parser.add_argument("--jobs", type=int, default=2, help="Rows made at once.")
     given = parser.parse_args()
+    given.out.parent.mkdir(parents=True, exist_ok=True)
     fabrics, frames = (FABRICS[:1], 10) if given.short else (FABRICS, 24)
     foreign = product(NEWTON if given.newton else (), fabrics)
     tasks = [Task(*each, frames, given.newton, given.kept) for each in foreign]

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from bodies import Soup, box, tube
-from pxr import Sdf, UsdGeom
+from pxr import Sdf, Usd, UsdGeom
 from shots import refine
 from stages import COLLIDER_API, GARMENT_API, author, new_stage, save, vec3
 
@@ -53,6 +54,33 @@ def test_a_stage_across_its_bodies_is_told_with_an_option_that_mends_it(tmp_path
         assert f"</World/body> inside it stand along {axis}, but gravity is 9.81 m/s^2 towards -{up}" in each
         assert f"give --gravity -{axis}" in each
     assert warned(shot, gravity=f"-{axis}") == warned(shot, gravity=f"-{up}") == []
+
+
+def across(shot: Path, folder: Path) -> str:
+    """A stage that names the other up axis over a shot in metres."""
+    root = Sdf.Layer.CreateNew(str(folder / "across.usda"))
+    root.subLayerPaths.append(str(shot))
+    right = Usd.Stage.Open(str(shot))
+    over = Usd.Stage.Open(root)
+    UsdGeom.SetStageUpAxis(over, {"Y": "Z", "Z": "Y"}[UsdGeom.GetStageUpAxis(right)])
+    UsdGeom.SetStageMetersPerUnit(over, 1.0)
+    over.SetTimeCodesPerSecond(right.GetTimeCodesPerSecond())
+    root.Save()
+    return root.realPath
+
+
+def test_a_sample_on_a_stage_with_the_other_axis_is_told(sample: Callable[[str], Path], tmp_path: Path):
+    assert warned(str(sample("skirt"))) == []
+    (said,) = warned(across(sample("skirt"), tmp_path))
+    assert "give --gravity -Y" in said
+
+
+@pytest.mark.real_data
+def test_a_dress_whose_ruffles_face_up_on_a_stage_with_the_other_axis_is_told(real_data: Path, tmp_path: Path):
+    shot, named = real_data / "shots" / "04_tiered_dress_kick_zup.usdc", {"garments": ("/shot/tiered_dress",)}
+    assert warned(str(shot), **named) == []
+    (said,) = warned(across(shot, tmp_path), **named)
+    assert "give --gravity -Z" in said
 
 
 def test_garments_author_one_gravity_and_options_go_before(tmp_path: Path):

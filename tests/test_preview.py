@@ -78,6 +78,24 @@ def test_same_picture_in_every_unit_axis_and_winding(sample: Callable[[str], Pat
         assert np.abs(other - pictures[0]).mean() < 0.5
 
 
+@pytest.mark.parametrize("orientation", ["rightHanded", "leftHanded"])
+@pytest.mark.parametrize("scale", [1.0, -1.0])
+def test_quads_are_drawn_as_renderers_cut_them(tmp_path: Path, orientation: str, scale: float) -> None:
+    shot = tmp_path / "kite.usda"
+    stage = Usd.Stage.CreateNew(str(shot))
+    mesh = UsdGeom.Mesh.Define(stage, "/Kite")
+    points = np.array([[0, 0, 0], [1, 0, 0.2], [3, 3, 0], [0, 1, 0.2]], np.float32)
+    mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(points))
+    mesh.CreateFaceVertexCountsAttr([4])
+    mesh.CreateFaceVertexIndicesAttr([0, 1, 2, 3])
+    mesh.CreateOrientationAttr(orientation)
+    UsdGeom.XformCommonAPI(mesh).SetScale((scale, 1.0, 1.0))
+    stage.Save()
+    (drawn,) = DrawnStage(shot).meshes(None)
+    mirrored = (orientation == "leftHanded") != (scale < 0)
+    assert drawn.triangles.tolist() == ([[0, 3, 2], [0, 2, 1]] if mirrored else [[0, 1, 2], [0, 2, 3]])
+
+
 def test_skinned_mesh_moves(sample: Callable[[str], Path]) -> None:
     stage = DrawnStage(sample("tshirt"))
     times = stage.times(stage.garments())

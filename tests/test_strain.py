@@ -13,7 +13,8 @@ from shots import fine, refine, run, sample_times
 from stages import GARMENT_API, new_stage, save, vec3
 
 from physgraph_usd.shot.refine import inspect_shot
-from physgraph_usd.solver.strain import strayed
+from physgraph_usd.shot.warnings import of_strain
+from physgraph_usd.solver.strain import StrainedPart, strayed
 from physgraph_usd.usd.read.reader import open_shot
 from physgraph_usd.usd.read.rest import FITTED
 
@@ -86,6 +87,14 @@ def test_cloth_in_its_own_size_is_not_warned_of(tmp_path: Path, default: bool, a
     assert found["garments"][0]["strained"] == []
     assert not [warning for warning in found["warnings"] if "rest" in warning]
     assert "command" not in found
+
+
+@pytest.mark.parametrize("source", ["default points", f"{FITTED}: median edge lengths of 46 time codes"])
+def test_a_fitted_shape_is_not_asked_for_again_nor_one_of_a_frame(source: str):
+    (said,) = of_strain({SLEEVE: [StrainedPart("in its middle", 16, 1.19, 0.02)]}, source)
+    assert "author primvars:rest" in said
+    assert ("--rest auto" in said) == (source == "default points")
+    assert "--rest FRAME" not in said
 
 
 @pytest.mark.parametrize(("puff", "odd"), [(1.0, {}), (1.05, {}), (1.0, {1.0: 1.5, 7.0: 1.5})])

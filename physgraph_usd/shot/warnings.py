@@ -160,9 +160,9 @@ def of_strain(found: Mapping[str, Sequence[StrainedPart]], source: str) -> list[
         large = [part for part in parts if part.needs_rest]
         for part in large[:1]:
             named.append(f"<{path}> {part.area_ratio:.0%} of its area on {counted(part.faces, 'face')} {part.where}")
-    fitted = "give --rest FRAME of a frame in which they have their size, or author primvars:rest"
-    authored = "give --rest auto, or author primvars:rest in the cloth's own size"
-    remedy = fitted if source.startswith(FITTED) else authored
+    authored = "author primvars:rest in the cloth's own size"
+    # One frame's points hold more parts at another size than a shape fitted to all frames.
+    remedy = authored if source.startswith(FITTED) else f"give --rest auto, or {authored}"
     return [WARNINGS["strained"](source=source, parts=", ".join(named), remedy=remedy)] if named else []
 
 

@@ -130,6 +130,12 @@ class PolygonMesh:
         previous[self.next_corner] = np.arange(len(previous))
         return previous
 
+    @property
+    def mirrored_corners(self) -> np.ndarray:
+        """For each corner, the corner to take its place to reverse the winding, shape (C,), int64; first ones stay."""
+        start, size = self.starts[self.corner_face], self.counts[self.corner_face]
+        return start + (start - np.arange(len(self.indices))) % size
+
     @cached_property
     def half_edges(self) -> HalfEdges:
         """Edges of the faces, and the edge of each half-edge."""

@@ -157,10 +157,9 @@ def wound_alike(mesh: PolygonMesh, points: Float[np.ndarray, "vertices 3"]) -> P
     mixed[piece[label[:count] == label[count:]]] = False  # A Moebius strip has no two sides.
     sign = np.where(turned, -1.0, 1.0)
     turned ^= (np.bincount(piece, sign * _volumes(mesh, points, piece), 2 * count) < 0.0)[piece]
-    corner = np.arange(len(mesh.indices)) - mesh.starts[mesh.corner_face]
-    mirrored = mesh.starts[mesh.corner_face] + (mesh.counts[mesh.corner_face] - corner) % mesh.counts[mesh.corner_face]
     flips = (turned & mixed[piece])[mesh.corner_face]
-    return replace(mesh, indices=mesh.indices[np.where(flips, mirrored, np.arange(len(mesh.indices)))])
+    corners = np.where(flips, mesh.mirrored_corners, np.arange(len(mesh.indices)))
+    return replace(mesh, indices=mesh.indices[corners])
 
 
 def _lowest(count: int, links: np.ndarray) -> np.ndarray:

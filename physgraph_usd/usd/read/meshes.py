@@ -29,10 +29,12 @@ NEUTRAL = (0.55, 0.54, 0.52)
 class DrawnMesh:
     """One visible mesh at one time.
 
+    Polygons are drawn as renderers draw them, and as the solver solves refined cloth: as fans from the first corner.
+
     Attributes:
         path: Prim path.
         points: World positions [m], Y up, shape (V, 3).
-        mesh: The polygons, counter-clockwise seen from outside.
+        mesh: The polygons, counter-clockwise seen from outside, starting at the authored first corner.
         face_colors: Linear RGB per polygon, shape (F, 3).
     """
 
@@ -43,7 +45,7 @@ class DrawnMesh:
 
     @cached_property
     def _split(self) -> TriangleSplit:
-        return self.mesh.triangulate(self.points)
+        return self.mesh.triangulate()
 
     @property
     def triangles(self) -> np.ndarray:
@@ -192,12 +194,11 @@ def _read(mesh: UsdGeom.Mesh, code: Usd.TimeCode, matrix: np.ndarray) -> DrawnMe
     )
     if not usable or not np.isfinite(positions).all():
         return None
+    polygons = PolygonMesh(counts, indices, len(positions))
     left = mesh.GetOrientationAttr().Get(code) == "leftHanded"
     # Use the determinant's sign only: the cube of a scale can overflow.
     if left != (np.linalg.slogdet(matrix[:3, :3])[0] < 0):
-        ends = np.cumsum(counts)
-        indices = indices[np.repeat(2 * ends - counts - 1, counts) - np.arange(len(indices))]
-    polygons = PolygonMesh(counts, indices, len(positions))
+        polygons = replace(polygons, indices=polygons.indices[polygons.mirrored_corners])
     return DrawnMesh(str(mesh.GetPath()), positions, polygons, _colors(mesh, code, len(counts)))
 
 
