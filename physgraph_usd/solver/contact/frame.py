@@ -30,6 +30,8 @@ FLOOR = 0.06
 """Gap below which gaps shrink by at most a tenth a move, as a fraction of the thickness."""
 BLENDED = 4
 """Rings around an unresolved tangle over which the cloth blends back to its start."""
+STALLED = 4
+"""Most passes of moving cloth out of bodies that get no more out."""
 Touch = SelfContact
 """A contact force term."""
 
@@ -128,16 +130,15 @@ class LevelContact:
     def out_of_bodies(self, x: Placed) -> tuple[Placed, int]:
         """Positions moved safely out of bodies [m], x itself if no cloth had to move, and the number of passes.
 
-        A pass that leaves as much cloth in bodies is undone and ends them.
+        Passes end once `STALLED` of them in a row left as much cloth in bodies; the best positions stay.
         """
-        passes, left = 0, self.cloth.in_bodies(x)
-        while left and not is_over():
-            out = self.moved(x, self.cloth.pushed_out(x))
-            now = self.cloth.in_bodies(out)
-            if now >= left:
-                break
-            x, left, passes = out, now, passes + 1
-        return x, passes
+        best, left, passes, stalled = x, self.cloth.in_bodies(x), 0, 0
+        while left and stalled < STALLED and not is_over():
+            x, passes, stalled = self.moved(x, self.cloth.pushed_out(x)), passes + 1, stalled + 1
+            now = self.cloth.in_bodies(x)
+            if now < left:
+                best, left, stalled = x, now, 0
+        return best, passes
 
 
 class FrameContact:
