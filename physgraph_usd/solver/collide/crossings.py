@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from .parts import Parts
@@ -36,12 +36,15 @@ class Crossings:
         return Crossings(empty, empty)
 
 
-def crossings(parts: Parts, x: Float[Tensor, "vertices 3"]) -> Crossings:
+def crossings(
+    parts: Parts, x: Float[Tensor, "vertices 3"], asked: Bool[Tensor, " vertices"] | None = None
+) -> Crossings:
     """All edges that pass through a face to which they are neither connected nor sewn.
 
     Args:
         parts: The parts.
         x: Positions [m].
+        asked: Mask of vertices; each crossing has one of these among its corners. All vertices when None.
     """
-    edge, face = piercing_edges(parts, x).T
+    edge, face = piercing_edges(parts, x, asked).T
     return Crossings(edge, face)

@@ -59,10 +59,12 @@ def find_clusters(
     count[i] = n
 
 
-def near_parts(parts: Parts, x: Float[Tensor, "vertices 3"], reach: Reach) -> Pairs:
-    """All near pairs at x [m]."""
+def near_parts(
+    parts: Parts, x: Float[Tensor, "vertices 3"], reach: Reach, *, asked: Bool[Tensor, " vertices"] | None = None
+) -> Pairs:
+    """All near pairs at x [m] with at least one vertex of a mask; of all vertices when None."""
     radius, play = reach.radius.double(), reach.play.double()
-    return _search(parts, query_of(x.double(), kind=NEAR, radius=radius, play=play, half=reach.half))
+    return _search(parts, query_of(x.double(), kind=NEAR, radius=radius, play=play, half=reach.half, asked=asked))
 
 
 def blocking_pairs(
@@ -90,9 +92,15 @@ def blocking_pairs(
     return _search(parts, query)
 
 
-def piercing_edges(parts: Parts, x: Float[Tensor, "vertices 3"]) -> Int[Tensor, "crossings 2"]:
-    """Indices of each edge and face that cross at x [m], sorted."""
-    found = _search(parts, query_of(x.double(), kind=CROSSING)).corners[:, :2].long()
+def piercing_edges(
+    parts: Parts, x: Float[Tensor, "vertices 3"], asked: Bool[Tensor, " vertices"] | None = None
+) -> Int[Tensor, "crossings 2"]:
+    """Indices of each edge and face that cross at x [m], sorted; if asked, those with a vertex of a mask."""
+    found = _search(parts, query_of(x.double(), kind=CROSSING, asked=asked)).corners[:, :2].long()
+    if asked is not None:
+        level = parts.level
+        corners = torch.cat([level.edges[found[:, 0]], level.triangles[found[:, 1]]], dim=1).long()
+        found = found[asked[corners].any(dim=1)]
     return found[torch.argsort(found[:, 0] * max(len(parts.level.triangles), 1) + found[:, 1])]
 
 

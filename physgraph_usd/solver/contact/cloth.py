@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
@@ -26,12 +27,7 @@ from .broad_phase import touch_one_another
 from .cloth_mesh import ClothMesh
 from .settings import ContactSettings
 from .springs import HALF, MARGIN, ClothSprings
-from .tangles import Tangles, gaps_out
-
-TANGLED = 2
-"""Rings around crossings within which cloth is promised only that the number of crossings does not grow."""
-OUT = 0.5
-"""Distance by which crossing parts move past one another in a round, in mean edges."""
+from .tangles import OUT, Tangles, gaps_out
 
 
 class ClothContact:
@@ -79,6 +75,8 @@ class ClothView:
 
     Attributes:
         mesh: The level's mesh, sewn as in this frame.
+        given_up: Mask of the vertices of tangles that are given up, None without such tangles. Parts whose vertices are
+            all given up are not searched for contact or crossings.
         keeps_sides: True if moves are promised to add no crossings.
         came_near: True if parts were near one another in any call of `term`; None before the first call.
     """
@@ -92,6 +90,7 @@ class ClothView:
         thickness: Float[Tensor, " garments"],
         settings: ContactSettings,
         seam: Seam | None = None,
+        given_up: Bool[Tensor, " vertices"] | None = None,
     ) -> None:
         """Take the frame.
 
@@ -102,7 +101,9 @@ class ClothView:
             thickness: Thickness of each garment [m].
             settings: Contact settings, in SI.
             seam: Sewn vertices, which stay together; None without seams.
+            given_up: As the attribute.
         """
+        self.given_up = given_up
         self.mesh, self.keeps_sides = lasting.mesh(level, seam), settings.cloth == "pairs"
         self._lasting, self._level, self._settings, self._thickness = lasting, level, settings, thickness
         self._base, self._seam = base, seam
@@ -135,50 +136,51 @@ class ClothView:
         thickness = 0.5 * self._thickness.double()[self._level.vertex_garment.long()]
         return Reach(thickness + play, play, HALF)
 
+    @property
+    def asked(self) -> Bool[Tensor, " vertices"] | None:
+        """Mask of the vertices that are not given up; None for all."""
+        return None if self.given_up is None else ~self.given_up
+
     def crossings(self, x: Float[Tensor, "vertices 3"]) -> Crossings:
-        """Crossings at x [m]; cached for the same tensor until its version changes."""
+        """Crossings at x [m], without given-up cloth; cached for the same tensor until its version changes."""
         return self._look(x).crossings
 
     def _look(self, x: Tensor) -> _Looked:
         """Cached crossings and tangles at x."""
         if self._looked is None or self._looked.x is not x or self._looked.version != x._version:
-            found = crossings(self.parts, x)
-            corners = self.mesh.corners_of(found)
-            tangles = Tangles.find(self.mesh, corners, rings=TANGLED) if found.count else None
+            found = crossings(self.parts, x, self.asked)
+            lost = torch.zeros_like(self.mesh.level.free[:, 0]) if self.given_up is None else self.given_up
+            tangles = Tangles.find(self.mesh, found, lost) if found.count or self.given_up is not None else None
             self._looked = _Looked(x, x._version, found, tangles)
         return self._looked
 
     def tangles(self, x: Float[Tensor, "vertices 3"]) -> Tangles | None:
-        """Tangles at x [m]: crossings and the cloth around them; None without crossings."""
+        """Tangles at x [m]: crossings and the cloth around them; None without crossings and given-up cloth."""
         return self._look(x).tangles
 
-    def remember(self, x: Float[Tensor, "vertices 3"]) -> None:
-        """Record that x [m] has no crossings, as after a safe move from positions without crossings."""
-        self._looked = _Looked(x, x._version, Crossings.none(x.device), None)
+    def remember(self, x: Float[Tensor, "vertices 3"], given_up: Tangles | None = None) -> None:
+        """Record that x [m] has no crossings outside given-up tangles, as after a safe move from such positions."""
+        self._looked = _Looked(x, x._version, Crossings.none(x.device), given_up)
 
-    def term(self, x: Float[Tensor, "vertices 3"], *, all_crossings: bool = False) -> SelfContact | None:
-        """Contact force between near parts, with crossings drawn apart; None if no parts are near.
-
-        Args:
-            x: Positions [m].
-            all_crossings: True also draws hopeless tangles apart.
-        """
+    def term(self, x: Float[Tensor, "vertices 3"]) -> SelfContact | None:
+        """Contact force between near parts at x [m], with crossings drawn apart; None if no parts are near."""
         found, tangles = self.crossings(x), self.tangles(x)
-        gaps = self._gaps(x, found, all_crossings=all_crossings)
-        found = found if tangles is None or all_crossings else tangles.hopeful(found)
+        gaps = self._gaps(x, found)
+        found = found if tangles is None else tangles.hopeful(found)
         if found.count:
             step, stiffness = OUT * float(self._level.spacing.mean()), self._settings.cloth_stiffness
             gaps = gaps.with_more(gaps_out(self.mesh, found, x, step=step, stiffness=stiffness))
         self.came_near = bool(self.came_near) or len(gaps.corners) > 0
         return SelfContact(self._level, gaps) if len(gaps.corners) else None
 
-    def _gaps(self, x: Tensor, found: Crossings, *, all_crossings: bool) -> PairConstraints:
+    def _gaps(self, x: Tensor, found: Crossings) -> PairConstraints:
         """Springs between all near parts that do not cross."""
-        near = self._springs.find(x, near_parts(self.parts, x, self.near))
-        if found.count:
-            corners, tangles = near.near.corners.long(), self.tangles(x)
+        near = self._springs.find(x, near_parts(self.parts, x, self.near, asked=self.asked))
+        tangles = self.tangles(x)
+        if tangles is not None:
+            corners = near.near.corners.long()
             kept = ~self.mesh.crossed(found)[corners].any(dim=1)
-            kept &= tangles is None or all_crossings or ~tangles.given_up[corners].all(dim=1)
+            kept &= ~tangles.given_up[corners].all(dim=1)
             near = near.where(kept)
         return self._springs.constraints(near)
 
@@ -193,10 +195,13 @@ class ClothView:
             before: The upsampled cage [m]; None if it is known not to cross.
             x: The result [m].
         """
-        found = self.crossings(x)
+        kept, tangles = self.crossings(x), self.tangles(x)
+        kept = kept if tangles is None else tangles.hopeful(kept)
+        found = kept if self.given_up is None else crossings(self.parts, x)
         first = Crossings.none(x.device) if before is None else crossings(self.parts, before)
         said = {
             name: {"crossings": each.count, "between_garments": int(np.triu(self.mesh.between(each), 1).sum())}
             for name, each in (("before", first), ("after", found))
         }
+        said["after"]["given_up"] = found.count - kept.count
         return said, self.mesh.crossed(found)

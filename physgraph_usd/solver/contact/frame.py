@@ -6,11 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ..collide.crossings import crossings
+from ..collide.crossings import Crossings, crossings
 from ..deadline import is_over
 from ..forces.contact import Contact
 from ..forces.seam import Seam
@@ -21,16 +22,16 @@ from ..level import Level, Placed, unhindered
 from .apart import drawn_apart
 from .bodies import FrameBodies, LevelBodies
 from .cloth import ClothContact, ClothView
+from .cloth_mesh import ClothMesh
 from .metric import HeldMetric
 from .promise import Promise
-from .push_out import moves, projected
+from .push_out import moves, projected, pushed_out
 from .repair import repaired_cage
 from .settings import ContactSettings
+from .tangles import Tangles
 
 FLOOR = 0.06
 """Gap below which gaps shrink by at most a tenth a move, as a fraction of the thickness."""
-BLENDED = 4
-"""Rings around an unresolved tangle over which the cloth blends back to its start."""
 PUSHES = 4
 """Most rounds of pushing cloth out of bodies and moving it there safely."""
 Touch = Contact | SelfContact
@@ -75,10 +76,10 @@ class LevelContact:
         """True if cloth crosses cloth at positions x [m] and the cloth has a promise."""
         return self.promise is not None and self.promise.view.crossings(x).count > 0
 
-    def comes_apart(self, x: Float[Tensor, "vertices 3"], *, all_crossings: bool = False) -> bool:
-        """True if x has crossings in hopeful tangles; with `all_crossings`, in any tangle."""
+    def comes_apart(self, x: Float[Tensor, "vertices 3"]) -> bool:
+        """True if x has crossings in hopeful tangles."""
         tangles = None if self.promise is None else self.promise.view.tangles(x)
-        return tangles is not None and (all_crossings or not bool(tangles.hopeless.all()))
+        return tangles is not None and not bool(tangles.hopeless.all())
 
     def begun(self, x: Float[Tensor, "vertices 3"]) -> Placed:
         """Start positions of a level [m], seams closed. Crossings here come from the input or from the level below."""
@@ -86,39 +87,21 @@ class LevelContact:
 
     def laid_back(self, x: Placed) -> Placed:
         """Positions with cut-off pieces moved back to their side of the cloth [m], if fewer parts cross then."""
-        if self.promise is None or not self.crosses(x):
+        if self.promise is None or not self.comes_apart(x):
             return x
         view = self.promise.view
-        out = drawn_apart(view.mesh, x, view.crossings(x), gap=view.gap)[0]
+        out = drawn_apart(view.mesh, x, view.crossings(x), gap=view.gap, asked=view.asked)[0]
         return x if out is x else Placed(self.closed(out))
-
-    def without_hope(self, x: Placed, start: Placed) -> Placed:
-        """Positions x [m] with hopeless tangles moved back to the start, blended over the rings around the tangle."""
-        tangles = None if self.promise is None else self.promise.view.tangles(x)
-        if self.promise is None or tangles is None or not bool(tangles.hopeless.any()):
-            return x
-        mesh, back = self.promise.view.mesh, tangles.given_up
-        share = back.to(x)
-        for ring in range(BLENDED):
-            wider = mesh.grown(back, 1)
-            share = torch.where(wider & ~back, 1.0 - (ring + 1.0) / (BLENDED + 1.0), share)
-            back = wider
-        return self.drawn(x, x + share.unsqueeze(1) * (start - x))
 
     def remember(self, x: Float[Tensor, "vertices 3"]) -> None:
         """As `ClothView.remember`, if there is a promise."""
         if self.promise is not None:
             self.promise.view.remember(x)
 
-    def terms(
-        self, x: Float[Tensor, "vertices 3"], *, all_crossings: bool = False
-    ) -> tuple[LevelContact, tuple[Touch, ...]]:
-        """The view from positions x [m], and the contact forces there, empty without contact.
-
-        Other arguments are as for `ClothView.term`.
-        """
+    def terms(self, x: Float[Tensor, "vertices 3"]) -> tuple[LevelContact, tuple[Touch, ...]]:
+        """The view from positions x [m], and the contact forces there, empty without contact."""
         seen, body = (None, None) if self.bodies is None else self.bodies.seen(x)
-        cloth = None if self.cloth is None else self.cloth.term(x, all_crossings=all_crossings)
+        cloth = None if self.cloth is None else self.cloth.term(x)
         return replace(self, bodies=seen), tuple(term for term in (body, cloth) if term is not None)
 
     def closed(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
@@ -136,11 +119,16 @@ class LevelContact:
         return unhindered(wanted) if self.promise is None else self.promise.draw(x, wanted)
 
     def out_of_bodies(self, x: Placed) -> tuple[Placed, int]:
-        """Positions moved safely out of bodies [m], x itself if no vertex had to move, and the number of passes."""
+        """Positions moved safely out of bodies [m], x itself if no vertex had to move, and the number of passes.
+
+        Faces are not lifted over corners of bodies if all cloth is given up: lifts of layers that cross never end.
+        """
         passes, bodies = 0, self.bodies
+        lost = None if self.cloth is None else self.cloth.given_up
+        push = projected if lost is None or not bool(lost.all()) else pushed_out
         for _ in range(PUSHES if bodies is not None else 0):
             assert bodies is not None
-            bodies, out, more = projected(bodies, x)
+            bodies, out, more = push(bodies, x)
             start, x, passes = x, self.moved(x, out), passes + more
             if out is start or x is out or is_over():
                 break
@@ -160,6 +148,7 @@ class FrameContact:
         thickness: Sequence[float],
         settings: ContactSettings,
         seams: Sequence[Seam | None] = (),
+        lost: Bool[Tensor, " coarse"] | None = None,
     ) -> None:
         """Take the frame.
 
@@ -171,7 +160,9 @@ class FrameContact:
             thickness: Thickness of each garment's cloth [m].
             settings: Contact settings, with the stiffness in SI.
             seams: The seam of each level, None for a level without seams; () for no seams at all.
+            lost: Mask of the cage's vertices that the last frame gave up; None for none.
         """
+        self._lost = lost
         self._levels, self._coarse, self._settings = tuple(levels), coarse, settings
         self._bodies, self._cloth, self._seams = bodies, cloth, seams
         self._thickness = torch.tensor(thickness, dtype=coarse.dtype, device=coarse.device)
@@ -185,23 +176,40 @@ class FrameContact:
         """
         return self._aimed[0]
 
+    @property
+    def given_up(self) -> Bool[Tensor, " coarse"] | None:
+        """Mask of the cage's vertices in tangles that are given up; None without such tangles."""
+        return self._aimed[2]
+
     @cached_property
-    def _aimed(self) -> tuple[Float[Tensor, "coarse 3"], bool | None]:
-        """The cage followed by the fine cloth, and True if the input has crossings, None if not searched."""
-        cage, out, crosses = self._levels[0], self._coarse, None
+    def _aimed(self) -> tuple[Float[Tensor, "coarse 3"], bool | None, Bool[Tensor, " coarse"] | None]:
+        """The cage to follow [m], True if the input has crossings or None if not searched, and `given_up`."""
+        cage, out, crosses, lost = self._levels[0], self._coarse, None, None
         if self._cloth is None:
-            return out, crosses
+            return out, crosses, lost
         seam = self._seam_at(cage)
         mesh = self._cloth.mesh(cage, seam)
         if self._bodies is not None:
             out = repaired_cage(cage, out, bodies=self._bodies.at(cage, self._levels[-1]), mesh=mesh)
         if self._settings.cloth == "pairs":
             found = crossings(mesh.parts, out)
-            gap = float(self._thickness.mean())
-            apart, left = drawn_apart(mesh, out, found, gap=gap)
             crosses = found.count > 0 if out is self._coarse else None
-            out = apart if found.count and not left else out
-        return (out if seam is None or out is self._coarse else seam.closed(out)), crosses
+            if found.count:
+                tangles = Tangles.find(mesh, found, torch.zeros_like(cage.free[:, 0]))
+                lost = tangles.giving_up(self._lost)
+                lost = lost if bool(lost.any()) else None
+            out = self._drawn_apart(mesh, out, found, None if lost is None else ~lost)
+        return (out if seam is None or out is self._coarse else seam.closed(out)), crosses, lost
+
+    def _drawn_apart(
+        self, mesh: ClothMesh, x: Tensor, found: Crossings, asked: Bool[Tensor, " coarse"] | None
+    ) -> Float[Tensor, "coarse 3"]:
+        """The cage [m] without its crossings at vertices that are not given up, if all these can be removed."""
+        if asked is not None:
+            kept = asked[mesh.corners_of(found)].any(dim=1)
+            found = Crossings(found.edge[kept], found.face[kept])
+        apart, left = drawn_apart(mesh, x, found, gap=float(self._thickness.mean()), asked=asked)
+        return apart if found.count and not left else x
 
     @property
     def depths(self) -> list[tuple[float, str]]:
@@ -211,8 +219,10 @@ class FrameContact:
     @cached_property
     def crossed(self) -> bool:
         """True if the cage crosses itself."""
-        cage, known = self._levels[0], self._aimed[1]
-        return self.at(cage).crosses(cage.base.apply(self._coarse)) if known is None else known
+        cage, (_, known, lost) = self._levels[0], self._aimed
+        if known is None:
+            return lost is not None or self.at(cage).crosses(cage.base.apply(self._coarse))
+        return known
 
     def at(self, level: Level) -> LevelContact:
         """The cached view of one level. Distances at rest use the rest shape without ease."""
@@ -225,10 +235,18 @@ class FrameContact:
             cloth = promise = None
             if self._cloth is not None:
                 own = {"base": base, "thickness": self._thickness, "settings": self._settings, "seam": seam}
+                own["given_up"] = self._given_up_at(level)
                 cloth = ClothView(self._cloth, level, **own)
                 promise = Promise(cloth, FLOOR * float(self._thickness.min())) if cloth.keeps_sides else None
             self._views[level.index] = LevelContact(bodies, cloth, seam, promise)
         return self._views[level.index]
+
+    def _given_up_at(self, level: Level) -> Bool[Tensor, " vertices"] | None:
+        """Mask of a level's vertices that depend only on given-up vertices of the cage."""
+        if self.given_up is None:
+            return None
+        kept = level.from_coarse @ (~self.given_up).cpu().numpy().astype(np.float64)
+        return torch.as_tensor(kept == 0.0, device=level.device)
 
     @property
     def _is_clean(self) -> bool:

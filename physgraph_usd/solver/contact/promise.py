@@ -49,9 +49,9 @@ class Promise:
         grow.
         """
         tangles = self.view.tangles(start)
-        if tangles is None:
-            x = self._go(start, wanted, None)
-            self.view.remember(x)
+        if tangles is None or bool(tangles.hopeless.all()):
+            x = self._go(start, wanted, None if tangles is None else tangles.label)
+            self.view.remember(x, tangles)
             return x
         free = tangles.label.clone()
         x = self._go(start, wanted, free)
@@ -87,8 +87,8 @@ class Promise:
         """
         parts = self.view.parts
         options = _MoveOptions(floor=self.floor, tangle=tangle)
-        moves = (aim != start).any(dim=1)
-        met = blocking_pairs(parts, start, aim, **options, asked=moves)
+        moves, asked = (aim != start).any(dim=1), self.view.asked
+        met = blocking_pairs(parts, start, aim, **options, asked=moves if asked is None else asked)
         if not len(met.value):
             return Placed(aim)
         at, ends = start.double(), aim

@@ -63,13 +63,15 @@ def state_left(problem: Problem, x: Placed) -> State:
     stored = problem.group.moving_frames.store(cage.points, x)
     fine = x.double() + torch.as_tensor(cage.origin).to(x.device)
     lasts = problem.group.settings.temporal != "off"
-    clean = view is not None and not view.crosses(x)
+    lost = None if problem.contact is None else problem.contact.given_up
+    clean = view is not None and lost is None and not view.crosses(x)
     return replace(
         stored,
         coarse=torch.as_tensor(cage.world),
         held=problem.start.held,
         fine=fine,
         clean=clean,
+        given_up=lost,
         bent=() if problem.creases is None else problem.creases.split(problem.forces[-1].level),
         creeps=lasts and keeps_creases(problem.frame) and not problem.start.rests,
     )

@@ -14,6 +14,7 @@ from torch import Tensor
 from ...errors import SolveError
 from ..contact.frame import LevelContact
 from ..contact.metric import SMOOTH, HeldMetric
+from ..contact.tangles import ROUNDS
 from ..deadline import is_over
 from ..forces.base import ForceModule
 from ..integrate.base import Carry, System
@@ -33,8 +34,8 @@ MOST, TOUCHING = 40, 3
 """Most steps of a level with contact: a multiple of the budget's, at most `MOST`, or the budget's if larger."""
 FEWER = 1.0 / 3.0
 """Fraction of the steps after which a warm frame in contact may finish, if near rest: one round."""
-UNTANGLINGS, WARM_UNTANGLINGS = 25, 4
-"""Most untangling rounds: at the cage in a cold frame, and in a warm frame."""
+WARM_ROUNDS = 4
+"""Most untangling rounds of a warm frame, or of a level finer than the cage."""
 
 
 def solve_frame(group: Group, frame: FrameInput, last: State | None) -> Solved:
@@ -129,19 +130,19 @@ def solve_one_level(
 def _untangle(problem: LevelProblem, view: LevelContact, x: Placed) -> tuple[Placed, list[LevelReport]]:
     """Rounds of few steps to shorten intersection contours: at the cage, and for crossings left from before."""
     level, budget = problem.level, problem.budget
-    cold, start = level.index == 0, x
+    cold = level.index == 0
     x = view.laid_back(x) if cold else x
     reports: list[LevelReport] = []
     short = replace(budget, steps=min(STEPS, budget.steps), tolerance=0.0, extra=0, least=0)
-    while len(reports) < (UNTANGLINGS if cold else WARM_UNTANGLINGS):
-        if is_over() or not view.comes_apart(x, all_crossings=cold):
+    while len(reports) < (ROUNDS if cold else WARM_ROUNDS):
+        if is_over() or not view.comes_apart(x):
             break
-        view, terms = view.terms(x, all_crossings=cold)
+        view, terms = view.terms(x)
         system = problem.system(view, terms, x)
         wanted, report = solve_level(system, problem.untangler, x, level=level.index, budget=short)
         x = view.drawn(x, wanted) if cold else view.moved(x, wanted)
         reports.append(report)
-    return view.without_hope(x, start) if cold else x, reports
+    return x, reports
 
 
 def _most_steps(budget: Budget, report: LevelReport, *, touched: bool) -> int:

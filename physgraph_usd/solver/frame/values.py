@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..contact.bodies import Touching
@@ -64,6 +64,7 @@ class State:
         held: Number of frames of a held pose.
         fine: Fine positions [m], world space, float64, to continue from; None before the first solve.
         clean: Whether nothing crosses among the garments solved together.
+        given_up: Mask of the cage vertices in tangles that are given up, shape (C,), bool; None without such tangles.
         bent: Remembered bends of the finest hinges of each garment [rad], shape (H,), None for a garment without
             memory; () if no garment has creases.
         creeps: Whether creases still change, so that equal input gives a different frame.
@@ -77,6 +78,7 @@ class State:
     held: int = 0
     fine: Float[Tensor, "vertices 3"] | None = None
     clean: bool = False
+    given_up: Bool[Tensor, " coarse"] | None = None
     bent: tuple[Tensor | None, ...] = ()
     creeps: bool = False
     failures: int = 0
@@ -130,8 +132,10 @@ def join(parts: Sequence[State]) -> State:
     creeps = any(part.creeps for part in parts)
     bent = tuple(each for part in parts for each in part.bent or (None,)) if any(part.bent for part in parts) else ()
     failures, wait = (max(getattr(part, name) for part in parts) for name in ("failures", "wait"))
+    lost = [torch.zeros(len(p.coarse), dtype=torch.bool) if p.given_up is None else p.given_up.cpu() for p in parts]
+    given_up = torch.cat(lost).to(parts[0].coarse.device) if any(p.given_up is not None for p in parts) else None
     kept = {"fine": walked, "clean": clean, "bent": bent, "creeps": creeps, "failures": failures, "wait": wait}
-    return State(*whole, held=min(part.held for part in parts), **kept)
+    return State(*whole, held=min(part.held for part in parts), given_up=given_up, **kept)
 
 
 def split(state: State, coarse: Sequence[slice], fine: Sequence[slice]) -> list[State]:
@@ -146,6 +150,7 @@ def split(state: State, coarse: Sequence[slice], fine: Sequence[slice]) -> list[
         replace(
             state,
             coarse=state.coarse[c],
+            given_up=None if state.given_up is None else state.given_up[c],
             detail=state.detail[f],
             frames=state.frames[c],
             fine=None if state.fine is None else state.fine[f],
