@@ -15,7 +15,8 @@ from physgraph_usd.solver.frame.refiner import Refiner
 from physgraph_usd.solver.integrate.base import Carry, System
 from physgraph_usd.solver.integrate.guard import Guard
 from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton, truncated
-from physgraph_usd.solver.integrate.solve import FAR, Budget, solve_level
+from physgraph_usd.solver.integrate.solve import solve_level
+from physgraph_usd.solver.integrate.stop import FAR, Budget
 from physgraph_usd.usd.read.reader import open_shot
 
 

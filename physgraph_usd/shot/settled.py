@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
-from ..solver.integrate.solve import FAR
+from ..solver.integrate.stop import FAR
 
 COLLAPSED, LIMITED, UNSOLVED = "collapsed", "time limit", "not solved"
 

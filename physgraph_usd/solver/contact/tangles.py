@@ -29,14 +29,15 @@ from torch import Tensor
 
 from ..collide.crossings import Crossings
 from ..forces.self_contact import PairConstraints
+from ..integrate.stop import UNTANGLINGS
 from ..level import Level
 from ..mesh.topology import joined_by
 from .cloth_mesh import ClothMesh
 
 TANGLED = 2
 """Rings around crossings that belong to a tangle."""
-OUT, ROUNDS = 0.5, 25
-"""Distance by which crossing parts move past one another in a round [mean edges], and most rounds at the cage."""
+OUT = 0.5
+"""Distance by which crossing parts move past one another in a round [mean edges]."""
 SURFACE = 0.5
 """Crossings per vertex of a tangle that is no longer one contour. Two sheets that meet along one contour have 0.31 at
 every level."""
@@ -97,7 +98,7 @@ class Tangles:
             last: Mask of the vertices that the last frame gave up, or None.
         """
         size = torch.bincount(self.label[self.label >= 0].long(), minlength=len(self.before))
-        hopeless = (self.before > SURFACE * size) & (size > (2.0 * OUT * ROUNDS) ** 2)
+        hopeless = (self.before > SURFACE * size) & (size > (2.0 * OUT * UNTANGLINGS) ** 2)
         if last is not None:
             met = self.label[last & (self.label >= 0)].long()
             hopeless |= torch.bincount(met, minlength=len(self.before)) > 0
