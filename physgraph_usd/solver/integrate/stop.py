@@ -17,9 +17,6 @@ ROUND, LONGEST = 4, 16
 """Most steps of a round with contact, and without: near pairs are found again after a round."""
 TOUCHING = 3
 """Most steps of the finest level with contact, relative to the budget's: blocked moves cost steps."""
-EXTRA, FAR = 3, 50.0
-"""Extra steps of the finest level of a cold frame, relative to the budget's, while the remaining move is over a number
-of tolerances: by default a visible tenth of a fine edge."""
 REST = 2.0
 """Remaining move [tolerances] below which a warm frame makes no step."""
 NEAR, EARLY = 10.0, 1.0 / 3.0
@@ -48,7 +45,6 @@ class Budget:
         tolerance: Stop when the RMS of H0^-1 F is under this many local edge lengths; 0 for never.
         deadline: `time.perf_counter` value after which only the first `least` steps may begin, or None.
         rest: Remaining move, in tolerances, below which no step is made from the start: cloth nearly at rest stays.
-        extra: Additional steps while the remaining move is over `FAR` tolerances.
         cancelled: Asked before each step whether the result is no longer needed; or None.
         least: Number of steps exempt from the deadline.
         touching: Most steps with contact, if more.
@@ -59,7 +55,6 @@ class Budget:
     tolerance: float = 0.0
     deadline: float | None = None
     rest: float = 1.0
-    extra: int = 0
     cancelled: Callable[[], bool] | None = None
     least: int = 0
     touching: int = 0
@@ -75,11 +70,11 @@ class Budget:
         """
         steps = min(ROUND if touching else LONGEST, self.steps)
         once = {} if first else {"rest": 1.0, "least": 0}
-        return replace(self, steps=steps, extra=0, tolerance=shrunk * self.tolerance, **once)
+        return replace(self, steps=steps, tolerance=shrunk * self.tolerance, **once)
 
     def for_untangling(self) -> Budget:
         """The budget of an untangling round, without a tolerance: contours shorten while nothing moves much."""
-        return replace(self, steps=min(ROUND, self.steps), tolerance=0.0, extra=0, least=0)
+        return replace(self, steps=min(ROUND, self.steps), tolerance=0.0, least=0)
 
     def reason(self, steps: int, remaining: Callable[[], float]) -> str:
         """Why no further step follows: "tolerance", "steps" or "budget"; "" if one does.
@@ -90,7 +85,7 @@ class Budget:
         """
         if self.tolerance > 0 and remaining() < self.tolerance * (1.0 if steps else self.rest):
             return "tolerance"
-        if steps >= self.steps and (steps >= self.steps + self.extra or not self.is_far(remaining())):
+        if steps >= self.steps:
             return "steps"
         return "budget" if self.is_spent(steps) else ""
 
@@ -107,17 +102,12 @@ class Budget:
             return True
         if touched and made >= EARLY * self.steps and report.remaining_move < self.near * self.tolerance:
             return True
-        most = self.steps + self.extra * self.is_far(report.remaining_move)
-        return made >= (max(most, self.touching) if touched else most)
+        return made >= (max(self.steps, self.touching) if touched else self.steps)
 
     def is_spent(self, steps: int) -> bool:
         """Whether no further step may begin after ``steps`` steps, whatever the cloth's state."""
         late = self.deadline is not None and steps >= self.least and time.perf_counter() >= self.deadline
         return late or is_over() or (self.cancelled is not None and self.cancelled())
-
-    def is_far(self, remaining_move: float) -> bool:
-        """Whether the remaining move justifies extra steps; never for tolerance 0."""
-        return self.tolerance > 0 and not remaining_move <= FAR * self.tolerance
 
 
 def level_budget(
@@ -145,4 +135,4 @@ def level_budget(
     if below:
         return Budget(COARSE_STEPS * steps, COARSE_TOLERANCE * tolerance, deadline, cancelled=cancelled)
     finest = Budget(steps, tolerance, deadline, cancelled=cancelled, least=1, touching=TOUCHING * steps)
-    return replace(finest, rest=REST, near=NEAR) if warm else replace(finest, extra=EXTRA * steps)
+    return replace(finest, rest=REST, near=NEAR) if warm else finest
