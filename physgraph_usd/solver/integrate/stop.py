@@ -13,8 +13,8 @@ from typing import Protocol
 
 from ..deadline import is_over
 
-ROUND = 4
-"""Most steps of a round with contact: near pairs are found again after a round."""
+ROUND, LONGEST = 4, 16
+"""Most steps of a round with contact, and without: near pairs are found again after a round."""
 TOUCHING = 3
 """Most steps of the finest level with contact, relative to the budget's: blocked moves cost steps."""
 REST = 2.0
@@ -68,7 +68,7 @@ class Budget:
             touching: Whether there is contact.
             shrunk: Factor of the tolerance: a metric with contact underestimates moves.
         """
-        steps = min(ROUND, self.steps) if touching else self.steps
+        steps = min(ROUND if touching else LONGEST, self.steps)
         once = {} if first else {"rest": 1.0, "least": 0}
         return replace(self, steps=steps, tolerance=shrunk * self.tolerance, **once)
 
