@@ -29,7 +29,8 @@ from physgraph_usd.solver.frame.group import Group
 from physgraph_usd.solver.frame.settings import SolveSettings
 from physgraph_usd.solver.integrate.base import Integrator, System
 from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton
-from physgraph_usd.solver.integrate.solve import Budget, solve_level
+from physgraph_usd.solver.integrate.solve import solve_level
+from physgraph_usd.solver.integrate.stop import Budget
 from physgraph_usd.solver.integrate.weights import KINDS, integrator_of, load_network
 from physgraph_usd.solver.level import refine_garments
 

@@ -43,7 +43,8 @@ from physgraph_usd.solver.grain import axes
 from physgraph_usd.solver.integrate.base import System
 from physgraph_usd.solver.integrate.metric import Metric
 from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton
-from physgraph_usd.solver.integrate.solve import Budget, solve_level
+from physgraph_usd.solver.integrate.solve import solve_level
+from physgraph_usd.solver.integrate.stop import Budget
 from physgraph_usd.solver.level import Level, build_levels, hinge_geometry, refine_garments
 from physgraph_usd.solver.mesh.elements import hinges_of
 from physgraph_usd.solver.scene import Frame, Garment, GarmentFrame, Grain, Scene

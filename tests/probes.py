@@ -25,7 +25,8 @@ from physgraph_usd.solver.forces.gravity import Gravity
 from physgraph_usd.solver.integrate.base import System
 from physgraph_usd.solver.integrate.metric import Metric
 from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton
-from physgraph_usd.solver.integrate.solve import Budget, solve_level
+from physgraph_usd.solver.integrate.solve import solve_level
+from physgraph_usd.solver.integrate.stop import Budget
 from physgraph_usd.solver.level import Level
 
 G = 9.81

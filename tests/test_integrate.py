@@ -18,7 +18,8 @@ from physgraph_usd.solver.integrate import method_named
 from physgraph_usd.solver.integrate.base import ForceField, Integrator, System
 from physgraph_usd.solver.integrate.metric import Metric
 from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton
-from physgraph_usd.solver.integrate.solve import Budget, solve_level
+from physgraph_usd.solver.integrate.solve import solve_level
+from physgraph_usd.solver.integrate.stop import Budget
 
 
 class Quadratic:

@@ -28,7 +28,8 @@ from physgraph_usd.solver.integrate.base import Carry, Integrator, System
 from physgraph_usd.solver.integrate.fused import seeing
 from physgraph_usd.solver.integrate.learned import LONGEST, LearnedMetric, limited
 from physgraph_usd.solver.integrate.network import VECTORS, Physgraph, PhysgraphConfig, pairs_of
-from physgraph_usd.solver.integrate.solve import Budget, solve_level
+from physgraph_usd.solver.integrate.solve import solve_level
+from physgraph_usd.solver.integrate.stop import Budget
 from physgraph_usd.solver.integrate.weights import (
     KINDS,
     integrator_of,

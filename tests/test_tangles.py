@@ -12,9 +12,10 @@ from physgraph_usd.solver.collide.crossings import Crossings
 from physgraph_usd.solver.collide.crossings import crossings as crossings_of
 from physgraph_usd.solver.contact.cloth_mesh import ClothMesh
 from physgraph_usd.solver.contact.promise import Promise
+from physgraph_usd.solver.contact.tangles import Tangles
 from physgraph_usd.solver.level import Level, Placed
 
-BOTH = np.ones((2, 2), bool)
+BOTH, SIZE = np.ones((2, 2), bool), 20
 LIFT = 0.3 * EDGE
 
 
@@ -142,3 +143,35 @@ class TestMoves:
         assert after[0, 1] <= before[0, 1]
         assert after[2, 3] == asked[2, 3] < before[2, 3]
         assert torch.equal(x[number >= 2], wanted[number >= 2])
+
+
+class TestGivenUp:
+    """Tangles full of contours and wider than all rounds reach are given up before any round."""
+
+    @staticmethod
+    def tangles(shape: str) -> tuple[Level, Tangles]:
+        """Two large sheets: waves that pass through one another at every edge, or one contour."""
+        garments = [named(square(SIZE), each) for each in "AB"]
+        level = levels_of(*garments, level=0, dtype=torch.float64)[0]
+        x = level.rest.clone()
+        half, noise = len(x) // 2, torch.as_tensor(np.random.default_rng(3).normal(size=(len(x), 1)))
+        x[half:] += 0.3 * EDGE * torch.tensor([1.0, 0.0, 0.7], dtype=x.dtype)
+        x[:, 1:2] += 0.3 * EDGE * noise if shape == "full" else 0.02 * EDGE * noise
+        if shape == "contour":
+            x[half:, 1] += 0.5 * x[half:, 0] + 0.1 * EDGE
+        mesh, found = found_in(level, x)
+        return level, Tangles.find(mesh, found, torch.zeros(len(x), dtype=torch.bool))
+
+    def test_waves_that_cross_everywhere_are_given_up(self):
+        level, tangles = self.tangles("full")
+        assert int(tangles.giving_up(None).sum()) > 0.9 * level.vertex_count
+
+    def test_one_contour_is_not(self):
+        assert not bool(self.tangles("contour")[1].giving_up(None).any())
+
+    def test_what_the_last_frame_gave_up_stays_so_while_its_cage_crosses(self):
+        level, tangles = self.tangles("contour")
+        last = torch.zeros(level.vertex_count, dtype=torch.bool)
+        last[int(torch.nonzero(tangles.label >= 0)[0])] = True
+        assert bool(tangles.giving_up(last)[tangles.label >= 0].all())
+        assert not bool(tangles.giving_up(last & (tangles.label < 0)).any())

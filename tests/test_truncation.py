@@ -15,7 +15,8 @@ from physgraph_usd.solver.frame.refiner import Refiner
 from physgraph_usd.solver.integrate.base import Carry, System
 from physgraph_usd.solver.integrate.guard import Guard
 from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton, truncated
-from physgraph_usd.solver.integrate.solve import FAR, Budget, solve_level
+from physgraph_usd.solver.integrate.solve import solve_level
+from physgraph_usd.solver.integrate.stop import Budget
 from physgraph_usd.usd.read.reader import open_shot
 
 
@@ -107,17 +108,3 @@ def test_collapsed_triangles_of_stiff_cloth_do_not_hold_up_the_rest(dtype: torch
     report = solve_level(system, QuasiNewton(), x, level=0, budget=Budget(100))[1]
     assert report.evaluations < 3 * report.steps
     assert report.energy_after < 4.5e-3
-
-
-class TestExtraSteps:
-    def test_far_from_rest_there_are_more_steps(self):
-        mesh, rest = sheet(8, 6)
-        system, x = finest_system(group_of(mesh, rest, level=1), wave(rest, squeeze=0.6))
-        few, more = (solve_level(system, QuasiNewton(), x, level=0, budget=b)[1] for b in (FEW, MORE))
-        assert few.remaining_move > FAR * FEW.tolerance
-        assert (few.steps, few.stopped) == (2, "steps")
-        assert 2 < more.steps <= 42
-        assert more.remaining_move <= FAR * MORE.tolerance
-
-
-FEW, MORE = Budget(2, 2e-3), Budget(2, 2e-3, extra=40)

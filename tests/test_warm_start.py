@@ -22,12 +22,12 @@ from physgraph_usd.solver.contact.settings import ContactSettings
 from physgraph_usd.solver.frame import recovery
 from physgraph_usd.solver.frame.group import Group
 from physgraph_usd.solver.frame.lead_in import lead_in
-from physgraph_usd.solver.frame.problem import NEAR
 from physgraph_usd.solver.frame.recovery import RunawayError, solve_soundly
 from physgraph_usd.solver.frame.refiner import Refiner
-from physgraph_usd.solver.frame.solve import STEPS, TOUCHING, solve_frame
+from physgraph_usd.solver.frame.solve import solve_frame
 from physgraph_usd.solver.frame.start import STILL, Start, start_of
 from physgraph_usd.solver.frame.values import Cage, FrameInput, Solved, State
+from physgraph_usd.solver.integrate.stop import NEAR, ROUND, TOUCHING
 from physgraph_usd.solver.level import refine_garments
 from physgraph_usd.solver.resolution import edge_strain
 from physgraph_usd.solver.scene import GarmentFrame
@@ -177,8 +177,8 @@ def test_a_warm_frame_is_done_early_only_near_rest(sample: Callable[[str], Path]
             steps.append(sum(each["steps"] for each in rounds))
             near = rounds[-1]["remaining_move"] < NEAR * RefineOptions().tolerance
             assert near or rounds[-1]["stopped"] == "stalled" or steps[-1] >= TOUCHING * 12
-    assert min(steps) == STEPS
-    assert max(steps) > TOUCHING * STEPS
+    assert min(steps) == ROUND
+    assert max(steps) > TOUCHING * ROUND
 
 
 @pytest.mark.slow

@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
-from ..solver.integrate.solve import FAR
-
 COLLAPSED, LIMITED, UNSOLVED = "collapsed", "time limit", "not solved"
+FAR = 50.0
+"""Remaining move [tolerances] above which a level is unsolved: by default a visible tenth of a fine edge."""
 
 
 @dataclass(frozen=True)

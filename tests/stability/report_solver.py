@@ -24,7 +24,8 @@ from physgraph_usd.solver.frame.solve import solve_frame
 from physgraph_usd.solver.frame.values import FrameInput
 from physgraph_usd.solver.integrate.base import Carry
 from physgraph_usd.solver.integrate.guard import Guard
-from physgraph_usd.solver.integrate.solve import Budget, solve_level
+from physgraph_usd.solver.integrate.solve import solve_level
+from physgraph_usd.solver.integrate.stop import Budget
 from physgraph_usd.solver.mesh.topology import PolygonMesh
 from physgraph_usd.solver.rigid import best_motion
 from physgraph_usd.solver.scene import GarmentFrame

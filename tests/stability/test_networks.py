@@ -15,7 +15,8 @@ from physgraph_usd.solver.integrate.base import Carry, System
 from physgraph_usd.solver.integrate.guard import Guard
 from physgraph_usd.solver.integrate.network import VECTORS, PhysgraphConfig
 from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton
-from physgraph_usd.solver.integrate.solve import Budget, solve_level
+from physgraph_usd.solver.integrate.solve import solve_level
+from physgraph_usd.solver.integrate.stop import Budget
 from physgraph_usd.solver.integrate.weights import KINDS, integrator_of, random_network, shipped_network
 from physgraph_usd.solver.scene import GarmentFrame
 

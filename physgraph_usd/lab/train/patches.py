@@ -34,7 +34,8 @@ from ...solver.integrate.base import System
 from ...solver.integrate.metric import Metric
 from ...solver.integrate.quasi_newton import QuasiNewton
 from ...solver.integrate.saddle import leave_saddle
-from ...solver.integrate.solve import Budget, solve_level
+from ...solver.integrate.solve import solve_level
+from ...solver.integrate.stop import Budget
 from ...solver.integrate.vertex_frame import VertexFrame
 from ...solver.level import Level, refine_garments
 from ...solver.mesh.topology import PolygonMesh, edges_of

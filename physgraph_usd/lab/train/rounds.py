@@ -33,7 +33,8 @@ from ...solver.integrate import METHODS, Method
 from ...solver.integrate.base import Carry, Integrator, System, resumed
 from ...solver.integrate.metric import Metric
 from ...solver.integrate.quasi_newton import QuasiNewton
-from ...solver.integrate.solve import Budget, solve_level
+from ...solver.integrate.solve import solve_level
+from ...solver.integrate.stop import Budget
 from ...solver.level import Level, refine_garments
 from ...solver.scene import Frame, Garment, GarmentFrame, Scene
 from .scenes import KINDS, moving_scene

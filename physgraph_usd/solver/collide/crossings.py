@@ -36,15 +36,22 @@ class Crossings:
         return Crossings(empty, empty)
 
 
-def crossings(parts: Parts, x: Float[Tensor, "vertices 3"]) -> Crossings:
+def crossings(
+    parts: Parts, x: Float[Tensor, "vertices 3"], asked: Bool[Tensor, " vertices"] | None = None
+) -> Crossings:
     """All edges that pass through a face to which they are neither connected nor sewn.
 
     Args:
         parts: The parts.
         x: Positions [m].
+        asked: Mask of vertices; each crossing has one of these among its corners. All vertices when None.
     """
-    edge, face = piercing_edges(parts, x).T
-    return Crossings(edge, face)
+    found = piercing_edges(parts, x, asked)
+    if asked is not None:
+        level = parts.level
+        corners = torch.cat([level.edges[found[:, 0]], level.triangles[found[:, 1]]], dim=1).long()
+        found = found[asked[corners].any(dim=1)]
+    return Crossings(*found.T)
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,14 +78,17 @@ class Pierced:
         return self.crossings.edge[self.own & (self.body == body)]
 
 
-def all_crossings(parts: Parts, x: Float[Tensor, "all 3"]) -> tuple[Crossings, Pierced]:
+def all_crossings(
+    parts: Parts, x: Float[Tensor, "all 3"], asked: Bool[Tensor, " all"] | None = None
+) -> tuple[Crossings, Pierced]:
     """As `crossings`, and the crossings of cloth and bodies.
 
     Args:
         parts: The parts.
         x: Positions of the cloth and of the bodies' corners [m].
+        asked: Mask of vertices; crossings of parts in clusters without any may be missing. All of the cloth when None.
     """
-    edge, face = piercing_edges(parts, x).T.contiguous()
+    edge, face = piercing_edges(parts, x, asked).T.contiguous()
     edges, faces = (torch.tensor(each, device=x.device) for each in parts.starts)
     of_edge, of_face = torch.bucketize(edge, edges, right=True), torch.bucketize(face, faces, right=True)
     with_body = (of_edge > 0) | (of_face > 0)

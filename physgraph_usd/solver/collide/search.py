@@ -65,13 +65,14 @@ def near_parts(
     x: Float[Tensor, "vertices 3"],
     reach: Reach,
     *,
+    asked: Bool[Tensor, " vertices"] | None = None,
     inside: Bool[Tensor, " vertices"] | None = None,
 ) -> Pairs:
     """All near pairs that contain cloth at x [m], but not of cloth inside a body with bodies.
 
     Arguments are as for `blocking_pairs`. Positions of the cloth alone give pairs of the cloth alone, in all searches.
     """
-    asked = torch.arange(len(x), device=x.device) < parts.level.vertex_count
+    asked = _of_cloth(parts, x) if asked is None else asked
     given = {"radius": reach.radius.double(), "play": reach.play.double(), "half": reach.half}
     return _search(parts, query_of(x.double(), kind=NEAR, asked=asked, inside=inside, **given))
 
@@ -104,11 +105,18 @@ def blocking_pairs(
     return _search(parts, query)
 
 
-def piercing_edges(parts: Parts, x: Float[Tensor, "vertices 3"]) -> Int[Tensor, "crossings 2"]:
-    """Indices of each edge and face that cross at x [m], sorted."""
-    asked = torch.arange(len(x), device=x.device) < parts.level.vertex_count
+def piercing_edges(
+    parts: Parts, x: Float[Tensor, "vertices 3"], asked: Bool[Tensor, " vertices"] | None = None
+) -> Int[Tensor, "crossings 2"]:
+    """Indices of each edge and face that cross at x [m], sorted; clusters without an asked vertex may be left out."""
+    asked = _of_cloth(parts, x) if asked is None else asked
     found = _search(parts, query_of(x.double(), kind=CROSSING, asked=asked)).corners[:, :2].long()
-    return found[torch.argsort(found[:, 0] * (parts.faces) + found[:, 1])]
+    return found[torch.argsort(found[:, 0] * max(parts.faces, 1) + found[:, 1])]
+
+
+def _of_cloth(parts: Parts, x: Tensor) -> Bool[Tensor, " vertices"]:
+    """Mask of the cloth's vertices."""
+    return torch.arange(len(x), device=x.device) < parts.level.vertex_count
 
 
 def _search(parts: Parts, query: Any) -> Pairs:

@@ -48,9 +48,7 @@ class Topology:
     rest: wp.array(dtype=wp.vec3d)
 
 
-def topology_of(
-    level: Level, meets: np.ndarray, label: np.ndarray, *, size: int, solids: Sequence[Solid] = ()
-) -> Any:
+def topology_of(level: Level, meets: np.ndarray, label: np.ndarray, *, size: int, solids: Sequence[Solid] = ()) -> Any:
     """The parts of a level and of bodies in clusters.
 
     A face belongs to the cluster of its first corner, an edge to that of one of its faces.
@@ -65,7 +63,10 @@ def topology_of(
     edges, faces = (each.cpu().numpy().astype(np.int64) for each in (level.edges, level.triangles))
     garment, rest, cloths = level.vertex_garment.cpu().numpy(), level.rest.double().cpu().numpy(), len(level.spans)
     for number, solid in enumerate(solids):
-        edges, faces = np.concatenate([edges, solid.edges + len(rest)]), np.concatenate([faces, solid.faces + len(rest)])
+        edges, faces = (
+            np.concatenate([edges, solid.edges + len(rest)]),
+            np.concatenate([faces, solid.faces + len(rest)]),
+        )
         garment = np.concatenate([garment, np.full(len(solid.points), cloths + number)])
         label = np.concatenate([label, np.arange(len(rest), len(rest) + len(solid.points))])
         rest = np.concatenate([rest, solid.points])

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ..collide.closest import displacements_to
@@ -50,7 +50,12 @@ class _Through:
 
 
 def drawn_apart(
-    mesh: ClothMesh, x: Float[Tensor, "vertices 3"], start: Crossings, *, gap: float
+    mesh: ClothMesh,
+    x: Float[Tensor, "vertices 3"],
+    start: Crossings,
+    *,
+    gap: float,
+    asked: Bool[Tensor, " vertices"] | None = None,
 ) -> tuple[Float[Tensor, "vertices 3"], int]:
     """Move cut-off pieces back to their side, as long as the number of crossings falls.
 
@@ -60,6 +65,7 @@ def drawn_apart(
         start: Crossings at x.
         gap: Largest final distance from the penetrated cloth [m]; replaced by a fraction of an edge if fewer parts
             cross then.
+        asked: As for `crossings`.
 
     Returns:
         Positions [m], x itself if nothing improves, and the number of crossings there.
@@ -73,7 +79,7 @@ def drawn_apart(
         at, found, through = x, start, first
         for _ in range(PASSES):
             moved = through.back(at, wide)
-            after = crossings(mesh.parts, moved)
+            after = crossings(mesh.parts, moved, asked)
             if after.count >= found.count:
                 break
             at, found = moved, after

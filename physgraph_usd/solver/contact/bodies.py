@@ -19,9 +19,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from ..collide.crossings import Pierced
 from ..colliders.base import Nearest, Solid, Surface
 from ..colliders.sign import behind
-from ..collide.crossings import Pierced
 from ..forces.self_contact import PairConstraints
 from ..level import Level
 from ..mesh.topology import joined_by, patches_with
@@ -67,7 +67,7 @@ class FrameBodies:
     """
 
     touching: tuple[Touching, ...]
-    shifts: tuple[Float[Tensor, "3"], ...]
+    shifts: tuple[Float[Tensor, 3], ...]
     points: Float[Tensor, "corners 3"]
     before: Float[Tensor, "corners 3"] | None
     longest: float
@@ -299,7 +299,6 @@ class LevelBodies:
         seeds[which[between[surface.inside(at[between], parts=2)]]] = True
         masks = (each.cpu().numpy() for each in (some, seeds))
         return torch.as_tensor(patches_with(self.level.edges.cpu().numpy(), *masks), device=x.device)
-
 
     def depths(
         self, x: Float[Tensor, "vertices 3"], inside: Bool[Tensor, "bodies vertices"] | None

@@ -7,7 +7,7 @@ nearest: otherwise cloth that pushes at a place and is held at another would sta
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import cast
 
@@ -16,11 +16,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ..colliders.base import Solid
 from ..collide.crossings import Crossings, Pierced, all_crossings, crossings
 from ..collide.pairs import Reach
 from ..collide.parts import Parts
 from ..collide.search import near_parts
+from ..colliders.base import Solid
 from ..forces.seam import Seam
 from ..forces.self_contact import PairConstraints, SelfContact
 from ..level import Level
@@ -30,14 +30,10 @@ from .broad_phase import touch_one_another
 from .cloth_mesh import ClothMesh
 from .settings import ContactSettings
 from .springs import HALF, MARGIN, ClothSprings, NearSprings
-from .tangles import Tangles, chords_of, gaps_out
+from .tangles import OUT, Tangles, chords_of, gaps_out
 
-TANGLED = 2
-"""Rings around crossings within which cloth is promised only that the number of crossings does not grow."""
 BESIDE = 1
 """Rings around crossings with a body within which cloth may pass through it."""
-OUT = 0.5
-"""Distance by which crossing parts move past one another in a round, in mean edges."""
 
 
 class ClothContact:
@@ -107,6 +103,8 @@ class ClothView:
     Attributes:
         mesh: The level's mesh, sewn as in this frame.
         frame: The bodies of the frame, or None.
+        given_up: Mask of the vertices of tangles that are given up, None without such tangles. Parts whose vertices are
+            all given up are not searched for contact or crossings with one another.
         keeps_sides: True if moves are promised to add no crossings of cloth with cloth.
         came_near: True if parts were near one another in any call of `term`; None before the first call.
     """
@@ -121,6 +119,7 @@ class ClothView:
         settings: ContactSettings,
         bodies: FrameBodies | None = None,
         seam: Seam | None = None,
+        given_up: Bool[Tensor, " vertices"] | None = None,
         is_clean: bool = False,
     ) -> None:
         """Take the frame.
@@ -133,8 +132,10 @@ class ClothView:
             settings: Contact settings, in SI.
             bodies: The bodies of the frame, or None.
             seam: Sewn vertices, which stay together; None without seams.
+            given_up: As the attribute.
             is_clean: Whether the upsampled cage is known to cross nothing.
         """
+        self.given_up = given_up
         self.keeps_sides = settings.cloth == "pairs" and bool(lasting.meets.any())
         self.mesh = lasting.mesh(level, seam, bodies, itself=self.keeps_sides)
         self._level, self._settings, self._thickness = level, settings, thickness
@@ -218,8 +219,13 @@ class ClothView:
             play = torch.nn.functional.pad(play, (0, len(radius) - len(play)))
         return Reach(radius, play, HALF)
 
+    @cached_property
+    def asked(self) -> Bool[Tensor, " all"] | None:
+        """Mask of the vertices that are not given up, True for the bodies' corners; None for all of the cloth."""
+        return None if self.given_up is None else ~self.padded(self.given_up)
+
     def crossings(self, x: Float[Tensor, "vertices 3"]) -> Crossings:
-        """Crossings at x [m]; cached for the same tensor until its version changes."""
+        """Crossings at x [m], without given-up cloth; cached for the same tensor until its version changes."""
         return self._look(x).crossings
 
     def inside(self, x: Float[Tensor, "vertices 3"]) -> Bool[Tensor, "bodies vertices"] | None:
@@ -237,16 +243,20 @@ class ClothView:
         bodies = None if self.frame is None else LevelBodies(self._level, self.frame, self.mesh.pieces)
         pierced = inside = None
         if bodies is None:
-            found = crossings(self.parts, x)
+            found = crossings(self.parts, x, self.asked)
         else:
-            found, pierced = all_crossings(self.parts, self.with_bodies(x))
+            found, pierced = all_crossings(self.parts, self.with_bodies(x), self.asked)
             inside = bodies.inside(x, pierced)
             inside = inside if bool(inside.any()) else None
-        tangles = Tangles.find(self.mesh, self.mesh.corners_of(found), rings=TANGLED) if found.count else None
+        lost = torch.zeros_like(self._level.free[:, 0]) if self.given_up is None else self.given_up
+        if self.given_up is not None:
+            kept = ~lost[self.mesh.corners_of(found)].all(dim=1)
+            found = Crossings(found.edge[kept], found.face[kept])
+        tangles = Tangles.find(self.mesh, found, lost) if found.count or self.given_up is not None else None
         return _Looked(x, x._version, found, tangles, pierced, inside)
 
     def tangles(self, x: Float[Tensor, "vertices 3"]) -> Tangles | None:
-        """Tangles at x [m]: crossings and the cloth around them; None without crossings."""
+        """Tangles at x [m]: crossings and the cloth around them; None without crossings and given-up cloth."""
         return self._look(x).tangles
 
     def exempt(self, x: Float[Tensor, "vertices 3"]) -> Bool[Tensor, " all"] | None:
@@ -266,7 +276,8 @@ class ClothView:
     def _within(self, x: Tensor) -> tuple[Tensor, Chords]:
         """The vertices inside each body, and the places inside on edges and faces whose corners are outside."""
         looked, bodies = self._look(x), self.bodies
-        assert bodies is not None and looked.pierced is not None
+        assert bodies is not None
+        assert looked.pierced is not None
         none = torch.zeros((len(bodies.frame.touching), len(x)), dtype=torch.bool, device=x.device)
         inside = none if looked.inside is None else looked.inside
         return inside, chords_of(self.mesh, looked.pierced, self.with_bodies(x), inside)
@@ -280,32 +291,26 @@ class ClothView:
         return None if some is None else torch.nn.functional.pad(some, (0, len(self.corners)))
 
     def is_clean(self, x: Float[Tensor, "vertices 3"]) -> bool:
-        """Whether nothing crosses at x [m], neither cloth nor bodies."""
+        """Whether nothing crosses at x [m], neither cloth, but where it is given up, nor bodies."""
         looked = self._look(x)
-        return looked.tangles is None and looked.inside is None and not (looked.pierced and looked.pierced.count)
+        return looked.crossings.count == 0 and looked.inside is None and not (looked.pierced and looked.pierced.count)
 
-    def remember(self, x: Float[Tensor, "vertices 3"]) -> None:
-        """Record that nothing crosses at x [m], as after a safe move from positions where nothing does."""
-        self._looked = _clean(x)
+    def remember(self, x: Float[Tensor, "vertices 3"], given_up: Tangles | None = None) -> None:
+        """Record that nothing crosses at x [m] but given-up cloth, as after a safe move from such positions."""
+        self._looked = replace(_clean(x), tangles=given_up)
 
-    def terms(self, x: Float[Tensor, "vertices 3"], *, all_crossings: bool = False) -> tuple[SelfContact, ...]:
-        """Contact forces with bodies and between near cloth, with crossings drawn apart; without those that are none.
-
-        Args:
-            x: Positions [m].
-            all_crossings: True also draws hopeless tangles apart.
-        """
-        looked = self._look(x)
-        inside = self.exempt(x)
-        at = self.with_bodies(x)
-        near = self._springs.find(at, near_parts(self.parts, at, self.near, inside=inside))
+    def terms(self, x: Float[Tensor, "vertices 3"]) -> tuple[SelfContact, ...]:
+        """Contact forces with bodies and between near cloth at x [m], with crossings drawn apart; () without any."""
+        looked, at = self._look(x), self.with_bodies(x)
+        pairs = near_parts(self.parts, at, self.near, asked=self.asked, inside=self.exempt(x))
+        near = self._springs.find(at, pairs)
         with_body = near.near.corners.amax(dim=1) >= self._level.vertex_count
         pushes = self._springs.constraints(near.where(with_body), at, self._settings.stiffness)
         if self.in_bodies(x) and self.bodies is not None:
             pushes = pushes.with_more(self.bodies.pulls(x, *self._within(x)))
-        gaps = self._gaps(x, near.where(~with_body), at, all_crossings=all_crossings)
+        gaps = self._gaps(x, near.where(~with_body), at)
         found, tangles = looked.crossings, looked.tangles
-        found = found if tangles is None or all_crossings else tangles.hopeful(found)
+        found = found if tangles is None else tangles.hopeful(found)
         if found.count:
             step, stiffness = OUT * float(self._level.spacing.mean()), self._settings.cloth_stiffness
             gaps = gaps.with_more(gaps_out(self.mesh, found, x, step=step, stiffness=stiffness))
@@ -313,14 +318,13 @@ class ClothView:
         named = (("contact", pushes), ("self_contact", gaps))
         return tuple(SelfContact(self._level, each, name) for name, each in named if len(each.corners))
 
-    def _gaps(self, x: Tensor, near: NearSprings, at: Tensor, *, all_crossings: bool) -> PairConstraints:
+    def _gaps(self, x: Tensor, near: NearSprings, at: Tensor) -> PairConstraints:
         """Springs between all near parts of the cloth that do not cross."""
-        found = self.crossings(x)
-        if found.count:
-            corners, tangles = near.near.corners.long(), self.tangles(x)
-            kept = ~self.mesh.crossed(found)[corners].any(dim=1)
-            kept &= tangles is None or all_crossings or ~tangles.given_up[corners].all(dim=1)
-            near = near.where(kept)
+        tangles = self.tangles(x)
+        if tangles is not None:
+            corners = near.near.corners.long()
+            kept = ~self.mesh.crossed(self.crossings(x))[corners].any(dim=1)
+            near = near.where(kept & ~tangles.given_up[corners].all(dim=1))
         return self._springs.constraints(near, at, self._settings.cloth_stiffness)
 
     def measure(
@@ -340,11 +344,16 @@ class ClothView:
             sides = ((before, first), (x, last))
             given = [(at, looked.inside, looked.pierced) for at, looked in sides]
             said["bodies"] = self.bodies.measured(*given)
+        kept, tangles = last.crossings, last.tangles
+        kept = kept if tangles is None else tangles.hopeful(kept)
+        found = kept if self.given_up is None else crossings(self.parts, x)
         if self.keeps_sides:
+            base = first.crossings if self.given_up is None else crossings(self.parts, before)
             crossed = {
                 name: {"crossings": each.count, "between_garments": int(np.triu(self.mesh.between(each), 1).sum())}
-                for name, each in ((name, looked.crossings) for name, looked in (("before", first), ("after", last)))
+                for name, each in (("before", base), ("after", found))
             }
+            crossed["after"]["given_up"] = found.count - kept.count
             near = bool(self.came_near) or any(each["crossings"] for each in crossed.values())
             said["cloth"] = {"near": near, **crossed}
-        return said, self.mesh.crossed(last.crossings)
+        return said, self.mesh.crossed(found)

@@ -10,9 +10,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ..colliders.base import Solid
 from ..collide.crossings import Crossings
 from ..collide.parts import Parts
+from ..colliders.base import Solid
 from ..forces.self_contact import PairConstraints
 from ..level import Level
 from ..mesh.topology import adjacency, find_edges, joined_by
@@ -50,10 +50,13 @@ class ClothMesh:
         self.beside = _across(adjacency(edges, count), label)
         start = count
         for solid in solids:
-            edges, triangles = (np.concatenate(each) for each in ((edges, solid.edges + start), (triangles, solid.faces + start)))
+            edges, triangles = (
+                np.concatenate(each) for each in ((edges, solid.edges + start), (triangles, solid.faces + start))
+            )
             start += len(solid.points)
         self.edges, self.triangles, self.opposite = (
-            torch.as_tensor(each, device=level.device).long() for each in (edges, triangles, _opposite(edges, triangles))
+            torch.as_tensor(each, device=level.device).long()
+            for each in (edges, triangles, _opposite(edges, triangles))
         )
         first, second = self.beside.nonzero()
         self._first, self._second = (

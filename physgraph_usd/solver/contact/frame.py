@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -25,11 +26,10 @@ from .metric import HeldMetric
 from .promise import Before, Promise
 from .repair import repaired_cage
 from .settings import ContactSettings
+from .tangles import Tangles
 
 FLOOR = 0.06
 """Gap below which gaps shrink by at most a tenth a move, as a fraction of the thickness."""
-BLENDED = 4
-"""Rings around an unresolved tangle over which the cloth blends back to its start."""
 STALLED = 4
 """Most passes of moving cloth out of bodies that get no more out."""
 Touch = SelfContact
@@ -72,10 +72,10 @@ class LevelContact:
         """True if cloth crosses cloth at positions x [m]."""
         return self.cloth.crossings(x).count > 0
 
-    def comes_apart(self, x: Float[Tensor, "vertices 3"], *, all_crossings: bool = False) -> bool:
-        """True if x has crossings in hopeful tangles; with `all_crossings`, in any tangle."""
+    def comes_apart(self, x: Float[Tensor, "vertices 3"]) -> bool:
+        """True if x has crossings in hopeful tangles."""
         tangles = self.cloth.tangles(x)
-        return tangles is not None and (all_crossings or not bool(tangles.hopeless.all()))
+        return tangles is not None and not bool(tangles.hopeless.all())
 
     def begun(self, x: Float[Tensor, "vertices 3"]) -> Placed:
         """Start positions of a level [m], seams closed. Crossings here come from the input or from the level below."""
@@ -86,29 +86,17 @@ class LevelContact:
         if not self.crosses(x):
             return x
         view = self.cloth
-        out = drawn_apart(view.mesh, x, view.crossings(x), gap=view.gap)[0]
+        asked = None if view.given_up is None else ~view.given_up
+        out = drawn_apart(view.mesh, x, view.crossings(x), gap=view.gap, asked=asked)[0]
         return x if out is x else Placed(self.closed(out))
-
-    def without_hope(self, x: Placed, start: Placed) -> Placed:
-        """Positions x [m] with hopeless tangles moved back to the start, blended over the rings around the tangle."""
-        tangles = self.cloth.tangles(x)
-        if tangles is None or not bool(tangles.hopeless.any()):
-            return x
-        mesh, back = self.cloth.mesh, tangles.given_up
-        share = back.to(x)
-        for ring in range(BLENDED):
-            wider = mesh.grown(back, 1)
-            share = torch.where(wider & ~back, 1.0 - (ring + 1.0) / (BLENDED + 1.0), share)
-            back = wider
-        return self.drawn(x, x + share.unsqueeze(1) * (start - x))
 
     def remember(self, x: Float[Tensor, "vertices 3"]) -> None:
         """As `ClothView.remember`."""
         self.cloth.remember(x)
 
-    def terms(self, x: Float[Tensor, "vertices 3"], *, all_crossings: bool = False) -> tuple[Touch, ...]:
+    def terms(self, x: Float[Tensor, "vertices 3"]) -> tuple[Touch, ...]:
         """As `ClothView.terms`."""
-        return self.cloth.terms(x, all_crossings=all_crossings)
+        return self.cloth.terms(x)
 
     def closed(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
         """Positions with their seams closed [m]."""
@@ -154,6 +142,7 @@ class FrameContact:
         thickness: Sequence[float],
         settings: ContactSettings,
         seams: Sequence[Seam | None] = (),
+        lost: Bool[Tensor, " coarse"] | None = None,
     ) -> None:
         """Take the frame.
 
@@ -165,7 +154,9 @@ class FrameContact:
             thickness: Thickness of each garment's cloth [m].
             settings: Contact settings, with the stiffness in SI.
             seams: The seam of each level, None for a level without seams; () for no seams at all.
+            lost: Mask of the cage's vertices that the last frame gave up; None for none.
         """
+        self._lost = lost
         self._levels, self._coarse, self._settings = tuple(levels), coarse, settings
         self._bodies, self._cloth, self._seams = bodies, cloth, seams
         self._thickness = torch.tensor(thickness, dtype=coarse.dtype, device=coarse.device)
@@ -181,7 +172,7 @@ class FrameContact:
 
     @cached_property
     def _cage(self) -> tuple[ClothMesh, Crossings, LevelBodies | None, Pierced | None, Tensor | None]:
-        """Mesh of the cage, its crossings, its view of the bodies, crossings with them, and its vertices inside each."""
+        """The cage's mesh, crossings, view of the bodies, crossings with them, and vertices inside each."""
         cage, bodies = self._levels[0], self._bodies
         mesh = self._cloth.mesh(cage, self._seam_at(cage), bodies, itself=self._settings.cloth == "pairs")
         if bodies is None:
@@ -191,18 +182,34 @@ class FrameContact:
         inside = view.inside(self._coarse, pierced)
         return mesh, found, view, pierced, inside if bool(inside.any()) else None
 
+    @property
+    def given_up(self) -> Bool[Tensor, " coarse"] | None:
+        """Mask of the cage's vertices in tangles that are given up; None without such tangles."""
+        return self._aimed[1]
+
     @cached_property
-    def _aimed(self) -> tuple[Float[Tensor, "coarse 3"], bool | None]:
-        """The cage followed by the fine cloth, and True if the input has crossings."""
+    def _aimed(self) -> tuple[Float[Tensor, "coarse 3"], Bool[Tensor, " coarse"] | None]:
+        """The cage followed by the fine cloth [m], and `given_up`."""
         cage, out, seam = self._levels[0], self._coarse, self._seam_at(self._levels[0])
         mesh, found, bodies, _, inside = self._cage
         if bodies is not None and inside is not None:
             out = repaired_cage(cage, out, bodies=bodies, inside=inside, mesh=mesh)
-        crosses = found.count > 0
-        found = found if out is self._coarse else crossings(mesh.parts, out)
-        apart, left = drawn_apart(mesh, out, found, gap=float(self._thickness.mean()))
-        out = apart if found.count and not left else out
-        return (out if seam is None or out is self._coarse else seam.closed(out)), crosses
+        found, lost = found if out is self._coarse else crossings(mesh.parts, out), None
+        if found.count:
+            lost = Tangles.find(mesh, found, torch.zeros_like(cage.free[:, 0])).giving_up(self._lost)
+            lost = lost if bool(lost.any()) else None
+            out = self._drawn_apart(mesh, out, found, None if lost is None else ~lost)
+        return out if seam is None or out is self._coarse else seam.closed(out), lost
+
+    def _drawn_apart(
+        self, mesh: ClothMesh, x: Tensor, found: Crossings, asked: Bool[Tensor, " coarse"] | None
+    ) -> Float[Tensor, "coarse 3"]:
+        """The cage [m] without its crossings at vertices that are not given up, if all these can be removed."""
+        if asked is not None:
+            kept = asked[mesh.corners_of(found)].any(dim=1)
+            found = Crossings(found.edge[kept], found.face[kept])
+        apart, left = drawn_apart(mesh, x, found, gap=float(self._thickness.mean()), asked=asked)
+        return apart if found.count and not left else x
 
     @property
     def depths(self) -> list[tuple[float, str]]:
@@ -213,7 +220,7 @@ class FrameContact:
     @property
     def crossed(self) -> bool:
         """True if the cage crosses itself."""
-        return bool(self._aimed[1])
+        return self._cage[1].count > 0
 
     def at(self, level: Level) -> LevelContact:
         """The cached view of one level. Distances at rest use the rest shape without ease."""
@@ -221,10 +228,18 @@ class FrameContact:
             level = self._levels[level.index]
             seam, base = self._seam_at(level), level.base.apply(self.aim)
             own = {"base": base, "thickness": self._thickness, "settings": self._settings, "seam": seam}
-            cloth = ClothView(self._cloth, level, bodies=self._bodies, is_clean=self._is_clean, **own)
+            own |= {"bodies": self._bodies, "given_up": self._given_up_at(level), "is_clean": self._is_clean}
+            cloth = ClothView(self._cloth, level, **own)
             promise = Promise(cloth, FLOOR * float(self._thickness.min()))
             self._views[level.index] = LevelContact(cloth, seam, promise)
         return self._views[level.index]
+
+    def _given_up_at(self, level: Level) -> Bool[Tensor, " vertices"] | None:
+        """Mask of a level's vertices that depend only on given-up vertices of the cage."""
+        if self.given_up is None:
+            return None
+        kept = level.from_coarse @ (~self.given_up).cpu().numpy().astype(np.float64)
+        return torch.as_tensor(kept == 0.0, device=level.device)
 
     @property
     def _is_clean(self) -> bool:

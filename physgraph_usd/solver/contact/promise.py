@@ -53,9 +53,7 @@ class Promise:
     view: ClothView
     floor: float
 
-    def move(
-        self, start: Placed, wanted: Float[Tensor, "vertices 3"], since: Before | None = None
-    ) -> Placed:
+    def move(self, start: Placed, wanted: Float[Tensor, "vertices 3"], since: Before | None = None) -> Placed:
         """Positions as close to the wanted positions as is safe [m], ``wanted`` itself if no pair blocks the move.
 
         In a tangle of the start, cloth may pass through itself as long as the tangle's number of crossings does not
@@ -68,10 +66,10 @@ class Promise:
                 that cannot give way.
         """
         view, tangles = self.view, self.view.tangles(start)
-        if tangles is None:
-            x, proved = self._go(start, wanted, None, since)
+        if tangles is None or bool(tangles.hopeless.all()):
+            x, proved = self._go(start, wanted, None if tangles is None else tangles.label, since)
             if proved and view.is_clean(start):
-                view.remember(x)
+                view.remember(x, tangles)
             return x
         free = tangles.label.clone()
         x, _ = self._go(start, wanted, free, since)
@@ -119,7 +117,8 @@ class Promise:
         """
         view, parts, count = self.view, self.view.parts, self.view.parts.level.vertex_count
         moves = (end != begin).any(dim=1)
-        met = blocking_pairs(parts, begin, end, **options, asked=moves)
+        asked = moves if view.asked is None else view.asked
+        met = blocking_pairs(parts, begin, end, **options, asked=asked)
         if not len(met.value):
             return end, True
         stand = not bool(moves[count:].any())

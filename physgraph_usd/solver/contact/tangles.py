@@ -29,14 +29,18 @@ from torch import Tensor
 
 from ..collide.crossings import Crossings, Pierced
 from ..forces.self_contact import PairConstraints
+from ..integrate.stop import UNTANGLINGS
 from ..mesh.topology import joined_by
 from .bodies import Chords
 from .cloth_mesh import ClothMesh
 
-HOPELESS = 100
-"""Most crossings of a hopeful tangle of the cage; the limit doubles at each finer level. Four tiers within a fraction
-of an edge of one another (8,810 crossings) still have 1,900 after a hundred rounds, strained by 0.6; all tangles below
-the limit came apart in a few."""
+TANGLED = 2
+"""Rings around crossings that belong to a tangle."""
+OUT = 0.5
+"""Distance by which crossing parts move past one another in a round [mean edges]."""
+SURFACE = 0.5
+"""Crossings per vertex of a tangle that is no longer one contour. Two sheets that meet along one contour have 0.31 at
+every level."""
 GRAZING = 0.2
 """Least |N.E|: an edge almost parallel to the face would be moved far along the normal."""
 
@@ -48,8 +52,7 @@ class Tangles:
     Attributes:
         label: The tangle of each vertex, -1 outside tangles, shape (V,), int32.
         before: Number of crossings of each tangle, shape (N,).
-        hopeless: True for tangles with too many crossings to shorten the contours; hopeless tangles follow the cage
-            without contact, shape (N,), bool.
+        hopeless: True for tangles with vertices that are given up, shape (N,), bool.
     """
 
     label: Int[Tensor, " vertices"]
@@ -58,26 +61,52 @@ class Tangles:
     _mesh: ClothMesh
 
     @staticmethod
-    def find(mesh: ClothMesh, corners: Int[Tensor, "crossings 5"], *, rings: int) -> Tangles:
-        """Tangles: connected components of the crossings and the cloth within some rings of them.
+    def find(mesh: ClothMesh, crossings: Crossings, given_up: Bool[Tensor, " vertices"]) -> Tangles:
+        """Tangles: connected components of the crossings and the cloth within `TANGLED` rings.
 
         Args:
             mesh: The cloth.
-            corners: Vertices of each crossing edge and face.
-            rings: Number of rings.
+            crossings: The crossings.
+            given_up: Mask of the vertices that are given up; these and all tangles they reach are one tangle.
         """
-        region = torch.zeros_like(mesh.level.free[:, 0])
+        corners = mesh.corners_of(crossings)
+        region = torch.zeros_like(given_up)
         region[corners.reshape(-1)] = True
-        region, edges = mesh.grown(region, rings), mesh.level.edges.long()
+        region, edges = mesh.grown(region, TANGLED) | given_up, mesh.level.edges.long()
         inside = edges[region[edges].all(dim=1)]
         across = torch.cat([corners[:, [0, place]] for place in range(1, 5)])
-        piece = joined_by(torch.cat([inside, across]).cpu().numpy(), mesh.level.vertex_count)
+        lost = torch.nonzero(given_up).squeeze(1)
+        together = torch.stack([lost[:1].expand(len(lost)), lost], dim=1)
+        piece = joined_by(torch.cat([inside, across, together]).cpu().numpy(), mesh.level.vertex_count)
         which = region.cpu().numpy()
         label = np.full(len(which), -1, np.int32)
         numbers, label[which] = np.unique(piece[which], return_inverse=True)
         labels = torch.as_tensor(label, device=region.device)
         before = torch.bincount(labels[corners[:, 0]].long(), minlength=len(numbers))
-        return Tangles(labels, before, before > HOPELESS << mesh.level.index, mesh)
+        hopeless = torch.bincount(labels[lost].long(), minlength=len(numbers)) > 0
+        return Tangles(labels, before, hopeless, mesh)
+
+    def giving_up(self, last: Bool[Tensor, " vertices"] | None) -> Bool[Tensor, " vertices"]:
+        """Mask of the vertices of the cage's tangles that no rounds pull apart, or that the last frame gave up.
+
+        In a round, two sheets move past one another by `OUT` edges. Along one contour that is enough at any length. A
+        tangle full of contours (`SURFACE`) comes apart from its rim, so it may be no wider than all rounds reach from
+        both sides. A tangle stays given up until the cage no longer crosses there, so that cloth does not jump. A piece
+        of cloth that is mostly given up is given up whole.
+
+        Args:
+            last: Mask of the vertices that the last frame gave up, or None.
+        """
+        size = torch.bincount(self.label[self.label >= 0].long(), minlength=len(self.before))
+        hopeless = (self.before > SURFACE * size) & (size > (2.0 * OUT * UNTANGLINGS) ** 2)
+        if last is not None:
+            met = self.label[last & (self.label >= 0)].long()
+            hopeless |= torch.bincount(met, minlength=len(self.before)) > 0
+        lost = self._of(hopeless)
+        mesh = self._mesh
+        piece = torch.as_tensor(joined_by(mesh.parts.links.cpu().numpy(), len(lost)), device=lost.device).long()
+        share = torch.bincount(piece, lost.double()) / torch.bincount(piece)
+        return lost | (share > 0.5)[piece]
 
     def worse(self, crossings: Crossings) -> Bool[Tensor, " vertices"]:
         """Mask of the vertices of hopeful tangles with more crossings than before."""

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..contact.bodies import FrameBodies, Touching
@@ -142,6 +142,7 @@ class Group:
         cage: Cage,
         *,
         settings: ContactSettings | None = None,
+        lost: Bool[Tensor, " coarse"] | None = None,
     ) -> FrameContact | None:
         """Contact of a frame's cloth, or None without possible contact.
 
@@ -149,6 +150,7 @@ class Group:
             frame: The frame.
             cage: Positions of the cages.
             settings: Contact settings; the group's own when None.
+            lost: As for `FrameContact`.
         """
         settings = settings or self.settings.contact
         touching = frame.touching if settings.form != "off" else ()
@@ -160,6 +162,7 @@ class Group:
         place = {"origin": cage.origin, "settings": settings}
         bodies = FrameBodies.begin(self.levels[0], touching, cage.points, **place) if touching else None
         cloths = {"thickness": [each.thickness for each in fabrics], "settings": settings, "seams": self.seams}
+        cloths["lost"] = lost
         return FrameContact(self.levels, cage.points, bodies=bodies, cloth=self.cloth, **cloths)
 
     def upsampled(self, frames: Sequence[GarmentFrame]) -> list[np.ndarray]:

@@ -89,7 +89,8 @@ def _is_clean(cages: Refiner, frame_at: Callable[[float | None], Frame], time: f
     """Whether nothing crosses in the cage solved at a time code without history."""
     cages.forget()
     entries = _solve(cages, frame_at, time)
-    return bool(entries) and all(not entry["contact"]["cloth"]["after"]["crossings"] for entry in entries)
+    sides = [entry["contact"]["cloth"]["after"] for entry in entries]
+    return bool(sides) and all(after["crossings"] == after["given_up"] for after in sides)
 
 
 def _solve(cages: Refiner, frame_at: Callable[[float | None], Frame], time: float) -> list[dict[str, Any]]:

@@ -63,7 +63,8 @@ def state_left(problem: Problem, x: Placed) -> State:
     stored = problem.group.moving_frames.store(cage.points, x)
     fine = x.double() + torch.as_tensor(cage.origin).to(x.device)
     lasts = problem.group.settings.temporal != "off"
-    clean = view is not None and view.cloth.is_clean(x)
+    lost = None if problem.contact is None else problem.contact.given_up
+    clean = view is not None and lost is None and view.cloth.is_clean(x)
     exempt = None if view is None else view.cloth.exempt(x)
     return replace(
         stored,
@@ -72,6 +73,7 @@ def state_left(problem: Problem, x: Placed) -> State:
         fine=fine,
         clean=clean,
         inside=None if exempt is None else exempt[: len(x)],
+        given_up=lost,
         bent=() if problem.creases is None else problem.creases.split(problem.forces[-1].level),
         creeps=lasts and keeps_creases(problem.frame) and not problem.start.rests,
     )

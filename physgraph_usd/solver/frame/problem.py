@@ -16,16 +16,13 @@ from ..forces.base import ForceModule
 from ..forces.seam import SewnForces
 from ..integrate.base import Integrator, System
 from ..integrate.metric import Metric
-from ..integrate.solve import Budget
+from ..integrate.stop import Budget
 from ..level import Level, Placed
 from .creases import Creases, creases_of
 from .group import Group
 from .level_forces import LevelForces
 from .start import Start, start_of, torn
 from .values import Cage, FrameInput, State
-
-NEAR = 10.0
-"""Remaining move [tolerances] below which a warm frame in contact may finish after a fraction of its steps."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,8 +37,6 @@ class LevelProblem:
         integrator: Makes the steps.
         untangler: Makes the steps to pull crossings apart.
         budget: Stopping criteria.
-        near: Remaining move [tolerances] below which a frame in contact may finish after a fraction of its steps; 0 for
-            never.
         outward: As in `leave_saddle`.
     """
 
@@ -52,7 +47,6 @@ class LevelProblem:
     integrator: Integrator
     untangler: Integrator
     budget: Budget
-    near: float
     outward: Float[Tensor, " garments"]
 
     @property
@@ -169,13 +163,11 @@ class Problem:
         recorded = lasting.level.device != "cpu"
         alone = lasting.lasting_system(self.aim, tie, rest_angle=angles) if recorded else lasting.system(module, tie)
         budget = settings.budget(self.finest - index, since, warm=self.warm)
-        if self.creases is not None and self.start.held:  # The stopping measure misses fading creases.
-            budget = replace(budget, rest=0.0)
+        if self.creases is not None:  # The stopping measure misses fading creases.
+            budget = replace(budget, near=0.0, rest=0.0 if self.start.held else budget.rest)
         budget = replace(budget, steps=0) if self.start.rests else budget
-        # With creases the stopping measure underestimates the remaining move.
-        near = NEAR if self.warm and self.creases is None else 0.0
         who = (self.group.integrator, self.group.untangler)
-        return LevelProblem(lasting, module, alone, self.view(index), *who, budget, near, self.group.outward)
+        return LevelProblem(lasting, module, alone, self.view(index), *who, budget, self.group.outward)
 
     def begun(
         self, index: int, below: Float[Tensor, "below 3"] | None
@@ -220,7 +212,7 @@ def begin(group: Group, frame: FrameInput, last: State | None) -> Problem:
     moved = frame.moved if settings.temporal == "tether" else np.inf  # Only the tether slows the cloth down.
     reset = {"frames": group.moving_frames, "finest": forces[-1].level, "reset": settings.reset}
     start = start_of(known, cage, **reset, moved=moved, pace=1.0 if creases is None else creases.pace)
-    contact = group.contact(frame, cage)
+    contact = group.contact(frame, cage, lost=None if known is None else known.given_up)
     if contact is not None and last is not None and last.clean and before is not None:
         contact.at(group.levels[-1]).remember(before)
     problem = Problem(

@@ -79,8 +79,9 @@ def _is_better(fresh: Mapping[str, Any], solved: Mapping[str, Any]) -> bool:
 
 
 def _crossings(telemetry: Mapping[str, Any]) -> int:
-    """Crossings of cloth with cloth in a result."""
-    return int(telemetry.get("contact", {}).get("cloth", {}).get("after", {}).get("crossings", 0))
+    """Crossings of cloth with cloth in a result, without given-up cloth: a start from the cage gives that up, too."""
+    after = telemetry.get("contact", {}).get("cloth", {}).get("after", {})
+    return int(after.get("crossings", 0) - after.get("given_up", 0))
 
 
 def _excess(telemetry: Mapping[str, Any], *, whole: bool = False) -> float:

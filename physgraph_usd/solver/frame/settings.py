@@ -8,14 +8,7 @@ from dataclasses import dataclass, field
 
 from ..contact.settings import ContactSettings
 from ..integrate import LEARNED, METHODS, Method
-from ..integrate.solve import Budget
-
-COARSE_STEPS, COARSE_TOLERANCE = 4, 0.1
-"""Steps and tolerance of a coarse level relative to the finest: coarse steps are cheap and shape the folds."""
-EXTRA = 3
-"""Extra steps of the finest level of a cold frame far from rest, relative to its regular steps."""
-REST = 2.0
-"""Remaining move, in tolerances, below which a frame starting from cloth at rest makes no step."""
+from ..integrate.stop import Budget, level_budget
 
 
 @dataclass(frozen=True)
@@ -62,18 +55,6 @@ class SolveSettings:
     cancelled: Callable[[], bool] | None = None
 
     def budget(self, below: int, clock: float, *, warm: bool) -> Budget:
-        """Steps and deadline of a level; the finest level makes at least one step.
-
-        Args:
-            below: Number of levels finer than this level.
-            clock: Time at which the frame was ready to be solved [s].
-            warm: Whether the level starts from the last frame's result.
-        """
-        deadline = None
-        if self.budget_ms is not None:
-            deadline = clock + 1e-3 * self.budget_ms * (1.0 - 0.7 * (below > 0)) ** min(below, 2)
-        if not below:
-            rest, extra = (REST, 0) if warm else (1.0, EXTRA * self.steps)
-            return Budget(self.steps, self.tolerance, deadline, rest, extra, self.cancelled, least=1)
-        steps, tolerance = COARSE_STEPS * self.steps, COARSE_TOLERANCE * self.tolerance
-        return Budget(steps, tolerance, deadline, cancelled=self.cancelled)
+        """The budget of a level, as for `level_budget`."""
+        limits = {"seconds": None if self.budget_ms is None else 1e-3 * self.budget_ms, "cancelled": self.cancelled}
+        return level_budget(self.steps, self.tolerance, below, warm=warm, clock=clock, **limits)

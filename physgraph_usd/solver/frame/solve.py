@@ -19,22 +19,14 @@ from ..forces.base import ForceModule
 from ..integrate.base import Carry, System
 from ..integrate.guard import PATIENCE
 from ..integrate.saddle import leave_saddle
-from ..integrate.solve import Budget, LevelReport, descend, solve_level
+from ..integrate.solve import LevelReport, descend, solve_level
+from ..integrate.stop import UNTANGLINGS, WARM_UNTANGLINGS
 from ..level import Placed, unhindered
 from .group import Group
 from .level_forces import blame
 from .outcome import measured, refuse_swallowed, scaled, state_left, telemetry_of
 from .problem import LevelProblem, begin
 from .values import FrameInput, Solved, State
-
-STEPS, LONGEST = 4, 16
-"""Steps of a round with contact, and without: pairs are detected again after a round."""
-MOST, TOUCHING = 40, 3
-"""Most steps of a level with contact: a multiple of the budget's, at most `MOST`, or the budget's if larger."""
-FEWER = 1.0 / 3.0
-"""Fraction of the steps after which a warm frame in contact may finish, if near rest: one round."""
-UNTANGLINGS, WARM_UNTANGLINGS = 25, 4
-"""Most untangling rounds: at the cage in a cold frame, and in a warm frame."""
 
 
 def solve_frame(group: Group, frame: FrameInput, last: State | None) -> Solved:
@@ -102,12 +94,13 @@ def solve_one_level(
         terms = view.terms(x)
         x = view.moved(x, leave_saddle(problem.system(view, terms, x), level, x, outward=problem.outward))
     carry, last, terms, made, touched, integrator = None, None, (), 0, False, problem.integrator
-    while not made or made < _most_steps(problem.budget, reports[-1], touched=touched):
+    while True:
         terms = view.terms(x)
         touched = touched or bool(terms)
         system = problem.system(view, terms, x, last=last)
         resume = carry if last is not None and system.has_same_metric(last) else None
-        of_round = _round_budget(budget, system, first=not made, steps=STEPS if terms else LONGEST)
+        shrunk = SMOOTH if isinstance(system.metric, HeldMetric) else 1.0
+        of_round = budget.for_round(first=not made, touching=bool(terms), shrunk=shrunk)
         carry, report = descend(system, integrator, x, level=level.index, budget=of_round, resume=resume)
         report.remaining_move = _smooth_move(system, carry, report)
         reports.append(report)
@@ -115,8 +108,7 @@ def solve_one_level(
         wanted = carry.x
         x, last = view.moved(x, wanted), system
         blocked = x is not wanted
-        near = touched and made >= FEWER * budget.steps and report.remaining_move < problem.near * budget.tolerance
-        if near or _is_last(report, blocked=blocked):
+        if budget.ends(report, made=made, touched=touched, blocked=blocked):
             break
         replaceable = smoothing is None and integrator.name != problem.untangler.name
         if carry.setbacks >= PATIENCE or (replaceable and _went_up(reports)):
@@ -129,43 +121,24 @@ def solve_one_level(
 def _untangle(problem: LevelProblem, view: LevelContact, x: Placed) -> tuple[Placed, list[LevelReport]]:
     """Rounds of few steps to shorten intersection contours: at the cage, and for crossings left from before."""
     level, budget = problem.level, problem.budget
-    cold, start = level.index == 0, x
+    cold = level.index == 0
     x = view.laid_back(x) if cold else x
     reports: list[LevelReport] = []
-    short = replace(budget, steps=min(STEPS, budget.steps), tolerance=0.0, extra=0, least=0)
+    short = budget.for_untangling()
     while len(reports) < (UNTANGLINGS if cold else WARM_UNTANGLINGS):
-        if is_over() or not view.comes_apart(x, all_crossings=cold):
+        if is_over() or not view.comes_apart(x):
             break
-        terms = view.terms(x, all_crossings=cold)
+        terms = view.terms(x)
         system = problem.system(view, terms, x)
         wanted, report = solve_level(system, problem.untangler, x, level=level.index, budget=short)
         x = view.drawn(x, wanted) if cold else view.moved(x, wanted)
         reports.append(report)
-    return view.without_hope(x, start) if cold else x, reports
-
-
-def _most_steps(budget: Budget, report: LevelReport, *, touched: bool) -> int:
-    """Most steps of a level, given the last round's report: more with contact or far from rest."""
-    most = budget.steps + budget.extra * budget.is_far(report.remaining_move)
-    return max(most, min(MOST, TOUCHING * budget.steps)) if touched else most
+    return x, reports
 
 
 def _went_up(reports: list[LevelReport]) -> bool:
     """Whether the last round began at a higher energy than the round before, whose steps met undetected contact."""
     return len(reports) > 1 and reports[-1].energy_before > reports[-2].energy_before
-
-
-def _is_last(report: LevelReport, *, blocked: bool) -> bool:
-    """Whether the rounds end here: no step was made, the budget is spent, or the cloth settled and was not blocked."""
-    return report.stopped == "budget" or not report.steps or (report.stopped == "tolerance" and not blocked)
-
-
-def _round_budget(budget: Budget, system: System, *, first: bool, steps: int) -> Budget:
-    """The budget of a round; with a contact metric the tolerance shrinks, because the metric underestimates moves."""
-    shrunk = SMOOTH if isinstance(system.metric, HeldMetric) else 1.0
-    rest = budget.rest if first else 1.0
-    tolerance, least = shrunk * budget.tolerance, budget.least if first else 0
-    return replace(budget, steps=min(steps, budget.steps), extra=0, tolerance=tolerance, rest=rest, least=least)
 
 
 def _smooth_move(system: System, carry: Carry, report: LevelReport) -> float:

@@ -16,8 +16,8 @@ from .settings import Reset
 from .values import Cage, State
 
 WORTH, LEAST_STRAIN = 2.0, 0.5
-"""Limits of the 99th percentile of edge strain with carried detail, relative to the upsampled cage's and absolute. Above
-both a frame starts cold: a crumpled cage tears carried detail."""
+"""Limits of the 99th percentile of edge strain with carried detail, relative to the upsampled cage's, and absolute. A
+frame starts cold above both: a crumpled cage tears carried detail."""
 STILL = 0.02
 """Largest motion of cage and bodies between samples, in mean cage edges, for a held pose: slow settling is visible in a
 held pose, so the cloth is slowed down."""

@@ -63,8 +63,9 @@ class State:
         frames: Cage frames, columns are tangent, bitangent, normal, shape (C, 3, 3).
         held: Number of frames of a held pose.
         fine: Fine positions [m], world space, float64, to continue from; None before the first solve.
-        clean: Whether nothing crosses, neither garments solved together nor bodies.
+        clean: Whether nothing crosses and is given up, neither garments solved together nor bodies.
         inside: Mask of the vertices inside a body, shape (V,); None if none is.
+        given_up: Mask of the cage vertices in tangles that are given up, shape (C,), bool; None without such tangles.
         bent: Remembered bends of the finest hinges of each garment [rad], shape (H,), None for a garment without
             memory; () if no garment has creases.
         creeps: Whether creases still change, so that equal input gives a different frame.
@@ -79,6 +80,7 @@ class State:
     fine: Float[Tensor, "vertices 3"] | None = None
     clean: bool = False
     inside: Bool[Tensor, " vertices"] | None = None
+    given_up: Bool[Tensor, " coarse"] | None = None
     bent: tuple[Tensor | None, ...] = ()
     creeps: bool = False
     failures: int = 0
@@ -136,8 +138,10 @@ def join(parts: Sequence[State]) -> State:
         masks = [(part, torch.zeros(len(part.detail), dtype=torch.bool, device=part.detail.device)) for part in parts]
         inside = torch.cat([none if part.inside is None else part.inside for part, none in masks])
     failures, wait = (max(getattr(part, name) for part in parts) for name in ("failures", "wait"))
-    kept = {"inside": inside, "fine": walked, "clean": clean, "bent": bent, "creeps": creeps, "failures": failures, "wait": wait}
-    return State(*whole, held=min(part.held for part in parts), **kept)
+    lost = [torch.zeros(len(p.coarse), dtype=torch.bool) if p.given_up is None else p.given_up.cpu() for p in parts]
+    given_up = torch.cat(lost).to(parts[0].coarse.device) if any(p.given_up is not None for p in parts) else None
+    kept = {"fine": walked, "clean": clean, "bent": bent, "creeps": creeps, "failures": failures, "wait": wait}
+    return State(*whole, held=min(part.held for part in parts), inside=inside, given_up=given_up, **kept)
 
 
 def split(state: State, coarse: Sequence[slice], fine: Sequence[slice]) -> list[State]:
@@ -152,6 +156,7 @@ def split(state: State, coarse: Sequence[slice], fine: Sequence[slice]) -> list[
         replace(
             state,
             coarse=state.coarse[c],
+            given_up=None if state.given_up is None else state.given_up[c],
             detail=state.detail[f],
             frames=state.frames[c],
             fine=None if state.fine is None else state.fine[f],

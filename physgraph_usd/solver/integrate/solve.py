@@ -4,50 +4,14 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from jaxtyping import Float
 from torch import Tensor
 
 from ...errors import SolveError
-from ..deadline import is_over
 from .base import Carry, Integrator, System, resumed
-
-FAR = 50.0
-"""Remaining move, in tolerances, above which a level counts as unsolved: by default a visible tenth of a fine edge."""
-
-
-@dataclass(frozen=True)
-class Budget:
-    """Stopping criteria.
-
-    Attributes:
-        steps: Most steps at one level.
-        tolerance: Stop when the RMS of H0^-1 F is under this many local edge lengths.
-        deadline: `time.perf_counter` value after which only the first `least` steps may begin, or None.
-        rest: Remaining move, in tolerances, below which no step is made from the start: cloth nearly at rest stays.
-        extra: Additional steps while the remaining move is over `FAR` tolerances.
-        cancelled: Asked before each step whether the result is no longer needed; or None.
-        least: Number of steps exempt from the deadline.
-    """
-
-    steps: int
-    tolerance: float = 0.0
-    deadline: float | None = None
-    rest: float = 1.0
-    extra: int = 0
-    cancelled: Callable[[], bool] | None = None
-    least: int = 0
-
-    def is_spent(self, steps: int) -> bool:
-        """Whether no further step may begin after ``steps`` steps, whatever the cloth's state."""
-        late = self.deadline is not None and steps >= self.least and time.perf_counter() >= self.deadline
-        return late or is_over() or (self.cancelled is not None and self.cancelled())
-
-    def is_far(self, remaining_move: float) -> bool:
-        """Whether the remaining move justifies extra steps; never for tolerance 0."""
-        return self.tolerance > 0 and not remaining_move <= FAR * self.tolerance
+from .stop import Budget
 
 
 @dataclass(eq=False)
@@ -141,17 +105,7 @@ def descend(
 
 
 def _reason_to_stop(system: System, carry: Carry, steps: int, budget: Budget) -> str:
-    if carry.mover == "stayed":
-        return "stalled"
-    if budget.tolerance > 0 and _remaining_move(system, carry) < budget.tolerance * (1.0 if steps else budget.rest):
-        return "tolerance"
-    if steps >= budget.steps and (
-        steps >= budget.steps + budget.extra or not budget.is_far(_remaining_move(system, carry))
-    ):
-        return "steps"
-    if budget.is_spent(steps):
-        return "budget"
-    return ""
+    return "stalled" if carry.mover == "stayed" else budget.reason(steps, lambda: _remaining_move(system, carry))
 
 
 def _remaining_move(system: System, carry: Carry) -> float:

@@ -1,0 +1,138 @@
+"""When a level ends: the cloth rests, the steps are spent, or the time is over.
+
+Every number of this decision is in this file. `Budget` holds the criteria of a level, or of one round of a level:
+`descend` asks `reason` before each step, and the rounds of a frame ask `ends` after each round.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+from ..deadline import is_over
+
+ROUND, LONGEST = 4, 16
+"""Most steps of a round with contact, and without: near pairs are found again after a round."""
+TOUCHING = 3
+"""Most steps of the finest level with contact, relative to the budget's: blocked moves cost steps."""
+REST = 2.0
+"""Remaining move [tolerances] below which a warm frame makes no step."""
+NEAR, EARLY = 10.0, 1.0 / 3.0
+"""A warm frame in contact ends below this remaining move [tolerances] after this fraction of its steps, one round."""
+COARSE_STEPS, COARSE_TOLERANCE, COARSE_TIME = 4, 0.1, 0.3
+"""Steps and tolerance of a coarse level, relative to the finest: coarse steps are cheap and shape the folds. And the
+fraction of its time that a level leaves to the coarser levels."""
+UNTANGLINGS, WARM_UNTANGLINGS = 25, 4
+"""Most untangling rounds: at the cage, and at a finer level or in a warm frame."""
+
+
+class Ended(Protocol):
+    """The part of a report that decides whether another round follows."""
+
+    steps: int
+    stopped: str
+    remaining_move: float
+
+
+@dataclass(frozen=True)
+class Budget:
+    """Stopping criteria of a level or a round.
+
+    Attributes:
+        steps: Most steps.
+        tolerance: Stop when the RMS of H0^-1 F is under this many local edge lengths; 0 for never.
+        deadline: `time.perf_counter` value after which only the first `least` steps may begin, or None.
+        rest: Remaining move, in tolerances, below which no step is made from the start: cloth nearly at rest stays.
+        cancelled: Asked before each step whether the result is no longer needed; or None.
+        least: Number of steps exempt from the deadline.
+        touching: Most steps with contact, if more.
+        near: Remaining move, in tolerances, below which a level in contact ends early; 0 for never.
+    """
+
+    steps: int
+    tolerance: float = 0.0
+    deadline: float | None = None
+    rest: float = 1.0
+    cancelled: Callable[[], bool] | None = None
+    least: int = 0
+    touching: int = 0
+    near: float = 0.0
+
+    def for_round(self, *, first: bool, touching: bool, shrunk: float) -> Budget:
+        """The budget of a round.
+
+        Args:
+            first: Whether this is the level's first round.
+            touching: Whether there is contact.
+            shrunk: Factor of the tolerance: a metric with contact underestimates moves.
+        """
+        steps = min(ROUND if touching else LONGEST, self.steps)
+        once = {} if first else {"rest": 1.0, "least": 0}
+        return replace(self, steps=steps, tolerance=shrunk * self.tolerance, **once)
+
+    def for_untangling(self) -> Budget:
+        """The budget of an untangling round, without a tolerance: contours shorten while nothing moves much."""
+        return replace(self, steps=min(ROUND, self.steps), tolerance=0.0, least=0)
+
+    def reason(self, steps: int, remaining: Callable[[], float]) -> str:
+        """Why no further step follows: "tolerance", "steps" or "budget"; "" if one does.
+
+        Args:
+            steps: Number of steps made.
+            remaining: Gives the remaining move, in local edge lengths.
+        """
+        if self.tolerance > 0 and remaining() < self.tolerance * (1.0 if steps else self.rest):
+            return "tolerance"
+        if steps >= self.steps:
+            return "steps"
+        return "budget" if self.is_spent(steps) else ""
+
+    def ends(self, report: Ended, *, made: int, touched: bool, blocked: bool) -> bool:
+        """Whether no further round of the level follows.
+
+        Args:
+            report: Report of the last round.
+            made: Steps of all rounds.
+            touched: Whether any round had contact.
+            blocked: Whether the last move was blocked.
+        """
+        if report.stopped == "budget" or not report.steps or (report.stopped == "tolerance" and not blocked):
+            return True
+        if touched and made >= EARLY * self.steps and report.remaining_move < self.near * self.tolerance:
+            return True
+        return made >= (max(self.steps, self.touching) if touched else self.steps)
+
+    def is_spent(self, steps: int) -> bool:
+        """Whether no further step may begin after ``steps`` steps, whatever the cloth's state."""
+        late = self.deadline is not None and steps >= self.least and time.perf_counter() >= self.deadline
+        return late or is_over() or (self.cancelled is not None and self.cancelled())
+
+
+def level_budget(
+    steps: int,
+    tolerance: float,
+    below: int,
+    *,
+    warm: bool,
+    clock: float = 0.0,
+    seconds: float | None = None,
+    cancelled: Callable[[], bool] | None = None,
+) -> Budget:
+    """The budget of a level; the finest level makes at least one step.
+
+    Args:
+        steps: Most steps at the finest level.
+        tolerance: Tolerance of the finest level, in local edge lengths.
+        below: Number of levels finer than this level.
+        warm: Whether the level starts from the last frame's result.
+        clock: Time at which the frame was ready to be solved [s].
+        seconds: Time limit for solving the frame from then on [s], or None.
+        cancelled: As for `Budget`.
+    """
+    deadline = None if seconds is None else clock + seconds * COARSE_TIME ** min(below, 2)
+    if below:
+        return Budget(COARSE_STEPS * steps, COARSE_TOLERANCE * tolerance, deadline, cancelled=cancelled)
+    finest = Budget(steps, tolerance, deadline, cancelled=cancelled, least=1, touching=TOUCHING * steps)
+    return replace(finest, rest=REST, near=NEAR) if warm else finest
