@@ -1,4 +1,4 @@
-"""Contact: the force, and sheets that rest on bodies."""
+"""Contact: sheets that rest on bodies."""
 
 from __future__ import annotations
 
@@ -7,56 +7,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from bodies import Soup, ball, box, distances, flipped, together, tube
 from cloth import FABRIC, sheet
 from folds import frame_with, named, refiner_with, square
-from sheets import level_of
 from touching import frame, measured, mesh_pose, refiner
 
 from physgraph_usd.solver.colliders.pose import Collider, ShapePose
 from physgraph_usd.solver.contact.broad_phase import Bodies
-from physgraph_usd.solver.forces.contact import Contact, Planes
 
 MESH, REST = sheet(12, 12, 0.05)
 FLAT = np.ascontiguousarray((REST - REST.mean(axis=0))[:, [0, 2, 1]] * np.array([1.0, 1.0, -1.0]))
 """The sheet lying level: normals up, gravity is down y."""
-
-
-def random_planes(count: int, seed: int = 0) -> tuple[Planes, torch.Tensor]:
-    rng = np.random.default_rng(seed)
-    normal = rng.normal(size=(count, 3))
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    x = torch.as_tensor(rng.normal(size=(count, 3)))
-    height = (torch.as_tensor(normal) * x).sum(dim=1) + torch.as_tensor(rng.uniform(-0.1, 0.1, count))
-    return Planes(torch.arange(count, dtype=torch.int32), torch.as_tensor(normal), height), x
-
-
-class TestForce:
-    level = level_of(REST, MESH.indices.reshape(-1, 3))
-
-    def test_it_is_minus_the_gradient(self):
-        planes, x = random_planes(self.level.vertex_count)
-        other = random_planes(self.level.vertex_count, 1)[0]
-        contact = Contact(self.level, [planes, replace(other, height=other.height - 0.5)], 1e4)
-        clear = torch.stack([(each.height - (each.normal * x).sum(dim=1)).abs() > 1e-3 for each in contact.planes])
-        force = torch.zeros_like(x)
-        contact.add_force(x, force)
-        rng = np.random.default_rng(5)
-        for vertex in rng.choice(np.flatnonzero(clear.all(dim=0).numpy()), 12):
-            for axis in range(3):
-                step = torch.zeros_like(x)
-                step[vertex, axis] = 1e-6
-                ahead, behind = (contact.add_force(x + s * step, torch.zeros_like(x)) for s in (1, -1))
-                slope = float(ahead - behind) / 2e-6
-                assert -slope == pytest.approx(float(force[vertex, axis]), rel=1e-5, abs=1e-6)
-
-    def test_above_a_plane_cloth_feels_nothing(self):
-        planes, x = random_planes(self.level.vertex_count)
-        below = replace(planes, height=(planes.normal * x).sum(dim=1) - 1e-3)
-        force = torch.zeros_like(x)
-        assert float(Contact(self.level, [below], 1e4).add_force(x, force)) == 0.0
-        assert not bool(force.any())
 
 
 def draped(height: float) -> np.ndarray:

@@ -15,9 +15,9 @@ from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.solver.colliders.mesh import MeshBody
 from physgraph_usd.solver.colliders.pose import MeshPose
-from physgraph_usd.solver.contact.bodies import FrameBodies, LevelBodies, Touching
+from physgraph_usd.solver.contact.bodies import FrameBodies, Touching
+from physgraph_usd.solver.contact.cloth import ClothContact, ClothView
 from physgraph_usd.solver.contact.measure import depths, pinched
-from physgraph_usd.solver.contact.push_out import pushed_out
 from physgraph_usd.solver.contact.settings import ContactSettings
 from physgraph_usd.solver.frame.refiner import Refiner
 from physgraph_usd.solver.level import Level
@@ -29,11 +29,15 @@ OVER, UNDER = (ball(0.15, at=(0.0, side * 0.13, 0.0), level=4) for side in (1.0,
 """Balls that overlap by 4 cm, in a lens of 7.5 cm about the middle of the sheet's plane."""
 
 
-def bodies_of(levels: tuple[Level, ...], cage: torch.Tensor, *soups: Any) -> FrameBodies:
-    """A frame's bodies, meshes all."""
+def view_of(levels: tuple[Level, ...], cage: torch.Tensor, *soups: Any) -> ClothView:
+    """The finest level of the sheet among bodies, meshes all."""
     posed = [MeshBody(device="cpu", threads=1).pose(MeshPose(*soup))[0] for soup in soups]
     touching = [Touching(f"/Body{index}", each, (0.002,)) for index, each in enumerate(posed)]
-    return FrameBodies.begin(levels, touching, cage, origin=np.zeros(3), settings=SETTINGS)
+    bodies = FrameBodies.begin(levels[0], touching, cage, origin=np.zeros(3), settings=SETTINGS)
+    base, thickness = levels[-1].base.apply(cage), torch.tensor([0.002])
+    return ClothView(
+        ClothContact(levels, [SHEET]), levels[-1], base=base, thickness=thickness, settings=SETTINGS, bodies=bodies
+    )
 
 
 def lens_of(level: Level, *, wider: float = 0.0) -> torch.Tensor:
@@ -52,11 +56,11 @@ class TestParts:
         found = surface.closest(x, torch.full((1,), torch.inf))
         way = surface.exit(x, found)
         lost = torch.ones(1, dtype=torch.bool)
-        assert not bool(pinched(surface, x, found, way, longest=0.02))
-        assert bool(pinched(surface, x, found, way, longest=0.02, lost=lost))
-        assert bool(pinched(surface, x, found, way, longest=0.06, lost=lost))
+        assert not bool(pinched(found, way, longest=0.02))
+        assert bool(pinched(found, way, longest=0.02, lost=lost))
+        assert bool(pinched(found, way, longest=0.06, lost=lost))
         # The report counts it as the solve leaves it.
-        assert [bool(depths(surface, x, -found.distance, 0.02, lost=each)[1]) for each in (None, lost)] == [False, True]
+        assert [bool(depths(surface, x, lost, 0.02, lost=each)[1]) for each in (None, lost)] == [False, True]
 
     @pytest.mark.parametrize("along", [0.5, -0.5])
     def test_a_face_that_a_part_comes_through_is_no_way_out_there(self, along: float):
@@ -77,29 +81,30 @@ class TestLost:
     """Which cloth no body sends out, and that it does not."""
 
     @staticmethod
-    def view(*soups: Any, height: float = 0.0) -> tuple[Level, LevelBodies, torch.Tensor]:
+    def view(*soups: Any, height: float = 0.0) -> tuple[Level, ClothView, torch.Tensor]:
         """The finest level of a flat sheet [m], and what it sees of bodies."""
         levels = levels_of(SHEET)
         cage = torch.as_tensor(SHEET.rest, dtype=torch.float32) + torch.tensor([0.0, height, 0.0])
-        view, x = bodies_of(levels, cage, *soups).at(levels[-1], levels[-1]), levels[-1].base.apply(cage)
-        return levels[-1], view.losing(x), x
+        return levels[-1], view_of(levels, cage, *soups), levels[-1].base.apply(cage)
 
     def test_cloth_right_through_an_overlap_is_lost_there(self):
         level, view, x = self.view(together(OVER, UNDER))
-        lost = view.tracks[0].lost
-        assert lost is not None
+        assert view.bodies is not None
+        assert view.bodies.lost is not None
+        lost = view.bodies.lost[0]
         assert int(lens_of(level).sum()) > 9
         assert bool(lost[lens_of(level, wider=-0.01)].all())
         assert not bool(lost[~lens_of(level, wider=0.01)].any())
-        out = pushed_out(view, x)[1]
+        out = view.pushed_out(x)
         assert torch.equal(out[lost], x[lost])
 
     def test_nor_does_a_body_whose_parts_only_graze_it(self):
         """In one part, whose face over it the other buries, but nowhere in both: it is pushed out."""
         _, view, x = self.view(together(OVER, UNDER), height=0.03)
-        assert [track.lost for track in view.tracks] == [None]
-        out = pushed_out(view, x)[1]
-        assert not torch.equal(out, x)
+        assert view.bodies is not None
+        assert view.bodies.lost is not None
+        assert not bool(view.bodies.lost[0].any())
+        assert not torch.equal(view.pushed_out(x), x)
 
 
 class TestRepairedCage:

@@ -32,8 +32,6 @@ from shots import refine
 from physgraph_usd.solver.collide.crossings import crossings
 from physgraph_usd.solver.collide.pairs import Reach
 from physgraph_usd.solver.collide.parts import Parts
-from physgraph_usd.solver.contact.bodies import LevelBodies
-from physgraph_usd.solver.contact.push_out import projected, pushed_out
 from physgraph_usd.solver.contact.settings import ContactSettings
 from physgraph_usd.solver.forces import elastic_terms
 from physgraph_usd.solver.forces.base import ForceModule
@@ -208,18 +206,6 @@ def test_seams_stay_closed_on_a_body(options: dict[str, Any]):
         assert gap_of(answer.points[0], base_of(cloth[0], cage, 1)) < 1e-7
         after = next(iter(answer.telemetry[0]["contact"]["bodies"].values()))["after"]
         assert after["inside"] == 0
-
-
-def test_what_bodies_push_out_is_closed():
-    """A face beside a seam that a body's corner comes through is lifted on its own side: that opens the seam."""
-    level, seam, base = two_halves()
-    bodies = LevelBodies(level, (), ContactSettings())
-    opened = base + 1e-3 * noise(base)
-    assert not torch.equal(seam.closed(opened), opened)
-    assert projected(bodies, opened)[1] is opened
-    bodies = replace(bodies, seam=seam)
-    for out in (projected(bodies, opened)[1], pushed_out(bodies, opened)[1]):
-        assert torch.equal(out, seam.closed(opened))
 
 
 def test_a_box_of_sewn_faces_settles():

@@ -26,7 +26,7 @@ from ...shot.solve import prepare_device
 from ...solver.contact.settings import ContactSettings
 from ...solver.fabric import Fabric
 from ...solver.forces.base import ForceModule
-from ...solver.forces.contact import Contact, Planes
+from ...solver.forces.self_contact import PairConstraints, SelfContact
 from ...solver.frame.group import Group
 from ...solver.frame.settings import SolveSettings
 from ...solver.integrate import METHODS
@@ -106,14 +106,17 @@ class Body:
         height = edge * 10.0 ** rng.uniform(*HEIGHT)
         return Body(float(rng.choice([-1.0, 1.0])), wave, float(rng.uniform(0.0, 2.0 * np.pi)), height, stiffness)
 
-    def contact(self, level: Level, base: Float[Tensor, "vertices 3"], *, span: slice) -> Contact:
+    def contact(self, level: Level, base: Float[Tensor, "vertices 3"], *, span: slice) -> SelfContact:
         """The force on a patch at a level, from the upsampled cages [m] and the span of the patch's vertices."""
         normal = self.side * VertexFrame(level, base).normal[span]
         cage = base[span]
         lift = self.height * torch.sin(cage @ torch.as_tensor(self.wave).to(cage) + self.phase)
         vertex = torch.arange(span.start, span.stop, dtype=torch.int32, device=base.device)
-        planes = Planes(vertex, normal.contiguous(), (normal * cage).sum(dim=1) + lift)
-        return Contact(level, [planes], self.stiffness)
+        weight = torch.zeros((len(vertex), 4), dtype=base.dtype, device=base.device)
+        weight[:, 0] = 1.0
+        height, stiffness = (normal * cage).sum(dim=1) + lift, self.stiffness * level.vertex_area[span]
+        corners = vertex.unsqueeze(1).repeat(1, 4)
+        return SelfContact(level, PairConstraints(corners, weight, normal.contiguous(), height, stiffness), "contact")
 
 
 def with_bodies(

@@ -11,7 +11,7 @@ import multiprocessing
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from functools import reduce
 
 import numpy as np
 import torch
@@ -22,7 +22,6 @@ from ...errors import PhysGraphError
 from ...shot.solve import prepare_device
 from ...solver.contact.metric import HeldMetric
 from ...solver.forces.base import Force, ForceModule
-from ...solver.forces.contact import Contact, Planes
 from ...solver.forces.guide import Guide
 from ...solver.forces.self_contact import PairConstraints, SelfContact
 from ...solver.forces.tether import Tether
@@ -70,9 +69,7 @@ class Round:
         frames: Their materials.
         gravity: [m/s^2], shape (3,).
         aim: The cage that the cloth follows, recentred [m], shape (C, 3).
-        bodies: Vertex, normal and height of the planes of each body [m].
-        stiffness: k_c of those [N/m^3].
-        pairs: The fields of `PairConstraints`; empty without pairs.
+        pairs: The fields of `PairConstraints`, of cloth and bodies; empty without contact.
         tie: Stiffness [1/s^2] of the tether; 0 without one.
         predicted: Where it ties [m], shape (V, 3); the start without one.
         stiff: K of the metric [N/m], shape (V,).
@@ -86,8 +83,6 @@ class Round:
     frames: tuple[GarmentFrame, ...]
     gravity: np.ndarray
     aim: np.ndarray
-    bodies: tuple[Arrays, ...]
-    stiffness: float
     pairs: Arrays
     tie: float
     predicted: np.ndarray
@@ -99,7 +94,7 @@ class Round:
     @property
     def touches(self) -> bool:
         """Whether something is near."""
-        return bool(self.bodies) or bool(self.pairs)
+        return bool(self.pairs)
 
 
 class Watch:
@@ -153,14 +148,10 @@ def _noted(words: str, group: Group, frames: Sequence[GarmentFrame], system: Sys
     """A system and a start as plain arrays."""
     field = system.field
     assert isinstance(field, ForceModule)
-    bodies, pairs, stiffness, tie, predicted = (), (), 0.0, 0.0, x
-    aim = None
+    gaps, tie, predicted, aim = list[PairConstraints](), 0.0, x, None
     for term in field.forces:
-        if isinstance(term, Contact):
-            bodies = tuple((p.vertex.numpy(), p.normal.numpy(), p.height.numpy()) for p in term.planes)
-            stiffness = float(term.stiffness)
-        elif isinstance(term, SelfContact):
-            pairs = tuple(getattr(term.gaps, each.name).numpy() for each in fields(term.gaps))
+        if isinstance(term, SelfContact):
+            gaps.append(term.gaps)
         elif isinstance(term, Tether):
             tie, predicted = term.stiffness, term.predicted
         elif isinstance(term, Guide):
@@ -169,8 +160,10 @@ def _noted(words: str, group: Group, frames: Sequence[GarmentFrame], system: Sys
     stiff = system.metric.stiff if isinstance(system.metric, HeldMetric) else torch.zeros_like(x[:, 0])
     plain = [replace(garment, level=len(group.levels) - 1) for garment in group.garments]
     predicted, stiff, x = (each.clone() for each in (predicted, stiff, x))
+    together = reduce(PairConstraints.with_more, gaps) if gaps else None
+    pairs = () if together is None else tuple(getattr(together, each.name).numpy() for each in fields(together))
     about = (words, tuple(plain), tuple(frames), group.gravity, aim.clone().numpy())
-    return Round(*about, bodies, stiffness, pairs, float(tie), predicted.numpy(), stiff.numpy(), x.numpy())
+    return Round(*about, pairs, float(tie), predicted.numpy(), stiff.numpy(), x.numpy())
 
 
 def system_of(rounds: Sequence[Round], *, device: str) -> System:
@@ -191,10 +184,6 @@ def system_of(rounds: Sequence[Round], *, device: str) -> System:
     if any(each.tie for each in rounds):
         ties = torch.tensor([each.tie for each in rounds for _ in each.garments], device=device)
         forces.append(Tether(level, lasting.density * ties, 1.0, joined([each.predicted for each in rounds])))
-    planes = [_planes(rounds, starts, place, joined) for place in range(max(len(each.bodies) for each in rounds))]
-    if planes:
-        own = [np.full(len(each.x), each.stiffness, np.float32) for each in rounds]
-        forces.append(Contact(level, planes, joined(own)))
     paired = [(each, start) for each, start in zip(rounds, starts, strict=True) if each.pairs]
     if paired:
         shifted = [(each.pairs[0] + start, *each.pairs[1:]) for each, start in paired]
@@ -203,15 +192,6 @@ def system_of(rounds: Sequence[Round], *, device: str) -> System:
     assert isinstance(metric, Metric)
     held = HeldMetric(metric, stiff) if bool((stiff > 0).any()) else metric
     return System(ForceModule(forces), held, free=level.free, spacing=level.spacing, level=level)
-
-
-def _planes(rounds: Sequence[Round], starts: np.ndarray, place: int, joined: Any) -> Planes:
-    """The planes of the bodies that come at one place in each round."""
-    there = [
-        (each.bodies[place], start) for each, start in zip(rounds, starts, strict=True) if len(each.bodies) > place
-    ]
-    vertex = joined([body[0] + start for body, start in there])
-    return Planes(vertex, *(joined([body[k] for body, _ in there]) for k in (1, 2)))
 
 
 def measured(each: Round, steps: int) -> Round | None:

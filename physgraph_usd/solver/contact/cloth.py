@@ -25,7 +25,7 @@ from ..forces.seam import Seam
 from ..forces.self_contact import PairConstraints, SelfContact
 from ..level import Level
 from ..scene import Garment
-from .bodies import Chords, FrameBodies, LevelBodies
+from .bodies import ON_SURFACE, Chords, FrameBodies, LevelBodies
 from .broad_phase import touch_one_another
 from .cloth_mesh import ClothMesh
 from .settings import ContactSettings
@@ -90,6 +90,7 @@ class _Looked:
     tangles: Tangles | None
     pierced: Pierced | None = None
     inside: Tensor | None = None
+    touching: Tensor | None = None
 
 
 def _clean(x: Tensor) -> _Looked:
@@ -260,12 +261,13 @@ class ClothView:
         return self._look(x).tangles
 
     def exempt(self, x: Float[Tensor, "vertices 3"]) -> Bool[Tensor, " all"] | None:
-        """Mask of the cloth inside or through a body at x [m], False for the bodies' corners; None if none is."""
+        """Mask of the cloth inside, through or on a body at x [m], False for the bodies' corners; None if none is."""
         looked = self._look(x)
         if looked.pierced is None or (looked.inside is None and not looked.pierced.count):
-            return None
+            return self.padded(looked.touching)
         some = self.mesh.grown(self.mesh.crossed(looked.pierced.crossings), BESIDE)
-        return self.padded(some if looked.inside is None else some | looked.inside.any(dim=0))
+        some = some if looked.inside is None else some | looked.inside.any(dim=0)
+        return self.padded(some if looked.touching is None else some | looked.touching)
 
     def in_bodies(self, x: Float[Tensor, "vertices 3"]) -> int:
         """Number of vertices inside bodies, and of crossings with bodies, at x [m]."""
@@ -273,18 +275,29 @@ class ClothView:
         inside = 0 if looked.inside is None else int(looked.inside.sum())
         return inside + (0 if looked.pierced is None else looked.pierced.count)
 
-    def _within(self, x: Tensor) -> tuple[Tensor, Chords]:
+    def _within(self, x: Tensor) -> tuple[Tensor, Chords | None]:
         """The vertices inside each body, and the places inside on edges and faces whose corners are outside."""
         looked, bodies = self._look(x), self.bodies
         assert bodies is not None
-        assert looked.pierced is not None
         none = torch.zeros((len(bodies.frame.touching), len(x)), dtype=torch.bool, device=x.device)
         inside = none if looked.inside is None else looked.inside
-        return inside, chords_of(self.mesh, looked.pierced, self.with_bodies(x), inside)
+        return inside, chords_of(self.mesh, looked.pierced, self.with_bodies(x), inside) if looked.pierced else None
+
+    def _on_bodies(self, near: NearSprings) -> Bool[Tensor, "bodies vertices"]:
+        """The vertices on the faces of each body; no shortest vector tells where they belong, but the face's normal."""
+        count, pairs = self._level.vertex_count, near.near
+        on = pairs.face & (pairs.way.norm(dim=1) < ON_SURFACE) & (pairs.corners[:, 0] < count)
+        corners = pairs.corners[on].long()
+        bodies = 0 if self.frame is None else len(self.frame.touching)
+        out = torch.zeros((bodies, count), dtype=torch.bool, device=pairs.corners.device)
+        out[self._owner[corners[:, 3]] - len(self._level.spans), corners[:, 0]] = True
+        return out
 
     def pushed_out(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
         """As `LevelBodies.pushed_out`; x itself if no cloth is inside or through a body."""
-        return x if self.bodies is None or not self.in_bodies(x) else self.bodies.pushed_out(x, *self._within(x))
+        if self.bodies is None or not self.in_bodies(x):
+            return x
+        return self.bodies.pushed_out(x, *self._within(x))
 
     def padded(self, some: Bool[Tensor, " vertices"] | None) -> Bool[Tensor, " all"] | None:
         """A mask of vertices with False for the bodies' corners."""
@@ -292,8 +305,7 @@ class ClothView:
 
     def is_clean(self, x: Float[Tensor, "vertices 3"]) -> bool:
         """Whether nothing crosses at x [m], neither cloth, but where it is given up, nor bodies."""
-        looked = self._look(x)
-        return looked.crossings.count == 0 and looked.inside is None and not (looked.pierced and looked.pierced.count)
+        return self._look(x).crossings.count == 0 and self.exempt(x) is None
 
     def remember(self, x: Float[Tensor, "vertices 3"], given_up: Tangles | None = None) -> None:
         """Record that nothing crosses at x [m] but given-up cloth, as after a safe move from such positions."""
@@ -306,8 +318,12 @@ class ClothView:
         near = self._springs.find(at, pairs)
         with_body = near.near.corners.amax(dim=1) >= self._level.vertex_count
         pushes = self._springs.constraints(near.where(with_body), at, self._settings.stiffness)
-        if self.in_bodies(x) and self.bodies is not None:
-            pushes = pushes.with_more(self.bodies.pulls(x, *self._within(x)))
+        touching = self._on_bodies(near.where(with_body))
+        if bool(touching.any()):
+            self._looked = replace(looked, touching=touching.any(dim=0))
+        if self.bodies is not None and (self.in_bodies(x) or bool(touching.any())):
+            inside, chords = self._within(x)
+            pushes = pushes.with_more(self.bodies.pulls(x, inside | touching, chords))
         gaps = self._gaps(x, near.where(~with_body), at)
         found, tangles = looked.crossings, looked.tangles
         found = found if tangles is None else tangles.hopeful(found)
