@@ -22,14 +22,14 @@ ALLOWED = {
     "contact/frame.py FrameContact.at: _views": "one a level",
     "contact/broad_phase.py Bodies._meets: _bounds": "of a pose, until the next one",
     "contact/broad_phase.py Bodies._posed: _surfaces": "of a pose, until the next one",
-    "contact/cloth.py ClothView._look: _looked": "of the positions asked for last, and of no others",
-    "contact/cloth.py ClothView.term: came_near": "of the frame's report alone",
+    "contact/cloth.py ClothView.look: _looked": "of the positions asked for last, and of no others",
+    "contact/cloth.py ClothView.terms: came_near": "of the frame's report alone",
+    "contact/cloth.py ClothView.terms: _looked": "of the positions asked for last, and of no others",
     "contact/cloth.py ClothView.remember: _looked": "what the last frame found at those positions",
     "contact/metric.py HeldMetric.solve: _last": "of the force solved for last, and of no other",
     "contact/metric.py HeldMetric.stiffened: _last": "of the force solved for last, and of no other",
     # Functions of topology or of materials.
     "contact/cloth.py ClothContact.mesh: _meshes": "of a level and what is sewn there",
-    "contact/measure.py _Cloth.of: _known": "of a level's triangles",
     "frame/group.py Group.forces_for: _forces": "of the materials; of the last ones alone",
     "frame/group.py Group._built: _integrators": "of the method",
     "frame/scene_frame.py SceneCloth.group: _groups": "one a set of garments solved together",
@@ -39,7 +39,6 @@ ALLOWED = {
     "contact/broad_phase.py Bodies.pose: _bounds": "the frame's poses",
     "contact/broad_phase.py Bodies.pose: _poses": "the frame's poses",
     "contact/broad_phase.py Bodies.pose: _surfaces": "the frame's poses",
-    "contact/measure.py _Cloth.move: _points": "the hierarchy is refitted before each question",
 }
 """Module, class and method, and the field; and why it may be written there."""
 RUN = "Refiner"

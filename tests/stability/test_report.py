@@ -35,6 +35,7 @@ def test_a_cell_that_is_known_is_not_measured_again(tmp_path: Path):
 
 BEYOND = {
     20: "rounding decides how much of what starts past a body's middle stays inside: none to nine vertices of 1,089",
+    21: "cloth in half a millimetre between jaws still moves by 4 mm in fifty more steps, and by 1 mm from frame to frame",
     33: "rounding grows where cloth buckles",
     39: "waves of two and three edges are not told of",
 }
@@ -45,7 +46,7 @@ ELSEWHERE = {38: "test_forces_analytic.py"}
 
 def the_case(number: int) -> object:
     """A case to run; the slowest on request alone."""
-    marks = [pytest.mark.xfail(reason=BEYOND[number], strict=number != 20)] if number in BEYOND else []
+    marks = [pytest.mark.xfail(reason=BEYOND[number], strict=number not in (20, 21))] if number in BEYOND else []
     marks += [pytest.mark.slow] if number == 9 else []
     return pytest.param(number, marks=marks, id=f"S{number}")
 

@@ -220,7 +220,7 @@ def _judge_part(
     module, contact, origin = group.potential(frames, refiner.touching(part, frame))
     finest = group.levels[-1]
     x = torch.as_tensor(points - origin, dtype=finest.dtype, device=finest.device)
-    touched = () if contact is None else contact.at(finest).terms(x)[1]
+    touched = () if contact is None else contact.at(finest).terms(x)
     energies = ForceModule((*module.forces, *touched)).energies(x)
     return energies, edge_strain(finest, x)["p99"], {} if contact is None else contact.measure(x)[0]
 

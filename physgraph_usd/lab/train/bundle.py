@@ -263,7 +263,7 @@ class RoundBundle(Bundle):
 
 def deal_rounds(rounds: Sequence[Round], size: int) -> list[list[Round]]:
     """Batches of at most so many rounds that can be one `RoundBundle`, in their order."""
-    piles: dict[tuple[int, bool, int], list[Round]] = {}
+    piles: dict[tuple[int, bool], list[Round]] = {}
     for each in rounds:
         piles.setdefault((each.garments[0].level, bool(each.gravity.any())), []).append(each)
     return [pile[k : k + size] for pile in piles.values() for k in range(0, len(pile), size)]

@@ -41,6 +41,7 @@ class Parts:
         level: Level,
         meets: np.ndarray,
         label: Int[np.ndarray, " vertices"] | None = None,
+        *,
         solids: Sequence[Solid] = (),
     ) -> None:
         """Gather the clusters.

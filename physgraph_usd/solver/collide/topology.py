@@ -60,16 +60,8 @@ def topology_of(level: Level, meets: np.ndarray, label: np.ndarray, *, size: int
         size: Most vertices of a cluster.
         solids: The bodies.
     """
-    edges, faces = (each.cpu().numpy().astype(np.int64) for each in (level.edges, level.triangles))
-    garment, rest, cloths = level.vertex_garment.cpu().numpy(), level.rest.double().cpu().numpy(), len(level.spans)
-    for number, solid in enumerate(solids):
-        edges, faces = (
-            np.concatenate([edges, solid.edges + len(rest)]),
-            np.concatenate([faces, solid.faces + len(rest)]),
-        )
-        garment = np.concatenate([garment, np.full(len(solid.points), cloths + number)])
-        label = np.concatenate([label, np.arange(len(rest), len(rest) + len(solid.points))])
-        rest = np.concatenate([rest, solid.points])
+    rest, edges, faces, garment, label = _with_solids(level, label, solids)
+    cloths = len(level.spans)
     vertices, used = len(rest), np.unique(faces)  # A vertex of no face is no cloth.
     cluster = np.zeros(vertices, np.int64)
     cluster[used] = halved(rest[used], garment[used], size)
@@ -101,6 +93,24 @@ def topology_of(level: Level, meets: np.ndarray, label: np.ndarray, *, size: int
     table.meets = array(np.asarray(meets).ravel())
     table.rest = wp.array(rest, dtype=wp.vec3d, device=device)
     return table
+
+
+def _with_solids(
+    level: Level, label: np.ndarray, solids: Sequence[Solid]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Positions, edges, faces, garments and labels of the cloth at rest and of bodies, which follow as garments."""
+    rest, garment = level.rest.double().cpu().numpy(), level.vertex_garment.cpu().numpy()
+    edges, faces = (each.cpu().numpy().astype(np.int64) for each in (level.edges, level.triangles))
+    points, sides, corners, owners = [rest], [edges], [faces], [garment]
+    start = len(rest)
+    for number, solid in enumerate(solids):
+        points.append(solid.points)
+        sides.append(solid.edges + start)
+        corners.append(solid.faces + start)
+        owners.append(np.full(len(solid.points), len(level.spans) + number))
+        start += len(solid.points)
+    label = np.concatenate([label, np.arange(len(rest), start)])
+    return *(np.concatenate(each) for each in (points, sides, corners, owners)), label  # type: ignore[return-value]
 
 
 def halved(points: np.ndarray, group: np.ndarray, size: int) -> np.ndarray:

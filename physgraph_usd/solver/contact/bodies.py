@@ -11,7 +11,7 @@ is inside or outside as a whole.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import reduce
 
 import numpy as np
@@ -26,7 +26,7 @@ from ..forces.self_contact import PairConstraints
 from ..level import Level
 from ..mesh.topology import joined_by, patches_with
 from .along import ApproachLimits, along
-from .measure import Penetration, is_between, penetration, pinched
+from .measure import is_between, pinched
 from .settings import ContactSettings
 
 ASKED = 8
@@ -299,50 +299,6 @@ class LevelBodies:
         seeds[which[between[surface.inside(at[between], parts=2)]]] = True
         masks = (each.cpu().numpy() for each in (some, seeds))
         return torch.as_tensor(patches_with(self.level.edges.cpu().numpy(), *masks), device=x.device)
-
-    def depths(
-        self, x: Float[Tensor, "vertices 3"], inside: Bool[Tensor, "bodies vertices"] | None
-    ) -> list[tuple[float, str]]:
-        """Mean depth [m] and body path of each garment that is wholly inside a closed body at x [m]."""
-        found = [(0.0, "")] * len(self.level.spans)
-        for index, own in enumerate(() if inside is None else inside):
-            each = self.frame.touching[index]
-            for place, span in enumerate(self.level.spans):
-                if each.surface.closed and span.stop > span.start and bool(own[span].all()):
-                    at = x[span] + self.frame.shifts[index]
-                    near = each.surface.closest(at, torch.full_like(at[:, 0], float("inf")))
-                    found[place] = max(found[place], (float(near.distance.mean()), each.path))
-        return found
-
-    def measured(
-        self,
-        before: tuple[Tensor, Tensor | None, Pierced | None],
-        after: tuple[Tensor, Tensor | None, Pierced | None],
-    ) -> dict[str, object]:
-        """Penetrations and crossings of each body before and after the solve, as plain values.
-
-        Args:
-            before: Positions of the upsampled cage [m], the vertices inside each body, and crossings with bodies; None
-                for none.
-            after: The same of the result.
-        """
-        bodies: dict[str, object] = {}
-        for index, each in enumerate(self.frame.touching):
-            name = each.path if each.surface.closed else f"{each.path} (open part)"
-            lost = None if self.lost is None else self.lost[index]
-            bodies[name] = {
-                side: asdict(self._penetration(index, *given, lost=known))
-                for side, given, known in (("before", before, None), ("after", after, lost))
-            }
-        return bodies
-
-    def _penetration(
-        self, index: int, x: Tensor, inside: Tensor | None, pierced: Pierced | None, *, lost: Tensor | None
-    ) -> Penetration:
-        own = torch.zeros_like(self.level.free[:, 0]) if inside is None else inside[index]
-        count, at = 0 if pierced is None else int((pierced.body == index).sum()), x + self.frame.shifts[index]
-        known = {"longest": self.frame.longest, "lost": lost, "crossings": count}
-        return penetration(self.frame.touching[index].surface, self.level, at, own, **known)
 
 
 @dataclass(frozen=True, eq=False)

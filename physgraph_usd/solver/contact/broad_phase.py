@@ -158,6 +158,7 @@ class Bodies:
         self,
         indices: Sequence[int],
         offsets: Sequence[Sequence[float | None]],
+        *,
         before: Sequence[Pose | None] = (),
         motion: Rigid = AT_REST,
     ) -> tuple[Touching, ...]:

@@ -7,7 +7,7 @@ nearest: otherwise cloth that pushes at a place and is held at another would sta
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from typing import cast
 
@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ..collide.crossings import Crossings, Pierced, all_crossings, crossings
+from ..collide.crossings import Crossings, all_crossings, crossings
 from ..collide.pairs import Reach
 from ..collide.parts import Parts
 from ..collide.search import near_parts
@@ -25,15 +25,13 @@ from ..forces.seam import Seam
 from ..forces.self_contact import PairConstraints, SelfContact
 from ..level import Level
 from ..scene import Garment
-from .bodies import ON_SURFACE, Chords, FrameBodies, LevelBodies
+from .bodies import Chords, FrameBodies, LevelBodies
 from .broad_phase import touch_one_another
 from .cloth_mesh import ClothMesh
+from .look import Look
 from .settings import ContactSettings
-from .springs import HALF, MARGIN, ClothSprings, NearSprings
+from .springs import ClothSprings, NearSprings
 from .tangles import OUT, Tangles, chords_of, gaps_out
-
-BESIDE = 1
-"""Rings around crossings with a body within which cloth may pass through it."""
 
 
 class ClothContact:
@@ -68,7 +66,7 @@ class ClothContact:
         key = (sewn.tobytes(), meets.tobytes(), *map(id, solids))
         known, mesh = self._meshes.get(level.index, ((), None))
         if mesh is None or key != known:
-            mesh = ClothMesh(level, meets, sewn, solids)
+            mesh = ClothMesh(level, meets, sewn, solids=solids)
             self._meshes[level.index] = key, mesh
         return mesh
 
@@ -78,24 +76,6 @@ def _meet(a: Garment, b: Garment) -> bool:
     if a is b:
         return a.self_contact
     return touch_one_another(a, b)
-
-
-@dataclass(frozen=True, eq=False)
-class _Looked:
-    """Crossings at positions, with the tensor's version counter when they were found."""
-
-    x: Tensor
-    version: int
-    crossings: Crossings
-    tangles: Tangles | None
-    pierced: Pierced | None = None
-    inside: Tensor | None = None
-    touching: Tensor | None = None
-
-
-def _clean(x: Tensor) -> _Looked:
-    """Positions at which nothing crosses."""
-    return _Looked(x, x._version, Crossings.none(x.device), None)
 
 
 class ClothView:
@@ -141,7 +121,7 @@ class ClothView:
         self.mesh = lasting.mesh(level, seam, bodies, itself=self.keeps_sides)
         self._level, self._settings, self._thickness = level, settings, thickness
         self._base, self._seam, self.frame = base, seam, bodies
-        self._base_is_clean, self._looked = is_clean, cast("_Looked | None", None)
+        self._base_is_clean, self._looked = is_clean, cast("Look | None", None)
         self.came_near: bool | None = None
 
     @cached_property
@@ -150,13 +130,13 @@ class ClothView:
         if self.frame is None:
             return None
         bodies = LevelBodies(self._level, self.frame, self.mesh.pieces)
-        inside = self._at_base.inside
+        inside = self.at_base.inside
         return bodies if inside is None else bodies.losing(self._base, inside)
 
     @cached_property
-    def _at_base(self) -> _Looked:
+    def at_base(self) -> Look:
         """Crossings, tangles and vertices inside bodies of the upsampled cage that is followed."""
-        return _clean(self._base) if self._base_is_clean else self._found(self._base)
+        return Look.clean(self._base) if self._base_is_clean else self.found(self._base)
 
     @property
     def parts(self) -> Parts:
@@ -183,63 +163,36 @@ class ClothView:
         return torch.cat([x.double(), self.corners])
 
     @cached_property
-    def _owner(self) -> Tensor:
-        """Garment of each vertex, then number of each body's corners as further garments."""
-        sizes = [len(each.points) for each in (() if self.frame is None else self.frame.solids)]
-        bodies = torch.arange(len(sizes)).repeat_interleave(torch.tensor(sizes, dtype=torch.int64))
-        own = self._level.vertex_garment.long()
-        return torch.cat([own, bodies.to(own) + len(self._level.spans)])
-
-    @cached_property
-    def _keep(self) -> Tensor:
-        """Distance kept by two garments, or by a garment and a body [m]."""
-        count = len(self._level.spans)
-        mean = 0.5 * (self._thickness.unsqueeze(0) + self._thickness.unsqueeze(1))
-        if self.frame is None:
-            return mean
-        offsets = torch.as_tensor(self.frame.offsets).to(mean)
-        out = mean.new_zeros((count + offsets.shape[1],) * 2)
-        out[:count, :count], out[:count, count:], out[count:, :count] = mean, offsets, offsets.T
-        return out
-
-    @cached_property
     def _springs(self) -> ClothSprings:
         """Contact spring finder of this frame."""
-        return ClothSprings(self.mesh, self._base, self.corners, self._owner, self._keep)
+        return ClothSprings(self.mesh, self._base, self._thickness, self.frame)
 
-    @cached_property
+    @property
     def near(self) -> Reach:
-        """Search radii of contact springs: half the distance kept, and half of `MARGIN` edges, a vertex [m]."""
-        play = 0.5 * MARGIN * self._level.spacing.double()
-        thickness = 0.5 * self._thickness.double()
-        radius = thickness[self._level.vertex_garment.long()] + play
-        if self.frame is not None:
-            beyond = self._keep[: len(thickness), len(thickness) :].double() - thickness.unsqueeze(1)
-            of_body = beyond.amax(dim=0).clamp_min(0.0) + play.max()
-            radius = torch.cat([radius, of_body[self._owner[len(play) :] - len(thickness)]])
-            play = torch.nn.functional.pad(play, (0, len(radius) - len(play)))
-        return Reach(radius, play, HALF)
+        """Search radii of contact springs."""
+        return self._springs.reach
 
     @cached_property
     def asked(self) -> Bool[Tensor, " all"] | None:
         """Mask of the vertices that are not given up, True for the bodies' corners; None for all of the cloth."""
-        return None if self.given_up is None else ~self.padded(self.given_up)
+        count = len(self.corners)
+        return None if self.given_up is None else torch.nn.functional.pad(~self.given_up, (0, count), value=True)
 
     def crossings(self, x: Float[Tensor, "vertices 3"]) -> Crossings:
         """Crossings at x [m], without given-up cloth; cached for the same tensor until its version changes."""
-        return self._look(x).crossings
+        return self.look(x).crossings
 
     def inside(self, x: Float[Tensor, "vertices 3"]) -> Bool[Tensor, "bodies vertices"] | None:
         """The vertices inside each body at x [m]; None if none is."""
-        return self._look(x).inside
+        return self.look(x).inside
 
-    def _look(self, x: Tensor) -> _Looked:
+    def look(self, x: Tensor) -> Look:
         """Cached crossings, tangles and vertices inside bodies at x."""
         if self._looked is None or self._looked.x is not x or self._looked.version != x._version:
-            self._looked = self._found(x)
+            self._looked = self.found(x)
         return self._looked
 
-    def _found(self, x: Tensor) -> _Looked:
+    def found(self, x: Tensor) -> Look:
         """Crossings, tangles and vertices inside bodies at x."""
         bodies = None if self.frame is None else LevelBodies(self._level, self.frame, self.mesh.pieces)
         pierced = inside = None
@@ -254,48 +207,31 @@ class ClothView:
             kept = ~lost[self.mesh.corners_of(found)].all(dim=1)
             found = Crossings(found.edge[kept], found.face[kept])
         tangles = Tangles.find(self.mesh, found, lost) if found.count or self.given_up is not None else None
-        return _Looked(x, x._version, found, tangles, pierced, inside)
+        return Look(x, x._version, found, tangles, pierced, inside)
 
     def tangles(self, x: Float[Tensor, "vertices 3"]) -> Tangles | None:
         """Tangles at x [m]: crossings and the cloth around them; None without crossings and given-up cloth."""
-        return self._look(x).tangles
+        return self.look(x).tangles
 
     def exempt(self, x: Float[Tensor, "vertices 3"]) -> Bool[Tensor, " all"] | None:
         """Mask of the cloth inside, through or on a body at x [m], False for the bodies' corners; None if none is."""
-        looked = self._look(x)
-        if looked.pierced is None or (looked.inside is None and not looked.pierced.count):
-            return self.padded(looked.touching)
-        some = self.mesh.grown(self.mesh.crossed(looked.pierced.crossings), BESIDE)
-        some = some if looked.inside is None else some | looked.inside.any(dim=0)
-        return self.padded(some if looked.touching is None else some | looked.touching)
+        return self.padded(self.look(x).exempt(self.mesh))
 
-    def in_bodies(self, x: Float[Tensor, "vertices 3"]) -> int:
+    def in_bodies(self, x: Float[Tensor, "vertices 3"]) -> tuple[int, int]:
         """Number of vertices inside bodies, and of crossings with bodies, at x [m]."""
-        looked = self._look(x)
-        inside = 0 if looked.inside is None else int(looked.inside.sum())
-        return inside + (0 if looked.pierced is None else looked.pierced.count)
+        return self.look(x).in_bodies
 
     def _within(self, x: Tensor) -> tuple[Tensor, Chords | None]:
         """The vertices inside each body, and the places inside on edges and faces whose corners are outside."""
-        looked, bodies = self._look(x), self.bodies
+        looked, bodies = self.look(x), self.bodies
         assert bodies is not None
         none = torch.zeros((len(bodies.frame.touching), len(x)), dtype=torch.bool, device=x.device)
         inside = none if looked.inside is None else looked.inside
         return inside, chords_of(self.mesh, looked.pierced, self.with_bodies(x), inside) if looked.pierced else None
 
-    def _on_bodies(self, near: NearSprings) -> Bool[Tensor, "bodies vertices"]:
-        """The vertices on the faces of each body; no shortest vector tells where they belong, but the face's normal."""
-        count, pairs = self._level.vertex_count, near.near
-        on = pairs.face & (pairs.way.norm(dim=1) < ON_SURFACE) & (pairs.corners[:, 0] < count)
-        corners = pairs.corners[on].long()
-        bodies = 0 if self.frame is None else len(self.frame.touching)
-        out = torch.zeros((bodies, count), dtype=torch.bool, device=pairs.corners.device)
-        out[self._owner[corners[:, 3]] - len(self._level.spans), corners[:, 0]] = True
-        return out
-
     def pushed_out(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
         """As `LevelBodies.pushed_out`; x itself if no cloth is inside or through a body."""
-        if self.bodies is None or not self.in_bodies(x):
+        if self.bodies is None or not any(self.in_bodies(x)):
             return x
         return self.bodies.pushed_out(x, *self._within(x))
 
@@ -305,23 +241,23 @@ class ClothView:
 
     def is_clean(self, x: Float[Tensor, "vertices 3"]) -> bool:
         """Whether nothing crosses at x [m], neither cloth, but where it is given up, nor bodies."""
-        return self._look(x).crossings.count == 0 and self.exempt(x) is None
+        return self.look(x).crossings.count == 0 and self.exempt(x) is None
 
     def remember(self, x: Float[Tensor, "vertices 3"], given_up: Tangles | None = None) -> None:
         """Record that nothing crosses at x [m] but given-up cloth, as after a safe move from such positions."""
-        self._looked = replace(_clean(x), tangles=given_up)
+        self._looked = replace(Look.clean(x), tangles=given_up)
 
     def terms(self, x: Float[Tensor, "vertices 3"]) -> tuple[SelfContact, ...]:
         """Contact forces with bodies and between near cloth at x [m], with crossings drawn apart; () without any."""
-        looked, at = self._look(x), self.with_bodies(x)
-        pairs = near_parts(self.parts, at, self.near, asked=self.asked, inside=self.exempt(x))
-        near = self._springs.find(at, pairs)
-        with_body = near.near.corners.amax(dim=1) >= self._level.vertex_count
+        looked, at = self.look(x), self.with_bodies(x)
+        inside = None if looked.inside is None else self.padded(looked.inside.any(dim=0))
+        near = self._springs.find(at, near_parts(self.parts, at, self.near, asked=self.asked, inside=inside))
+        near, with_body = self._springs.sided(near, self.exempt(x))
         pushes = self._springs.constraints(near.where(with_body), at, self._settings.stiffness)
-        touching = self._on_bodies(near.where(with_body))
+        touching = self._springs.on_bodies(near.where(with_body))
         if bool(touching.any()):
             self._looked = replace(looked, touching=touching.any(dim=0))
-        if self.bodies is not None and (self.in_bodies(x) or bool(touching.any())):
+        if self.bodies is not None and (any(self.in_bodies(x)) or bool(touching.any())):
             inside, chords = self._within(x)
             pushes = pushes.with_more(self.bodies.pulls(x, inside | touching, chords))
         gaps = self._gaps(x, near.where(~with_body), at)
@@ -342,34 +278,3 @@ class ClothView:
             kept = ~self.mesh.crossed(self.crossings(x))[corners].any(dim=1)
             near = near.where(kept & ~tangles.given_up[corners].all(dim=1))
         return self._springs.constraints(near, at, self._settings.cloth_stiffness)
-
-    def measure(
-        self, before: Float[Tensor, "vertices 3"], x: Float[Tensor, "vertices 3"]
-    ) -> tuple[dict[str, object], Bool[Tensor, " vertices"]]:
-        """Penetrations and crossings before and after, as plain values, and the vertices of crossing cloth after.
-
-        Positions that safe moves reached from a start without crossings have none and are not searched again.
-
-        Args:
-            before: The upsampled cage [m].
-            x: The result [m].
-        """
-        first, last = self._at_base if torch.equal(before, self._base) else self._found(before), self._look(x)
-        said: dict[str, object] = {}
-        if self.bodies is not None and self.frame is not None:
-            sides = ((before, first), (x, last))
-            given = [(at, looked.inside, looked.pierced) for at, looked in sides]
-            said["bodies"] = self.bodies.measured(*given)
-        kept, tangles = last.crossings, last.tangles
-        kept = kept if tangles is None else tangles.hopeful(kept)
-        found = kept if self.given_up is None else crossings(self.parts, x)
-        if self.keeps_sides:
-            base = first.crossings if self.given_up is None else crossings(self.parts, before)
-            crossed = {
-                name: {"crossings": each.count, "between_garments": int(np.triu(self.mesh.between(each), 1).sum())}
-                for name, each in (("before", base), ("after", found))
-            }
-            crossed["after"]["given_up"] = found.count - kept.count
-            near = bool(self.came_near) or any(each["crossings"] for each in crossed.values())
-            said["cloth"] = {"near": near, **crossed}
-        return said, self.mesh.crossed(found)

@@ -25,6 +25,7 @@ from .cloth_mesh import ClothMesh
 from .metric import HeldMetric
 from .promise import Before, Promise
 from .repair import repaired_cage
+from .report import depths, measured
 from .settings import ContactSettings
 from .tangles import Tangles
 
@@ -121,7 +122,7 @@ class LevelContact:
         Passes end once `STALLED` of them in a row left as much cloth in bodies; the best positions stay.
         """
         best, left, passes, stalled = x, self.cloth.in_bodies(x), 0, 0
-        while left and stalled < STALLED and not is_over():
+        while any(left) and stalled < STALLED and not is_over():
             x, passes, stalled = self.moved(x, self.cloth.pushed_out(x)), passes + 1, stalled + 1
             now = self.cloth.in_bodies(x)
             if now < left:
@@ -213,9 +214,9 @@ class FrameContact:
 
     @property
     def depths(self) -> list[tuple[float, str]]:
-        """As `LevelBodies.depths` of the cage; empty without bodies."""
+        """As `report.depths` of the cage; empty without bodies."""
         _, _, bodies, _, inside = self._cage
-        return [] if bodies is None else bodies.depths(self._coarse, inside)
+        return [] if bodies is None else depths(bodies, self._coarse, inside)
 
     @property
     def crossed(self) -> bool:
@@ -269,6 +270,10 @@ class FrameContact:
             moved["projected"] = {"vertices": int((shifts > 0).sum()), "largest_mm": far, "passes": passes}
         return out, moved
 
+    def is_out(self, x: Placed) -> bool:
+        """Whether no cloth is inside or through a body at x [m]."""
+        return not any(self.at(self._levels[-1]).cloth.in_bodies(x))
+
     def measure(self, x: Float[Tensor, "vertices 3"]) -> tuple[dict[str, object], Bool[Tensor, " vertices"]]:
         """Penetrations and crossings before and after, as plain values, and a mask of the vertices of crossing cloth.
 
@@ -276,4 +281,4 @@ class FrameContact:
             x: The result [m].
         """
         view = self.at(self._levels[-1])
-        return view.cloth.measure(view.closed(self._levels[-1].base.apply(self._coarse)), x)
+        return measured(view.cloth, view.closed(self._levels[-1].base.apply(self._coarse)), x)

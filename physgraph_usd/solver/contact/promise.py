@@ -16,6 +16,9 @@ from .along import ApproachLimits, along
 from .cloth import ClothView
 from .safe_move import ROUNDS, safe_move
 
+HALVINGS = 2
+"""Most halvings of a move with bodies. With one, half as many vertices more of shot 02 jump at level 1, in a fifth less
+time."""
 TRIES = 4
 """Most tries that hold only the worsened tangles to the promise, before all hopeful tangles are held."""
 
@@ -100,11 +103,11 @@ class Promise:
         inside = view.exempt(start) if since is None else view.padded(since.inside)
         options = _Options(floor=self.floor, tangle=label, inside=inside)
         end = view.with_bodies(aim)
-        x, proved = self._on(begin, end, options, aim.dtype, halve=since is not None)
+        x, proved = self._on(begin, end, options, aim.dtype, halvings=0 if since is None else HALVINGS)
         return Placed(aim if x is end else x[:count].to(aim)), proved
 
     def _on(
-        self, begin: Tensor, end: Tensor, options: _Options, dtype: torch.dtype, *, halve: bool
+        self, begin: Tensor, end: Tensor, options: _Options, dtype: torch.dtype, *, halvings: int
     ) -> tuple[Tensor, bool]:
         """Positions after a move of cloth and bodies, and whether all pairs with bodies are proved apart.
 
@@ -113,7 +116,7 @@ class Promise:
             end: Wanted positions [m]; those of bodies are reached.
             options: Options of the search.
             dtype: Type to which positions of the cloth are rounded.
-            halve: Whether a move that is not proved is made in two halves: planes may turn once more.
+            halvings: How often a move that is not proved may be made in two halves: planes may turn once more.
         """
         view, parts, count = self.view, self.view.parts, self.view.parts.level.vertex_count
         moves = (end != begin).any(dim=1)
@@ -134,11 +137,11 @@ class Promise:
             if not len(met.value):
                 return ends, True
             planes = planes.joined(ApproachLimits.of(begin, ends, met, self.floor, corners=True))
-        if halve:
+        if halvings:
             middle = 0.5 * (begin + end)
             middle[:count] = view.closed(middle[:count].to(dtype)).double()
-            middle, first = self._on(begin, middle, options, dtype, halve=False)
-            ends, second = self._on(middle, end, options, dtype, halve=False)
+            middle, first = self._on(begin, middle, options, dtype, halvings=halvings - 1)
+            ends, second = self._on(middle, end, options, dtype, halvings=halvings - 1)
             return ends, first and second
         if not stand:  # Cloth that stays behind a body that moves on would be in the body.
             options = _Options(**options)

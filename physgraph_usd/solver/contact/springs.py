@@ -14,17 +14,20 @@ area, or a third of the least of the cloth corners' areas.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
+import numpy as np
 import torch
 import warp as wp
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..collide.distance import weights_of
-from ..collide.pairs import NearPairs, Pairs
+from ..collide.pairs import NearPairs, Pairs, Reach
 from ..forces.self_contact import PairConstraints
 from ..mesh.kernels import KERNELS
 from ..mesh.threads import argument, run
+from .bodies import ON_SURFACE, FrameBodies
 from .cloth_mesh import ClothMesh
 
 wp.set_module_options(KERNELS)
@@ -100,32 +103,61 @@ class NearSprings:
         return NearSprings(self.near.where(torch.nonzero(kept).squeeze(1)), self.offset[kept])
 
 
+def _kept(thickness: Float[Tensor, " garments"], offsets: np.ndarray | None) -> Float[Tensor, "all all"]:
+    """Distance kept by two garments, or by a garment and a body, which follow as further garments [m]."""
+    mean, count = 0.5 * (thickness.unsqueeze(0) + thickness.unsqueeze(1)), len(thickness)
+    if offsets is None:
+        return mean
+    own = torch.as_tensor(offsets).to(mean)
+    out = mean.new_zeros((count + own.shape[1],) * 2)
+    out[:count, :count], out[:count, count:], out[count:, :count] = mean, own, own.T
+    return out
+
+
 class ClothSprings:
-    """Finder of the contact springs of a level's cloth with itself and with bodies in one frame."""
+    """Finder of the contact springs of a level's cloth with itself and with bodies in one frame.
+
+    Attributes:
+        owner: Garment of each vertex, then number of each corner's body after those of the garments, int32.
+    """
 
     def __init__(
         self,
         mesh: ClothMesh,
         base: Float[Tensor, "vertices 3"],
-        bodies: Float[Tensor, "corners 3"],
-        owner: Int[Tensor, " all"],
-        keep: Float[Tensor, "garments garments"],
+        thickness: Float[Tensor, " garments"],
+        bodies: FrameBodies | None,
     ) -> None:
         """Take the frame.
 
         Args:
             mesh: The level's mesh.
             base: The upsampled cage [m]; distances between parts in the cage are not widened.
-            bodies: Positions of the bodies' corners [m].
-            owner: Garment of each vertex; bodies follow as further garments.
-            keep: Distance kept by two garments, or a garment and a body [m].
+            thickness: Thickness of each garment [m].
+            bodies: The bodies of the frame, or None.
         """
-        level = mesh.level
-        self._mesh, self._cloths, self._owner = mesh, len(level.spans), owner.to(torch.int32).contiguous()
-        self._area = level.vertex_area.double()
-        self._rest, self._base = (torch.cat([each.double(), bodies]) for each in (level.rest, base))
-        self._keep = keep.double().contiguous()
-        self._spacing = torch.nn.functional.pad(level.spacing.double(), (0, len(bodies)), value=torch.inf)
+        level, none = mesh.level, base.new_zeros((0, 3)).double()
+        points = none if bodies is None else bodies.points
+        self._mesh, self._cloths, self._area = mesh, len(level.spans), level.vertex_area.double()
+        self._keep = _kept(thickness.double(), None if bodies is None else bodies.offsets).contiguous()
+        sizes = torch.tensor([len(each.points) for each in (() if bodies is None else bodies.solids)]).long()
+        others = torch.arange(len(sizes)).repeat_interleave(sizes).to(level.vertex_garment) + self._cloths
+        self.owner = torch.cat([level.vertex_garment, others]).to(torch.int32).contiguous()
+        self._rest, self._base = (torch.cat([each.double(), points]) for each in (level.rest, base))
+        self._spacing = torch.nn.functional.pad(level.spacing.double(), (0, len(points)), value=torch.inf)
+
+    @cached_property
+    def reach(self) -> Reach:
+        """Search radii: half the distance kept by garments, and half of `MARGIN` edges; a body's adds what it keeps."""
+        level, count = self._mesh.level, self._mesh.level.vertex_count
+        play, garment = 0.5 * MARGIN * level.spacing.double(), level.vertex_garment.long()
+        thickness = self._keep.diagonal()[: self._cloths]
+        radius, others = 0.5 * thickness[garment] + play, len(self.owner) - count
+        if others:
+            beyond = (self._keep[: self._cloths, self._cloths :] - 0.5 * thickness.unsqueeze(1)).amax(dim=0)
+            of_body = beyond.clamp_min(0.0) + play.max()
+            radius = torch.cat([radius, of_body[self.owner[count:].long() - self._cloths]])
+        return Reach(radius, torch.nn.functional.pad(play, (0, others)), HALF)
 
     def find(self, x: Float[Tensor, "all 3"], pairs: Pairs) -> NearSprings:
         """Pairs that have a spring.
@@ -140,7 +172,7 @@ class ClothSprings:
         )
         kept = torch.empty(count, dtype=torch.bool, device=device)
         inputs: list[object] = [argument(each, wp.vec3d) for each in (x.contiguous(), self._rest, self._base)]
-        inputs += [argument(self._owner), argument(self._keep.view(-1)), len(self._keep), self._cloths]
+        inputs += [argument(self.owner), argument(self._keep.view(-1)), len(self._keep), self._cloths]
         inputs += [argument(self._spacing)]
         inputs += [argument(pairs.corners, wp.vec4i), argument(pairs.face)]
         inputs += [argument(weight, wp.vec4d), argument(way, wp.vec3d), argument(offset), argument(kept)]
@@ -163,3 +195,28 @@ class ClothSprings:
         least = torch.where(corners < count, self._area[corners.clamp_max(count - 1)], torch.inf)
         share = torch.where(near.face & (corners[:, 0] < count), least[:, 0], least.amin(dim=1) / 3.0)
         return self._mesh.anchored(near.corners, near.weight, normal, springs.offset, stiffness * share, x)
+
+    def sided(
+        self, near: NearSprings, exempt: Bool[Tensor, " all"] | None
+    ) -> tuple[NearSprings, Bool[Tensor, " springs"]]:
+        """Springs that know their side, and a mask of those with bodies.
+
+        Where cloth goes through a body (`exempt`), the shortest vector between edges, or from the body's vertices, may
+        point either way; from a vertex outside to a face it points out.
+        """
+        corners, count = near.near.corners.long(), self._mesh.level.vertex_count
+        with_body = corners.amax(dim=1) >= count
+        if exempt is None:
+            return near, with_body
+        of_vertex = near.near.face & (corners[:, 0] < count)
+        kept = ~with_body | of_vertex | ~exempt[corners].any(dim=1)
+        return near.where(kept), with_body[kept]
+
+    def on_bodies(self, near: NearSprings) -> Bool[Tensor, "bodies vertices"]:
+        """The vertices on the faces of each body; no shortest vector tells where they belong, but the face's normal."""
+        count, pairs = self._mesh.level.vertex_count, near.near
+        on = pairs.face & (pairs.way.norm(dim=1) < ON_SURFACE) & (pairs.corners[:, 0] < count)
+        corners = pairs.corners[on].long()
+        out = torch.zeros((len(self._keep) - self._cloths, count), dtype=torch.bool, device=corners.device)
+        out[self.owner[corners[:, 3]].long() - self._cloths, corners[:, 0]] = True
+        return out

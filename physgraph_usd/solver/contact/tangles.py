@@ -194,7 +194,7 @@ def gaps_out(
 def chords_of(
     mesh: ClothMesh, pierced: Pierced, x: Float[Tensor, "all 3"], inside: Bool[Tensor, "bodies vertices"]
 ) -> Chords:
-    """The middle of the crossings of each edge and face of the cloth whose corners are outside a body.
+    """The middle of the crossings of each edge and face of the cloth whose corners and neighbours are outside a body.
 
     Args:
         mesh: The cloth and the bodies.
@@ -216,7 +216,8 @@ def chords_of(
     mean = mean / mean.sum(dim=1, keepdim=True)
     first = torch.full_like(keys, len(key)).scatter_reduce(0, row, torch.arange(len(key), device=x.device), "amin")
     body, corners = pierced.body[first], corners[first]
-    outside = ~inside[body.unsqueeze(1), corners].any(dim=1)
+    around = torch.stack([mesh.grown(own, 1) for own in inside])  # Beside vertices inside, these draw the cloth along.
+    outside = ~around[body.unsqueeze(1), corners].any(dim=1)
     return Chords(body[outside], corners[outside], mean[outside].to(mesh.level.rest))
 
 

@@ -157,8 +157,8 @@ class Refiner:
     def _solve(self, frame: Frame, wanted: Sequence[bool] | None) -> State:
         refuse_far(self.scene, frame)
         gap = self._is_gap(frame.time)
-        if self._settings.temporal == "off":  # Without history the result depends on this frame only, to the bit.
-            self._cloth.bodies.forget()
+        if self._settings.temporal == "off" or not any(each.last for each in self._memories):
+            self._cloth.bodies.forget()  # Without history the result depends on this frame only, to the bit.
         self._cloth.bodies.pose(frame.colliders)
         count = len(frame.garments)
         asked = [True] * count if wanted is None else list(wanted)

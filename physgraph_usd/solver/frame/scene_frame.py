@@ -105,6 +105,7 @@ class SceneCloth:
         part: Sequence[int],
         frames: Sequence[GarmentFrame],
         near: Sequence[int],
+        *,
         origin: Origin | None = None,
     ) -> tuple[Touching, ...]:
         """Surfaces of bodies, and the distance kept from each by each garment; with their places in the start frame."""
@@ -112,7 +113,8 @@ class SceneCloth:
         pairs = zip(felt, frames, strict=True)
         offsets = [[frame.offset if body in bodies else None for body in near] for bodies, frame in pairs]
         known = () if origin is None else origin.colliders
-        return self.bodies.touching(near, offsets, known, AT_REST if origin is None else origin.motion)
+        motion = AT_REST if origin is None else origin.motion
+        return self.bodies.touching(near, offsets, before=known, motion=motion)
 
     def heat(self, index: int, points: np.ndarray, crossing: np.ndarray | None) -> dict[str, np.ndarray]:
         """Depth of a garment inside bodies with overlapping bounds, pushing or not, and crossings of cloth.
@@ -226,7 +228,7 @@ class SceneFrame:
         cage = None if origin.state is not None else self._cage_walked(part)
         elapsed = origin.elapsed(self.frame.time, self.cloth.scene.seconds)
         while True:
-            touching = self.cloth.touching(part, frames, near, origin)
+            touching = self.cloth.touching(part, frames, near, origin=origin)
             moved = origin.moved(part, self.frame, near, self.cloth.scene.gravity)
             walked = None if cage is None else cage[0]
             given = FrameInput(frames, self.frame.time, touching, moved, walked=walked, elapsed=elapsed)

@@ -55,10 +55,11 @@ def solve_frame(group: Group, frame: FrameInput, last: State | None) -> Solved:
         broken = blame(group.garments, problem.forces[-1], problem.cage.points, error=error, at=frame.at)
         raise SolveError(broken) from error
     assert x is not None
-    finish = dict[str, object]()
+    finish, shown = dict[str, object](), x
     if problem.contact is not None:
-        x, finish = problem.contact.finish(x)
-    left, shown = state_left(problem, x), scaled(problem, x)
+        shown, finish = problem.contact.finish(x)
+        x = shown if problem.contact.is_out(shown) else x  # What is pushed out in vain is not carried on.
+    left, shown = state_left(problem, x), scaled(problem, shown)
     solved = time.perf_counter()
     telemetry = telemetry_of(problem, shown, module, reports=reports)
     contact, crossing = measured(problem, shown)
