@@ -9,7 +9,7 @@ from pathlib import Path
 from shots import cloth_shot
 
 POSIX_ONLY = ("fcntl", "grp", "pwd", "resource", "termios")
-EXTRAS = ("matplotlib", "plotly", "viser", "trimesh", "PIL", "distributed")
+EXTRAS = ("matplotlib", "plotly", "viser", "PIL", "distributed")
 """Libraries that a farm node can do without."""
 BLOCKED = f"""
 import sys

@@ -14,6 +14,8 @@ from .topology import EDGE, FACE, LANES, VERTEX, Topology
 
 wp.set_module_options(KERNELS)
 
+WITHIN = wp.constant(wp.float64(20.0))
+"""Largest distance of a body's edges and vertices from cloth that they push, in plays, of which an edge has twenty."""
 ALL = wp.constant(8)
 """Most blocks compared at a time."""
 
@@ -80,6 +82,14 @@ def value_of(face: wp.bool, c: wp.vec4i, parts: Topology, query: Query):
     if gap_along(middles, face, zero, b, d, f) >= least and gap_along(middles, face, zero, v, p, q) >= least:
         return one
     if query.kind == NEAR:
+        with_body = parts.owner[c[0]] >= parts.cloths or parts.owner[c[3]] >= parts.cloths
+        if with_body and not (face and parts.owner[c[0]] < parts.cloths):
+            play = (
+                query.play
+            )  # Bodies' edges and vertices matter to cloth of larger faces; else its vertices see the faces.
+            room = wp.min(room, WITHIN * wp.max(wp.max(play[c[0]], play[c[1]]), wp.max(play[c[2]], play[c[3]])))
+            if distance_of(face, zero, b, d, f) >= room:
+                return one
         return nearness(face, c, parts, query, room)
     return safe_fraction(face, b, d, f, v - b, p - d, q - f, query.floor)
 

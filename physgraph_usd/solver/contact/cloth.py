@@ -155,8 +155,7 @@ class ClothView:
     @cached_property
     def corners(self) -> Float[Tensor, "corners 3"]:
         """Positions of the bodies' corners in this frame [m], float64."""
-        none = self._base.new_zeros((0, 3)).double()
-        return none if self.frame is None else self.frame.points
+        return self._base.new_zeros((0, 3)).double() if self.frame is None else self.frame.points
 
     def with_bodies(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "all 3"]:
         """Positions of the cloth and of the bodies' corners [m], float64."""
