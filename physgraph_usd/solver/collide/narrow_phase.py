@@ -88,8 +88,6 @@ def value_of(face: wp.bool, c: wp.vec4i, parts: Topology, query: Query):
                 query.play
             )  # Bodies' edges and vertices matter to cloth of larger faces; else its vertices see the faces.
             room = wp.min(room, WITHIN * wp.max(wp.max(play[c[0]], play[c[1]]), wp.max(play[c[2]], play[c[3]])))
-            if distance_of(face, zero, b, d, f) >= room:
-                return one
         return nearness(face, c, parts, query, room)
     return safe_fraction(face, b, d, f, v - b, p - d, q - f, query.floor)
 

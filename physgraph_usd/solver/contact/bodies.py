@@ -122,6 +122,7 @@ class LevelBodies:
         level: The level.
         frame: The bodies.
         pieces: Piece of each vertex of the uncut cloth, shape (V,).
+        lost: For each body, a mask of the cloth between its overlapping parts, shape (V,); None if not asked for.
     """
 
     level: Level
@@ -212,7 +213,7 @@ class LevelBodies:
     def pinched(
         self, x: Float[Tensor, "vertices 3"], inside: Bool[Tensor, "bodies vertices"]
     ) -> Bool[Tensor, " vertices"]:
-        """Mask of the vertices inside bodies that stay there."""
+        """Mask of the vertices between overlapping parts of bodies, too far from a way out."""
         out = inside.any(dim=0)
         for index, own in enumerate(inside):
             out[self._vertices_out(index, x, own)[0]] = False

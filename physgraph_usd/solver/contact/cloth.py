@@ -87,7 +87,7 @@ class ClothView:
         given_up: Mask of the vertices of tangles that are given up, None without such tangles. Parts whose vertices are
             all given up are not searched for contact or crossings with one another.
         keeps_sides: True if moves are promised to add no crossings of cloth with cloth.
-        came_near: True if parts were near one another in any call of `term`; None before the first call.
+        came_near: True if parts were near one another in any call of `terms`; None before the first call.
     """
 
     def __init__(

@@ -80,12 +80,6 @@ class ClothMesh:
         out[corners[corners < len(out)]] = True
         return out
 
-    def areas(self, corners: Int[Tensor, "pairs 4"]) -> Float[Tensor, " pairs"]:
-        """Area that stands for each pair [m^2]: the first vertex's, or the least of the corners' in the cloth."""
-        area, count = self.level.vertex_area, self.level.vertex_count
-        all_of = torch.where(corners < count, area[corners.clamp_max(count - 1)], torch.inf)
-        return torch.where(corners[:, 0] < count, all_of[:, 0], all_of.amin(dim=1))
-
     def anchored(
         self,
         corners: Int[Tensor, "pairs 4"],
@@ -95,7 +89,7 @@ class ClothMesh:
         stiffness: Float[Tensor, " pairs"],
         x: Float[Tensor, "all 3"],
     ) -> PairConstraints:
-        """Constraints of the cloth's corners, in which bodies' corners are constant at x [m]; the rest is theirs."""
+        """Constraints in which the corners of bodies are constant at x [m]; other arguments are `PairConstraints`'."""
         count = self.level.vertex_count
         if len(x) > count:
             fixed = corners >= count

@@ -16,9 +16,7 @@ class ContactSettings:
         cloth: Contact of cloth with cloth: "pairs" of points, faces and edges, or "off".
         stiffness: k_c of bodies, in stretch stiffnesses over the square of the cage's mean edge.
         cloth_stiffness: k_c of cloth pairs, in the same unit.
-        clearance: Fraction of the offset that the final projection leaves at least.
-        projections: Most passes of the final projection.
-        lifts: Most lifts of pierced faces in the final projection.
+        clearance: Fraction of the offset to which cloth inside bodies is moved out after the solve.
         way_out: Longest push of vertices that get between overlapping parts of a body, in the cage's mean edges.
             Vertices between such parts in the input stay.
         measured: True measures contact even if it is off.
@@ -29,8 +27,6 @@ class ContactSettings:
     stiffness: float = 15.0
     cloth_stiffness: float = 15.0
     clearance: float = 0.25
-    projections: int = 10
-    lifts: int = 40
     way_out: float = 0.5
     measured: bool = False
 

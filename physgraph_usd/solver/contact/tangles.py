@@ -37,7 +37,7 @@ from .cloth_mesh import ClothMesh
 TANGLED = 2
 """Rings around crossings that belong to a tangle."""
 OUT = 0.5
-"""Distance by which crossing parts move past one another in a round [mean edges]."""
+"""Relative move of a crossing edge and face in a round [mean edges]."""
 SURFACE = 0.5
 """Crossings per vertex of a tangle that is no longer one contour. Two sheets that meet along one contour have 0.31 at
 every level."""
@@ -175,7 +175,7 @@ def gaps_out(
     Args:
         mesh: The cloth.
         crossings: Crossings at x.
-        x: Positions of cloth, and of the bodies' corners if some of the crossings are with bodies [m].
+        x: Positions [m].
         step: Relative move of the edge and the face [m].
         stiffness: k_c [N/m^3].
     """
@@ -187,8 +187,10 @@ def gaps_out(
     length = way.norm(dim=1).repeat(2)
     normal = torch.nn.functional.normalize(way, dim=1, eps=1e-30).repeat(2, 1)
     here = (normal * (weight.unsqueeze(2) * x[corners]).sum(dim=1)).sum(dim=1)
-    strength = stiffness * share * mesh.areas(corners)
-    return mesh.anchored(corners.to(torch.int32), weight, normal, here + step * length, strength, x)
+    strength = stiffness * share * mesh.level.vertex_area[corners[:, 0]]
+    return PairConstraints(
+        corners.to(torch.int32).contiguous(), weight.contiguous(), normal, here + step * length, strength
+    )
 
 
 def chords_of(
