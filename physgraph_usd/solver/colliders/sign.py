@@ -31,19 +31,9 @@ MARGIN, ROUNDING = 1.001, 1e-6
 """Factor on the length and margin [m] for a segment to count as clear of the surface: distances are float32."""
 
 
-def is_clear(distance: Float[Tensor, " segments"], length: Float[Tensor, " segments"]) -> Bool[Tensor, " segments"]:
-    """Mask of the segments too short to pass through a surface.
-
-    Args:
-        distance: Sum of both ends' distances from the surface [m].
-        length: Lengths of the segments [m].
-    """
-    return distance > MARGIN * length + ROUNDING
-
-
 @wp.func
 def _is_clear(edge: wp.vec2i, x: wp.array(dtype=wp.vec3f), distance: wp.array(dtype=wp.float32)):
-    """`is_clear` of an edge."""
+    """Whether an edge is too short to pass through a surface, by its ends' distances from it [m]."""
     length = wp.length(x[edge[1]] - x[edge[0]])
     return distance[edge[0]] + distance[edge[1]] > MARGIN * length + ROUNDING
 
@@ -79,12 +69,7 @@ def _join(
 
 
 def signed_distances(
-    surface: Surface,
-    x: Float[Tensor, "vertices 3"],
-    edges: Int[Tensor, "edges 2"],
-    *,
-    reach: float,
-    least: Float[Tensor, " vertices"] | None = None,
+    surface: Surface, x: Float[Tensor, "vertices 3"], edges: Int[Tensor, "edges 2"], *, reach: float
 ) -> Float[Tensor, " vertices"]:
     """Distances to a surface [m], negative inside closed surfaces and behind open surfaces with a fixed side.
 
@@ -95,32 +80,12 @@ def signed_distances(
         x: Points in the surface's coordinates [m].
         edges: Pairs of neighbouring points.
         reach: Distance beyond which only the side is determined [m].
-        least: Known lower bounds [m], or None. Points outside by these bounds keep them without a query.
     """
-    return signed_and_closest(surface, x, edges, reach=reach, least=least)[0]
-
-
-def signed_and_closest(
-    surface: Surface,
-    x: Float[Tensor, "vertices 3"],
-    edges: Int[Tensor, "edges 2"],
-    *,
-    reach: float,
-    least: Float[Tensor, " vertices"] | None = None,
-) -> tuple[Float[Tensor, " vertices"], Nearest | None]:
-    """Signed distances and the closest points of points with negative distances; None if one was out of reach.
-
-    Arguments are as for `signed_distances`.
-    """
-    if least is not None and bool((least > 0.0).all()):
-        return least, None
     low, high = (torch.as_tensor(corner, dtype=x.dtype, device=x.device) for corner in surface.bounds)
-    away = torch.maximum((low - x).clamp_min(0.0), (x - high).clamp_min(0.0)).norm(dim=1)
-    asked = away <= reach if least is None else (away <= reach) & (least <= 0.0)
-    out = away if least is None else torch.maximum(away, least)
-    near = torch.nonzero(asked).squeeze(1)
+    out = torch.maximum((low - x).clamp_min(0.0), (x - high).clamp_min(0.0)).norm(dim=1)
+    near = torch.nonzero(out <= reach).squeeze(1)
     if not len(near):
-        return out, None
+        return out
     # Behind an open surface cloth may be at any distance.
     limit = float("inf") if surface.fixed_side is not None else max(reach, LEAST_REACH)
     found = surface.closest(x[near], torch.full_like(near, limit, dtype=x.dtype))
@@ -131,8 +96,7 @@ def signed_and_closest(
         out[near] *= found.side
     elif surface.closed:
         out[near] *= _sides(surface, x, out, near=near, told=found.side, edges=edges)
-    inside = found.some(torch.nonzero(out[near] < 0).squeeze(1))
-    return out, inside if bool(inside.distance.isfinite().all()) else None
+    return out
 
 
 def behind(found: Nearest, side: Float[Tensor, " points"] | float) -> Bool[Tensor, " points"]:
