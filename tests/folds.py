@@ -178,7 +178,7 @@ def frame_with(
 
 def near_pairs(parts: Parts, x: torch.Tensor, near: Reach) -> NearPairs:
     """The pairs found near one another, with their shortest vectors, without those that only rest distances let in."""
-    at, pairs = x.double(), near_parts(parts, x, near)
+    at, pairs = x.double(), near_parts(parts, x, near).pairs
     weight, corners = weights(at, pairs.corners, pairs.face), pairs.corners.long()
     way, radius = (weight.unsqueeze(2) * at[corners]).sum(dim=1), near.radius[corners]
     of_face = radius[:, 0] + radius[:, 1:].amax(dim=1)

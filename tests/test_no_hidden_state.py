@@ -25,6 +25,8 @@ ALLOWED = {
     "contact/cloth.py ClothView.look: _looked": "of the positions asked for last, and of no others",
     "contact/cloth.py ClothView.terms: came_near": "of the frame's report alone",
     "contact/cloth.py ClothView.terms: _looked": "of the positions asked for last, and of no others",
+    "contact/springs.py ClothSprings.near: _near": "of the positions asked for last, and of no others",
+    "contact/springs.py ClothSprings.blocking: _near": "at the end of the move asked for last",
     "contact/cloth.py ClothView.remember: _looked": "what the last frame found at those positions",
     "contact/metric.py HeldMetric.solve: _last": "of the force solved for last, and of no other",
     "contact/metric.py HeldMetric.stiffened: _last": "of the force solved for last, and of no other",

@@ -15,8 +15,9 @@ import torch
 from folds import named
 from meshes import grid
 
+from physgraph_usd.solver.collide.pairs import Pairs, Reach
 from physgraph_usd.solver.collide.parts import Parts
-from physgraph_usd.solver.collide.search import blocking_pairs, piercing_edges
+from physgraph_usd.solver.collide.search import blocking_and_near, blocking_pairs, near_parts, piercing_edges
 from physgraph_usd.solver.level import Level, build_levels
 from physgraph_usd.solver.mesh.topology import PolygonMesh
 
@@ -66,6 +67,13 @@ def spiral() -> tuple[np.ndarray, np.ndarray]:
 SHAPES: tuple[Shape, ...] = (flat, slit, tube, spiral)
 
 
+def named_pairs(pairs: Pairs) -> list[Pair]:
+    """Pairs as sets of two sets of vertices."""
+    split = np.where(pairs.face.numpy(), 1, 2)
+    both = zip(pairs.corners.tolist(), split.tolist(), strict=True)
+    return [frozenset((frozenset(c[:k]), frozenset(c[k:]))) for c, k in both]
+
+
 class Cloth:
     """A mesh, its parts, and the toolkit's view of it."""
 
@@ -82,11 +90,7 @@ class Cloth:
         some = np.ones(len(x), bool) if asked is None else asked
         given = [torch.as_tensor(each) for each in (x, end)]
         pairs = blocking_pairs(self.parts, *given, floor=0.0, asked=torch.as_tensor(some))
-        split = np.where(pairs.face.numpy(), 1, 2)
-        listed = [
-            frozenset((frozenset(c[:k]), frozenset(c[k:])))
-            for c, k in zip(pairs.corners.tolist(), split.tolist(), strict=True)
-        ]
+        listed = named_pairs(pairs)
         assert len(set(listed)) == len(listed)
         return set(listed)
 
@@ -198,3 +202,44 @@ def test_a_search_depends_on_nothing_before_it(shape: Shape):
         first, again = blocking_pairs(cloth.parts, x, end, **given), blocking_pairs(others.parts, x, end, **given)
         for name in ("corners", "value", "face"):
             assert torch.equal(getattr(first, name), getattr(again, name))
+
+
+def near_by(cloth: Cloth, rng: np.random.Generator) -> Reach:
+    """Search radii as of contact springs, unequal among the vertices."""
+    play = torch.as_tensor(0.05 * EDGE * rng.uniform(0.5, 1.5, len(cloth.rest)))
+    return Reach(play + 0.05 * EDGE, play, 0.5)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_no_pair_that_blocks_a_move_is_lost_where_near_pairs_are_known(shape: Shape):
+    """Small and large moves from their start, on each of which some vertices leave their neighbours' reach."""
+    cloth, rng, total, more = Cloth(shape), np.random.default_rng(5), 0, 0
+    for x, end in random_moves(cloth, 30, seed=9):
+        some, reach = 10.0 ** rng.uniform(-3.0, 0.0, (len(x), 1)), near_by(cloth, rng)
+        start, aim = torch.as_tensor(x), torch.as_tensor(x + some * (end - x))
+        given = {"floor": 0.01 * EDGE, "asked": torch.ones(len(x), dtype=torch.bool)}
+        near = near_parts(cloth.parts, start, reach)
+        expected = set(named_pairs(blocking_pairs(cloth.parts, start, aim, **given)))
+        found = set(named_pairs(blocking_pairs(cloth.parts, start, aim, near=near, **given)))
+        assert expected <= found
+        total, more = total + len(expected), more + len(found - expected)
+    assert total > 50
+    assert more < 0.01 * total  # Kept apart along an axis, by their boxes, which known pairs do not ask.
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_one_search_finds_what_blocks_a_move_and_what_is_near_at_its_end(shape: Shape):
+    cloth, rng, found, more = Cloth(shape), np.random.default_rng(7), [0, 0], 0
+    for x, end in random_moves(cloth, 30, seed=10):
+        reach, floor = near_by(cloth, rng), 0.01 * EDGE
+        start, aim = torch.as_tensor(x), torch.as_tensor(end)
+        blocked, near = blocking_and_near(cloth.parts, start, aim, reach, floor=floor)
+        asked = torch.ones(len(x), dtype=torch.bool)
+        expected = set(named_pairs(blocking_pairs(cloth.parts, start, aim, floor=floor, asked=asked)))
+        both, at_end = set(named_pairs(blocked)), set(named_pairs(near_parts(cloth.parts, aim, reach).pairs))
+        assert expected <= both
+        assert set(named_pairs(near.pairs)) == at_end - both
+        found = [found[0] + len(expected), found[1] + len(at_end)]
+        more += len(both - expected)
+    assert min(found) > 50
+    assert more < 0.01 * found[0]

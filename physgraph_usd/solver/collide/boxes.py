@@ -31,8 +31,9 @@ FAR = wp.constant(wp.float64(1.0e30))
 """Corner of an empty box."""
 WIDER = wp.constant(wp.float64(1.000001))
 """Factor on search distances, for their rounding to single precision."""
-MOVE, NEAR, CROSSING = (wp.constant(each) for each in range(3))
-"""Queries: parts that come too near on straight paths, near parts, and edges that pass through faces."""
+MOVE, NEAR, CROSSING, MOVE_NEAR = (wp.constant(each) for each in range(4))
+"""Queries: parts that come too near on straight paths, near parts, edges that pass through faces, and parts that come
+too near on straight paths or are near at the end."""
 
 _OVERLAPPING = """
     const float* a = (const float*)boxes.data + (part / 8) * 96 + part % 8;
@@ -86,7 +87,7 @@ class Query:
     """What is searched: the kind of query, positions at both ends, queried vertices, and distances.
 
     Attributes:
-        kind: `MOVE`, `NEAR` or `CROSSING`.
+        kind: `MOVE`, `NEAR`, `CROSSING` or `MOVE_NEAR`.
         clusters: Number of clusters searched: those of the cloth, or all.
         start: Positions [m].
         end: Positions at the end; those at the start without a move [m].

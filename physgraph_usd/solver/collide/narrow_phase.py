@@ -8,7 +8,7 @@ import warp as wp
 
 from ..mesh.kernels import KERNELS
 from ..mesh.piercing import passes_through
-from .boxes import CROSSING, NEAR, Boxes, Query, boxes_near, lowest_bit, without_lowest
+from .boxes import CROSSING, MOVE, NEAR, Boxes, Query, boxes_near, lowest_bit, without_lowest
 from .separation import distance_of, gap_along, safe_fraction
 from .topology import EDGE, FACE, LANES, VERTEX, Topology
 
@@ -41,12 +41,12 @@ def sum_of(face: wp.bool, a: wp.float64, b: wp.float64, c: wp.float64, d: wp.flo
 
 @wp.func
 def nearness(face: wp.bool, c: wp.vec4i, parts: Topology, query: Query, within: wp.float64):
-    """Distance of a pair of parts over its search distance, which is smaller for pairs near at rest; at most 1."""
+    """Distance of a pair at the end over its search distance, which is smaller for pairs near at rest; at most 1."""
     p, rest = query.play, parts.rest
-    distance = distance_of(face, query.start[c[0]], query.start[c[1]], query.start[c[2]], query.start[c[3]])
+    distance = distance_of(face, query.end[c[0]], query.end[c[1]], query.end[c[2]], query.end[c[3]])
     if distance < within and parts.owner[c[0]] == parts.owner[c[3]]:
         at_rest = distance_of(face, rest[c[0]], rest[c[1]], rest[c[2]], rest[c[3]])
-        play = wp.float64(2.0) * wp.min(wp.min(p[c[0]], p[c[1]]), wp.min(p[c[2]], p[c[3]]))
+        play = sum_of(face, p[c[0]], p[c[1]], p[c[2]], p[c[3]])
         within = wp.min(within, query.half * at_rest + play)
     return wp.min(distance / within, wp.float64(1.0))
 
@@ -67,7 +67,8 @@ def is_asked(parts: Topology, query: Query, c: wp.vec4i):
 def value_of(face: wp.bool, c: wp.vec4i, parts: Topology, query: Query):
     """Safe fraction of the paths of a vertex and a face or of two edges, or their distance over the search distance.
 
-    The value is 1 for pairs that are no result. Most are apart along the line through their middles already.
+    The value is 1 for pairs that are no result. Most are apart along the line through their middles already. If both
+    are searched, the safe fraction is less by 1, and thus negative.
     """
     one, zero = wp.float64(1.0), wp.vec3d()
     if not is_asked(parts, query, c):
@@ -81,15 +82,19 @@ def value_of(face: wp.bool, c: wp.vec4i, parts: Topology, query: Query):
     least = room * wp.length(middles)
     if gap_along(middles, face, zero, b, d, f) >= least and gap_along(middles, face, zero, v, p, q) >= least:
         return one
-    if query.kind == NEAR:
-        with_body = parts.owner[c[0]] >= parts.cloths or parts.owner[c[3]] >= parts.cloths
-        if with_body and not (face and parts.owner[c[0]] < parts.cloths):
-            play = (
-                query.play
-            )  # Bodies' edges and vertices matter to cloth of larger faces; else its vertices see the faces.
-            room = wp.min(room, WITHIN * wp.max(wp.max(play[c[0]], play[c[1]]), wp.max(play[c[2]], play[c[3]])))
-        return nearness(face, c, parts, query, room)
-    return safe_fraction(face, b, d, f, v - b, p - d, q - f, query.floor)
+    if query.kind != NEAR:
+        fraction = safe_fraction(face, b, d, f, v - b, p - d, q - f, query.floor)
+        if query.kind == MOVE:
+            return fraction
+        if fraction < one:
+            return fraction - one
+    with_body = parts.owner[c[0]] >= parts.cloths or parts.owner[c[3]] >= parts.cloths
+    if with_body and not (face and parts.owner[c[0]] < parts.cloths):
+        play = (
+            query.play
+        )  # Bodies' edges and vertices matter to cloth of larger faces; else its vertices see the faces.
+        room = wp.min(room, WITHIN * wp.max(wp.max(play[c[0]], play[c[1]]), wp.max(play[c[2]], play[c[3]])))
+    return nearness(face, c, parts, query, room)
 
 
 @wp.func
@@ -195,3 +200,17 @@ def find_pairs(
     if query.kind != CROSSING:
         count = search_kind(parts, query, boxes, found, n, EDGE, EDGE, i, j, count)
     found.count[n] = count
+
+
+@wp.kernel
+def check_pairs(
+    start: wp.int32,
+    parts: Topology,
+    query: Query,
+    corners: wp.array(dtype=wp.vec4i),
+    face: wp.array(dtype=wp.bool),
+    value: wp.array(dtype=wp.float64),
+):
+    """Values of given pairs."""
+    i = start + wp.tid()
+    value[i] = value_of(face[i], corners[i], parts, query)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -16,8 +16,8 @@ class Reach:
     Attributes:
         radius: Two parts are near within the sum of their radii, the largest of their corners' radii [m], shape (V,),
             float64.
-        play: Parts of one garment are near only within `half` of their distance at rest plus twice the least play [m],
-            shape (V,).
+        play: Parts of one garment are near only within `half` of their distance at rest plus the sum of their plays,
+            the largest of their corners' [m], shape (V,); at most the radius, and 0 for bodies.
         half: Fraction of the distance at rest; a large number omits no pair.
     """
 
@@ -33,7 +33,7 @@ class Pairs:
     Attributes:
         corners: A vertex and the corners of a face, or the ends of two edges, shape (N, 4).
         value: For moves, the safe fraction of the paths, in (0, 1); for near pairs, the distance over the search
-            distance; shape (N,).
+            distance; shape (N,), float64.
         face: True for a vertex and a face, shape (N,).
     """
 
@@ -53,6 +53,30 @@ class Pairs:
         if kept.dtype == torch.bool:  # Once for all three.
             kept = torch.nonzero(kept).squeeze(1)
         return Pairs(self.corners[kept], self.value[kept], self.face[kept])
+
+    def joined(self, other: Pairs) -> Pairs:
+        """These pairs and others."""
+        return Pairs(*(torch.cat([getattr(self, each.name), getattr(other, each.name)]) for each in fields(self)))
+
+
+@dataclass(frozen=True, eq=False)
+class NearAt:
+    """All near pairs at some positions.
+
+    Attributes:
+        pairs: The pairs.
+        reach: The search radii.
+    """
+
+    pairs: Pairs
+    reach: Reach
+
+    def leaving(self, way: Float[Tensor, "vertices 3"], floor: float) -> Bool[Tensor, " vertices"]:
+        """Mask of the vertices that move too far for two parts that are not near to keep a floor [m] by themselves.
+
+        Such parts are farther from one another than the sum of their plays. Bodies do not move.
+        """
+        return (way.norm(dim=1) > self.reach.play - 0.5 * floor) & (self.reach.play > 0.0)
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,9 +17,9 @@ from torch import Tensor
 
 from ..mesh.kernels import KERNELS
 from ..mesh.threads import LEAST_PER_THREAD, LEAST_QUERIES, argument, run
-from .boxes import CROSSING, MOVE, NEAR, Boxes, Query, bound_clusters, bound_parts, boxes_near, query_of
-from .narrow_phase import Found, find_pairs
-from .pairs import Pairs, Reach
+from .boxes import CROSSING, MOVE, MOVE_NEAR, NEAR, Boxes, Query, bound_clusters, bound_parts, boxes_near, query_of
+from .narrow_phase import Found, check_pairs, find_pairs
+from .pairs import NearAt, Pairs, Reach
 from .parts import Parts
 from .topology import LANES, Topology
 
@@ -67,14 +67,14 @@ def near_parts(
     *,
     asked: Bool[Tensor, " vertices"] | None = None,
     inside: Bool[Tensor, " vertices"] | None = None,
-) -> Pairs:
+) -> NearAt:
     """All near pairs that contain cloth at x [m], but not of cloth inside a body with bodies.
 
     Arguments are as for `blocking_pairs`. Positions of the cloth alone give pairs of the cloth alone, in all searches.
     """
     asked = _of_cloth(parts, x) if asked is None else asked
     given = {"radius": reach.radius.double(), "play": reach.play.double(), "half": reach.half}
-    return _search(parts, query_of(x.double(), kind=NEAR, asked=asked, inside=inside, **given))
+    return NearAt(_search(parts, query_of(x.double(), kind=NEAR, asked=asked, inside=inside, **given)), reach)
 
 
 def blocking_pairs(
@@ -86,8 +86,12 @@ def blocking_pairs(
     asked: Bool[Tensor, " vertices"],
     tangle: Int[Tensor, " vertices"] | None = None,
     inside: Bool[Tensor, " vertices"] | None = None,
+    near: NearAt | None = None,
 ) -> Pairs:
-    """All pairs of parts that no plane keeps apart on straight paths (`separation`).
+    """All pairs of parts that no plane keeps apart on straight paths (`separation`), some of them twice.
+
+    With near pairs at the start, only these are checked, and other pairs of vertices that move too far for parts that
+    are not near (`NearAt.leaving`).
 
     Args:
         parts: The parts.
@@ -97,12 +101,36 @@ def blocking_pairs(
         asked: Vertices of which each pair must contain at least one.
         tangle: The tangle of each vertex, int32, -1 outside tangles; pairs inside a single tangle are skipped; or None.
         inside: Cloth vertices inside a body, whose pairs with bodies are skipped; or None.
+        near: All near pairs at the start that contain cloth and may block; None if unknown.
     """
-    if not bool(asked.any()):
-        return Pairs.empty(0, asked.device)
-    given = {"floor": floor, "asked": asked, "tangle": tangle, "inside": inside}
-    query = query_of(start.double(), end.double(), kind=MOVE, **given)
-    return _search(parts, query)
+    given = {"kind": MOVE, "floor": floor, "asked": asked, "tangle": tangle, "inside": inside}
+    start, end = start.double(), end.double()
+    if near is None:
+        return _search(parts, query_of(start, end, **given)) if bool(asked.any()) else Pairs.empty(0, asked.device)
+    found = _blocking_among(near.pairs, parts, query_of(start, end, **given))
+    given["asked"] = asked & near.leaving(end - start, floor)
+    if not bool(given["asked"].any()):
+        return found
+    return found.joined(_search(parts, query_of(start, end, **given)))
+
+
+def blocking_and_near(
+    parts: Parts,
+    start: Float[Tensor, "vertices 3"],
+    end: Float[Tensor, "vertices 3"],
+    reach: Reach,
+    *,
+    floor: float,
+    asked: Bool[Tensor, " vertices"] | None = None,
+) -> tuple[Pairs, NearAt]:
+    """All pairs that block a move, and all near pairs at its end, by one search.
+
+    Arguments are as for `blocking_pairs`; ``asked`` contains all vertices that may move, and is all cloth when None.
+    """
+    asked = _of_cloth(parts, start) if asked is None else asked
+    given = {"radius": reach.radius.double(), "play": reach.play.double(), "half": reach.half, "floor": floor}
+    found = _search(parts, query_of(start.double(), end.double(), kind=MOVE_NEAR, asked=asked, **given))
+    return found.where(found.value < 0.0), NearAt(found.where(found.value >= 0.0), reach)
 
 
 def piercing_edges(
@@ -138,6 +166,14 @@ def _search(parts: Parts, query: Any) -> Pairs:
     return _pairs_of(parts, clusters, query)
 
 
+def _blocking_among(pairs: Pairs, parts: Parts, query: Any) -> Pairs:
+    """The pairs that block a query's move."""
+    value = torch.empty_like(pairs.value)
+    inputs = [query, argument(pairs.corners, wp.vec4i), argument(pairs.face), argument(value)]
+    _launch(parts, check_pairs, len(value), *inputs)
+    return Pairs(pairs.corners, value, pairs.face).where(value < 1.0)
+
+
 def _near_clusters(parts: Parts, query: Any, tree: wp.Bvh) -> Int[Tensor, "pairs 2"]:
     """Pairs of clusters that no axis separates at both ends, int32."""
     size, room, device = query.clusters, CLUSTERS, parts.level.device
@@ -168,8 +204,7 @@ def _pairs_of(parts: Parts, clusters: Int[Tensor, "clusters 2"], query: Any) -> 
     if not len(over):
         return found
     begin = torch.nn.functional.pad(count[over].cumsum(dim=0, dtype=torch.int32), (1, 0))
-    more, _ = _write(parts, clusters[over], query, begin)
-    return Pairs(*(torch.cat([getattr(found, n), getattr(more, n)]) for n in ("corners", "value", "face")))
+    return found.joined(_write(parts, clusters[over], query, begin)[0])
 
 
 def _write(

@@ -17,9 +17,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..collide.crossings import Crossings, all_crossings, crossings
-from ..collide.pairs import Reach
 from ..collide.parts import Parts
-from ..collide.search import near_parts
 from ..colliders.base import Solid
 from ..forces.seam import Seam
 from ..forces.self_contact import PairConstraints, SelfContact
@@ -101,7 +99,7 @@ class ClothView:
         bodies: FrameBodies | None = None,
         seam: Seam | None = None,
         given_up: Bool[Tensor, " vertices"] | None = None,
-        is_clean: bool = False,
+        doubtful: Bool[Tensor, " coarse"] | None = None,
     ) -> None:
         """Take the frame.
 
@@ -114,14 +112,14 @@ class ClothView:
             bodies: The bodies of the frame, or None.
             seam: Sewn vertices, which stay together; None without seams.
             given_up: As the attribute.
-            is_clean: Whether the upsampled cage is known to cross nothing.
+            doubtful: Mask of the cage's vertices around all that crosses in it; None if unknown.
         """
         self.given_up = given_up
         self.keeps_sides = settings.cloth == "pairs" and bool(lasting.meets.any())
         self.mesh = lasting.mesh(level, seam, bodies, itself=self.keeps_sides)
         self._level, self._settings, self._thickness = level, settings, thickness
         self._base, self._seam, self.frame = base, seam, bodies
-        self._base_is_clean, self._looked = is_clean, cast("Look | None", None)
+        self._doubtful, self._looked = doubtful, cast("Look | None", None)
         self.came_near: bool | None = None
 
     @cached_property
@@ -136,7 +134,16 @@ class ClothView:
     @cached_property
     def at_base(self) -> Look:
         """Crossings, tangles and vertices inside bodies of the upsampled cage that is followed."""
-        return Look.clean(self._base) if self._base_is_clean else self.found(self._base)
+        return self.of_cage(self._base)
+
+    def of_cage(self, x: Float[Tensor, "vertices 3"]) -> Look:
+        """As `look` for an upsampled cage [m], searched only around what crosses in the cage itself."""
+        if self._doubtful is None:
+            return self.found(x)
+        if not bool(self._doubtful.any()):
+            return Look.clean(x)
+        clear = self._level.from_coarse @ (~self._doubtful).cpu().numpy().astype(np.float64)
+        return self.found(x, torch.as_tensor(clear < 1.0, device=x.device))
 
     @property
     def parts(self) -> Parts:
@@ -162,14 +169,9 @@ class ClothView:
         return torch.cat([x.double(), self.corners])
 
     @cached_property
-    def _springs(self) -> ClothSprings:
-        """Contact spring finder of this frame."""
+    def springs(self) -> ClothSprings:
+        """Finder of near pairs and contact springs in this frame."""
         return ClothSprings(self.mesh, self._base, self._thickness, self.frame)
-
-    @property
-    def near(self) -> Reach:
-        """Search radii of contact springs."""
-        return self._springs.reach
 
     @cached_property
     def asked(self) -> Bool[Tensor, " all"] | None:
@@ -181,24 +183,21 @@ class ClothView:
         """Crossings at x [m], without given-up cloth; cached for the same tensor until its version changes."""
         return self.look(x).crossings
 
-    def inside(self, x: Float[Tensor, "vertices 3"]) -> Bool[Tensor, "bodies vertices"] | None:
-        """The vertices inside each body at x [m]; None if none is."""
-        return self.look(x).inside
-
     def look(self, x: Tensor) -> Look:
         """Cached crossings, tangles and vertices inside bodies at x."""
         if self._looked is None or self._looked.x is not x or self._looked.version != x._version:
             self._looked = self.found(x)
         return self._looked
 
-    def found(self, x: Tensor) -> Look:
-        """Crossings, tangles and vertices inside bodies at x."""
+    def found(self, x: Tensor, some: Bool[Tensor, " vertices"] | None = None) -> Look:
+        """Crossings, tangles and vertices inside bodies at x, of the given vertices; of all when None."""
+        asked = self.asked if some is None else self.padded(some if self.given_up is None else some & ~self.given_up)
         bodies = None if self.frame is None else LevelBodies(self._level, self.frame, self.mesh.pieces)
         pierced = inside = None
         if bodies is None:
-            found = crossings(self.parts, x, self.asked)
+            found = crossings(self.parts, x, asked)
         else:
-            found, pierced = all_crossings(self.parts, self.with_bodies(x), self.asked)
+            found, pierced = all_crossings(self.parts, self.with_bodies(x), asked)
             inside = bodies.inside(x, pierced)
             inside = inside if bool(inside.any()) else None
         lost = torch.zeros_like(self._level.free[:, 0]) if self.given_up is None else self.given_up
@@ -250,10 +249,10 @@ class ClothView:
         """Contact forces with bodies and between near cloth at x [m], with crossings drawn apart; () without any."""
         looked, at = self.look(x), self.with_bodies(x)
         inside = None if looked.inside is None else self.padded(looked.inside.any(dim=0))
-        near = self._springs.find(at, near_parts(self.parts, at, self.near, asked=self.asked, inside=inside))
-        near, with_body = self._springs.sided(near, self.exempt(x))
-        pushes = self._springs.constraints(near.where(with_body), at, self._settings.stiffness)
-        touching = self._springs.on_bodies(near.where(with_body))
+        near = self.springs.find(at, self.springs.near(x, at, asked=self.asked, inside=inside).pairs)
+        near, with_body = self.springs.sided(near, self.exempt(x))
+        pushes = self.springs.constraints(near.where(with_body), at, self._settings.stiffness)
+        touching = self.springs.on_bodies(near.where(with_body))
         if bool(touching.any()):
             self._looked = replace(looked, touching=touching.any(dim=0))
         if self.bodies is not None and (any(self.in_bodies(x)) or bool(touching.any())):
@@ -276,4 +275,4 @@ class ClothView:
             corners = near.near.corners.long()
             kept = ~self.mesh.crossed(self.crossings(x))[corners].any(dim=1)
             near = near.where(kept & ~tangles.given_up[corners].all(dim=1))
-        return self._springs.constraints(near, at, self._settings.cloth_stiffness)
+        return self.springs.constraints(near, at, self._settings.cloth_stiffness)

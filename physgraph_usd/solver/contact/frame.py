@@ -229,7 +229,7 @@ class FrameContact:
             level = self._levels[level.index]
             seam, base = self._seam_at(level), level.base.apply(self.aim)
             own = {"base": base, "thickness": self._thickness, "settings": self._settings, "seam": seam}
-            own |= {"bodies": self._bodies, "given_up": self._given_up_at(level), "is_clean": self._is_clean}
+            own |= {"bodies": self._bodies, "given_up": self._given_up_at(level), "doubtful": self._doubtful}
             cloth = ClothView(self._cloth, level, **own)
             promise = Promise(cloth, FLOOR * float(self._thickness.min()))
             self._views[level.index] = LevelContact(cloth, seam, promise)
@@ -242,12 +242,14 @@ class FrameContact:
         kept = level.from_coarse @ (~self.given_up).cpu().numpy().astype(np.float64)
         return torch.as_tensor(kept == 0.0, device=level.device)
 
-    @property
-    def _is_clean(self) -> bool:
-        """Whether the upsampled cage is known to cross nothing: its triangles lie in those of a cage that does not."""
-        cage, (_, found, _, pierced, inside) = self._levels[0], self._cage
-        has_quads = len(cage.membrane) > len(cage.triangles)
-        return not (has_quads or any(self._seams) or found.count or (pierced and pierced.count) or inside is not None)
+    @cached_property
+    def _doubtful(self) -> Bool[Tensor, " coarse"]:
+        """Mask of the cage's vertices around all that crosses in it, or was repaired."""
+        mesh, found, _, pierced, inside = self._cage
+        some = mesh.crossed(found) | (self.aim != self._coarse).any(dim=1)
+        some = some if pierced is None else some | mesh.crossed(pierced.crossings)
+        some = some if inside is None else some | inside.any(dim=0)
+        return mesh.grown(some, 1)
 
     def _seam_at(self, level: Level) -> Seam | None:
         """The seam of a level."""

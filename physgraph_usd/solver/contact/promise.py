@@ -103,27 +103,35 @@ class Promise:
         inside = view.exempt(start) if since is None else view.padded(since.inside)
         options = _Options(floor=self.floor, tangle=label, inside=inside)
         end = view.with_bodies(aim)
-        x, proved = self._on(begin, end, options, aim.dtype, halvings=0 if since is None else HALVINGS)
+        if since is None or label is not None or inside is not None:
+            near = view.springs.known(start) if since is None else None
+            met = blocking_pairs(view.parts, begin, end, **options, asked=self._moving(begin, end), near=near)
+        else:
+            met = view.springs.blocking(begin, end, aim, floor=self.floor, asked=view.asked)
+        x, proved = self._on(begin, end, met, options, dtype=aim.dtype, halvings=0 if since is None else HALVINGS)
         return Placed(aim if x is end else x[:count].to(aim)), proved
 
+    def _moving(self, begin: Tensor, end: Tensor) -> Bool[Tensor, " all"]:
+        """Mask of the vertices that move, or of all that are not given up."""
+        return (end != begin).any(dim=1) if self.view.asked is None else self.view.asked
+
     def _on(
-        self, begin: Tensor, end: Tensor, options: _Options, dtype: torch.dtype, *, halvings: int
+        self, begin: Tensor, end: Tensor, met: Pairs, options: _Options, *, dtype: torch.dtype, halvings: int
     ) -> tuple[Tensor, bool]:
         """Positions after a move of cloth and bodies, and whether all pairs with bodies are proved apart.
 
         Args:
             begin: Positions of cloth and bodies [m], float64.
             end: Wanted positions [m]; those of bodies are reached.
+            met: Pairs that block the move.
             options: Options of the search.
             dtype: Type to which positions of the cloth are rounded.
             halvings: How often a move that is not proved may be made in two halves: planes may turn once more.
         """
         view, parts, count = self.view, self.view.parts, self.view.parts.level.vertex_count
-        moves = (end != begin).any(dim=1)
-        asked = moves if view.asked is None else view.asked
-        met = blocking_pairs(parts, begin, end, **options, asked=asked)
         if not len(met.value):
             return end, True
+        moves = (end != begin).any(dim=1)
         stand = not bool(moves[count:].any())
         free = parts.level.free & moves[:count].unsqueeze(1) if stand else parts.level.free
         free = torch.nn.functional.pad(free, (0, 0, 0, len(end) - count))
@@ -140,9 +148,12 @@ class Promise:
         if halvings:
             middle = 0.5 * (begin + end)
             middle[:count] = view.closed(middle[:count].to(dtype)).double()
-            middle, first = self._on(begin, middle, options, dtype, halvings=halvings - 1)
-            ends, second = self._on(middle, end, options, dtype, halvings=halvings - 1)
-            return ends, first and second
+            proved = True
+            for aim in (middle, end):
+                met = blocking_pairs(parts, begin, aim, **options, asked=self._moving(begin, aim))
+                begin, one = self._on(begin, aim, met, options, dtype=dtype, halvings=halvings - 1)
+                proved = proved and one
+            return begin, proved
         if not stand:  # Cloth that stays behind a body that moves on would be in the body.
             options = _Options(**options)
             options["inside"] = torch.arange(len(moves), device=moves.device) < count

@@ -28,7 +28,7 @@ def measured(
         before: The upsampled cage [m].
         x: The result [m].
     """
-    first, last = view.at_base if torch.equal(before, view.at_base.x) else view.found(before), view.look(x)
+    first, last = view.at_base if torch.equal(before, view.at_base.x) else view.of_cage(before), view.look(x)
     said: dict[str, object] = {}
     if view.bodies is not None:
         said["bodies"] = _of_bodies(view.bodies, before, first, x, last)

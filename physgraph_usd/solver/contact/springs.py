@@ -23,7 +23,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..collide.distance import weights_of
-from ..collide.pairs import NearPairs, Pairs, Reach
+from ..collide.pairs import NearAt, NearPairs, Pairs, Reach
+from ..collide.search import blocking_and_near, near_parts
 from ..forces.self_contact import PairConstraints
 from ..mesh.kernels import KERNELS
 from ..mesh.threads import argument, run
@@ -145,6 +146,7 @@ class ClothSprings:
         self.owner = torch.cat([level.vertex_garment, others]).to(torch.int32).contiguous()
         self._rest, self._base = (torch.cat([each.double(), points]) for each in (level.rest, base))
         self._spacing = torch.nn.functional.pad(level.spacing.double(), (0, len(points)), value=torch.inf)
+        self._near: tuple[Tensor, int, NearAt] | None = None
 
     @cached_property
     def reach(self) -> Reach:
@@ -158,6 +160,38 @@ class ClothSprings:
             of_body = beyond.clamp_min(0.0) + play.max()
             radius = torch.cat([radius, of_body[self.owner[count:].long() - self._cloths]])
         return Reach(radius, torch.nn.functional.pad(play, (0, others)), HALF)
+
+    def known(self, x: Float[Tensor, "vertices 3"]) -> NearAt | None:
+        """Near pairs at the cloth's positions x [m] if the last search found them there; None otherwise."""
+        near = self._near
+        return near[2] if near is not None and near[0] is x and near[1] == x._version else None
+
+    def near(
+        self,
+        x: Float[Tensor, "vertices 3"],
+        at: Float[Tensor, "all 3"],
+        *,
+        asked: Bool[Tensor, " all"] | None,
+        inside: Bool[Tensor, " all"] | None,
+    ) -> NearAt:
+        """Near pairs at the cloth's positions x, with bodies ``at`` [m]; masks are as for `near_parts`."""
+        near = self.known(x) or near_parts(self._mesh.parts, at, self.reach, asked=asked, inside=inside)
+        self._near = x, x._version, near
+        return near
+
+    def blocking(
+        self,
+        begin: Float[Tensor, "all 3"],
+        end: Float[Tensor, "all 3"],
+        x: Float[Tensor, "vertices 3"],
+        *,
+        floor: float,
+        asked: Bool[Tensor, " all"] | None,
+    ) -> Pairs:
+        """Pairs that block a move of cloth and bodies to an end with the cloth at x [m]; near pairs there are kept."""
+        found, near = blocking_and_near(self._mesh.parts, begin, end, self.reach, floor=floor, asked=asked)
+        self._near = x, x._version, near
+        return found
 
     def find(self, x: Float[Tensor, "all 3"], pairs: Pairs) -> NearSprings:
         """Pairs that have a spring.
