@@ -99,7 +99,7 @@ class ClothView:
         bodies: FrameBodies | None = None,
         seam: Seam | None = None,
         given_up: Bool[Tensor, " vertices"] | None = None,
-        doubtful: Bool[Tensor, " coarse"] | None = None,
+        doubtful: Bool[Tensor, " vertices"] | None = None,
     ) -> None:
         """Take the frame.
 
@@ -112,7 +112,7 @@ class ClothView:
             bodies: The bodies of the frame, or None.
             seam: Sewn vertices, which stay together; None without seams.
             given_up: As the attribute.
-            doubtful: Mask of the cage's vertices around all that crosses in it; None if unknown.
+            doubtful: Mask of the vertices that the cage places near what crosses in it; None if unknown.
         """
         self.given_up = given_up
         self.keeps_sides = settings.cloth == "pairs" and bool(lasting.meets.any())
@@ -138,12 +138,8 @@ class ClothView:
 
     def of_cage(self, x: Float[Tensor, "vertices 3"]) -> Look:
         """As `look` for an upsampled cage [m], searched only around what crosses in the cage itself."""
-        if self._doubtful is None:
-            return self.found(x)
-        if not bool(self._doubtful.any()):
-            return Look.clean(x)
-        clear = self._level.from_coarse @ (~self._doubtful).cpu().numpy().astype(np.float64)
-        return self.found(x, torch.as_tensor(clear < 1.0, device=x.device))
+        known_clean = self._doubtful is not None and not bool(self._doubtful.any())
+        return Look.clean(x) if known_clean else self.found(x, self._doubtful)
 
     @property
     def parts(self) -> Parts:

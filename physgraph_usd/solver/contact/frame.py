@@ -229,7 +229,7 @@ class FrameContact:
             level = self._levels[level.index]
             seam, base = self._seam_at(level), level.base.apply(self.aim)
             own = {"base": base, "thickness": self._thickness, "settings": self._settings, "seam": seam}
-            own |= {"bodies": self._bodies, "given_up": self._given_up_at(level), "doubtful": self._doubtful}
+            own |= {"bodies": self._bodies, "given_up": self._given_up_at(level), "doubtful": _share_of(level, self._doubtful) > 0.0}
             cloth = ClothView(self._cloth, level, **own)
             promise = Promise(cloth, FLOOR * float(self._thickness.min()))
             self._views[level.index] = LevelContact(cloth, seam, promise)
@@ -237,10 +237,7 @@ class FrameContact:
 
     def _given_up_at(self, level: Level) -> Bool[Tensor, " vertices"] | None:
         """Mask of a level's vertices that depend only on given-up vertices of the cage."""
-        if self.given_up is None:
-            return None
-        kept = level.from_coarse @ (~self.given_up).cpu().numpy().astype(np.float64)
-        return torch.as_tensor(kept == 0.0, device=level.device)
+        return None if self.given_up is None else _share_of(level, ~self.given_up) == 0.0
 
     @cached_property
     def _doubtful(self) -> Bool[Tensor, " coarse"]:
@@ -284,3 +281,8 @@ class FrameContact:
         """
         view = self.at(self._levels[-1])
         return measured(view.cloth, view.closed(self._levels[-1].base.apply(self._coarse)), x)
+
+
+def _share_of(level: Level, some: Bool[Tensor, " coarse"]) -> Float[Tensor, " vertices"]:
+    """Sum of the weights of some cage vertices in each vertex of a level."""
+    return torch.as_tensor(level.from_coarse @ some.cpu().numpy().astype(np.float64), device=level.device)
