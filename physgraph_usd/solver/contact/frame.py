@@ -229,7 +229,8 @@ class FrameContact:
             level = self._levels[level.index]
             seam, base = self._seam_at(level), level.base.apply(self.aim)
             own = {"base": base, "thickness": self._thickness, "settings": self._settings, "seam": seam}
-            own |= {"bodies": self._bodies, "given_up": self._given_up_at(level), "doubtful": _share_of(level, self._doubtful) > 0.0}
+            own |= {"bodies": self._bodies, "given_up": self._given_up_at(level)}
+            own |= {"doubtful": _share_of(level, self._doubtful) > 0.0}
             cloth = ClothView(self._cloth, level, **own)
             promise = Promise(cloth, FLOOR * float(self._thickness.min()))
             self._views[level.index] = LevelContact(cloth, seam, promise)
