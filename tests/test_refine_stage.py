@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from layers import world_metres
 from pxr import Sdf, Usd, UsdGeom
 from shots import CLOTH, FAST, TIMES, cloth_shot, fine, refine
@@ -65,6 +66,11 @@ def test_five_lines_from_an_open_stage_to_a_layer(tmp_path: Path):
     stage.GetSessionLayer().subLayerPaths.insert(0, layer.identifier)
     assert len(UsdGeom.Mesh(stage.GetPrimAtPath(CLOTH)).GetPointsAttr().Get(1.0)) > 35
     assert [problem for problem in pg.validate_layer(layer) if problem.severity == "error"] == []
+
+
+def test_device_auto_is_the_card_or_the_processor(stage: Usd.Stage):
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    assert np.array_equal(points(refined(stage, device="auto")), points(refined(stage, device=device)))
 
 
 def test_the_same_cloth_as_from_the_file(stage: Usd.Stage, tmp_path: Path):

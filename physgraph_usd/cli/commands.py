@@ -120,6 +120,7 @@ def tag(shot: str, out: Path, *, garments: tuple[str, ...], colliders: tuple[str
 @click.option("-o", "--out", type=click.Path(path_type=Path), help="Layer to save into.  [default: SHOT.tuned.usda]")
 @of_field("garments")
 @of_field("colliders")
+@of_field("device")
 @click.option("--port", type=int, default=8080, help="Port on this machine; the next free one where it is taken.")
 @overwrite_option
 def tune(shot: str, *, port: int, **options: Any) -> None:
@@ -216,7 +217,7 @@ def chart(shot: str, out: Path, **options: Any) -> None:
     "--config", "config_file", required=True, type=click.Path(path_type=Path), metavar="FILE.toml", help="What and how."
 )
 @out_option("DIR", "Folder for the log, the checkpoint, the weights and their card.")
-@click.option("--device", default="cpu", metavar="cpu|cuda", help="Where to compute.")
+@of_field("device")
 @click.option("--minutes", type=float, metavar="M", help="Train so long.  [default: the configuration's]")
 @click.option("--resume", is_flag=True, help="Go on from the folder's checkpoint.")
 def train(config_file: Path, out: Path, *, device: str, **options: Any) -> None:
@@ -224,12 +225,12 @@ def train(config_file: Path, out: Path, *, device: str, **options: Any) -> None:
     from ..lab.train.record import run_training
     from ..shot.solve import prepare_device
 
-    prepare_device(device)
+    device = prepare_device(device)
     click.echo(run_training(config_file, out, device=device, say=partial(click.echo, err=True), **options))
 
 
 @click.command("warm-up")
-@click.option("--device", default="cpu", metavar="cpu|cuda", help="Where to compute.")
+@of_field("device")
 def warm_up(device: str) -> None:
     """Compile all kernels ahead of the first refine, as for an image of a farm's machines.
 
@@ -238,8 +239,7 @@ def warm_up(device: str) -> None:
     from ..shot.solve import prepare_device
     from ..solver.mesh.kernels import compile_kernels
 
-    prepare_device(device)
-    compile_kernels(device)
+    compile_kernels(prepare_device(device))
 
 
 @click.command("report-schema")

@@ -98,7 +98,7 @@ class RefineOptions:
         metavar="SECONDS",
         above=0,
     )
-    device: str = _solver("cpu", "Where to compute.", metavar="cpu|cuda")
+    device: str = _solver("cpu", "Where to compute; auto: on the card where there is one.", metavar="cpu|cuda|auto")
     overrides: Sequence[str] = _scene(
         (),
         f"Override an attribute of garments or colliders, such as bendStiffness=2e-4 for all garments{LIST}.",
@@ -222,8 +222,8 @@ class RefineOptions:
             raise UsageError(
                 "root and skip existing are for layers, preroll makes a chunk: give stitch the root, or resume"
             )
-        if self.device != "cpu" and not self.device.startswith("cuda"):
-            raise UsageError(f"unknown device '{self.device}'; known: cpu, cuda")
+        if self.device not in ("cpu", "auto") and not self.device.startswith("cuda"):
+            raise UsageError(f"unknown device '{self.device}'; known: cpu, cuda, auto")
 
     def targets(self, layer: Path) -> list[tuple[str, Path]]:
         """Description and path of every file written by a run."""

@@ -27,16 +27,25 @@ MOST_THREADS = 4
 Outcomes = Generator[Outcome, None, None]
 
 
-def prepare_device(device: str) -> None:
+def prepare_device(device: str) -> str:
     """Start Warp, and limit torch to one thread: torch's sums depend on the number of threads.
+
+    Args:
+        device: "cpu", "cuda", a certain card as "cuda:1", or "auto" for a card where there is one.
+
+    Returns:
+        The device's name in torch and Warp.
 
     Raises:
         UsageError: CUDA was requested but is missing.
     """
     start_warp()
     torch.set_num_threads(1)
+    if device == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
     if device.startswith("cuda") and not torch.cuda.is_available():
-        raise UsageError("device 'cuda' was asked for and no CUDA device is there; use --device cpu")
+        raise UsageError("device 'cuda' was asked for and no CUDA device is there; use --device auto or cpu")
+    return device
 
 
 def open_for(shot: str | Stage, options: RefineOptions) -> Shot:
@@ -75,13 +84,12 @@ class ShotSolver:
 
     def __call__(self, times: Sequence[float | None]) -> Outcomes:
         """Solve time codes in order; a failed one yields its error, the next starts from the last solved frame."""
-        device = self._options.device
-        prepare_device(device)
+        device = prepare_device(self._options.device)
         shot = self._opened = self._opened or open_for(self._shot, self._options)
         settings = self._options.solve_settings()
         options = {"device": device, "threads": self._threads, "heat_map": self._options.heat_map}
         refiner = Refiner(shot.scene, settings, levels=self.levels, **options)
-        self._begin(shot, refiner, times)
+        self._begin(shot, refiner, times, device)
         for time in times:
             began = clock.perf_counter()
             try:
@@ -95,10 +103,10 @@ class ShotSolver:
             leave_if_asked()  # A signal may have cut the frame short.
             yield outcome
 
-    def _begin(self, shot: Shot, refiner: Refiner, times: Sequence[float | None]) -> None:
+    def _begin(self, shot: Shot, refiner: Refiner, times: Sequence[float | None], device: str) -> None:
         """Start a shot in the middle, if its cage crosses itself, with the cage advanced from an earlier frame."""
         earlier = [] if not times or times[0] is None else shot.times_until(times[0])
-        settings = {"times": earlier, "device": self._options.device, "threads": self._threads}
+        settings = {"times": earlier, "device": device, "threads": self._threads}
         found = cages_walked(shot.scene, self._options.solve_settings(), shot.frame, **settings)
         if found is not None:
             refiner.begin_at(found[0], since=found[1])
@@ -118,9 +126,9 @@ def time_frames(shot: Shot, options: RefineOptions, levels: list[int]) -> dict[s
         options: Options of a run.
         levels: Subdivisions of each garment.
     """
-    prepare_device(options.device)
+    device = prepare_device(options.device)
     threads = min(MOST_THREADS, max(1, os.cpu_count() or 1))
-    refiner = Refiner(shot.scene, options.solve_settings(), levels=levels, device=options.device, threads=threads)
+    refiner = Refiner(shot.scene, options.solve_settings(), levels=levels, device=device, threads=threads)
     times, spent = list(shot.scene.times) or [None], []
     middle = max(len(times) // 2 - 1, 0)
     for time in times[middle : middle + 3]:

@@ -77,6 +77,7 @@ class TuneSession:
         garments: Sequence[str] = (),
         colliders: Sequence[str] = (),
         out: str | Path | None = None,
+        device: str = "cpu",
         overwrite: bool = False,
     ) -> None:
         """Open a shot at its first frame.
@@ -86,13 +87,14 @@ class TuneSession:
             garments: Prim paths, names, globs or collections; empty finds applied schemas.
             colliders: Bodies, as ``garments``.
             out: Layer to save into; ``<shot>.tuned.usda`` beside the shot when None.
+            device: Where to compute: "cpu", "cuda" or "auto".
             overwrite: Whether a file there may be replaced.
 
         Raises:
             UsageError: The layer exists.
             StageError: The shot cannot be read.
         """
-        prepare_device("cpu")
+        self._device = prepare_device(device)
         self.out = Path(out) if out is not None else Path(shot).with_suffix(".tuned.usda")
         if self.out.exists() and not overwrite:
             raise UsageError(f"{self.out} exists; choose another name with -o, or replace it by --overwrite")
@@ -109,7 +111,7 @@ class TuneSession:
         # A level that is chosen from the fabric would be chosen anew from what is tried.
         chosen = zip(scene.garments, self.levels, strict=True)
         self.values = {g.path: {"refine:level": float(k)} for g, k in chosen if g.level == AUTO_LEVEL}
-        self._solver = FrameSolver(self.shot, self.levels, contact=True)
+        self._solver = FrameSolver(self.shot, self.levels, contact=True, device=self._device)
         self._shown: Shown | None = None  # None once anything was set.
 
     def close(self) -> None:
@@ -167,7 +169,7 @@ class TuneSession:
             raise UsageError(f"level {level}: give 0 or more")
         self._try(garment, {"refine:level": level})
         self.levels[index] = level
-        self._solver = FrameSolver(self.shot, self.levels, contact=self.contact)
+        self._solver = FrameSolver(self.shot, self.levels, contact=self.contact, device=self._device)
 
     def set_contact(self, on: bool) -> None:
         """Let cloth feel bodies and cloth, or nothing."""
@@ -230,7 +232,7 @@ class TuneSession:
         times, run = (clock.perf_counter() - began, clock.process_time() - spent), self._solver.run
         telemetry = tuple(dict(entry) for entry in state.telemetry)
         ends = (run[0], run[-1]) if run else None
-        command = _command(self.out, run, self._named, contact=self.contact) if run else ""
+        command = _command(self.out, run, self._named, contact=self.contact, device=self._device) if run else ""
         self._shown = Shown(self.shot.frame(self.time), state.points, telemetry, *times, ends, command)
         return self._shown
 

@@ -32,7 +32,7 @@ class FrameSolver:
         refinements: The subdivisions of each garment, coarsest first.
     """
 
-    def __init__(self, shot: Shot, levels: Sequence[int], *, contact: bool) -> None:
+    def __init__(self, shot: Shot, levels: Sequence[int], *, contact: bool, device: str = "cpu") -> None:
         """Subdivide each garment so often; ``contact`` lets cloth feel bodies and cloth.
 
         Raises:
@@ -41,7 +41,7 @@ class FrameSolver:
         self._times = shot.scene.times
         self._settings = _settings(contact=contact)
         self._threads = min(MOST_THREADS, os.cpu_count() or 1)
-        self._exact = Refiner(shot.scene, self._settings, levels=levels, threads=self._threads)
+        self._exact = Refiner(shot.scene, self._settings, levels=levels, device=device, threads=self._threads)
         self._quick: tuple[Refiner, float | None] | None = None  # And the time code where it is.
         self.refinements = self._exact.refinements
         self.run: tuple[float | None, ...] = ()
