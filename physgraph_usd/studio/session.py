@@ -261,11 +261,17 @@ def _rounded(values: Mapping[str, float]) -> dict[str, float]:
 
 
 def _command(
-    out: Path, run: tuple[float | None, ...], named: tuple[Sequence[str], Sequence[str]], *, contact: bool
+    out: Path,
+    run: tuple[float | None, ...],
+    named: tuple[Sequence[str], Sequence[str]],
+    *,
+    contact: bool,
+    device: str,
 ) -> str:
     """The command that refines a saved layer to the last frame of a run."""
     words = ["physgraph-usd", "refine", str(out), "-o", str(out.with_suffix(".refined.usdc"))]
     words += [] if run[0] is None else ["--frames", f"{run[0]!r}:{run[-1]!r}"]
+    words += [] if device == "cpu" else ["--device", device]
     for option, paths in zip(("--garment", "--collider"), named, strict=True):
         words += [word for path in paths for word in (option, path)]
     return join(words + ([] if contact else ["--contact", "off", "--self-contact", "off"]))
