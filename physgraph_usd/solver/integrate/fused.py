@@ -20,7 +20,7 @@ import warp as wp
 from jaxtyping import Float
 from torch import Tensor
 
-from ..mesh.kernels import KERNELS
+from ..mesh.kernels import ALONE, KERNELS
 from ..mesh.stencil import vectors
 from ..mesh.threads import Launch
 from .network import FLOOR, LOG_OFFSET, LOG_SCALE, Physgraph, clock_of, counted, families_of, pairs_of
@@ -153,12 +153,12 @@ def seeing(parts: Parts, pairs: Pairs, smoothed: tuple[int, ...], families: Fami
         families: Family of each vector, whose mean square normalises the products, and whether the vector counts in the
             mean.
     """
-    # Warp's kernel hash misses some values captured by generic functions; the module name includes them.
+    # Warp's kernel hash misses some values captured by generic functions; the kernel's name includes them.
     made = hashlib.sha256(repr((parts, pairs, smoothed, families)).encode()).hexdigest()[:16]
     measure, compare = _measuring(1 + max(row for row, _ in parts), smoothed), _comparing(parts, families)
     show = _showing(parts, pairs, 1 + max(families)[0])
 
-    @wp.kernel(module=f"{__name__}.{made}")
+    @wp.kernel(name=f"see_{made}", **ALONE)
     def see(
         first: wp.int32,
         vertices: wp.int32,
@@ -278,7 +278,7 @@ def _showing(parts: Parts, pairs: Pairs, kinds: int) -> Any:
 def combining(parts: Parts) -> wp.Kernel:
     """The kernel combining the vectors, given as rows and normal parts."""
 
-    @wp.kernel(module="unique")
+    @wp.kernel(**ALONE)
     def combine(
         first: wp.int32,
         vertices: wp.int32,
