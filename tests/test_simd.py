@@ -10,9 +10,15 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
+from cloth import finest_system, group_of, sheet, wave
 from torch import Tensor
 
 from physgraph_usd.solver.forces import base, bending, membrane, stretch
+from physgraph_usd.solver.integrate.eight_vertices import EightPhysgraph
+from physgraph_usd.solver.integrate.fused import FusedPhysgraph
+from physgraph_usd.solver.integrate.network import VECTORS, PhysgraphConfig
+from physgraph_usd.solver.integrate.vertex_frame import VertexFrame
+from physgraph_usd.solver.integrate.weights import random_network
 from physgraph_usd.solver.mesh.kernels import KERNELS
 from physgraph_usd.solver.mesh.simd import EIGHT, eight_elements
 from physgraph_usd.solver.mesh.stencil import incidence, vectors
@@ -149,6 +155,32 @@ def test_gathers_agree() -> None:
         inputs = [wp.from_torch(starts), wp.from_torch(slots), vectors(corner_force), vectors(total)]
         Launch(kernel, VERTICES, inputs, device="cpu")({})
     assert torch.equal(*totals)
+
+
+@pytest.mark.parametrize("count", [3, 8, 21])
+@pytest.mark.parametrize(
+    "config",
+    [
+        PhysgraphConfig(vectors=VECTORS, width=16, depth=3),
+        PhysgraphConfig(vectors=("metric", "move1"), width=5),
+        PhysgraphConfig(vectors=("metric", "secant", "secant.smooth"), width=20),
+    ],
+)
+def test_networks_agree(config: PhysgraphConfig, count: int) -> None:
+    """The network as one kernel and as two around products of matrices, also with displacements that are limited."""
+    mesh, rest = sheet(count, 2)
+    system, x = finest_system(group_of(mesh, rest, level=1, dtype=torch.float32), wave(rest))
+    network, vertices = random_network(config, seed=3, scale=0.5), len(x)
+    assert system.level is not None
+    around = VertexFrame(system.level, x)
+    rng = np.random.default_rng(2)
+    sizes = rng.choice([0.0, 1e-5, 1e-3], size=(vertices, 1))
+    two = FusedPhysgraph(network, vertices, 0.02, device="cpu", threads=1)
+    ones = [EightPhysgraph(network, vertices, 0.02, threads=threads) for threads in (1, 3)]
+    bases = [torch.as_tensor(sizes * rng.normal(size=(vertices, 3)), dtype=torch.float32) for _ in two.bases]
+    plain, eight, shared = (each(bases, system.spacing, system.reach, 4, frame=lambda: around) for each in (two, *ones))
+    assert torch.equal(eight, shared)
+    assert float((eight - plain).abs().max()) <= 1e-5 * float(plain.abs().max())
 
 
 def test_formulas_are_for_the_cpu_alone() -> None:

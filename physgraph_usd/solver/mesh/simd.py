@@ -4,15 +4,18 @@ On a CPU a Warp kernel computes its elements one by one. The same formula on Cla
 quarter of the time. Vectors have eight floats on every processor, so that results are equal to the bit also where
 registers are longer. CUDA and double precision take the plain kernel beside each formula.
 
-A formula is C++ with these names:
+A formula is C++ with these names; the last two only in `eight_elements`:
 
 | name | meaning |
 |---|---|
 | ``Eight`` | a number of each element; operators act on each element |
 | ``Vec`` | a 3-vector of each element, with ``dot`` and ``cross`` |
-| ``corner(k)`` | positions of the k-th corners [m], a ``Vec`` |
-| ``load(parameter0)``, ``load4(parameter0)`` | a parameter: an ``Eight``, or four indexed with [] |
 | ``root``, ``larger``, ``rint``, ``fabs`` | functions of an ``Eight`` |
+| ``element[i]`` | index of the i-th element; the last block repeats the last element |
+| ``load(array)``, ``load4(array)`` | an ``Eight`` of an array with a number for each element; four, indexed with [] |
+| ``vec([&](int i) { return address; })`` | the ``Vec`` with three floats of each element, from any address |
+| ``write(to, width, values, n)`` | writes n ``Eight`` values, n > 3, as rows of a table of a given width |
+| ``corner(k)`` | positions of the k-th corners [m], a ``Vec`` |
 | ``store(energy, {force, ...})`` | writes energies [J], an ``Eight``, and the force on each corner [N], a ``Vec`` |
 """
 
@@ -72,20 +75,10 @@ auto columns = [&](const Four* row) -> Quad {
     return out;
 };
 
-const int begin = 8 * block, count = energies.shape[0];
+const int begin = 8 * block;
 const bool whole = begin + 8 <= count;
-size_t element[8];  // The last block repeats the last element.
+size_t element[8];
 for (int i = 0; i < 8; ++i) element[i] = begin + i < count ? begin + i : count - 1;
-constexpr int K = sizeof(*corners.data) / sizeof(int);
-auto corner = [&](int k) -> Vec {
-    Four row[8];
-    for (int i = 0; i < 8; ++i) {
-        const float* p = (const float*)(x.data + corners.data[element[i]][k]);
-        row[i] = Four{p[0], p[1], p[2], 0.0f};
-    }
-    Quad c = columns(row);
-    return {c[0], c[1], c[2]};
-};
 auto load = [&](const wp::array_t<float>& array) -> Eight {
     if (whole) return *(const Eight*)(array.data + begin);
     Eight out;
@@ -97,20 +90,34 @@ auto load4 = [&](const auto& array) -> Quad {
     for (int i = 0; i < 8; ++i) row[i] = *(const Four*)(array.data + element[i]);
     return columns(row);
 };
+auto vec = [&](auto address) -> Vec {
+    Four row[8];
+    for (int i = 0; i < 8; ++i) {
+        const float* p = (const float*)address(i);
+        row[i] = Four{p[0], p[1], p[2], 0.0f};
+    }
+    Quad c = columns(row);
+    return {c[0], c[1], c[2]};
+};
+auto write = [&](float* to, int width, const Eight* values, int n) {
+    for (int c = 0; c < n; c += 4) {  // Four columns at a time; the last four may overlap.
+        const int from = c + 4 <= n ? c : n - 4;
+        Eight half[4];
+        transpose(values + from, half);
+        for (int i = 0; i < 4; ++i) {
+            *(Four*)(to + width * element[i] + from) = __builtin_shufflevector(half[i], half[i], 0, 1, 2, 3);
+            *(Four*)(to + width * element[i + 4] + from) = __builtin_shufflevector(half[i], half[i], 4, 5, 6, 7);
+        }
+    }
+};
+"""
+_OF_ELEMENTS = r"""
+constexpr int K = sizeof(*corners.data) / sizeof(int);
+auto corner = [&](int k) { return vec([&](int i) { return x.data + corners.data[element[i]][k]; }); };
 auto store = [&](Eight energy, const Vec (&force)[K]) {
     if (whole) *(Eight*)(energies.data + begin) = energy;
     else for (int i = 0; i < 8; ++i) energies.data[element[i]] = energy[i];
-    for (int c = 0; c < 3 * K; c += 4) {  // Four columns at a time; the last four may overlap.
-        const int from = c + 4 <= 3 * K ? c : 3 * K - 4;
-        Eight half[4];
-        transpose(&force[0].x + from, half);
-        for (int i = 0; i < 4; ++i) {
-            float *low = (float*)(corner_force.data + K * element[i]) + from;
-            float *high = (float*)(corner_force.data + K * element[i + 4]) + from;
-            *(Four*)low = __builtin_shufflevector(half[i], half[i], 0, 1, 2, 3);
-            *(Four*)high = __builtin_shufflevector(half[i], half[i], 4, 5, 6, 7);
-        }
-    }
+    write((float*)corner_force.data, 3 * K, &force[0].x, 3 * K);
 };
 """
 
@@ -118,6 +125,17 @@ auto store = [&](Eight energy, const Vec (&force)[K]) {
 def on_cpu(source: str) -> str:
     """Source of a native function; empty on CUDA, which has no such vectors."""
     return f"#ifndef __CUDACC__\n{source}\n#endif\n"
+
+
+def eight_at_once(formula: str, count: str) -> str:
+    """Source of a native function for the elements 8 block to 8 block + 7 of a number of elements, named in C++."""
+    return on_cpu(f"const int count = {count};\n{_NAMES}\n{formula}")
+
+
+def annotate(function: Any, *kinds: Any) -> None:
+    """Set the Warp types of a function's parameters, in order."""
+    code = function.__code__
+    function.__annotations__ = dict(zip(code.co_varnames[: code.co_argcount], kinds, strict=True))
 
 
 def eight_elements(name: str, formula: str, *, corners: int, parameter: Any = wp.float32) -> wp.Kernel:
@@ -133,20 +151,14 @@ def eight_elements(name: str, formula: str, *, corners: int, parameter: Any = wp
         The kernel; an item is a block of `EIGHT` elements.
     """
 
-    def eight(
-        block: Any, x: Any, corners: Any, parameter0: Any, parameter1: Any, energies: Any, corner_force: Any
-    ) -> None: ...
+    def eight(block, x, corners, parameter0, parameter1, energies, corner_force): ...
 
-    def kernel(
-        first: Any, x: Any, corners: Any, parameter0: Any, parameter1: Any, energies: Any, corner_force: Any
-    ) -> None:
+    def kernel(first, x, corners, parameter0, parameter1, energies, corner_force):
         native(first + wp.tid(), x, corners, parameter0, parameter1, energies, corner_force)
 
     kinds = (wp.vec3f, wp.types.vector(corners, wp.int32), parameter, parameter, wp.float32, wp.vec3f)
     for each in (eight, kernel):
-        each.__annotations__ = dict(
-            zip(each.__code__.co_varnames, [wp.int32, *(wp.array(dtype=kind) for kind in kinds)], strict=True)
-        )
+        annotate(each, wp.int32, *(wp.array(dtype=kind) for kind in kinds))
     eight.__qualname__ = f"{name}_of_eight"
-    native = wp.func_native(on_cpu(_NAMES + formula))(eight)
+    native = wp.func_native(eight_at_once(_OF_ELEMENTS + formula, "energies.shape[0]"))(eight)
     return cast(wp.Kernel, wp.kernel(kernel, name=name, **ALONE))
