@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import scipy.sparse as sp
 import torch
 import warp as wp
 from cloth import finest_system, group_of, sheet, wave
@@ -19,9 +20,10 @@ from physgraph_usd.solver.integrate.fused import FusedPhysgraph
 from physgraph_usd.solver.integrate.network import VECTORS, PhysgraphConfig
 from physgraph_usd.solver.integrate.vertex_frame import VertexFrame
 from physgraph_usd.solver.integrate.weights import random_network
+from physgraph_usd.solver.mesh import stencil
 from physgraph_usd.solver.mesh.kernels import KERNELS
 from physgraph_usd.solver.mesh.simd import EIGHT, eight_elements
-from physgraph_usd.solver.mesh.stencil import incidence, vectors
+from physgraph_usd.solver.mesh.stencil import Stencil, incidence, vectors
 from physgraph_usd.solver.mesh.threads import LEAST_PER_THREAD, Launch
 
 VERTICES = 500
@@ -181,6 +183,18 @@ def test_networks_agree(config: PhysgraphConfig, count: int) -> None:
     plain, eight, shared = (each(bases, system.spacing, system.reach, 4, frame=lambda: around) for each in (two, *ones))
     assert torch.equal(eight, shared)
     assert float((eight - plain).abs().max()) <= 1e-5 * float(plain.abs().max())
+
+
+def test_stencils_agree() -> None:
+    rng = np.random.default_rng(5)
+    matrix = sp.csr_matrix(sp.random(300, VERTICES, density=0.02, random_state=rng))
+    x = torch.as_tensor(rng.normal(size=(VERTICES, 3)).astype(np.float32))
+    out = torch.full((300, 3), math.nan)
+    columns, starts = (torch.as_tensor(each.astype(np.int32)) for each in (matrix.indices, matrix.indptr))
+    values = torch.as_tensor(matrix.data.astype(np.float32))
+    arrays = [wp.from_torch(each) for each in (starts, columns, values)]
+    Launch(stencil._GATHER[torch.float32], 300, [*arrays, vectors(x), vectors(out)], device="cpu")({})
+    assert torch.equal(out, Stencil(matrix, dtype=torch.float32, device="cpu").apply(x))
 
 
 def test_formulas_are_for_the_cpu_alone() -> None:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ..level import Level
 from ..mesh.kernels import ALONE, KERNELS
-from ..mesh.simd import EIGHT, on_cpu
+from ..mesh.simd import EIGHT, FOUR, on_cpu
 from ..mesh.stencil import QUAD, SCALAR, VECTOR, incidence, overloads, vectors
 from ..mesh.threads import Launch
 
@@ -148,14 +148,16 @@ def _gather_corners(
 
 
 @wp.func_native(
-    on_cpu("""
-    typedef float Four __attribute__((vector_size(16), aligned(4), may_alias));
+    on_cpu(
+        FOUR
+        + """
     float* f = (float*)(force.data + vertex);
     Four total = {f[0], f[1], f[2], 0.0f};
     for (int k = starts.data[vertex]; k < starts.data[vertex + 1]; ++k)
         total += *(const Four*)(corner_force.data + slots.data[k]);
     for (int i = 0; i < 3; ++i) f[i] = total[i];
-    """)
+    """
+    )
 )
 def _sum_corners(
     vertex: wp.int32,

@@ -122,6 +122,12 @@ auto store = [&](Eight energy, const Vec (&force)[K]) {
 """
 
 
+FOUR = """
+typedef float Four __attribute__((vector_size(16), aligned(4), may_alias));
+"""
+"""Source of the type of four floats, for sums of vectors."""
+
+
 def on_cpu(source: str) -> str:
     """Source of a native function; empty on CUDA, which has no such vectors."""
     return f"#ifndef __CUDACC__\n{source}\n#endif\n"
