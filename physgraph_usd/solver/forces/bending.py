@@ -32,52 +32,18 @@ from torch import Tensor
 
 from ..grain import bending_factor
 from ..level import Level
-from ..mesh.kernels import FUSED
+from ..mesh.kernels import KERNELS
+from ..mesh.simd import eight_elements
 from ..mesh.stencil import add_at
 from ..mesh.threads import argument
 from .base import Elements, element_overloads
 
-wp.set_module_options(FUSED)
+wp.set_module_options(KERNELS)
 
 TURN = 2.0 * math.pi
 """A full turn [rad]."""
 PER_TURN = 1.0 / TURN
 _SIX = wp.types.vector(length=6, dtype=wp.int32)
-
-
-@wp.func
-def _larger(a: Any, b: Any):
-    """The larger of two numbers; Warp's function takes five instructions, to handle NaN."""
-    return wp.where(a > b, a, b)
-
-
-@wp.func
-def _angle(y: wp.float32, x: wp.float32) -> wp.float32:  # pyright: ignore[reportRedeclaration]
-    """The angle of (x, y) to 2e-7 rad, by a minimax polynomial of the arctangent on [0, 1], without a branch.
-
-    The C library's function takes as long for similar angles, and twice as long for varied angles.
-    """
-    along = wp.abs(x)
-    across = wp.abs(y)
-    steep = across > along
-    a = wp.where(steep, along, across) / (wp.where(steep, across, along) + wp.float32(1.0e-37))
-    s = a * a
-    p = wp.float32(0.023040125) - wp.float32(0.0043554027) * s
-    p = wp.float32(-0.057773575) + p * s
-    p = wp.float32(0.09794234) + p * s
-    p = wp.float32(-0.13976581) + p * s
-    p = wp.float32(0.19962704) + p * s
-    p = wp.float32(-0.3333166) + p * s
-    angle = a + a * s * p
-    angle = wp.where(steep, wp.float32(math.pi / 2.0) - angle, angle)
-    angle = wp.where(x < wp.float32(0.0), wp.float32(math.pi) - angle, angle)
-    return wp.where(y < wp.float32(0.0), -angle, angle)
-
-
-@wp.func
-def _angle(y: wp.float64, x: wp.float64) -> wp.float64:
-    """The angle of (x, y) [rad]."""
-    return wp.atan2(y, x)
 
 
 @wp.func
@@ -89,13 +55,14 @@ def _bent(axis: Any, ik: Any, il: Any, weight: Any, rest_angle: Any):
     square = wp.dot(axis, axis)
     # The floors are relative to the hinge's own size: they act on collapsed triangles only.
     tiny = type(weight)(1.0e-12) * (square + wp.dot(ik, ik) + wp.dot(il, il))
-    square = _larger(square, tiny + type(weight)(1.0e-30))
+    square = wp.max(square, tiny + type(weight)(1.0e-30))
     length = wp.sqrt(square)  # pyright: ignore[reportArgumentType]
     floor = tiny * square + type(weight)(1.0e-37)
-    s1 = _larger(wp.dot(n1, n1), floor)
-    s2 = _larger(wp.dot(n2, n2), floor)
+    s1 = wp.max(wp.dot(n1, n1), floor)
+    s2 = wp.max(wp.dot(n2, n2), floor)
     # n1 x n2 . e / |e| is -|e| n1 . (x_l - x_i).
-    theta = _angle(-length * wp.dot(n1, il), wp.dot(n1, n2))
+    # Without + 0 a collapsed hinge's angle would be that of (-0, 0), half a turn.
+    theta = wp.atan2(-length * wp.dot(n1, il), wp.dot(n1, n2) + type(weight)(0.0))
     bent = theta - rest_angle
     bent = bent - type(weight)(TURN) * wp.rint(bent * type(weight)(PER_TURN))
     moment = weight * bent * length
@@ -156,6 +123,57 @@ def _bending_of_quads(
     corner_force[6 * h + 5] = at_l * half
 
 
+_EIGHT_BENT = r"""
+Vec n1 = cross(axis, ik), n2 = cross(il, axis);
+Eight square = dot(axis, axis);
+Eight tiny = 1.0e-12f * (square + dot(ik, ik) + dot(il, il));
+square = larger(square, tiny + 1.0e-30f);
+Eight length = root(square), floor = tiny * square + 1.0e-37f;
+Eight s1 = larger(dot(n1, n1), floor), s2 = larger(dot(n2, n2), floor);
+
+// The angle of (along, across) to 2e-7 rad, by a minimax polynomial of the arctangent on [0, 1].
+Eight across = -length * dot(n1, il), along = dot(n1, n2);
+auto steep = fabs(across) > fabs(along);
+Eight a = (steep ? fabs(along) : fabs(across)) / ((steep ? fabs(across) : fabs(along)) + 1.0e-37f), s = a * a;
+Eight p = 0.023040125f - 0.0043554027f * s;
+p = -0.057773575f + p * s;
+p = 0.09794234f + p * s;
+p = -0.13976581f + p * s;
+p = 0.19962704f + p * s;
+p = -0.3333166f + p * s;
+Eight theta = a + a * s * p;
+theta = steep ? 1.57079632679f - theta : theta;
+theta = along < 0.0f ? 3.14159265359f - theta : theta;
+theta = __builtin_elementwise_copysign(theta, across);
+
+Eight weight = load(parameter0), bent = theta - load(parameter1);
+bent = bent - 6.28318530718f * rint(bent * 0.159154943092f);
+Eight moment = weight * bent * length;
+Vec at_k = n1 * (moment / s1), at_l = n2 * (moment / s2);
+Eight per_square = 1.0f / square;
+Vec at_j = -(at_k * (dot(ik, axis) * per_square) + at_l * (dot(il, axis) * per_square));
+Vec at_i = -at_j - at_k - at_l;
+Eight energy = 0.5f * weight * bent * bent;
+"""
+"""`_bent` for eight hinges."""
+_EIGHT = eight_elements(
+    "eight_bending",
+    """
+    Vec xi = corner(0), axis = corner(1) - xi, ik = corner(2) - xi, il = corner(3) - xi;"""
+    + _EIGHT_BENT
+    + "store(energy, {at_i, at_j, at_k, at_l});",
+    corners=4,
+)
+_EIGHT_OF_QUADS = eight_elements(
+    "eight_bending_of_quads",
+    """
+    Eight half = 0.5f + Eight{};
+    Vec xi = corner(0), axis = corner(1) - xi;
+    Vec ik = ((corner(2) - xi) + (corner(3) - xi)) * half, il = ((corner(4) - xi) + (corner(5) - xi)) * half;"""
+    + _EIGHT_BENT
+    + "store(energy, {at_i, at_j, at_k * half, at_k * half, at_l * half, at_l * half});",
+    corners=6,
+)
 _KERNELS = element_overloads(_bending, width=4, parameters=2)
 _KERNELS_OF_QUADS = element_overloads(_bending_of_quads, width=6, parameters=2)
 
@@ -212,11 +230,13 @@ class Bending:
         narrow = (level.hinges[:, 2] == level.hinges[:, 3]) & (level.hinges[:, 4] == level.hinges[:, 5])
         self._kinds = [
             _Kind(
-                which, corners, Elements(kernels, corners, [self.weight[which], level.rest_angle[which]], level=level)
+                which,
+                corners,
+                Elements(kernels, corners, [self.weight[which], level.rest_angle[which]], level=level, eight=eight),
             )
-            for which, columns, kernels in (
-                (torch.nonzero(narrow)[:, 0], [0, 1, 2, 4], _KERNELS),
-                (torch.nonzero(~narrow)[:, 0], [0, 1, 2, 3, 4, 5], _KERNELS_OF_QUADS),
+            for which, columns, kernels, eight in (
+                (torch.nonzero(narrow)[:, 0], [0, 1, 2, 4], _KERNELS, _EIGHT),
+                (torch.nonzero(~narrow)[:, 0], [0, 1, 2, 3, 4, 5], _KERNELS_OF_QUADS, _EIGHT_OF_QUADS),
             )
             for corners in (level.hinges[which][:, columns],)
             if len(which)

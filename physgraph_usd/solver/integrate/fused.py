@@ -1,9 +1,9 @@
-"""`Physgraph` as two kernels around a few matrix products, on the CPU and on CUDA.
+"""`Physgraph` as two kernels around a few matrix products, for CUDA.
 
-In torch a step at 26,000 vertices writes some forty arrays; on a CPU the cost is several force evaluations. Here one
-kernel computes normals, neighbour means and scalar products in a single pass, so values gathered from the neighbours
-are used while still cached. The layers are matrix products, and a second kernel combines. A normal part is a number
-times the normal; its products are computed from the number.
+In torch a step at 26,000 vertices writes some forty arrays. Here one kernel computes normals, neighbour means and
+scalar products in a single pass, so values gathered from the neighbours are used while still cached. The layers are
+matrix products, and a second kernel combines. A normal part is a number times the normal; its products are computed
+from the number. On the CPU `eight_vertices` takes a single kernel.
 """
 
 # Warp's kernels are typed by values that only Warp reads.
@@ -20,17 +20,26 @@ import warp as wp
 from jaxtyping import Float
 from torch import Tensor
 
-from ..mesh.kernels import KERNELS
+from ..mesh.kernels import ALONE, KERNELS
 from ..mesh.stencil import vectors
 from ..mesh.threads import Launch
-from .network import FLOOR, LOG_OFFSET, LOG_SCALE, Physgraph, clock_of, counted, families_of, pairs_of
+from .eight_vertices import EightPhysgraph
+from .network import (
+    FLOOR,
+    LOG_OFFSET,
+    LOG_SCALE,
+    Families,
+    Pairs,
+    Parts,
+    Physgraph,
+    clock_of,
+    counted_families,
+    in_rows,
+    pairs_in,
+)
 from .vertex_frame import VertexFrame, normal_of
 
 wp.set_module_options(KERNELS)
-
-Parts = tuple[tuple[int, bool], ...]
-Pairs = tuple[tuple[int, int], ...]
-Families = tuple[tuple[int, bool], ...]
 
 
 class FusedPhysgraph:
@@ -67,8 +76,7 @@ class FusedPhysgraph:
         normal = wp.zeros(vertices if self._frames else 1, dtype=wp.vec3f, device=device)
         x, others, number = (wp.zeros(1, dtype=kind, device=device) for kind in (wp.vec3f, wp.vec2i, wp.int32))
         shared, place = [vertices, flat, spacing, normal], {"device": device, "threads": threads}
-        pairs = tuple((a, b) for a, b in pairs_of(names).T.tolist())
-        families = tuple(zip(families_of(names), counted(names), strict=True))
+        pairs, families = pairs_in(names), counted_families(names)
         mesh = [x, number, others, number, number]
         see = seeing(parts, pairs, smoothed, families)
         self._see = Launch(see, vertices, [*shared, *mesh, wp.from_torch(self._features)], **place)
@@ -119,27 +127,13 @@ class FusedPhysgraph:
 
 
 @functools.lru_cache(maxsize=8)
-def fused_physgraph(network: Physgraph, vertices: int, longest: float, *, device: str, threads: int) -> FusedPhysgraph:
-    """A `FusedPhysgraph`, reused in the next frame; the network's weights must stay constant."""
+def fused_physgraph(
+    network: Physgraph, vertices: int, longest: float, *, device: str, threads: int
+) -> FusedPhysgraph | EightPhysgraph:
+    """The kernels for a device, reused in the next frame; the network's weights must stay constant."""
+    if device == "cpu":
+        return EightPhysgraph(network, vertices, longest, threads=threads)
     return FusedPhysgraph(network, vertices, longest, device=device, threads=threads)
-
-
-def in_rows(names: Sequence[str]) -> tuple[tuple[str, ...], tuple[int, ...], Parts]:
-    """Rows of the kernels' table for vectors of given names.
-
-    Returns:
-        The whole vectors, which are the first rows; the whole vectors with neighbour means as the last rows; for each
-        name its row and whether the name is the normal part of the row.
-    """
-    split = [name.partition(".")[::2] for name in names]
-    wholes = tuple(dict.fromkeys(whole for whole, _ in split))
-    smoothed = tuple(wholes.index(whole) for whole, part in split if part == "smooth")
-
-    def place(whole: str, part: str) -> tuple[int, bool]:
-        row = wholes.index(whole)
-        return (len(wholes) + smoothed.index(row), False) if part == "smooth" else (row, part == "normal")
-
-    return wholes, smoothed, tuple(place(*each) for each in split)
 
 
 @functools.cache
@@ -153,12 +147,12 @@ def seeing(parts: Parts, pairs: Pairs, smoothed: tuple[int, ...], families: Fami
         families: Family of each vector, whose mean square normalises the products, and whether the vector counts in the
             mean.
     """
-    # Warp's kernel hash misses some values captured by generic functions; the module name includes them.
+    # Warp's kernel hash misses some values captured by generic functions; the kernel's name includes them.
     made = hashlib.sha256(repr((parts, pairs, smoothed, families)).encode()).hexdigest()[:16]
     measure, compare = _measuring(1 + max(row for row, _ in parts), smoothed), _comparing(parts, families)
     show = _showing(parts, pairs, 1 + max(families)[0])
 
-    @wp.kernel(module=f"{__name__}.{made}")
+    @wp.kernel(name=f"see_{made}", **ALONE)
     def see(
         first: wp.int32,
         vertices: wp.int32,
@@ -278,7 +272,7 @@ def _showing(parts: Parts, pairs: Pairs, kinds: int) -> Any:
 def combining(parts: Parts) -> wp.Kernel:
     """The kernel combining the vectors, given as rows and normal parts."""
 
-    @wp.kernel(module="unique")
+    @wp.kernel(**ALONE)
     def combine(
         first: wp.int32,
         vertices: wp.int32,

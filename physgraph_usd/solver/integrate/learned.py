@@ -24,6 +24,7 @@ from torch import Tensor, nn
 from ...errors import SolveError
 from ..level import Level
 from .base import Carry, System
+from .eight_vertices import EightPhysgraph
 from .fused import FusedPhysgraph, fused_physgraph
 from .network import Physgraph
 from .recorded import MOST_GARMENTS, Memory, Recording, Recordings, pays
@@ -88,7 +89,7 @@ class LearnedMetric:
         """The displacement of the next step [m]."""
         return self._combined(carry, system=system, fused=self._fused(system))
 
-    def _fused(self, system: System) -> FusedPhysgraph | None:
+    def _fused(self, system: System) -> FusedPhysgraph | EightPhysgraph | None:
         """The network as kernels, or None if not fused."""
         if not self._fuse or system.spacing.dtype != torch.float32:
             return None
@@ -101,7 +102,7 @@ class LearnedMetric:
         carry: Carry,
         *,
         system: System,
-        fused: FusedPhysgraph | None,
+        fused: FusedPhysgraph | EightPhysgraph | None,
         secant: Callable[[Carry], Tensor] | None = None,
     ) -> Tensor:
         """The network's combination of vectors [m]; a recording provides its own L-BFGS direction."""

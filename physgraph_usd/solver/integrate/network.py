@@ -29,6 +29,10 @@ FLOOR = 1e-9
 LOG_SCALE, LOG_OFFSET = 0.25 / math.log(10.0), 1.5
 """Scale and offset of lengths: (log10 + 3) / 2 of a length, from the natural logarithm of the squared length."""
 
+Parts = tuple[tuple[int, bool], ...]
+Pairs = tuple[tuple[int, int], ...]
+Families = tuple[tuple[int, bool], ...]
+
 
 @dataclass(frozen=True)
 class PhysgraphConfig:
@@ -132,6 +136,34 @@ def pairs_of(names: Sequence[str]) -> Int[Tensor, "2 pairs"]:
     count = len(names)
     chosen = [(a, b) for a in range(count) for b in range(a + 1, count) if seen(a, b)]
     return torch.tensor(chosen, dtype=torch.int64).reshape(-1, 2).T
+
+
+def pairs_in(names: Sequence[str]) -> Pairs:
+    """`pairs_of` as a tuple, for kernels."""
+    return tuple((a, b) for a, b in pairs_of(names).T.tolist())
+
+
+def counted_families(names: Sequence[str]) -> Families:
+    """Family of each vector, and whether the vector counts in the family's mean square, for kernels."""
+    return tuple(zip(families_of(names), counted(names), strict=True))
+
+
+def in_rows(names: Sequence[str]) -> tuple[tuple[str, ...], tuple[int, ...], Parts]:
+    """Rows of the kernels' table for vectors of given names.
+
+    Returns:
+        The whole vectors, which are the first rows; the whole vectors with neighbour means as the last rows; for each
+        name its row and whether the name is the normal part of the row.
+    """
+    split = [name.partition(".")[::2] for name in names]
+    wholes = tuple(dict.fromkeys(whole for whole, _ in split))
+    smoothed = tuple(wholes.index(whole) for whole, part in split if part == "smooth")
+
+    def place(whole: str, part: str) -> tuple[int, bool]:
+        row = wholes.index(whole)
+        return (len(wholes) + smoothed.index(row), False) if part == "smooth" else (row, part == "normal")
+
+    return wholes, smoothed, tuple(place(*each) for each in split)
 
 
 def clock_of(step: int | Tensor) -> Any:

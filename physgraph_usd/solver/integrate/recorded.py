@@ -29,7 +29,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from ..mesh.kernels import KERNELS
+from ..mesh.kernels import ALONE, KERNELS
 from ..mesh.threads import Launch
 from .base import Carry, System
 from .secants import Dot, Secant
@@ -286,7 +286,7 @@ def _overload(scalar: type) -> wp.Kernel:
     """The coefficients of the L-BFGS direction from the vectors' scalar products, one thread per garment."""
     each = wp.types.vector(length=SECANTS, dtype=scalar)
 
-    @wp.kernel(module="unique")
+    @wp.kernel(**ALONE)
     def combine(first: wp.int32, products: wp.array(dtype=scalar, ndim=3), out: wp.array(dtype=scalar, ndim=2)):
         g = first + wp.tid()
         n = wp.static(SECANTS)

@@ -7,6 +7,7 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
+from typing import Any
 
 import torch
 import warp as wp
@@ -19,8 +20,8 @@ _TARGET = "-target-cpu x86-64-v3" if torch.backends.cpu.get_cpu_capability() in 
 _FLAGS = (wp.config.cpu_compiler_flags or "-march=native").replace("-march=native", _TARGET)
 KERNELS = {"enable_backward": False, "cpu_compiler_flags": _FLAGS}
 """Options of Warp modules: no derivatives; on the CPU Warp's default flags, for the target instructions."""
-FUSED = KERNELS | {"cpu_compiler_flags": f"{_FLAGS} -ffp-contract=fast"}
-"""Options of modules with the heaviest kernels: on the CPU a product and a sum are fused into one instruction."""
+ALONE: dict[str, Any] = {"module": "unique", "module_options": KERNELS}
+"""Arguments of `wp.kernel` for a kernel that compiles alone."""
 
 
 @functools.cache

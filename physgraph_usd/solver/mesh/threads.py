@@ -38,18 +38,21 @@ class Launch:
         device: str,
         threads: int = 1,
         least: int = LEAST_PER_THREAD,
+        at_once: int = 1,
     ) -> None:
         """Prepare the launch.
 
         Args:
             kernel: Kernel of (first, *inputs).
-            size: Number of items.
+            size: Number of items; of elements if a kernel's item is a block of elements.
             inputs: The kernel's arrays; changing arrays are given again at each call.
             device: "cpu" or a CUDA device.
             threads: Most threads to use on the CPU.
             least: Items per thread below which an additional thread costs more than the gain.
+            at_once: Number of elements in an item of the kernel.
         """
         self._threads = threads = max(1, min(threads, size // least)) if device == "cpu" else 1
+        size = -(-size // at_once)
         self._device = None if device == "cpu" else device
         slices = min(SLICES * threads, size // LEAST_SLICE) if threads > 1 and least < LEAST_PER_THREAD else threads
         bounds = _tapered(size, slices) if slices > threads else [size * i // slices for i in range(slices + 1)]
