@@ -7,6 +7,7 @@ import numpy as np
 import torch
 import trimesh
 
+from physgraph_usd.solver.colliders.base import Surface
 from physgraph_usd.solver.colliders.mesh import MeshBody, MeshSurface
 from physgraph_usd.solver.colliders.pose import MeshPose
 
@@ -59,9 +60,17 @@ def split(soup: Soup) -> Soup:
     return points[triangles.ravel()], np.arange(triangles.size, dtype=np.int32).reshape(-1, 3)
 
 
-def surfaces(soup: Soup) -> tuple[MeshSurface, ...]:
+def surfaces(soup: Soup, side: str = "auto") -> tuple[MeshSurface, ...]:
     """The closed and the open part, posed."""
-    return MeshBody(device="cpu", threads=1).pose(MeshPose(*soup))
+    return MeshBody(side=side, device="cpu", threads=1).pose(MeshPose(*soup))
+
+
+def signed(surface: Surface, x: np.ndarray) -> np.ndarray:
+    """Distances of world positions from a surface [m], negative inside or on the disallowed side."""
+    at = torch.as_tensor(x - surface.origin)
+    found = surface.closest(at, endless(len(x)))
+    wrong = surface.inside(at) if surface.closed else found.is_behind(surface.fixed_side or 0.0)
+    return torch.where(wrong, -found.distance, found.distance).numpy()
 
 
 def distances(soup: Soup, x: np.ndarray) -> np.ndarray:

@@ -7,32 +7,20 @@ from pathlib import Path
 import igl
 import numpy as np
 import pytest
-import torch
-from bodies import Soup, around, ball, flipped, split, together, tube
+from bodies import Soup, around, ball, flipped, signed, split, surfaces, together, tube
 from cloth import sheet
 from pxr import Usd, UsdGeom, Vt
 from stages import COLLIDER_API, add_sheet, author, new_stage, save, set_matrix, vec3
 from touching import frame, measured, mesh_pose, refiner
 
 from physgraph_usd.errors import SchemaError
-from physgraph_usd.solver.colliders.mesh import MeshBody, MeshSurface
 from physgraph_usd.solver.colliders.pose import MeshPose, ShapePose
-from physgraph_usd.solver.colliders.sign import signed_distances
 from physgraph_usd.usd.read.reader import open_shot
 from physgraph_usd.usd.schema import COLLIDER, SIDES
 
 MESH, REST = sheet(6, 6, 0.05)
 FLAT = np.ascontiguousarray((REST - REST.mean(axis=0))[:, [0, 2, 1]] * np.array([1.0, 1.0, -1.0]))
 """A small sheet lying level."""
-
-
-def surfaces(soup: Soup, side: str) -> tuple[MeshSurface, ...]:
-    return MeshBody(side=side, device="cpu", threads=1).pose(MeshPose(*soup))
-
-
-def signed(surface: MeshSurface, x: np.ndarray, edges: np.ndarray | None = None) -> np.ndarray:
-    pairs = torch.as_tensor(np.zeros((0, 2), np.int32) if edges is None else edges)
-    return signed_distances(surface, torch.as_tensor(x - surface.origin), pairs, reach=10.0).numpy()
 
 
 def floor(size: float = 1.0, cells: int = 4) -> Soup:
@@ -60,7 +48,7 @@ class TestWinding:
     def test_open_pieces_have_the_inside_that_libigls_winding_number_gives(self, name: str):
         soup = TUBES[name]
         (surface,) = surfaces(soup, "winding")
-        assert (surface.closed, surface.certain) == (True, True)
+        assert surface.closed
         outward = TUBES["two" if name == "two" else "tube"]
         x = around(soup, 3000)
         number = np.asarray(igl.winding_number(outward[0], outward[1].astype(np.int64), x))
