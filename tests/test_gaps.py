@@ -2,34 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
-import numpy as np
-import pytest
 import torch
-from energies import evaluate
-from folds import EDGE, curved, flat, levels_of, named, placed, square, strip, view_of
+from folds import EDGE, levels_of, named, square, view_of
 from test_tangles import pair
 
 from physgraph_usd.solver.contact.cloth import ClothView
 from physgraph_usd.solver.forces.self_contact import PairConstraints, SelfContact
-
-QUIET: dict[str, Callable[[np.ndarray], np.ndarray]] = {
-    "flat": flat,
-    "curved": curved,
-    "half a turn": lambda points: curved(points, np.pi),
-    "rippled": lambda points: points + np.outer(0.004 * np.sin(40 * points[:, 0]), [0.0, 1.0, 0.0]),
-}
-
-
-class TestOneSheet:
-    @pytest.mark.parametrize("name", QUIET)
-    def test_what_is_bent_little_pushes_nothing(self, name: str):
-        garment = named(strip(12, 4))
-        levels = levels_of(garment, level=1)
-        x = placed(levels[-1], QUIET[name])
-        terms = view_of(levels, [garment]).terms(x)
-        assert not any(bool(evaluate(term, x)[1].abs().max() > 0.0) for term in terms)
 
 
 class TestCrossing:

@@ -109,11 +109,6 @@ class TestDone:
         assert tuple(Sdf.Layer.FindOrOpen(str(out)).ListTimeSamplesForPath(f"{CLOTH}.velocities")) == TIMES
         assert faults(out, shot) == []
 
-    def test_the_shot_is_not_touched(self, shot: Path, tmp_path: Path):
-        before = shot.read_bytes()
-        refine(shot, tmp_path / "fine.usdc")
-        assert shot.read_bytes() == before
-
     def test_pinned_points_keep_the_input_to_the_bit(self, tmp_path: Path):
         """S17 through the whole tool: the layer repeats the shot's own float32."""
         shot = cloth_shot(tmp_path / "shot.usdc", times=(1.0, 2.0))
@@ -204,12 +199,6 @@ class TestOptions:
             refine(shot, tmp_path / "fine.usdc", **{name: file}, progress=lambda done, _: frames.append(done))
         assert file.read_bytes() == b"mine"
         assert frames == []
-
-    def test_the_shot_itself_is_never_the_output(self, shot: Path):
-        before = shot.read_bytes()
-        with pytest.raises(UsageError):
-            refine(shot, shot, overwrite=True)
-        assert shot.read_bytes() == before
 
     def test_dry_run_writes_nothing_and_knows_everything(self, shot: Path, tmp_path: Path):
         report = refine(

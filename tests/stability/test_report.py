@@ -40,8 +40,8 @@ BEYOND = {
     39: "waves of two and three edges are not told of",
 }
 """Cases whose bound is not met, and why; S20 meets it by some roundings."""
-ELSEWHERE = {38: "test_forces_analytic.py"}
-"""Cases that a file of their own measures mesh by mesh."""
+ELSEWHERE = {1: "test_meshes.py", 38: "test_forces_analytic.py", 40: "test_forces_gradients.py"}
+"""Cases that a file of their own measures by method, or mesh by mesh."""
 
 
 def the_case(number: int) -> object:
