@@ -38,6 +38,16 @@ def tube(radius: float = 0.1, length: float = 0.4, *, around: int = 32, rows: in
     return points, np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]]).astype(np.int32)
 
 
+def pane(size: float = 1.0, cells: int = 4) -> Soup:
+    """An open level square at height zero whose front is up."""
+    ticks = np.linspace(-0.5 * size, 0.5 * size, cells + 1)
+    z, x = np.meshgrid(ticks, ticks)
+    ids = np.arange(x.size).reshape(cells + 1, cells + 1)
+    a, b, c, d = (part.ravel() for part in (ids[:-1, :-1], ids[:-1, 1:], ids[1:, 1:], ids[1:, :-1]))
+    faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]).astype(np.int32)
+    return np.stack([x.ravel(), np.zeros(x.size), z.ravel()], axis=1), faces
+
+
 def together(*soups: Soup) -> Soup:
     """Several bodies as one mesh."""
     starts = np.cumsum([0, *(len(points) for points, _ in soups)])

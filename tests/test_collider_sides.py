@@ -7,7 +7,7 @@ from pathlib import Path
 import igl
 import numpy as np
 import pytest
-from bodies import Soup, around, ball, flipped, signed, split, surfaces, together, tube
+from bodies import around, ball, flipped, pane, signed, split, surfaces, together, tube
 from cloth import sheet
 from pxr import Usd, UsdGeom, Vt
 from stages import COLLIDER_API, add_sheet, author, new_stage, save, set_matrix, vec3
@@ -21,16 +21,6 @@ from physgraph_usd.usd.schema import COLLIDER, SIDES
 MESH, REST = sheet(6, 6, 0.05)
 FLAT = np.ascontiguousarray((REST - REST.mean(axis=0))[:, [0, 2, 1]] * np.array([1.0, 1.0, -1.0]))
 """A small sheet lying level."""
-
-
-def floor(size: float = 1.0, cells: int = 4) -> Soup:
-    """An open level square at height zero whose front is up."""
-    ticks = np.linspace(-0.5 * size, 0.5 * size, cells + 1)
-    z, x = np.meshgrid(ticks, ticks)
-    points = np.stack([x.ravel(), np.zeros(x.size), z.ravel()], axis=1)
-    ids = np.arange(x.size).reshape(cells + 1, cells + 1)
-    a, b, c, d = (part.ravel() for part in (ids[:-1, :-1], ids[:-1, 1:], ids[1:, 1:], ids[1:, :-1]))
-    return points, np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]).astype(np.int32)
 
 
 TUBE = tube(rows=17)
@@ -84,7 +74,7 @@ class TestStart:
 class TestFrontAndBack:
     @pytest.mark.parametrize(("side", "up"), [("front", 1.0), ("back", -1.0), ("start", None)])
     def test_the_side_of_an_open_surface_is_fixed(self, side: str, up: float | None):
-        (surface,) = surfaces(floor(), side)
+        (surface,) = surfaces(pane(), side)
         assert (surface.closed, surface.fixed_side) == (False, up)
         x = np.array([[0.1, 0.2, 0.1], [0.1, -0.2, 0.1], [2.0, 0.2, 0.1], [2.0, -0.2, 0.1]])
         signs = np.sign(signed(surface, x))
@@ -94,7 +84,7 @@ class TestFrontAndBack:
     @pytest.mark.parametrize(("side", "above"), [("front", True), ("back", False), ("auto", False)])
     def test_cloth_that_starts_under_a_floor(self, side: str, above: bool):
         start = FLAT + np.array([0.0, -0.004, 0.0])
-        state = refiner((MESH, REST), side=side, gravity=np.zeros(3)).solve(frame(start, mesh_pose(floor())))
+        state = refiner((MESH, REST), side=side, gravity=np.zeros(3)).solve(frame(start, mesh_pose(pane())))
         points = state.points[0]
         assert points is not None
         assert (points[:, 1] > 0.0).all() == above
@@ -109,7 +99,7 @@ class TestOnStages:
     def stage(self, tmp_path: Path) -> Usd.Stage:
         made = new_stage(tmp_path / "s.usda")
         add_sheet(made)
-        points, triangles = floor()
+        points, triangles = pane()
         mesh = UsdGeom.Mesh.Define(made, BODY)
         mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(triangles), 3, np.int32)))
         mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(triangles.ravel()))

@@ -10,7 +10,7 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from bodies import ball, box, flipped, tube
+from bodies import ball, box, flipped, pane, tube
 from brute import between
 from cloth import DOWN, Answer, base_of
 from folds import EDGE, Cloth, curved, frame_with, named, refiner_with, sewn, square
@@ -20,7 +20,7 @@ from sheets import garment_of
 from test_contact import MESH as WIDE
 from test_contact import REST as WIDE_REST
 from test_contact import draped
-from test_contact_bodies import KINDS, STEP, STILL, bodies, jaws, needles, pane
+from test_contact_bodies import KINDS, STEP, STILL, bodies, jaws, needles
 from test_tangles import cornered, dented
 
 from physgraph_usd.solver.colliders.pose import MeshPose

@@ -45,16 +45,6 @@ class TestPins:
         assert max(moves) < STILL, moves
 
 
-def pane(size: float, cells: int = 4) -> Soup:
-    """An open level square at height zero."""
-    ticks = np.linspace(-0.5 * size, 0.5 * size, cells + 1)
-    z, x = np.meshgrid(ticks, ticks)
-    ids = np.arange(x.size).reshape(cells + 1, cells + 1)
-    a, b, c, d = (part.ravel() for part in (ids[:-1, :-1], ids[:-1, 1:], ids[1:, 1:], ids[1:, :-1]))
-    faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]).astype(np.int32)
-    return np.stack([x.ravel(), np.zeros(x.size), z.ravel()], axis=1), faces
-
-
 def jaws(gap: float, kind: str) -> tuple[Any, ...]:
     """Two bodies above and below the plane of x and z, a gap apart; "one" has both in one mesh."""
     shift = np.array([0.0, 0.05 + 0.5 * gap, 0.0])
