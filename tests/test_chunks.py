@@ -164,7 +164,8 @@ class TestLayers:
         shot = cloth_shot(tmp_path / "shot.usdc")
         assert len({layer_with(shot, tmp_path / str(n)).read_bytes() for n in range(3)}) == 1
 
-    @pytest.mark.parametrize("temporal", ["tether", pytest.param("warm", marks=pytest.mark.slow)])
+    @pytest.mark.slow
+    @pytest.mark.parametrize("temporal", ["tether", "warm"])
     def test_s34_seams_do_not_show_with_history(self, tmp_path: Path, temporal: str):
         """Less than a twentieth of a fine edge, RMS, is left at a seam, and it fades; cloth moves far more."""
         shot = cloth_shot(tmp_path / "shot.usdc", times=LONG)

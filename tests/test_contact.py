@@ -41,7 +41,6 @@ SHAPES = {
 MESHES: dict[str, tuple[Soup, float]] = {
     "ball": (ball(level=4), 0.19),
     "block": (box((0.3, 0.2, 0.3)), 0.095),
-    "flipped": (flipped(ball(level=4)), 0.19),
     "mixed": (flipped(ball(level=4), 0.5), 0.19),
     "two": (together(ball(0.12, at=(-0.12, 0.0, 0.0)), ball(0.12, at=(0.14, 0.0, 0.0))), 0.11),
 }

@@ -46,7 +46,9 @@ def frames_of(name: str) -> list[float]:
     return [float(times[index]) for index in (0, SHOTS[name].frames // 2, SHOTS[name].frames - 1)]
 
 
-@pytest.mark.parametrize("name", SHOTS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow) if name == "dancer" else name for name in SHOTS]
+)
 def test_cages_do_not_cross_and_stay_out_of_bodies(sample: Callable[[str], Path], tmp_path: Path, name: str) -> None:
     told, layer = SHOTS[name], tmp_path / "fine.usdc"
     for time in frames_of(name):

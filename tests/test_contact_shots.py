@@ -39,9 +39,8 @@ def check(report: Any) -> list[dict[str, Any]]:
     return measured
 
 
-@pytest.mark.parametrize(
-    ("name", "frames"), [pytest.param("skirt", (24.0, 26.0), marks=pytest.mark.slow), ("tshirt", (27.0, 29.0))]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "frames"), [("skirt", (24.0, 26.0)), ("tshirt", (27.0, 29.0))])
 def test_samples(sample: Callable[[str], Path], tmp_path: Path, name: str, frames: tuple[float, float]):
     report = refine(sample(name), tmp_path / "fine.usdc", level=2, steps=12, frames=frames)
     assert "contact" in report.modelled

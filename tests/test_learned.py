@@ -22,7 +22,7 @@ from physgraph_usd.lab.methods.paper_network import PaperConfig
 from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.solver.fabric import Fabric
 from physgraph_usd.solver.integrate.base import Carry, Integrator, System
-from physgraph_usd.solver.integrate.learned import LONGEST, LearnedMetric, limited
+from physgraph_usd.solver.integrate.learned import LONGEST, LearnedMetric
 from physgraph_usd.solver.integrate.network import VECTORS, Physgraph, PhysgraphConfig
 from physgraph_usd.solver.integrate.solve import solve_level
 from physgraph_usd.solver.integrate.stop import Budget
@@ -55,16 +55,6 @@ def run(integrator: Integrator, system: System, x: torch.Tensor, *, steps: int =
     return carry
 
 
-@pytest.mark.parametrize("config", [PLAIN, ALL])
-def test_untrained_it_takes_the_metric_step(config: PhysgraphConfig):
-    system, x = problem()
-    integrator = integrator_of(make_network(config))
-    carry = integrator.start(system, x)
-    assert carry.preconditioned is not None
-    expected = limited(carry.preconditioned, system.spacing)
-    assert torch.allclose(integrator.propose(system, carry).detach(), expected, atol=1e-12)
-
-
 @pytest.mark.parametrize(
     "vectors",
     [
@@ -86,13 +76,6 @@ def test_the_kernels_do_what_torch_does(vectors: tuple[str, ...]):
         move, expected = one.propose(system, carry), other.propose(system, carry)
         assert float((move - expected).abs().max()) < 1e-5 * float(expected.abs().max())
         assert not bool(move[~system.free.squeeze(1)].any())
-
-
-@pytest.mark.parametrize("config", [PLAIN, ALL, PAPER])
-def test_one_evaluation_a_step(config: PhysgraphConfig | PaperConfig):
-    system, x = problem()
-    run(integrator_of(random_network(config, seed=1, scale=SMALL)), system, x, steps=4)
-    assert system.evaluations == 5
 
 
 @pytest.mark.parametrize("config", [PLAIN, PAPER])

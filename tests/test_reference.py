@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 from cloth import DOWN, frame_of, sheet, wave
@@ -49,12 +48,6 @@ def test_no_method_with_any_budget_ends_below_it(found: Reference, method: str):
     for steps in (12, 96):
         points, _ = problem.go_on(frame, replace(ALONE, method=METHODS[method], steps=steps), [None])
         assert found.gap(problem.judge(frame, points, ALONE).energy) > -1e-4
-
-
-def test_who_asks_again_gets_the_same(bounded: Reference):
-    again = find_reference(*squeezed(), settings=ALONE, short=True)
-    assert (again.least, again.by, again.apart) == (bounded.least, bounded.by, bounded.apart)
-    assert np.array_equal(again.points[0], bounded.points[0])
 
 
 def test_a_bounded_search_compares_two_starts_at_least(found: Reference, bounded: Reference):
