@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from bodies import around, ball, flipped, pane, signed, split, surfaces, together, tube
 from cloth import sheet
+from folds import frame_with, measured, named, refiner_with
 from pxr import Usd, UsdGeom, Vt
 from stages import COLLIDER_API, add_sheet, author, new_stage, save, set_matrix, vec3
-from touching import frame, measured, mesh_pose, refiner
 
 from physgraph_usd.errors import SchemaError
 from physgraph_usd.solver.colliders.pose import MeshPose, ShapePose
@@ -21,6 +21,7 @@ from physgraph_usd.usd.schema import COLLIDER, SIDES
 MESH, REST = sheet(6, 6, 0.05)
 FLAT = np.ascontiguousarray((REST - REST.mean(axis=0))[:, [0, 2, 1]] * np.array([1.0, 1.0, -1.0]))
 """A small sheet lying level."""
+SHEET = named((MESH, REST))
 
 
 TUBE = tube(rows=17)
@@ -51,11 +52,12 @@ class TestWinding:
         """A dome without a floor: on auto what starts under it belongs there."""
         points, triangles = ball(0.2, level=4)
         dome = points, triangles[points[triangles][:, :, 1].min(axis=1) > -0.05]
-        state = refiner((MESH, REST), side=side).solve(frame(FLAT + np.array([0.0, 0.19, 0.0]), mesh_pose(dome)))
+        state = refiner_with([SHEET], ["mesh"], level=2, side=side).solve(
+            frame_with([FLAT + np.array([0.0, 0.19, 0.0])], dome)
+        )
         assert measured(state)["inside"] == 0
         assert measured(state, "before")["inside"] == (0 if side == "auto" else pytest.approx(75, abs=25))
         found = state.points[0]
-        assert found is not None
         assert (np.linalg.norm(found, axis=1) > 0.1995).all() == (side == "winding")
 
 
@@ -64,9 +66,8 @@ class TestStart:
     def test_cloth_inside_a_closed_body_stays_there_only_with_start(self, side: str):
         soup = ball(0.3, level=4)
         start = FLAT + np.array([0.0, -0.2, 0.0])
-        state = refiner((MESH, REST), side=side).solve(frame(start, mesh_pose(soup)))
+        state = refiner_with([SHEET], ["mesh"], level=2, side=side).solve(frame_with([start], soup))
         points = state.points[0]
-        assert points is not None
         radius = np.linalg.norm(points, axis=1)
         assert (radius < 0.3).all() == (side == "start")
 
@@ -84,9 +85,10 @@ class TestFrontAndBack:
     @pytest.mark.parametrize(("side", "above"), [("front", True), ("back", False), ("auto", False)])
     def test_cloth_that_starts_under_a_floor(self, side: str, above: bool):
         start = FLAT + np.array([0.0, -0.004, 0.0])
-        state = refiner((MESH, REST), side=side, gravity=np.zeros(3)).solve(frame(start, mesh_pose(pane())))
+        state = refiner_with([SHEET], ["mesh"], level=2, side=side, gravity=np.zeros(3)).solve(
+            frame_with([start], pane())
+        )
         points = state.points[0]
-        assert points is not None
         assert (points[:, 1] > 0.0).all() == above
         assert (points[:, 1] < 0.0).all() != above
 

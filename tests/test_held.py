@@ -10,9 +10,9 @@ import pytest
 import torch
 from bodies import ball
 from cloth import sheet
+from folds import frame_with, named, refiner_with
 from pxr import Usd, UsdGeom, Vt
 from shots import refine
-from touching import frame, mesh_pose, refiner
 
 from physgraph_usd.solver.frame import start
 from physgraph_usd.solver.frame.start import STILL, slowing
@@ -20,6 +20,7 @@ from physgraph_usd.solver.frame.values import State, join, split
 from physgraph_usd.solver.scene import Frame
 
 MESH, REST = sheet(8, 8, 0.05)
+SHEET = named((MESH, REST))
 HANGING = REST - REST.mean(axis=0)
 NORMAL = np.eye(3)[np.ptp(HANGING, axis=0).argmin()]
 BALL = ball(0.1)
@@ -75,13 +76,13 @@ class TestHeldPose:
 
 def at(count: int, *, ball_moves: float = 0.0) -> Frame:
     """A sheet held over a ball that it hangs on, but for its drift."""
-    body = mesh_pose((BALL[0] - (0.09 - ball_moves) * NORMAL, BALL[1]))
-    return frame(HANGING + count * DRIFT, body, time=float(count))
+    body = (BALL[0] - (0.09 - ball_moves) * NORMAL, BALL[1])
+    return frame_with([HANGING + count * DRIFT], body, time=float(count))
 
 
 def solved(frames: list[Frame]) -> np.ndarray:
     """Positions in each frame, solved in so few steps that cloth settles for long [m], shape (F, V, 3)."""
-    solver = refiner((MESH, REST), level=1, steps=1, tolerance=0.0)
+    solver = refiner_with([SHEET], ["mesh"], level=1, steps=1, tolerance=0.0)
     return np.stack([np.asarray(solver.solve(each).points[0]) for each in frames])
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pxr import Sdf, Usd, UsdGeom
-from shots import CLOTH, TIMES, cloth_shot, faults, fine, refine, sample_times
+from shots import CLOTH, TIMES, cloth_shot, faults, fine, only, refine, sample_times
 
 from physgraph_usd.errors import UsageError
 from physgraph_usd.shot.options import RefineOptions
@@ -22,10 +22,6 @@ BEND = "physgraph:material:bendStiffness"
 @pytest.fixture
 def shot(tmp_path: Path) -> Path:
     return cloth_shot(tmp_path / "shot.usdc")
-
-
-def only(folder: Path, *names: str) -> bool:
-    return sorted(file.name for file in folder.iterdir()) == sorted(names)
 
 
 class TestDone:

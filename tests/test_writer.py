@@ -8,9 +8,7 @@ import numpy as np
 import pytest
 from layers import (
     COAT,
-    MIRROR,
     TIMES,
-    dress_up,
     errors,
     fine_points,
     grid,
@@ -31,13 +29,6 @@ from physgraph_usd.usd.write.primvars import FineMap, to_numpy, to_vt
 from physgraph_usd.usd.write.writer import LayerWriter
 
 ROOT = Path(__file__).resolve().parents[1]
-
-
-@pytest.fixture
-def dressed(tmp_path: Path) -> Path:
-    path = tmp_path / "shot.usda"
-    dress_up(make_shot(path, matrix=MIRROR))
-    return path
 
 
 @pytest.mark.parametrize(("mode", "suffix"), [("over", ".usdc"), ("sibling", ".usda")])
