@@ -12,7 +12,6 @@ import torch
 
 from physgraph_usd.lab.chart.problem import Problem, plain_detail
 from physgraph_usd.lab.samples import write_sample
-from physgraph_usd.solver.colliders.sign import signed_distances
 from physgraph_usd.solver.scene import Frame
 from physgraph_usd.usd.read.reader import Shot, open_shot
 
@@ -47,15 +46,16 @@ def frames_of(shot: Shot, times: Sequence[float]) -> list[Frame]:
 
 
 def distances(problem: Problem, frame: Frame, points: Sequence[np.ndarray]) -> np.ndarray:
-    """Distance of each fine vertex from the nearest body [m], negative inside; a lower bound beyond `NEAR`."""
+    """Distance of each fine vertex from the nearest body [m], negative inside, infinite beyond `NEAR`."""
     refiner, found = problem.refiner, []
     for part in refiner.parts_of(frame):
-        level = refiner.group_of(part).levels[-1]
         world = np.concatenate([points[index] for index in part])
         nearest = np.full(len(world), np.inf)
         for each in refiner.touching(part, frame):
             x = torch.as_tensor(world - each.surface.origin, dtype=torch.float32)
-            own = signed_distances(each.surface, x, level.edges, reach=NEAR)
+            inside = each.surface.inside(x)
+            reach = torch.where(inside, float("inf"), NEAR).to(x)
+            own = each.surface.closest(x, reach).distance * torch.where(inside, -1.0, 1.0)
             nearest = np.minimum(nearest, own.double().numpy())
         found.append(nearest)
     return np.concatenate(found)

@@ -7,6 +7,7 @@ import numpy as np
 import torch
 import trimesh
 
+from physgraph_usd.solver.colliders.base import Surface
 from physgraph_usd.solver.colliders.mesh import MeshBody, MeshSurface
 from physgraph_usd.solver.colliders.pose import MeshPose
 
@@ -37,6 +38,16 @@ def tube(radius: float = 0.1, length: float = 0.4, *, around: int = 32, rows: in
     return points, np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]]).astype(np.int32)
 
 
+def pane(size: float = 1.0, cells: int = 4) -> Soup:
+    """An open level square at height zero whose front is up."""
+    ticks = np.linspace(-0.5 * size, 0.5 * size, cells + 1)
+    z, x = np.meshgrid(ticks, ticks)
+    ids = np.arange(x.size).reshape(cells + 1, cells + 1)
+    a, b, c, d = (part.ravel() for part in (ids[:-1, :-1], ids[:-1, 1:], ids[1:, 1:], ids[1:, :-1]))
+    faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]).astype(np.int32)
+    return np.stack([x.ravel(), np.zeros(x.size), z.ravel()], axis=1), faces
+
+
 def together(*soups: Soup) -> Soup:
     """Several bodies as one mesh."""
     starts = np.cumsum([0, *(len(points) for points, _ in soups)])
@@ -59,9 +70,17 @@ def split(soup: Soup) -> Soup:
     return points[triangles.ravel()], np.arange(triangles.size, dtype=np.int32).reshape(-1, 3)
 
 
-def surfaces(soup: Soup) -> tuple[MeshSurface, ...]:
+def surfaces(soup: Soup, side: str = "auto") -> tuple[MeshSurface, ...]:
     """The closed and the open part, posed."""
-    return MeshBody(device="cpu", threads=1).pose(MeshPose(*soup))
+    return MeshBody(side=side, device="cpu", threads=1).pose(MeshPose(*soup))
+
+
+def signed(surface: Surface, x: np.ndarray) -> np.ndarray:
+    """Distances of world positions from a surface [m], negative inside or on the disallowed side."""
+    at = torch.as_tensor(x - surface.origin)
+    found = surface.closest(at, endless(len(x)))
+    wrong = surface.inside(at) if surface.closed else found.is_behind(surface.fixed_side or 0.0)
+    return torch.where(wrong, -found.distance, found.distance).numpy()
 
 
 def distances(soup: Soup, x: np.ndarray) -> np.ndarray:

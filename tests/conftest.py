@@ -73,6 +73,16 @@ def sample(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
     return write
 
 
+@pytest.fixture
+def dressed(tmp_path: Path) -> Path:
+    """A shot of a coat with all that depends on topology, under a parent that mirrors it."""
+    from layers import MIRROR, dress_up, make_shot
+
+    path = tmp_path / "shot.usda"
+    dress_up(make_shot(path, matrix=MIRROR))
+    return path
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Skip GPU tests, with the reason, where there is no CUDA device."""
     gpu = [item for item in items if item.get_closest_marker("gpu")]

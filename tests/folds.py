@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from cloth import DOWN, FABRIC, GUIDE, Solver, settings_of
+from cloth import DOWN, FABRIC, GUIDE, Answer, Solver, settings_of
 from meshes import grid
 from sheets import garment_of
 
@@ -148,6 +148,7 @@ def refiner_with(
     garments: Sequence[Garment],
     kinds: Sequence[str] = (),
     *,
+    side: str = "auto",
     level: int = 1,
     gravity: np.ndarray = DOWN,
     contact: ContactSettings | None = None,
@@ -157,7 +158,7 @@ def refiner_with(
 ) -> Solver:
     """A refiner of garments that feel every collider, and one another."""
     feel = [replace(garment, colliders=tuple(range(len(kinds)))) for garment in garments]
-    colliders = tuple(Collider(f"/World/Body{index}", kind) for index, kind in enumerate(kinds))
+    colliders = tuple(Collider(f"/World/Body{index}", kind, side=side) for index, kind in enumerate(kinds))
     settings = settings_of(contact=contact or ContactSettings(), **options)
     scene = Scene(tuple(feel), gravity, tuple(times), colliders)
     return Solver(Refiner(scene, settings, levels=[level] * len(feel), dtype=dtype))
@@ -174,6 +175,11 @@ def frame_with(
     """Several garments and bodies, or soups of triangles, at one time code."""
     bodies = tuple(MeshPose(*pose) if isinstance(pose, tuple) else pose for pose in poses)
     return Frame(time, tuple(GarmentFrame(cage, fabric, guide, offset=offset) for cage in cages), bodies)
+
+
+def measured(answer: Answer, which: str = "after", body: int = 0) -> dict[str, Any]:
+    """What was measured against one body, before or after."""
+    return list(answer.telemetry[0]["contact"]["bodies"].values())[body][which]
 
 
 def near_pairs(parts: Parts, x: torch.Tensor, near: Reach) -> NearPairs:

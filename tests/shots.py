@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from click.testing import CliRunner, Result
 from layers import errors, open_over, world_metres
 from pxr import Sdf
@@ -88,6 +89,22 @@ def faults(layer: Path, shot: Path) -> list[str]:
 def run(*args: object) -> Result:
     """The command, in this process."""
     return CliRunner().invoke(main, [str(arg) for arg in args])
+
+
+def interrupted(shot: Path, out: Path, *, after: int, **options: Any) -> None:
+    """Refine until the user interrupts, after some frames."""
+
+    def interrupt(done: int, _: int) -> None:
+        if done == after:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        refine(shot, out, progress=interrupt, **options)
+
+
+def only(folder: Path, *names: str) -> bool:
+    """Whether a folder holds these files and no others."""
+    return sorted(file.name for file in folder.iterdir()) == sorted(names)
 
 
 def command(*args: object, **options: Any) -> subprocess.CompletedProcess[str]:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
 
+from physgraph_usd.usd.read.reader import Shot
 from physgraph_usd.usd.write.plain import PlainStage
 
 GARMENT_API = "PhysGraphGarmentAPI"
@@ -91,6 +92,11 @@ def add_sheet(
     if tagged:
         mesh.GetPrim().AddAppliedSchema(GARMENT_API)
     return mesh
+
+
+def said(shot: Shot) -> str:
+    """Warnings of an open shot, one a line."""
+    return "\n".join(map(str, shot.warnings))
 
 
 def save(stage: Usd.Stage) -> str:

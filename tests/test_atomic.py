@@ -6,7 +6,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -106,54 +105,6 @@ def test_hosts_of_one_disk_do_not_meet(tmp_path: Path, monkeypatch: pytest.Monke
     assert names(tmp_path) == ["out.usdc"]
 
 
-WRITE = """
-import sys, time
-from pathlib import Path
-import numpy as np
-from pxr import Sdf, Vt
-from physgraph_usd.interrupts import signals_noted
-from physgraph_usd.usd.write.stream import LayerStream
-points = Sdf.Path("/World/coat.points")
-with signals_noted(), LayerStream(Path(sys.argv[1]), overwrite=True) as stream:
-    stream.attribute(points, Sdf.ValueTypeNames.Point3fArray)
-    for frame in range(100000):
-        stream.set(points, Vt.Vec3fArray.FromNumpy(np.full((1000, 3), frame, np.float32)), time=float(frame))
-        stream.flush()
-        if frame == 3:
-            sys.stdout.write("ready\\n")
-            sys.stdout.flush()
-"""
-
-
-@pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
-def test_a_killed_writer_leaves_nothing_under_the_name(tmp_path: Path, number: signal.Signals) -> None:
-    target = tmp_path / "out.usdc"
-    process = subprocess.Popen(
-        [sys.executable, "-c", WRITE, str(target)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
-        cwd=Path(__file__).resolve().parents[1],
-    )
-    with process:
-        assert process.stdout is not None
-        process.stdout.readline()
-        time.sleep(0.05)
-        process.send_signal(number)
-        try:
-            process.wait(timeout=30)
-        finally:
-            process.kill()
-    left = names(tmp_path)
-    assert target.name not in left
-    if number is not signal.SIGKILL:
-        assert left == []
-    with LayerStream(target) as stream:
-        fill(stream, 2)
-        stream.commit()
-    assert names(tmp_path) == ["out.usdc"]
-
-
 class Destroyed:
     """An object in whose destructor a termination signal comes."""
 
@@ -178,42 +129,3 @@ def test_a_signal_in_a_destructor_ends_the_next_flush(tmp_path: Path) -> None:
     assert names(tmp_path) == []
     assert reached == ["flush"]
     leave_if_asked()  # The next run of this process is not asked to end.
-
-
-FULL = """
-import resource, sys
-from pathlib import Path
-import numpy as np
-from pxr import Sdf, Vt
-from physgraph_usd.errors import LayerError
-from physgraph_usd.usd.write.stream import LayerStream
-resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, 300_000))
-points = Sdf.Path("/World/coat.points")
-try:
-    with LayerStream(Path(sys.argv[1])) as stream:
-        stream.attribute(points, Sdf.ValueTypeNames.Point3fArray)
-        for frame in range(100):
-            stream.set(points, Vt.Vec3fArray.FromNumpy(np.full((1000, 3), frame, np.float32)), time=float(frame))
-        stream.commit()
-except LayerError as error:
-    sys.stdout.write(str(error))
-"""
-
-
-@pytest.mark.skipif(os.name == "nt", reason="limits of POSIX")
-@pytest.mark.parametrize("suffix", [".usdc", ".usda"])
-def test_a_full_disk_is_a_clear_error(tmp_path: Path, suffix: str) -> None:
-    target = tmp_path / f"out{suffix}"
-    done = subprocess.run(
-        [sys.executable, "-c", FULL, str(target)],
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-        cwd=Path(__file__).resolve().parents[1],
-    )
-    assert done.returncode == 0, done.stderr
-    assert f"cannot write {target}" in done.stdout
-    assert "File too large" in done.stdout
-    assert "\n" not in done.stdout
-    assert names(tmp_path) == []

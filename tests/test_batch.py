@@ -9,22 +9,17 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from click.testing import CliRunner, Result
+from click.testing import Result
 from jsonschema import Draft202012Validator
 from pxr import Usd, UsdGeom
-from shots import CLOTH, cloth_shot
+from shots import CLOTH, cloth_shot, run
 
-from physgraph_usd import cli
 from physgraph_usd.errors import UsageError
 from physgraph_usd.shot import summary
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.refine import refine_shot
 
 SMALL = ("--level", "0")
-
-
-def run(*args: object) -> Result:
-    return CliRunner().invoke(cli.main, [str(arg) for arg in args], catch_exceptions=False)
 
 
 def torn(shot: Path) -> Path:

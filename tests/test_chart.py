@@ -8,7 +8,6 @@ import math
 import shutil
 import sys
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -27,24 +26,19 @@ from shots import cloth_shot, refine
 
 from physgraph_usd import cli
 from physgraph_usd.errors import UsageError
-from physgraph_usd.lab.chart import options
 from physgraph_usd.lab.chart.journal import Journal
 from physgraph_usd.lab.chart.measure import (
     DEFAULT,
-    FURTHER,
     SMOOTH,
     UPSAMPLED,
-    allowance,
-    budgets_of,
-    expected_ms,
     find_curves,
 )
-from physgraph_usd.lab.chart.options import LONG, SHORT, ChartOptions, make_plan
+from physgraph_usd.lab.chart.options import ChartOptions
 from physgraph_usd.lab.chart.peers.run import PEERS, Peer, parse_peers
 from physgraph_usd.lab.chart.reference import Solutions
 from physgraph_usd.lab.chart.run import chart_shot
-from physgraph_usd.lab.chart.table import Chart, Point, collate, typical
-from physgraph_usd.lab.chart.words import advice, settings
+from physgraph_usd.lab.chart.table import Chart
+from physgraph_usd.lab.chart.words import settings
 from physgraph_usd.lab.methods import METHODS
 from physgraph_usd.solver.integrate import Method
 from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton
@@ -87,17 +81,6 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Chart]:
     while "warm" not in {row["term"] for row in chart.terms}:
         chart = chart_shot(shot, folder / "out", OPTIONS)
     return shot, folder / "out", chart
-
-
-def point(method: str, steps: int, ms: float, gap: float) -> Point:
-    zeros = dict.fromkeys(("tolerance", "strain", "inside", "percent", "deepest_mm", "crossings", "tangles"), 0)
-    times = dict.fromkeys(("ms", "ms_median", "ms_least"), ms)
-    about: dict[str, Any] = {"integrator": method, "nested": True, "made": steps, "frames": 1, "repeats": 1}
-    return Point(method, steps=steps, gap=gap, energy=gap, energies={"stretch": gap}, **about, **zeros, **times)
-
-
-def chart_of(*points: Point) -> Chart:
-    return Chart({"waited": 0.0}, points, (), (), ())
 
 
 @pytest.mark.slow
@@ -232,70 +215,6 @@ def test_the_page_in_a_browser(made: tuple[Path, Path, Chart]):
         assert "contact" in page.locator("#terms").text_content()
 
 
-def test_the_front_is_what_nothing_is_below_sooner():
-    chart = chart_of(
-        point("a", 1, 10.0, 0.4), point("b", 1, 12.0, 0.5), point("b", 2, 20.0, 0.1), point("a", 2, 30.0, 0.1)
-    )
-    assert [(each.method, each.ms) for each in chart.front] == [("a", 10.0), ("b", 20.0)]
-
-
-def test_a_sentence_says_which_method_to_take():
-    """With the option that asks for it, where `refine` knows the method."""
-    for name, said in (("physgraph", "Take physgraph (--integrator physgraph) for"), ("gd", "Take gd for")):
-        points = point(name, 1, 10.0, 0.4), point(name, 4, 40.0, 0.1)
-        assert advice(chart_of(*points, point(DEFAULT, 12, 19.0, 0.2))).startswith("Take refine's default")
-        assert advice(chart_of(*points, point(DEFAULT, 12, 60.0, 0.2))).startswith(said)
-
-
-def test_the_bar_goes_on_where_a_part_takes_longer(monkeypatch: pytest.MonkeyPatch):
-    seconds, shown = [0.0], list[float]()
-    monkeypatch.setattr(options.time, "perf_counter", lambda: seconds[0])
-    clock = options.Clock(1.0, lambda part, *_: shown.append(part))
-    for name in options.PARTS:
-        clock.enter(name)
-        for _ in range(5):
-            seconds[0] += 10.0
-            clock.say("something")
-    assert all(a < b < 1.0 for a, b in pairwise(shown))
-
-
-def test_a_warm_row_is_judged_by_its_last_frame_and_lowers_what_is_known(tmp_path: Path):
-    journal = Journal(tmp_path, {"shot": "a"}, overwrite=False)
-    journal.add("reference", frame=3.0, start=2.0, least=1.0, energies={"all": 1.0}, by="b", apart=None, seconds=0.0)
-    judged = {"energies": {"all": 0.5}, "inside": 0, "tangles": 0}
-    journal.add("warm", method="a", steps=6, frame=3.0, repeat=0, ms=4.0, **judged)
-    journal.add("warm", method="a", steps=6, frame=3.0, repeat=1, ms=6.0)
-    chart = collate(journal)
-    [own] = chart.warm
-    assert (own.gap, own.ms_least, own.ms_most, own.repeats) == (0.0, 4.0, 6.0, 2)
-    assert chart.references[0]["least"] == 0.5
-
-
-def test_times_to_a_gap_are_read_between_budgets():
-    chart = chart_of(
-        point("a", 1, 10.0, 0.4), point("a", 2, 20.0, 0.5), point("a", 4, 40.0, 0.1), point("b", 1, 5.0, 0.6)
-    )
-    assert chart.time_to("a", 0.4) == 10.0
-    assert chart.time_to("a", 0.2) == pytest.approx(20.0)
-    assert chart.time_to("a", 0.01) is None
-    assert chart.times_to(0.2) == {"a": pytest.approx(20.0)}
-
-
-@pytest.mark.parametrize(("ms", "on_front"), [(19.0, True), (21.0, True), (30.0, False)])
-def test_the_default_is_on_the_front_or_not(ms: float, on_front: bool):
-    place = chart_of(point("a", 1, 10.0, 0.4), point("a", 4, 40.0, 0.1), point(DEFAULT, 12, ms, 0.2)).default_place()
-    assert place is not None
-    assert place["on_front"] is on_front
-    assert place["ratio"] == pytest.approx(ms / 20.0)
-
-
-def test_a_busy_machine_is_told():
-    chart = replace(chart_of(point("a", 1, 10.0, 0.4)), about={"waited": 0.3})
-    assert "waited for a core 30% of the time" in chart.busy
-    assert chart.busy in list(chart.lines())
-    assert typical([10.0, 30.0, 11.0, 90.0, 12.0]) == 11.0
-
-
 def test_every_integrator_is_found_when_the_chart_is_made(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(METHODS, "newcomer", Method(lambda: QuasiNewton(history=2), nested=True))
     curves = {curve.name: curve.method.nested for curve in find_curves()}
@@ -305,35 +224,6 @@ def test_every_integrator_is_found_when_the_chart_is_made(monkeypatch: pytest.Mo
     assert "quasi-newton, flat" not in curves
     with pytest.raises(UsageError, match="unknown integrator 'nobody'"):
         find_curves(["nobody"])
-
-
-def test_budgets_grow_by_the_size_s_factor():
-    assert list(budgets_of(2.0))[:5] == [1, 2, 4, 8, 16]
-    assert list(budgets_of(4.0))[:4] == [1, 4, 16, 64]
-    assert list(budgets_of(1.5))[:8] == [1, 2, 3, 4, 6, 8, 12, 16]
-
-
-def test_the_next_budget_is_expected_on_a_line_and_who_is_nearly_there_may_take_longer():
-    assert [allowance(gap) for gap in (0.5, 0.099, 0.031, 0.03, 0.001)] == [1.0, FURTHER, FURTHER, 1.0, 1.0]
-    assert FURTHER > 2.0, "one more budget has to fit"
-    rows = [{"steps": 1, "ms": 718.0}, {"steps": 2, "ms": 1206.0}, {"steps": 4, "ms": 9e9}]
-    assert expected_ms(rows[:1], 1, 2.0) == 718.0
-    assert expected_ms(rows, 2, 2.0) == pytest.approx(1206.0 + 2 * 488.0)
-
-
-@pytest.mark.parametrize("default_ms", [5.0, 300.0, 1500.0])
-def test_the_short_form_is_planned_under_its_time(default_ms: float):
-    plan = make_plan(SHORT, curves=12, default_ms=default_ms, elapsed_ms=default_ms, judge_ms=0.2 * default_ms)
-    assert plan.minutes <= 9.0
-    assert plan.frames >= 1
-    assert plan.repeats >= SHORT.repeats
-    assert make_plan(LONG, curves=12, default_ms=default_ms, elapsed_ms=default_ms, judge_ms=0.0).minutes > plan.minutes
-
-
-def test_solves_that_no_fewer_steps_make_quicker_get_fewer_budgets():
-    """A crossed shot: drawing it apart takes as long with one step as with twelve."""
-    costs = {"curves": 14, "default_ms": 500.0, "elapsed_ms": 500.0, "judge_ms": 50.0}
-    assert make_plan(SHORT, **costs, least_ms=430.0).growth > make_plan(SHORT, **costs).growth
 
 
 @pytest.mark.parametrize("changes", [{"count": 0}, {"budget_minutes": -1.0}, {"device": "tpu"}, {"clock": "sun"}])

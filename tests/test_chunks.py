@@ -15,7 +15,7 @@ from cloth import rms
 from frame_solvers import counting
 from hypothesis import given
 from hypothesis import strategies as st
-from shots import EDGE, cloth_shot, faults, fine, refine, run, sample_times
+from shots import EDGE, cloth_shot, faults, fine, interrupted, refine, run, sample_times
 
 from physgraph_usd.errors import LayerError, SolveError
 from physgraph_usd.shot.chunks import chunks_of, solve_in_chunks
@@ -93,18 +93,6 @@ class TestFarmFolder:
                 frames.read(0, 0.0)
 
 
-def interrupted(shot: Path, out: Path, *, after: int, **options: Any) -> Path:
-    """Interrupt a run after some frames; returns the folder of those that it had finished."""
-
-    def interrupt(done: int, _: int) -> None:
-        if done == after:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        refine(shot, out, progress=interrupt, **options)
-    return out.with_name(f"{out.name}.frames")
-
-
 class TestKeptFrames:
     @pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.slow)])
     def test_a_resumed_run_goes_on_as_if_it_had_not_been_interrupted(self, tmp_path: Path, workers: int):
@@ -124,7 +112,8 @@ class TestKeptFrames:
 
     def test_frames_that_failed_or_are_not_whole_are_solved_again_and_damaged_ones_are_named(self, tmp_path: Path):
         shot, out = cloth_shot(tmp_path / "shot.usdc", broken={2.0: float("nan")}), tmp_path / "fine.usdc"
-        folder = interrupted(shot, out, after=5, temporal="off")
+        folder = out.with_name(f"{out.name}.frames")
+        interrupted(shot, out, after=5, temporal="off")
         assert {file.name for file in folder.glob("*.npz")} == {"0.npz", "1.failed.npz", "2.npz", "3.npz", "4.npz"}
         (folder / "2.npz").write_bytes((folder / "2.npz").read_bytes()[:-40])
         whole = (folder / "3.npz").read_bytes()
@@ -164,7 +153,8 @@ class TestLayers:
         shot = cloth_shot(tmp_path / "shot.usdc")
         assert len({layer_with(shot, tmp_path / str(n)).read_bytes() for n in range(3)}) == 1
 
-    @pytest.mark.parametrize("temporal", ["tether", pytest.param("warm", marks=pytest.mark.slow)])
+    @pytest.mark.slow
+    @pytest.mark.parametrize("temporal", ["tether", "warm"])
     def test_s34_seams_do_not_show_with_history(self, tmp_path: Path, temporal: str):
         """Less than a twentieth of a fine edge, RMS, is left at a seam, and it fades; cloth moves far more."""
         shot = cloth_shot(tmp_path / "shot.usdc", times=LONG)

@@ -100,15 +100,6 @@ def test_every_command_explains_itself(command: str) -> None:
 
 
 class TestRefine:
-    def test_layer_report_and_root(self, sample: Sample, tmp_path: Path) -> None:
-        out, report, root = tmp_path / "fine.usdc", tmp_path / "fine.json", tmp_path / "fine.usda"
-        result = run("refine", sample("swatch"), "-o", out, "--report", report, "--root", root, *SMALL)
-        assert (result.exit_code, result.stdout.split()) == (0, [str(out)])
-        assert "%" not in result.stderr, "a bar where there is no terminal"
-        assert json.loads(report.read_text(encoding="utf-8"))
-        assert root.is_file()
-        assert run("validate", out, "--shot", sample("swatch")).exit_code == 0
-
     @pytest.mark.parametrize(("paths", "code"), [("relative", 1), ("absolute", 0)])
     def test_a_moved_layer_finds_its_shot_by_absolute_paths(
         self, sample: Sample, tmp_path: Path, paths: str, code: int
@@ -140,12 +131,6 @@ class TestRefine:
         named = {"-o": tmp_path / "fine.usdc"} | {option: tmp_path / "x.abc"}
         result = run("refine", sample("swatch"), *(word for pair in named.items() for word in pair), *more, *SMALL)
         assert (result.exit_code, "'.abc'; known: ." in result.stderr) == (2, True), result.stderr
-        assert not list(tmp_path.iterdir())
-
-    def test_a_dry_run_makes_no_folder(self, sample: Sample, tmp_path: Path) -> None:
-        more = ("--report", tmp_path / "b" / "c", "--root", tmp_path / "d")
-        result = run("refine", sample("swatch"), "-o", tmp_path / "a", *more, "--dry-run", *SMALL)
-        assert (result.exit_code, bool(json.loads(result.stdout))) == (0, True)
         assert not list(tmp_path.iterdir())
 
     @pytest.mark.parametrize("option", ["--report", "--root"])

@@ -7,42 +7,21 @@ from pathlib import Path
 import igl
 import numpy as np
 import pytest
-import torch
-from bodies import Soup, around, ball, flipped, split, together, tube
+from bodies import around, ball, flipped, pane, signed, split, surfaces, together, tube
 from cloth import sheet
+from folds import frame_with, measured, named, refiner_with
 from pxr import Usd, UsdGeom, Vt
 from stages import COLLIDER_API, add_sheet, author, new_stage, save, set_matrix, vec3
-from touching import frame, measured, mesh_pose, refiner
 
 from physgraph_usd.errors import SchemaError
-from physgraph_usd.solver.colliders.mesh import MeshBody, MeshSurface
 from physgraph_usd.solver.colliders.pose import MeshPose, ShapePose
-from physgraph_usd.solver.colliders.sign import signed_distances
 from physgraph_usd.usd.read.reader import open_shot
 from physgraph_usd.usd.schema import COLLIDER, SIDES
 
 MESH, REST = sheet(6, 6, 0.05)
 FLAT = np.ascontiguousarray((REST - REST.mean(axis=0))[:, [0, 2, 1]] * np.array([1.0, 1.0, -1.0]))
 """A small sheet lying level."""
-
-
-def surfaces(soup: Soup, side: str) -> tuple[MeshSurface, ...]:
-    return MeshBody(side=side, device="cpu", threads=1).pose(MeshPose(*soup))
-
-
-def signed(surface: MeshSurface, x: np.ndarray, edges: np.ndarray | None = None) -> np.ndarray:
-    pairs = torch.as_tensor(np.zeros((0, 2), np.int32) if edges is None else edges)
-    return signed_distances(surface, torch.as_tensor(x - surface.origin), pairs, reach=10.0).numpy()
-
-
-def floor(size: float = 1.0, cells: int = 4) -> Soup:
-    """An open level square at height zero whose front is up."""
-    ticks = np.linspace(-0.5 * size, 0.5 * size, cells + 1)
-    z, x = np.meshgrid(ticks, ticks)
-    points = np.stack([x.ravel(), np.zeros(x.size), z.ravel()], axis=1)
-    ids = np.arange(x.size).reshape(cells + 1, cells + 1)
-    a, b, c, d = (part.ravel() for part in (ids[:-1, :-1], ids[:-1, 1:], ids[1:, 1:], ids[1:, :-1]))
-    return points, np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]).astype(np.int32)
+SHEET = named((MESH, REST))
 
 
 TUBE = tube(rows=17)
@@ -60,7 +39,7 @@ class TestWinding:
     def test_open_pieces_have_the_inside_that_libigls_winding_number_gives(self, name: str):
         soup = TUBES[name]
         (surface,) = surfaces(soup, "winding")
-        assert (surface.closed, surface.certain) == (True, True)
+        assert surface.closed
         outward = TUBES["two" if name == "two" else "tube"]
         x = around(soup, 3000)
         number = np.asarray(igl.winding_number(outward[0], outward[1].astype(np.int64), x))
@@ -73,11 +52,12 @@ class TestWinding:
         """A dome without a floor: on auto what starts under it belongs there."""
         points, triangles = ball(0.2, level=4)
         dome = points, triangles[points[triangles][:, :, 1].min(axis=1) > -0.05]
-        state = refiner((MESH, REST), side=side).solve(frame(FLAT + np.array([0.0, 0.19, 0.0]), mesh_pose(dome)))
+        state = refiner_with([SHEET], ["mesh"], level=2, side=side).solve(
+            frame_with([FLAT + np.array([0.0, 0.19, 0.0])], dome)
+        )
         assert measured(state)["inside"] == 0
         assert measured(state, "before")["inside"] == (0 if side == "auto" else pytest.approx(75, abs=25))
         found = state.points[0]
-        assert found is not None
         assert (np.linalg.norm(found, axis=1) > 0.1995).all() == (side == "winding")
 
 
@@ -86,9 +66,8 @@ class TestStart:
     def test_cloth_inside_a_closed_body_stays_there_only_with_start(self, side: str):
         soup = ball(0.3, level=4)
         start = FLAT + np.array([0.0, -0.2, 0.0])
-        state = refiner((MESH, REST), side=side).solve(frame(start, mesh_pose(soup)))
+        state = refiner_with([SHEET], ["mesh"], level=2, side=side).solve(frame_with([start], soup))
         points = state.points[0]
-        assert points is not None
         radius = np.linalg.norm(points, axis=1)
         assert (radius < 0.3).all() == (side == "start")
 
@@ -96,7 +75,7 @@ class TestStart:
 class TestFrontAndBack:
     @pytest.mark.parametrize(("side", "up"), [("front", 1.0), ("back", -1.0), ("start", None)])
     def test_the_side_of_an_open_surface_is_fixed(self, side: str, up: float | None):
-        (surface,) = surfaces(floor(), side)
+        (surface,) = surfaces(pane(), side)
         assert (surface.closed, surface.fixed_side) == (False, up)
         x = np.array([[0.1, 0.2, 0.1], [0.1, -0.2, 0.1], [2.0, 0.2, 0.1], [2.0, -0.2, 0.1]])
         signs = np.sign(signed(surface, x))
@@ -106,9 +85,10 @@ class TestFrontAndBack:
     @pytest.mark.parametrize(("side", "above"), [("front", True), ("back", False), ("auto", False)])
     def test_cloth_that_starts_under_a_floor(self, side: str, above: bool):
         start = FLAT + np.array([0.0, -0.004, 0.0])
-        state = refiner((MESH, REST), side=side, gravity=np.zeros(3)).solve(frame(start, mesh_pose(floor())))
+        state = refiner_with([SHEET], ["mesh"], level=2, side=side, gravity=np.zeros(3)).solve(
+            frame_with([start], pane())
+        )
         points = state.points[0]
-        assert points is not None
         assert (points[:, 1] > 0.0).all() == above
         assert (points[:, 1] < 0.0).all() != above
 
@@ -121,7 +101,7 @@ class TestOnStages:
     def stage(self, tmp_path: Path) -> Usd.Stage:
         made = new_stage(tmp_path / "s.usda")
         add_sheet(made)
-        points, triangles = floor()
+        points, triangles = pane()
         mesh = UsdGeom.Mesh.Define(made, BODY)
         mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(triangles), 3, np.int32)))
         mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(triangles.ravel()))

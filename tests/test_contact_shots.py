@@ -9,8 +9,6 @@ from typing import Any
 import pytest
 from shots import cloth_shot, refine
 
-from benchmarks.contact_shots import groups_of
-
 SHOTS: dict[str, tuple[list[str], list[str], tuple[float, float]]] = {
     "01_newton_shirt_dab_cm.usdc": (["/shot/char/shirt_geo"], ["/shot/char/body_geo"], (1043, 1044)),
     "02_makehuman_usdskel_dm.usdc": (["/shot/char/top", "/shot/char/shorts"], ["/shot/char/body"], (23, 24)),
@@ -41,9 +39,8 @@ def check(report: Any) -> list[dict[str, Any]]:
     return measured
 
 
-@pytest.mark.parametrize(
-    ("name", "frames"), [pytest.param("skirt", (24.0, 26.0), marks=pytest.mark.slow), ("tshirt", (27.0, 29.0))]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "frames"), [("skirt", (24.0, 26.0)), ("tshirt", (27.0, 29.0))])
 def test_samples(sample: Callable[[str], Path], tmp_path: Path, name: str, frames: tuple[float, float]):
     report = refine(sample(name), tmp_path / "fine.usdc", level=2, steps=12, frames=frames)
     assert "contact" in report.modelled
@@ -59,13 +56,6 @@ def test_real_shots(real_data: Path, tmp_path: Path, name: str):
         shot, tmp_path / "fine.usdc", level=2, steps=12, frames=frames, garments=garments, colliders=colliders
     )
     assert len(check(report)) >= 2
-
-
-def test_groups_are_counted_once():
-    """Garments solved together share their levels, and each may have more to tell."""
-    levels, other = [{"level": 0}], [{"level": 0}]
-    told = [{"levels": levels}, {"levels": levels, "near": []}, {"start": "reused"}, {"levels": other}]
-    assert groups_of(told) == [told[1], told[3]]
 
 
 def test_why_contact_is_left_out_is_told(sample: Callable[[str], Path], tmp_path: Path):

@@ -113,21 +113,6 @@ class TestAgainstEveryPair:
                 count += len(expected)
         assert count > 30
 
-    @pytest.mark.parametrize("kinds", [("triangles", "triangles"), ("quads", "triangles"), ("quads", "mixed")])
-    @pytest.mark.parametrize("level", [0, 1, 2])
-    def test_of_two_random_sheets_that_cross(self, kinds: tuple[str, str], level: int):
-        one, other = (square(3, kind=kind) for kind in kinds)
-        finest = levels_of(named(one, "A"), named(other, "B"), level=level)[-1]
-        first = (finest.vertex_garment == 0).numpy()
-        for seed in range(4):
-            rng = np.random.default_rng(seed)
-            x = finest.rest.double().numpy() + 0.1 * EDGE * rng.normal(size=finest.rest.shape)
-            x[~first] = x[~first] @ rotation(seed) + 0.02 * rng.normal(size=3)
-            at = torch.as_tensor(x, dtype=finest.dtype)
-            expected = every(Soup.of(finest, at))
-            assert found_at(finest, at) == expected
-            assert len(expected) > 2
-
     @pytest.mark.parametrize("seed", range(6))
     def test_of_faces_that_fold_into_those_beside_them(self, seed: int):
         """Parts one edge apart: in a coarse irregular mesh they pass through one another."""
@@ -183,20 +168,6 @@ def overlapped(rest: np.ndarray, seed: int) -> np.ndarray:
     points[:, 0] += np.where(left, 1.0, -1.0) * 0.4 * past * (1 - 2 * np.abs(rest[:, 0])) ** 4
     rng = np.random.default_rng(seed)
     return points + 0.05 * EDGE * rng.normal(size=points.shape)
-
-
-@pytest.mark.parametrize("name", SCENES)
-def test_against_the_ipc_toolkit(name: str):
-    ipctk = pytest.importorskip("ipctk", reason="the IPC toolkit is not installed; it is in the extra `dev`")
-    level, x = scene(name)
-    soup = Soup.of(level, x)
-    mesh = ipctk.CollisionMesh(soup.x, soup.edges.astype(np.int32), soup.faces.astype(np.int32))
-    found = found_at(level, x)
-    assert ipctk.has_intersections(mesh, soup.x) == bool(found)
-    for e, edge in enumerate(soup.edges):
-        for f in np.flatnonzero(~np.isin(soup.faces, edge).any(axis=1)):
-            hit = ipctk.is_edge_intersecting_triangle(*soup.x[edge], *soup.x[soup.faces[f]])
-            assert hit == ((e, int(f)) in found)
 
 
 class TestWhatCounts:
@@ -260,15 +231,6 @@ class TestWhatCounts:
 
 class TestUpsampledOnTriangles:
     """A level's vertices on the triangles of the level below: what does not cross there does not cross here."""
-
-    @pytest.mark.parametrize("kind", ["quads", "mixed"])
-    def test_quads_are_not_upsampled_by_their_means(self, kind: str):
-        """Bent ones have their middle on a diagonal, and not where the mean of their corners is."""
-        levels = levels_of(named(square(4, kind=kind)), level=1, dtype=torch.float64)
-        x, level = torch.as_tensor(crumpled(levels[0].rest.numpy(), 1, size=0.7)), levels[-1]
-        assert level.flat_from_below is not None
-        assert level.from_below is not None
-        assert float((level.flat_from_below.apply(x) - level.from_below.apply(x)).norm(dim=1).max()) > 0.01 * EDGE
 
     @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
     @pytest.mark.parametrize("kind", ["quads", "mixed", "triangles"])

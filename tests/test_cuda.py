@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-import trimesh
 from click.testing import CliRunner
 from cloth import frame_of, settings_of, sheet, wave
 from folds import sewn
@@ -20,8 +19,6 @@ from physgraph_usd.cli import main
 from physgraph_usd.lab.methods.paper_network import PaperConfig, has_triton
 from physgraph_usd.lab.methods.paper_steps import LearnedPaper
 from physgraph_usd.lab.samples import write_sample
-from physgraph_usd.solver.colliders.mesh import MeshBody
-from physgraph_usd.solver.colliders.pose import MeshPose
 from physgraph_usd.solver.frame.group import Group
 from physgraph_usd.solver.frame.solve import solve_frame
 from physgraph_usd.solver.frame.values import FrameInput
@@ -137,23 +134,6 @@ def test_sewn_cloth_agrees_and_repeats() -> None:
     assert np.array_equal(answers[1].points[0], answers[2].points[0])
     pairs = np.argwhere(np.triu(np.linalg.norm(points[:, None] - points, axis=2) < 1e-9, 1))
     assert np.array_equal(answers[1].points[0][pairs[:, 0]], answers[1].points[0][pairs[:, 1]])
-
-
-def test_what_a_bodys_normals_tell_is_the_same_asked_together(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two balls that overlap, as one mesh: where one is inside the other, normals tell nothing."""
-    balls = [trimesh.creation.icosphere(subdivisions=3, radius=radius) for radius in (0.2, 0.15)]
-    balls[1].apply_translation([0.25, 0.0, 0.0])
-    points = np.concatenate([np.asarray(each.vertices) for each in balls])
-    faces = np.concatenate([np.asarray(balls[0].faces), np.asarray(balls[1].faces) + len(balls[0].vertices)])
-    x, told = np.random.default_rng(1).uniform([-0.3, -0.3, -0.3], [0.5, 0.3, 0.3], (2000, 3)), []
-    for device, most in (("cpu", 0), ("cuda", 0), ("cuda", 10_000)):
-        monkeypatch.setattr("physgraph_usd.solver.colliders.mesh.TOGETHER", most)
-        (surface,) = MeshBody(device=device, threads=1).pose(MeshPose(points, faces.astype(np.int32)))
-        asked = torch.as_tensor(x - surface.origin, device=device)
-        told.append(surface.closest(asked, torch.full_like(asked[:, 0], torch.inf)).side.cpu())
-    assert torch.equal(told[1], told[2])
-    assert float((told[0] != told[1]).double().mean()) < 0.01
-    assert 0.01 < float((told[0] == 0).double().mean()) < 0.5
 
 
 def test_a_metric_with_springs_agrees() -> None:

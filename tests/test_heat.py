@@ -26,7 +26,6 @@ from physgraph_usd.usd.read.reader import open_shot
 from physgraph_usd.usd.write.writer import LayerWriter
 
 NAMES = ("penetration", "crossing")
-NO_EDGES = np.zeros((0, 2), np.int32)
 
 
 class TestPenetration:
@@ -36,13 +35,13 @@ class TestPenetration:
         (surface,) = MeshBody(device="cpu", threads=1).pose(MeshPose(*soup))
         inside = np.linalg.norm(x, axis=1) < 0.199
         clear = np.abs(np.linalg.norm(x, axis=1) - 0.2) > 2e-3
-        found = penetration_map([surface], x, NO_EDGES)
+        found = penetration_map([surface], x)
         np.testing.assert_allclose(found[clear], (1e3 * distances(soup, x) * inside)[clear], atol=5e-3)
 
     @pytest.mark.parametrize(("side", "depth"), [("auto", 0.0), ("back", 0.0), ("front", 20.0)])
     def test_an_open_body_has_a_behind_only_where_its_side_is_fixed(self, side: str, depth: float):
         (surface,) = MeshBody(side=side, device="cpu", threads=1).pose(MeshPose(*tube(around=256)))
-        found = penetration_map([surface], np.array([[0.08, 0.0, 0.0]]), NO_EDGES)
+        found = penetration_map([surface], np.array([[0.08, 0.0, 0.0]]))
         assert found[0] == pytest.approx(depth, abs=0.1)
 
 

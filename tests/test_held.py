@@ -10,9 +10,9 @@ import pytest
 import torch
 from bodies import ball
 from cloth import sheet
+from folds import frame_with, named, refiner_with
 from pxr import Usd, UsdGeom, Vt
 from shots import refine
-from touching import frame, mesh_pose, refiner
 
 from physgraph_usd.solver.frame import start
 from physgraph_usd.solver.frame.start import STILL, slowing
@@ -20,6 +20,7 @@ from physgraph_usd.solver.frame.values import State, join, split
 from physgraph_usd.solver.scene import Frame
 
 MESH, REST = sheet(8, 8, 0.05)
+SHEET = named((MESH, REST))
 HANGING = REST - REST.mean(axis=0)
 NORMAL = np.eye(3)[np.ptp(HANGING, axis=0).argmin()]
 BALL = ball(0.1)
@@ -53,47 +54,35 @@ class TestHeldPose:
         assert free[8:].min() > 1e-5
         assert held[8:].max() == pytest.approx(1e-6, rel=0.01), "it stays, but for the drift"
 
-    def test_with_a_body_that_moves_nothing_changes(self, monkeypatch: pytest.MonkeyPatch):
-        frames = [at(count, ball_moves=0.003 * count) for count in range(6)]
+    @pytest.mark.parametrize("what", ["a body", "a corner of the cage", "what an artist sets"])
+    def test_what_moves_or_is_set_anew_is_followed(self, monkeypatch: pytest.MonkeyPatch, what: str):
+        """However little of it that is: as where nothing is ever slowed down."""
+
+        def changing(count: int) -> Frame:
+            whole = at(count, ball_moves=0.003 * count if what == "a body" else 0.0)
+            (garment,) = whole.garments
+            points, fabric = garment.points.copy(), garment.fabric
+            if what == "a corner of the cage":
+                points[0] += 0.002 * count * NORMAL
+            elif what == "what an artist sets":
+                fabric = replace(fabric, bend=fabric.bend * 1.3**count)
+            return replace(whole, garments=(replace(garment, points=points, fabric=fabric),))
+
+        frames = [changing(count) for count in range(5)]
         slow = solved(frames)
         monkeypatch.setattr(start, "slowing", never)
         assert bool((slow == solved(frames)).all())
 
-    def test_where_one_corner_moves_nothing_changes(self, monkeypatch: pytest.MonkeyPatch):
-        """However little that is of the cage."""
-
-        def bent(count: int) -> Frame:
-            whole = at(count)
-            (garment,) = whole.garments
-            points = garment.points.copy()
-            points[0] += 0.002 * count * NORMAL
-            return replace(whole, garments=(replace(garment, points=points),))
-
-        slow = solved([bent(count) for count in range(5)])
-        monkeypatch.setattr(start, "slowing", never)
-        assert bool((slow == solved([bent(count) for count in range(5)])).all())
-
-    def test_what_an_artist_sets_is_followed(self, monkeypatch: pytest.MonkeyPatch):
-        def tuned(count: int) -> Frame:
-            whole = at(count)
-            (garment,) = whole.garments
-            stiffer = replace(garment.fabric, bend=garment.fabric.bend * 1.3**count)
-            return replace(whole, garments=(replace(garment, fabric=stiffer),))
-
-        slow = solved([tuned(count) for count in range(5)])
-        monkeypatch.setattr(start, "slowing", never)
-        assert bool((slow == solved([tuned(count) for count in range(5)])).all())
-
 
 def at(count: int, *, ball_moves: float = 0.0) -> Frame:
     """A sheet held over a ball that it hangs on, but for its drift."""
-    body = mesh_pose((BALL[0] - (0.09 - ball_moves) * NORMAL, BALL[1]))
-    return frame(HANGING + count * DRIFT, body, time=float(count))
+    body = (BALL[0] - (0.09 - ball_moves) * NORMAL, BALL[1])
+    return frame_with([HANGING + count * DRIFT], body, time=float(count))
 
 
 def solved(frames: list[Frame]) -> np.ndarray:
     """Positions in each frame, solved in so few steps that cloth settles for long [m], shape (F, V, 3)."""
-    solver = refiner((MESH, REST), level=1, steps=1, tolerance=0.0)
+    solver = refiner_with([SHEET], ["mesh"], level=1, steps=1, tolerance=0.0)
     return np.stack([np.asarray(solver.solve(each).points[0]) for each in frames])
 
 

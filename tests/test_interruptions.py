@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import psutil
 import pytest
-from shots import cloth_shot, command, faults, refine, run, sample_times
+from shots import cloth_shot, command, faults, interrupted, run, sample_times
 
 from physgraph_usd.shot.frames import LOCK, frames_folder
 from physgraph_usd.usd.write.atomic import HOST
@@ -240,20 +240,13 @@ def test_a_second_run_leaves_the_frames_of_the_first_alone(shot: Path, whole: by
     assert [file.name for file in out.parent.iterdir()] == [out.name]
 
 
-def interrupted(shot: Path, out: Path, **options: bool) -> None:
-    """A run in this process that its user ends after three frames."""
-
-    def end(done: int, _: int) -> None:
-        if done == 3:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        refine(shot, out, level=2, steps=4, temporal="off", progress=end, **options)
+ENDED: dict[str, Any] = {"after": 3, "level": 2, "steps": 4, "temporal": "off"}
+"""A run in this process that its user ends after three frames."""
 
 
 def test_frames_of_another_run_are_neither_used_nor_dropped_unasked(shot: Path, tmp_path: Path):
     out = tmp_path / "fine.usdc"
-    interrupted(shot, out)
+    interrupted(shot, out, **ENDED)
     count = len(finished(out))
     assert count == 3
     for resume in ((), ("--resume",)):
@@ -264,7 +257,7 @@ def test_frames_of_another_run_are_neither_used_nor_dropped_unasked(shot: Path, 
 
 
 def test_finished_frames_are_not_kept_when_not_asked_for(shot: Path, tmp_path: Path):
-    interrupted(shot, tmp_path / "fine.usdc", keep_frames=False)
+    interrupted(shot, tmp_path / "fine.usdc", **ENDED, keep_frames=False)
     assert not list(tmp_path.iterdir())
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,22 +11,19 @@ import numpy as np
 import pytest
 import torch
 from click.testing import CliRunner
-from cloth import DOWN, FABRIC, GUIDE, finest_system, group_of, sheet, wave
+from cloth import FABRIC, GUIDE, finest_system, group_of, sheet, wave
 from safetensors import safe_open
 from safetensors.torch import save_file
-from sheets import rotation
 
 from physgraph_usd.cli import main
 from physgraph_usd.errors import WeightsError
-from physgraph_usd.lab.methods import METHODS, paper_network
+from physgraph_usd.lab.methods import METHODS
 from physgraph_usd.lab.methods.paper_network import PaperConfig
 from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.solver.fabric import Fabric
-from physgraph_usd.solver.frame.group import Group
 from physgraph_usd.solver.integrate.base import Carry, Integrator, System
-from physgraph_usd.solver.integrate.fused import seeing
-from physgraph_usd.solver.integrate.learned import LONGEST, LearnedMetric, limited
-from physgraph_usd.solver.integrate.network import VECTORS, Physgraph, PhysgraphConfig, pairs_of
+from physgraph_usd.solver.integrate.learned import LONGEST, LearnedMetric
+from physgraph_usd.solver.integrate.network import VECTORS, Physgraph, PhysgraphConfig
 from physgraph_usd.solver.integrate.solve import solve_level
 from physgraph_usd.solver.integrate.stop import Budget
 from physgraph_usd.solver.integrate.weights import (
@@ -38,7 +34,6 @@ from physgraph_usd.solver.integrate.weights import (
     random_network,
     save_network,
 )
-from physgraph_usd.solver.level import refine_garments
 from physgraph_usd.solver.scene import GarmentFrame
 
 ALL = PhysgraphConfig(vectors=VECTORS, width=16, depth=3)
@@ -58,35 +53,6 @@ def run(integrator: Integrator, system: System, x: torch.Tensor, *, steps: int =
     for _ in range(steps):
         carry = integrator.step(system, carry)
     return carry
-
-
-@pytest.mark.parametrize("config", [PLAIN, ALL])
-def test_untrained_it_takes_the_metric_step(config: PhysgraphConfig):
-    system, x = problem()
-    integrator = integrator_of(make_network(config))
-    carry = integrator.start(system, x)
-    assert carry.preconditioned is not None
-    expected = limited(carry.preconditioned, system.spacing)
-    assert torch.allclose(integrator.propose(system, carry).detach(), expected, atol=1e-12)
-
-
-def test_untrained_the_papers_network_stays():
-    system, x = problem()
-    carry = run(integrator_of(make_network(PAPER).eval().requires_grad_(False)), system, x)
-    assert torch.equal(carry.x, x)
-
-
-def test_edges_in_pieces_are_the_edges_at_once(monkeypatch: pytest.MonkeyPatch):
-    """Without gradients a CPU updates edges piece by piece; with them all go at once."""
-    system, x = problem()
-    integrator = integrator_of(random_network(PAPER, seed=3, scale=SMALL))
-    with torch.enable_grad():
-        whole = run(integrator, system, x)
-    monkeypatch.setattr(paper_network, "PIECE", 7)
-    with torch.no_grad():
-        pieces = run(integrator, system, x)
-    assert not torch.equal(whole.x, x)
-    assert torch.allclose(pieces.x, whole.x, rtol=0.0, atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -112,50 +78,6 @@ def test_the_kernels_do_what_torch_does(vectors: tuple[str, ...]):
         assert not bool(move[~system.free.squeeze(1)].any())
 
 
-def test_networks_of_one_size_do_not_share_a_kernel():
-    """Warp keeps what it compiled under a hash that does not see everything; the names of the kernels must."""
-    three, two = ((0, False), (1, False), (0, True)), ((0, False), (1, False), (1, True))
-    one, other = ((0, True),) * 3, ((0, True), (1, True), (0, False))
-    made = [(three, ((0, 1), (0, 2)), one), (two, ((0, 1), (0, 2)), one), (three, ((0, 1), (1, 2)), one)]
-    made.append((three, ((0, 1), (0, 2)), other))
-    names = {seeing(parts, pairs, (), families).module.name for parts, pairs, families in made}
-    assert len(names) == len(made)
-
-
-def test_products_are_those_of_whole_vectors_and_of_what_belongs_together():
-    names = ("secant", "metric", "secant.normal", "metric.normal", "move1.normal", "metric.smooth")
-    pairs = [(names[a], names[b]) for a, b in pairs_of(names).T.tolist()]
-    assert set(pairs) == {
-        ("secant", "metric"),
-        ("metric", "metric.smooth"),
-        ("secant.normal", "metric.normal"),
-        ("secant.normal", "move1.normal"),
-    }
-
-
-@pytest.mark.parametrize("config", [PLAIN, ALL, PAPER])
-def test_one_evaluation_a_step(config: PhysgraphConfig | PaperConfig):
-    system, x = problem()
-    run(integrator_of(random_network(config, seed=1, scale=SMALL)), system, x, steps=4)
-    assert system.evaluations == 5
-
-
-@pytest.mark.parametrize(("dtype", "most"), [(torch.float32, 1e-4), (torch.float64, 1e-5)])
-@pytest.mark.parametrize("config", [PLAIN, ALL])
-def test_s11_it_turns_with_the_cloth(config: PhysgraphConfig, dtype: torch.dtype, most: float):
-    mesh, rest = sheet(6, 5)
-    turn, far = rotation(3), np.array([1e5, -2e5, 3e5])
-    integrator = integrator_of(random_network(config, seed=2, scale=SMALL))
-    ends = []
-    for points, about, down in ((wave(rest), rest, DOWN), (wave(rest) @ turn.T + far, rest @ turn.T, turn @ DOWN)):
-        system, x = finest_system(group_of(mesh, about, level=2, dtype=dtype, gravity=down), points)
-        carry = run(integrator, system, x)
-        ends.append(((carry.x - x).double().numpy(), float(system.spacing.mean())))
-    assert np.abs(ends[0][0]).max() > 0.01 * ends[0][1]
-    error = np.abs(ends[1][0] @ turn - ends[0][0]).max() / ends[0][1]
-    assert error < most, error
-
-
 @pytest.mark.parametrize("config", [PLAIN, PAPER])
 @pytest.mark.parametrize(("size", "stiffer"), [(100.0, 1.0), (1.0, 1000.0), (0.01, 1e-3)])
 def test_no_units_reach_the_network(config: PhysgraphConfig | PaperConfig, size: float, stiffer: float):
@@ -170,29 +92,6 @@ def test_no_units_reach_the_network(config: PhysgraphConfig | PaperConfig, size:
         x = group.levels[-1].base.apply(coarse)
         moves.append((run(integrator, systems[-1], x).x - x) / s)
     assert float((moves[1] - moves[0]).abs().max()) < 1e-5 * 0.025
-
-
-def test_raw_features_do_see_units():
-    """The paper's own features are the comparison: they change with the scene's scale, so the test above can fail."""
-    mesh, rest = sheet(6, 5)
-    integrator = integrator_of(random_network(replace(PAPER, features="paper"), seed=2))
-    moves = []
-    for c in (1.0, 1000.0):
-        fabric = Fabric(c * FABRIC.stretch, c * FABRIC.bend, c * FABRIC.density)
-        group = group_of(mesh, rest, level=1)
-        systems, coarse = group.systems([GarmentFrame(wave(rest), fabric, c * GUIDE)])
-        x = group.levels[-1].base.apply(coarse)
-        moves.append(run(integrator, systems[-1], x).x - x)
-    assert float((moves[1] - moves[0]).abs().max()) > 1e-3 * 0.025
-
-
-@pytest.mark.parametrize("config", [PLAIN, ALL, PAPER])
-def test_s34_a_run_repeats_bit_for_bit(config: PhysgraphConfig | PaperConfig):
-    ends = []
-    for _ in range(2):
-        system, x = problem(torch.float32)
-        ends.append(run(integrator_of(random_network(config, seed=3, scale=SMALL)), system, x, steps=5).x)
-    assert torch.equal(ends[0], ends[1])
 
 
 @pytest.mark.parametrize("config", [PLAIN, PAPER])
@@ -220,24 +119,6 @@ def test_s12_no_force_no_step_and_no_step_beyond_the_cap(config: PhysgraphConfig
     assert longest <= LONGEST * (1 + 1e-6)
     if factor == 0.0 and config is PLAIN:
         assert longest == 0.0
-
-
-def test_s10_a_patch_moves_as_it_would_in_a_larger_garment():
-    """Beside three copies of itself and a resting sheet, a garment's displacement is its own."""
-    mesh, rest = sheet(6, 5)
-    integrator = integrator_of(random_network(PLAIN, seed=5, scale=SMALL))
-    alone, x = finest_system(group_of(mesh, rest, level=1), wave(rest))
-    one = run(integrator, alone, x).x - x
-    group = group_of(mesh, rest, level=1)
-    garments = list(group.garments) * 2
-    both = Group.of(
-        garments, refine_garments(garments, [1, 1]), DOWN, group.settings, dtype=torch.float64, device="cpu"
-    )
-    frames = [GarmentFrame(wave(rest), FABRIC, GUIDE), GarmentFrame(rest + np.array([0.0, 0.0, 1.0]), FABRIC, GUIDE)]
-    systems, coarse = both.systems(frames)
-    begin = both.levels[-1].base.apply(coarse)
-    two = (run(integrator, systems[-1], begin).x - begin)[: len(one)]
-    assert float((two - one).abs().max()) < 0.01 * float(one.abs().max())
 
 
 def test_weights_come_back_as_they_were(tmp_path: Path):

@@ -5,9 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
-from meshes import any_mesh, grid, mesh_of
+from meshes import grid, mesh_of
 from sheets import equilateral, garment_of, level_of
 from test_forces import force_of
 
@@ -16,43 +14,7 @@ from physgraph_usd.solver.level import (
     build_levels,
     hinge_geometry,
     refine_garments,
-    rest_shape,
 )
-from physgraph_usd.solver.mesh.elements import hinges_of
-from physgraph_usd.solver.mesh.topology import PolygonMesh, edges_of
-
-
-def shape_of(rest: np.ndarray, triangles: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
-    edges, hinges = edges_of(triangles, len(rest)).vertices, hinges_of(triangles)
-    shape = rest_shape(
-        rest,
-        edges,
-        triangles,
-        share=np.ones(len(triangles)),
-        hinges=hinges,
-        twists=np.zeros(len(hinges), bool),
-        bent=np.ones(len(hinges), bool),
-        size=np.ones(len(rest)),
-    )
-    return shape, edges, hinges
-
-
-def areas(rest: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    a, b, c = (rest[triangles[:, n]] for n in range(3))
-    return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
-
-
-@given(mesh=any_mesh(), seed=st.integers(0, 2**16))
-def test_areas_of_springs_and_of_vertices_sum_to_the_sheet(mesh: PolygonMesh, seed: int):
-    rest = np.random.default_rng(seed).normal(size=(mesh.vertex_count, 3))
-    triangles = mesh.triangulate(rest).triangles
-    shape, edges, _ = shape_of(rest, triangles)
-    total = areas(rest, triangles)
-    assert shape["spring_area"].sum() == pytest.approx(total.sum())
-    assert shape["vertex_area"].sum() == pytest.approx(total.sum())
-    for edge, value in zip(edges, shape["spring_area"], strict=True):
-        touching = np.isin(triangles, edge).sum(axis=1) == 2
-        assert value == pytest.approx(total[touching].sum() / 3)
 
 
 def two_garments(depths: tuple[int, ...]) -> tuple[Level, ...]:

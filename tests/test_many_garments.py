@@ -17,7 +17,6 @@ from shots import refine
 from stages import add_sheet, new_stage
 
 from physgraph_usd.shot.refine import inspect_shot
-from physgraph_usd.shot.report import of_a_kind
 from physgraph_usd.solver.contact.broad_phase import TouchingGroups
 from physgraph_usd.solver.scene import Garment, GarmentFrame
 from physgraph_usd.usd.read.find import felt_by, find_colliders
@@ -105,16 +104,6 @@ def joined(count: int, pairs: Sequence[tuple[int, int]]) -> list[tuple[int, ...]
 
 
 class TestWarnings:
-    def test_of_a_kind_are_one(self):
-        given = [f"</g{index}>: edges of {index + 0.5} mm" for index in range(5)] + ["</g1>: is still", "stage: odd"]
-        assert of_a_kind(given) == {
-            "</g0>, </g1>, </g2> and 2 more: edges of 0.5 mm (the figures are those of the first)": [
-                f"/g{index}" for index in range(5)
-            ],
-            "</g1>: is still": [],
-            "stage: odd": [],
-        }
-
     def test_of_a_shot_name_all_prims_in_the_report(self, tmp_path: Path):
         shot = tmp_path / "shot.usda"
         stage = sheets(shot, 5)

@@ -10,8 +10,6 @@ import ast
 from collections.abc import Iterator
 from pathlib import Path
 
-import pytest
-
 PACKAGE = Path(__file__).resolve().parents[1] / "physgraph_usd" / "solver"
 FOLDERS = ("contact", "collide", "frame")
 OWN = {"self", "cls"}
@@ -82,37 +80,6 @@ def written(tree: ast.AST) -> Iterator[tuple[str, str]]:
                 field = field_of(node) if target else called_on(node) if isinstance(node, ast.Call) else None
                 if field is not None:
                     yield f"{owner.name}.{method.name}", field
-
-
-@pytest.mark.parametrize(
-    "line",
-    [
-        "self.a = 1",
-        "self.a += 1",
-        "self.a: int = 1",
-        "self.a[0] = 1",
-        "self.a.b[0].c = 1",
-        "x, (self.a, y) = 1, (2, 3)",
-        "del self.a[0]",
-        "for self.a in x: ...",
-        "object.__setattr__(self, 'a', 1)",
-        "self.a.append(1)",
-        "cls.a = 1",
-        "self.a[0].copy_(x)",
-        "def inner(): self.a = 1",
-    ],
-)
-def test_what_is_written_is_seen(line: str):
-    source = "class C:\n    def {}(self, x):\n        {}"
-    assert list(written(ast.parse(source.format("f", line)))) == [("C.f", "a")]
-    assert not list(written(ast.parse(source.format("__init__", line))))
-
-
-@pytest.mark.parametrize(
-    "line", ["x = self.a", "x[self.a] = 1", "self.a(x)", "self.a.get(x)", "x.a = 1", "self.__b__()"]
-)
-def test_what_is_only_read_is_not(line: str):
-    assert not list(written(ast.parse(f"class C:\n    def f(self, x):\n        {line}")))
 
 
 def test_nothing_is_written_but_what_is_listed():

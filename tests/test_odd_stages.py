@@ -103,7 +103,7 @@ def test_a_rest_shape_whose_points_are_all_at_one_place_is_refused(tmp_path: Pat
         open_shot(str(shot))
 
 
-@pytest.mark.parametrize("name", ["sleeve", "torus"])
+@pytest.mark.parametrize("name", ["sleeve", pytest.param("torus", marks=pytest.mark.slow)])
 def test_a_garment_of_a_millimetre_is_refined_in_the_time_of_a_large_one(tmp_path: Path, name: str):
     shot = write_sample(name, tmp_path)
     stage = Usd.Stage.Open(str(shot))

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from layers import (
     COAT,
-    MIRROR,
     TIMES,
     dress_up,
     errors,
@@ -25,13 +24,6 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdSkel
 from physgraph_usd.errors import LayerError
 from physgraph_usd.usd.read.reader import open_shot
 from physgraph_usd.usd.write.writer import LayerWriter
-
-
-@pytest.fixture
-def dressed(tmp_path: Path) -> Path:
-    path = tmp_path / "shot.usda"
-    dress_up(make_shot(path, matrix=MIRROR))
-    return path
 
 
 @pytest.mark.parametrize("mode", ["over", "sibling"])

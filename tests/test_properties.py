@@ -188,18 +188,3 @@ def test_units_axes_handedness_and_scale_do_not_change_the_cloth(sheet: Sheet, h
         here, _ = refined(sheet, Path(one), Convention(), tolerance=0.0)
         there, _ = refined(sheet, Path(two), how, tolerance=0.0)
     np.testing.assert_allclose(there[1.0], here[1.0], atol=1e-2 * EDGE if how.left_handed else 1e-3 * EDGE)
-
-
-@FEW
-@given(sheet=sheets(planar=True), data=st.data())
-def test_a_part_of_the_frames_is_what_it_is_in_the_whole(sheet: Sheet, data: st.DataObject):
-    assume(len(sheet.moving) > 1)
-    times = list(sheet.moving)
-    first = data.draw(st.integers(0, len(times) - 1))
-    last = data.draw(st.integers(first, len(times) - 1))
-    with folder() as one, folder() as two:
-        whole, _ = refined(sheet, Path(one), Convention())
-        part, _ = refined(sheet, Path(two), Convention(), frames=(times[first], times[last]))
-    assert list(part) == times[first : last + 1]
-    for time in part:
-        np.testing.assert_array_equal(part[time], whole[time])

@@ -6,19 +6,12 @@ import hashlib
 from pathlib import Path
 
 import pytest
-from layers import COAT, MIRROR, dress_up, errors, make_shot, open_over, write_layer, write_shot
+from layers import COAT, errors, open_over, write_layer, write_shot
 from pxr import Sdf, Usd, UsdGeom, UsdUtils
 
 from physgraph_usd.errors import UsageError
 from physgraph_usd.usd.provenance import file_hashes, mute_refined, read_record, refined_layers, write_root
 from physgraph_usd.usd.read.reader import open_shot
-
-
-@pytest.fixture
-def dressed(tmp_path: Path) -> Path:
-    path = tmp_path / "shot.usda"
-    dress_up(make_shot(path, matrix=MIRROR))
-    return path
 
 
 def test_a_usdz_shot_and_its_root(dressed: Path, tmp_path: Path) -> None:

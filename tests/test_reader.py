@@ -15,6 +15,7 @@ from stages import (
     author,
     instanced_shot,
     new_stage,
+    said,
     save,
     set_matrix,
     sheet_faces,
@@ -29,10 +30,6 @@ from physgraph_usd.usd.read.reader import Shot, open_shot
 
 def world(shot: Shot, time: float | None, index: int = 0) -> np.ndarray:
     return shot.frame(time).garments[index].points
-
-
-def said(shot: Shot) -> str:
-    return "\n".join(map(str, shot.warnings))
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -6,11 +6,9 @@ import json
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner, Result
+from click.testing import Result
 from pxr import Sdf
-from shots import VALID, faults
-
-from physgraph_usd.cli import main
+from shots import VALID, faults, run
 
 pytestmark = pytest.mark.real_data
 
@@ -18,10 +16,6 @@ FIRST = {"01_newton_shirt_dab_cm.usdc": "1001:1003", "02_makehuman_usdskel_dm.us
 FAST = ("06", "07", "09")
 """Shots of which a few frames are a fast test: by numbers that their names begin with."""
 STAGES = ("stages/float_units", "stages/usd_wg", "stages/usdskel")
-
-
-def run(*args: object) -> Result:
-    return CliRunner().invoke(main, [str(arg) for arg in args])
 
 
 def options(garments: list[str]) -> list[str]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 from cloth import DOWN, frame_of, sheet, wave
@@ -12,7 +11,6 @@ from sheets import garment_of
 
 pytest.importorskip("pxr", reason="benchmarks read stages with usd-core")
 
-from benchmarks.learned import FRONT, SCHEDULES, Runs, measured
 from physgraph_usd.lab.chart.problem import ALONE, Problem
 from physgraph_usd.lab.chart.reference import Reference, find_reference
 from physgraph_usd.lab.methods import METHODS
@@ -52,12 +50,6 @@ def test_no_method_with_any_budget_ends_below_it(found: Reference, method: str):
         assert found.gap(problem.judge(frame, points, ALONE).energy) > -1e-4
 
 
-def test_who_asks_again_gets_the_same(bounded: Reference):
-    again = find_reference(*squeezed(), settings=ALONE, short=True)
-    assert (again.least, again.by, again.apart) == (bounded.least, bounded.by, bounded.apart)
-    assert np.array_equal(again.points[0], bounded.points[0])
-
-
 def test_a_bounded_search_compares_two_starts_at_least(found: Reference, bounded: Reference):
     for less in (bounded, find_reference(*squeezed(), settings=ALONE, seconds=0.0)):
         assert less.seconds < found.seconds
@@ -71,28 +63,3 @@ def test_who_finds_less_lowers_it():
     less = known.lowered({"stretch": 1.5, "bending": -0.5}, "another, 3 steps")
     assert (less.least, less.by, less.apart) == (1.0, "another, 3 steps", pytest.approx(1.0 / 9.0))
     assert Reference.of(less.plain()) == less
-
-
-class Made(Runs):
-    """Descents whose energies are known beforehand."""
-
-    def __init__(self, energies: dict[tuple[int, ...], float]) -> None:
-        self._energies = energies
-        self._made = {}
-
-    def __call__(self, steps: tuple[int, ...]) -> tuple[float, float, float]:
-        self._made[steps] = self._energies[steps], float(sum(steps)), 0.0
-        return self._made[steps]
-
-
-def test_all_are_counted_from_the_least_that_any_finds():
-    """Who was within 3% of the reference that was known before goes on until within 3% of the one that was found."""
-    energies = {steps: 2.0 + 0.001 * n for n, steps in enumerate(reversed((*FRONT, *SCHEDULES)))}
-    ours = dict.fromkeys(energies, 1.0) | {SCHEDULES[0]: 1.0}
-    slow = energies | {FRONT[0]: 2.2, FRONT[3]: 1.1}
-    known, (base, other) = measured(Reference(10.0, 2.0, {}, "many steps"), {"slow": Made(slow), "ours": Made(ours)})
-    assert known.least == 1.0
-    assert known.by.startswith("ours, ")
-    assert min(base[f"gap {s}"] for s in SCHEDULES) > 0.1
-    assert other[f"gap {SCHEDULES[0]}"] == 0.0
-    assert base["reached"] == sum(FRONT[3])

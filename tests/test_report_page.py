@@ -87,22 +87,6 @@ def test_the_close_picture_is_of_cloth_in_a_body(tmp_path: Path):
     assert verdict(report).startswith(worst.reason.partition(" edges")[0].partition(" vertices")[0])
 
 
-def test_a_verdict_says_first_what_is_wrong():
-    def frame(time: float, inside: int, crossings: int) -> dict[str, object]:
-        after = {"inside": inside, "crossings": crossings}
-        return {"time": time, "garments": [{"contact": {"bodies": {"/Body": {"after": after}}}}]}
-
-    report = RefineReport("shot.usda", None, {}, garments=[{"path": CLOTH}], seconds={"frames": 2.5})
-    report.frames = [frame(1.0, 0, 0), frame(2.0, 0, 0)]
-    assert verdict(report) == "2 frames refined, nothing crosses, nothing is inside a body, 1.2 s a frame."
-    report.frames = [frame(1.0, 3, 0), frame(2.0, 7, 0)]
-    report.unsettled = [{"path": CLOTH, "time": 2.0}]
-    assert verdict(report) == (
-        "7 vertices are inside bodies at time code 2, the worst frame; 1 frame did not settle; "
-        "2 frames refined, nothing crosses, 1.2 s a frame."
-    )
-
-
 @pytest.mark.browser
 def test_the_page_in_a_browser(made: tuple[Path, Path, RefineReport]):
     with opened(made[1].parent / "report" / "report.html") as shown:

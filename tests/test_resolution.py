@@ -17,7 +17,7 @@ from pxr import Usd
 from sheets import garment_of
 from stages import add_sheet, author, new_stage, save
 
-from physgraph_usd.shot.notes import of_folds, of_slack
+from physgraph_usd.shot.notes import of_slack
 from physgraph_usd.solver.fabric import PRESETS, Fabric
 from physgraph_usd.solver.folds import EDGES_PER_WAVE, FOLDING, carried_bend, raised_by
 from physgraph_usd.solver.forces import elastic_terms
@@ -28,7 +28,6 @@ from physgraph_usd.solver.mesh.subdivide import subdivide_times
 from physgraph_usd.solver.resolution import (
     AUTO,
     MOST,
-    SHARP_FRACTION,
     LevelChoice,
     choose_levels,
     sample_frames,
@@ -103,20 +102,6 @@ def test_sharp_folds_are_counted():
     assert pleated(0.0) == 0.0
     assert pleated(np.radians(30.0)) == 0.0
     assert 0.2 < pleated(np.radians(70.0)) < 0.5
-
-
-def folds(level: int, shares: dict[float | None, tuple[float, ...]]) -> list[str]:
-    garments = [{"path": f"/coat{index}", "level": level, "fine_edge_mm": 8.0} for index in range(2)]
-    frames = [{"time": t, "garments": [{"sharp_folds": each} for each in found]} for t, found in shares.items()]
-    return of_folds(garments, frames)
-
-
-def test_one_note_a_run_where_folds_are_too_sharp_for_the_mesh():
-    assert folds(2, {}) == folds(2, {1.0: (SHARP_FRACTION, 0.0)}) == []
-    (said,) = folds(2, {1.0: (0.0, 0.011), 7.0: (0.034, 0.0), 9.0: (0.02, 0.0)})
-    assert said.startswith("level: 3% of the edges of </coat0> at time code 7 fold by more than 45 degrees")
-    assert "and in 1 other garment; --level 3 halves the edges of 8.0 mm, for up to 4 times the time" in said
-    assert "--level" not in "".join(folds(5, {None: (0.2, 0.0)}))
 
 
 @pytest.mark.parametrize("squeeze", [0.0, 0.005, 0.05])

@@ -5,7 +5,6 @@ A trial is one pair of random sheets and one move. Many pairs make one mesh, eac
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -22,7 +21,6 @@ from physgraph_usd.solver.mesh.topology import PolygonMesh
 ipctk = pytest.importorskip("ipctk", reason="the IPC toolkit is not installed; it is in the extra `dev`")
 EDGE = 0.02
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]
-Wish = Callable[[np.ndarray, np.random.Generator], np.ndarray]
 
 
 def sheet(rng: np.random.Generator, points: int) -> tuple[np.ndarray, np.ndarray]:

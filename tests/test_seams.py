@@ -83,44 +83,6 @@ def noise(like: torch.Tensor, seed: int = 0) -> torch.Tensor:
     return torch.randn(like.shape, generator=torch.Generator().manual_seed(seed), dtype=like.dtype)
 
 
-class TestSeam:
-    def test_closed_points_meet_at_their_mean(self):
-        _, seam, base = two_halves()
-        x = base + 1e-3 * noise(base)
-        out = seam.closed(x)
-        for a, b in seam.pairs:
-            torch.testing.assert_close(out[a], 0.5 * (x[a] + x[b]))
-            assert torch.equal(out[a], out[b])
-        away = torch.ones(len(x), dtype=torch.bool)
-        away[seam.pairs.reshape(-1)] = False
-        assert torch.equal(out[away], x[away])
-
-    def test_what_is_closed_stays_to_the_last_bit(self):
-        """Also where three meet: a third of the sum of three equal numbers is not always that number."""
-        levels = levels_of(*(named(square(2), name) for name in "ABC"))
-        level = levels[-1]
-        third = level.vertex_count // 3
-        groups = np.arange(third)[:, None] + third * np.arange(3)
-        seam = Seam(level, np.concatenate([groups[:, :2], groups[:, 1:]]))
-        out = seam.closed(level.rest + noise(level.rest))
-        assert torch.equal(out[:third], out[third : 2 * third])
-        assert torch.equal(out[:third], out[2 * third :])
-        assert torch.equal(seam.closed(out), out)
-
-    def test_what_may_not_move_draws_the_rest_to_it(self):
-        level, seam, base = two_halves()
-        held = level.free.clone()
-        first = torch.as_tensor(seam.pairs[:, 0])
-        held[first] = False
-        level = replace(level, pin=(~held[:, 0]).to(level.pin))
-        seam = Seam(level, seam.pairs)
-        x = base + 1e-3 * noise(base)
-        out = seam.closed(x)
-        assert torch.equal(out[first], x[first])
-        torch.testing.assert_close(out[seam.pairs[:, 1]], x[first], rtol=0, atol=1e-15)
-        assert not seam.shared(noise(x))[seam.pairs[:, 1]].any()
-
-
 class TestForces:
     def sewn(self) -> tuple[SewnForces, ForceModule, Seam, torch.Tensor]:
         level, seam, base = two_halves()
@@ -135,26 +97,6 @@ class TestForces:
         assert float(rise) / (2 * step) == pytest.approx(-float((force * way).sum()), rel=1e-6)
         for a, b in seam.pairs:
             assert torch.equal(force[a], force[b])
-
-    def test_opening_the_seam_changes_nothing(self):
-        forces, apart, seam, x = self.sewn()
-        x = seam.closed(x)
-        opened = x.clone()
-        way = 1e-3 * noise(x)[seam.pairs[:, 0]]
-        opened[seam.pairs[:, 0]] += way
-        opened[seam.pairs[:, 1]] -= way
-        (before, force), (after, same) = forces.energy_and_force(x), forces.energy_and_force(opened)
-        assert float(after) == pytest.approx(float(before), rel=1e-12)
-        torch.testing.assert_close(same, force, rtol=1e-9, atol=1e-12)
-        assert float(apart.energy_and_force(opened)[0]) != pytest.approx(float(before), rel=1e-3)
-
-    def test_the_diagonal_is_the_mean_of_what_is_sewn(self):
-        forces, apart, seam, x = self.sewn()
-        x = seam.closed(x)
-        own, sewn = apart.diagonal(x), forces.diagonal(x)
-        a, b = seam.pairs[0]
-        assert float(sewn[a]) == pytest.approx(float(0.5 * (own[a] + own[b])))
-        assert (sewn > 0).all()
 
 
 def stretched(points: np.ndarray) -> np.ndarray:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from bodies import ball
 from pxr import Sdf, UsdGeom
-from shots import CLOTH, TIMES, cloth_shot, faults, fine, refine, sample_times
+from shots import CLOTH, TIMES, cloth_shot, faults, fine, only, refine, sample_times
 from stages import COLLIDER_API, add_sheet, new_stage, save, sheet_points, vec3
 
 from physgraph_usd.errors import GarmentError, UsageError
@@ -20,10 +20,6 @@ from physgraph_usd.errors import GarmentError, UsageError
 @pytest.fixture
 def shot(tmp_path: Path) -> Path:
     return cloth_shot(tmp_path / "shot.usdc")
-
-
-def only(folder: Path, *names: str) -> bool:
-    return sorted(file.name for file in folder.iterdir()) == sorted(names)
 
 
 class TestFramesThatFail:

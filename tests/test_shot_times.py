@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pxr import Sdf, UsdGeom
-from stages import add_sheet, new_stage, save, set_matrix, sheet_points, sheet_shot
+from stages import add_sheet, new_stage, said, save, set_matrix, sheet_points, sheet_shot
 
 from physgraph_usd.errors import StageError, UsageError
 from physgraph_usd.usd.read.reader import Shot, open_shot
@@ -16,10 +16,6 @@ from physgraph_usd.usd.times import merge, snap, within
 
 def world(shot: Shot, time: float | None, index: int = 0) -> np.ndarray:
     return shot.frame(time).garments[index].points
-
-
-def said(shot: Shot) -> str:
-    return "\n".join(map(str, shot.warnings))
 
 
 def test_s31_times_are_the_union_of_authored_samples_and_nothing_else(tmp_path: Path) -> None:

@@ -7,10 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from click.testing import CliRunner, Result
-from shots import cloth_shot
+from shots import cloth_shot, run
 
-from physgraph_usd import cli
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.report import RefineReport
 
@@ -20,10 +18,6 @@ def shot(tmp_path: Path) -> Path:
     folder = tmp_path / "show" / "seq" / "shot"
     folder.mkdir(parents=True)
     return cloth_shot(folder / "s.usda", times=(1.0, 2.0))
-
-
-def run(*args: object) -> Result:
-    return CliRunner().invoke(cli.main, [str(arg) for arg in args], catch_exceptions=False)
 
 
 def planned(shot: Path, *args: object) -> dict[str, Any]:

@@ -170,18 +170,6 @@ def same_surface(fine: PolygonMesh, points: np.ndarray, other: np.ndarray, other
     return float(distance.max())
 
 
-def test_children_of_a_triangle_and_a_quad():
-    refinement = subdivide(mesh_of([[0, 1, 2], [2, 1, 3, 4]], 6))
-    assert refinement.edges.tolist() == [[0, 1], [0, 2], [1, 2], [1, 3], [2, 4], [3, 4]]
-    assert faces_of(refinement.mesh) == [
-        *([0, 6, 7], [6, 1, 8], [7, 8, 2], [6, 8, 7]),
-        *([2, 8, 12, 10], [1, 9, 12, 8], [3, 11, 12, 9], [4, 10, 12, 11]),
-    ]
-    assert refinement.parent_face.tolist() == [0, 0, 0, 0, 1, 1, 1, 1]
-    assert refinement.linear[12].toarray().tolist() == [[0, 0.25, 0.25, 0.25, 0.25, 0]]
-    assert refinement.linear[8].toarray().tolist() == [[0, 0.5, 0.5, 0, 0, 0]]
-
-
 @given(any_mesh(duplicates=False))
 def test_children_conform_and_boundaries_stay_boundaries(mesh: PolygonMesh):
     """Half a parent edge has the parent's faces, any other child edge exactly two: no T-junction, no new boundary."""
@@ -192,19 +180,6 @@ def test_children_conform_and_boundaries_stay_boundaries(mesh: PolygonMesh):
     assert fine.count[halves].tolist() == np.repeat(mesh.half_edges.count, 2).tolist()
     others = np.delete(fine.count, halves)
     assert np.all(others == 2)
-
-
-@given(any_mesh(duplicates=False))
-def test_winding_agreement_is_kept(mesh: PolygonMesh):
-    """An edge's half-edges run as the parent's do; inside a face they run in opposite directions."""
-    refinement = subdivide(mesh)
-    fine, parent = refinement.mesh.half_edges, mesh.half_edges
-    forward = np.bincount(fine.edge, fine.forward, len(fine.edges))
-    along = np.bincount(parent.edge, parent.forward, len(parent.edges))
-    first, second = find_edges(fine.edges, edge_subset([refinement], refinement.edges)).reshape(-1, 2).T
-    assert np.array_equal(forward[first], along)
-    assert np.array_equal(forward[second], parent.count - along)
-    assert np.all(np.delete(forward, np.concatenate([first, second])) == 1)
 
 
 @pytest.mark.parametrize("case", [tetrahedron(), grid(5, 3, "triangles")])

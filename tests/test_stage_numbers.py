@@ -83,7 +83,7 @@ def test_json_is_what_every_parser_reads(tmp_path: Path):
     }
 
 
-@pytest.mark.parametrize("rate", [0.0, -1.0, NAN, INF])
+@pytest.mark.parametrize("rate", [0.0, NAN])
 @pytest.mark.parametrize("which", ["shot.usda", "fine.usda"])
 def test_validate_and_preview_name_a_rate_that_is_none(shot: Path, which: str, rate: float):
     """USD looks for samples without end."""

@@ -13,7 +13,7 @@ import pytest
 from cloth import rms
 from layers import open_over
 from pxr import Sdf, Usd, UsdGeom
-from shots import CLOTH, EDGE, cloth_shot, faults, fine, refine, run, sample_times
+from shots import CLOTH, EDGE, cloth_shot, faults, fine, interrupted, refine, run, sample_times
 from stages import add_sheet, new_stage, save, vec3
 
 from physgraph_usd.errors import AbsentError, LayerError, PhysGraphError, UsageError
@@ -267,13 +267,7 @@ def test_an_interrupted_chunk_is_named_as_missing_and_goes_on(tmp_path: Path):
     shot = cloth_shot(tmp_path / "shot.usdc")
     (first,) = refine_chunks(shot, tmp_path, [(1.0, 3.0)], preroll=2)
     out, options = tmp_path / "second", {"frames": (4.0, 6.0), "preroll": 2}
-
-    def interrupt(done: int, _: int) -> None:
-        if done == 2:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        refine(shot, out, progress=interrupt, **options)
+    interrupted(shot, out, after=2, **options)
     kept = {file.name: file.read_bytes() for file in out.iterdir() if file.suffix == ".npz"}
     assert {"1.before3.npz", "2.before3.npz", "3.npz", "4.npz"} <= kept.keys()
     with pytest.raises(UsageError, match=r"frames 6:6 are in no chunk; .*second .4:5.*go on by --resume"):

@@ -6,13 +6,15 @@ import numpy as np
 import pytest
 import torch
 from brute import Soup, crossings
-from folds import EDGE, SHAPES, curved, folded, levels_of, named, placed, promise_of, square, strip
+from folds import EDGE, SHAPES, curved, folded, levels_of, named, placed, promise_of, square, strip, view_of
 
 from physgraph_usd.solver.collide.crossings import Crossings
 from physgraph_usd.solver.collide.crossings import crossings as crossings_of
+from physgraph_usd.solver.contact.cloth import ClothView
 from physgraph_usd.solver.contact.cloth_mesh import ClothMesh
 from physgraph_usd.solver.contact.promise import Promise
 from physgraph_usd.solver.contact.tangles import Tangles
+from physgraph_usd.solver.forces.self_contact import PairConstraints, SelfContact
 from physgraph_usd.solver.level import Level, Placed
 
 BOTH, SIZE = np.ones((2, 2), bool), 20
@@ -175,3 +177,25 @@ class TestGivenUp:
         last[int(torch.nonzero(tangles.label >= 0)[0])] = True
         assert bool(tangles.giving_up(last)[tangles.label >= 0].all())
         assert not bool(tangles.giving_up(last & (tangles.label < 0)).any())
+
+
+class TestSides:
+    """On which side of one another the parts of two sheets that cross are kept."""
+
+    def gaps(self, x: torch.Tensor) -> tuple[ClothView, PairConstraints]:
+        garments = [named(square(4), name) for name in "AB"]
+        view = view_of(levels_of(*garments), garments, thickness=0.4 * EDGE)
+        (term,) = view.terms(x)
+        assert isinstance(term, SelfContact)
+        return view, term.gaps
+
+    def test_what_crosses_has_no_side_to_keep(self):
+        """It is drawn out instead, by two planes for each edge and face; what is beside it keeps its side."""
+        x = pair("cornered")[1].float()
+        view, gaps = self.gaps(x)
+        found = view.crossings(x)
+        out = 2 * found.count
+        assert 0 < out < len(gaps.corners)
+        crossed = view.mesh.crossed(found)
+        assert not crossed[gaps.corners[:-out].long()].any()
+        assert crossed[gaps.corners[-out:].long()].all()

@@ -12,7 +12,6 @@ from layers import (
     TIMES,
     errors,
     fine_points,
-    grid,
     make_shot,
     open_over,
     refine_all,
@@ -117,23 +116,6 @@ def test_extents_hold_points_and_model_hints_hold_extents(tmp_path: Path) -> Non
     assert np.all(world[1] >= 3 * box[1] - 1e-5)
     rig = UsdGeom.ModelAPI(fine.GetPrimAtPath("/World/rig")).GetExtentsHintAttr()
     assert np.all(np.asarray(rig.Get(4.0))[1] >= box[1] - 1e-6)
-
-
-@pytest.mark.parametrize("quads", [True, False])
-def test_they_follow_area(quads: bool) -> None:
-    points, counts, indices = grid(3, 2, quads=quads)
-    points = points + np.random.default_rng(1).normal(size=points.shape) * 0.1
-    expected = np.zeros_like(points)
-    start = 0
-    for count in counts:
-        face = indices[start : start + count]
-        start += count
-        area = sum(np.cross(points[face[i]], points[face[(i + 1) % count]]) for i in range(count))
-        expected[face] += area
-    expected /= np.linalg.norm(expected, axis=1, keepdims=True)
-    normals = VertexNormals(PolygonMesh(counts, indices, len(points)))(points)
-    assert normals.dtype == np.float32
-    np.testing.assert_allclose(normals, expected, atol=1e-6)
 
 
 def test_no_area_takes_the_neighbours_and_stays_unit() -> None:

@@ -15,12 +15,11 @@ from click.testing import CliRunner, Result
 from physgraph_usd.cli import main
 from physgraph_usd.lab.methods.paper_network import PaperConfig
 from physgraph_usd.lab.train import record
-from physgraph_usd.lab.train.bundle import Bundle, JointSystem, deal
 from physgraph_usd.lab.train.held_out import nested_gap
 from physgraph_usd.lab.train.loop import TrainConfig, Trainer
 from physgraph_usd.lab.train.patches import Patch, PatchConfig, describe, make_patches
 from physgraph_usd.solver.integrate.network import PhysgraphConfig
-from physgraph_usd.solver.integrate.weights import integrator_of, load_network, random_network
+from physgraph_usd.solver.integrate.weights import integrator_of, load_network
 
 FEW = PatchConfig(count=3, levels=(1, 1), edges=(5, 6), reference_steps=20)
 TINY = """
@@ -46,12 +45,6 @@ def patches() -> list[Patch]:
     return make_patches(FEW, seed=3)
 
 
-@pytest.fixture(scope="module")
-def resting() -> list[Patch]:
-    """Patches on bodies."""
-    return make_patches(replace(FEW, touched=1.0), seed=3)
-
-
 def test_the_same_seed_makes_the_same_patches(patches: list[Patch]):
     again = make_patches(FEW, seed=3)
     assert describe(again) == describe(patches)
@@ -60,68 +53,6 @@ def test_the_same_seed_makes_the_same_patches(patches: list[Patch]):
         assert one.least == other.least
         assert one.frame.fabric == other.frame.fabric
     assert not np.array_equal(make_patches(FEW, seed=4)[0].frame.points, patches[0].frame.points)
-
-
-def joint(patches: list[Patch], *, through_forces: bool = True) -> tuple[JointSystem, torch.Tensor]:
-    bundle = Bundle(patches, device="cpu", through_forces=through_forces)
-    return bundle.systems[-1], torch.cat([p.begin(len(p.systems) - 1) for p in patches])
-
-
-def calm(patches: list[Patch]) -> list[Patch]:
-    """Those that gravity pulls, or those that it does not: as many as can be stepped as one."""
-    return max(deal(patches, 8), key=len)
-
-
-@pytest.mark.parametrize(
-    "config",
-    [
-        PhysgraphConfig(width=8),
-        PhysgraphConfig(("secant", "metric", "metric.normal", "move1.smooth", "diagonal.smooth"), 8),
-    ],
-)
-@pytest.mark.parametrize("which", ["patches", "resting"])
-def test_patches_side_by_side_move_as_they_do_alone(
-    config: PhysgraphConfig, which: str, request: pytest.FixtureRequest
-):
-    patches: list[Patch] = request.getfixturevalue(which)
-    integrator = integrator_of(random_network(config, seed=1, scale=0.1))
-    patches = calm(patches)
-    system, x = joint(patches)
-    together = integrator.start(system, x)
-    for _ in range(3):
-        together = integrator.step(system, together)
-    assert system.level is not None
-    spans = system.level.spans
-    for number, (patch, span) in enumerate(zip(patches, spans, strict=True)):
-        carry = integrator.start(patch.systems[-1], x[span])
-        for _ in range(3):
-            carry = integrator.step(patch.systems[-1], carry)
-        spacing = float(patch.systems[-1].spacing.mean())
-        assert float((carry.x - together.x[span]).abs().max()) < 1e-3 * spacing
-        assert float(system.energies[-1][number]) == pytest.approx(carry.energy, rel=1e-4)
-
-
-@pytest.mark.parametrize("which", ["patches", "resting"])
-def test_the_energys_gradient_is_minus_the_force(which: str, request: pytest.FixtureRequest):
-    system, x = joint(calm(request.getfixturevalue(which)))
-    x.requires_grad_()
-    system.energy_and_force(x)
-    (gradient,) = torch.autograd.grad(system.energies[-1].sum(), x)
-    _, force = system.energy_and_force(x.detach())
-    assert torch.allclose(gradient * system.free, -force, rtol=1e-5, atol=1e-7 * float(force.abs().max()))
-
-
-def test_the_forces_gradient_is_a_product_with_the_hessian(patches: list[Patch]):
-    """u . H w by the gradient of u . F against a difference quotient of it along w, for smooth u and w."""
-    system, x = joint(patches[:1])
-    generator = torch.Generator().manual_seed(1)
-    u, w = (system.apply_metric_inverse(torch.randn(x.shape, generator=generator)) * system.free for _ in range(2))
-    w = 0.01 * w / (w.norm(dim=1) / system.spacing).max()
-    there = x.clone().requires_grad_()
-    _, force = system.energy_and_force(there)
-    (gradient,) = torch.autograd.grad((u * force).sum(), there)
-    quotient = 0.5 * float((u * (system.energy_and_force(x + w)[1] - system.energy_and_force(x - w)[1])).sum())
-    assert float((gradient * w).sum()) == pytest.approx(quotient, rel=0.03)
 
 
 @pytest.mark.slow

@@ -95,15 +95,6 @@ class TestNearPairs:
         assert len(expected) > 100
         assert listed == expected
 
-    def test_ways_are_as_long_as_parts_are_apart(self):
-        level = levels_of(named(strip(8, 3)))[-1]
-        x = placed(level, folded)
-        found = near_pairs(Parts(level, ONE), x, reach_of(level, 0.012))
-        way = (found.weight.unsqueeze(2) * x[found.corners.long()]).sum(dim=1)
-        torch.testing.assert_close(way, found.way)
-        assert float(found.way.norm(dim=1).max()) < 0.012
-        assert float(found.weight.sum(dim=1).abs().max()) < 1e-6
-
     def test_of_one_garment_what_is_near_at_rest_is_nearer_than_half_of_that(self):
         """As the force asks: a flat sheet has none, a folded one has those of the fold."""
         level = levels_of(named(strip(8, 3)))[-1]

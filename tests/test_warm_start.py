@@ -100,6 +100,7 @@ class TestTangledStart:
             assert told["contact"]["cloth"]["after"]["crossings"] == 0
             assert told["start"].startswith("warm") == (time > 0)
 
+    @pytest.mark.slow
     def test_of_a_shot_crosses_less_than_its_input(self, tmp_path: Path):
         """Three frames of the T-shirt whose cages cross themselves."""
         shot = open_shot(str(write_sample("tshirt", tmp_path)))

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 from layers import (
     COAT,
-    MIRROR,
     TIMES,
-    dress_up,
     errors,
     fine_points,
     grid,
@@ -33,13 +29,6 @@ from physgraph_usd.usd.write.primvars import FineMap, to_numpy, to_vt
 from physgraph_usd.usd.write.writer import LayerWriter
 
 ROOT = Path(__file__).resolve().parents[1]
-
-
-@pytest.fixture
-def dressed(tmp_path: Path) -> Path:
-    path = tmp_path / "shot.usda"
-    dress_up(make_shot(path, matrix=MIRROR))
-    return path
 
 
 @pytest.mark.parametrize(("mode", "suffix"), [("over", ".usdc"), ("sibling", ".usda")])
@@ -93,24 +82,6 @@ def test_used_values_stay_on_the_prim(dressed: Path, tmp_path: Path) -> None:
     assert not prim.GetAttribute("physgraph:material:shearStiffness").HasAuthoredValue()
 
 
-DIGEST = """
-import hashlib, sys
-sys.path.insert(0, "tests")
-from pathlib import Path
-from layers import write_layer
-out = write_layer(Path(sys.argv[1]), Path(sys.argv[2]), overwrite=True, velocities=True)
-sys.stdout.write(hashlib.sha256(out.read_bytes()).hexdigest())
-"""
-
-
-def test_the_same_calls_give_the_same_bytes(dressed: Path, tmp_path: Path) -> None:
-    digests = set()
-    for _ in range(2):
-        command = [sys.executable, "-c", DIGEST, str(dressed), str(tmp_path / "out.usdc")]
-        digests.add(subprocess.run(command, cwd=ROOT, capture_output=True, check=True, timeout=60).stdout)
-    assert len(digests) == 1
-
-
 def test_wrong_calls_leave_nothing(dressed: Path, tmp_path: Path) -> None:
     shot = open_shot(str(dressed), level=1)
     steps = refine_all(shot)
@@ -151,43 +122,6 @@ def test_a_primvar_that_fits_no_mesh_is_hidden_and_named(dressed: Path, tmp_path
     assert not UsdGeom.PrimvarsAPI(prim).GetPrimvar("heat").HasAuthoredValue()
 
 
-PEAK = """
-import resource, sys
-sys.path.insert(0, "tests")
-from pathlib import Path
-from layers import fine_points, make_shot, refine_all
-from pxr import Gf, UsdGeom
-from physgraph_usd.usd.read.reader import open_shot
-from physgraph_usd.usd.write.writer import LayerWriter
-folder, frames = Path(sys.argv[1]), int(sys.argv[2])
-stage = make_shot(folder / "shot.usda", size=(158, 158), times=(0.0,))
-operation = UsdGeom.Xform(stage.GetPrimAtPath("/World/rig")).GetOrderedXformOps()[0]
-for frame in range(frames):
-    operation.Set(Gf.Matrix4d(1.0), float(frame))
-stage.Save()
-shot = open_shot(str(folder / "shot.usda"), level=1)
-steps = refine_all(shot)
-points = fine_points(shot, steps, 0.0)[0]
-with LayerWriter(shot, steps, folder / "out.usdc", velocities=True, overwrite=True) as writer:
-    for frame in range(frames):
-        writer.write(float(frame), [points + 0.001 * frame])
-assert len(points) > 100_000
-sys.stdout.write(str(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss))
-"""
-
-
-@pytest.mark.slow
-def test_memory_does_not_grow_with_frames(tmp_path: Path) -> None:
-    peaks = []
-    for frames in (24, 120):
-        folder = tmp_path / str(frames)
-        folder.mkdir()
-        command = [sys.executable, "-c", PEAK, str(folder), str(frames)]
-        done = subprocess.run(command, cwd=ROOT, capture_output=True, check=True, timeout=120, text=True)
-        peaks.append(int(done.stdout))
-    assert peaks[1] < 1.1 * peaks[0], f"peak memory {peaks} KiB"
-
-
 def test_a_layer_that_is_open_elsewhere_is_seen_anew(tmp_path: Path) -> None:
     path, out = tmp_path / "shot.usda", tmp_path / "out.usdc"
     make_shot(path)
@@ -210,27 +144,6 @@ def fine_map(levels: int = 2, *, dropped: int | None = None) -> FineMap:
     return FineMap(cage, subdivide_times(cage, levels), COUNTS, kept)
 
 
-@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
-def test_a_linear_field_stays_linear(dtype: type) -> None:
-    fine = fine_map()
-    values, indices = fine.primvar("vertex", POINTS[:, 0].astype(dtype))
-    assert indices is None
-    assert values is not None
-    assert values.dtype == dtype
-    np.testing.assert_allclose(values, fine.interpolate(POINTS)[:, 0], atol=1e-3)
-
-
-@pytest.mark.parametrize("dropped", [None, 2])
-def test_words_are_carried_by_index_alone(dropped: int | None) -> None:
-    fine = fine_map(dropped=dropped)
-    words, _ = to_numpy(Vt.StringArray([f"face{face}" for face in range(len(COUNTS))]))
-    values, indices = fine.primvar("uniform", words, smooth=False)
-    assert values is None
-    assert indices is not None
-    kept = [face for face in range(len(COUNTS)) if face != dropped]
-    np.testing.assert_array_equal(indices, np.repeat(kept, 16))
-
-
 @pytest.mark.parametrize(("dropped", "indexed"), [(None, True), (2, False)])
 def test_texture_coordinates_follow_the_points(dropped: int | None, indexed: bool) -> None:
     fine = fine_map(dropped=dropped)
@@ -251,13 +164,6 @@ def test_the_wrong_number_of_values_is_refused() -> None:
         fine_map().primvar("vertex", np.zeros(5))
     with pytest.raises(ValueError, match=r"indices from 0 to 9 into 2 values"):
         fine_map().primvar("vertex", np.zeros(2), indices=np.full(12, 9) * (np.arange(12) > 0))
-
-
-@pytest.mark.parametrize("dropped", [None, 2])
-def test_a_partition_of_faces_stays_one(dropped: int | None) -> None:
-    fine = fine_map(dropped=dropped)
-    parts = [fine.subset("face", np.array(part)) for part in ([0, 3], [1], [2, 4, 5])]
-    np.testing.assert_array_equal(np.sort(np.concatenate(parts)), np.arange(fine.fine.face_count))
 
 
 def test_a_partition_of_points_stays_one() -> None:

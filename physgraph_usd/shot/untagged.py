@@ -16,7 +16,6 @@ import torch
 from ..errors import StageError, counted
 from ..solver.colliders.mesh import MeshBody
 from ..solver.colliders.pose import MeshPose, Pose
-from ..solver.colliders.sign import signed_distances
 from ..solver.contact.broad_phase import bounds_of
 from ..solver.mesh.kernels import start_warp
 from ..solver.resolution import sample_frames
@@ -106,7 +105,7 @@ def _judged(
     body = MeshBody(device="cpu", threads=1)
     for index, pose in poses:
         cages = [cage.points for cage in frames[index].garments]
-        fractions = [_fraction_at(body, pose, *each) for each in zip(garments, cages, strict=True)]
+        fractions = [_fraction_at(body, pose, cage) for cage in cages]
         if any(fractions):
             most = int(np.argmax(fractions))
             garment = garments[most]
@@ -227,22 +226,23 @@ def _strained(
             yield source.sources["rest"], strained_parts(garment, cages, source.subsets, up=-shot.scene.gravity)
 
 
-def _fraction_at(body: MeshBody, pose: Pose, garment: Garment, cage: np.ndarray) -> float:
+def _fraction_at(body: MeshBody, pose: Pose, cage: np.ndarray) -> float:
     """Fraction of a cage's vertices inside a body's closed part, or near the body.
 
     Args:
         body: The body.
         pose: Pose of the body.
-        garment: The garment.
         cage: Positions of the cage [m], shape (V, 3).
 
     Returns:
         The fraction; 0 without contact. A room or a sky around the whole cage, with no walls nearby, counts as no
         contact.
     """
-    fraction, edges = 0.0, torch.as_tensor(garment.mesh.half_edges.edges)
+    fraction = 0.0
     for surface in body.pose(pose) if isinstance(pose, MeshPose) else ():
-        signed = signed_distances(surface, torch.as_tensor(cage - surface.origin), edges, reach=2.0 * NEAR)
-        touches = (signed.abs() <= NEAR).any() or ((signed < 0).any() and (signed > 0).any())
-        fraction = max(fraction, float((signed <= NEAR).double().mean())) if bool(touches) else fraction
+        x = torch.as_tensor(cage - surface.origin)
+        near = surface.closest(x, torch.full_like(x[:, 0], NEAR)).distance.isfinite()
+        inside = surface.inside(x)
+        touches = near.any() or (inside.any() and not inside.all())
+        fraction = max(fraction, float((near | inside).double().mean())) if bool(touches) else fraction
     return fraction

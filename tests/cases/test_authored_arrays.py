@@ -8,13 +8,9 @@ import numpy as np
 import pytest
 from layers import COAT, dress_up, errors, make_shot, open_over, write_layer, write_shot
 from pxr import Sdf, Usd, UsdGeom, Vt
-from stages import add_sheet, new_stage, save, sheet_points, vec3
+from stages import add_sheet, new_stage, said, save, sheet_points, vec3
 
-from physgraph_usd.usd.read.reader import Shot, open_shot
-
-
-def said(shot: Shot) -> str:
-    return "\n".join(map(str, shot.warnings))
+from physgraph_usd.usd.read.reader import open_shot
 
 
 def per_corner(mesh: UsdGeom.Mesh, *, apart: float = 0.0) -> None:

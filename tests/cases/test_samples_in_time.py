@@ -10,13 +10,13 @@ import pytest
 from layers import errors, write_layer
 from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 from shots import CLOTH, refine
-from stages import COLLIDER_API, add_sheet, author, new_stage, save, sheet_points, vec3
+from stages import COLLIDER_API, add_sheet, author, new_stage, said, save, sheet_points, vec3
 
 from physgraph_usd.errors import GarmentError, SchemaError
 from physgraph_usd.shot.cuts import jumps
 from physgraph_usd.shot.refine import inspect_shot
 from physgraph_usd.usd.check.validate import validate_layer
-from physgraph_usd.usd.read.reader import Shot, open_shot
+from physgraph_usd.usd.read.reader import open_shot
 
 TIMES = (1.0, 2.0, 3.0, 4.0)
 STEP = np.array([0.5, 0.0, 0.0])
@@ -68,10 +68,6 @@ HIDES = {
     hide_by_scale: "it scales by 0, 0 and 0",
     hide_by_blocked_transform: "xformOp:translate of </World> has no value",
 }
-
-
-def said(shot: Shot) -> str:
-    return "\n".join(map(str, shot.warnings))
 
 
 class TestFramesWithoutTheGarment:

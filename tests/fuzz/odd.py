@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, Vt
+from stages import vec3
 
 from .bases import garments_of
 from .damage import INF, NAN, numbers
@@ -17,10 +18,6 @@ _BODIES = ("floor", "sphere", "capsule", "cube", "plane", "cylinder", "cone")
 
 def _floats(values: np.ndarray) -> Vt.FloatArray:
     return Vt.FloatArray.FromNumpy(np.ascontiguousarray(values, np.float32))
-
-
-def _vectors(points: np.ndarray) -> Vt.Vec3fArray:
-    return Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(points, np.float32))
 
 
 def _times(mesh: UsdGeom.Mesh) -> list[Usd.TimeCode]:
@@ -57,7 +54,7 @@ def _variants(draft: Draft) -> None:
         with choices.GetVariantEditContext():
             mesh = UsdGeom.Mesh(stage.OverridePrim(garment.GetPath()))
             if name == "moved":
-                mesh.GetPointsAttr().Set(_vectors(points * draft.pick([0.0, 1.1, 100.0])), draft.pick(_times(mesh)))
+                mesh.GetPointsAttr().Set(vec3(points * draft.pick([0.0, 1.1, 100.0])), draft.pick(_times(mesh)))
             elif name == "switched" and draft.chance(0.5):
                 mesh.GetPrim().SetActive(False)
             elif name == "switched":
@@ -80,7 +77,7 @@ def _large_face(draft: Draft) -> None:
     if draft.chance(0.2):
         ring += 0.05 * draft.rng.standard_normal(ring.shape)
     for code in _times(mesh):
-        mesh.GetPointsAttr().Set(_vectors(ring), code)
+        mesh.GetPointsAttr().Set(vec3(ring), code)
     mesh.GetFaceVertexCountsAttr().Set(Vt.IntArray([count]))
     mesh.GetFaceVertexIndicesAttr().Set(Vt.IntArray.FromNumpy(np.arange(count, dtype=np.int32)))
     twice = draft.chance(0.3)
@@ -122,7 +119,7 @@ def _glitch(draft: Draft) -> None:
         "torn": lambda: points + draft.rng.standard_normal(points.shape),
         "body eightfold": lambda: centre + 8.0 * (points - centre),
     }[how]()
-    mesh.GetPointsAttr().Set(_vectors(changed), code)
+    mesh.GetPointsAttr().Set(vec3(changed), code)
     draft.save(stage, f"{mesh.GetPath()} at {code}: {how}")
 
 
@@ -142,7 +139,7 @@ def _coincident(draft: Draft) -> None:
         points = numbers(mesh.GetPointsAttr().Get(code)).reshape(-1, 3).copy()
         for one, other in pairs if code.IsDefault() or draft.chance(0.7) else ():
             points[one] = points[other]
-        mesh.GetPointsAttr().Set(_vectors(np.vstack([points, np.zeros((loose, 3))])), code)
+        mesh.GetPointsAttr().Set(vec3(np.vstack([points, np.zeros((loose, 3))])), code)
     if draft.chance(0.5):
         first = int(counts[0])
         mesh.GetFaceVertexCountsAttr().Set(Vt.IntArray.FromNumpy(np.append(counts, first).astype(np.int32)))

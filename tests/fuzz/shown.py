@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom, Vt
+from stages import vec3
 
 from .bases import garments_of
 from .damage import numbers
 from .meshes import OWN, a_mesh
 from .mutant import Draft, Kind
-
-
-def _vectors(points: np.ndarray) -> Vt.Vec3fArray:
-    return Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(points, np.float32))
 
 
 def _faces(mesh: UsdGeom.Mesh) -> list[np.ndarray]:
@@ -107,7 +104,7 @@ def _cut(draft: Draft) -> None:
     apart = draft.pick([0.0, 0.0, 1e-5, 1e-2])
     for code in (Usd.TimeCode.Default(), *map(Usd.TimeCode, mesh.GetPointsAttr().GetTimeSamples())):
         points = numbers(mesh.GetPointsAttr().Get(code)).reshape(-1, 3)[source]
-        mesh.GetPointsAttr().Set(_vectors(points + apart * np.sin(np.arange(len(points)))[:, None]), code)
+        mesh.GetPointsAttr().Set(vec3(points + apart * np.sin(np.arange(len(points)))[:, None]), code)
     if draft.chance(0.3):
         draft.options["overrides"] = (f"seam:tolerance={draft.pick(['1e-4', '0.1', '1'])}",)
     draft.save(stage, f"{mesh.GetPath()}: {len(cut)} faces cut, {apart:g} apart" + ", twice" * twice)
@@ -127,7 +124,7 @@ def _pieces(draft: Draft) -> None:
     _set_faces(mesh, extra if alone else [*faces, *extra])
     for code in (Usd.TimeCode.Default(), *map(Usd.TimeCode, mesh.GetPointsAttr().GetTimeSamples())):
         points = numbers(mesh.GetPointsAttr().Get(code)).reshape(-1, 3)
-        mesh.GetPointsAttr().Set(_vectors(np.vstack([points, points.mean(axis=0) + size * box])), code)
+        mesh.GetPointsAttr().Set(vec3(np.vstack([points, points.mean(axis=0) + size * box])), code)
     if draft.chance(0.5):
         subset = UsdGeom.Subset.Define(stage, mesh.GetPath().AppendChild("badge"))
         subset.CreateIndicesAttr(Vt.IntArray(draft.pick([[0, 1], [*range(len(faces))], [10**6], []])))

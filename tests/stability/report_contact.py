@@ -1,6 +1,6 @@
 """Measurements of the stability report where cloth touches bodies, itself or other garments: S18 to S28 and S30.
 
-Each takes a method's name. The scenes are those of `test_contact_*.py` beside it, which hold `quasi-newton` to bounds.
+Each takes a method's name. Bodies of the scenes are those of `test_contact_bodies.py` beside it.
 """
 
 from __future__ import annotations
@@ -10,19 +10,22 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from bodies import ball, box, flipped, tube
+from bodies import ball, box, flipped, pane, tube
+from brute import between
 from cloth import DOWN, Answer, base_of
-from folds import EDGE, Cloth, curved, frame_with, named, refiner_with, square
+from folds import EDGE, Cloth, curved, frame_with, named, refiner_with, sewn, square
 from report_solver import Result, under
-from scenes import shot_of
+from scenes import shot_of, sleeve
+from sheets import garment_of
 from test_contact import MESH as WIDE
 from test_contact import REST as WIDE_REST
 from test_contact import draped
-from test_contact_bodies import KINDS, STILL, jaws, pane
-from test_contact_cloth import THICK, WEIGHTLESS, counted, crossed, seam_gap, told, tube_of_cloth
-from test_contact_moving import STEP, needles
+from test_contact_bodies import KINDS, STEP, STILL, bodies, jaws, needles
+from test_tangles import cornered, dented
 
 from physgraph_usd.solver.colliders.pose import MeshPose
+from physgraph_usd.solver.level import refine_garments
+from physgraph_usd.solver.mesh.topology import PolygonMesh
 
 SHEET = square(8)
 REST = SHEET[1]
@@ -30,9 +33,60 @@ ACROSS = 0.3
 """Side of the bodies between layers [m]."""
 
 
-def bodies(answer: Answer, which: str = "after") -> list[dict[str, Any]]:
-    """What was measured against each body."""
-    return [each[which] for each in answer.telemetry[0].get("contact", {}).get("bodies", {}).values()]
+THICK = 1e-3
+"""Thickness of the fabric [m]."""
+WEIGHTLESS = np.zeros(3)
+
+
+def faces_of(cloth: Cloth, level: int = 1) -> np.ndarray:
+    """Triangles of the fine cloth."""
+    chain = refine_garments([garment_of(*cloth)], [level])[0]
+    mesh: PolygonMesh = chain[-1].mesh if chain else cloth[0]
+    return mesh.triangulate().triangles.astype(np.int64)
+
+
+def told(answer: Answer, which: str, name: str = "crossings") -> int:
+    """What the report says of cloth through cloth."""
+    return answer.telemetry[0]["contact"]["cloth"][which][name]
+
+
+def counted(answer: Answer, *cloths: Cloth) -> int:
+    """Edges of either garment through faces of the other, by brute force."""
+    return between(answer.points, [faces_of(cloth) for cloth in cloths])
+
+
+def crossed(kind: str) -> tuple[list[Cloth], list[np.ndarray]]:
+    """Two sheets that start through one another."""
+    cloths = [square(12, edge=0.5 * EDGE), square(10, edge=0.5 * EDGE)]
+    lower, upper = (cloth[1] for cloth in cloths)
+    upper = upper + np.array([0.0037, 0.0, 0.0051])
+    tilted = upper + np.outer(0.3 * upper[:, 0] + 0.11 * upper[:, 2], [0.0, 1.0, 0.0])
+    return cloths, [lower, {"dented": dented(upper), "cornered": cornered(upper), "tilted": tilted}[kind]]
+
+
+def tube_of_cloth() -> Cloth:
+    """An open upright tube, as a sleeve."""
+    mesh, points = sleeve(8, 5, edge=EDGE)
+    return mesh, points[:, [1, 2, 0]] + np.array([0.002, 0.13 * EDGE, 0.003])
+
+
+def halves() -> tuple[list[Cloth], list[np.ndarray], np.ndarray, np.ndarray]:
+    """A sheet cut in two along x = 0: cloths, cages, and fine vertices of the seam on either side, in order."""
+    left = square(4)
+    cloths = [(left[0], left[1] + np.array([-0.1, 0.0, 0.0])), (left[0], left[1] + np.array([0.1, 0.0, 0.0]))]
+    fine = [base_of(*cloth, 1) for cloth in cloths]
+    seams = [np.flatnonzero(np.abs(points[:, 0]) < 1e-9) for points in fine]
+    seams = [which[np.argsort(points[which, 2])] for which, points in zip(seams, fine, strict=True)]
+    return cloths, [cloth[1] for cloth in cloths], seams[0], seams[1]
+
+
+def seam_gap(gravity: np.ndarray, squeeze: float, **options: Any) -> float:
+    """How far the seam of two halves opens at most [m]."""
+    cloths, cages, left, right = halves()
+    garments = [named(cloth, name) for cloth, name in zip(cloths, "AB", strict=True)]
+    cages = [cage * np.array([1.0 - squeeze, 1.0, 1.0]) for cage in cages]
+    answer = refiner_with(sewn(garments, *cages), gravity=gravity, **options).solve(frame_with(cages))
+    return float(np.linalg.norm(answer.points[0][left] - answer.points[1][right], axis=1).max())
 
 
 def inside(answer: Answer) -> int:

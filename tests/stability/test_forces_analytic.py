@@ -98,7 +98,8 @@ def test_s38_cantilever_angle(kind: str):
     assert rigidity == pytest.approx(1.0 - BENT[kind] ** 2, abs=0.05)
 
 
-@pytest.mark.parametrize(("kind", "tolerance"), [(kind, 0.025 if kind in GOOD[:2] else 0.005) for kind in KINDS])
-def test_s38_catenary(kind: str, tolerance: float):
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "irregular"])
+def test_s38_catenary(kind: str):
+    tolerance = 0.025 if kind == "equilateral" else 0.005
     sag = hanging_chain(kind, CHAIN_LENGTH, CHAIN_SPAN, CHAIN)
     assert sag == pytest.approx(catenary_sag(CHAIN_LENGTH, CHAIN_SPAN), rel=tolerance)

@@ -8,17 +8,23 @@ import torch
 from energies import apart, difference_force, evaluate
 from sheets import KINDS, level_of
 from test_forces import crumple, force_of
+from test_forces_needles import needle_sheet
 
 NAMES = ("stretch", "membrane", "bending", "gravity", "guide", "tether")
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("bent", [False, True])
+@pytest.mark.parametrize("kind", [*KINDS, "needles"])
 @pytest.mark.parametrize("name", NAMES)
-def test_s40_gradient(name: str, kind: str):
-    points, triangles = KINDS[kind](0.4, 0.3, 0.1)
-    force = force_of(name, level_of(points, triangles))
-    x = crumple(points, 0.01, 8)
-    assert apart(evaluate(force, x)[1], difference_force(force, x, 2e-4)) < 1e-6
+def test_s40_gradient(name: str, kind: str, *, bent: bool):
+    """Of sheets that rest flat or rolled up, and of needles whose aspect is 30."""
+    points, triangles = needle_sheet(30.0) if kind == "needles" else KINDS[kind](0.4, 0.3, 0.1)
+    noise = 0.001 if kind == "needles" else 0.01
+    if bent:
+        points[:, 2] = 0.1 * np.sin(9.0 * points[:, 0])
+    force = force_of(name, level_of(points, triangles, bent=bent))
+    x = crumple(points, noise, 8)
+    assert apart(evaluate(force, x)[1], difference_force(force, x, 0.02 * noise)) < 1e-6
 
 
 @pytest.mark.parametrize("length", [1e-4, 1e-2, 0.999, 1.001, 10.0])

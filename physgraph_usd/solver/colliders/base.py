@@ -42,7 +42,8 @@ class Nearest:
         distance: Unsigned distances [m], infinite if nothing was in reach, shape (N,).
         point: Closest points [m], shape (N, 3).
         normal: Normals of the surface at the closest points, outward on closed surfaces, shape (N, 3).
-        side: 1 on the normals' side, -1 behind, 0 if a closed mesh needs `Surface.inside`, shape (N,).
+        side: 1 on the normals' side, -1 behind, shape (N,). Where parts of a closed mesh overlap, only `Surface.inside`
+            tells what is inside.
         rim: True if the closest point is on the rim of an open surface, shape (N,).
         face: Triangle of the closest point, -1 on primitives, shape (N,), int32.
     """
@@ -58,6 +59,14 @@ class Nearest:
         """The selected points."""
         return Nearest(**{each.name: getattr(self, each.name)[which] for each in fields(self)})
 
+    def is_behind(self, side: Float[Tensor, " points"] | float) -> Bool[Tensor, " points"]:
+        """Mask of the points behind an open surface: on the disallowed side, and not past the rim.
+
+        Args:
+            side: Allowed side: 1 along the normals, -1 against, 0 undecided.
+        """
+        return (self.side * side < 0) & ~self.rim
+
     def with_those(self, which: Int[Tensor, " some"], others: Nearest) -> Nearest:
         """A copy with some points replaced."""
         names = [each.name for each in fields(self)]
@@ -71,9 +80,7 @@ class Surface(Protocol):
     Attributes:
         closed: True if the surface has an inside.
         fixed_side: Allowed side of an open surface, 1 along the normals or -1; None if the start decides.
-        certain: True if the sides from `closest` are final, so that `inside` is not needed.
         origin: World position of the origin of the surface's coordinates [m], shape (3,), float64.
-        bounds: Least and greatest corner [m], in the surface's coordinates, shape (2, 3), float64.
         solid: The surface's triangles, in any pose; primitives are divided into triangles.
         world: World positions of the triangles' corners [m], shape (B, 3), float64.
     """
@@ -85,13 +92,7 @@ class Surface(Protocol):
     def fixed_side(self) -> float | None: ...  # noqa: D102
 
     @property
-    def certain(self) -> bool: ...  # noqa: D102
-
-    @property
     def origin(self) -> np.ndarray: ...  # noqa: D102
-
-    @property
-    def bounds(self) -> np.ndarray: ...  # noqa: D102
 
     @property
     def solid(self) -> Solid: ...  # noqa: D102

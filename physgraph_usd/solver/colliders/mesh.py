@@ -28,8 +28,6 @@ LIFT = 1e-4
 """Height above a vertex at which the surface is tested for being buried, relative to the surface's size."""
 ON_EDGE = 1e-4
 """Barycentric coordinate below which a point is on an edge."""
-TOGETHER = 100_000
-"""Most faces for which CUDA tests all normals in a single launch."""
 
 
 @wp.kernel
@@ -92,7 +90,6 @@ class MeshSurface:
     Attributes:
         closed: True if the surface has an inside.
         fixed_side: Allowed side of an open surface, 1 along the normals or -1; None if the start decides.
-        certain: True if winding numbers give every side, also for surfaces with holes.
         origin: World position of the origin of the surface's coordinates [m], shape (3,), float64.
         bounds: Least and greatest corner [m], shape (2, 3), float64.
         triangles: Corners, shape (T, 3), int32.
@@ -123,7 +120,6 @@ class MeshSurface:
         """
         self.closed = rim is None
         self.fixed_side = None if self.closed else FIXED.get(side)
-        self.certain = self.closed and side == "winding"
         self.triangles = triangles
         sides = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
         self.edges, shared = np.unique(sides, axis=0, return_counts=True)
@@ -132,7 +128,7 @@ class MeshSurface:
         self.solid = Solid.of(pose.points[self._used], compact.reshape(-1, 3))
         self._rim = None if rim is None else [torch.as_tensor(each, device=device) for each in rim]
         self.corners = torch.as_tensor(triangles, device=device).long()
-        # At a hole or where more than two faces meet a pseudonormal says nothing.
+        # At a hole or where more than two faces meet, the other side of a face need not be inside.
         ragged = np.isin(triangles, self.edges[shared != 2]).any(axis=1)
         self.ragged, self.has_holes = torch.as_tensor(ragged, device=device), bool(ragged.any())
         self.origin, self.bounds = np.zeros(3), np.zeros((2, 3))
@@ -167,20 +163,8 @@ class MeshSurface:
         return points if np.isfinite(points).all() else None
 
     def closest(self, x: Float[Tensor, "points 3"], reach: Float[Tensor, " points"]) -> Nearest:
-        """The closest points within reach [m].
-
-        The side is the pseudonormal's (Baerentzen and Aanaes 2005). On a closed surface the side is correct unless the
-        face is buried in another part of the surface, passes through another part, or is at a hole, or two parts are
-        equally near: their normals add up to a wrong normal. In these cases the side is 0, and `inside` decides. A
-        certain surface uses `inside` for all points.
-        """
-        found = self._closest(self.mesh, x, reach)
-        if self.certain:
-            return replace(found, side=1.0 - 2.0 * self.inside(x).to(x))
-        if self.closed and len(x):
-            tied = ((x - found.point) * found.normal).sum(dim=1) * found.side < 0
-            found.side[self._faces.is_mute(found.face) | tied] = 0.0
-        return found
+        """The closest points within reach [m]; the side is the pseudonormal's (Baerentzen and Aanaes 2005)."""
+        return self._closest(self.mesh, x, reach)
 
     def _closest(self, mesh: wp.Mesh, x: Tensor, reach: Tensor) -> Nearest:
         count = len(x)
@@ -265,35 +249,14 @@ class Faces:
         self._asked: Tensor | None = None
         self._buried: Tensor | None = None
         self._overlaps: Tensor | None = None
-        self._mute: Tensor | None = None
         self._up: Tensor | None = None
         self._skins: dict[bool, tuple[wp.Mesh, Tensor]] = {}
 
     def turned(self) -> Faces:
         """The properties that remain valid after a rigid motion."""
         other = Faces(self._surface)
-        other._asked, other._buried = self._asked, self._buried
-        other._overlaps, other._mute = self._overlaps, self._mute
+        other._asked, other._buried, other._overlaps = self._asked, self._buried, self._overlaps
         return other
-
-    def is_mute(self, face: Tensor) -> Bool[Tensor, " points"]:
-        """Mask of the faces with normals that do not give the side; each face is tested once a pose.
-
-        On CUDA all faces are tested at once, up to a limit: a test of a few takes as long.
-        """
-        if self._mute is None:
-            every = torch.arange(len(self._surface.corners), dtype=torch.int32, device=face.device)
-            together = face.is_cuda and len(every) <= TOGETHER
-            self._mute = self._tells_nothing(every) if together else torch.full_like(every, -1, dtype=torch.int8)
-        new = face[self._mute[face.long()] < 0]
-        if len(new):
-            new = torch.unique(new)
-            self._mute[new.long()] = self._tells_nothing(new)
-        return self._mute[face.long()] > 0
-
-    def _tells_nothing(self, face: Tensor) -> Tensor:
-        """1 if a face's normal does not give the side, else 0."""
-        return (self.is_buried(face) | self.is_unsure(face)).to(torch.int8)
 
     def is_buried(self, face: Tensor) -> Bool[Tensor, " points"]:
         """Mask of the faces with a corner inside the surface; each corner is tested once a pose."""

@@ -1,7 +1,7 @@
 """Self-intersecting faces of a surface, as in armpits and crotches of skinned bodies.
 
-A face with all corners outside the surface and without self-intersection is wholly exposed: its pseudonormal tells
-inside from outside for certain.
+A face with all corners outside the surface and without self-intersection is wholly exposed: cloth can leave through
+all of it.
 """
 
 # Warp's kernels are typed by values that only Warp reads.

@@ -25,14 +25,12 @@ class ShapeSurface:
     Attributes:
         closed: True.
         fixed_side: None.
-        certain: False.
         origin: World position of the centre [m], shape (3,), float64.
         bounds: Least and greatest corner [m], infinite for a plane, shape (2, 3), float64.
     """
 
     closed = True
     fixed_side: float | None = None
-    certain = False
 
     def __init__(self, pose: ShapePose, *, device: str = "cpu") -> None:
         """Take a pose."""

@@ -21,7 +21,6 @@ from torch import Tensor
 
 from ..collide.crossings import Pierced
 from ..colliders.base import Nearest, Solid, Surface
-from ..colliders.sign import behind
 from ..forces.self_contact import PairConstraints
 from ..level import Level
 from ..mesh.topology import joined_by, patches_with
@@ -168,7 +167,7 @@ class LevelBodies:
         if surface.closed:
             return surface.inside(at)
         found = surface.closest(at, torch.full_like(at[:, 0], float("inf")))
-        return behind(found, self.side(index)[which])
+        return found.is_behind(self.side(index)[which])
 
     def side(self, index: int) -> Float[Tensor, " vertices"]:
         """Allowed side of an open surface for each vertex: 1 or -1; 0 if undecided or closed."""

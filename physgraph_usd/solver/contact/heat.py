@@ -12,7 +12,6 @@ import warp as wp
 
 from ..colliders.base import Surface
 from ..colliders.mesh import MeshSurface
-from ..colliders.sign import signed_distances
 from ..mesh.kernels import KERNELS
 from ..mesh.threads import Launch
 from .measure import depths
@@ -45,9 +44,7 @@ def _mark(
                 gone += query.t + 1.0e-6 * length
 
 
-def penetration_map(
-    surfaces: Sequence[Surface], points: np.ndarray, edges: np.ndarray, *, device: str = "cpu"
-) -> np.ndarray:
+def penetration_map(surfaces: Sequence[Surface], points: np.ndarray, *, device: str = "cpu") -> np.ndarray:
     """Depth of each vertex in the deepest of some bodies [mm].
 
     In a closed body the depth is the length of the way out; behind an open surface with a fixed side, the distance.
@@ -56,20 +53,19 @@ def penetration_map(
     Args:
         surfaces: The posed bodies.
         points: World positions [m], shape (V, 3), float64.
-        edges: Pairs of neighbouring vertices, shape (E, 2).
         device: "cpu" or a CUDA device.
 
     Returns:
         Shape (V,), float32, 0 outside.
     """
     deepest = torch.zeros(len(points), dtype=torch.float64, device=device)
-    pairs = torch.as_tensor(np.ascontiguousarray(edges, np.int32), device=device)
     for surface in surfaces:
-        if not (surface.closed or surface.fixed_side is not None):
-            continue
         x = torch.as_tensor(points - surface.origin, dtype=torch.float64, device=device)
-        signed = signed_distances(surface, x, pairs, reach=0.0)
-        depth = depths(surface, x, signed < 0, float("inf"))[0] if surface.closed else (-signed).clamp_min(0.0)
+        if surface.closed:
+            depth = depths(surface, x, surface.inside(x), float("inf"))[0]
+        else:
+            found = surface.closest(x, torch.full_like(deepest, float("inf")))
+            depth = torch.where(found.is_behind(surface.fixed_side or 0.0), found.distance, 0.0)
         deepest = torch.maximum(deepest, depth)
     return (1e3 * deepest).to(torch.float32).cpu().numpy()
 

@@ -132,7 +132,7 @@ class SceneCloth:
         edges = edges_of(triangles, len(points)).vertices
         crosses = body_crossings(surfaces, points, edges, triangles=triangles, device=self._device)
         crosses = crosses if crossing is None else crosses | crossing
-        depth = penetration_map(surfaces, points, edges, device=self._device)
+        depth = penetration_map(surfaces, points, device=self._device)
         return {"penetration": depth, "crossing": crosses.astype(np.float32)}
 
 
