@@ -1,6 +1,6 @@
 """Milliseconds of the CPU's kernels for eight elements at once, beside those of the plain kernels, on one core.
 
-    python -m benchmarks.kernels [--edges 100000]
+    python -m benchmarks.step --kernels
 
 A waved square sheet of triangles; parameters are random. The least of 40 runs in turns, and the largest difference of
 the forces, or displacements, over the largest.
@@ -11,14 +11,12 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-import click
 import torch
 import warp as wp
 from torch import Tensor
 
 from benchmarks.rows import say
 from benchmarks.step import SHIPPED, sheet
-from physgraph_usd.shot.solve import prepare_device
 from physgraph_usd.solver.forces import bending, membrane, stretch
 from physgraph_usd.solver.integrate.eight_vertices import EightPhysgraph
 from physgraph_usd.solver.integrate.fused import FusedPhysgraph
@@ -31,11 +29,8 @@ from physgraph_usd.solver.mesh.threads import Launch
 REPEATS = 40
 
 
-@click.command()
-@click.option("--edges", default=100_000, show_default=True)
-def main(edges: int) -> None:
-    """Print a row a kernel."""
-    prepare_device("cpu")
+def compare(edges: int = 100_000) -> None:
+    """Print a row a kernel, on a sheet of about so many edges."""
     torch.set_num_threads(1)
     system, x = sheet(edges, "cpu")
     level = system.level
@@ -81,8 +76,3 @@ def row(name: str, items: int, plain: Callable[[], Tensor], eight: Callable[[], 
             least[place] = min(least[place], time.perf_counter() - start)
     off = float((results[0] - results[1]).abs().max() / results[0].abs().max())
     say(f"| {name} | {items:,} | {1e3 * least[0]:.2f} ms | {1e3 * least[1]:.2f} ms | {off:.1e} |")
-
-
-if __name__ == "__main__":
-    with torch.no_grad():
-        main()
