@@ -16,10 +16,11 @@ import warp as wp
 from torch import Tensor
 
 from benchmarks.rows import say
-from benchmarks.step import SHIPPED, sheet
 from physgraph_usd.solver.forces import bending, membrane, stretch
+from physgraph_usd.solver.integrate.base import System
 from physgraph_usd.solver.integrate.eight_vertices import EightPhysgraph
 from physgraph_usd.solver.integrate.fused import FusedPhysgraph
+from physgraph_usd.solver.integrate.network import PhysgraphConfig
 from physgraph_usd.solver.integrate.vertex_frame import VertexFrame
 from physgraph_usd.solver.integrate.weights import random_network
 from physgraph_usd.solver.mesh.simd import EIGHT
@@ -29,10 +30,9 @@ from physgraph_usd.solver.mesh.threads import Launch
 REPEATS = 40
 
 
-def compare(edges: int = 100_000) -> None:
-    """Print a row a kernel, on a sheet of about so many edges."""
+def compare(system: System, x: Tensor, config: PhysgraphConfig) -> None:
+    """Print a row a kernel, at positions of a sheet [m]; the network is of a given size."""
     torch.set_num_threads(1)
-    system, x = sheet(edges, "cpu")
     level = system.level
     assert level is not None
     six, four = level.hinges, level.hinges[:, [0, 1, 2, 4]]
@@ -41,7 +41,7 @@ def compare(edges: int = 100_000) -> None:
     row("membrane", len(level.membrane), *elements(membrane._KERNELS, membrane._EIGHT, x, corners=level.membrane))
     row("hinges", len(four), *elements(bending._KERNELS, bending._EIGHT, x, corners=four))
     row("quads", len(six), *elements(bending._KERNELS_OF_QUADS, bending._EIGHT_OF_QUADS, x, corners=six))
-    network, around = random_network(SHIPPED, seed=1, scale=0.1), VertexFrame(level, x)
+    network, around = random_network(config, seed=1, scale=0.1), VertexFrame(level, x)
     two = FusedPhysgraph(network, len(x), 0.5, device="cpu", threads=1)
     bases = [0.001 * torch.randn(x.shape, generator=torch.Generator().manual_seed(1)) for _ in two.bases]
     calls = [

@@ -25,6 +25,7 @@ from typing import Any, cast
 import numpy as np
 import torch
 
+from benchmarks.kernels import compare
 from benchmarks.rows import Row, say, under
 from physgraph_usd.lab.methods.paper_network import PaperConfig
 from physgraph_usd.shot.solve import prepare_device
@@ -65,9 +66,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     given = parser.parse_args(arguments)
     prepare_device(given.device)
     if given.kernels:
-        from benchmarks.kernels import compare
-
-        compare()
+        compare(*sheet(100_000, "cpu"), SHIPPED)
         return
     names = ["edges", "forces", "metric solve", *METHOD]
     say("| " + " | ".join(names) + " | the paper |\n" + "|---" * (len(names) + 1) + "|")
