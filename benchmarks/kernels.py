@@ -1,6 +1,6 @@
 """Milliseconds of the CPU's kernels for eight elements at once, beside those of the plain kernels, on one core.
 
-    python -m benchmarks.kernels [--edges 100000]
+    python -m benchmarks.step --kernels
 
 A waved square sheet of triangles; parameters are random. The least of 40 runs in turns, and the largest difference of
 the forces, or displacements, over the largest.
@@ -11,17 +11,16 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-import click
 import torch
 import warp as wp
 from torch import Tensor
 
 from benchmarks.rows import say
-from benchmarks.step import SHIPPED, sheet
-from physgraph_usd.shot.solve import prepare_device
 from physgraph_usd.solver.forces import bending, membrane, stretch
+from physgraph_usd.solver.integrate.base import System
 from physgraph_usd.solver.integrate.eight_vertices import EightPhysgraph
 from physgraph_usd.solver.integrate.fused import FusedPhysgraph
+from physgraph_usd.solver.integrate.network import PhysgraphConfig
 from physgraph_usd.solver.integrate.vertex_frame import VertexFrame
 from physgraph_usd.solver.integrate.weights import random_network
 from physgraph_usd.solver.mesh.simd import EIGHT
@@ -31,13 +30,9 @@ from physgraph_usd.solver.mesh.threads import Launch
 REPEATS = 40
 
 
-@click.command()
-@click.option("--edges", default=100_000, show_default=True)
-def main(edges: int) -> None:
-    """Print a row a kernel."""
-    prepare_device("cpu")
+def compare(system: System, x: Tensor, config: PhysgraphConfig) -> None:
+    """Print a row a kernel, at positions of a sheet [m]; the network is of a given size."""
     torch.set_num_threads(1)
-    system, x = sheet(edges, "cpu")
     level = system.level
     assert level is not None
     six, four = level.hinges, level.hinges[:, [0, 1, 2, 4]]
@@ -46,7 +41,7 @@ def main(edges: int) -> None:
     row("membrane", len(level.membrane), *elements(membrane._KERNELS, membrane._EIGHT, x, corners=level.membrane))
     row("hinges", len(four), *elements(bending._KERNELS, bending._EIGHT, x, corners=four))
     row("quads", len(six), *elements(bending._KERNELS_OF_QUADS, bending._EIGHT_OF_QUADS, x, corners=six))
-    network, around = random_network(SHIPPED, seed=1, scale=0.1), VertexFrame(level, x)
+    network, around = random_network(config, seed=1, scale=0.1), VertexFrame(level, x)
     two = FusedPhysgraph(network, len(x), 0.5, device="cpu", threads=1)
     bases = [0.001 * torch.randn(x.shape, generator=torch.Generator().manual_seed(1)) for _ in two.bases]
     calls = [
@@ -81,8 +76,3 @@ def row(name: str, items: int, plain: Callable[[], Tensor], eight: Callable[[], 
             least[place] = min(least[place], time.perf_counter() - start)
     off = float((results[0] - results[1]).abs().max() / results[0].abs().max())
     say(f"| {name} | {items:,} | {1e3 * least[0]:.2f} ms | {1e3 * least[1]:.2f} ms | {off:.1e} |")
-
-
-if __name__ == "__main__":
-    with torch.no_grad():
-        main()
