@@ -90,9 +90,8 @@ def value_of(face: wp.bool, c: wp.vec4i, parts: Topology, query: Query):
             return fraction - one
     with_body = parts.owner[c[0]] >= parts.cloths or parts.owner[c[3]] >= parts.cloths
     if with_body and not (face and parts.owner[c[0]] < parts.cloths):
-        play = (
-            query.play
-        )  # Bodies' edges and vertices matter to cloth of larger faces; else its vertices see the faces.
+        # A body's edges and vertices matter to cloth with larger faces; else the cloth's vertices see the body's faces.
+        play = query.play
         room = wp.min(room, WITHIN * wp.max(wp.max(play[c[0]], play[c[1]]), wp.max(play[c[2]], play[c[3]])))
     return nearness(face, c, parts, query, room)
 
