@@ -100,8 +100,12 @@ def never(_held: int, _motion: float, _pace: float = 1.0, *, again: bool = False
 NAMES = ("wide", "thin", "alike")
 
 
-def tubes(file: Path) -> Path:
-    """Closed tubes of 2 cm, a wide one and two thin ones at one place inside it that cross its caps."""
+def tubes(file: Path, jitter: int) -> Path:
+    """Closed tubes of 2 cm, a wide one and two thin ones inside it that cross its caps, all but at one place.
+
+    Vertices are moved by up to 0.1 um: at exactly one place rounding decides which of two equal tubes is outside.
+    """
+    rng = np.random.default_rng(jitter)
     stage = Usd.Stage.CreateNew(str(file))
     UsdGeom.SetStageUpAxis(stage, "Y")
     UsdGeom.SetStageMetersPerUnit(stage, 0.01)
@@ -118,18 +122,17 @@ def tubes(file: Path) -> Path:
         mesh.CreateFaceVertexCountsAttr([4] * len(faces))
         mesh.CreateFaceVertexIndicesAttr(np.ravel(faces).tolist())
         mesh.CreateSubdivisionSchemeAttr("none")
-        mesh.CreatePointsAttr().Set(Vt.Vec3fArray.FromNumpy(np.array(points, np.float32)), 1.0)
+        moved = np.array(points) + 1e-5 * (rng.random((len(points), 3)) - 0.5)
+        mesh.CreatePointsAttr().Set(Vt.Vec3fArray.FromNumpy(moved.astype(np.float32)), 1.0)
     stage.Save()
     return file
 
 
-def test_tubes_that_cross_keep_their_length_in_few_steps(tmp_path: Path):
-    """Two steps a level do not settle them; the wide one grew by 0.4 of its length, the thin ones shrank by 0.7.
-
-    They are 2 m long. With the shot and three jitters of 1e-7 m they end between 1.89 and 2.47 m.
-    """
+@pytest.mark.parametrize("jitter", range(3))
+def test_tubes_that_cross_keep_their_length_in_few_steps(tmp_path: Path, jitter: int):
+    """Two steps a level do not settle them; the wide one grew by 0.4 of its length, the thin ones shrank by 0.7."""
     few = {"level": 1, "steps": 2, "integrator": "quasi-newton"}
-    report = refine(tubes(tmp_path / "shot.usda"), tmp_path / "fine.usdc", garments=["/World/*"], **few)
+    report = refine(tubes(tmp_path / "shot.usda", jitter), tmp_path / "fine.usdc", garments=["/World/*"], **few)
     assert report.unsettled
     stage = Usd.Stage.Open(str(tmp_path / "fine.usdc"))
     for name in NAMES:

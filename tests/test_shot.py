@@ -163,7 +163,7 @@ class TestOptions:
 
         if torch.cuda.is_available():
             pytest.skip("there is a CUDA device")
-        with pytest.raises(UsageError, match="--device cpu"):
+        with pytest.raises(UsageError, match="--device auto or cpu"):
             refine(shot, tmp_path / "fine.usdc", device="cuda")
         assert only(tmp_path, "shot.usdc")
 

@@ -103,11 +103,11 @@ class Promise:
         inside = view.exempt(start) if since is None else view.padded(since.inside)
         options = _Options(floor=self.floor, tangle=label, inside=inside)
         end = view.with_bodies(aim)
-        if since is None or label is not None or inside is not None:
-            near = view.springs.known(start) if since is None else None
-            met = blocking_pairs(view.parts, begin, end, **options, asked=self._moving(begin, end), near=near)
-        else:
+        near = view.springs.known(start) if since is None else None
+        if near is None and label is None and inside is None:
             met = view.springs.blocking(begin, end, aim, floor=self.floor, asked=view.asked)
+        else:
+            met = blocking_pairs(view.parts, begin, end, **options, asked=self._moving(begin, end), near=near)
         x, proved = self._on(begin, end, met, options, dtype=aim.dtype, halvings=0 if since is None else HALVINGS)
         return Placed(aim if x is end else x[:count].to(aim)), proved
 

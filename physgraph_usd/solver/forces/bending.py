@@ -61,8 +61,9 @@ def _bent(axis: Any, ik: Any, il: Any, weight: Any, rest_angle: Any):
     s1 = wp.max(wp.dot(n1, n1), floor)
     s2 = wp.max(wp.dot(n2, n2), floor)
     # n1 x n2 . e / |e| is -|e| n1 . (x_l - x_i).
-    # Without + 0 a collapsed hinge's angle would be that of (-0, 0), half a turn.
-    theta = wp.atan2(-length * wp.dot(n1, il), wp.dot(n1, n2) + type(weight)(0.0))
+    # Adding 0 removes the sign of a zero: a flat hinge folds to one side, and a collapsed hinge has the angle 0.
+    zero = type(weight)(0.0)
+    theta = wp.atan2(zero - length * wp.dot(n1, il), wp.dot(n1, n2) + zero)
     bent = theta - rest_angle
     bent = bent - type(weight)(TURN) * wp.rint(bent * type(weight)(PER_TURN))
     moment = weight * bent * length
@@ -144,7 +145,7 @@ p = -0.3333166f + p * s;
 Eight theta = a + a * s * p;
 theta = steep ? 1.57079632679f - theta : theta;
 theta = along < 0.0f ? 3.14159265359f - theta : theta;
-theta = __builtin_elementwise_copysign(theta, across);
+theta = across < 0.0f ? -theta : theta;
 
 Eight weight = load(parameter0), bent = theta - load(parameter1);
 bent = bent - 6.28318530718f * rint(bent * 0.159154943092f);
