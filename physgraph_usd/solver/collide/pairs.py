@@ -72,11 +72,13 @@ class NearAt:
     reach: Reach
 
     def leaving(self, way: Float[Tensor, "vertices 3"], floor: float) -> Bool[Tensor, " vertices"]:
-        """Mask of the vertices that move too far for two parts that are not near to keep a floor [m] by themselves.
+        """Mask of the vertices whose move [m] may bring parts that are not near closer than a floor [m].
 
-        Such parts are farther from one another than the sum of their plays. Bodies do not move.
+        Parts that are not near are farther apart than the sum of their plays. Two parts whose vertices move by at most
+        their play less half the floor keep the floor. Where a play is under half the floor any move counts, and the
+        parts keep at least half the floor.
         """
-        return (way.norm(dim=1) > self.reach.play - 0.5 * floor) & (self.reach.play > 0.0)
+        return way.norm(dim=1) > (self.reach.play - 0.5 * floor).clamp_min(0.0)
 
 
 @dataclass(frozen=True, eq=False)

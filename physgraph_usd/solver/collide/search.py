@@ -8,6 +8,7 @@ axis separates at both ends, and their parts in the same way.
 # pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportIndexIssue=false, reportCallIssue=false, reportGeneralTypeIssues=false
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -130,7 +131,8 @@ def blocking_and_near(
     asked = _of_cloth(parts, start) if asked is None else asked
     given = {"radius": reach.radius.double(), "play": reach.play.double(), "half": reach.half, "floor": floor}
     found = _search(parts, query_of(start.double(), end.double(), kind=MOVE_NEAR, asked=asked, **given))
-    return found.where(found.value < 0.0), NearAt(found.where(found.value >= 0.0), reach)
+    blocking, near = (found.where(mask) for mask in (found.value < 0.0, found.value >= 0.0))
+    return replace(blocking, value=blocking.value + 1.0), NearAt(near, reach)
 
 
 def piercing_edges(

@@ -169,7 +169,7 @@ def _sum_corners(
 
 
 @wp.kernel(**ALONE)
-def _GATHER_AT_ONCE(
+def _gather_corners_at_once(
     first: wp.int32,
     starts: wp.array(dtype=wp.int32),
     slots: wp.array(dtype=wp.int32),
@@ -232,7 +232,7 @@ class Elements:
             kernel, self.count, [x, packed, *arrays, *buffers], device=device, threads=threads, at_once=at_once
         )
         inputs = [wp.from_torch(starts), wp.from_torch(slots), buffers[1], x]
-        gather = cast(wp.Kernel, _GATHER_AT_ONCE) if single else _GATHER[dtype]
+        gather = cast(wp.Kernel, _gather_corners_at_once) if single else _GATHER[dtype]
         self._gather = Launch(gather, level.vertex_count, inputs, device=device, threads=threads)
 
     def evaluate(
