@@ -107,7 +107,7 @@ class _EnergyForce(torch.autograd.Function):
 
 
 class _MetricSolve(torch.autograd.Function):
-    """H0^-1 F, or its shorter answer; both are symmetric, so each is its own transpose."""
+    """H0^-1 F [m], or the short solve's result; both operators are symmetric, and equal to their transposes."""
 
     @staticmethod
     def forward(ctx: Any, force: Tensor, system: JointSystem, short: bool) -> Tensor:
@@ -127,14 +127,14 @@ def _solved(system: JointSystem, force: Tensor, *, short: bool) -> Tensor:
 
 
 def unrolled(integrator: Integrator, system: System, carry: Carry, steps: int) -> Carry:
-    """The carry after so many steps."""
+    """The carry after a number of steps."""
     for _ in range(steps):
         carry = integrator.step(system, carry)
     return carry
 
 
 def detached(carry: Any) -> Any:
-    """The carry without the graph that led to it."""
+    """A copy of the carry, detached from the gradient graph."""
     if isinstance(carry, Tensor):
         return carry.detach()
     if isinstance(carry, tuple):
@@ -155,7 +155,7 @@ class Twin:
         self._before = torch.ones(system.garments, dtype=x.dtype, device=x.device)
 
     def unroll(self, steps: int, *, other: Float[Tensor, "vertices 3"]) -> None:
-        """Make so many steps; the other descent is at ``other`` [m] before it makes as many."""
+        """Make a number of steps; ``other`` holds the first descent's positions before the same steps [m]."""
         self._carry = detached(self._carry)
         self._before = self._apart(other).detach()
         self._carry = unrolled(self._integrator, self._system, self._carry, steps)
@@ -227,7 +227,7 @@ class Bundle:
         return torch.where(again[owner].unsqueeze(1), self._ends[index], x)
 
     def learn(self, index: int, energies: Float[Tensor, "steps patches"]) -> None:
-        """Note energies that lie below the least known ones."""
+        """Lower each patch's least known energy to the least of new energies [J]."""
         reached = torch.nan_to_num(energies.double(), nan=torch.inf).amin(dim=0)
         self.least[index] = torch.minimum(self.least[index], reached)
 
@@ -262,7 +262,7 @@ class RoundBundle(Bundle):
 
 
 def deal_rounds(rounds: Sequence[Round], size: int) -> list[list[Round]]:
-    """Batches of at most so many rounds that can be one `RoundBundle`, in their order."""
+    """Group rounds of equal level and gravity, in order, into batches for `RoundBundle` of a largest size."""
     piles: dict[tuple[int, bool], list[Round]] = {}
     for each in rounds:
         piles.setdefault((each.garments[0].level, bool(each.gravity.any())), []).append(each)
@@ -270,7 +270,7 @@ def deal_rounds(rounds: Sequence[Round], size: int) -> list[list[Round]]:
 
 
 def deal(patches: Sequence[Patch], size: int) -> list[list[Patch]]:
-    """Batches of at most so many patches that can be one `Bundle`, in the patches' order."""
+    """Group patches of equal level and gravity, in order, into batches for `Bundle` of a largest size."""
     piles: dict[tuple[int, bool], list[Patch]] = {}
     for patch in patches:
         piles.setdefault((patch.garment.level, bool(patch.gravity.any())), []).append(patch)

@@ -1,4 +1,4 @@
-"""The parts of a level's cloth, its vertices, edges and faces, in clusters that are near one another at rest."""
+"""Parts of cloth and bodies, that is vertices, edges and faces, in clusters by distance at rest."""
 
 # Warp's structs are typed by values that only Warp reads.
 # pyright: reportArgumentType=false, reportAttributeAccessIssue=false

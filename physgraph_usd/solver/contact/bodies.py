@@ -201,7 +201,7 @@ class LevelBodies:
     def _vertices_out(
         self, index: int, x: Tensor, inside: Tensor
     ) -> tuple[Int[Tensor, " some"], Float[Tensor, "some 3"], Float[Tensor, " some"]]:
-        """The vertices inside a body that do not stay there, their ways out and depths [m]."""
+        """Vertices to be moved out of a body, their unit directions out, and depths [m]."""
         which = torch.nonzero(inside).squeeze(1)
         normal, depth, stays = self.ways_out(index, x[which], self.side(index)[which])
         if self.lost is not None:

@@ -123,7 +123,7 @@ class Bodies:
         self._meshes = [MeshBody(side=c.side, device=self._device, threads=self._threads) for c in self.colliders]
 
     def pose(self, poses: Sequence[Pose | None]) -> None:
-        """Take the poses of one frame, one for each collider."""
+        """Set the pose of each collider for a frame."""
         self._poses, self._surfaces, self._bounds = poses, {}, {}
 
     def pose_of(self, index: int) -> Pose | None:

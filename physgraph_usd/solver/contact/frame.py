@@ -25,7 +25,7 @@ from .cloth_mesh import ClothMesh
 from .metric import HeldMetric
 from .promise import Before, Promise
 from .repair import repaired_cage
-from .report import depths, measured
+from .report import measured, swallowed
 from .settings import ContactSettings
 from .tangles import Tangles
 
@@ -213,10 +213,10 @@ class FrameContact:
         return apart if found.count and not left else x
 
     @property
-    def depths(self) -> list[tuple[float, str]]:
-        """As `report.depths` of the cage; empty without bodies."""
+    def swallowed(self) -> list[tuple[float, str]]:
+        """As `report.swallowed` of the cage; empty without bodies."""
         _, _, bodies, _, inside = self._cage
-        return [] if bodies is None else depths(bodies, self._coarse, inside)
+        return [] if bodies is None else swallowed(bodies, self._coarse, inside)
 
     @property
     def crossed(self) -> bool:

@@ -1,4 +1,4 @@
-"""What crosses at given positions: cloth with cloth, cloth with bodies, and what is inside them."""
+"""Crossings of cloth with cloth and with bodies at given positions, and cloth inside bodies."""
 
 from __future__ import annotations
 

@@ -68,7 +68,7 @@ def _penetration(bodies: LevelBodies, index: int, x: Tensor, look: Look, *, lost
     return penetration(surface, bodies.level, at, inside, **known)
 
 
-def depths(
+def swallowed(
     bodies: LevelBodies, x: Float[Tensor, "vertices 3"], inside: Bool[Tensor, "bodies vertices"] | None
 ) -> list[tuple[float, str]]:
     """Mean depth [m] and body path of each garment that is wholly inside a closed body at x [m]."""

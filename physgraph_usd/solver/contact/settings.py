@@ -36,7 +36,7 @@ class ContactSettings:
         return self.form != "off" or self.measured
 
     def to_measure(self) -> ContactSettings | None:
-        """Settings that measure all contact, if these leave out contact to be measured; else None."""
+        """Settings with all contact on, to measure contact that is switched off; None if nothing has to be measured."""
         if not self.measured or (self.form != "off" and self.cloth != "off"):
             return None
         on = ContactSettings()

@@ -28,8 +28,8 @@ def refuse_swallowed(problem: Problem) -> None:
     Raises:
         SolveError: Some cloth is wholly in a body.
     """
-    depths = [] if problem.contact is None else problem.contact.depths
-    for garment, each, (deep, body) in zip(problem.group.garments, problem.frame.garments, depths, strict=False):
+    swallowed = [] if problem.contact is None else problem.contact.swallowed
+    for garment, each, (deep, body) in zip(problem.group.garments, problem.frame.garments, swallowed, strict=False):
         size = float(np.linalg.norm(np.ptp(each.points, axis=0))) if len(each.points) else 0.0
         if deep > size:
             what = f"it is {1e3 * deep:.4g} mm deep in <{body}>, and only {1e3 * size:.4g} mm large"
