@@ -22,10 +22,10 @@ import numpy as np
 
 from ..interrupts import leave_if_asked
 from ..solver.frame.refiner import Refiner
+from ..solver.mesh.kernels import device_of, start_warp
 from ..usd.read.reader import Shot
 from .frames import Lead, Outcome
 from .options import RefineOptions
-from .solve import prepare_device
 
 Both = Sequence[tuple[Outcome, Lead]]
 """The frames before a seam, each with the solution of the process behind the seam."""
@@ -136,7 +136,8 @@ class SafeMover:
     ) -> tuple[list[np.ndarray | None], str]:
         """Move cloth as `Mover` requires, in world positions [m]."""
         if self._refiner is None:
-            device = prepare_device(self._options.device)
+            start_warp()
+            device = device_of(self._options.device)
             how = {"levels": self._levels, "device": device, "threads": os.cpu_count() or 1}
             self._refiner = Refiner(self._opened.scene, self._options.solve_settings(), **how)
         frame = self._opened.frame(time)

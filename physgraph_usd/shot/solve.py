@@ -11,11 +11,11 @@ from typing import Any
 
 import torch
 
-from ..errors import SolveError, StageError, UsageError
+from ..errors import SolveError, StageError
 from ..interrupts import leave_if_asked
 from ..solver.frame.lead_in import cages_walked
 from ..solver.frame.refiner import Refiner
-from ..solver.mesh.kernels import start_warp
+from ..solver.mesh.kernels import device_of, start_warp
 from ..usd.read.reader import Shot
 from ..usd.view import Stage
 from .frames import Outcome
@@ -30,22 +30,11 @@ Outcomes = Generator[Outcome, None, None]
 def prepare_device(device: str) -> str:
     """Start Warp, and limit torch to one thread: torch's sums depend on the number of threads.
 
-    Args:
-        device: "cpu", "cuda", a certain card as "cuda:1", or "auto" for a card where there is one.
-
-    Returns:
-        The device's name in torch and Warp.
-
-    Raises:
-        UsageError: CUDA was requested but is missing.
+    Arguments, result and errors are `device_of`'s.
     """
     start_warp()
     torch.set_num_threads(1)
-    if device == "auto":
-        return "cuda" if torch.cuda.is_available() else "cpu"
-    if device.startswith("cuda") and not torch.cuda.is_available():
-        raise UsageError("device 'cuda' was asked for and no CUDA device is there; use --device auto or cpu")
-    return device
+    return device_of(device)
 
 
 def open_for(shot: str | Stage, options: RefineOptions) -> Shot:

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 import warp as wp
 
-from ...errors import PhysGraphError
+from ...errors import PhysGraphError, UsageError
 
 _STDERR = 2
 _TARGET = "-target-cpu x86-64-v3" if torch.backends.cpu.get_cpu_capability() in ("AVX2", "AVX512") else "-march=native"
@@ -55,6 +55,22 @@ def compile_kernels(device: str) -> None:
     """Compile all kernels of imported modules; Warp caches the kernels for later processes."""
     start_warp()
     wp.force_load(device)
+
+
+def device_of(asked: str) -> str:
+    """The device's name in torch and Warp.
+
+    Args:
+        asked: "cpu", "cuda", a certain card as "cuda:1", or "auto" for a card where there is one.
+
+    Raises:
+        UsageError: CUDA was requested but is missing.
+    """
+    if asked == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    if asked.startswith("cuda") and not torch.cuda.is_available():
+        raise UsageError("device 'cuda' was asked for and no CUDA device is there; use --device auto or cpu")
+    return asked
 
 
 def kernels_are_compiled() -> bool:
