@@ -153,7 +153,7 @@ def test_gathers_agree() -> None:
     starts, slots = incidence(corners, VERTICES)
     corner_force = torch.as_tensor(rng.normal(size=(8001, 3)).astype(np.float32))[:-1]
     totals = torch.ones(2, VERTICES, 3)
-    for kernel, total in zip((base._GATHER[torch.float32], base._GATHER_AT_ONCE), totals, strict=True):
+    for kernel, total in zip((base._GATHER[torch.float32], base._gather_corners_at_once), totals, strict=True):
         inputs = [wp.from_torch(starts), wp.from_torch(slots), vectors(corner_force), vectors(total)]
         Launch(kernel, VERTICES, inputs, device="cpu")({})
     assert torch.equal(*totals)
