@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -103,7 +103,8 @@ def case_of(name: str, count: int, seed: int = 0) -> Case:
     corners[::13] = [5, 6, 7, 8, 7, 8][: term.corners]
     size = (count,) if term.numbers == 1 else (count, term.numbers)
     parameters = [rng.uniform(0.1, 1.5, size=size).astype(np.float32) for _ in range(2)]
-    return Case(*map(torch.as_tensor, (x, corners.astype(np.int32))), [torch.as_tensor(each) for each in parameters])
+    own = [torch.as_tensor(each) for each in parameters]
+    return Case(torch.as_tensor(x), torch.as_tensor(corners.astype(np.int32)), own)
 
 
 @pytest.mark.parametrize("count", [1, 7, 8, 9, 1003])
@@ -153,7 +154,8 @@ def test_gathers_agree() -> None:
     starts, slots = incidence(corners, VERTICES)
     corner_force = torch.as_tensor(rng.normal(size=(8001, 3)).astype(np.float32))[:-1]
     totals = torch.ones(2, VERTICES, 3)
-    for kernel, total in zip((base._GATHER[torch.float32], base._gather_corners_at_once), totals, strict=True):
+    kernels = base._GATHER[torch.float32], cast(wp.Kernel, base._gather_corners_at_once)
+    for kernel, total in zip(kernels, totals, strict=True):
         inputs = [wp.from_torch(starts), wp.from_torch(slots), vectors(corner_force), vectors(total)]
         Launch(kernel, VERTICES, inputs, device="cpu")({})
     assert torch.equal(*totals)

@@ -70,7 +70,7 @@ def _angle(y: wp.float32, x: wp.float32) -> wp.float32:  # pyright: ignore[repor
 def _angle(y: wp.float64, x: wp.float64) -> wp.float64:
     """The angle of (x, y) [rad], 0 for (0, 0): adding 0 removes the sign of a zero."""
     zero = wp.float64(0.0)
-    return wp.atan2(y + zero, x + zero)
+    return wp.float64(wp.atan2(y + zero, x + zero))
 
 
 @wp.func
