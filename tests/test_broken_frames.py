@@ -8,6 +8,7 @@ from time import perf_counter
 
 import numpy as np
 import pytest
+from cloth import rms
 from glitches import GLITCHES, run
 from layers import world_metres
 from pxr import Usd
@@ -28,9 +29,9 @@ def clean() -> list[np.ndarray]:
     "name", [name if name in FAST else pytest.param(name, marks=pytest.mark.slow) for name in GLITCHES]
 )
 def test_cloth_is_back_after_five_frames(clean: list[np.ndarray], name: str):
-    """Unmended, cloth that a body swallowed for one frame stayed 34 mm from its place for good."""
+    """RMS: a fold may snap either way. Unmended, cloth that a body swallowed for a frame stayed 34 mm away for good."""
     told = run(1, AFTER, travel=0.0, glitch=GLITCHES[name], at=AT)
-    assert np.linalg.norm(told[-1][0] - clean[-1], axis=1).max() < 1e-3
+    assert rms(told[-1][0] - clean[-1]) < 1e-3
     assert told[AT + 1][1].get("broken_before", AT) == AT
 
 

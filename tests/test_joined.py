@@ -14,6 +14,7 @@ from shots import cloth_shot
 from physgraph_usd.shot.frames import Lead, Outcome
 from physgraph_usd.shot.joined import SafeMover, joined
 from physgraph_usd.shot.options import RefineOptions
+from physgraph_usd.shot.solve import ShotSolver
 from physgraph_usd.usd.read.reader import open_shot
 
 
@@ -68,7 +69,7 @@ def test_a_frame_that_failed_on_one_side_is_taken_as_it_is():
 def test_folds_that_change_sides_stop_before_they_cross(tmp_path: Path):
     """Half way between a half that lies over the other one, and under it, they would pass through each other."""
     with closing(open_shot(str(cloth_shot(tmp_path / "shot.usdc", times=(1.0,), size=(4, 3))))) as opened:
-        move = SafeMover(opened, RefineOptions(), [0])
+        move = SafeMover(ShotSolver(opened.path, [0], RefineOptions(), opened=opened), ["/Cloth"])
         flat = opened.frame(1.0).garments[0].points * [1.0, 1.0, 0.0]
         middle = flat.mean(axis=0)
         turned = np.flatnonzero(flat[:, 0] > middle[0] + 0.01)

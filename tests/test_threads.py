@@ -15,11 +15,18 @@ import torch
 import warp as wp
 
 import physgraph_usd
+from physgraph_usd.solver.mesh import threads as threads_module
 from physgraph_usd.solver.mesh.stencil import Stencil
-from physgraph_usd.solver.mesh.threads import LEAST_PER_THREAD, LEAST_QUERIES, Launch
+from physgraph_usd.solver.mesh.threads import Launch
 
 
-@pytest.mark.parametrize("rows", [3, LEAST_PER_THREAD, 3 * LEAST_PER_THREAD + 7])
+@pytest.fixture(autouse=True)
+def threaded(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Threads for however little work."""
+    monkeypatch.setattr(threads_module, "LEAST_SECONDS", 0.0)
+
+
+@pytest.mark.parametrize("rows", [3, 4000, 12_007])
 def test_threads_give_the_same_bits(rows: int) -> None:
     rng = np.random.default_rng(3)
     matrix = sp.csr_matrix(sp.random(rows, 50, density=0.1, random_state=rng))
@@ -30,18 +37,28 @@ def test_threads_give_the_same_bits(rows: int) -> None:
 
 
 class TestSlices:
-    @pytest.mark.parametrize("size", [500, 501, 12345, 300_200])
+    @pytest.mark.parametrize("size", [1, 7, 500, 501, 12345, 300_200])
     def test_each_item_is_in_one(self, size: int):
-        counts = self.counted(size, least=LEAST_QUERIES)
-        assert bool((counts == 1).all())
-
-    @staticmethod
-    def counted(size: int, *, least: int, threads: int = 2) -> torch.Tensor:
-        """How often each item is met."""
-        wp.init()
         out = torch.zeros(size, dtype=torch.int32)
-        Launch(_meet, size, [wp.from_torch(out)], device="cpu", threads=threads, least=least)({})
-        return out
+        launch = Launch(_meet, size, [wp.from_torch(out)], device="cpu", threads=2)
+        launch({})
+        assert bool((out == 1).all())
+        launch({})
+        assert bool((out == 2).all())
+
+    def test_a_launch_gets_threads_once_its_work_is_known_to_be_worth_them(self, monkeypatch: pytest.MonkeyPatch):
+        monkeypatch.setattr(threads_module, "LEAST_SECONDS", 1e-3)
+        asked: list[int] = []
+        monkeypatch.setattr(Launch, "_shared", lambda _self, threads, _work: asked.append(threads) or 1.0)
+        monkeypatch.setattr(threads_module, "_item_seconds", known := {})
+        launch = Launch(_meet, 1000, [wp.zeros(1000, dtype=wp.int32, device="cpu")], device="cpu", threads=8)
+        launch({})
+        assert asked == []
+        (name,) = known
+        for seconds in (1e-6, 1.9e-6, 2.1e-6, 1.0):
+            known[name] = seconds
+            launch({})
+        assert asked == [2, 8]
 
 
 @wp.kernel

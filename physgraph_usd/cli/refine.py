@@ -166,6 +166,10 @@ def _solved(jobs: Sequence[Job], output: Output) -> Generator[RefineReport | Phy
     """Fate of the jobs that are not finished."""
     if not jobs:
         return
+    from ..shot.processes import import_ahead
+
+    if output.several or any(options.workers > 1 and not options.scheduler for *_, options in jobs):
+        import_ahead()
     with imports_uncollected():
         from ..shot.refine import refine_shots
 

@@ -9,7 +9,7 @@ does not solve finished frames again.
 from __future__ import annotations
 
 import time as clock
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import replace
 from itertools import pairwise
@@ -20,7 +20,8 @@ import numpy as np
 from ..errors import LayerError, SolveError
 from ..interrupts import leave_if_asked
 from .frames import Finished, Folders, FrameFolder, Lead, Outcome
-from .processes import POLL_SECONDS, Start, memory_is_named, result_of
+from .joined import Mover, join
+from .processes import POLL_SECONDS, Start, memory_is_named, result_of, wait_for
 
 PREROLL = 6
 """Frames solved before a chunk if frames depend on their predecessors."""
@@ -29,6 +30,8 @@ LATE_SECONDS = 60.0
 """Longest time for a file to appear after its process has ended [s]: network file systems cache missing files."""
 Solver = Callable[[Sequence[float | None]], Iterator[Outcome]]
 """Solves time codes in order; must be picklable to run in several processes."""
+Seams = Mapping[int, tuple[int, float]]
+"""By number of a frame solved on both sides of a seam: number of the first frame after the seam, and `Lead.weight`."""
 
 
 def chunks_of(missing: Sequence[int], workers: int) -> list[list[range]]:
@@ -47,18 +50,13 @@ def _ranges(numbers: Sequence[int]) -> list[range]:
     return [range(numbers[a], numbers[b - 1] + 1) for a, b in pairwise([*starts, len(numbers)])]
 
 
-def seams_of(
-    chunks: Sequence[Sequence[range]], frames: Finished | Folders, *, preroll: int
-) -> dict[int, tuple[int, float]]:
+def seams_of(chunks: Sequence[Sequence[range]], frames: Finished | Folders, *, preroll: int) -> Seams:
     """Find the frames solved on both sides of a seam.
 
     Args:
         chunks: The frames of each worker.
         frames: Stored results; frames of an earlier run have their own seams.
         preroll: Frames solved before each range.
-
-    Returns:
-        By frame number: the number of the first frame after the seam, and the `Lead.weight`.
     """
     starts = frames.seams()
     parts = [part for chunk in chunks for part in chunk if part.start]
@@ -82,6 +80,7 @@ def solve_in_chunks(
     only: range | None = None,
     preroll: int = PREROLL,
     start: Start | None = None,
+    mover: Mover | None = None,
 ) -> Generator[Outcome, None, None]:
     """Solve all time codes except the kept ones, in this process or in several, and yield all in order.
 
@@ -94,6 +93,8 @@ def solve_in_chunks(
         preroll: Frames solved before each chunk except the shot's first; yielded as the ``lead`` of the same frames of
             the previous chunk.
         start: Starts a chunk in another process; None solves in this process.
+        mover: Moves cloth safely; other processes then join the frames before a seam once both sides are solved, and
+            a ``lead`` holds the joined frame. Picklable.
 
     Raises:
         SolveError: A process died.
@@ -107,7 +108,7 @@ def solve_in_chunks(
     if start is None:
         solved = _solve(solver, list(times), [part for chunk in chunks for part in chunk], frames, preroll)
     else:
-        calls = [start(_work, solver, list(times), chunk, frames, preroll) for chunk in chunks]
+        calls = [start(_work, (solver, list(times), chunk, frames, preroll), seams, mover) for chunk in chunks]
         owners = {k: call for chunk, call in zip(chunks, calls, strict=True) for part in chunk for k in part}
     for index in wanted:
         time = times[index]
@@ -117,7 +118,10 @@ def solve_in_chunks(
             lead = frames.read(index, time, seam=seam)
             if lead is None and seam not in frames.kept:
                 lead = _collect(frames, index, time, owner=owners.get(seam), solved=solved, seam=seam)
-            outcome = outcome if lead is None else replace(outcome, lead=Lead(lead, seam, weight))
+            if index in owners:
+                wait_for(owners[index])  # It may join its last frames with the next chunk.
+            made = frames.read(index, time, seam=seam, joined=True)
+            outcome = outcome if lead is None else replace(outcome, lead=Lead(lead, seam, weight, made))
         yield outcome
 
 
@@ -142,7 +146,8 @@ def finished_frames(
             outcome = replace(outcome, reused=(False,) * len(outcome.reused))
         seam, weight = seams.get(index, (None, 0.0))
         lead = None if seam is None else frames.read(index, times[index], seam=seam)
-        yield outcome if lead is None or seam is None else replace(outcome, lead=Lead(lead, seam, weight))
+        made = None if seam is None else frames.read(index, times[index], seam=seam, joined=True)
+        yield outcome if lead is None or seam is None else replace(outcome, lead=Lead(lead, seam, weight, made))
 
 
 def _solve(
@@ -157,10 +162,30 @@ def _solve(
                 yield index
 
 
-def _work(*job: Any) -> None:
-    """Solve a chunk in a worker process."""
+def _work(job: tuple[Any, ...], seams: Seams, mover: Mover | None) -> None:
+    """Solve a chunk in a worker process, and join its frames before a seam if the next chunk's are there."""
     for _ in _solve(*job):
         pass
+    _, times, chunk, frames, _ = job
+    own = {index for part in chunk for index in part}
+    for start in sorted({start for start, _ in seams.values()}) if mover else ():
+        numbers = [index for index, (seam, _) in seams.items() if seam == start]
+        if mover and own.issuperset(numbers):
+            _join(frames, {index: times[index] for index in numbers}, seams, mover)
+
+
+def _join(frames: FrameFolder, times: Mapping[int, float | None], seams: Seams, mover: Mover) -> None:
+    """Join and store the frames before a seam, by number, unless the next chunk's are missing or the cloth jumps."""
+    both = list[tuple[Outcome, Lead]]()
+    for index, time in times.items():
+        seam, weight = seams[index]
+        own, lead = frames.read(index, time), frames.read(index, time, seam=seam)
+        if own is None or lead is None:
+            return
+        both.append((own, Lead(lead, seam, weight)))
+    joint = join(both, mover)
+    for index, outcome in zip(times, joint.frames, strict=True) if not joint.why else ():
+        frames.write(index, outcome, seam=seams[index][0], joined=True)
 
 
 def _collect(

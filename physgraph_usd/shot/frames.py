@@ -39,10 +39,10 @@ CHUNK = "chunk"
 """Entry in a chunk's record: number of the first frame, and of the frame after the last."""
 _DONE, _FAILED = ".npz", ".failed.npz"
 _FRAMES = ".frames"
-_BEFORE = ".before"
+_BEFORE, _JOINED = ".before", ".joined"
 _DAMAGED = (OSError, ValueError, KeyError, TypeError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error)
 """Errors of numpy and zipfile when reading a file not written by `FrameFolder.write`."""
-_OURS = re.compile(r"(\d+(\.before\d+)?(\.failed)?\.npz|run\.json)(\.[\w-]+\.\d+\.tmp)?")
+_OURS = re.compile(r"(\d+(\.(before|joined)\d+)?(\.failed)?\.npz|run\.json)(\.[\w-]+\.\d+\.tmp)?")
 """File names of finished frames and of the record, including temporary names while writing."""
 
 
@@ -54,11 +54,13 @@ class Lead:
         outcome: Result of the process after the seam.
         seam: Number of the first frame solved by the process after the seam alone.
         weight: Weight of ``outcome`` in the joined frame: k / (L + 1) in the k-th of the L frames solved twice.
+        joined: The joined frame, if the process before the seam has joined it.
     """
 
     outcome: Outcome
     seam: int
     weight: float
+    joined: Outcome | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,8 +166,8 @@ class Finished:
         self.folder, self._counts = folder, tuple(counts)
         self.kept = frozenset(whole_frames(folder))
 
-    def _file(self, index: int, suffix: str = _DONE, *, seam: int | None = None) -> Path:
-        return self.folder / (f"{index}" + ("" if seam is None else f"{_BEFORE}{seam}") + suffix)
+    def _file(self, index: int, suffix: str = _DONE, *, seam: int | None = None, joined: bool = False) -> Path:
+        return self.folder / (f"{index}" + ("" if seam is None else f"{_JOINED if joined else _BEFORE}{seam}") + suffix)
 
     @property
     def failed(self) -> set[int]:
@@ -179,13 +181,13 @@ class Finished:
         found = {int(seam) for name in names if (seam := name.partition(_BEFORE)[2]).isdecimal()}
         return found & self.kept
 
-    def read(self, index: int, time: float | None, *, seam: int | None = None) -> Outcome | None:
-        """A frame's result, or None if not finished; ``seam`` as in `write`.
+    def read(self, index: int, time: float | None, *, seam: int | None = None, joined: bool = False) -> Outcome | None:
+        """A frame's result, or None if not finished; ``seam`` and ``joined`` as in `write`.
 
         Raises:
             LayerError: The file is damaged.
         """
-        files = (self._file(index, suffix, seam=seam) for suffix in (_DONE, _FAILED))
+        files = (self._file(index, suffix, seam=seam, joined=joined) for suffix in (_DONE, _FAILED))
         file = next((each for each in files if each.exists()), None)
         if file is None:
             return None
@@ -298,7 +300,7 @@ class FrameFolder(Finished):
         self.kept = frozenset(found if resume else ())
         self.dropped = 0 if resume or different else len(found)
         for file in self.folder.glob(f"*{_DONE}"):
-            if file.name.endswith(_FAILED) or not zipfile.is_zipfile(file):
+            if file.name.endswith(_FAILED) or _JOINED in file.name or not zipfile.is_zipfile(file):
                 file.unlink()
         if not self.kept:
             self._clear()
@@ -321,8 +323,14 @@ class FrameFolder(Finished):
         """Store the absolute path, for processes with a different working directory."""
         return self.__dict__ | {"folder": self.folder.absolute(), "_lock": None}
 
-    def write(self, index: int, outcome: Outcome, *, seam: int | None = None) -> None:
-        """Write a frame's result; ``seam``: number of the frame whose pre-roll the result belongs to, or None.
+    def write(self, index: int, outcome: Outcome, *, seam: int | None = None, joined: bool = False) -> None:
+        """Write a frame's result.
+
+        Args:
+            index: Number of the frame.
+            outcome: The result.
+            seam: Number of the frame whose pre-roll the result belongs to, or None.
+            joined: Whether the result is the frame as joined with that pre-roll.
 
         Raises:
             LayerError: The disk is full, or the folder is gone or taken by a new run: a task on a remote machine may
@@ -332,7 +340,7 @@ class FrameFolder(Finished):
         maps = [(k, name, values) for k, heat in enumerate(outcome.heat) for name, values in (heat or {}).items()]
         arrays |= {f"heat{k}.{name}": values for k, name, values in maps} | {"heated": np.array(len(outcome.heat))}
         arrays |= {"record": json.dumps(outcome.record), "reused": np.array(outcome.reused, dtype=bool)}
-        file = self._file(index, _DONE if outcome.points else _FAILED, seam=seam)
+        file = self._file(index, _DONE if outcome.points else _FAILED, seam=seam, joined=joined)
         temporary = temporary_path(file, suffix="")
         try:
             if (self.folder / RUN).read_text(encoding="utf-8") != self._run:
@@ -395,6 +403,6 @@ class Folders:
         """Numbers of the frames before which chunks, or two processes of one chunk, meet."""
         return set().union(*(folder.seams() for folder in {*self._owners.values()})) & self.kept
 
-    def read(self, index: int, time: float | None, *, seam: int | None = None) -> Outcome | None:
+    def read(self, index: int, time: float | None, *, seam: int | None = None, joined: bool = False) -> Outcome | None:
         """Read a frame like `Finished.read`; a seam's pre-roll is in the folder of the first frame after the seam."""
-        return self._owners[index if seam is None else seam].read(index, time, seam=seam)
+        return self._owners[index if seam is None else seam].read(index, time, seam=seam, joined=joined)

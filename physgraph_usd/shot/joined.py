@@ -13,19 +13,14 @@ solutions, nothing is joined and the cloth jumps.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from ..interrupts import leave_if_asked
-from ..solver.frame.refiner import Refiner
-from ..solver.mesh.kernels import device_of, start_warp
-from ..usd.read.reader import Shot
 from .frames import Lead, Outcome
-from .options import RefineOptions
 
 Both = Sequence[tuple[Outcome, Lead]]
 """The frames before a seam, each with the solution of the process behind the seam."""
@@ -95,7 +90,7 @@ def joined(
     for outcome in outcomes:
         ends = bool(both) and (outcome.lead is None or outcome.lead.seam != both[0][1].seam)
         if ends:
-            yield from _and_warn(both, join(both, move), warn, seen)
+            yield from _and_warn(both, _known(both) or join(both, move), warn, seen)
             both = []
         # "Reused" refers to the last pre-roll frame, which was not written.
         first = replace(outcome, reused=(False,) * len(outcome.reused)) if ends else outcome
@@ -103,7 +98,17 @@ def joined(
             yield first
         else:
             both.append((first, outcome.lead))
-    yield from _and_warn(both, join(both, move), warn, seen)
+    yield from _and_warn(both, _known(both) or join(both, move), warn, seen)
+
+
+def _known(both: Both) -> Joint | None:
+    """The frames of a seam as the process before it has joined them, or None."""
+    found = [
+        replace(lead.joined, reused=tuple(a and b for a, b in zip(own.reused, lead.joined.reused, strict=True)))
+        for own, lead in both
+        if lead.joined is not None
+    ]
+    return Joint(tuple(found), "") if len(found) == len(both) else None
 
 
 def _and_warn(
@@ -117,35 +122,39 @@ def _and_warn(
     return joint.frames
 
 
+class Movable(Protocol):
+    """A shot's cloth, moved without a solve."""
+
+    def moved_safely(
+        self, time: float | None, start: Positions, wanted: Positions
+    ) -> list[tuple[np.ndarray | None, dict[str, Any]]]:
+        """Like `Refiner.moved_safely`, at a time code."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
 class SafeMover:
-    """Moves the cloth of a shot without new intersections or vertices in bodies; the solver is built on first use."""
+    """Moves the cloth of a shot without new intersections or vertices in bodies, as `Mover` requires.
 
-    def __init__(self, opened: Shot, options: RefineOptions, levels: Sequence[int]) -> None:
-        """Take a shot.
+    Attributes:
+        cloth: The cloth.
+        paths: Path of each garment.
+    """
 
-        Args:
-            opened: The shot.
-            options: Options of the refinement.
-            levels: Subdivisions of each garment.
-        """
-        self._opened, self._options, self._levels = opened, options, list(levels)
-        self._refiner: Refiner | None = None
+    cloth: Movable
+    paths: Sequence[str]
 
     def __call__(
         self, time: float | None, near: Positions, far: Positions, wanted: Positions
     ) -> tuple[list[np.ndarray | None], str]:
-        """Move cloth as `Mover` requires, in world positions [m]."""
-        if self._refiner is None:
-            start_warp()
-            device = device_of(self._options.device)
-            how = {"levels": self._levels, "device": device, "threads": os.cpu_count() or 1}
-            self._refiner = Refiner(self._opened.scene, self._options.solve_settings(), **how)
-        frame = self._opened.frame(time)
-        found = self._refiner.moved_safely(frame, near, wanted)
-        sides = [[contact for _, contact in self._refiner.moved_safely(frame, side, side)] for side in (near, far)]
+        """Move cloth; the two solutions are measured only if the result crosses something."""
+        found = self.cloth.moved_safely(time, near, wanted)
+        sides: list[list[dict[str, Any]]] = []
+        if any(count for _, contact in found for count in _counts(contact).values()):
+            sides = [[contact for _, contact in self.cloth.moved_safely(time, side, side)] for side in (near, far)]
         worse = (
-            f"joined, <{source.path}> would have {more}"
-            for source, (_, contact), *others in zip(self._opened.sources, found, *sides, strict=True)
+            f"joined, <{path}> would have {more}"
+            for path, (_, contact), *others in zip(self.paths, found, *sides, strict=True)
             if (more := _worse(contact, others))
         )
         return [points for points, _ in found], next(worse, "")
@@ -155,7 +164,7 @@ def _worse(contact: Mapping[str, Any], others: Sequence[Mapping[str, Any]]) -> s
     """The first contact count larger than in all compared solutions, in words."""
     before = [_counts(each) for each in others]
     for name, count in _counts(contact).items():
-        if count > max(each.get(name, 0) for each in before):
+        if count > max((each.get(name, 0) for each in before), default=0):
             return f"{count:,} {name}"
     return ""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 import multiprocessing
 import os
 import re
@@ -13,6 +14,7 @@ import traceback
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor, ThreadPoolExecutor, wait
 from functools import partial
+from multiprocessing.context import BaseContext
 from typing import Any
 
 from ..errors import PhysGraphError, SolveError
@@ -23,8 +25,26 @@ PATIENCE_SECONDS = 10.0
 """Time for a process to clean up after it was asked to end [s]."""
 _MEMORY = re.compile(r"out of memory|n.t allocate|to allocate|bad_alloc", re.IGNORECASE)
 
+_PRELOAD = "physgraph_usd.shot.refine"
+"""Imported once for all processes, except on Windows: torch, Warp and the solver take 3 s."""
+
 Start = Callable[..., Future[Any]]
 """Starts a function with arguments in another process; all of them and the result must be picklable."""
+
+
+def import_ahead() -> None:
+    """Begin to import the solver for later processes, while this process goes on; nothing on Windows."""
+    if _context().get_start_method() == "forkserver":
+        importlib.import_module("multiprocessing.forkserver").ensure_running()
+
+
+def _context() -> BaseContext:
+    """How processes start: forked from a server process that has imported the solver, and nothing else."""
+    if "forkserver" not in multiprocessing.get_all_start_methods():
+        return multiprocessing.get_context("spawn")
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload([_PRELOAD])
+    return context
 
 
 @contextlib.contextmanager
@@ -36,11 +56,11 @@ def separate_processes(workers: int) -> Iterator[Start]:
     Args:
         workers: Most calls at a time; later calls wait.
     """
-    spawn, over = multiprocessing.get_context("spawn"), threading.Event()
+    context, over = _context(), threading.Event()
     pids: set[int] = set()
 
     def call(function: Callable[..., Any], *args: Any) -> Any:
-        with ProcessPoolExecutor(1, spawn, initializer=_begin) as pool:
+        with ProcessPoolExecutor(1, context, initializer=_begin) as pool:
             pids.add(pool.submit(os.getpid).result())
             return None if over.is_set() else pool.submit(_answer, function, *args).result()
 
@@ -79,6 +99,13 @@ def call_each(
                 yield error
 
 
+def wait_for(future: Future[Any]) -> None:
+    """Wait for a call's end."""
+    while not future.done():
+        leave_if_asked()
+        wait([future], POLL_SECONDS)
+
+
 def result_of(future: Future[Any], *, at: str = "") -> Any:
     """Wait for a call's result.
 
@@ -91,9 +118,7 @@ def result_of(future: Future[Any], *, at: str = "") -> Any:
             stderr.
         SolveError: The process died, or a farm dropped the call.
     """
-    while not future.done():
-        leave_if_asked()
-        wait([future], POLL_SECONDS)
+    wait_for(future)
     if future.cancelled():
         raise SolveError(f"a call was cancelled{at}: the farm's scheduler is gone, or dropped the call")
     error = future.exception()

@@ -188,7 +188,7 @@ class Run:
     def _solved(self, frames: FrameFolder | None) -> Outcomes:
         """Frames in order, including reused frames of an interrupted run, joined if solved by several processes."""
         times, numbers, options, joins = self._times, self._numbers, self.options, self.joins
-        mover = SafeMover(self.shot, options, self.solver.levels)
+        mover = SafeMover(self.solver, [str(source.path) for source in self.shot.sources])
         if joins is not None:
             solved = finished_frames(joins.frames, times, numbers, preroll=joins.preroll)
             yield from joined(solved, mover, self.report.warn, seen=joins.seen)
@@ -200,7 +200,7 @@ class Run:
         self._warn_of_finished(frames, len(numbers))
         with self._processes() as start:
             chunks = {"workers": options.workers, "only": numbers, "preroll": self._preroll, "start": start}
-            with closing(solve_in_chunks(self.solver, times, frames, **chunks)) as solved:
+            with closing(solve_in_chunks(self.solver, times, frames, mover=mover, **chunks)) as solved:
                 yield from solved if self._is_chunk else joined(solved, mover, self.report.warn)
 
     def _processes(self) -> AbstractContextManager[Start | None]:

@@ -9,6 +9,7 @@ from collections.abc import Generator, Sequence
 from statistics import mean
 from typing import Any
 
+import numpy as np
 import torch
 
 from ..errors import SolveError, StageError
@@ -16,14 +17,13 @@ from ..interrupts import leave_if_asked
 from ..solver.frame.lead_in import cages_walked
 from ..solver.frame.refiner import Refiner
 from ..solver.mesh.kernels import device_of, start_warp
+from ..solver.mesh.threads import cores
 from ..usd.read.reader import Shot
 from ..usd.view import Stage
 from .frames import Outcome
 from .options import RefineOptions
 from .untagged import open_with_colliders
 
-MOST_THREADS = 4
-"""Most useful threads for a frame's kernels: the metric's solve is single-threaded."""
 Outcomes = Generator[Outcome, None, None]
 
 
@@ -62,23 +62,21 @@ class ShotSolver:
         """Take a shot; ``opened`` is used in this process only, other processes open the shot again."""
         self.levels = levels
         self._shot, self._options = shot, dataclasses.replace(options, progress=None)
-        self._threads = min(MOST_THREADS, max(1, (os.cpu_count() or 1) // options.workers))
+        self._threads = max(1, cores() // options.workers)
         self._opened = opened
+        self._refiner: Refiner | None = None
 
     def __getstate__(self) -> dict[str, Any]:
-        """Drop the open stage: each process opens the shot itself, perhaps in a different working directory."""
+        """Drop what is open: each process opens the shot itself, perhaps in a different working directory."""
         weights = self._options.weights
         options = self._options if weights is None else dataclasses.replace(self._options, weights=weights.absolute())
-        return self.__dict__ | {"_opened": None, "_shot": os.path.abspath(self._shot), "_options": options}
+        opened = {"_opened": None, "_refiner": None}
+        return self.__dict__ | opened | {"_shot": os.path.abspath(self._shot), "_options": options}
 
     def __call__(self, times: Sequence[float | None]) -> Outcomes:
         """Solve time codes in order; a failed one yields its error, the next starts from the last solved frame."""
-        device = prepare_device(self._options.device)
-        shot = self._opened = self._opened or open_for(self._shot, self._options)
-        settings = self._options.solve_settings()
-        options = {"device": device, "threads": self._threads, "heat_map": self._options.heat_map}
-        refiner = Refiner(shot.scene, settings, levels=self.levels, **options)
-        self._begin(shot, refiner, times, device)
+        shot, refiner = self._built()
+        self._begin(shot, refiner, times)
         for time in times:
             began = clock.perf_counter()
             try:
@@ -91,11 +89,30 @@ class ShotSolver:
                 outcome = Outcome(time, (), (), {"time": time, "error": str(error)})
             leave_if_asked()  # A signal may have cut the frame short.
             yield outcome
+        self._refiner = refiner
 
-    def _begin(self, shot: Shot, refiner: Refiner, times: Sequence[float | None], device: str) -> None:
+    def moved_safely(
+        self, time: float | None, start: Sequence[np.ndarray | None], wanted: Sequence[np.ndarray | None]
+    ) -> list[tuple[np.ndarray | None, dict[str, Any]]]:
+        """Like `Refiner.moved_safely`, at a time code; the levels are those of the last solved range, if any."""
+        shot = self._opened
+        if self._refiner is None or shot is None:
+            shot, self._refiner = self._built()
+        self._refiner.forget()
+        return self._refiner.moved_safely(shot.frame(time), start, wanted)
+
+    def _built(self) -> tuple[Shot, Refiner]:
+        """The shot, opened if necessary, and a new refiner."""
+        device = prepare_device(self._options.device)
+        self._opened = self._opened or open_for(self._shot, self._options)
+        options = {"device": device, "threads": self._threads, "heat_map": self._options.heat_map}
+        settings = self._options.solve_settings()
+        return self._opened, Refiner(self._opened.scene, settings, levels=self.levels, **options)
+
+    def _begin(self, shot: Shot, refiner: Refiner, times: Sequence[float | None]) -> None:
         """Start a shot in the middle, if its cage crosses itself, with the cage advanced from an earlier frame."""
         earlier = [] if not times or times[0] is None else shot.times_until(times[0])
-        settings = {"times": earlier, "device": device, "threads": self._threads}
+        settings = {"times": earlier, "device": device_of(self._options.device), "threads": self._threads}
         found = cages_walked(shot.scene, self._options.solve_settings(), shot.frame, **settings)
         if found is not None:
             refiner.begin_at(found[0], since=found[1])
@@ -116,8 +133,7 @@ def time_frames(shot: Shot, options: RefineOptions, levels: list[int]) -> dict[s
         levels: Subdivisions of each garment.
     """
     device = prepare_device(options.device)
-    threads = min(MOST_THREADS, max(1, os.cpu_count() or 1))
-    refiner = Refiner(shot.scene, options.solve_settings(), levels=levels, device=device, threads=threads)
+    refiner = Refiner(shot.scene, options.solve_settings(), levels=levels, device=device, threads=cores())
     times, spent = list(shot.scene.times) or [None], []
     middle = max(len(times) // 2 - 1, 0)
     for time in times[middle : middle + 3]:

@@ -29,7 +29,7 @@ from .options import RefineOptions
 from .refine import check_places, running, write_all
 from .report import RefineReport
 from .run import fine_meshes, numbers_in
-from .solve import open_for
+from .solve import ShotSolver, open_for
 
 SEAM_BOUND = 0.05
 """Largest increase of a frame's move by a seam, RMS over a garment, in mean fine edges; figures in `docs/farm.md`."""
@@ -265,7 +265,8 @@ def check_seams(
             start = pair[1].run[CHUNK][0]
             numbers = [k for k in pair[0].numbers if k >= start - pair[0].preroll]
             joins = _joins(pair, opened, seam_bound)
-            mover = SafeMover(opened, pair[0].options(), pair[0].run["levels"])
+            solver = ShotSolver(str(shot or pair[0].shot), pair[0].run["levels"], pair[0].options(), opened=opened)
+            mover = SafeMover(solver, [str(source.path) for source in opened.sources])
             leading = finished_frames(joins.frames, pair[0].run["times"], numbers, preroll=joins.preroll)
             for _ in joined(leading, mover, lambda _: None, seen=joins.seen):
                 pass

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import pairwise
 
 from ..shot.options import RefineOptions
-from ..shot.solve import MOST_THREADS, sampled_at
+from ..shot.solve import sampled_at
 from ..solver.frame.lead_in import cages_walked
 from ..solver.frame.refiner import Refiner
 from ..solver.frame.settings import SolveSettings
+from ..solver.mesh.threads import cores
 from ..solver.scene import State
 from ..usd.read.reader import Shot
 
@@ -40,7 +40,7 @@ class FrameSolver:
         """
         self._times = shot.scene.times
         self._settings = _settings(contact=contact)
-        self._threads = min(MOST_THREADS, os.cpu_count() or 1)
+        self._threads = cores()
         self._exact = Refiner(shot.scene, self._settings, levels=levels, device=device, threads=self._threads)
         self._quick: tuple[Refiner, float | None] | None = None  # And the time code where it is.
         self.refinements = self._exact.refinements

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import platform
 import statistics
 import time
@@ -16,8 +15,9 @@ import torch
 
 from ...errors import UsageError
 from ...shot.options import RefineOptions
-from ...shot.solve import MOST_THREADS, prepare_device
+from ...shot.solve import prepare_device
 from ...shot.untagged import open_with_colliders
+from ...solver.mesh.threads import cores
 from ...solver.resolution import choose_levels, sample_frames
 from ...solver.scene import Frame, Scene
 from ...usd.files import check_targets, files_of
@@ -106,7 +106,7 @@ def _measure(opened: Shot, folder: Path, options: ChartOptions) -> Chart:
     )
 
     def build(scene: Scene, levels: Sequence[int], dtype: torch.dtype = torch.float32) -> Problem:
-        threads = min(MOST_THREADS, os.cpu_count() or 1) if options.clock == "wall" else 1
+        threads = cores() if options.clock == "wall" else 1
         return Problem(scene, levels, device=options.device, threads=threads, dtype=dtype, clock=options.clock)
 
     problems = build(opened.scene, levels), build(opened.scene, levels, torch.float64)
@@ -175,7 +175,7 @@ def _about(opened: Shot, levels: Sequence[int], options: ChartOptions) -> dict[s
         "levels": list(levels),
         "device": device,
         "processor": name or platform.machine(),
-        "cores": os.cpu_count(),
+        "cores": cores(),
         "clock": options.clock,
         "default": {"integrator": RefineOptions().integrator, "steps": COLD.steps, "tolerance": COLD.tolerance},
         "options": options.plain(),

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ..level import Level
 from ..mesh.kernels import KERNELS
-from ..mesh.threads import LEAST_QUERIES, Launch
+from ..mesh.threads import run
 from .distance import weights_on_triangle
 
 wp.set_module_options(KERNELS)
@@ -96,5 +96,5 @@ def displacements_to(
     inputs = [wp.from_torch(at, dtype=wp.vec3d), wp.from_torch(level.triangles.int().contiguous(), dtype=wp.vec3i)]
     inputs += [tree.id, *(wp.from_torch(each.int().contiguous()) for each in (asked, which)), begin, members]
     inputs += [2.0 * float(level.spacing.mean()), wp.from_torch(out, dtype=wp.vec3d)]
-    Launch(_closest_of, len(asked), inputs, device=device, threads=level.threads, least=LEAST_QUERIES)({})
+    run(_closest_of, len(asked), inputs, device=device, threads=level.threads)
     return out

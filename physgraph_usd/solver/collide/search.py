@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ..mesh.kernels import KERNELS
-from ..mesh.threads import LEAST_PER_THREAD, LEAST_QUERIES, argument, run
+from ..mesh.threads import argument, run
 from .boxes import CROSSING, MOVE, MOVE_NEAR, NEAR, Boxes, Query, bound_clusters, bound_parts, boxes_near, query_of
 from .narrow_phase import Found, check_pairs, find_pairs
 from .pairs import NearAt, Pairs, Reach
@@ -183,7 +183,7 @@ def _near_clusters(parts: Parts, query: Any, tree: wp.Bvh) -> Int[Tensor, "pairs
         slots = torch.empty((size, room), dtype=torch.int32, device=device)
         count = torch.empty(size, dtype=torch.int32, device=device)
         inputs = [query, parts.boxes, tree.id, room, argument(slots.view(-1)), argument(count)]
-        _launch(parts, find_clusters, size, *inputs, least=LEAST_QUERIES)
+        _launch(parts, find_clusters, size, *inputs)
         most = int(count.max())
         if most <= room:
             break
@@ -219,11 +219,10 @@ def _write(
     found.corners = wp.from_torch(out.corners, dtype=wp.vec4i)
     found.value, found.face = wp.from_torch(out.value), wp.from_torch(out.face)
     inputs = [argument(clusters.contiguous(), wp.vec2i), query, parts.boxes, found]
-    _launch(parts, find_pairs, len(clusters), *inputs, least=LEAST_QUERIES)
+    _launch(parts, find_pairs, len(clusters), *inputs)
     return out, count
 
 
-def _launch(parts: Parts, kernel: wp.Kernel, size: int, *inputs: object, least: int = LEAST_PER_THREAD) -> None:
-    """Run a kernel over clusters or pairs of clusters; a further thread needs a minimum number of items."""
-    launched = {"device": parts.level.device, "threads": parts.level.threads, "least": least}
-    run(kernel, size, [parts.topology, *inputs], **launched)
+def _launch(parts: Parts, kernel: wp.Kernel, size: int, *inputs: object) -> None:
+    """Run a kernel over clusters or pairs of clusters."""
+    run(kernel, size, [parts.topology, *inputs], device=parts.level.device, threads=parts.level.threads)

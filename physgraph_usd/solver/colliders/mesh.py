@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..mesh.kernels import KERNELS
-from ..mesh.threads import LEAST_QUERIES, argument, run
+from ..mesh.threads import argument, run
 from .base import Nearest, Solid
 from .orient import FIXED, Pieces, pieces_of
 from .overlap import overlapping
@@ -224,8 +224,7 @@ class MeshSurface:
 
     def run(self, kernel: wp.Kernel, mesh: wp.Mesh, count: int, inputs: list[object]) -> None:
         """Launch over points in slices on several threads."""
-        given = {"device": self.device, "threads": self.threads, "least": LEAST_QUERIES}
-        run(kernel, count, [mesh.id, *inputs], **given)
+        run(kernel, count, [mesh.id, *inputs], device=self.device, threads=self.threads)
 
     def _on_rim(self, face: Tensor, weight: Tensor) -> Bool[Tensor, " points"]:
         """Mask of the closest points on a rim edge or a rim vertex."""

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ..mesh.kernels import KERNELS
 from ..mesh.piercing import passes_through, wide
-from ..mesh.threads import LEAST_QUERIES, Launch
+from ..mesh.threads import run
 
 wp.set_module_options(KERNELS)
 
@@ -69,5 +69,5 @@ def overlapping(mesh: wp.Mesh, faces: Int[Tensor, " faces"], *, threads: int = 1
     if len(faces):
         ask = faces.to(torch.int32).contiguous()
         inputs = [mesh.id, wp.from_torch(ask), mesh.points, mesh.indices, wp.from_torch(out)]
-        Launch(_overlap, len(faces), inputs, device=str(faces.device), threads=threads, least=LEAST_QUERIES)({})
+        run(_overlap, len(faces), inputs, device=str(faces.device), threads=threads)
     return out > 0

@@ -1,14 +1,17 @@
 """Kernel launches prepared once: on the CPU in slices on several threads, on CUDA as a whole.
 
 Warp runs a CPU kernel on the calling thread and releases the interpreter lock meanwhile, so slices run in parallel.
-Each item writes only to its own places, so the number of threads changes no bit of the result.
+Each item writes only to its own places, so the number of threads changes no bit of the result. How many threads a
+launch gets follows from the time that the kernel took for an item so far.
 """
 
 from __future__ import annotations
 
 import copy
 import functools
-from collections.abc import Iterator, Mapping, Sequence
+import os
+import time
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from itertools import pairwise
 from typing import Any
@@ -17,13 +20,18 @@ import torch
 import warp as wp
 from torch import Tensor
 
-LEAST_PER_THREAD = 4000
-"""Items per thread below which an additional thread costs more than the gain."""
-LEAST_QUERIES = 250
-"""Items per thread, as above, for items that query a hierarchy or represent many elements."""
-SLICES, LEAST_SLICE = 8, 32
-"""Slices per thread for such items, and their least average size: some items cost a hundred times as much as average,
-so free threads take the next slice, and slices shrink to shorten the wait for the last."""
+LEAST_SECONDS = 5e-4
+"""Work per thread below which another thread costs more than it gains: waking one takes some 0.2 ms [s]."""
+SLICES, SLICE_SECONDS = 8, 5e-5
+"""Slices per thread and their least average work [s]: some items cost a hundred times as much as average, so free
+threads take the next slice, and slices shrink to shorten the wait for the last."""
+_item_seconds: dict[str, float] = {}
+"""By kernel: time of an item in its last launches, on one thread [s]."""
+
+
+def cores() -> int:
+    """Number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 class Launch:
@@ -37,7 +45,6 @@ class Launch:
         *,
         device: str,
         threads: int = 1,
-        least: int = LEAST_PER_THREAD,
         at_once: int = 1,
     ) -> None:
         """Prepare the launch.
@@ -48,46 +55,51 @@ class Launch:
             inputs: The kernel's arrays; changing arrays are given again at each call.
             device: "cpu" or a CUDA device.
             threads: Most threads to use on the CPU.
-            least: Items per thread below which an additional thread costs more than the gain.
             at_once: Number of elements in an item of the kernel.
         """
-        self._threads = threads = max(1, min(threads, size // least)) if device == "cpu" else 1
-        size = -(-size // at_once)
+        self._size, self._name = -(-size // at_once), f"{kernel.module.name}.{kernel.key}"
         self._device = None if device == "cpu" else device
-        slices = min(SLICES * threads, size // LEAST_SLICE) if threads > 1 and least < LEAST_PER_THREAD else threads
-        bounds = _tapered(size, slices) if slices > threads else [size * i // slices for i in range(slices + 1)]
-        whole = wp.launch(kernel, dim=size, inputs=[0, *inputs], device=device, record_cmd=True)
-        self._commands: list[wp.Launch] = []
-        if whole is not None and size:
-            self._commands = [whole] if slices == 1 else [_part(whole, a, b) for a, b in pairwise(bounds)]
+        self._most = threads if self._device is None else 1
+        whole = wp.launch(kernel, dim=self._size, inputs=[0, *inputs], device=device, record_cmd=True)
+        self._whole: wp.Launch | None = whole if self._size else None
+        self._slices: list[wp.Launch] = []
 
     def change(self, changed: Mapping[int, Any]) -> None:
         """Replace some inputs from now on, by position in ``inputs``."""
-        for command in self._commands:
+        for command in (self._whole, *self._slices) if self._whole is not None else ():
             for place, array in changed.items():
                 command.set_param_at_index(place + 1, array)
 
     def __call__(self, changed: Mapping[int, Any]) -> None:
         """Run with some inputs replaced, by position in ``inputs``."""
         self.change(changed)
+        if self._whole is None:
+            return
         if self._device is not None:
-            stream = current_stream(self._device)
-            for command in self._commands:
-                command.launch(stream=stream)
+            self._whole.launch(stream=current_stream(self._device))
             return
-        if self._threads == 1:
-            _run(iter(self._commands))
-            return
-        left = iter(self._commands)  # A list's iterator hands each command to one thread only.
-        others: list[Future[None]] = []
+        known = _item_seconds.get(self._name, 0.0)
+        work = known * self._size
+        threads = self._most if LEAST_SECONDS == 0.0 else min(self._most, int(work / LEAST_SECONDS))
+        spent = _run([self._whole]) if threads < 2 else self._shared(threads, work)
+        _item_seconds[self._name] = 0.5 * (known + spent / self._size)
+
+    def _shared(self, threads: int, work: float) -> float:
+        """Run on several threads, given the work [s]; returns the time of all threads together [s]."""
+        assert self._whole is not None
+        if not self._slices:
+            count = SLICES * threads if LEAST_SECONDS == 0.0 else min(SLICES * threads, int(work / SLICE_SECONDS))
+            bounds = _tapered(self._size, min(count, self._size))
+            self._slices = [_part(self._whole, a, b) for a, b in pairwise(bounds) if b > a]
+        left = iter(self._slices)  # A list's iterator hands each command to one thread only.
+        others: list[Future[float]] = []
         try:
-            for _ in range(self._threads - 1):
-                others.append(_pool(self._threads).submit(_run, left))
-            _run(left)
+            for _ in range(threads - 1):
+                others.append(_pool(self._most).submit(_run, left))
+            spent = _run(left)
         finally:
             wait(others)  # The caller may free its arrays only after all threads have finished.
-        for other in others:
-            other.result()
+        return spent + sum(other.result() for other in others)
 
 
 def run(
@@ -97,11 +109,10 @@ def run(
     *,
     device: str,
     threads: int = 1,
-    least: int = LEAST_PER_THREAD,
 ) -> None:
     """Run a kernel once, like a `Launch`."""
     if device == "cpu":
-        Launch(kernel, size, inputs, device=device, threads=threads, least=least)({})
+        Launch(kernel, size, inputs, device=device, threads=threads)({})
     elif size:
         wp.launch(kernel, dim=size, inputs=[0, *inputs], device=device, stream=current_stream(device))
 
@@ -130,10 +141,12 @@ def _part(whole: wp.Launch, begin: int, end: int) -> wp.Launch:
     return part
 
 
-def _run(commands: Iterator[wp.Launch]) -> None:
-    """Launch the remaining commands."""
+def _run(commands: Iterable[wp.Launch]) -> float:
+    """Launch the remaining commands; returns the time that they took [s]."""
+    began = time.perf_counter()
     for command in commands:
         command.launch()
+    return time.perf_counter() - began
 
 
 def current_stream(device: str) -> wp.Stream:
