@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import pickle
 import threading
 from concurrent.futures import Future
@@ -20,7 +21,8 @@ from shots import EDGE, cloth_shot, faults, fine, interrupted, refine, run, samp
 from physgraph_usd.errors import LayerError, SolveError
 from physgraph_usd.shot.chunks import chunks_of, solve_in_chunks
 from physgraph_usd.shot.frames import FrameFolder, Outcome
-from physgraph_usd.shot.processes import memory_is_named
+from physgraph_usd.shot.processes import cores, memory_is_named, result_of, separate_processes
+from physgraph_usd.solver.mesh.kernels import cards_for
 
 SEAM = 5e-2
 """Largest difference that the number of workers makes, RMS over a frame, in fine edge lengths; 0.036 was measured."""
@@ -48,6 +50,18 @@ def test_what_a_gpu_lacks_may_be_there_without_it(said: str):
     with pytest.raises(SolveError, match="out of memory on the CUDA device; a lower --level or --device cpu"):
         with memory_is_named():
             raise RuntimeError(said)
+
+
+def test_processes_share_out_cards_and_cores(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("OMP_NUM_THREADS", "6")
+    with separate_processes(3, cards=["0", "2"]) as start:
+        calls = [start(os.getenv, name) for name in ("CUDA_VISIBLE_DEVICES",) * 3 + ("OMP_NUM_THREADS",)]
+        *cards, threads = [result_of(call) for call in calls]
+    assert sorted(cards) in (["0", "0", "2"], ["0", "2", "2"])
+    assert threads == str(max(1, cores() // 3))
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "4,7")
+    assert cards_for("cuda") == cards_for("auto") == ["4", "7"]
+    assert cards_for("cuda:1") == cards_for("cpu") == []
 
 
 class TestFarmFolder:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import itertools
 import multiprocessing
 import os
 import re
@@ -25,11 +26,19 @@ PATIENCE_SECONDS = 10.0
 """Time for a process to clean up after it was asked to end [s]."""
 _MEMORY = re.compile(r"out of memory|n.t allocate|to allocate|bad_alloc", re.IGNORECASE)
 
+_THREADS = "OMP_NUM_THREADS"
 _PRELOAD = "physgraph_usd.shot.refine"
 """Imported once for all processes, except on Windows: torch, Warp and the solver take 3 s."""
 
 Start = Callable[..., Future[Any]]
 """Starts a function with arguments in another process; all of them and the result must be picklable."""
+
+
+def cores() -> int:
+    """Number of cores that this process may use, at most OMP_NUM_THREADS."""
+    count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    most = os.environ.get(_THREADS, "")
+    return min(count, int(most)) if most.isdecimal() and int(most) else count
 
 
 def import_ahead() -> None:
@@ -48,28 +57,30 @@ def _context() -> BaseContext:
 
 
 @contextlib.contextmanager
-def separate_processes(workers: int) -> Iterator[Start]:
+def separate_processes(workers: int, *, cards: Sequence[str] = ()) -> Iterator[Start]:
     """Start each call in a new process; calls still running at the end of the block are ended.
 
     A pool of processes breaks as a whole when one of them dies, so each call has a pool of one.
 
     Args:
         workers: Most calls at a time; later calls wait.
+        cards: Cards that calls use in turn, as CUDA_VISIBLE_DEVICES names them; all see all cards without any.
     """
     context, over = _context(), threading.Event()
+    turns, threads = itertools.cycle(cards or [None]), max(1, cores() // workers)
     pids: set[int] = set()
 
     def call(function: Callable[..., Any], *args: Any) -> Any:
-        with ProcessPoolExecutor(1, context, initializer=_begin) as pool:
+        with ProcessPoolExecutor(1, context, initializer=_begin, initargs=(next(turns), threads)) as pool:
             pids.add(pool.submit(os.getpid).result())
             return None if over.is_set() else pool.submit(_answer, function, *args).result()
 
-    with ThreadPoolExecutor(workers) as threads:
+    with ThreadPoolExecutor(workers) as callers:
         try:
-            yield partial(threads.submit, call)
+            yield partial(callers.submit, call)
         finally:
             over.set()
-            threads.shutdown(wait=False, cancel_futures=True)
+            callers.shutdown(wait=False, cancel_futures=True)
             running = [child for child in multiprocessing.active_children() if child.pid in pids]
             for child in running:
                 child.terminate()
@@ -79,7 +90,7 @@ def separate_processes(workers: int) -> Iterator[Start]:
 
 
 def call_each(
-    function: Callable[..., Any], jobs: Sequence[tuple[Any, ...]], *, workers: int
+    function: Callable[..., Any], jobs: Sequence[tuple[Any, ...]], *, workers: int, cards: Sequence[str] = ()
 ) -> Generator[Any, None, None]:
     """Call a function once per job, each call in a new process, and yield results in order.
 
@@ -87,11 +98,12 @@ def call_each(
         function: The function; picklable.
         jobs: Arguments of each call.
         workers: Most calls at a time.
+        cards: As in `separate_processes`.
 
     Returns:
         Per job the result, or the `PhysGraphError` raised.
     """
-    with separate_processes(workers) as start:
+    with separate_processes(workers, cards=cards) as start:
         for future in [start(function, *job) for job in jobs]:
             try:
                 yield result_of(future)
@@ -151,8 +163,11 @@ def memory_is_named() -> Iterator[None]:
         raise SolveError("out of memory; a lower --level or fewer --workers needs less") from error
 
 
-def _begin() -> None:
-    """Prepare a worker process: the parent handles Ctrl-C, and a worker ends with its parent."""
+def _begin(card: str | None, threads: int) -> None:
+    """Prepare a worker process: its card, if any, and threads; the parent handles Ctrl-C; it ends with its parent."""
+    os.environ[_THREADS] = str(threads)
+    if card is not None:
+        os.environ["CUDA_VISIBLE_DEVICES"] = card
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
 

@@ -12,6 +12,7 @@ from typing import Any
 from ..errors import LayerError, PhysGraphError, StageError, UsageError
 from ..interrupts import SIGNALLED, exit_code_of, signals_noted
 from ..solver.integrate.metric import FACTOR
+from ..solver.mesh.kernels import cards_for
 from ..usd.files import check_targets, files_of
 from ..usd.provenance import is_result_of, write_root
 from ..usd.read.reader import Shot
@@ -189,7 +190,8 @@ def refine_shots(
         for (shot, out, options), there in zip(jobs, found, strict=True)
         if there is None
     ]
-    return in_order(found, call_each(refine, alone, workers=at_once))
+    cards = cards_for(jobs[0][2].device) if jobs else []
+    return in_order(found, call_each(refine, alone, workers=at_once, cards=cards))
 
 
 def check_places(out: Path, options: RefineOptions) -> None:

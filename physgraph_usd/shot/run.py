@@ -14,7 +14,7 @@ from typing import Any, Protocol
 
 from ..errors import NOTICE, AbsentError, SolveError, counted
 from ..solver.level import refine_garments
-from ..solver.mesh.kernels import kernels_are_compiled
+from ..solver.mesh.kernels import cards_for, kernels_are_compiled
 from ..solver.mesh.subdivide import Refinement
 from ..solver.mesh.topology import PolygonMesh
 from ..solver.scene import Garment
@@ -207,7 +207,9 @@ class Run:
         """Starter of chunks: on a farm, in processes of this machine, or None to solve in this process."""
         if self.options.scheduler:
             return connected(self.options.scheduler)
-        return separate_processes(self.options.workers) if self.options.workers > 1 else nullcontext()
+        if self.options.workers == 1:
+            return nullcontext()
+        return separate_processes(self.options.workers, cards=cards_for(self.options.device))
 
     def _warn_of_finished(self, frames: FrameFolder, count: int) -> None:
         """Warn if frames of an earlier run are used, or could have been."""

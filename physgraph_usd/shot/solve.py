@@ -17,11 +17,11 @@ from ..interrupts import leave_if_asked
 from ..solver.frame.lead_in import cages_walked
 from ..solver.frame.refiner import Refiner
 from ..solver.mesh.kernels import device_of, start_warp
-from ..solver.mesh.threads import cores
 from ..usd.read.reader import Shot
 from ..usd.view import Stage
 from .frames import Outcome
 from .options import RefineOptions
+from .processes import cores
 from .untagged import open_with_colliders
 
 Outcomes = Generator[Outcome, None, None]

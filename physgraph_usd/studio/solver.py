@@ -7,11 +7,11 @@ from dataclasses import replace
 from itertools import pairwise
 
 from ..shot.options import RefineOptions
+from ..shot.processes import cores
 from ..shot.solve import sampled_at
 from ..solver.frame.lead_in import cages_walked
 from ..solver.frame.refiner import Refiner
 from ..solver.frame.settings import SolveSettings
-from ..solver.mesh.threads import cores
 from ..solver.scene import State
 from ..usd.read.reader import Shot
 

@@ -188,8 +188,9 @@ def _near_clusters(parts: Parts, query: Any, tree: wp.Bvh) -> Int[Tensor, "pairs
         if most <= room:
             break
         room = most
-    first = torch.arange(size, dtype=torch.int32, device=device).repeat_interleave(count)
-    second = slots[torch.arange(room, device=device) < count.unsqueeze(1)]
+    total = int(count.sum())
+    first = torch.arange(size, dtype=torch.int32, device=device).repeat_interleave(count, output_size=total)
+    second = slots.view(-1)[_used(torch.arange(size, device=device) * room, count, total)]
     order = torch.argsort(first.long() * size + second)  # Not the tree's, which the pose decides in which it was built.
     return torch.stack([first[order], second[order]], dim=1)
 
@@ -200,13 +201,19 @@ def _pairs_of(parts: Parts, clusters: Int[Tensor, "clusters 2"], query: Any) -> 
     room = min(max(PAIRS // size, LEAST), MOST)
     begin = torch.arange(size + 1, dtype=torch.int32, device=device) * room
     found, count = _write(parts, clusters, query, begin)
-    kept = (torch.arange(room, device=device) < count.unsqueeze(1)) & (count <= room).unsqueeze(1)
-    found = found.where(kept.view(-1))
+    kept = torch.where(count <= room, count, 0)
+    found = found.where(_used(begin[:-1], kept, int(kept.sum())))
     over = torch.nonzero(count > room).squeeze(1)
     if not len(over):
         return found
     begin = torch.nn.functional.pad(count[over].cumsum(dim=0, dtype=torch.int32), (1, 0))
     return found.joined(_write(parts, clusters[over], query, begin)[0])
+
+
+def _used(begin: Int[Tensor, " rows"], count: Int[Tensor, " rows"], total: int) -> Int[Tensor, " total"]:
+    """Places in use: ``count`` of each row, from ``begin`` on."""
+    before = begin - (count.cumsum(dim=0) - count)
+    return before.repeat_interleave(count, output_size=total) + torch.arange(total, device=count.device)
 
 
 def _write(

@@ -17,6 +17,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..level import Level
+from ..mesh.stencil import rows_of
 
 
 class Tether:
@@ -47,6 +48,7 @@ class Tether:
         self._level = level
         self._density, self._area = density.to(level.rest)[level.vertex_garment.long()], level.vertex_area
         self._weight = stiffness * self._density * self._area
+        self._pull = rows_of(self._weight.unsqueeze(1))
         self.predicted, self.stiffness = predicted, stiffness
 
     def aim(self, predicted: Float[Tensor, "vertices 3"], stiffness: float) -> None:
@@ -54,11 +56,12 @@ class Tether:
         self.predicted.copy_(predicted)
         self.stiffness = stiffness
         self._weight.copy_(stiffness * self._density * self._area)
+        self._pull.copy_(self._weight.unsqueeze(1))
 
     def add_force(self, x: Float[Tensor, "vertices 3"], force: Float[Tensor, "vertices 3"]) -> Float[Tensor, ""]:
         """Add the force [N] in place and return the energy [J]."""
         stray = x - self.predicted
-        pull = self._weight.unsqueeze(1) * stray
+        pull = self._pull * stray
         force -= pull
         return 0.5 * (pull * stray).sum(dtype=torch.float64)
 

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..level import Level
+from ..mesh.stencil import rows_of
 
 Solver = Callable[[Tensor], Tensor]
 """Maps right-hand sides [N] to solutions [m], shape (V, 3)."""
@@ -88,7 +89,7 @@ class System:
         self.field, self.metric = field, metric
         self.free, self.spacing, self.level = free, spacing, level
         self._all_free = bool(free.all())
-        self._mask = free.to(spacing.dtype)  # A factor of the vectors' own type saves a conversion at each product.
+        self._mask = rows_of(free.to(spacing.dtype))
         self.evaluations = self.metric_solves = self.failed = 0
 
     @property
@@ -143,9 +144,19 @@ class System:
         return self.metric.diagonal.to(self.spacing)
 
     @cached_property
+    def rest_diagonal_rows(self) -> Float[Tensor, "vertices 3"]:
+        """`rest_diagonal` in each column."""
+        return rows_of(self.rest_diagonal.unsqueeze(1))
+
+    @cached_property
+    def _per_edge(self) -> Float[Tensor, "vertices 3"]:
+        """Factor from a move to its share of `relative_move` [1/m]."""
+        return rows_of((1.0 / (self.spacing * self.free.sum().clamp_min(1).sqrt())).unsqueeze(1))
+
+    @cached_property
     def reach(self) -> Float[Tensor, " vertices"]:
         """The spacing [m], and 0 at fixed vertices."""
-        return self.spacing * self._mask.squeeze(1)
+        return self.spacing * self._mask[:, 0]
 
     def remaining_move(self, preconditioned: Float[Tensor, "vertices 3"]) -> float:
         """RMS of H0^-1 F over the free vertices, in local edge lengths."""
@@ -153,8 +164,8 @@ class System:
 
     def relative_move(self, preconditioned: Float[Tensor, "vertices 3"]) -> Float[Tensor, ""]:
         """`remaining_move` as a tensor on the device, float64."""
-        relative = preconditioned.square().sum(dim=1) / self.spacing.square()
-        return (relative.sum(dtype=torch.float64) / self.free.sum().clamp_min(1)).sqrt()
+        relative = preconditioned * self._per_edge
+        return relative.square().sum(dtype=torch.float64).sqrt()
 
 
 @dataclass(frozen=True, eq=False)

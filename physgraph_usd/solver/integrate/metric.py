@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from scipy.sparse.linalg import splu
 from torch import Tensor
 
-from ..mesh.stencil import Stencil, add_at
+from ..mesh.stencil import Stencil, add_at, rows_of
 from .base import Solver
 from .multifrontal import DissectedSolver, Elimination
 
@@ -64,7 +64,7 @@ class Metric:
             free: False at fixed vertices, whose rows become identity rows.
             dtype: Scalar type of the right-hand sides.
         """
-        self._mask, self._free, self._matrix = free.to(dtype), free.squeeze(1), matrix
+        self._mask, self._free, self._matrix = rows_of(free.to(dtype)), free.squeeze(1), matrix
         self._merged: MergedMetric | None = None
         keep = sp.diags(self._free.cpu().numpy().astype(np.float64))
         couplings = sp.csr_matrix(keep @ (matrix - sp.diags(matrix.diagonal())) @ keep)

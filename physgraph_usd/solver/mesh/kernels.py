@@ -73,6 +73,17 @@ def device_of(asked: str) -> str:
     return asked
 
 
+def cards_for(asked: str) -> list[str]:
+    """Names, for CUDA_VISIBLE_DEVICES, of the cards that processes may share out; none for a certain card or the CPU.
+
+    Arguments are as for `device_of`.
+    """
+    if asked not in ("cuda", "auto"):
+        return []
+    visible = os.environ.get("CUDA_VISIBLE_DEVICES")
+    return visible.split(",") if visible else [str(card) for card in range(torch.cuda.device_count())]
+
+
 def kernels_are_compiled() -> bool:
     """Whether some of our kernels are already compiled for this user and version of Warp."""
     start_warp()

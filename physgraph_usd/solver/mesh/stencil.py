@@ -11,7 +11,7 @@ import numpy as np
 import scipy.sparse as sp
 import torch
 import warp as wp
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
 from .kernels import ALONE, KERNELS
@@ -96,6 +96,11 @@ def overloads(kernel: Any, *kinds: Any) -> dict[torch.dtype, wp.Kernel]:
 
 
 _GATHER = overloads(_gather_rows, wp.int32, wp.int32, SCALAR, VECTOR, VECTOR)
+
+
+def rows_of(column: Shaped[Tensor, "rows 1"]) -> Shaped[Tensor, "rows 3"]:
+    """A column three times: a product with a tensor of the same shape takes a tenth of the time of one by a column."""
+    return column.expand(-1, 3).contiguous()
 
 
 def vectors(tensor: Tensor) -> Any:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import copy
 import functools
-import os
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
@@ -27,11 +26,6 @@ SLICES, SLICE_SECONDS = 8, 5e-5
 threads take the next slice, and slices shrink to shorten the wait for the last."""
 _item_seconds: dict[str, float] = {}
 """By kernel: time of an item in its last launches, on one thread [s]."""
-
-
-def cores() -> int:
-    """Number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 class Launch:
