@@ -1,68 +1,72 @@
-"""How long an artist waits in `tune`: from a slider to the cloth, by median, at 25,000 vertices or more.
+"""How long an artist waits in `tune`: from a move of a slider to the first new cloth, and to the settled cloth.
 
-    python -m benchmarks.tune [--quick]
+    python -m benchmarks.tune [--moves 20] [--shot NAME]... [--folder SHOTS]
 
-Moves the stretch, bending, density and guide sliders of a frame of the skirt to random places, one after another, with
-contact and without. Prints wall and processor seconds of the quick solve from where the cloth was, and of the solve as
-`refine` makes it at rest. Other work on the machine lengthens wall seconds alone.
+Moves six sliders of a frame in the middle of each shot to random places, one after another, with contact; real shots
+where their folder is given. Prints a row a shot: median and longest wall seconds until the first round is handed over
+and until the frame is settled. The page adds what it takes to send the points to the browser and to draw them.
 """
 
 from __future__ import annotations
 
 import random
-import sys
 import tempfile
+import time
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from statistics import median
 
-from benchmarks.rows import say
-from physgraph_usd.lab.samples import write_sample
-from physgraph_usd.studio.session import Shown, TuneSession
+import click
+
+from benchmarks.contact_shots import REAL
+from benchmarks.rows import say, table
+from physgraph_usd.lab.samples import SAMPLES, write_sample
+from physgraph_usd.studio.session import TuneSession
 from physgraph_usd.studio.values import TUNABLES
 
-MOVED = ("stretchStiffness", "bendStiffness", "density", "guide:stiffness")
-MOVES, SHORT_MOVES = 24, 8
-SETTLED = 3
-"""How often the solve at rest is timed."""
+MOVED = ("stretchStiffness", "bendStiffness", "density", "guide:stiffness", "rest:weftEase", "contact:offset")
+CHOSEN = ("skirt", "dancer", "layers")
+"""Samples where none is named."""
 
 
-def main() -> None:
-    """Measure both and print the medians."""
-    moves = SHORT_MOVES if "--quick" in sys.argv else MOVES
-    with tempfile.TemporaryDirectory() as folder:
-        session = TuneSession(write_sample("skirt", Path(folder)))
-        session.set_time(session.times[len(session.times) // 2])
-        points = session.solve().points[0]
-        count = 0 if points is None else len(points)
-        say(f"skirt, {count:,} vertices, one move of a slider; medians in seconds")
-        for contact in (False, True):
-            session.set_contact(contact)
-            session.solve()
-            soon, rest = measure(session, moves)
-            words = "with contact" if contact else "without contact"
-            say(f"{words}: quick {told(soon)}; at rest, as refine does, {told(rest)}")
-        session.close()
+@click.command()
+@click.option("--moves", default=20, show_default=True)
+@click.option("--shot", "names", multiple=True, default=CHOSEN, show_default=True, help="Samples.")
+@click.option("--folder", type=click.Path(path_type=Path), help="The real shots, which we may not ship.")
+def main(moves: int, names: Sequence[str], folder: Path | None) -> None:
+    """Print what each shot takes."""
+    head = ["vertices", "first cloth, median [s]", "longest", "settled, median [s]", "longest"]
+    say(table(["shot", *head], []))
+    with tempfile.TemporaryDirectory() as made:
+        for name, session in sessions(names, folder, Path(made)):
+            session.set_time(session.times[len(session.times) // 2])
+            count = sum(len(points) for points in session.settle().points if points is not None)
+            chance = random.Random(1)
+            first, settled = zip(
+                *(waits(session, MOVED[k % len(MOVED)], chance.random()) for k in range(moves)), strict=True
+            )
+            cells = [f"{value:.2f}" for each in (first, settled) for value in (median(each), max(each))]
+            say(f"| {name} | {count:,} | {' | '.join(cells)} |")
+            session.close()
 
 
-def measure(session: TuneSession, moves: int) -> tuple[list[Shown], list[Shown]]:
-    """Quick solves after so many moves, and some solves at rest."""
-    chance, garment = random.Random(1), session.garments[0]
-    soon, rest = [], []
-    for move in range(moves):
-        name = MOVED[move % len(MOVED)]
-        session.set_value(garment, name, TUNABLES[name].at(chance.random()))
-        soon.append(session.solve())
-        if (move + 1) % (moves // SETTLED) == 0:
-            settled = session.settle()
-            assert settled is not None
-            rest.append(settled)
-    return soon, rest
+def sessions(names: Sequence[str], folder: Path | None, made: Path) -> Iterator[tuple[str, TuneSession]]:
+    """Shots, opened."""
+    for name in (each for each in SAMPLES if each in names):
+        yield name, TuneSession(write_sample(name, made), out=made / f"{name}.tuned.usda")
+    for name, (garments, bodies, _) in REAL.items() if folder is not None else ():
+        if folder is not None and (folder / name).exists():
+            out = made / f"{Path(name).stem}.tuned.usda"
+            yield name, TuneSession(folder / name, garments=garments, colliders=bodies, out=out)
 
 
-def told(solves: list[Shown]) -> str:
-    """Medians, and the longest."""
-    wall, cpu = [each.seconds for each in solves], [each.cpu_seconds for each in solves]
-    return f"{median(wall):.2f} wall, {median(cpu):.2f} processor, longest {max(wall):.2f} wall"
+def waits(session: TuneSession, name: str, place: float) -> tuple[float, float]:
+    """Seconds from a move of a slider to the first new cloth, and to the settled cloth."""
+    began, seen = time.perf_counter(), list[float]()
+    session.set_value(session.garments[0], name, TUNABLES[name].at(place))
+    session.solve(lambda _: seen.append(time.perf_counter() - began))
+    session.settle()
+    return seen[0], time.perf_counter() - began
 
 
 if __name__ == "__main__":

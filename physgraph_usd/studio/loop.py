@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Protocol
+
+import numpy as np
 
 from ..errors import PhysGraphError
 from .session import Shown, TuneSession
 
-REST_SECONDS = 0.5
+REST_SECONDS = 0.1
 """How long nothing must be asked before the frame is solved as ``refine`` does."""
 
 Change = Callable[[TuneSession], None]
@@ -21,6 +23,10 @@ class Watcher(Protocol):
 
     def busy(self, what: str) -> None:
         """Work has begun."""
+        ...
+
+    def seen(self, points: Mapping[str, np.ndarray]) -> None:
+        """Positions of some garments on their way [m], world space, by path."""
         ...
 
     def show(self, shown: Shown) -> None:
@@ -80,24 +86,30 @@ class SolveLoop:
                 self._watcher.fail(error)
 
     def _solve(self, asked: list[Change]) -> bool:
-        """Make changes and solve the frame; returns whether it is settled."""
+        """Make changes and solve the frame roughly; returns whether it is settled."""
         for change in asked:
             try:
                 change(self._session)
             except PhysGraphError as error:
                 self._watcher.fail(error)
         self._watcher.busy("solving")
-        shown = self._session.solve()
+        rounds = list[None]()
+
+        def seen(points: Mapping[str, np.ndarray]) -> None:
+            rounds.append(None)
+            self._watcher.seen(points)
+
+        # A round at least, so that cloth follows a hand that goes on.
+        shown = self._session.solve(seen, lambda: bool(rounds) and self._is_wanted())
         self._watcher.show(shown)
-        return shown.run is not None
+        return shown.settled
 
     def _settle(self) -> bool:
-        """Solve the frame as ``refine`` does; returns whether it was not given up for a change."""
-        self._watcher.busy("settling as refine does")
-        shown = self._session.settle(cancelled=self._is_wanted)
-        if shown is not None:
-            self._watcher.show(shown)
-        return shown is not None
+        """Solve the frame on as ``refine`` does; returns whether it was not given up for a change."""
+        self._watcher.busy("settling")
+        shown = self._session.settle(self._watcher.seen, self._is_wanted)
+        self._watcher.show(shown)
+        return shown.settled
 
     def _is_wanted(self) -> bool:
         """Whether something is to be done at once; read without the lock between steps."""

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from time import sleep
 from typing import Any
+
+import numpy as np
 
 from ..errors import PhysGraphError
 from ..interrupts import leave_if_asked
@@ -61,13 +63,16 @@ class TunePage:
         """Say that work has begun."""
         self._state.content = _badge(f"{what} …", WORKING)
 
+    def seen(self, points: Mapping[str, np.ndarray]) -> None:
+        """Draw garments on their way."""
+        self._picture.move(points)
+
     def show(self, shown: Shown) -> None:
         """Draw a solved frame and write its figures and values."""
         self._picture.draw(shown)
-        settled = shown.run is not None
-        state = "settled: as refine solves it" if settled else "quick: solved from where the cloth was"
-        self._state.content = _badge(state, SETTLED if settled else MOVING)
-        self._command.content = _small(f"<code>{html.escape(shown.command)}</code>")
+        state = "settled: as refine solves it" if shown.settled else "on its way"
+        self._state.content = _badge(state, SETTLED if shown.settled else MOVING)
+        self._command.content = _small(f"<code>{html.escape(self._session.command)}</code>")
         index = self._session.garments.index(self._garment)
         self._figures.content = _table(figures(shown, index))
         follow, self._follow = self._follow, False

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -44,7 +45,7 @@ class Picture:
         self._right = np.array([0.0, 1.0, 0.0]) if abs(up[0]) > 0.9 else np.array([1.0, 0.0, 0.0])
         front = np.cross(self._right, up)
         self._apart = 0.62 * (float((points @ self._right).max() - (points @ self._right).min()) + 0.1 * self._size)
-        self._handles: dict[str, tuple[object, Any]] = {}
+        self._handles: dict[str, tuple[tuple[int, int, bool] | None, Any]] = {}
         server.scene.set_up_direction(up)
         eye = front + 0.16 * up
         away = max(1.4 * self._size, 5.6 * self._apart)
@@ -72,6 +73,18 @@ class Picture:
             self._place(f"body/fine/{index}", mesh, BODY, side=both)
             self._place(f"body/coarse/{index}", mesh if both else None, BODY, side=-both)
 
+    def move(self, points: Mapping[str, np.ndarray]) -> None:
+        """Move garments that are drawn in plain colour, by path."""
+        for path, each in points.items():
+            index = self._session.garments.index(path)
+            key, handle = self._handles.get(f"fine/{index}", (None, None))
+            if handle is not None and key is not None and key[0] == len(each) and key[2]:
+                handle.vertices = self._shifted(each, side=self.shows == BOTH)
+
+    def _shifted(self, points: np.ndarray, *, side: int) -> np.ndarray:
+        """Points where they are drawn on a side."""
+        return (points - self._centre + side * self._apart * self._right).astype(np.float32)
+
     def _place(
         self,
         name: str,
@@ -88,7 +101,7 @@ class Picture:
             if handle is not None:
                 handle.remove()
             return
-        points = (mesh[0] - self._centre + side * self._apart * self._right).astype(np.float32)
+        points = self._shifted(mesh[0], side=side)
         key = (len(points), len(mesh[1]), colors is None)
         if handle is not None and known == key and colors is None:
             handle.vertices = points

@@ -2,8 +2,8 @@
 
 session = TuneSession("shot.usda", out="shot.tuned.usda")
 session.set_value("/World/Coat", "bendStiffness", 2e-5)
-session.solve()    # Soon, from where the cloth was.
-session.settle()   # As `refine` solves this frame: the positions that the saved layer gives.
+session.solve()    # Roughly, from where the cloth was.
+session.settle()   # On from there, as `refine` solves.
 session.save()
 """
 
@@ -25,10 +25,10 @@ from ..shot.warnings import of_unfelt
 from ..solver.fabric import PRESETS
 from ..solver.mesh.subdivide import Refinement
 from ..solver.resolution import choose_levels, sample_frames
-from ..solver.scene import Frame, State
+from ..solver.scene import Frame
 from ..usd.schema import AUTO_LEVEL, FABRIC, GARMENT, fabric_values
 from ..usd.write.tag import tag
-from .solver import FrameSolver
+from .solver import FrameSolver, Seen
 from .values import TUNABLES
 
 
@@ -42,9 +42,7 @@ class Shown:
         telemetry: The solver's figures of each garment, as in a report's frame.
         seconds: Wall time of reading and solving.
         cpu_seconds: This process's own time for it.
-        run: First and last time code of the run of ``refine`` that gives these positions; None where none does, because
-            the cloth was solved from where it was.
-        command: That run, of the layer as it would be saved now; empty where there is none.
+        settled: Whether the frame is solved as ``refine`` solves it.
     """
 
     frame: Frame
@@ -52,8 +50,7 @@ class Shown:
     telemetry: tuple[dict[str, Any], ...]
     seconds: float
     cpu_seconds: float
-    run: tuple[float | None, float | None] | None
-    command: str
+    settled: bool
 
 
 class TuneSession:
@@ -186,30 +183,34 @@ class TuneSession:
             raise UsageError(f"no sample at time code {time}; they run from {self.times[0]} to {self.times[-1]}")
         self.time, self._shown = time, None
 
-    def solve(self) -> Shown:
-        """The frame with the values tried, soon: from where the cloth was, if that is this frame or the one before.
+    def solve(self, seen: Seen = lambda _: None, cancelled: Callable[[], bool] = lambda: False) -> Shown:
+        """The frame with the values tried, roughly, from where the cloth was.
+
+        Arguments are those of `FrameSolver.solve`.
 
         Raises:
             SolveError: A term of the potential is not finite.
             StageError: The frame cannot be read.
         """
-        return self._shown or self._show(self._solver.solve_soon)
+        return self._shown or self._show(seen, cancelled, rough=True)
 
-    def settle(self, cancelled: Callable[[], bool] = lambda: False) -> Shown | None:
-        """The frame as ``refine`` gives it; None where ``cancelled``, which is asked before each step, says so.
+    def settle(self, seen: Seen = lambda _: None, cancelled: Callable[[], bool] = lambda: False) -> Shown:
+        """The frame as ``refine`` solves it from where the cloth is; not settled where ``cancelled``.
 
-        Raises:
-            SolveError: A term of the potential is not finite.
-            StageError: The frame cannot be read.
+        Arguments and errors are those of `solve`.
         """
-        if self._shown is not None and self._shown.run is not None:
+        if self._shown is not None and self._shown.settled:
             return self._shown
-        before = self._shown
-        shown = self._show(lambda shot, time: self._solver.solve_as_refine(shot, time, cancelled=cancelled))
-        if shown.run is None:
-            self._shown = before
-            return None
-        return shown
+        return self._show(seen, cancelled, rough=False)
+
+    @property
+    def command(self) -> str:
+        """The command that refines the whole shot with the saved layer."""
+        words = ["physgraph-usd", "refine", str(self.out), "-o", str(self.out.with_suffix(".refined.usdc"))]
+        words += [] if self._device == "cpu" else ["--device", self._device]
+        for option, paths in zip(("--garment", "--collider"), self._named, strict=True):
+            words += [word for path in paths for word in (option, path)]
+        return join(words + ([] if self.contact else ["--contact", "off", "--self-contact", "off"]))
 
     def save(self) -> Path:
         """Write the values tried as a layer over the shot, as ``tag`` does; nothing else is ever written.
@@ -226,14 +227,12 @@ class TuneSession:
         self._overwrite = True  # It is this session's own from here on.
         return written
 
-    def _show(self, solve: Callable[..., State]) -> Shown:
+    def _show(self, seen: Seen, cancelled: Callable[[], bool], *, rough: bool) -> Shown:
         began, spent = clock.perf_counter(), clock.process_time()
-        state = solve(self.shot, self.time)
-        times, run = (clock.perf_counter() - began, clock.process_time() - spent), self._solver.run
-        telemetry = tuple(dict(entry) for entry in state.telemetry)
-        ends = (run[0], run[-1]) if run else None
-        command = _command(self.out, run, self._named, contact=self.contact, device=self._device) if run else ""
-        self._shown = Shown(self.shot.frame(self.time), state.points, telemetry, *times, ends, command)
+        state = self._solver.solve(self.shot, self.time, rough=rough, seen=seen, cancelled=cancelled)
+        times = clock.perf_counter() - began, clock.process_time() - spent
+        found = state.points, tuple(map(dict, state.telemetry)), *times, not (rough or cancelled())
+        self._shown = Shown(self.shot.frame(self.time), *found)
         return self._shown
 
     def _index(self, garment: str) -> int:
@@ -258,20 +257,3 @@ class TuneSession:
 def _rounded(values: Mapping[str, float]) -> dict[str, float]:
     """Values as floats that a layer can hold."""
     return {name: float(np.float32(value)) for name, value in values.items()}
-
-
-def _command(
-    out: Path,
-    run: tuple[float | None, ...],
-    named: tuple[Sequence[str], Sequence[str]],
-    *,
-    contact: bool,
-    device: str,
-) -> str:
-    """The command that refines a saved layer to the last frame of a run."""
-    words = ["physgraph-usd", "refine", str(out), "-o", str(out.with_suffix(".refined.usdc"))]
-    words += [] if run[0] is None else ["--frames", f"{run[0]!r}:{run[-1]!r}"]
-    words += [] if device == "cpu" else ["--device", device]
-    for option, paths in zip(("--garment", "--collider"), named, strict=True):
-        words += [word for path in paths for word in (option, path)]
-    return join(words + ([] if contact else ["--contact", "off", "--self-contact", "off"]))

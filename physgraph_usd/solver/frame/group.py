@@ -25,7 +25,7 @@ from ..mesh.subdivide import Refinement
 from ..scene import Garment, GarmentFrame, recentred
 from ..seams import level_seams
 from .from_cage import Followers, MovingFrames
-from .level_forces import LevelForces, build_forces
+from .level_forces import LevelForces
 from .settings import SolveSettings
 from .values import Cage, FrameInput
 
@@ -112,12 +112,13 @@ class Group:
         return Cage(world, origin, self.tensor(world - origin))
 
     def forces_for(self, frames: Sequence[GarmentFrame]) -> list[LevelForces]:
-        """The lasting terms of each level, rebuilt with their metrics when a material changes."""
+        """The lasting terms of each level, new ones when a material changes."""
         key = tuple((frame.fabric, frame.guide) for frame in frames)
         if key not in self._forces:
-            weights = {"frames": frames, "gravity": self.gravity}
-            pairs = zip(self.levels, self.guide_maps, strict=True)
-            made = [build_forces(level, guide_map, self.garments, **weights) for level, guide_map in pairs]
+            before = [each.lent() for last in self._forces.values() for each in last] or [None] * len(self.levels)
+            given = self.garments, tuple(frames), self.gravity
+            places = zip(self.levels, self.guide_maps, before, strict=True)
+            made = [LevelForces(level, guide_map, *given, before=lender) for level, guide_map, lender in places]
             self._forces.clear()
             self._forces[key] = made
         return self._forces[key]

@@ -35,6 +35,7 @@ class SolvedFrame:
         state: State for the next frame.
         crossing: Whether each fine vertex belongs to cloth that crosses cloth.
         first: Whether no frame was solved before.
+        whole: Whether the solve went on to its end, for values that no longer moved.
     """
 
     time: float | None
@@ -46,6 +47,7 @@ class SolvedFrame:
     state: State
     crossing: np.ndarray
     first: bool = False
+    whole: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,7 +190,7 @@ def jumped_from(
 def is_same(part: tuple[int, ...], frame: Frame, memories: Sequence[Memory], near: Sequence[int]) -> bool:
     """Whether garments and nearby bodies are unchanged, were solved together, and creases are at rest."""
     for index, each in zip(part, (each.last for each in memories), strict=True):
-        if each is None or each.part != part or near != each.near:
+        if each is None or each.part != part or near != each.near or not each.whole:
             return False
         if each.state.creeps and frame.time != each.time:
             return False

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ..fabric import Fabric
 from ..forces import body_terms, elastic_terms
 from ..forces.base import Force, ForceModule
 from ..forces.bending import Bending
@@ -26,23 +27,85 @@ from ..scene import Garment, GarmentFrame
 
 @dataclass(frozen=True, eq=False)
 class LevelForces:
-    """Terms acting on one level's cloth, frame after frame.
+    """Terms acting on one level's cloth, frame after frame; each is built on first use.
 
     Attributes:
-        level: The level, with the cloth's rest lengths.
-        terms: Stretch, membrane, bending and gravity.
-        guide: The guide, without a target.
-        metric: The factorised rest Hessian of all terms.
-        density: Areal density of each garment [kg/m^2].
-        bends: Whether any cloth resists bending.
+        plain: The level, with the rest lengths of its rest shape.
+        guide_map: Averaging operator of the level.
+        garments: The garments.
+        frames: Values of the garments at one time code.
+        gravity: [m/s^2], shape (3,).
+        before: Terms of other materials, with a factor to lend; or None.
     """
 
-    level: Level
-    terms: tuple[Force, ...]
-    guide: Guide
-    metric: Metric
-    density: Float[Tensor, " garments"]
-    bends: bool
+    plain: Level
+    guide_map: GuideMap
+    garments: Sequence[Garment]
+    frames: Sequence[GarmentFrame]
+    gravity: np.ndarray
+    before: LevelForces | None = None
+
+    @cached_property
+    def level(self) -> Level:
+        """The level, with the cloth's rest lengths."""
+        return self.plain.eased(self._fabrics)
+
+    @cached_property
+    def terms(self) -> tuple[Force, ...]:
+        """Stretch, membrane, bending and gravity."""
+        raised = [each.raises_bending for each in self.garments]
+        elastic = elastic_terms(self.level, self._fabrics, raised=raised)
+        return (*elastic, *body_terms(self.level, self._fabrics, gravity=self.gravity))
+
+    @cached_property
+    def guide(self) -> Guide:
+        """The guide, without a target."""
+        pairs = zip(self.frames, self.garments, strict=True)
+        stiffness = np.concatenate([frame.guide * garment.guide_scale for frame, garment in pairs])
+        return Guide(self.level, self.guide_map, torch.as_tensor(stiffness))
+
+    @cached_property
+    def metric(self) -> Metric:
+        """The factorised rest Hessian of all terms."""
+        matrix = on_edges(self._module.rest_matrix(), self.level.springs.cpu().numpy())
+        return Metric(matrix, free=self.level.free, dtype=self.level.dtype)
+
+    @cached_property
+    def rough_metric(self) -> Metric:
+        """The metric, or the last materials' with the diagonal of these: quick, and good enough to descend by."""
+        if self.before is None or "metric" in self.__dict__:
+            return self.metric
+        return self.before.metric.scaled(self._stiffness / self.before._stiffness)
+
+    @cached_property
+    def density(self) -> Float[Tensor, " garments"]:
+        """Areal density of each garment [kg/m^2]."""
+        density = [fabric.density for fabric in self._fabrics]
+        return torch.tensor(density, dtype=self.level.dtype, device=self.level.device)
+
+    @property
+    def bends(self) -> bool:
+        """Whether any cloth resists bending."""
+        return any(fabric.bend > 0 for fabric in self._fabrics)
+
+    @property
+    def _fabrics(self) -> list[Fabric]:
+        return [frame.fabric for frame in self.frames]
+
+    @cached_property
+    def _stiffness(self) -> Float[Tensor, " vertices"]:
+        """Diagonal of the Hessian at rest [N/m], positive."""
+        tiny = torch.finfo(self.level.dtype).tiny
+        return self._module.diagonal(self.level.rest).clamp_min(tiny)
+
+    @property
+    def _module(self) -> ForceModule:
+        """All terms, the guide without a target."""
+        return ForceModule((*self.terms, self.guide))
+
+    def lent(self) -> LevelForces:
+        """The terms that can lend a factor to those of the next materials."""
+        return self if self.before is None or "metric" in self.__dict__ else self.before
 
     def without_facets(
         self, x: Float[Tensor, "vertices 3"], below: Float[Tensor, "coarse 3"], smooth: Stencil
@@ -62,10 +125,17 @@ class LevelForces:
             return self.terms
         return tuple(each.resting_at(rest_angle) if isinstance(each, Bending) else each for each in self.terms)
 
-    def system(self, module: ForceModule, tie: tuple[float, Float[Tensor, "vertices 3"]] | None = None) -> System:
+    def system(
+        self,
+        module: ForceModule,
+        tie: tuple[float, Float[Tensor, "vertices 3"]] | None = None,
+        *,
+        rough: bool = False,
+    ) -> System:
         """The system of a frame without contact, given its terms; the tie as in `lasting_system`."""
         forces = module.forces if tie is None else (*module.forces, self.tether(*tie))
-        return self.system_in(ForceModule(forces, remembers=True))
+        metric = self.rough_metric if rough else self.metric
+        return self.system_in(ForceModule(forces, remembers=True), metric)
 
     def system_in(self, field: ForceField, metric: Preconditioner | None = None, *, lasting: bool = False) -> System:
         """The system of the level in any field, with the level's metric by default."""
@@ -111,38 +181,6 @@ class LevelForces:
     def tether(self, stiffness: float, predicted: Float[Tensor, "vertices 3"]) -> Tether:
         """The tie to predicted positions [m], of stiffness [1/s^2]."""
         return Tether(self.level, self.density, stiffness, predicted)
-
-
-def build_forces(
-    level: Level,
-    guide_map: GuideMap,
-    garments: Sequence[Garment],
-    *,
-    frames: Sequence[GarmentFrame],
-    gravity: np.ndarray,
-) -> LevelForces:
-    """Weigh the terms of a level by the materials of a frame.
-
-    Args:
-        level: The level.
-        guide_map: Averaging operator of the level.
-        garments: The garments.
-        frames: Values of the garments at one time code.
-        gravity: [m/s^2], shape (3,).
-    """
-    fabrics = [frame.fabric for frame in frames]
-    level = level.eased(fabrics)
-    stiffness = np.concatenate([frame.guide * g.guide_scale for frame, g in zip(frames, garments, strict=True)])
-    terms = (
-        *elastic_terms(level, fabrics, raised=[each.raises_bending for each in garments]),
-        *body_terms(level, fabrics, gravity=gravity),
-    )
-    guide = Guide(level, guide_map, torch.as_tensor(stiffness))
-    matrix = on_edges(ForceModule((*terms, guide)).rest_matrix(), level.springs.cpu().numpy())
-    metric = Metric(matrix, free=level.free, dtype=level.dtype)
-    density = torch.tensor([fabric.density for fabric in fabrics], dtype=level.dtype, device=level.device)
-    bends = any(fabric.bend > 0 for fabric in fabrics)
-    return LevelForces(level, terms, guide, metric, density, bends)
 
 
 def blame(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -38,6 +38,7 @@ class LevelProblem:
         untangler: Makes the steps to pull crossings apart.
         budget: Stopping criteria.
         outward: As in `leave_saddle`.
+        show: Called with the positions after each round [m]; or None.
     """
 
     lasting: LevelForces
@@ -48,6 +49,7 @@ class LevelProblem:
     untangler: Integrator
     budget: Budget
     outward: Float[Tensor, " garments"]
+    show: Callable[[Placed], None] | None = None
 
     @property
     def level(self) -> Level:
@@ -161,13 +163,23 @@ class Problem:
         tie = None if self.tether is None or self.start.detailed is None else (self.tether, self.start.detailed)
         # Recorded steps of a level on CUDA are reused in the next frame.
         recorded = lasting.level.device != "cpu"
-        alone = lasting.lasting_system(self.aim, tie, rest_angle=angles) if recorded else lasting.system(module, tie)
+        alone = (
+            lasting.lasting_system(self.aim, tie, rest_angle=angles)
+            if recorded
+            else lasting.system(module, tie, rough=settings.rough)
+        )
         budget = settings.budget(self.finest - index, since, warm=self.warm)
         if self.creases is not None:  # The stopping measure misses fading creases.
             budget = replace(budget, near=0.0, rest=0.0 if self.start.held else budget.rest)
         budget = replace(budget, steps=0) if self.start.rests else budget
         who = (self.group.integrator, self.group.untangler)
         return LevelProblem(lasting, module, alone, self.view(index), *who, budget, self.group.outward)
+
+    def placed(self, x: Placed) -> list[np.ndarray]:
+        """World positions of each garment [m], given those of the finest level."""
+        group = self.group
+        points = group.followers.placed(x, self.cage.origin, self.cage.world)
+        return [points[span] for span in group.levels[-1].spans]
 
     def begun(
         self, index: int, below: Float[Tensor, "below 3"] | None

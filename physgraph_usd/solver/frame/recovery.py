@@ -43,7 +43,8 @@ def solve_soundly(group: Group, frame: FrameInput, last: State | None) -> Solved
     """
     solved = solve_frame(group, frame, last)
     why = _unsound(solved.telemetry)
-    ended_early = is_over() or group.settings.budget_ms is not None or group.settings.steps == 0
+    settings = group.settings
+    ended_early = is_over() or settings.budget_ms is not None or settings.steps == 0 or not settings.whole
     if not why or (last is None and frame.walked is None) or ended_early:
         return solved
     if last is not None and last.wait:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+
+import numpy as np
 
 from ..contact.settings import ContactSettings
 from ..integrate import LEARNED, METHODS, Method
@@ -41,6 +43,8 @@ class SolveSettings:
         reset: Thresholds for a cold start.
         contact: Contact settings.
         cancelled: Asked before each step whether the result is no longer needed; or None.
+        rough: Whether new materials descend by the last ones' factor: for values that are still moving.
+        shown: Called with the positions of each garment [m], by path, after each round of the finest level; or None.
     """
 
     method: Method = METHODS[LEARNED]
@@ -53,6 +57,13 @@ class SolveSettings:
     reset: Reset = field(default_factory=Reset)
     contact: ContactSettings = field(default_factory=ContactSettings)
     cancelled: Callable[[], bool] | None = None
+    rough: bool = False
+    shown: Callable[[Mapping[str, np.ndarray]], None] | None = None
+
+    @property
+    def whole(self) -> bool:
+        """Whether the solve goes, or went, on to its end."""
+        return not (self.rough or (self.cancelled is not None and self.cancelled()))
 
     def budget(self, below: int, clock: float, *, warm: bool) -> Budget:
         """The budget of a level, as for `level_budget`."""

@@ -7,8 +7,11 @@ and makes rounds: contact is detected, the integrator steps, and cloth moves as 
 from __future__ import annotations
 
 import time
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 
+import numpy as np
 from torch import Tensor
 
 from ...errors import SolveError
@@ -25,7 +28,7 @@ from ..level import Placed, unhindered
 from .group import Group
 from .level_forces import blame
 from .outcome import measured, refuse_swallowed, scaled, state_left, telemetry_of
-from .problem import LevelProblem, begin
+from .problem import LevelProblem, Problem, begin
 from .values import FrameInput, Solved, State
 
 
@@ -47,6 +50,8 @@ def solve_frame(group: Group, frame: FrameInput, last: State | None) -> Solved:
         x, reports, module = None, list[LevelReport](), ForceModule(())
         for index in problem.levels:
             level = problem.level(index, since=prepared)
+            if index == problem.finest and group.settings.shown is not None:
+                level = replace(level, show=partial(_show, problem, group.settings.shown))
             x, made, module = solve_one_level(level, *problem.begun(index, x))
             if index < problem.finest:
                 made[-1].energies = module.energies(x)
@@ -67,8 +72,13 @@ def solve_frame(group: Group, frame: FrameInput, last: State | None) -> Solved:
     marks = (problem.began, prepared, solved, time.perf_counter())
     pairs = zip(("prepare", "solve", "measure"), marks, marks[1:], strict=False)
     telemetry["milliseconds"] = {name: round(1e3 * (end - start), 3) for name, start, end in pairs}
-    points, spans = group.followers.placed(shown, problem.cage.origin, problem.cage.world), group.levels[-1].spans
-    return Solved([points[span] for span in spans], left, telemetry, [crossing[span] for span in spans])
+    return Solved(problem.placed(shown), left, telemetry, [crossing[span] for span in group.levels[-1].spans])
+
+
+def _show(problem: Problem, shown: Callable[[Mapping[str, np.ndarray]], None], x: Placed) -> None:
+    """Show positions of the finest level [m], as `SolveSettings.shown`."""
+    paths = [garment.path for garment in problem.group.garments]
+    shown(dict(zip(paths, problem.placed(scaled(problem, x)), strict=True)))
 
 
 def solve_one_level(
@@ -88,7 +98,10 @@ def solve_one_level(
     if view is None:
         x = x if smoothing is None else leave_saddle(problem.alone, level, x + smoothing, outward=problem.outward)
         x, report = solve_level(problem.alone, problem.integrator, x, level=level.index, budget=budget)
-        return unhindered(x), [report], problem.module
+        x = unhindered(x)
+        if problem.show is not None:
+            problem.show(x)
+        return x, [report], problem.module
     x, reports = _untangle(problem, view, view.begun(x))
     if smoothing is not None:
         x = view.moved(x, x + smoothing) if level.index else x
@@ -109,6 +122,8 @@ def solve_one_level(
         wanted = carry.x
         x, last = view.moved(x, wanted), system
         blocked = x is not wanted
+        if problem.show is not None:
+            problem.show(x)
         if budget.ends(report, made=made, touched=touched, blocked=blocked):
             break
         replaceable = smoothing is None and integrator.name != problem.untangler.name

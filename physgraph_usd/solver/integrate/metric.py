@@ -79,6 +79,13 @@ class Metric:
         other._hold(self._stiffness + springs.double())
         return other
 
+    def scaled(self, stiffer: Float[Tensor, " vertices"]) -> Metric:
+        """R^-1 H0 R^-1 with the diagonal of H0 times given factors; the factor of H0 is used."""
+        other, root = copy.copy(self), rows_of(stiffer.to(self._mask).rsqrt().unsqueeze(1))
+        other._scaled, other._mask = self._scaled * root, self._mask * root
+        other.diagonal = torch.where(self._free, self.diagonal * stiffer.double(), 1.0)
+        return other
+
     def merged(self, label: np.ndarray) -> MergedMetric:
         """The metric of the same cloth with all vertices of equal label merged; cached while the labels stay the same.
 
