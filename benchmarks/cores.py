@@ -1,11 +1,4 @@
-"""One frame on several cores, and a whole shot by several processes, in turns.
-
-    python -m benchmarks.cores [--shot NAME]... [--frames 12] [--workers 60] [--turns 2] [--level 2]
-
-Refines samples by the command that a user gives. Prints a row a sample: milliseconds of a warm frame on 1, 2, 4 and so
-on of this machine's cores (prepared, solved and measured; the median over frames, the least over turns), then the
-seconds of a shot of so many frames, all of the command, by as many processes.
-"""
+"""One frame on several cores, and a shot by several processes: `python -m benchmarks.versions --cores`."""
 
 from __future__ import annotations
 
@@ -18,42 +11,35 @@ import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
-
-import click
+from typing import Any
 
 from benchmarks.rows import say, table
-from benchmarks.versions import groups_of
 from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.shot.processes import cores
 from physgraph_usd.usd.read.reader import open_shot
 
-CHOSEN = ("dancer", "skirt")
-"""Samples where none is named."""
+FRAMES, SHOT = 12, 60
+"""Frames on several cores, and by several processes."""
 
 
-@click.command()
-@click.option("--shot", "names", multiple=True, default=CHOSEN, show_default=True)
-@click.option("--frames", default=12, show_default=True, help="Frames of one process.")
-@click.option("--workers", default=60, show_default=True, help="Frames of several processes; 0 leaves them out.")
-@click.option("--turns", default=2, show_default=True)
-@click.option("--level", default=2, show_default=True)
-def main(names: Sequence[str], **numbers: int) -> None:
-    """Print what cores and processes gain."""
+def compare(names: Sequence[str], *, turns: int, level: int) -> None:
+    """Print a row a sample: milliseconds of a warm frame (prepared, solved and measured; the median over frames, the
+    least over turns) on 1, 2, 4 and so on of this machine's cores, then seconds of the command by as many processes.
+    """
     counts = [2**k for k in range(cores().bit_length())]
     head = [f"warm frame, {count} cores [ms]" for count in counts]
-    head += [f"{numbers['workers']} frames, {count} processes [s]" for count in counts if numbers["workers"]]
+    head += [f"{SHOT} frames, {count} processes [s]" for count in counts]
     say(table(["sample", *head], []))
     with tempfile.TemporaryDirectory() as folder:
         for name in names:
             shot = write_sample(name, Path(folder))
             times = open_shot(str(shot)).scene.times
             cells = []
-            for frames, option in ((numbers["frames"], "OMP_NUM_THREADS"), (numbers["workers"], "--workers")):
-                if frames:
-                    asked = [str(shot), "--level", str(numbers["level"])]
-                    asked += ["--frames", f"{times[0]}:{times[min(frames, len(times)) - 1]}"]
-                    runs = [[taken(asked, option, count) for count in counts] for _ in range(numbers["turns"])]
-                    cells += [f"{min(each):,.1f}" for each in zip(*runs, strict=True)]
+            for frames, option in ((FRAMES, "OMP_NUM_THREADS"), (SHOT, "--workers")):
+                asked = [str(shot), "--level", str(level)]
+                asked += ["--frames", f"{times[0]}:{times[min(frames, len(times)) - 1]}"]
+                runs = [[taken(asked, option, count) for count in counts] for _ in range(turns)]
+                cells += [f"{min(each):,.1f}" for each in zip(*runs, strict=True)]
             say(f"| {name} | {' | '.join(cells)} |")
 
 
@@ -74,5 +60,7 @@ def taken(arguments: Sequence[str], option: str, count: int) -> float:
         return statistics.median(sum(sum(each["milliseconds"].values()) for each in groups_of(f)) for f in frames)
 
 
-if __name__ == "__main__":
-    main()
+def groups_of(frame: dict[str, Any]) -> list[dict[str, Any]]:
+    """What a frame's report says of each group of garments that was solved; each garment of a group repeats it."""
+    solved = [each for each in frame["garments"] if each.get("energy_joules")]
+    return list({json.dumps([each["milliseconds"], each["energy_joules"]]): each for each in solved}.values())

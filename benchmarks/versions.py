@@ -1,6 +1,7 @@
 """Two or more checkouts side by side, in turns: time of a warm frame, energy and crossings, shot by shot.
 
     python -m benchmarks.versions OTHER... [--shot NAME]... [--folder SHOTS] [--frames 8] [--turns 1] [--level 2]
+    python -m benchmarks.versions --cores      this version on several cores, and by several processes
 
 Each OTHER is a checkout of another version. Every shot is refined by each of them and by this one in turn, on one core,
 in a process of its own, by the command that a user gives. Prints a row a shot: of each version the milliseconds of a
@@ -26,6 +27,7 @@ import click
 
 from benchmarks.contact_shots import REAL
 from benchmarks.contact_shots import SAMPLES as TOUCHING
+from benchmarks.cores import compare, groups_of
 from benchmarks.rows import say, table
 from physgraph_usd.lab.samples import SAMPLES, write_sample
 from physgraph_usd.usd.read.reader import open_shot
@@ -53,15 +55,21 @@ class Cost:
 
 
 @click.command()
-@click.argument("others", nargs=-1, required=True, type=click.Path(exists=True, file_okay=False, path_type=Path))
+@click.argument("others", nargs=-1, type=click.Path(exists=True, file_okay=False, path_type=Path))
 @click.option("--folder", type=click.Path(path_type=Path), help="The real shots, which we may not ship.")
 @click.option("--shot", "names", multiple=True, help="Only these: samples, or beginnings of real shots' names.")
 @click.option("--frames", default=8, show_default=True, help="Frames of each; 0 for whole shots.")
 @click.option("--turns", default=1, show_default=True, help="How often each version refines each shot.")
 @click.option("--level", default=2, show_default=True)
+@click.option("--cores", is_flag=True, help="This version alone, samples on several cores, instead.")
 @click.option("--core", default=0, show_default=True, help="The core that all run on.")
-def main(others: Sequence[Path], folder: Path | None, names: Sequence[str], **numbers: int) -> None:
+def main(others: Sequence[Path], folder: Path | None, names: Sequence[str], cores: bool, **numbers: int) -> None:
     """Print what each version takes for each shot."""
+    if cores:
+        compare(names or ("dancer", "skirt"), turns=numbers["turns"], level=numbers["level"])
+        return
+    if not others:
+        raise click.UsageError("name a checkout of another version, or give --cores")
     trees = [*(other.resolve() for other in others), HERE]
     head = [*(f"{tree.name}: warm frame, energy, crossings" for tree in trees), "time, energy over"]
     say(table(["shot", *head], []))
@@ -107,12 +115,6 @@ def taken(tree: Path, arguments: Sequence[str], made: Path, core: int) -> Cost:
     energies = [sum(sum(each["energy_joules"]["output"].values()) for each in groups) for groups in warm]
     crossings = sum(left for groups in frames for each in groups for left in crossings_of(each.get("contact") or {}))
     return Cost(statistics.median(milliseconds), statistics.mean(energies), crossings)
-
-
-def groups_of(frame: dict[str, Any]) -> list[dict[str, Any]]:
-    """What a frame's report says of each group of garments that was solved; each garment of a group repeats it."""
-    solved = [each for each in frame["garments"] if each.get("energy_joules")]
-    return list({json.dumps([each["milliseconds"], each["energy_joules"]]): each for each in solved}.values())
 
 
 def crossings_of(contact: dict[str, Any]) -> Iterator[int]:
