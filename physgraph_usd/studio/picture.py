@@ -20,6 +20,8 @@ COARSE, FINE, BODY, FLOOR, SKY = (201, 160, 110), (122, 150, 190), (150, 150, 15
 """Colours, sRGB."""
 LOW, MIDDLE, HIGH = np.array([[36, 64, 142], [222, 222, 218], [178, 24, 43]], float)
 """Colours of a painted map at its least, at the value that changes nothing, and at its most."""
+LIT: dict[str, Any] = {"receive_shadow": False}
+"""Shadows fall on the floor alone: on cloth their bands would look like wrinkles."""
 BOTH, FINE_ONLY = "coarse beside fine", "fine alone"
 SHOWS = (BOTH, FINE_ONLY)
 PLAIN = "none"
@@ -106,9 +108,10 @@ class Picture:
         if handle is not None and known == key and colors is None:
             handle.vertices = points
         elif colors is None:
-            handle = self._scene.add_mesh_simple(name, points, mesh[1], color=color, flat_shading=flat, side="double")
+            look: dict[str, Any] = {"color": color, "flat_shading": flat, "side": "double"} | LIT
+            handle = self._scene.add_mesh_simple(name, points, mesh[1], **look)
         else:
-            handle = self._scene.add_glb(name, _colored(points, mesh[1], colors))
+            handle = self._scene.add_glb(name, _colored(points, mesh[1], colors), **LIT)
         self._handles[name] = key, handle
 
     def _light(self, frame: Frame, up: np.ndarray) -> None:
