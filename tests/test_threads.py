@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from importlib import import_module
 from pathlib import Path
 
@@ -21,9 +22,9 @@ from physgraph_usd.solver.mesh.threads import Launch
 
 
 @pytest.fixture(autouse=True)
-def threaded(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Threads for however little work."""
-    monkeypatch.setattr(threads_module, "LEAST_SECONDS", 0.0)
+def slow_items(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each item counts as a second of work, so that launches use all threads."""
+    monkeypatch.setattr(threads_module, "_item_seconds", defaultdict(lambda: 1.0))
 
 
 @pytest.mark.parametrize("rows", [3, 4000, 12_007])
@@ -50,7 +51,7 @@ class TestSlices:
         monkeypatch.setattr(threads_module, "LEAST_SECONDS", 1e-3)
         asked: list[int] = []
         monkeypatch.setattr(Launch, "_shared", lambda _self, threads, _work: asked.append(threads) or 1.0)
-        monkeypatch.setattr(threads_module, "_item_seconds", known := {})
+        monkeypatch.setattr(threads_module, "_item_seconds", known := defaultdict(float))
         launch = Launch(_meet, 1000, [wp.zeros(1000, dtype=wp.int32, device="cpu")], device="cpu", threads=8)
         launch({})
         assert asked == []

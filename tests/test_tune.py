@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import gc
 import io
 import shlex
 import threading
+import weakref
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
@@ -24,8 +26,11 @@ from shots import CLOTH, EDGE, cloth_shot
 
 from physgraph_usd.cli import main
 from physgraph_usd.errors import PhysGraphError, UsageError
+from physgraph_usd.shot.options import RefineOptions
+from physgraph_usd.solver.frame.refiner import Refiner
 from physgraph_usd.studio.loop import SolveLoop
 from physgraph_usd.studio.session import Shown, TuneSession
+from physgraph_usd.usd.read.reader import open_shot
 from physgraph_usd.usd.write.tag import tag
 
 STIFF = 3e-4
@@ -87,6 +92,33 @@ def test_a_rough_solve_shows_each_round_and_ends_near_the_settled_cloth(session:
     assert len(seen) >= 1
     assert np.abs(seen[-1] - rough).max() < 1e-6
     assert rms(rough - settled) < 0.3 * rms(start - settled)
+
+
+def test_a_first_frame_is_settled_at_once_and_matches_refine(session: TuneSession, shot: Path):
+    shown = session.solve()
+    assert shown.settled
+    assert session.settle() is shown
+    with closing(open_shot(str(shot), garments=[CLOTH])) as opened:
+        settings = RefineOptions().solve_settings()
+        (known,) = Refiner(opened.scene, settings, levels=session.levels).solve(opened.frame(1.0)).points
+    assert known is not None
+    assert np.abs(known - points(shown)).max() < 1e-7
+
+
+def test_old_materials_are_forgotten(session: TuneSession):
+    """Each one kept a Cholesky factor."""
+    session.settle()
+    (group,) = session._solver._refiner.groups
+    kept: list[weakref.ref[object]] = []
+    for k in range(4):
+        session.set_value(CLOTH, "bendStiffness", STIFF * (k + 1))
+        session.solve()
+        session.settle()
+        ((*_, finest),) = group._forces.values()
+        kept.append(weakref.ref(finest))
+        del finest
+    gc.collect()
+    assert [each() is None for each in kept] == [True, True, True, False]
 
 
 def test_a_settling_that_is_cancelled_goes_on_from_there(session: TuneSession):
@@ -194,7 +226,8 @@ def test_changes_during_a_solve_are_solved_once_and_then_settled(session: TuneSe
     assert log.settled.wait(30.0)
     loop.close()
     assert session.value(CLOTH, "bendStiffness") == pytest.approx(10 * STIFF)
-    assert [shown.settled for shown in log.shown] in ([False, False, True], [False, True])
+    assert len(log.shown) <= 3
+    assert log.shown[-1].settled
     assert log.rounds >= 2
     assert len(log.errors) == 1
 

@@ -9,6 +9,7 @@ import multiprocessing
 import os
 import re
 import signal
+import sys
 import threading
 import time
 import traceback
@@ -28,7 +29,7 @@ _MEMORY = re.compile(r"out of memory|n.t allocate|to allocate|bad_alloc", re.IGN
 
 _THREADS = "OMP_NUM_THREADS"
 _PRELOAD = "physgraph_usd.shot.refine"
-"""Imported once for all processes, except on Windows: torch, Warp and the solver take 3 s."""
+"""Imported once for all processes, on Linux: torch, Warp and the solver take 3 s."""
 
 Start = Callable[..., Future[Any]]
 """Starts a function with arguments in another process; all of them and the result must be picklable."""
@@ -42,14 +43,17 @@ def cores() -> int:
 
 
 def import_ahead() -> None:
-    """Begin to import the solver for later processes, while this process goes on; nothing on Windows."""
+    """Start the server process of `_context`, which imports the solver meanwhile; nothing except on Linux."""
     if _context().get_start_method() == "forkserver":
         importlib.import_module("multiprocessing.forkserver").ensure_running()
 
 
 def _context() -> BaseContext:
-    """How processes start: forked from a server process that has imported the solver, and nothing else."""
-    if "forkserver" not in multiprocessing.get_all_start_methods():
+    """Start method of processes: on Linux, fork of a server process that has imported the solver; else a new process.
+
+    The libraries of macOS may crash in a forked process.
+    """
+    if sys.platform != "linux":
         return multiprocessing.get_context("spawn")
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload([_PRELOAD])
@@ -164,7 +168,7 @@ def memory_is_named() -> Iterator[None]:
 
 
 def _begin(card: str | None, threads: int) -> None:
-    """Prepare a worker process: its card, if any, and threads; the parent handles Ctrl-C; it ends with its parent."""
+    """Prepare a worker process: threads, the card if any, no Ctrl-C, which is the parent's; end with the parent."""
     os.environ[_THREADS] = str(threads)
     if card is not None:
         os.environ["CUDA_VISIBLE_DEVICES"] = card

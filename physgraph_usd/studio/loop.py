@@ -1,4 +1,4 @@
-"""A thread that makes the changes asked of a session and solves its frame, so that a page stays alive."""
+"""A thread that changes a session's values and solves its frame, while the page answers."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Watcher(Protocol):
         ...
 
     def seen(self, points: Mapping[str, np.ndarray]) -> None:
-        """Positions of some garments on their way [m], world space, by path."""
+        """Positions of some garments before they are settled [m], world space, by path."""
         ...
 
     def show(self, shown: Shown) -> None:
@@ -65,7 +65,7 @@ class SolveLoop:
             self._changed.notify()
 
     def close(self) -> None:
-        """End the thread, after the step that it is at."""
+        """End the thread after the present step."""
         with self._changed:
             self._closing = True
             self._changed.notify()
@@ -99,13 +99,13 @@ class SolveLoop:
             rounds.append(None)
             self._watcher.seen(points)
 
-        # A round at least, so that cloth follows a hand that goes on.
+        # Cancelled after a round at the earliest: cloth moves even while changes keep coming.
         shown = self._session.solve(seen, lambda: bool(rounds) and self._is_wanted())
         self._watcher.show(shown)
         return shown.settled
 
     def _settle(self) -> bool:
-        """Solve the frame on as ``refine`` does; returns whether it was not given up for a change."""
+        """Settle the frame; returns whether no change cancelled that."""
         self._watcher.busy("settling")
         shown = self._session.settle(self._watcher.seen, self._is_wanted)
         self._watcher.show(shown)

@@ -64,7 +64,7 @@ class TunePage:
         self._state.content = _badge(f"{what} …", WORKING)
 
     def seen(self, points: Mapping[str, np.ndarray]) -> None:
-        """Draw garments on their way."""
+        """Draw garments that are not settled."""
         self._picture.move(points)
 
     def show(self, shown: Shown) -> None:

@@ -76,7 +76,7 @@ class Picture:
             self._place(f"body/coarse/{index}", mesh if both else None, BODY, side=-both)
 
     def move(self, points: Mapping[str, np.ndarray]) -> None:
-        """Move garments that are drawn in plain colour, by path."""
+        """Draw garments at new positions [m], by path, unless a painted map colours them."""
         for path, each in points.items():
             index = self._session.garments.index(path)
             key, handle = self._handles.get(f"fine/{index}", (None, None))
@@ -84,7 +84,7 @@ class Picture:
                 handle.vertices = self._shifted(each, side=self.shows == BOTH)
 
     def _shifted(self, points: np.ndarray, *, side: int) -> np.ndarray:
-        """Points where they are drawn on a side."""
+        """Points moved to the left (-1), the middle (0) or the right (1) of the picture [m], float32."""
         return (points - self._centre + side * self._apart * self._right).astype(np.float32)
 
     def _place(

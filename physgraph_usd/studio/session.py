@@ -41,7 +41,6 @@ class Shown:
         points: Fine positions of each garment [m], world space; None for one without a sample here.
         telemetry: The solver's figures of each garment, as in a report's frame.
         seconds: Wall time of reading and solving.
-        cpu_seconds: This process's own time for it.
         settled: Whether the frame is solved as ``refine`` solves it.
     """
 
@@ -49,7 +48,6 @@ class Shown:
     points: tuple[np.ndarray | None, ...]
     telemetry: tuple[dict[str, Any], ...]
     seconds: float
-    cpu_seconds: float
     settled: bool
 
 
@@ -184,7 +182,7 @@ class TuneSession:
         self.time, self._shown = time, None
 
     def solve(self, seen: Seen = lambda _: None, cancelled: Callable[[], bool] = lambda: False) -> Shown:
-        """The frame with the values tried, roughly, from where the cloth was.
+        """The frame with the values tried, roughly, from the last result; a first frame as `settle` does.
 
         Arguments are those of `FrameSolver.solve`.
 
@@ -195,7 +193,7 @@ class TuneSession:
         return self._shown or self._show(seen, cancelled, rough=True)
 
     def settle(self, seen: Seen = lambda _: None, cancelled: Callable[[], bool] = lambda: False) -> Shown:
-        """The frame as ``refine`` solves it from where the cloth is; not settled where ``cancelled``.
+        """The frame as ``refine`` solves it from the last result; not settled if ``cancelled``.
 
         Arguments and errors are those of `solve`.
         """
@@ -228,10 +226,10 @@ class TuneSession:
         return written
 
     def _show(self, seen: Seen, cancelled: Callable[[], bool], *, rough: bool) -> Shown:
-        began, spent = clock.perf_counter(), clock.process_time()
+        began, rough = clock.perf_counter(), rough and self._solver.begun  # A first frame is as `refine` solves it.
         state = self._solver.solve(self.shot, self.time, rough=rough, seen=seen, cancelled=cancelled)
-        times = clock.perf_counter() - began, clock.process_time() - spent
-        found = state.points, tuple(map(dict, state.telemetry)), *times, not (rough or cancelled())
+        seconds = clock.perf_counter() - began
+        found = state.points, tuple(map(dict, state.telemetry)), seconds, not (rough or cancelled())
         self._shown = Shown(self.shot.frame(self.time), *found)
         return self._shown
 

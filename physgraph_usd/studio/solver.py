@@ -18,7 +18,7 @@ from ..solver.scene import Frame, State
 from ..usd.read.reader import Shot
 
 Seen = Callable[[Mapping[str, np.ndarray]], None]
-"""Called with positions of some garments [m], world space, by path: valid cloth, on its way."""
+"""Called with positions of some garments before they are settled [m], world space, by path."""
 
 
 class FrameSolver:
@@ -39,6 +39,11 @@ class FrameSolver:
         self._at: tuple[float | None, ...] = ()  # The time code solved last; none before the first.
         self.refinements = self._refiner.refinements
 
+    @property
+    def begun(self) -> bool:
+        """Whether a frame was solved since the solver was made, or last told whether cloth feels contact."""
+        return bool(self._at)
+
     def feel(self, *, contact: bool) -> None:
         """Let cloth feel bodies and cloth, or nothing, from here on; the next frame starts cold."""
         self._settings, self._at = _settings(contact=contact), ()
@@ -52,13 +57,13 @@ class FrameSolver:
         seen: Seen = lambda _: None,
         cancelled: Callable[[], bool] = lambda: False,
     ) -> State:
-        """Solve a frame; the next solve goes on from its result, whole or not.
+        """Solve a frame from the last result, which may be rough or cancelled.
 
         Args:
             shot: The shot, read with the values that are tried.
             time: Time code.
-            rough: Whether the values still move.
-            seen: Receives the cloth after each round, and the smooth cage before a first frame.
+            rough: As in `SolveSettings`.
+            seen: Called after each round, and with the cages' smooth surface before a cold frame.
             cancelled: Asked before each step: whether to stop there.
 
         Raises:
@@ -67,7 +72,7 @@ class FrameSolver:
         """
         frame = shot.frame(time)
         follows = bool(self._at) and (self._at[0], time) in set(pairwise(self._times))
-        temporal = self._settings.temporal if follows else "warm"  # A frame that is held has no time to be slow in.
+        temporal = self._settings.temporal if follows else "warm"  # No time passes for the tether to slow cloth down.
         settings = replace(self._settings, rough=rough, shown=seen, cancelled=cancelled, temporal=temporal)
         if self._at:
             self._refiner = self._refiner.fork(settings)

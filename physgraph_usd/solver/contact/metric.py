@@ -25,7 +25,7 @@ from torch import Tensor
 
 from ..integrate.base import Solver
 from ..integrate.metric import Metric
-from ..mesh.stencil import rows_of
+from ..mesh.stencil import three_columns
 
 SMOOTH, ROUGH = 0.1, 2.0
 """Weights of the smooth and the rough part of P."""
@@ -51,7 +51,7 @@ class HeldMetric:
         self._plain = plain
         own = plain.diagonal.to(stiff)
         self._held = plain.between((own / (own + stiff)).sqrt().unsqueeze(1))
-        self._rough = rows_of((ROUGH / (own + stiff)).unsqueeze(1))
+        self._rough = three_columns(ROUGH / (own + stiff))
         self._last: tuple[Tensor, int, Tensor] | None = None
 
     def serves(self, stiff: Float[Tensor, " vertices"]) -> bool:

@@ -26,7 +26,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..level import PIN_MARGIN, Level
-from ..mesh.stencil import Stencil, rows_of
+from ..mesh.stencil import Stencil, three_columns
 
 SOFT_PIN = 10.0
 """Stiffness of a pin of weight 1/2, in guide stiffnesses."""
@@ -82,10 +82,10 @@ class Guide:
         soft = np.where((pin > 0) & (pin < 1.0 - PIN_MARGIN), SOFT_PIN * pin / np.maximum(1.0 - pin, PIN_MARGIN), 0.0)
         self._coarse_weight = per_area * guide_map.coarse_area
         self._pin_weight = soft * np.asarray(guide_map.fine_areas @ per_area).ravel()
-        self._weight = torch.as_tensor(self._coarse_weight, dtype=level.dtype, device=level.device)
-        self._weight = rows_of(self._weight.unsqueeze(1))
-        self._pin = torch.as_tensor(self._pin_weight, dtype=level.dtype, device=level.device)
-        self._pin = rows_of(self._pin.unsqueeze(1))
+        self._weight, self._pin = (
+            three_columns(torch.as_tensor(each, dtype=level.dtype, device=level.device))
+            for each in (self._coarse_weight, self._pin_weight)
+        )
         self._has_soft_pins = bool(soft.any())
         self._target = torch.zeros((len(per_area), 3), dtype=level.dtype, device=level.device)
         self._base = torch.zeros_like(level.rest)

@@ -17,7 +17,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..level import Level
-from ..mesh.stencil import rows_of
+from ..mesh.stencil import three_columns
 
 
 class Tether:
@@ -48,7 +48,7 @@ class Tether:
         self._level = level
         self._density, self._area = density.to(level.rest)[level.vertex_garment.long()], level.vertex_area
         self._weight = stiffness * self._density * self._area
-        self._pull = rows_of(self._weight.unsqueeze(1))
+        self._pull = three_columns(self._weight)
         self.predicted, self.stiffness = predicted, stiffness
 
     def aim(self, predicted: Float[Tensor, "vertices 3"], stiffness: float) -> None:

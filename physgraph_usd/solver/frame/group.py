@@ -115,10 +115,10 @@ class Group:
         """The lasting terms of each level, new ones when a material changes."""
         key = tuple((frame.fabric, frame.guide) for frame in frames)
         if key not in self._forces:
-            before = [each.lent() for last in self._forces.values() for each in last] or [None] * len(self.levels)
-            given = self.garments, tuple(frames), self.gravity
-            places = zip(self.levels, self.guide_maps, before, strict=True)
-            made = [LevelForces(level, guide_map, *given, before=lender) for level, guide_map, lender in places]
+            known = [each for last in self._forces.values() for each in last] if self.settings.rough else []
+            lent = [each.lends() for each in known] or [None] * len(self.levels)
+            given, places = (self.garments, tuple(frames), self.gravity), zip(self.levels, self.guide_maps, strict=True)
+            made = [LevelForces(*place, *given, lent=each) for place, each in zip(places, lent, strict=True)]
             self._forces.clear()
             self._forces[key] = made
         return self._forces[key]

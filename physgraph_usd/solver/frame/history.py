@@ -35,7 +35,7 @@ class SolvedFrame:
         state: State for the next frame.
         crossing: Whether each fine vertex belongs to cloth that crosses cloth.
         first: Whether no frame was solved before.
-        whole: Whether the solve went on to its end, for values that no longer moved.
+        whole: As `SolveSettings.whole`, at the end of the solve.
     """
 
     time: float | None

@@ -35,7 +35,7 @@ class LevelForces:
         garments: The garments.
         frames: Values of the garments at one time code.
         gravity: [m/s^2], shape (3,).
-        before: Terms of other materials, with a factor to lend; or None.
+        lent: Metric of other materials, and the diagonal of their Hessian at rest [N/m], for `rough_metric`; or None.
     """
 
     plain: Level
@@ -43,7 +43,7 @@ class LevelForces:
     garments: Sequence[Garment]
     frames: Sequence[GarmentFrame]
     gravity: np.ndarray
-    before: LevelForces | None = None
+    lent: tuple[Metric, Float[Tensor, " vertices"]] | None = None
 
     @cached_property
     def level(self) -> Level:
@@ -72,10 +72,11 @@ class LevelForces:
 
     @cached_property
     def rough_metric(self) -> Metric:
-        """The metric, or the last materials' with the diagonal of these: quick, and good enough to descend by."""
-        if self.before is None or "metric" in self.__dict__:
+        """The metric, or the lent one scaled to the diagonal of these terms, which needs no factorisation."""
+        if self.lent is None or self._factorised:
             return self.metric
-        return self.before.metric.scaled(self._stiffness / self.before._stiffness)
+        metric, stiffness = self.lent
+        return metric.scaled(self._stiffness / stiffness)
 
     @cached_property
     def density(self) -> Float[Tensor, " garments"]:
@@ -103,9 +104,14 @@ class LevelForces:
         """All terms, the guide without a target."""
         return ForceModule((*self.terms, self.guide))
 
-    def lent(self) -> LevelForces:
-        """The terms that can lend a factor to those of the next materials."""
-        return self if self.before is None or "metric" in self.__dict__ else self.before
+    @property
+    def _factorised(self) -> bool:
+        """Whether `metric` is known."""
+        return "metric" in self.__dict__
+
+    def lends(self) -> tuple[Metric, Float[Tensor, " vertices"]] | None:
+        """The metric and diagonal for other materials' `lent`: these terms' own, if factorised."""
+        return (self.metric, self._stiffness) if self._factorised else self.lent
 
     def without_facets(
         self, x: Float[Tensor, "vertices 3"], below: Float[Tensor, "coarse 3"], smooth: Stencil

@@ -250,7 +250,8 @@ class SceneFrame:
         for place, (index, memory) in enumerate(zip(part, memories, strict=True)):
             at = self.frame.time, self.frame.garments[index], self.frame.colliders, near, part
             points, crossing = solved.points[place], solved.crossing[place]
-            now = SolvedFrame(*at, points, states[place], crossing, memory.last is None, self.settings.whole)
+            ends = {"first": memory.last is None, "whole": self.settings.whole}
+            now = SolvedFrame(*at, points, states[place], crossing, **ends)
             before = memory.last if origin.broken is None else origin.frames[place]
             found.append(Answer(points, entry, Memory(now, before)))
         return found

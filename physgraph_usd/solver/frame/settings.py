@@ -43,7 +43,7 @@ class SolveSettings:
         reset: Thresholds for a cold start.
         contact: Contact settings.
         cancelled: Asked before each step whether the result is no longer needed; or None.
-        rough: Whether new materials descend by the last ones' factor: for values that are still moving.
+        rough: Whether a new material uses the last material's Cholesky factor as preconditioner.
         shown: Called with the positions of each garment [m], by path, after each round of the finest level; or None.
     """
 
@@ -62,7 +62,7 @@ class SolveSettings:
 
     @property
     def whole(self) -> bool:
-        """Whether the solve goes, or went, on to its end."""
+        """Whether the solve is neither rough nor cancelled: such a result may be reused for equal input."""
         return not (self.rough or (self.cancelled is not None and self.cancelled()))
 
     def budget(self, below: int, clock: float, *, warm: bool) -> Budget:

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..level import Level
-from ..mesh.stencil import rows_of
+from ..mesh.stencil import three_columns
 
 Solver = Callable[[Tensor], Tensor]
 """Maps right-hand sides [N] to solutions [m], shape (V, 3)."""
@@ -89,7 +89,7 @@ class System:
         self.field, self.metric = field, metric
         self.free, self.spacing, self.level = free, spacing, level
         self._all_free = bool(free.all())
-        self._mask = rows_of(free.to(spacing.dtype))
+        self._mask = three_columns(free.squeeze(1).to(spacing.dtype))
         self.evaluations = self.metric_solves = self.failed = 0
 
     @property
@@ -144,14 +144,14 @@ class System:
         return self.metric.diagonal.to(self.spacing)
 
     @cached_property
-    def rest_diagonal_rows(self) -> Float[Tensor, "vertices 3"]:
-        """`rest_diagonal` in each column."""
-        return rows_of(self.rest_diagonal.unsqueeze(1))
+    def rest_diagonal_columns(self) -> Float[Tensor, "vertices 3"]:
+        """`rest_diagonal` [N/m], in each of three columns."""
+        return three_columns(self.rest_diagonal)
 
     @cached_property
     def _per_edge(self) -> Float[Tensor, "vertices 3"]:
         """Factor from a move to its share of `relative_move` [1/m]."""
-        return rows_of((1.0 / (self.spacing * self.free.sum().clamp_min(1).sqrt())).unsqueeze(1))
+        return three_columns(1.0 / (self.spacing * self.free.sum().clamp_min(1).sqrt()))
 
     @cached_property
     def reach(self) -> Float[Tensor, " vertices"]:

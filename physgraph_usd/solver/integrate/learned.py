@@ -150,7 +150,7 @@ def _vector(name: str, *, system: System, carry: Carry, secant: Callable[[Carry]
     if name == "secant":
         return secant(carry)
     if name.startswith("diagonal"):
-        return (memory.force if name == "diagonal1" else carry.force) / system.rest_diagonal_rows
+        return (memory.force if name == "diagonal1" else carry.force) / system.rest_diagonal_columns
     if name.startswith("metric"):
         image = (carry.preconditioned, *memory.images)[int(name.removeprefix("metric") or 0)]
         assert image is not None

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from scipy.sparse.linalg import splu
 from torch import Tensor
 
-from ..mesh.stencil import Stencil, add_at, rows_of
+from ..mesh.stencil import Stencil, add_at, three_columns
 from .base import Solver
 from .multifrontal import DissectedSolver, Elimination
 
@@ -64,7 +64,8 @@ class Metric:
             free: False at fixed vertices, whose rows become identity rows.
             dtype: Scalar type of the right-hand sides.
         """
-        self._mask, self._free, self._matrix = rows_of(free.to(dtype)), free.squeeze(1), matrix
+        self._free, self._matrix = free.squeeze(1), matrix
+        self._mask = three_columns(self._free.to(dtype))
         self._merged: MergedMetric | None = None
         keep = sp.diags(self._free.cpu().numpy().astype(np.float64))
         couplings = sp.csr_matrix(keep @ (matrix - sp.diags(matrix.diagonal())) @ keep)
@@ -80,8 +81,12 @@ class Metric:
         return other
 
     def scaled(self, stiffer: Float[Tensor, " vertices"]) -> Metric:
-        """R^-1 H0 R^-1 with the diagonal of H0 times given factors; the factor of H0 is used."""
-        other, root = copy.copy(self), rows_of(stiffer.to(self._mask).rsqrt().unsqueeze(1))
+        """R H0 R, R a diagonal, solved by the Cholesky factor of H0; its diagonal is that of H0 times given numbers.
+
+        Args:
+            stiffer: R^2 at each vertex, positive.
+        """
+        other, root = copy.copy(self), three_columns(stiffer.to(self._mask).rsqrt())
         other._scaled, other._mask = self._scaled * root, self._mask * root
         other.diagonal = torch.where(self._free, self.diagonal * stiffer.double(), 1.0)
         return other

@@ -10,6 +10,7 @@ from __future__ import annotations
 import copy
 import functools
 import time
+from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from itertools import pairwise
@@ -20,11 +21,11 @@ import warp as wp
 from torch import Tensor
 
 LEAST_SECONDS = 5e-4
-"""Work per thread below which another thread costs more than it gains: waking one takes some 0.2 ms [s]."""
+"""Least work per thread [s]; waking a thread takes some 0.2 ms."""
 SLICES, SLICE_SECONDS = 8, 5e-5
 """Slices per thread and their least average work [s]: some items cost a hundred times as much as average, so free
 threads take the next slice, and slices shrink to shorten the wait for the last."""
-_item_seconds: dict[str, float] = {}
+_item_seconds: defaultdict[str, float] = defaultdict(float)
 """By kernel: time of an item in its last launches, on one thread [s]."""
 
 
@@ -72,9 +73,9 @@ class Launch:
         if self._device is not None:
             self._whole.launch(stream=current_stream(self._device))
             return
-        known = _item_seconds.get(self._name, 0.0)
+        known = _item_seconds[self._name]
         work = known * self._size
-        threads = self._most if LEAST_SECONDS == 0.0 else min(self._most, int(work / LEAST_SECONDS))
+        threads = min(self._most, int(work / LEAST_SECONDS))
         spent = _run([self._whole]) if threads < 2 else self._shared(threads, work)
         _item_seconds[self._name] = 0.5 * (known + spent / self._size)
 
@@ -82,8 +83,7 @@ class Launch:
         """Run on several threads, given the work [s]; returns the time of all threads together [s]."""
         assert self._whole is not None
         if not self._slices:
-            count = SLICES * threads if LEAST_SECONDS == 0.0 else min(SLICES * threads, int(work / SLICE_SECONDS))
-            bounds = _tapered(self._size, min(count, self._size))
+            bounds = _tapered(self._size, min(SLICES * threads, int(work / SLICE_SECONDS), self._size))
             self._slices = [_part(self._whole, a, b) for a, b in pairwise(bounds) if b > a]
         left = iter(self._slices)  # A list's iterator hands each command to one thread only.
         others: list[Future[float]] = []
