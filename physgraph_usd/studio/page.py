@@ -188,12 +188,17 @@ def figures(shown: Shown, index: int) -> dict[str, str]:
         lines["Strain, 99th percentile"] = f"{100.0 * entry['strain']['p99']:.2g} %"
     contact = entry.get("contact", {})
     if "cloth" in contact:
-        lines["Crossings of cloth"] = str(contact["cloth"]["after"]["crossings"])
+        lines["Crossings of cloth, before and after"] = _both(contact["cloth"], "crossings")
     if "bodies" in contact:
-        lines["Vertices inside bodies"] = str(sum(body["after"]["inside"] for body in contact["bodies"].values()))
+        for path, body in contact["bodies"].items():
+            lines[f"Inside {path.rpartition('/')[2]}, before and after"] = _both(body, "inside")
     if "levels" in entry:
         lines["Evaluations"] = str(sum(level["evaluations"] for level in entry["levels"]))
     return lines | {"Seconds": f"{shown.seconds:.2f}", "Start": str(entry.get("start", ""))}
+
+
+def _both(entry: Mapping[str, Any], name: str) -> str:
+    return f"{entry['before'][name]} → {entry['after'][name]}"
 
 
 def _badge(text: str, color: str) -> str:

@@ -36,6 +36,8 @@ FLOOR_SIZE = 12.0
 """Half of the floor's width, in the size of what is drawn."""
 GAP = 0.1
 """Space between columns, in the size of what is drawn."""
+SAMPLED = 6
+"""Frames whose widths set the columns apart."""
 WIRE_PIXELS = 0.8
 
 
@@ -94,39 +96,49 @@ class Picture:
         self.view = View()
         self.bar: Map | None = None
         self.stroke: Stroke | None = None
-        self._scene, self._session = server.scene, session
+        self._server, self._scene, self._session = server, server.scene, session
         scene, frame = session.shot.scene, session.shot.frame(session.time)
         points = np.concatenate([each.points for each in frame.garments])
         low, high = points.min(axis=0), points.max(axis=0)
         self.centre, self.size = 0.5 * (low + high), float(np.linalg.norm(high - low))
         up = -scene.gravity / np.linalg.norm(scene.gravity)
         self.right = np.array([0.0, 1.0, 0.0]) if abs(up[0]) > 0.9 else np.array([1.0, 0.0, 0.0])
-        bodies = [mesh[0] for mesh in map(mesh_of, filter(None, frame.colliders)) if mesh is not None]
-        self._drawn = np.concatenate([points, *bodies])
-        self._across = np.ptp(self._drawn @ self.right) + GAP * self.size
+        times = session.times[:: max(1, len(session.times) // SAMPLED)]
+        drawn = [_everything(session.shot.frame(time)) for time in times]
+        self._drawn = drawn[0]
+        self._across = max(np.ptp(each @ self.right) for each in drawn) + GAP * self.size
         self._handles: dict[str, tuple[object, Any]] = {}
         self.fine: dict[int, Any] = {}
         server.scene.set_up_direction(up)
         eye = np.cross(self.right, up) + 0.16 * up
-        server.initial_camera.position = max(1.4 * self.size, 3.4 * self._across) * eye / np.linalg.norm(eye)
+        server.initial_camera.position = self._wide(self.view) * eye / np.linalg.norm(eye)
         server.initial_camera.look_at = (0.0, 0.0, 0.0)
         server.initial_camera.fov = np.radians(38.0)
         self._light(up)
 
+    def look(self, view: View) -> None:
+        """Show cloth in another way; every browser's camera goes as far off as the columns need."""
+        ratio = self._wide(view) / self._wide(self.view)
+        self.view = view
+        for client in self._server.get_clients().values() if ratio != 1.0 else ():
+            at, camera = client.camera.look_at, client.camera
+            camera.position = at + ratio * (camera.position - at)
+
     def draw(self, shown: Shown, *, kept: Shown | None = None) -> None:
         """Draw a frame; ``kept`` is A's."""
-        self.bar = None
-        columns = self.view.columns
-        named = set[str]()
-        for place, column in enumerate(columns):
-            at = self._offset(place, len(columns))
-            for index in range(len(shown.points)):
-                named |= self._draw_garment(shown, kept, index, column=column, at=at)
-            if not (self.view.wiped and place):
-                named |= self._draw_bodies(shown.frame, column, at=at)
-        for name in self._handles.keys() - named:
-            self._handles.pop(name)[1].remove()
-        self.fine = {k: self._handles[f"{FINE}/{k}"][1] for k in range(len(shown.points)) if f"{FINE}/{k}" in named}
+        with self._server.atomic():  # Pictures between two states are never drawn.
+            self.bar = None
+            columns = self.view.columns
+            named = set[str]()
+            for place, column in enumerate(columns):
+                at = self._offset(place, len(columns))
+                for index in range(len(shown.points)):
+                    named |= self._draw_garment(shown, kept, index, column=column, at=at)
+                if not (self.view.wiped and place):
+                    named |= self._draw_bodies(shown.frame, column, at=at)
+            for name in self._handles.keys() - named:
+                self._handles.pop(name)[1].remove()
+            self.fine = {k: self._handles[f"{FINE}/{k}"][1] for k in range(len(shown.points)) if f"{FINE}/{k}" in named}
 
     def move(self, points: Mapping[str, np.ndarray]) -> None:
         """Draw refined garments at new positions [m], by path; a map's colours, wires and a wipe follow in `draw`."""
@@ -141,6 +153,11 @@ class Picture:
         """The place [m] in the shot of a point on the refined cloth that is drawn."""
         count = len(self.view.columns)
         return point + self.centre - self._offset(count - 1, count)
+
+    def _wide(self, view: View) -> float:
+        """How far off the camera stands for a view [m]."""
+        columns = 1 if view.wiped else len(view.columns)
+        return max(1.4 * self.size, 1.7 * columns * self._across)
 
     def _offset(self, place: int, count: int) -> np.ndarray:
         """How far a column stands from the middle [m]."""
@@ -158,7 +175,7 @@ class Picture:
         if column == FINE:
             found = find_map(self._session, shown, index, self.view.map, stroke=self.stroke)
         colors = None if found is None else self._colored(*found)
-        sheet = self._wiped(sheet, column)
+        sheet = self._wiped(sheet, column, _everything(shown.frame))
         name = f"{column}/{index}"
         self._place(name, sheet, COLORS[column], at=at, flat=column == CAGE, colors=colors)
         return {name} | (self._draw_wires(name, sheet, at=at) if self.view.wires else set())
@@ -186,11 +203,11 @@ class Picture:
             found = points
         return None if found is None or len(found) != count else Sheet(found, split, edges)
 
-    def _wiped(self, sheet: Sheet, column: str) -> Sheet:
-        """The part of a mesh on its side of the wipe."""
+    def _wiped(self, sheet: Sheet, column: str, drawn: np.ndarray) -> Sheet:
+        """The part of a mesh on its side of the wipe, which goes over all that is drawn [m], shape (N, 3)."""
         if not self.view.wiped or len(self.view.columns) < 2:
             return sheet
-        low, high = (self._drawn @ self.right).min(), (self._drawn @ self.right).max()
+        low, high = (drawn @ self.right).min(), (drawn @ self.right).max()
         line = low + self.view.wipe * (high - low)
         first = column == self.view.columns[0]
 
@@ -286,6 +303,12 @@ def mesh_of(pose: Pose) -> tuple[np.ndarray, np.ndarray] | None:
         return None
     points, triangles = tessellated(pose.kind, pose.size)
     return points @ pose.turn.T + pose.centre, triangles
+
+
+def _everything(frame: Frame) -> np.ndarray:
+    """Points of all cages and bodies [m], shape (N, 3)."""
+    bodies = [mesh[0] for mesh in map(mesh_of, filter(None, frame.colliders)) if mesh is not None]
+    return np.concatenate([*(each.points for each in frame.garments), *bodies])
 
 
 def _edges(mesh: PolygonMesh) -> np.ndarray:
