@@ -1,11 +1,13 @@
 """How long an artist waits in `tune`: from a move of a slider to the first new cloth, and to the settled cloth.
 
     python -m benchmarks.tune [--moves 20] [--shot NAME]... [--folder SHOTS] [--page]
+    python -m benchmarks.tune --pictures docs
 
 Moves six sliders of a frame in the middle of each shot to random places, one after another, with contact; real shots
 where their folder is given. Prints a row a shot: median and longest wall seconds until the first round is handed over
 and until the frame is settled. With ``--page`` a browser is driven instead, and the time is from the mouse's press to
-the new vertices at the graphics card; without a card the processor draws, on the solver's cores.
+the new vertices at the graphics card; without a card the processor draws, on the solver's cores. ``--pictures``
+writes the pictures and the film of docs/tune.md; it takes the program ffmpeg.
 """
 
 from __future__ import annotations
@@ -19,7 +21,7 @@ from statistics import median
 
 import click
 
-from benchmarks import page_timing
+from benchmarks import page_driver
 from benchmarks.contact_shots import REAL
 from benchmarks.rows import say, table
 from physgraph_usd.lab.samples import SAMPLES, write_sample
@@ -37,8 +39,11 @@ CHOSEN = ("skirt", "dancer", "layers")
 @click.option("--shot", "names", multiple=True, default=CHOSEN, show_default=True, help="Samples.")
 @click.option("--folder", type=click.Path(path_type=Path), help="The real shots, which we may not ship.")
 @click.option("--page", is_flag=True, help="In a browser.")
-def main(moves: int, names: Sequence[str], folder: Path | None, *, page: bool) -> None:
-    """Print what each shot takes."""
+@click.option("--pictures", type=click.Path(path_type=Path), help="Write the pictures and the film into its folders.")
+def main(moves: int, names: Sequence[str], folder: Path | None, *, page: bool, pictures: Path | None) -> None:
+    """Print what each shot takes, or write the pictures."""
+    if pictures is not None:
+        return draw(pictures)
     head = ["vertices", "first cloth, median [s]", "longest", "settled, median [s]", "longest"]
     say(table(["shot", *head], []))
     with tempfile.TemporaryDirectory() as made:
@@ -80,10 +85,26 @@ def in_page(session: TuneSession, tried: Sequence[tuple[Tunable, float]], count:
     page = TunePage(session)
     try:
         least = count // max(len(session.garments), 1) // 2
-        with page_timing.opened(page.url, vertices=least) as shown:
-            return [page_timing.waits(shown, tunable, place) for tunable, place in tried]
+        with page_driver.opened(page.url, vertices=least) as shown:
+            return [page_driver.waits(shown, tunable, place) for tunable, place in tried]
     finally:
         page.close()
+
+
+def draw(folder: Path) -> None:
+    """Write the pictures and the film of the page, with the skirt."""
+    with tempfile.TemporaryDirectory() as made:
+        ((_, session),) = sessions(["skirt"], None, Path(made))
+        session.set_time(session.times[len(session.times) // 2])
+        page = TunePage(session)
+        try:
+            with page_driver.opened(page.url, vertices=1) as shown:
+                tour = page_driver.Tour(shown)
+                tour.go(folder / "pictures")
+                tour.write(folder / "films" / "tune.mp4")
+        finally:
+            page.close()
+            session.close()
 
 
 if __name__ == "__main__":

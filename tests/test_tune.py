@@ -269,13 +269,14 @@ def test_a_drag_is_one_step_of_undo():
     history = History(Setting((1,)), seconds=lambda: now[0])
     for time in (1.0, 1.5, 2.0, 9.0):
         now[0] = time
-        history.put(Setting((1,)), "Density")
-    history.put(Setting((1,)), "Detail")
+        history.put(Setting((1,)), "Density", joins=True)
+    history.put(Setting((1,)), "Pin")
+    history.put(Setting((1,)), "Pin")
     steps = []
     while history.undone_next:
         steps.append(history.undone_next)
         history.undo()
-    assert steps == ["Detail", "Density", "Density"]
+    assert steps == ["Pin", "Pin", "Density", "Density"]
 
 
 def test_a_value_is_taken_from_the_shot_again(session: TuneSession):

@@ -23,7 +23,7 @@ class PaintPanel:
         """Add the controls."""
         self._desk, self._view, gui = desk, view, desk.gui
         self._name, self._stroke = OFF, None
-        self._painted: set[int] = set()  # Handles that have the callbacks, by identity.
+        self._attached: dict[int, Any] = {}  # Handles that have the callbacks.
         size = desk.picture.size
         self.brush = Brush(radius=0.05 * size)
         choice = gui.add_dropdown(
@@ -40,23 +40,19 @@ class PaintPanel:
 
     def choose(self, session: TuneSession, name: str) -> None:
         """Take up the brush for a map of `MAPS`, or put it down."""
-        self._name = name
+        self._name, self._desk.picture.paintable = name, name != OFF
         if name != OFF:
             row = GARMENT[name]
             self._value.value = float((row.soft or (0.0, 1.0))[1])
             self._view.set(map=name)
 
     def attach(self) -> None:
-        """Have drags on the refined cloth that is drawn paint, where the brush is taken up; else turn the view."""
-        for index, handle in self._desk.picture.fine.items():
-            if self._name != OFF and id(handle) not in self._painted:
+        """Have drags on the refined cloth that is drawn paint; without targets they turn the view."""
+        for index, handle in self._desk.picture.targets.items():
+            if self._attached.get(index) is not handle:
                 handle.on_drag("left")(lambda event, index=index: self._dragged(index, event))
                 handle.on_click(lambda event, index=index: self._clicked(index, event))
-                self._painted.add(id(handle))
-            elif self._name == OFF and id(handle) in self._painted:
-                handle.remove_drag_callback("all")
-                handle.remove_click_callback("all")
-                self._painted.discard(id(handle))
+        self._attached = dict(self._desk.picture.targets)
 
     def _clicked(self, index: int, event: Any) -> None:
         origin, along = np.asarray(event.ray_origin), np.asarray(event.ray_direction)

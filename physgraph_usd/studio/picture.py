@@ -36,6 +36,8 @@ FLOOR_SIZE = 12.0
 """Half of the floor's width, in the size of what is drawn."""
 GAP = 0.1
 """Space between columns, in the size of what is drawn."""
+AWAY = 3.8
+"""How far off the camera stands, in widths of a column: three are seen."""
 SAMPLED = 6
 """Frames whose widths set the columns apart."""
 WIRE_PIXELS = 0.8
@@ -86,7 +88,9 @@ class Picture:
 
     Attributes:
         view: How cloth is shown.
-        fine: Handles of the refined garments that are drawn, by number.
+        paintable: Whether the refined garments lie under meshes that cannot be seen, for the mouse to meet: those that
+            show a map are made anew with each change of their colours, and miss it meanwhile.
+        targets: Handles of those meshes, by number of the garment.
         bar: The map that is drawn, or None.
         stroke: The map under the brush, drawn in place of the session's; or None.
     """
@@ -108,21 +112,14 @@ class Picture:
         self._drawn = drawn[0]
         self._across = max(np.ptp(each @ self.right) for each in drawn) + GAP * self.size
         self._handles: dict[str, tuple[object, Any]] = {}
-        self.fine: dict[int, Any] = {}
+        self.paintable = False
+        self.targets: dict[int, Any] = {}
         server.scene.set_up_direction(up)
         eye = np.cross(self.right, up) + 0.16 * up
-        server.initial_camera.position = self._wide(self.view) * eye / np.linalg.norm(eye)
+        server.initial_camera.position = max(1.4 * self.size, AWAY * self._across) * eye / np.linalg.norm(eye)
         server.initial_camera.look_at = (0.0, 0.0, 0.0)
         server.initial_camera.fov = np.radians(38.0)
         self._light(up)
-
-    def look(self, view: View) -> None:
-        """Show cloth in another way; every browser's camera goes as far off as the columns need."""
-        ratio = self._wide(view) / self._wide(self.view)
-        self.view = view
-        for client in self._server.get_clients().values() if ratio != 1.0 else ():
-            at, camera = client.camera.look_at, client.camera
-            camera.position = at + ratio * (camera.position - at)
 
     def draw(self, shown: Shown, *, kept: Shown | None = None) -> None:
         """Draw a frame; ``kept`` is A's."""
@@ -138,7 +135,8 @@ class Picture:
                     named |= self._draw_bodies(shown.frame, column, at=at)
             for name in self._handles.keys() - named:
                 self._handles.pop(name)[1].remove()
-            self.fine = {k: self._handles[f"{FINE}/{k}"][1] for k in range(len(shown.points)) if f"{FINE}/{k}" in named}
+            found = {index: self._handles.get(f"target/{index}") for index in range(len(shown.points))}
+            self.targets = {index: each[1] for index, each in found.items() if each is not None}
 
     def move(self, points: Mapping[str, np.ndarray]) -> None:
         """Draw refined garments at new positions [m], by path; a map's colours, wires and a wipe follow in `draw`."""
@@ -153,11 +151,6 @@ class Picture:
         """The place [m] in the shot of a point on the refined cloth that is drawn."""
         count = len(self.view.columns)
         return point + self.centre - self._offset(count - 1, count)
-
-    def _wide(self, view: View) -> float:
-        """How far off the camera stands for a view [m]."""
-        columns = 1 if view.wiped else len(view.columns)
-        return max(1.4 * self.size, 1.7 * columns * self._across)
 
     def _offset(self, place: int, count: int) -> np.ndarray:
         """How far a column stands from the middle [m]."""
@@ -178,6 +171,9 @@ class Picture:
         sheet = self._wiped(sheet, column, _everything(shown.frame))
         name = f"{column}/{index}"
         self._place(name, sheet, COLORS[column], at=at, flat=column == CAGE, colors=colors)
+        if column == FINE and self.paintable:
+            self._place(f"target/{index}", sheet, COLORS[column], at=at, opacity=0.0)
+            return {name, f"target/{index}"}
         return {name} | (self._draw_wires(name, sheet, at=at) if self.view.wires else set())
 
     def _colored(self, found: Map, values: np.ndarray) -> np.ndarray:
@@ -253,6 +249,7 @@ class Picture:
         at: np.ndarray,
         flat: bool = False,
         colors: np.ndarray | None = None,
+        opacity: float | None = None,
     ) -> None:
         """Show a mesh under a name; only points are sent where that is enough."""
         known, handle = self._handles.pop(name, (None, None))
@@ -263,7 +260,7 @@ class Picture:
             if not np.array_equal(handle.vertices, points):
                 handle.vertices = points
         elif colors is None:
-            look: dict[str, Any] = {"color": color, "flat_shading": flat, "side": "double"}
+            look: dict[str, Any] = {"color": color, "flat_shading": flat, "side": "double", "opacity": opacity}
             handle = self._scene.add_mesh_simple(name, points, sheet.triangles, **look)
         elif handle is not None and known == key:
             handle.glb_data = _glb(points, sheet.triangles, colors)

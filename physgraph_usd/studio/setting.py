@@ -57,10 +57,10 @@ class History:
         """The change that `redo` makes again, or ""."""
         return self._steps[self._at + 1][1] if self._at + 1 < len(self._steps) else ""
 
-    def put(self, setting: Setting, change: str) -> None:
-        """Go on to a setting by a change, in words; it joins an equal change just before."""
+    def put(self, setting: Setting, change: str, *, joins: bool = False) -> None:
+        """Go on to a setting by a change, in words; one that ``joins`` is a step with an equal change just before."""
         now = self._seconds()
-        joined = self._at > 0 and change == self.undone_next and now - self._last < JOINED_SECONDS
+        joined = joins and self._at > 0 and change == self.undone_next and now - self._last < JOINED_SECONDS
         self._at += 0 if joined else 1
         self._steps[self._at :] = [(setting, change)]
         self._last = now

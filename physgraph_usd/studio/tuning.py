@@ -82,7 +82,7 @@ class Tuning:
         """
         if name not in TUNABLES:
             raise UsageError(f"unknown value '{name}'; known values: {', '.join(TUNABLES)}")
-        self._try(garment, self._values(garment) | _rounded({name: value}), TUNABLES[name].label)
+        self._try(garment, self._values(garment) | _rounded({name: value}), TUNABLES[name].label, joins=True)
 
     def reset(self, garment: str, name: str) -> None:
         """Take a value from the shot again, where it was tried.
@@ -172,14 +172,17 @@ class Tuning:
         self._index(garment)
         return dict(self.setting.values.get(garment, {}))
 
-    def _try(self, garment: str, values: Mapping[str, float], change: str, **others: object) -> None:
+    def _try(
+        self, garment: str, values: Mapping[str, float], change: str, *, joins: bool = False, **others: object
+    ) -> None:
         """Go on to a garment's values, and ``others`` of the setting."""
-        self._put(replace(self.setting, values={**self.setting.values, garment: values}, **others), change)
+        setting = replace(self.setting, values={**self.setting.values, garment: values}, **others)
+        self._put(setting, change, joins=joins)
 
-    def _put(self, setting: Setting, change: str) -> None:
+    def _put(self, setting: Setting, change: str, *, joins: bool = False) -> None:
         """Go on to a setting; one that cannot be used changes nothing."""
         self.shot = self._tried.read(setting)
-        self.history.put(setting, change)
+        self.history.put(setting, change, joins=joins)
 
 
 def _rounded(values: Mapping[str, float]) -> dict[str, float]:

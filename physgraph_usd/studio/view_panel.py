@@ -44,7 +44,7 @@ class ViewPanel:
 
     def set(self, **changes: Any) -> None:
         """Change how cloth is looked at, by the names of `View`."""
-        self._desk.picture.look(replace(self._desk.picture.view, **changes))
+        self._desk.picture.view = replace(self._desk.picture.view, **changes)
         for name, value in changes.items():
             put(self._controls[name], value=value)
 
