@@ -24,7 +24,12 @@ from .membrane import in_plane_terms
 def elastic_terms(
     level: Level, fabrics: Sequence[Fabric], *, raised: Sequence[bool] | None = None
 ) -> tuple[Force, ...]:
-    """The elastic terms of the cloth.
+    """The elastic terms of the cloth; arguments are those of `bending_term`."""
+    return (*in_plane_terms(level, fabrics), bending_term(level, fabrics, raised=raised))
+
+
+def bending_term(level: Level, fabrics: Sequence[Fabric], *, raised: Sequence[bool] | None = None) -> Force:
+    """The bending of the cloth.
 
     Args:
         level: The level.
@@ -36,9 +41,7 @@ def elastic_terms(
     if any(fabric.weft_bend is not None for fabric in fabrics):
         weft = [fabric.bend if fabric.weft_bend is None else fabric.weft_bend for fabric in fabrics]
     least = None if raised is None else _carried(level, fabrics, raised)
-    bends = _each(level, [fabric.bend for fabric in fabrics])
-    bending = Bending(level, bends, weft=weft, least=least)
-    return (*in_plane_terms(level, fabrics), bending)
+    return Bending(level, _each(level, [fabric.bend for fabric in fabrics]), weft=weft, least=least)
 
 
 def body_terms(level: Level, fabrics: Sequence[Fabric], *, gravity: np.ndarray) -> tuple[Force, ...]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -12,10 +12,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..fabric import Fabric
-from ..forces import body_terms, elastic_terms
+from ..forces import bending_term, body_terms
 from ..forces.base import Force, ForceModule
 from ..forces.bending import Bending
 from ..forces.guide import Guide, GuideMap
+from ..forces.membrane import in_plane_terms
 from ..forces.tether import Tether
 from ..integrate.base import ForceField, Preconditioner, System
 from ..integrate.metric import Metric, on_edges
@@ -23,6 +24,42 @@ from ..integrate.saddle import facets
 from ..level import Level
 from ..mesh.stencil import Stencil
 from ..scene import Garment, GarmentFrame
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """Elastic terms that depend on some of the fabrics' values.
+
+    Attributes:
+        fabrics: Fabrics with those values, and the defaults of all others.
+        level: The level, with the rest lengths of these fabrics.
+        terms: The terms.
+    """
+
+    fabrics: tuple[Fabric, ...]
+    level: Level
+    terms: tuple[Force, ...]
+
+    @cached_property
+    def stiffness(self) -> Float[Tensor, " vertices"]:
+        """Diagonal of the Hessian at rest [N/m]."""
+        return ForceModule(self.terms).diagonal(self.level.rest)
+
+
+@dataclass(frozen=True, eq=False)
+class Lent:
+    """The results of other materials that new ones may use.
+
+    Attributes:
+        metric: Their metric.
+        stiffness: Diagonal of their Hessian at rest [N/m].
+        in_plane, bending: Their elastic terms.
+    """
+
+    metric: Metric
+    stiffness: Float[Tensor, " vertices"]
+    in_plane: Part
+    bending: Part
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +72,7 @@ class LevelForces:
         garments: The garments.
         frames: Values of the garments at one time code.
         gravity: [m/s^2], shape (3,).
-        lent: Metric of other materials, and the diagonal of their Hessian at rest [N/m], for `rough_metric`; or None.
+        lent: Results of other materials: their metric for `rough_metric`, and terms that are the same here; or None.
     """
 
     plain: Level
@@ -43,19 +80,34 @@ class LevelForces:
     garments: Sequence[Garment]
     frames: Sequence[GarmentFrame]
     gravity: np.ndarray
-    lent: tuple[Metric, Float[Tensor, " vertices"]] | None = None
+    lent: Lent | None = None
 
-    @cached_property
+    @property
     def level(self) -> Level:
         """The level, with the cloth's rest lengths."""
-        return self.plain.eased(self._fabrics)
+        return self._in_plane.level
 
     @cached_property
     def terms(self) -> tuple[Force, ...]:
         """Stretch, membrane, bending and gravity."""
+        body = body_terms(self.level, self._fabrics, gravity=self.gravity)
+        return (*self._in_plane.terms, *self._bending.terms, *body)
+
+    @cached_property
+    def _in_plane(self) -> Part:
+        fabrics = tuple(replace(each, bend=0.0, weft_bend=None) for each in self._elastic)
+        if self.lent is not None and self.lent.in_plane.fabrics == fabrics:
+            return self.lent.in_plane
+        level = self.plain.eased(fabrics)
+        return Part(fabrics, level, in_plane_terms(level, fabrics))
+
+    @cached_property
+    def _bending(self) -> Part:
+        fabrics = self._elastic
+        if self.lent is not None and self.lent.bending.fabrics == fabrics:
+            return self.lent.bending
         raised = [each.raises_bending for each in self.garments]
-        elastic = elastic_terms(self.level, self._fabrics, raised=raised)
-        return (*elastic, *body_terms(self.level, self._fabrics, gravity=self.gravity))
+        return Part(fabrics, self.level, (bending_term(self.level, fabrics, raised=raised),))
 
     @cached_property
     def guide(self) -> Guide:
@@ -75,8 +127,7 @@ class LevelForces:
         """The metric, or the lent one scaled to the diagonal of these terms, which needs no factorisation."""
         if self.lent is None or self._factorised:
             return self.metric
-        metric, stiffness = self.lent
-        return metric.scaled(self._stiffness / stiffness)
+        return self.lent.metric.scaled(self._stiffness / self.lent.stiffness)
 
     @cached_property
     def density(self) -> Float[Tensor, " garments"]:
@@ -93,11 +144,18 @@ class LevelForces:
     def _fabrics(self) -> list[Fabric]:
         return [frame.fabric for frame in self.frames]
 
+    @property
+    def _elastic(self) -> tuple[Fabric, ...]:
+        """The fabrics without the values that no elastic term depends on."""
+        return tuple(replace(each, density=0.0, thickness=0.0, crease_time=0.0) for each in self._fabrics)
+
     @cached_property
     def _stiffness(self) -> Float[Tensor, " vertices"]:
         """Diagonal of the Hessian at rest [N/m], positive."""
         tiny = torch.finfo(self.level.dtype).tiny
-        return self._module.diagonal(self.level.rest).clamp_min(tiny)
+        others = [each for each in self._module.forces if each not in (*self._in_plane.terms, *self._bending.terms)]
+        parts = [self._in_plane.stiffness, self._bending.stiffness, ForceModule(others).diagonal(self.level.rest)]
+        return torch.stack(parts).sum(dim=0).clamp_min(tiny)
 
     @property
     def _module(self) -> ForceModule:
@@ -109,9 +167,11 @@ class LevelForces:
         """Whether `metric` is known."""
         return "metric" in self.__dict__
 
-    def lends(self) -> tuple[Metric, Float[Tensor, " vertices"]] | None:
-        """The metric and diagonal for other materials' `lent`: these terms' own, if factorised."""
-        return (self.metric, self._stiffness) if self._factorised else self.lent
+    def lends(self) -> Lent | None:
+        """The results for other materials' `lent`; their metric is these terms' own, if factorised."""
+        if self._factorised:
+            return Lent(self.metric, self._stiffness, self._in_plane, self._bending)
+        return None if self.lent is None else replace(self.lent, in_plane=self._in_plane, bending=self._bending)
 
     def without_facets(
         self, x: Float[Tensor, "vertices 3"], below: Float[Tensor, "coarse 3"], smooth: Stencil
