@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import html
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from time import sleep
 from typing import Any
 
 import numpy as np
 
-from ..errors import PhysGraphError
+from ..errors import LayerError, PhysGraphError
 from ..interrupts import leave_if_asked
 from .desk import Desk, put, small
 from .guard import guarded_server
@@ -60,7 +61,8 @@ class TunePage:
         self.loop.close()
         tried = {path: dict(values) for path, values in self._session.setting.values.items()}
         looked = {"time": self._session.time, "garment": self._desk.garment, "camera": self._camera}
-        self._desk.notes.save(looked | {"view": self._view.looked, "values": tried})
+        with suppress(LayerError):  # A folder that cannot be written to; saving the layer has said so.
+            self._desk.notes.save(looked | {"view": self._view.looked, "values": tried})
         self._server.stop()
 
     def busy(self, what: str) -> None:
