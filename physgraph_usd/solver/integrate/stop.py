@@ -51,7 +51,7 @@ class Budget:
         least: Number of steps exempt from the deadline.
         touching: Most steps with contact, if more.
         near: Remaining move, in tolerances, below which a level in contact ends early; 0 for never.
-        hurried: Whether somebody waits for the end of the first round.
+        hurried: Whether somebody waits for the first round, and another solve follows: contact gives no more steps.
     """
 
     steps: int
@@ -106,7 +106,7 @@ class Budget:
             return True
         if touched and made >= EARLY * self.steps and report.remaining_move < self.near * self.tolerance:
             return True
-        return made >= (max(self.steps, self.touching) if touched else self.steps)
+        return made >= (max(self.steps, self.touching) if touched and not self.hurried else self.steps)
 
     def is_spent(self, steps: int) -> bool:
         """Whether no further step may begin after ``steps`` steps, whatever the cloth's state."""
