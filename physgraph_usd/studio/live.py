@@ -104,7 +104,8 @@ class Answers:
 
     def _points_file(self, index: int, points: np.ndarray) -> str:
         """Write points under the name that the last answer did not use; a reader sees the old or the new file."""
-        file = self._folder / f"points-{index}-{self._count % 2}.npy"
+        level = len(self._session.refinements[index])
+        file = self._folder / f"points-{index}-{level}-{self._count % 2}.npy"
         part = file.with_suffix(".part")
         with part.open("wb") as stream:
             np.save(stream, points.astype(np.float32))
