@@ -256,6 +256,7 @@ def follow(label, state="settled", patience=100.0):
         if not goes_on or (shown.state.startswith(state) and (first is not None or not seen)):
             break
     SEEN[label] = {"first": first, "seconds": time.perf_counter() - began, "state": shown.state}
+    SEEN[label] |= {"sent": dict(shown._known.values) if shown._known else {}}
     SEEN[label] |= {"failure": live_view().last_failure(), "level": bpy.context.scene.physgraph.level}
     for item in [item for item in bpy.data.objects if item.type == "MESH"]:
         measure(item, f"{label}:{item.name}:{bpy.context.scene.frame_current}")
@@ -274,6 +275,16 @@ def live_points():
 def go(frame):
     """Go to a frame."""
     bpy.context.scene.frame_set(frame)
+
+
+def push():
+    """Set a point that undo goes back to."""
+    bpy.ops.ed.undo_push(message="step")
+
+
+def undo():
+    """Undo."""
+    bpy.ops.ed.undo()
 
 
 def keep(label):

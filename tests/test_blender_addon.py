@@ -108,7 +108,7 @@ def odd(program: str, tmp_path_factory: pytest.TempPathFactory) -> Seen:
     return run_job(tmp_path_factory.mktemp("odd"), *both[0], *both[1])
 
 
-def within_a_cage_edge(seen: Seen, label: str, frame: int, name: str = FINE) -> None:
+def within_a_cage_edge(seen: Seen, label: str, frame: int, *, name: str = FINE) -> None:
     """Each vertex on either side has one of the other nearer than the cage's longest edge."""
     coarse, fine = seen.array(label, COAT, frame), seen.array(label, name, frame)
     faces = seen.array(label, COAT, frame, what="faces")
@@ -273,6 +273,12 @@ def lively(program: str, tmp_path_factory: pytest.TempPathFactory) -> Seen:
         step("look", "on"),
         step("choose", "Bodies", use_bend=True, bend=200.0),
         step("follow", "bent"),
+        step("push"),
+        step("choose", "Bodies", use_bend=True, bend=2000.0),
+        step("push"),
+        step("follow", "stiff"),
+        step("undo"),
+        step("follow", "undone"),
         step("go", 3),
         step("follow", "third"),
         step("choose", "Bodies", level=1, preset="silk"),
@@ -291,13 +297,18 @@ class TestLive:
     def test_the_cloth_lies_where_the_coarse_cloth_does(self, lively: Seen) -> None:
         for label, frame in (("first", 2), ("bent", 2), ("third", 3), ("other", 3)):
             assert lively.found[label]["state"] == "settled", lively.found[label]
-            within_a_cage_edge(lively, label, frame, LIVE)
+            within_a_cage_edge(lively, label, frame, name=LIVE)
 
     def test_it_follows_values_and_frames(self, lively: Seen) -> None:
         bent = lively.array("bent", LIVE, 2) - lively.array("first", LIVE, 2)
         assert np.abs(bent).max() > 1e-3
         assert np.abs(lively.array("third", LIVE, 3) - lively.array("bent", LIVE, 2)).max() > 0.1
         assert lively.found["bent"]["first"] < 5.0
+
+    def test_it_follows_undo(self, lively: Seen) -> None:
+        bends = [lively.found[label]["sent"]["bendStiffness"] for label in ("bent", "stiff", "undone")]
+        assert bends == pytest.approx([200e-6, 2000e-6, 200e-6])
+        assert np.abs(lively.array("undone", LIVE, 2) - lively.array("stiff", LIVE, 2)).max() > 1e-3
 
     def test_a_level_that_is_chosen_goes_onto_the_panel(self, lively: Seen) -> None:
         level = lively.found["first"]["level"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -87,9 +88,15 @@ def test_a_process_that_fails_says_why(live: ModuleType, program: list[str], tmp
 
 def test_one_that_does_not_end_is_killed(live: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(live, "PATIENCE_SECONDS", 0.2)
-    process = live.LiveProcess([sys.executable, "-c", "import time; time.sleep(60)"], tmp_path / "log")
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    first = json.dumps({"garments": [], "folder": str(folder)})
+    code = f"import sys, time; sys.stdout.write({first!r} + chr(10)); sys.stdout.flush(); time.sleep(60)"
+    process = live.LiveProcess([sys.executable, "-c", code], tmp_path / "log")
+    wait_for(process, lambda news: news.shot)
     process.stop().join(PATIENCE_SECONDS)
     assert process._process.returncode == -signal.SIGKILL
+    assert not folder.exists()
 
 
 def test_a_line_that_is_no_json_is_an_error(live: ModuleType, tmp_path: Path) -> None:

@@ -1,7 +1,8 @@
 """A session for another program: requests come as lines of JSON, and answers leave as lines of JSON.
 
-The first answer describes the shot: `{"garments": [PATH, ...], "times": [TIME, ...], "levels": {PATH: 2}}`. Nothing is
-solved before the first request, which may be empty. A request is an object of these keys, each optional:
+The first answer describes the shot: `{"garments": [PATH, ...], "times": [TIME, ...], "levels": {PATH: 2}, "folder":
+FOLDER}`. The files of the answers lie in the folder, which is removed at the end. Nothing is solved before the first
+request, which may be empty. A request is an object of these keys, each optional:
 
     {"authored": [PATH, ...]}               Take the garments' values from the shot again.
     {"preset": {PATH: "denim"}}             Try a fabric.
@@ -63,7 +64,7 @@ class Answers:
         self.stream, self._session, self._folder = stream, session, folder
         self._lock, self._count = threading.Lock(), 0
         levels = dict(zip(session.garments, session.levels, strict=True))
-        self.say(garments=session.garments, times=session.times, levels=levels)
+        self.say(garments=session.garments, times=session.times, levels=levels, folder=str(folder))
 
     def say(self, **answer: Any) -> None:
         """Write an answer; after the reader has gone, nothing."""
@@ -103,7 +104,7 @@ class Answers:
             self.say(points=files, faces=faces, settled=settled, time=self._session.time)
 
     def _points_file(self, index: int, points: np.ndarray) -> str:
-        """Write points under the name that the last answer did not use; a reader sees the old or the new file."""
+        """Write points into one of two files in turn; replacement is atomic."""
         level = len(self._session.refinements[index])
         file = self._folder / f"points-{index}-{level}-{self._count % 2}.npy"
         part = file.with_suffix(".part")
@@ -113,7 +114,7 @@ class Answers:
         return str(file)
 
     def _faces_file(self, index: int) -> str:
-        """Write the faces of a garment's level, where they are not written yet."""
+        """Write the faces of a garment's level once."""
         chain = self._session.refinements[index]
         mesh = chain[-1].mesh if chain else self._session.shot.scene.garments[index].mesh
         file = self._folder / f"faces-{index}-{len(chain)}.npz"
@@ -123,7 +124,7 @@ class Answers:
 
 
 def serve(session: TuneSession, stream: BinaryIO) -> None:
-    """Answer the requests on standard input until it ends or one asks to quit; none before that is left undone.
+    """Answer the requests on standard input until the end of the input, or until a request to quit.
 
     Raises:
         SolveError: The thread that solves has ended.
@@ -154,7 +155,7 @@ def serve(session: TuneSession, stream: BinaryIO) -> None:
 
 
 def _finish(loop: SolveLoop) -> None:
-    """Wait until all that was asked is changed, though not solved."""
+    """Wait until the loop has made all changes; their frame need not be solved."""
     done = threading.Event()
     loop.ask(lambda _: done.set())
     while not done.wait(POLL_SECONDS):
@@ -164,7 +165,7 @@ def _finish(loop: SolveLoop) -> None:
 
 
 def changes_in(request: Mapping[str, Any], session: TuneSession, *, save: Change) -> list[Change]:
-    """The changes that a request asks for.
+    """Changes of a session, from a request.
 
     Raises:
         UsageError: A key, a garment, a name or a value cannot be used.
@@ -242,7 +243,7 @@ def _checked(garment: Any, session: TuneSession) -> str:
 
 
 def _check_limits(garment: str, name: str, value: float) -> None:
-    """Refuse a value that a layer may not hold."""
+    """Refuse (UsageError) a value outside the schema's limits."""
     parse_overrides([f"{garment}.{GARMENT[name].name}={value!r}"])
 
 

@@ -9,7 +9,7 @@ import subprocess
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import BinaryIO, NamedTuple
 from zlib import crc32
 
 PRESETS = ("paper", "silk", "cotton", "wool", "polyester", "denim", "jersey", "rib", "leather")
@@ -225,15 +225,15 @@ class CommandError(Exception):
     """The command could not be started, or failed; says what it said."""
 
 
-def start(line: list[str], **streams: Any) -> subprocess.Popen[bytes]:
-    """Start a command line; ``streams`` are arguments of `subprocess.Popen`.
+def start(line: list[str], *, stdin: int, stdout: int, stderr: BinaryIO) -> subprocess.Popen[bytes]:
+    """Start a command line; the streams are as `subprocess.Popen` takes them.
 
     Raises:
         CommandError: It cannot be started.
     """
     environment = {name: value for name, value in os.environ.items() if name not in OF_BLENDER}
     try:
-        return subprocess.Popen(line, env=environment, **streams)
+        return subprocess.Popen(line, env=environment, stdin=stdin, stdout=stdout, stderr=stderr)
     except OSError as error:
         raise CommandError(
             f"cannot run '{line[0]}': {error.strerror or error}. Install physgraph-usd in a Python of its own and "

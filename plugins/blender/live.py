@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import queue
+import shutil
 import subprocess
 import threading
 from collections.abc import Mapping, Sequence
@@ -19,13 +20,13 @@ from .command import PATIENCE_SECONDS, Settings, start, words_in
 
 @dataclass
 class News:
-    """The answers since the last question; of positions the newest alone.
+    """The answers since the last call of `LiveProcess.news`; only the newest positions.
 
     Attributes:
-        shot: Garments, time codes and levels of the shot, where the process has just read it.
+        shot: Garments, time codes and levels of the shot, once, after reading; else empty.
         points: Files of positions [m], world space, by the garment's prim path.
         faces: Files of faces, alike.
-        settled: Whether the newest positions are those that `refine` gives; None without any.
+        settled: Whether the newest positions are settled, as by `refine`; None without positions.
         errors: Errors in words.
         ended: Whether the process has ended.
     """
@@ -41,7 +42,7 @@ class News:
 class LiveProcess:
     """A running `physgraph-usd live`.
 
-    It ends by itself when its input does: however the program that started it ends, it does not stay behind.
+    The process ends with its input, so also after a crash of Blender.
     """
 
     def __init__(self, line: list[str], log: Path) -> None:
@@ -55,13 +56,14 @@ class LiveProcess:
             CommandError: It cannot be started.
         """
         self._log, self._answers = log, queue.SimpleQueue[dict[str, Any] | None]()
+        self._folder = ""
         with log.open("wb") as stream:
             self._process = start(line, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=stream)
         self._input, self._output = cast(BinaryIO, self._process.stdin), cast(BinaryIO, self._process.stdout)
         threading.Thread(target=self._read, name="physgraph live", daemon=True).start()
 
     def send(self, request: Mapping[str, Any]) -> None:
-        """Send a request; one to a process that has ended goes nowhere."""
+        """Send a request; ignored after the process has ended."""
         with suppress(BrokenPipeError, ValueError):
             self._input.write(json.dumps(request).encode() + b"\n")
             self._input.flush()
@@ -83,14 +85,14 @@ class LiveProcess:
                 found.faces |= answer["faces"]
                 found.settled = answer["settled"]
             elif "garments" in answer:
-                found.shot = answer
+                found.shot, self._folder = answer, answer["folder"]
 
     def last_words(self) -> str:
         """The process's words on standard error."""
         return words_in(self._log.read_text(encoding="utf-8", errors="replace"))
 
     def stop(self) -> threading.Thread:
-        """Have the process end after its present step, or be killed soon; returns the thread that sees to it."""
+        """End the process after its present step, or kill it after `PATIENCE_SECONDS`; returns the waiting thread."""
         with suppress(BrokenPipeError):
             self._input.close()
         thread = threading.Thread(target=self._end, name="physgraph live ends", daemon=True)
@@ -112,14 +114,16 @@ class LiveProcess:
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
+            if self._folder:
+                shutil.rmtree(self._folder, ignore_errors=True)
 
 
 def request_for(settings: Settings, known: Settings, garments: Sequence[str]) -> dict[str, Any]:
-    """The request that takes a process from known settings to others; empty where they are the same.
+    """The difference between two settings as a request; empty if they are equal.
 
     Args:
-        settings: What the panel says; a level of -1 is none.
-        known: What the process knows; without preset and values it has the shot's own.
+        settings: Values on the panel; a level of -1 changes nothing.
+        known: Values in the process; without preset and values, the shot's own.
         garments: Prim paths.
     """
     found: dict[str, Any] = {}

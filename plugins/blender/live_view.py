@@ -17,7 +17,7 @@ POLL_SECONDS = 0.05
 HIDDEN = {"coarse": "physgraph_hides_coarse", "refined": "physgraph_hides_refined"}
 """Custom properties of a live object: whether it has hidden another object, and whether that was selected."""
 LIVE = "physgraph_is_live"
-"""Custom property of a live object, which outlives its coarse one."""
+"""Custom property of every live object, also after the coarse object was deleted."""
 
 
 class Live:
@@ -52,7 +52,7 @@ class Live:
         self._process = LiveProcess(line, self._files.log)
 
     def send(self) -> None:
-        """Send what has changed on the panel, once the process has read the shot."""
+        """Send the changes of the panel, once the process has read the shot."""
         if self._known is not None and (scene := self._scene()) is not None:
             settings = scene.physgraph.as_given(scene)
             request = request_for(settings, self._known, list(self.paths.values()))
@@ -61,7 +61,7 @@ class Live:
                 self._process.send(request)
 
     def go(self) -> None:
-        """Send the present frame, where the process has it."""
+        """Send the present frame, if it was exported."""
         scene = self._scene()
         if scene is None or self._known is None or self._times == [None]:
             return
@@ -71,7 +71,7 @@ class Live:
             self.state = f"frame {scene.frame_current} was not exported"
 
     def poll(self) -> str | None:
-        """Draw what the process has answered; returns why it ended, if it did."""
+        """Draw the process's answers; returns the reason if the process has ended, else None."""
         news = self._process.news()
         if news.shot:
             self._begin(news.shot)
@@ -88,7 +88,7 @@ class Live:
         return (self._process.last_words() or "physgraph-usd ended and said nothing") if news.ended else None
 
     def draw(self) -> None:
-        """Show the newest positions, in objects that are made where there are none."""
+        """Show the newest positions; missing objects are made."""
         scene = self._scene()
         for coarse, path in objects_of(self.paths).items() if scene else ():
             if path in self._points:
@@ -103,7 +103,7 @@ class Live:
                 file.unlink(missing_ok=True)
 
     def _begin(self, shot: dict) -> None:
-        """Have the present frame solved with what the panel says; a level that was chosen goes onto the panel."""
+        """Have the present frame solved with the panel's values; show the command's choice of level on the panel."""
         scene, levels = self._scene(), set(shot["levels"].values())
         self._times = shot["times"]
         if scene is None:
@@ -128,13 +128,13 @@ class PHYSGRAPH_OT_live(bpy.types.Operator):
     bl_label = "Live"
 
     _current: Live | None = None
-    """What is shown now."""
+    """The live cloth of the window."""
     _failure = ""
-    """Why the last one ended."""
+    """Reason why the last live cloth ended, or ""."""
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        """Whether there is something to show or to stop; says what is missing."""
+        """Whether a garment is selected or Live is on; the reason is shown on the button if not."""
         reasons = {
             "A garment is being refined; Esc cancels": now_running() is not None,
             "Leave this mode for object mode": context.mode != "OBJECT",
@@ -222,7 +222,7 @@ def now_live() -> Live | None:
 
 
 def last_failure() -> str:
-    """Why the last live cloth ended, or ""."""
+    """Reason why the last live cloth ended, or ""."""
     return PHYSGRAPH_OT_live._failure
 
 
@@ -235,14 +235,14 @@ def stop() -> None:
 
 
 def send(settings: bpy.types.PropertyGroup, context: bpy.types.Context) -> None:
-    """Have the live cloth follow the panel; called by Blender when a value changes."""
+    """Send the panel's values to the live cloth; called by Blender after each change."""
     live = now_live()
     if live and settings.id_data.session_uid == live.scene:
         live.send()
 
 
 def tick() -> float | None:
-    """Draw what has been answered; returns the seconds until the next time, None for never."""
+    """Draw new answers; returns the seconds until the next call, None for no call."""
     live = now_live()
     if live is None:
         return None
@@ -260,7 +260,7 @@ def tick() -> float | None:
 
 
 def remove_objects() -> None:
-    """Remove every live object, also one that was saved in a file, and show what they hid."""
+    """Remove all live objects, also from a saved file, and show the objects hidden by them."""
     for item in [item for item in bpy.data.objects if LIVE in item]:
         coarse = item.physgraph_live
         for name, other in _others(coarse).items() if coarse else ():
@@ -308,7 +308,7 @@ def _frame_changed(scene: bpy.types.Scene, *_: object) -> None:
 
 @persistent
 def _undone(*_: object) -> None:
-    """Undo takes back values without telling, and may take back a live object."""
+    """Send values and restore objects: undo changes both without calling `send`."""
     live = now_live()
     if live:
         live.send()
@@ -330,12 +330,12 @@ def _is_seen(item: bpy.types.Object | None) -> bool:
 
 
 def _others(coarse: bpy.types.Object) -> dict[str, bpy.types.Object | None]:
-    """What a live object may hide, by the keys of `HIDDEN`."""
+    """Objects hidden by a live object, by the keys of `HIDDEN`."""
     return {"coarse": coarse, "refined": next((refined_of(scene, coarse) for scene in coarse.users_scene), None)}
 
 
 def _show(scene: bpy.types.Scene, coarse: bpy.types.Object, points: np.ndarray, *, faces: Faces) -> None:
-    """Move the live object of a garment to positions [m], world space; made or rebuilt where need be."""
+    """Move the live object of a garment to positions [m], world space; make or rebuild it if needed."""
     item = next((item for item in scene.objects if item.physgraph_live == coarse), None)
     if item is None:
         name = f"{coarse.name}_live"
@@ -355,7 +355,7 @@ def _show(scene: bpy.types.Scene, coarse: bpy.types.Object, points: np.ndarray, 
 
 
 def _build(mesh: bpy.types.Mesh, count: int, faces: Faces) -> None:
-    """Give a mesh so many vertices, and faces."""
+    """Give a mesh a number of vertices, and faces."""
     mesh.clear_geometry()
     mesh.vertices.add(count)
     mesh.loops.add(len(faces.corners))

@@ -63,7 +63,7 @@ def prepare(context: bpy.types.Context) -> Prepared:
 
 
 def objects_of(paths: dict[int, str]) -> dict[bpy.types.Object, str]:
-    """The coarse objects that are still there, and their prim paths.
+    """Coarse objects that still exist, and their prim paths.
 
     Args:
         paths: Prim paths by the objects' numbers.

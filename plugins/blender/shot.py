@@ -32,7 +32,7 @@ def coarse_of(item: bpy.types.Object) -> bpy.types.Object:
 
 
 def refined_of(scene: bpy.types.Scene, coarse: bpy.types.Object) -> bpy.types.Object | None:
-    """The refined object of a coarse one, if there is one."""
+    """The refined object of a coarse object, or None."""
     return next((item for item in scene.objects if item.physgraph_coarse == coarse), None)
 
 
@@ -126,7 +126,7 @@ def bring_back(
 
 
 def author_level(file: Path, paths: Iterable[str], level: int) -> None:
-    """Write a number of subdivisions onto garments of an exported file; -1 has it chosen."""
+    """Write a number of subdivisions onto garments of an exported file; -1 lets the command choose."""
     from pxr import Sdf, Usd
 
     stage = Usd.Stage.Open(str(file))
@@ -136,7 +136,7 @@ def author_level(file: Path, paths: Iterable[str], level: int) -> None:
 
 
 def collection_for_cloth(scene: bpy.types.Scene) -> bpy.types.Collection:
-    """The collection of refined and live objects; made where there is none."""
+    """The collection of refined and live objects; made if missing."""
     collection = bpy.data.collections.get(COLLECTION) or bpy.data.collections.new(COLLECTION)
     if collection not in scene.collection.children_recursive:
         scene.collection.children.link(collection)
