@@ -84,8 +84,8 @@ def process(shot: Path) -> Iterator[Process]:
     try:
         yield made
     finally:
-        made.run.kill()
-        made.run.communicate()
+        if made.run.poll() is None:
+            made.end()
 
 
 @pytest.fixture

@@ -114,8 +114,8 @@ class LiveProcess:
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
-            if self._folder:
-                shutil.rmtree(self._folder, ignore_errors=True)
+        if self._folder:  # A process that was killed leaves it.
+            shutil.rmtree(self._folder, ignore_errors=True)
 
 
 def request_for(settings: Settings, known: Settings, garments: Sequence[str]) -> dict[str, Any]:
