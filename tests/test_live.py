@@ -84,8 +84,7 @@ def process(shot: Path) -> Iterator[Process]:
     try:
         yield made
     finally:
-        if made.run.poll() is None:
-            made.end()
+        made.run.communicate(timeout=PATIENCE_SECONDS)
 
 
 @pytest.fixture
