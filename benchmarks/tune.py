@@ -1,10 +1,13 @@
 """How long an artist waits in `tune`: from a move of a slider to the first new cloth, and to the settled cloth.
 
-    python -m benchmarks.tune [--moves 20] [--shot NAME]... [--folder SHOTS]
+    python -m benchmarks.tune [--moves 20] [--shot NAME]... [--folder SHOTS] [--page]
+    python -m benchmarks.tune --pictures docs
 
 Moves six sliders of a frame in the middle of each shot to random places, one after another, with contact; real shots
 where their folder is given. Prints a row a shot: median and longest wall seconds until the first round is handed over
-and until the frame is settled. The page adds what it takes to send the points to the browser and to draw them.
+and until the frame is settled. With ``--page`` a browser is driven instead, and the time is from the mouse's press to
+the new vertices at the graphics card; without a card the processor draws, on the solver's cores. ``--pictures``
+writes the pictures and the film of docs/tune.md; it takes the program ffmpeg.
 """
 
 from __future__ import annotations
@@ -18,11 +21,13 @@ from statistics import median
 
 import click
 
+from benchmarks import page_driver
 from benchmarks.contact_shots import REAL
 from benchmarks.rows import say, table
 from physgraph_usd.lab.samples import SAMPLES, write_sample
+from physgraph_usd.studio.page import TunePage
 from physgraph_usd.studio.session import TuneSession
-from physgraph_usd.studio.values import TUNABLES
+from physgraph_usd.studio.values import TUNABLES, Tunable
 
 MOVED = ("stretchStiffness", "bendStiffness", "density", "guide:stiffness", "rest:weftEase", "contact:offset")
 CHOSEN = ("skirt", "dancer", "layers")
@@ -33,8 +38,12 @@ CHOSEN = ("skirt", "dancer", "layers")
 @click.option("--moves", default=20, show_default=True)
 @click.option("--shot", "names", multiple=True, default=CHOSEN, show_default=True, help="Samples.")
 @click.option("--folder", type=click.Path(path_type=Path), help="The real shots, which we may not ship.")
-def main(moves: int, names: Sequence[str], folder: Path | None) -> None:
-    """Print what each shot takes."""
+@click.option("--page", is_flag=True, help="In a browser.")
+@click.option("--pictures", type=click.Path(path_type=Path), help="Write the pictures and the film into its folders.")
+def main(moves: int, names: Sequence[str], folder: Path | None, *, page: bool, pictures: Path | None) -> None:
+    """Print what each shot takes, or write the pictures."""
+    if pictures is not None:
+        return draw(pictures)
     head = ["vertices", "first cloth, median [s]", "longest", "settled, median [s]", "longest"]
     say(table(["shot", *head], []))
     with tempfile.TemporaryDirectory() as made:
@@ -42,9 +51,8 @@ def main(moves: int, names: Sequence[str], folder: Path | None) -> None:
             session.set_time(session.times[len(session.times) // 2])
             count = sum(len(points) for points in session.settle().points if points is not None)
             chance = random.Random(1)
-            first, settled = zip(
-                *(waits(session, MOVED[k % len(MOVED)], chance.random()) for k in range(moves)), strict=True
-            )
+            tried = [(TUNABLES[MOVED[k % len(MOVED)]], chance.random()) for k in range(moves)]
+            first, settled = zip(*(in_page if page else in_session)(session, tried, count), strict=True)
             cells = [f"{value:.2f}" for each in (first, settled) for value in (median(each), max(each))]
             say(f"| {name} | {count:,} | {' | '.join(cells)} |")
             session.close()
@@ -60,13 +68,43 @@ def sessions(names: Sequence[str], folder: Path | None, made: Path) -> Iterator[
             yield name, TuneSession(folder / name, garments=garments, colliders=bodies, out=out)
 
 
-def waits(session: TuneSession, name: str, place: float) -> tuple[float, float]:
-    """Seconds from a move of a slider to the first new cloth, and to the settled cloth."""
-    began, seen = time.perf_counter(), list[float]()
-    session.set_value(session.garments[0], name, TUNABLES[name].at(place))
-    session.solve(lambda _: seen.append(time.perf_counter() - began))
-    session.settle()
-    return seen[0], time.perf_counter() - began
+def in_session(session: TuneSession, tried: Sequence[tuple[Tunable, float]], _: int) -> list[tuple[float, float]]:
+    """Seconds of each move to the first new cloth, and to the settled cloth."""
+    found = []
+    for tunable, place in tried:
+        began, seen = time.perf_counter(), list[float]()
+        session.set_value(session.garments[0], tunable.name, tunable.at(place))
+        session.solve(lambda _, began=began, seen=seen: seen.append(time.perf_counter() - began))
+        session.settle()
+        found.append((seen[0], time.perf_counter() - began))
+    return found
+
+
+def in_page(session: TuneSession, tried: Sequence[tuple[Tunable, float]], count: int) -> list[tuple[float, float]]:
+    """As `in_session`, in a browser."""
+    page = TunePage(session)
+    try:
+        least = count // max(len(session.garments), 1) // 2
+        with page_driver.opened(page.url, vertices=least) as shown:
+            return [page_driver.waits(shown, tunable, place) for tunable, place in tried]
+    finally:
+        page.close()
+
+
+def draw(folder: Path) -> None:
+    """Write the pictures and the film of the page, with the skirt."""
+    with tempfile.TemporaryDirectory() as made:
+        ((_, session),) = sessions(["skirt"], None, Path(made))
+        session.set_time(session.times[len(session.times) // 2])
+        page = TunePage(session)
+        try:
+            with page_driver.opened(page.url, vertices=1) as shown:
+                tour = page_driver.Tour(shown)
+                tour.go(folder / "pictures")
+                tour.write(folder / "films" / "tune.mp4")
+        finally:
+            page.close()
+            session.close()
 
 
 if __name__ == "__main__":

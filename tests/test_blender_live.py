@@ -113,7 +113,9 @@ sys.path.insert(0, {str(Path(__file__).parent)!r})
 from pathlib import Path
 from blender import addon_module
 process = addon_module("live").LiveProcess({program!r}, Path({str(tmp_path / "log")!r}))
-while not process.news().shot:
+while not (news := process.news()).shot:
+    if news.ended:
+        sys.exit(process.last_words())
     time.sleep(0.01)
 process.send({{}})
 sys.stdout.write(str(process._process.pid) + chr(10))
@@ -168,6 +170,6 @@ def test_the_session_then_has_what_the_panel_says(
         assert {name: session.value(CLOTH, name) for name in TUNABLES} == {
             name: fresh.value(CLOTH, name) for name in TUNABLES
         }
-        assert session.levels == fresh.levels
+        assert session.setting.levels == fresh.setting.levels
         fresh.close()
     session.close()

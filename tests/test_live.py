@@ -24,7 +24,8 @@ from shots import CLOTH, cloth_shot
 from physgraph_usd.errors import UsageError
 from physgraph_usd.solver.fabric import PRESETS
 from physgraph_usd.studio.live import changes_in
-from physgraph_usd.studio.session import Shown, TuneSession
+from physgraph_usd.studio.session import TuneSession
+from physgraph_usd.studio.takes import Shown
 
 PATIENCE_SECONDS = 60.0
 STIFF = {"bendStiffness": 3e-4, "guide:stiffness": 100.0}

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import gc
-import io
 import shlex
 import threading
+import time as clock
 import weakref
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import replace
 from itertools import count
@@ -18,18 +18,24 @@ import pytest
 
 pytest.importorskip("pxr", reason="shots are read with usd-core")
 
-from browser import served
 from click.testing import CliRunner
-from cloth import rms
+from cloth import frame_of, rms, sheet
+from meshes import grid
 from pxr import Usd, UsdGeom
 from shots import CLOTH, EDGE, cloth_shot
 
 from physgraph_usd.cli import main
-from physgraph_usd.errors import PhysGraphError, UsageError
+from physgraph_usd.errors import PhysGraphError, SchemaError, UsageError
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.solver.frame.refiner import Refiner
+from physgraph_usd.solver.scene import Garment, Scene
+from physgraph_usd.studio.brush import SMOOTH, Brush, Stroke, hit
 from physgraph_usd.studio.loop import SolveLoop
+from physgraph_usd.studio.maps import HIGH, LOW, MEASURED, MIDDLE, stretches
+from physgraph_usd.studio.notes import Notes
 from physgraph_usd.studio.session import Shown, TuneSession
+from physgraph_usd.studio.setting import History, Setting
+from physgraph_usd.studio.takes import FRESH, STALE
 from physgraph_usd.usd.read.reader import open_shot
 from physgraph_usd.usd.write.tag import tag
 
@@ -71,9 +77,9 @@ def test_a_settled_frame_is_what_refine_gives_from_the_same_state(session: TuneS
     session.set_value(CLOTH, "bendStiffness", STIFF)
     session.set_value(CLOTH, "guide:stiffness", 100.0)
     rough = session.solve()
-    own = session._solver._refiner
+    own = session.solver.refiner
     settled = session.settle()
-    exact = own.fork(replace(session._solver._settings, temporal="warm"))
+    exact = own.fork(replace(session.solver._settings, temporal="warm"))
     state = exact.solve(session.shot.frame(session.time))
     (known,) = state.points
     assert known is not None
@@ -100,7 +106,7 @@ def test_a_first_frame_is_settled_at_once_and_matches_refine(session: TuneSessio
     assert session.settle() is shown
     with closing(open_shot(str(shot), garments=[CLOTH])) as opened:
         settings = RefineOptions().solve_settings()
-        (known,) = Refiner(opened.scene, settings, levels=session.levels).solve(opened.frame(1.0)).points
+        (known,) = Refiner(opened.scene, settings, levels=session.setting.levels).solve(opened.frame(1.0)).points
     assert known is not None
     assert np.abs(known - points(shown)).max() < 1e-7
 
@@ -108,7 +114,7 @@ def test_a_first_frame_is_settled_at_once_and_matches_refine(session: TuneSessio
 def test_old_materials_are_forgotten(session: TuneSession):
     """Each one kept a Cholesky factor."""
     session.settle()
-    (group,) = session._solver._refiner.groups
+    (group,) = session.solver.refiner.groups
     kept: list[weakref.ref[object]] = []
     for k in range(4):
         session.set_value(CLOTH, "bendStiffness", STIFF * (k + 1))
@@ -197,7 +203,7 @@ class Log:
     def __init__(self) -> None:
         self.shown: list[Shown] = []
         self.errors: list[str] = []
-        self.rounds = 0
+        self.rounds = self.solves = 0
         self.go, self.settled = threading.Event(), threading.Event()
 
     def busy(self, what: str) -> None:
@@ -211,6 +217,9 @@ class Log:
         self.shown.append(shown)
         if shown.settled:
             self.settled.set()
+
+    def solved(self) -> None:
+        self.solves += 1
 
     def fail(self, error: PhysGraphError) -> None:
         self.errors.append(str(error))
@@ -232,41 +241,188 @@ def test_changes_during_a_solve_are_solved_once_and_then_settled(session: TuneSe
     assert len(log.errors) == 1
 
 
-@pytest.mark.browser
-def test_the_page_in_a_browser(tmp_path: Path):
-    pytest.importorskip("viser", reason="the page is served with viser")
-    image = pytest.importorskip("PIL.Image", reason="screenshots are compared with pillow")
-    from physgraph_usd.studio.page import TunePage
+def test_undo_and_redo_bring_back_values_maps_and_levels(session: TuneSession):
+    session.set_value(CLOTH, "bendStiffness", STIFF)
+    session.set_level(CLOTH, 1)
+    session.paint(CLOTH, "bendScale", np.full_like(session.painted(CLOTH, "bendScale"), 3.0))
+    session.set_contact(False)
+    said = []
+    while session.history.undone_next:
+        said.append(session.history.undone_next)
+        session.undo()
+    assert said == ["contact off", "Bending Stiffness Scale", "Subdivisions", "Bending Stiffness"]
+    assert session.setting.values == {}
+    assert session.painted(CLOTH, "bendScale").max() == 1.0
+    for _ in said:
+        session.redo()
+    assert session.value(CLOTH, "bendStiffness") == pytest.approx(STIFF)
+    assert session.painted(CLOTH, "bendScale").max() == 3.0
+    assert (session.setting.levels, session.setting.contact) == ((1,), False)
+    assert points(session.solve()).shape[0] == session.refinements[0][-1].mesh.vertex_count
+    session.undo()
+    session.set_value(CLOTH, "density", 0.4)
+    assert session.history.redone_next == ""
 
-    shot = cloth_shot(tmp_path / "sheet.usda", size=(8, 6))
-    session = TuneSession(shot, garments=[CLOTH])
-    page = TunePage(session, port=8200)
-    with closing(session), closing(page), served(page.url) as shown:
 
-        def picture() -> np.ndarray:
-            shown.wait_for_timeout(500)
-            whole = image.open(io.BytesIO(shown.screenshot()))
-            return np.asarray(whole.convert("RGB"), float)[250:, :1000]
+def test_a_drag_is_one_step_of_undo():
+    now = [0.0]
+    history = History(Setting((1,)), seconds=lambda: now[0])
+    for time in (1.0, 1.5, 2.0, 9.0):
+        now[0] = time
+        history.put(Setting((1,)), "Density", joins=True)
+    history.put(Setting((1,)), "Pin")
+    history.put(Setting((1,)), "Pin")
+    steps = []
+    while history.undone_next:
+        steps.append(history.undone_next)
+        history.undo()
+    assert steps == ["Pin", "Pin", "Density", "Density"]
 
-        settled = shown.get_by_text("settled: as refine solves it")
-        settled.wait_for(timeout=30000)
-        before, at_first = picture(), points(session.solve())
-        row = shown.locator(".value", has_text="Guide Stiffness")
-        slider = row.locator("xpath=../following-sibling::div[1]").get_by_role("slider")
-        box = slider.bounding_box()
-        shown.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
-        shown.mouse.down()
-        shown.mouse.move(box["x"] - 100, box["y"] + box["height"] / 2, steps=5)
-        shown.mouse.up()
-        shown.get_by_text("N/m³").first.wait_for()
-        shown.wait_for_function("!document.querySelector('#state').textContent.startsWith('settled')")
-        settled.wait_for(timeout=30000)
-        tuned = session.value(CLOTH, "guide:stiffness")
-        assert tuned is not None
-        assert tuned < 1500.0
-        assert np.abs(picture() - before).mean() > 0.1
-        assert np.abs(points(session.solve()) - at_first).max() > 1e-4
-        shown.get_by_role("button", name="Save layer").click()
-        shown.get_by_text("saved into").wait_for()
-        stage = Usd.Stage.Open(str(session.out))
-        assert stage.GetPrimAtPath(CLOTH).GetAttribute("physgraph:guide:stiffness").Get() == tuned
+
+def test_a_value_is_taken_from_the_shot_again(session: TuneSession):
+    first = session.value(CLOTH, "density")
+    session.set_value(CLOTH, "density", 0.9)
+    session.set_value(CLOTH, "rest:weftEase", 3.0)
+    session.reset(CLOTH, "density")
+    assert session.value(CLOTH, "density") == first
+    assert session.value(CLOTH, "rest:weftEase") == 3.0
+    session.set_as_authored(CLOTH)
+    assert session.value(CLOTH, "rest:weftEase") == 0.0
+
+
+def test_a_and_b_are_exchanged_with_their_cloth(session: TuneSession):
+    a = points(session.settle())
+    session.keep()
+    session.set_value(CLOTH, "guide:stiffness", 100.0)
+    b = points(session.settle())
+    session.swap()
+    assert rms(points(session.settle()) - a) < 0.2 * rms(b - a)
+    assert session.value(CLOTH, "guide:stiffness") == 2000.0
+    assert session.kept_shown is not None
+    assert np.array_equal(points(session.kept_shown), b)
+    session.set_time(session.times[1])
+    assert session.kept_shown is None
+    assert session.go_on(None)
+    assert session.kept_shown is not None
+    assert session.kept_shown.frame.time == session.times[1]
+    assert not session.go_on(None)
+
+
+def test_a_painted_map_is_solved_and_saved_as_a_primvar(session: TuneSession, tmp_path: Path):
+    before = points(session.settle())
+    held = session.painted(CLOTH, "pin")
+    assert held.max() == 0.0
+    held = np.where(np.arange(len(held)) < len(held) // 2, 1.0, 0.0)
+    session.paint(CLOTH, "pin", held)
+    after = points(session.settle())
+    cage = session.shot.frame(session.time).garments[0].points
+    assert np.abs(after[: len(cage)] - cage)[held == 1.0].max() < 1e-6
+    assert np.abs(before[: len(cage)] - cage)[held == 1.0].max() > 1e-4
+    session.save()
+    with closing(open_shot(str(session.out))) as saved:
+        assert np.array_equal(saved.scene.garments[0].pin, held)
+    with closing(TuneSession(session.out, out=tmp_path / "again.usda")) as again:
+        assert np.array_equal(again.painted(CLOTH, "pin"), held)
+
+
+def test_what_is_painted_outside_its_limits_changes_nothing(session: TuneSession):
+    with pytest.raises(SchemaError, match="pin"):
+        session.paint(CLOTH, "pin", np.full_like(session.painted(CLOTH, "pin"), -1.0))
+    with pytest.raises(UsageError, match="known maps"):
+        session.paint(CLOTH, "weight", session.painted(CLOTH, "pin"))
+    assert session.setting.painted == {}
+
+
+def test_the_range_is_solved_as_refine_solves_it(session: TuneSession, shot: Path):
+    span = (session.codes[0], session.codes[-1])
+    while session.go_on(span):
+        pass
+    assert session.takes.states(session.codes, session.setting) == [FRESH] * len(session.codes)
+    with closing(open_shot(str(shot), garments=[CLOTH])) as opened:
+        refiner = Refiner(opened.scene, RefineOptions().solve_settings(), levels=session.setting.levels)
+        states = list(refiner.refine(opened.frame(time) for time in session.codes))
+    session.set_time(session.codes[-1])
+    (last,) = states[-1].points
+    assert last is not None
+    assert np.abs(points(session.solve()) - last).max() < 1e-6
+    session.set_value(CLOTH, "bendStiffness", STIFF)
+    assert session.takes.states(session.codes, session.setting) == [STALE] * len(session.codes)
+    assert session.go_on(span)
+    assert session.takes.states(session.codes, session.setting) == [FRESH] + [STALE] * (len(session.codes) - 1)
+    session.undo()
+    assert session.takes.fresh(session.codes[0], session.setting) is not None
+
+
+def test_a_loop_plays_the_range_round_and_goes_on_with_changes(session: TuneSession):
+    log = Log()
+    log.go.set()
+    loop = SolveLoop(session, log, rest_seconds=0.01)
+
+    def play(_: TuneSession) -> None:
+        loop.span, loop.playing = (session.codes[0], session.codes[2]), True
+
+    loop.ask(play)
+    wait_for(lambda: len(log.shown) > 8)
+    loop.ask(lambda own: own.set_value(CLOTH, "bendStiffness", STIFF))
+    seen = len(log.shown)
+    wait_for(lambda: len(log.shown) > seen + 4)
+    loop.ask(lambda _: setattr(loop, "playing", False))
+    loop.close()
+    times = [each.frame.time for each in log.shown[-4:]]
+    assert set(times) == set(session.codes[:3])
+    assert session.value(CLOTH, "bendStiffness") == pytest.approx(STIFF)
+    assert log.errors == []
+
+
+def wait_for(happened: Callable[[], bool], seconds: float = 60.0) -> None:
+    end = clock.monotonic() + seconds
+    while not happened():
+        assert clock.monotonic() < end
+        clock.sleep(0.01)
+
+
+def test_strains_are_of_the_stretched_cloth():
+    """A flat sheet, stretched by a tenth along its width and pressed together by a twentieth along its height."""
+    mesh, rest = sheet(6, 5)
+    scene = Scene((Garment.of(CLOTH, mesh.indices.reshape(-1, 3), rest),), np.array([0.0, -9.81, 0.0]))
+    refiner = Refiner(scene, RefineOptions().solve_settings(), levels=[1])
+    flat = refiner.group_of((0,)).levels[-1].rest.double().numpy()
+    found = stretches(refiner, frame_of(rest), 0, flat * [1.1, 0.95, 1.0])
+    assert np.sort(found[:, :2], axis=1) == pytest.approx(np.array([[-5.0, 10.0]] * len(found)), abs=0.01)
+    assert found[:, 2] == pytest.approx(np.full(len(found), -5.0), abs=0.01)
+    colors = MEASURED["strain along weft"].colors(np.array([-9.0, 0.0, 9.0]))
+    assert colors[:, :3].tolist() == [LOW.tolist(), MIDDLE.tolist(), HIGH.tolist()]
+
+
+def test_a_brush_paints_where_it_touches_and_on_the_other_side():
+    mesh, rest = grid(9, 9)
+    stroke = Stroke(CLOTH, "pin", np.zeros(len(rest)))
+    where = {"mesh": mesh, "rest": rest, "right": np.array([1.0, 0.0, 0.0])}
+    at = hit(rest[10] + [0, 0, 1.0], np.array([0.0, 0.0, -1.0]), rest, mesh.triangulate(rest).triangles)
+    assert at is not None
+    assert at == pytest.approx(rest[10])
+    brush = Brush(radius=0.15 * np.ptp(rest[:, 0]), value=1.0, strength=1.0, mirrored=True)
+    stroke.touch(brush, at, rest, **where)
+    mirror = int(np.linalg.norm(rest - [np.ptp(rest[:, 0]) - rest[10, 0], rest[10, 1], 0.0], axis=1).argmin())
+    assert stroke.values[10] == pytest.approx(1.0)
+    assert stroke.values[mirror] == pytest.approx(1.0)
+    assert (stroke.values > 0).sum() <= 10
+    peak = stroke.values.max()
+    stroke.touch(replace(brush, mode=SMOOTH), at, rest, **where)
+    assert stroke.values.max() < peak
+    assert hit(rest[10] + [0, 0, 1.0], np.array([0.0, 0.0, 1.0]), rest, mesh.triangulate(rest).triangles) is None
+
+
+def test_notes_are_read_again_and_no_other_file_is_taken_for_them(tmp_path: Path):
+    layer = tmp_path / "a.tuned.usda"
+    notes = Notes(layer)
+    notes.presets["mine"] = {"bendStiffness": 2e-5}
+    notes.save({"time": 3.0})
+    again = Notes(layer)
+    assert (again.presets, again.looked) == ({"mine": {"bendStiffness": 2e-5}}, {"time": 3.0})
+    again.path.write_text('{"kind": "something else"}')
+    with pytest.raises(UsageError, match="move it away"):
+        Notes(layer)
+    again.path.write_text("not json")
+    with pytest.raises(UsageError, match="cannot be read"):
+        Notes(layer)

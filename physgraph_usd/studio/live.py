@@ -44,7 +44,8 @@ from ..solver.fabric import PRESETS
 from ..usd.lookup import parse_overrides
 from ..usd.schema import GARMENT
 from .loop import Change, SolveLoop
-from .session import Shown, TuneSession
+from .session import TuneSession
+from .takes import Shown
 from .values import TUNABLES
 
 POLL_SECONDS = 0.1
@@ -63,7 +64,7 @@ class Answers:
         """Describe the shot; ``folder`` takes the files of points and faces."""
         self.stream, self._session, self._folder = stream, session, folder
         self._lock, self._count = threading.Lock(), 0
-        levels = dict(zip(session.garments, session.levels, strict=True))
+        levels = dict(zip(session.garments, session.setting.levels, strict=True))
         self.say(garments=session.garments, times=session.times, levels=levels, folder=str(folder))
 
     def say(self, **answer: Any) -> None:
@@ -74,6 +75,9 @@ class Answers:
 
     def busy(self, what: str) -> None:
         """Work has begun, which is no answer."""
+
+    def solved(self) -> None:
+        """Another frame is solved, which is no answer."""
 
     def seen(self, points: Mapping[str, np.ndarray]) -> None:
         """Answer with a round."""

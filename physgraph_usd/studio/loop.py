@@ -1,8 +1,9 @@
-"""A thread that changes a session's values and solves its frame, while the page answers."""
+"""A thread that changes a session's values, solves its frame and plays its range, while the page answers."""
 
 from __future__ import annotations
 
 import threading
+import time as clock
 from collections.abc import Callable, Mapping
 from typing import Protocol
 
@@ -30,7 +31,11 @@ class Watcher(Protocol):
         ...
 
     def show(self, shown: Shown) -> None:
-        """A frame is solved."""
+        """A frame is solved, or played."""
+        ...
+
+    def solved(self) -> None:
+        """A frame of the range, or A, is solved."""
         ...
 
     def fail(self, error: PhysGraphError) -> None:
@@ -41,7 +46,12 @@ class Watcher(Protocol):
 class SolveLoop:
     """The owner of a session: changes that come while a frame is solved are made together, and solved once.
 
-    When nothing has been asked for `REST_SECONDS`, the frame is solved as ``refine`` does; a change ends that.
+    When nothing has been asked for `REST_SECONDS`, the frame is solved as ``refine`` does; then A and the range are.
+    A change ends that.
+
+    Attributes:
+        span: First and last time code that are solved in the background and played; None solves none.
+        playing: Whether the range is played: each of its frames is shown once it is solved; set by a change.
     """
 
     def __init__(self, session: TuneSession, watcher: Watcher, *, rest_seconds: float = REST_SECONDS) -> None:
@@ -53,8 +63,11 @@ class SolveLoop:
             rest_seconds: Time without a change before a frame is settled.
         """
         self._session, self._watcher, self._rest = session, watcher, rest_seconds
+        self.span: tuple[float, float] | None = None
+        self.playing = False
         self._asked: list[Change] = [lambda _: None]
         self._changed, self._closing = threading.Condition(), False
+        self._due = 0.0  # When the next frame may be played.
         self._thread = threading.Thread(target=self._work, name="tune", daemon=True)
         self._thread.start()
 
@@ -77,26 +90,30 @@ class SolveLoop:
         self._thread.join()
 
     def _work(self) -> None:
-        resting = False
+        patience: float | None = self._rest
         while True:
             with self._changed:
-                self._changed.wait_for(self._is_wanted, None if resting else self._rest)
+                self._changed.wait_for(self._is_wanted, patience)
                 if self._closing:
                     return
                 asked, self._asked = self._asked, []
             try:
-                resting = self._solve(asked) if asked else self._settle()
+                self._change(asked)
+                patience = self._play() if self.playing else self._solve() if asked else self._go_on()
             except PhysGraphError as error:
-                resting = True
+                patience, self.playing = None, False
                 self._watcher.fail(error)
 
-    def _solve(self, asked: list[Change]) -> bool:
-        """Make changes and solve the frame roughly; returns whether it is settled."""
+    def _change(self, asked: list[Change]) -> None:
+        """Make changes; one that cannot be made changes nothing."""
         for change in asked:
             try:
                 change(self._session)
             except PhysGraphError as error:
                 self._watcher.fail(error)
+
+    def _solve(self) -> float:
+        """Solve the frame roughly; returns how long to wait for a change."""
         self._watcher.busy("solving")
         rounds = list[None]()
 
@@ -107,14 +124,30 @@ class SolveLoop:
         # Cancelled after a round at the earliest: cloth moves even while changes keep coming.
         shown = self._session.solve(seen, lambda: bool(rounds) and self._is_wanted())
         self._watcher.show(shown)
-        return shown.settled
+        return 0.0 if shown.settled else self._rest
 
-    def _settle(self) -> bool:
-        """Settle the frame; returns whether no change cancelled that."""
-        self._watcher.busy("settling")
-        shown = self._session.settle(self._watcher.seen, self._is_wanted)
+    def _go_on(self) -> float | None:
+        """Settle the frame, or solve what else is looked at; returns how long to wait for a change."""
+        shown = self._session.solve()
+        if not shown.settled:
+            self._watcher.busy("settling")
+            self._watcher.show(self._session.settle(self._watcher.seen, self._is_wanted))
+            return 0.0
+        if not self._session.go_on(self.span, self._is_wanted):
+            return None
+        self._watcher.solved()
+        return 0.0
+
+    def _play(self) -> float:
+        """Show the next frame of the range that is solved, or solve it; returns how long to wait for a change."""
+        shown = self._session.step(self.span, self._is_wanted)
+        if shown is None:
+            self._watcher.solved()
+            return 0.0
         self._watcher.show(shown)
-        return shown.settled
+        now = clock.monotonic()
+        self._due = max(now, self._due + self._session.shot.scene.seconds)
+        return self._due - now
 
     def _is_wanted(self) -> bool:
         """Whether something is to be done at once; read without the lock between steps."""

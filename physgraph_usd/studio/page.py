@@ -1,11 +1,9 @@
-"""The page: coarse and fine cloth at a frame, sliders, the report's figures, and a button that saves."""
+"""The page: cloth on the left; state, history, time, picture, values, painting and figures on the right."""
 
 from __future__ import annotations
 
 import html
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
-from itertools import pairwise
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from time import sleep
 from typing import Any
@@ -14,26 +12,23 @@ import numpy as np
 
 from ..errors import PhysGraphError
 from ..interrupts import leave_if_asked
-from ..solver.fabric import PRESETS
-from ..usd.schema import CONTACT, FABRIC, GARMENT, REFINEMENT
+from .desk import Desk, put, small
 from .guard import guarded_server
 from .loop import SolveLoop
-from .picture import PLAIN, SHOWS, Picture
-from .session import Shown, TuneSession
-from .values import PAINTED, TUNABLES, Tunable
+from .notes import Notes
+from .paint_panel import PaintPanel
+from .picture import Picture
+from .session import TuneSession
+from .takes import Shown
+from .time_panel import TimePanel
+from .value_panel import ValuePanel
+from .view_panel import ViewPanel
 
-AS_AUTHORED, OWN = "as authored", "own values"
 WORKING, MOVING, SETTLED, WRONG = "#b45f06", "#5b6470", "#1a7f37", "#c0392b"
 """Colours of the page's state."""
-FINEST = 0.002
-"""Step of a slider, in its length."""
+UNDO, REDO = "Undo", "Redo"
 POLL_SECONDS = 0.1
 """How often the main thread asks whether a signal came."""
-STYLE = """<style>
-div:has(> .value) + div .mantine-NumberInput-root, div:has(> .value) + div .mantine-Slider-markLabel,
-div:has(> .value) + div > .mantine-Flex-root > div:first-child {display: none}
-</style>"""
-"""Under a value written out a slider fills its row: its own number is a place on a logarithmic scale."""
 
 
 class TunePage:
@@ -45,18 +40,27 @@ class TunePage:
     """
 
     def __init__(self, session: TuneSession, *, port: int = 8080) -> None:
-        """Serve the page and solve the first frame, at this port or the next free one."""
-        self._session, self._garment = session, session.garments[0]
+        """Serve the page and solve the first frame, at this port or the next free one.
+
+        Raises:
+            UsageError: The file of the session's notes is another program's.
+        """
+        notes = Notes(session.out)
+        self._session = session
         self._server, self.url = guarded_server(port=port, label="physgraph-usd tune")
-        self._picture = Picture(self._server, session)
-        self._sliders: dict[str, tuple[Any, Any]] = {}
-        self._follow = False  # Whether sliders go to new values; not under the artist's hand.
+        self._desk = Desk(self._server.gui, session, Picture(self._server, session), notes)
+        self._look_as(notes.looked)
         self._build()
         self.loop = SolveLoop(session, self)
+        self._desk.ask = self.loop.ask
+        self._time.loop = self.loop
 
     def close(self) -> None:
-        """End the thread and the server."""
+        """End the thread and the server, and write the notes."""
         self.loop.close()
+        tried = {path: dict(values) for path, values in self._session.setting.values.items()}
+        looked = {"time": self._session.time, "garment": self._desk.garment, "camera": self._camera}
+        self._desk.notes.save(looked | {"view": self._view.looked, "values": tried})
         self._server.stop()
 
     def busy(self, what: str) -> None:
@@ -65,123 +69,101 @@ class TunePage:
 
     def seen(self, points: Mapping[str, np.ndarray]) -> None:
         """Draw garments that are not settled."""
-        self._picture.move(points)
+        self._desk.picture.move(points)
 
     def show(self, shown: Shown) -> None:
         """Draw a solved frame and write its figures and values."""
-        self._picture.draw(shown)
-        state = "settled: as refine solves it" if shown.settled else "on its way"
-        self._state.content = _badge(state, SETTLED if shown.settled else MOVING)
-        self._command.content = _small(f"<code>{html.escape(self._session.command)}</code>")
-        index = self._session.garments.index(self._garment)
-        self._figures.content = _table(figures(shown, index))
-        follow, self._follow = self._follow, False
-        for name, (text, slider) in self._sliders.items():
-            self._write_value(TUNABLES[name], text, slider if follow else None)
+        session = self._session
+        self._desk.picture.draw(shown, kept=session.kept_shown)
+        self._paint.attach()
+        put(self._figures, content=_table(figures(shown, self._desk.index)))
+        self._values.update()
+        self._view.update()
+        self._time.update()
+        self._write_history()
+        put(self._command, content=f"<code>{small(session.command)}</code>")
+        words = "playing" if self.loop.playing else "settled: as refine solves it" if shown.settled else "on its way"
+        self._state.content = _badge(words, SETTLED if shown.settled else MOVING)
+
+    def solved(self) -> None:
+        """Write which frames are solved, and draw A."""
+        if self.loop.playing:
+            self._time.update()
+        else:
+            self.show(self._session.solve())
 
     def fail(self, error: PhysGraphError) -> None:
         """Write an error."""
         self._state.content = _badge(str(error), WRONG)
 
+    def _look_as(self, looked: Mapping[str, Any]) -> None:
+        """Garment, frame and camera as they were last."""
+        session = self._session
+        if looked.get("garment") in session.garments:
+            self._desk.garment = looked["garment"]
+        if looked.get("time") in session.times:
+            session.set_time(looked["time"])
+        self._camera: dict[str, list[float]] | None = looked.get("camera")
+
+        @self._server.on_client_connect
+        def _(client: Any) -> None:
+            if self._camera:
+                for name, value in self._camera.items():
+                    setattr(client.camera, name, value)
+            client.camera.on_update(self._look_from)
+
+    def _look_from(self, camera: Any) -> None:
+        found = {name: getattr(camera, name) for name in ("position", "look_at", "up_direction")}
+        self._camera = {name: [float(each) for each in value] for name, value in found.items()}
+
     def _build(self) -> None:
-        gui = self._server.gui
+        gui, desk = self._server.gui, self._desk
         gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
         gui.main_panel.dock_right()
         gui.set_panel_label(f"Tune {Path(self._session.shot.path).name}")
-        gui.add_html(STYLE)
         self._state = gui.add_html(_badge("opening …", WORKING))
-        self._build_view()
-        for group in dict.fromkeys(tunable.group for tunable in TUNABLES.values()):
-            with gui.add_folder(group):
-                self._build_group(group)
-        with gui.add_folder("Figures"):
+        self._build_history()
+        if len(self._session.garments) > 1:
+            choice = gui.add_dropdown("Garment", self._session.garments, initial_value=desk.garment)
+            desk.on(choice, lambda session, garment: setattr(desk, "garment", garment))
+        self._time = TimePanel(desk)
+        tabs = gui.add_tab_group()
+        with tabs.add_tab("Values"):
+            self._values = ValuePanel(desk)
+        with tabs.add_tab("Picture"):
+            self._view = ViewPanel(desk)
+        with tabs.add_tab("Paint"):
+            self._paint = PaintPanel(desk, self._view)
+        with tabs.add_tab("Figures"):
             self._figures = gui.add_html("")
-        save = gui.add_button("Save layer", hint="Writes the values as a layer, as physgraph-usd tag does.")
-        save.on_click(lambda _: self.loop.ask(self._save))
-        self._saved = gui.add_html(_small(f"into {html.escape(str(self._session.out))}"))
-        self._command = gui.add_html("")
+            self._command = gui.add_html("")
 
-    def _build_view(self) -> None:
-        """Controls of garment, frame and picture."""
-        gui, session = self._server.gui, self._session
-        if len(session.garments) > 1:
-            choice = gui.add_dropdown("Garment", session.garments, initial_value=self._garment)
-            choice.on_update(lambda event: self._ask(event, lambda _: self._choose(choice.value)))
-        times = [time for time in session.times if time is not None]
-        if len(times) > 1:
-            step = min(b - a for a, b in pairwise(times))
-            at = session.time or times[0]
-            frame = gui.add_slider("Frame", times[0], times[-1], step, at, hint="Time code of a sample.")
-            frame.on_update(lambda event: self._ask(event, lambda _: self._go(nearest(times, frame.value))))
-        shows = gui.add_dropdown("Show", SHOWS, initial_value=SHOWS[0])
-        shows.on_update(lambda event: self._ask(event, lambda _: setattr(self._picture, "shows", shows.value)))
-        colors = gui.add_dropdown("Painted map", (PLAIN, *PAINTED), initial_value=PLAIN)
-        colors.on_update(lambda event: self._ask(event, lambda _: setattr(self._picture, "map", colors.value)))
+    def _build_history(self) -> None:
+        """Save, undo and redo."""
+        gui, desk = self._server.gui, self._desk
+        save = gui.add_button("Save layer", hint="Writes what is tried as a layer, as physgraph-usd tag does.")
+        desk.press(save, self._save)
+        self._saved = gui.add_html(small(f"into {self._session.out}", "saved"))
+        self._history = gui.add_button_group("History", (UNDO, REDO), hint="Keys: Z, and shift with Z.")
 
-    def _build_group(self, group: str) -> None:
-        """A slider for each value of a display group, after the group's other controls."""
-        gui = self._server.gui
-        if group == FABRIC:
-            self._preset = gui.add_dropdown("Preset", (AS_AUTHORED, OWN, *sorted(PRESETS)), initial_value=AS_AUTHORED)
-            self._preset.on_update(lambda event: self._ask(event, self._set_preset))
-        elif group == REFINEMENT:
-            self._build_level()
-        elif group == CONTACT:
-            contact = gui.add_checkbox("Contact", True, hint="With bodies and of cloth with cloth.")
-            contact.on_update(lambda event: self._ask(event, lambda session: session.set_contact(contact.value)))
-        for tunable in (each for each in TUNABLES.values() if each.group == group):
-            text = gui.add_html("")
-            hint = f"{GARMENT[tunable.name].name}: {GARMENT[tunable.name].doc}"
-            slider = gui.add_slider(" ", 0.0, 1.0, FINEST, 0.5, hint=hint)
-            slider.on_update(partial(self._moved, tunable, slider))
-            self._sliders[tunable.name] = text, slider
-            self._write_value(tunable, text, slider)
+        @self._history.on_click
+        def _(event: Any) -> None:
+            desk.ask(TuneSession.undo if event.target.value.startswith(UNDO) else TuneSession.redo)
 
-    def _build_level(self) -> None:
-        row, level_now = GARMENT["refine:level"], self._session.levels[0]
-        hint = f"{row.name}: {row.doc}"
-        most = max(row.soft or (0, level_now))
-        level = self._server.gui.add_slider(row.label, 0, int(most), 1, min(level_now, int(most)), hint=hint)
-        level.on_update(lambda event: self._ask(event, lambda each: each.set_level(self._garment, int(level.value))))
+        gui.add_command("Undo", hotkey="Z").on_trigger(lambda _: desk.ask(TuneSession.undo))
+        gui.add_command("Redo", hotkey="Z", modifier="shift").on_trigger(lambda _: desk.ask(TuneSession.redo))
 
-    def _choose(self, garment: str) -> None:
-        self._garment, self._follow = garment, True
-
-    def _go(self, time: float) -> None:
-        self._session.set_time(time)
-        self._follow = True
-
-    def _moved(self, tunable: Tunable, slider: Any, event: Any) -> None:
-        """A slider was moved, by the artist or by the page."""
-        if event.client is None:
-            return
-        value = tunable.at(slider.value)
-        if self._preset.value != OWN:
-            self._preset.value = OWN
-        self.loop.ask(lambda session: session.set_value(self._garment, tunable.name, value))
-
-    def _set_preset(self, session: TuneSession) -> None:
-        self._follow = True
-        if self._preset.value == AS_AUTHORED:
-            session.set_as_authored(self._garment)
-        elif self._preset.value != OWN:
-            session.set_preset(self._garment, self._preset.value)
-
-    def _write_value(self, tunable: Tunable, text: Any, slider: Any) -> None:
-        """Write a value, and put its slider there unless that is None."""
-        value = self._session.value(self._garment, tunable.name)
-        text.content = _row(tunable.label, tunable.text(value))
-        if slider is not None:
-            slider.value = tunable.place(value if value is not None else tunable.ends[0])
+    def _write_history(self) -> None:
+        history = self._session.history
+        options = f"{UNDO} {history.undone_next}".strip(), f"{REDO} {history.redone_next}".strip()
+        put(self._history, options=options)
 
     def _save(self, session: TuneSession) -> None:
         written = session.save()
-        self._saved.content = _small(f"saved into {html.escape(str(written))}")
-
-    def _ask(self, event: Any, change: Any) -> None:
-        """Have the session changed, where the artist asked for it."""
-        if event.client is not None:
-            self.loop.ask(change)
+        tried = session.setting.values
+        names = sorted({name for values in tried.values() for name in values})
+        maps = sorted({name for maps in session.setting.painted.values() for name in maps})
+        self._saved.content = small(f"saved {', '.join(names + maps) or 'no value'} into {written}", "saved")
 
 
 def serve(session: TuneSession, *, port: int = 8080, say: Callable[[str], None]) -> None:
@@ -196,11 +178,6 @@ def serve(session: TuneSession, *, port: int = 8080, say: Callable[[str], None])
         page.close()
 
 
-def nearest(times: Sequence[float], time: float) -> float:
-    """The sample that is nearest to a time code."""
-    return min(times, key=lambda each: abs(each - time))
-
-
 def figures(shown: Shown, index: int) -> dict[str, str]:
     """Figures of a solved garment in words, by name, as in a report."""
     points, entry = shown.points[index], shown.telemetry[index]
@@ -211,12 +188,17 @@ def figures(shown: Shown, index: int) -> dict[str, str]:
         lines["Strain, 99th percentile"] = f"{100.0 * entry['strain']['p99']:.2g} %"
     contact = entry.get("contact", {})
     if "cloth" in contact:
-        lines["Crossings of cloth"] = str(contact["cloth"]["after"]["crossings"])
+        lines["Crossings of cloth, before and after"] = _both(contact["cloth"], "crossings")
     if "bodies" in contact:
-        lines["Vertices inside bodies"] = str(sum(body["after"]["inside"] for body in contact["bodies"].values()))
+        for path, body in contact["bodies"].items():
+            lines[f"Inside {path.rpartition('/')[2]}, before and after"] = _both(body, "inside")
     if "levels" in entry:
         lines["Evaluations"] = str(sum(level["evaluations"] for level in entry["levels"]))
     return lines | {"Seconds": f"{shown.seconds:.2f}", "Start": str(entry.get("start", ""))}
+
+
+def _both(entry: Mapping[str, Any], name: str) -> str:
+    return f"{entry['before'][name]} → {entry['after'][name]}"
 
 
 def _badge(text: str, color: str) -> str:
@@ -224,15 +206,6 @@ def _badge(text: str, color: str) -> str:
         f"margin:0.4em 0.8em;padding:0.35em 0.7em;border-radius:0.4em;color:white;background:{color};font-size:0.85em"
     )
     return f"<div id='state' style='{style}'>{html.escape(text)}</div>"
-
-
-def _row(label: str, value: str) -> str:
-    style = "display:flex;justify-content:space-between;margin:0 0.8em -0.35em 0.8em;font-size:0.85em"
-    return f"<div class='value' style='{style}'><span>{html.escape(label)}</span><b>{html.escape(value)}</b></div>"
-
-
-def _small(content: str) -> str:
-    return f"<div style='margin:0.1em 1em;font-size:0.75em;color:#5b6470;overflow-wrap:anywhere'>{content}</div>"
 
 
 def _table(lines: dict[str, str]) -> str:

@@ -1,4 +1,4 @@
-"""A shot and the values that an artist tries on it, with a page or without one.
+"""A shot and what an artist tries on it, solved frame by frame, with a page or without one.
 
 session = TuneSession("shot.usda", out="shot.tuned.usda")
 session.set_value("/World/Coat", "bendStiffness", 2e-5)
@@ -10,59 +10,31 @@ session.save()
 from __future__ import annotations
 
 import time as clock
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from copy import copy
 from pathlib import Path
 from shlex import join
-from typing import Any
-
-import numpy as np
 
 from ..errors import UsageError
 from ..shot.solve import prepare_device
-from ..shot.untagged import AUTO, find_candidates, open_with_colliders
+from ..shot.untagged import find_candidates
 from ..shot.warnings import of_unfelt
-from ..solver.fabric import PRESETS
 from ..solver.mesh.subdivide import Refinement
-from ..solver.resolution import choose_levels, sample_frames
-from ..solver.scene import Frame
-from ..usd.schema import AUTO_LEVEL, FABRIC, GARMENT, fabric_values
-from ..usd.write.tag import tag
+from .setting import Setting
 from .solver import FrameSolver, Seen
-from .values import TUNABLES
+from .takes import Shown, Start, Take, Takes
+from .tuning import Tuning
 
 
-@dataclass(frozen=True, eq=False)
-class Shown:
-    """A solved frame.
-
-    Attributes:
-        frame: The input: cages, values and bodies.
-        points: Fine positions of each garment [m], world space; None for one without a sample here.
-        telemetry: The solver's figures of each garment, as in a report's frame.
-        seconds: Wall time of reading and solving.
-        settled: Whether the frame is solved as ``refine`` solves it.
-    """
-
-    frame: Frame
-    points: tuple[np.ndarray | None, ...]
-    telemetry: tuple[dict[str, Any], ...]
-    seconds: float
-    settled: bool
-
-
-class TuneSession:
+class TuneSession(Tuning):
     """Values tried on a shot, and the cloth with them.
 
     Attributes:
         out: The layer that `save` writes.
-        garments: Prim paths of the garments.
-        times: The shot's time codes; (None,) where it has no samples.
-        time: The one that is solved next.
-        levels: Subdivisions of each garment.
-        contact: Whether cloth feels bodies and cloth.
+        solver: What solves the frame; it stands where the cloth is.
+        takes: Frames of the shot that were solved in order.
+        kept: The setting A that the present one is compared with, and its cloth; or None.
         warning: Bodies that the cloth touches and does not feel, in words, or "".
-        values: The values that `save` authors, by prim path and the schema's short names.
     """
 
     def __init__(
@@ -89,90 +61,29 @@ class TuneSession:
             UsageError: The layer exists.
             StageError: The shot cannot be read.
         """
-        self._device = prepare_device(device)
+        self._device, self._overwrite = prepare_device(device), overwrite
         self.out = Path(out) if out is not None else Path(shot).with_suffix(".tuned.usda")
         if self.out.exists() and not overwrite:
             raise UsageError(f"{self.out} exists; choose another name with -o, or replace it by --overwrite")
-        self.shot = self._opened = open_with_colliders(shot, garments=garments, colliders=colliders)
-        named = self.shot.colliders if AUTO in colliders else tuple(colliders)
-        self._overwrite, self._named = overwrite, (tuple(garments), named)
-        scene = self.shot.scene
-        self.garments = tuple(garment.path for garment in scene.garments)
-        self.times: tuple[float | None, ...] = scene.times or (None,)
-        self.time, self.contact = self.times[0], True
-        frames = sample_frames(self.shot.every_time, self.shot.frame)
+        super().__init__(shot, garments=garments, colliders=colliders)
         self.warning = "".join(of_unfelt([each for each in find_candidates(self.shot) if each.is_taken]))
-        self.levels = [choice.level for choice in choose_levels(scene, frames)]
-        # A level that is chosen from the fabric would be chosen anew from what is tried.
-        chosen = zip(scene.garments, self.levels, strict=True)
-        self.values = {g.path: {"refine:level": float(k)} for g, k in chosen if g.level == AUTO_LEVEL}
-        self._solver = FrameSolver(self.shot, self.levels, contact=True, device=self._device)
-        self._shown: Shown | None = None  # None once anything was set.
+        self.solver = FrameSolver(self.shot, self.setting.levels, contact=True, device=self._device)
+        self._solves = self.setting  # What the solver was made for, or solved last.
+        self._shown: tuple[Setting, Shown] | None = None
+        self.takes = Takes()
+        self.kept: Take | None = None
 
     def close(self) -> None:
         """Let go of the stage."""
-        self._opened.close()
+        self._tried.close()
 
     @property
     def refinements(self) -> Sequence[Sequence[Refinement]]:
         """The subdivisions of each garment, coarsest first."""
-        return self._solver.refinements
-
-    def value(self, garment: str, name: str) -> float | None:
-        """A tunable value of a garment in the frame, SI; None where nothing gives one."""
-        return TUNABLES[name].read(self.shot.frame(self.time).garments[self._index(garment)])
-
-    def set_value(self, garment: str, name: str, value: float) -> None:
-        """Try a value [SI], rounded as a layer holds it.
-
-        Raises:
-            UsageError: The garment or the name is unknown, or the value is outside its limits.
-        """
-        if name not in TUNABLES:
-            raise UsageError(f"unknown value '{name}'; known values: {', '.join(TUNABLES)}")
-        self._try(garment, {name: value})
-
-    def set_preset(self, garment: str, preset: str) -> None:
-        """Try a fabric's values in place of those that were tried.
-
-        Raises:
-            UsageError: The garment or the fabric is unknown.
-        """
-        if preset not in PRESETS:
-            raise UsageError(f"unknown preset '{preset}'; known presets: {', '.join(sorted(PRESETS))}")
-        tried = self.values.get(garment, {})
-        kept = {name: value for name, value in tried.items() if GARMENT[name].group != FABRIC}
-        self._read_with(garment, kept | _rounded(fabric_values(PRESETS[preset])))
-
-    def set_as_authored(self, garment: str) -> None:
-        """Take a garment's values from the shot again; its level stays.
-
-        Raises:
-            UsageError: The garment is unknown.
-        """
-        values = self.values.get(garment, {})
-        self._read_with(garment, {name: value for name, value in values.items() if name not in TUNABLES})
-
-    def set_level(self, garment: str, level: int) -> None:
-        """Try another number of subdivisions.
-
-        Raises:
-            UsageError: The garment is unknown, or the level is outside its limits.
-        """
-        index = self._index(garment)
-        if level < 0:
-            raise UsageError(f"level {level}: give 0 or more")
-        self._try(garment, {"refine:level": level})
-        self.levels[index] = level
-        self._solver = FrameSolver(self.shot, self.levels, contact=self.contact, device=self._device)
-
-    def set_contact(self, on: bool) -> None:
-        """Let cloth feel bodies and cloth, or nothing."""
-        self.contact, self._shown = on, None
-        self._solver.feel(contact=on)
+        return self.solver.refinements
 
     def set_time(self, time: float | None) -> None:
-        """Go to a time code.
+        """Go to a time code; cloth that was solved there with this setting is taken from `takes`.
 
         Raises:
             UsageError: The shot has no sample there.
@@ -180,6 +91,22 @@ class TuneSession:
         if time not in self.times:
             raise UsageError(f"no sample at time code {time}; they run from {self.times[0]} to {self.times[-1]}")
         self.time, self._shown = time, None
+        take = self.takes.fresh(time, self.setting)
+        if take is not None:
+            self.solver, self._solves = copy(take.start.solver), take.setting
+            self._shown = take.setting, take.shown
+
+    def keep(self) -> None:
+        """Keep the present setting and its cloth as A."""
+        shown = self.solve()
+        self.kept = Take(Start(self.setting, self.shot, copy(self.solver)), shown)
+
+    def swap(self) -> None:
+        """Go to A's setting, from A's cloth, and keep the present one as A; does nothing without A."""
+        if (kept := self.kept) is not None:
+            self.keep()
+            self._put(kept.setting, "A and B exchanged")
+            self.solver, self._solves = copy(kept.start.solver), kept.setting
 
     def solve(self, seen: Seen = lambda _: None, cancelled: Callable[[], bool] = lambda: False) -> Shown:
         """The frame with the values tried, roughly, from the last result; a first frame as `settle` does.
@@ -187,71 +114,114 @@ class TuneSession:
         Arguments are those of `FrameSolver.solve`.
 
         Raises:
+            GarmentError: A rest shape cannot be solved on.
             SolveError: A term of the potential is not finite.
             StageError: The frame cannot be read.
         """
-        return self._shown or self._show(seen, cancelled, rough=True)
+        return self._known or self._show(seen, cancelled, rough=True)
 
     def settle(self, seen: Seen = lambda _: None, cancelled: Callable[[], bool] = lambda: False) -> Shown:
         """The frame as ``refine`` solves it from the last result; not settled if ``cancelled``.
 
         Arguments and errors are those of `solve`.
         """
-        if self._shown is not None and self._shown.settled:
-            return self._shown
-        return self._show(seen, cancelled, rough=False)
+        known = self._known
+        return known if known and known.settled else self._show(seen, cancelled, rough=False)
+
+    @property
+    def kept_shown(self) -> Shown | None:
+        """A's cloth in the present frame; None without A, or where that is not solved."""
+        if self.kept is None or self.kept.shown.frame.time == self.time:
+            return None if self.kept is None else self.kept.shown
+        return take.shown if (take := self.takes.fresh(self.time, self.kept.setting)) else None
+
+    def go_on(self, span: tuple[float, float] | None, cancelled: Callable[[], bool] = lambda: False) -> bool:
+        """Solve what else is looked at: A in this frame, or the next frame of a range; returns whether there was any.
+
+        Args:
+            span: First and last time code to solve in order into `takes`, with A's setting too; None solves none.
+            cancelled: As in `settle`.
+
+        Raises:
+            SolveError: A term of the potential is not finite.
+            StageError: A frame cannot be read.
+        """
+        if self.kept is not None and self.kept_shown is None:
+            self.kept = self.kept.start.at(self.time, cancelled)
+            return True
+        return self._solve_next(self.codes_in(span), cancelled) is not None
+
+    def step(self, span: tuple[float, float] | None, cancelled: Callable[[], bool] = lambda: False) -> Shown | None:
+        """Go to the next frame of a range, from its end to its start; arguments and errors are those of `go_on`.
+
+        A frame that is not fresh is solved in order: then the first such frame is gone to.
+
+        Returns:
+            The frame; None if solving it was cancelled.
+        """
+        times = self.codes_in(span)
+        if not times:
+            return self.solve()
+        after = next((time for time in times if self.time is None or time > self.time), times[0])
+        if any(self.takes.fresh(after, each.setting) is None for each in self._starts()):
+            solved = self._solve_next(times, cancelled)
+            after = times[0] if solved is None else solved
+        self.set_time(after)
+        return self._known
+
+    def _starts(self) -> list[Start]:
+        """The present setting, and A's."""
+        self._prepare()
+        present = Start(self.setting, self.shot, self.solver)
+        return [present] if self.kept is None else [present, self.kept.start]
+
+    def _solve_next(self, times: Sequence[float], cancelled: Callable[[], bool]) -> float | None:
+        """Solve the first frame of a range that is not fresh; returns its time code."""
+        found = (self.takes.solve_next(times, start, cancelled) for start in self._starts() if times)
+        return next((time for time in found if time is not None), None)
 
     @property
     def command(self) -> str:
         """The command that refines the whole shot with the saved layer."""
         words = ["physgraph-usd", "refine", str(self.out), "-o", str(self.out.with_suffix(".refined.usdc"))]
         words += [] if self._device == "cpu" else ["--device", self._device]
-        for option, paths in zip(("--garment", "--collider"), self._named, strict=True):
+        for option, paths in zip(("--garment", "--collider"), self._tried.named, strict=True):
             words += [word for path in paths for word in (option, path)]
-        return join(words + ([] if self.contact else ["--contact", "off", "--self-contact", "off"]))
+        return join(words + ([] if self.setting.contact else ["--contact", "off", "--self-contact", "off"]))
 
     def save(self) -> Path:
-        """Write the values tried as a layer over the shot, as ``tag`` does; nothing else is ever written.
+        """Write what is tried as a layer over the shot, as ``tag`` does; nothing else is ever written.
 
         Raises:
             UsageError: The layer's name is one of the shot's files, or its suffix is unknown.
             StageError: A garment lies in an instance.
             LayerError: It cannot be written.
         """
-        (_, bodies), over = self._named, self._overwrite
-        written = tag(
-            self._opened.path, self.out, garments=self.garments, colliders=bodies, values=self.values, overwrite=over
-        )
+        written = self._tried.save(self.setting, self.out, overwrite=self._overwrite)
         self._overwrite = True  # It is this session's own from here on.
         return written
 
+    @property
+    def _known(self) -> Shown | None:
+        """The last result, where it is of the present setting and time."""
+        return self._shown[1] if self._shown is not None and self._shown[0] is self.setting else None
+
     def _show(self, seen: Seen, cancelled: Callable[[], bool], *, rough: bool) -> Shown:
-        began, rough = clock.perf_counter(), rough and self._solver.begun  # A first frame is as `refine` solves it.
-        state = self._solver.solve(self.shot, self.time, rough=rough, seen=seen, cancelled=cancelled)
-        seconds = clock.perf_counter() - began
-        found = state.points, tuple(map(dict, state.telemetry)), seconds, not (rough or cancelled())
-        self._shown = Shown(self.shot.frame(self.time), *found)
-        return self._shown
+        began = clock.perf_counter()
+        self._prepare()
+        rough = rough and self.solver.begun  # A first frame is as `refine` solves it.
+        state = self.solver.solve(self.shot, self.time, rough=rough, seen=seen, cancelled=cancelled)
+        given = {"seconds": clock.perf_counter() - began, "settled": not (rough or cancelled())}
+        self._shown = self.setting, Shown.of(self.shot.frame(self.time), state, **given)
+        return self._shown[1]
 
-    def _index(self, garment: str) -> int:
-        if garment not in self.garments:
-            raise UsageError(f"no garment <{garment}>; garments: {', '.join(self.garments)}")
-        return self.garments.index(garment)
-
-    def _try(self, garment: str, values: Mapping[str, float]) -> None:
-        """Read the shot with values more, rounded to floats that a layer can hold."""
-        self._read_with(garment, self.values.get(garment, {}) | _rounded(values))
-
-    def _read_with(self, garment: str, values: dict[str, float]) -> None:
-        """Read the shot with a garment's values; values that cannot be used change nothing."""
-        self._index(garment)
-        tried = {**self.values, garment: values}
-        texts = [
-            f"{path}.{GARMENT[name].name}={value!r}" for path, each in tried.items() for name, value in each.items()
-        ]
-        self.shot, self.values, self._shown = self._opened.with_values(texts), tried, None
-
-
-def _rounded(values: Mapping[str, float]) -> dict[str, float]:
-    """Values as floats that a layer can hold."""
-    return {name: float(np.float32(value)) for name, value in values.items()}
+    def _prepare(self) -> None:
+        """Have a solver for the present setting: a new one where levels or maps changed, from where the cloth was."""
+        setting, before = self.setting, self._solves
+        if setting.levels != before.levels or setting.painted is not before.painted:
+            old = self.solver
+            self.solver = FrameSolver(self.shot, setting.levels, contact=setting.contact, device=self._device)
+            self.solver.go_on_from(old)
+        if setting.contact != before.contact:
+            self.solver.feel(contact=setting.contact)
+        self._solves = setting

@@ -25,6 +25,7 @@ class FrameSolver:
     """Solves frames of a shot at fixed levels, each from where the cloth was last.
 
     Attributes:
+        refiner: What solves; forked for each frame.
         refinements: The subdivisions of each garment, coarsest first.
     """
 
@@ -35,14 +36,21 @@ class FrameSolver:
             GarmentError: A rest shape cannot be solved on.
         """
         self._times, self._settings = shot.scene.times, _settings(contact=contact)
-        self._refiner = Refiner(shot.scene, self._settings, levels=levels, device=device, threads=cores())
+        self.refiner = Refiner(shot.scene, self._settings, levels=levels, device=device, threads=cores())
         self._at: tuple[float | None, ...] = ()  # The time code solved last; none before the first.
-        self.refinements = self._refiner.refinements
+        self.refinements = self.refiner.refinements
 
     @property
     def begun(self) -> bool:
         """Whether a frame was solved since the solver was made, or last told whether cloth feels contact."""
         return bool(self._at)
+
+    def go_on_from(self, other: FrameSolver) -> None:
+        """Start the next frame where another solver's cloth was; cold if it was never begun, or at other levels."""
+        counts = [[len(chain) for chain in each.refinements] for each in (self, other)]
+        if other.begun and counts[0] == counts[1]:
+            self.refiner.go_on_from(other.refiner)
+            self._at = other._at
 
     def feel(self, *, contact: bool) -> None:
         """Let cloth feel bodies and cloth, or nothing, from here on; the next frame starts cold."""
@@ -75,20 +83,20 @@ class FrameSolver:
         temporal = self._settings.temporal if follows else "warm"  # No time passes for the tether to slow cloth down.
         settings = replace(self._settings, rough=rough, shown=seen, cancelled=cancelled, temporal=temporal)
         if self._at:
-            self._refiner = self._refiner.fork(settings)
+            self.refiner = self.refiner.fork(settings)
         else:
-            self._refiner.use(settings)
+            self.refiner.use(settings)
             self._lead_in(shot, time)
-            seen(self._upsampled(frame))
-        state = self._refiner.solve(frame, sampled_at(shot, time))
+            seen(self.smooth(frame))
+        state = self.refiner.solve(frame, sampled_at(shot, time))
         self._at = (time,)
         return state
 
-    def _upsampled(self, frame: Frame) -> dict[str, np.ndarray]:
+    def smooth(self, frame: Frame) -> dict[str, np.ndarray]:
         """The smooth surface of each cage [m], by path."""
         found = dict[str, np.ndarray]()
-        for part in self._refiner.parts_of(frame):
-            group = self._refiner.group_of(part)
+        for part in self.refiner.parts_of(frame):
+            group = self.refiner.group_of(part)
             points = group.upsampled([frame.garments[index] for index in part])
             found |= zip((garment.path for garment in group.garments), points, strict=True)
         return found
@@ -98,7 +106,7 @@ class FrameSolver:
         earlier = [] if time is None else shot.times_until(time)
         found = cages_walked(shot.scene, self._settings, shot.frame, times=earlier, threads=cores())
         if found is not None:
-            self._refiner.begin_at(found[0], since=found[1])
+            self.refiner.begin_at(found[0], since=found[1])
 
 
 def _settings(*, contact: bool) -> SolveSettings:

@@ -9,8 +9,8 @@ from functools import reduce
 import numpy as np
 
 from ..solver.mesh.subdivide import Refinement
-from ..solver.scene import Garment, GarmentFrame
-from ..usd.schema import GARMENT
+from ..solver.scene import GarmentFrame
+from ..usd.schema import GARMENT, PAINTED
 
 
 @dataclass(frozen=True)
@@ -42,13 +42,25 @@ class Tunable:
         return GARMENT[self.name].group
 
     @property
+    def title(self) -> str:
+        """The label without "Stiffness", which would not fit beside a number, and the unit, which says as much."""
+        short = self.label.removesuffix(" Stiffness")
+        return f"{short} [{self.unit}]" if self.unit else short
+
+    @property
+    def hint(self) -> str:
+        """The effect that one sees, and its attribute."""
+        return f"{SAYS[self.name]} {GARMENT[self.name].name}"
+
+    @property
     def ends(self) -> tuple[float, float]:
         """The slider's ends, SI: the schema's soft limits."""
         return GARMENT[self.name].soft or (0.0, 1.0)
 
-    def text(self, value: float | None) -> str:
-        """A value as the page writes it."""
-        return "not set" if value is None else f"{float(f'{value * self.factor:.3g}'):,.8g} {self.unit}".strip()
+    def shown(self, value: float) -> tuple[float, int]:
+        """A value as the page shows it, to three figures, and how many decimals that takes."""
+        number = float(f"{value * self.factor:.3g}")
+        return number, max(0, 2 - int(np.floor(np.log10(abs(number))))) if number else 0
 
     def place(self, value: float) -> float:
         """The place of a value on the slider, 0 to 1; values beyond its ends are at them."""
@@ -88,16 +100,28 @@ TUNABLES: dict[str, Tunable] = {
 }
 """Every value that can be tuned, by the schema's short name, in the page's order."""
 
-PAINTED: dict[str, Callable[[Garment], np.ndarray]] = {
-    "stretchScale": lambda garment: garment.stretch_scale,
-    "bendScale": lambda garment: garment.bend_scale,
-    "guideScale": lambda garment: garment.guide_scale,
-    "detailScale": lambda garment: garment.detail_scale,
-    "pin": lambda garment: garment.pin,
+SAYS = {
+    "rest:weftEase": "Higher: more folds, running along the warp.",
+    "rest:warpEase": "Higher: more folds, running along the weft.",
+    "rest:creaseTime": "Folds stay in the cloth after half this time; 0: never.",
+    "stretchStiffness": "Lower: cloth gives way and folds less; higher: it folds.",
+    "weftStretchStiffness": "Along the weft. Lower: cloth gives way and folds less.",
+    "shearStiffness": "Lower: cloth drapes round shapes; higher: it buckles in slanting folds.",
+    "bendStiffness": "Higher: fewer, larger folds.",
+    "weftBendStiffness": "Along the weft. Higher: fewer, larger folds.",
+    "density": "Higher: cloth hangs more heavily between the places that hold it.",
+    "thickness": "Higher: layers and folds keep farther apart.",
+    "stretchLimit": "Cloth resists far more beyond this strain.",
+    "guide:stiffness": "Higher: closer to the animation, with shallower folds.",
+    "refine:detail": "Times the folds that were added; 0: a smooth surface.",
+    "contact:offset": "Higher: cloth keeps farther off the bodies.",
 }
-"""How each painted map is found in a garment, by the schema's short name."""
+"""The effect that one sees when a value changes, by the schema's short name."""
+
+MAPS = tuple(name for name, row in GARMENT.items() if row.group == PAINTED and name != "grain")
+"""The painted maps that can be seen and painted, by the schema's short names."""
 
 
-def painted_on(garment: Garment, refinements: Sequence[Refinement], name: str) -> np.ndarray:
-    """A map of `PAINTED` on a garment's finest vertices, shape (V,), by its subdivisions, coarsest first."""
-    return reduce(lambda values, step: np.asarray(step.linear @ values), refinements, PAINTED[name](garment))
+def on_fine(values: np.ndarray, refinements: Sequence[Refinement]) -> np.ndarray:
+    """Values of a cage's vertices on the finest, shape (V,), by the cage's subdivisions, coarsest first."""
+    return reduce(lambda found, step: np.asarray(step.linear @ found), refinements, values)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time as clock
 from collections.abc import Iterable, Iterator, Sequence
 from copy import copy
+from dataclasses import replace
 from statistics import median
 from typing import Any
 
@@ -107,6 +108,12 @@ class Refiner:
         other._settings = settings
         return other
 
+    def go_on_from(self, other: Refiner) -> None:
+        """Start the next frame from the last frame of a refiner of the same meshes; its result is not reused."""
+        lasts = [None if each.last is None else replace(each.last, whole=False) for each in other._memories]
+        self._memories = tuple(replace(each, last=last) for each, last in zip(other._memories, lasts, strict=True))
+        self._time = other._time
+
     def parts_of(self, frame: Frame) -> list[tuple[int, ...]]:
         """Numbers of the garments solved together in a frame."""
         return self._cloth.parts_of(frame, self._settings)
@@ -169,7 +176,7 @@ class Refiner:
         points = [answers[index].points if index in answers and asked[index] else None for index in range(count)]
         absent: dict[str, object] = {"start": "left out: the garment has no sample here"}
         telemetry = [absent if points[index] is None else answers[index].telemetry for index in range(count)]
-        heat = [self._heat(index, each) for index, each in enumerate(points)] if self._heat_map else []
+        heat = [self.heat(index, each) for index, each in enumerate(points)] if self._heat_map else []
         return State(frame.time, tuple(points), tuple(telemetry), tuple(reused), tuple(heat))
 
     def energy(self, frame: Frame, points: Sequence[np.ndarray]) -> float:
@@ -206,8 +213,8 @@ class Refiner:
                     found[index] = each, contact
         return found
 
-    def _heat(self, index: int, points: np.ndarray | None) -> dict[str, np.ndarray] | None:
-        """A garment's heat map, or None without positions [m]."""
+    def heat(self, index: int, points: np.ndarray | None) -> dict[str, np.ndarray] | None:
+        """A garment's depth in bodies and its crossings in the last frame; None without positions [m]."""
         memory = self._memories[index]
         crossing = memory.last.crossing if memory.solved and memory.last is not None else None
         return None if points is None else self._cloth.heat(index, points, crossing)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -68,4 +68,5 @@ class SolveSettings:
     def budget(self, below: int, clock: float, *, warm: bool) -> Budget:
         """The budget of a level, as for `level_budget`."""
         limits = {"seconds": None if self.budget_ms is None else 1e-3 * self.budget_ms, "cancelled": self.cancelled}
-        return level_budget(self.steps, self.tolerance, below, warm=warm, clock=clock, **limits)
+        found = level_budget(self.steps, self.tolerance, below, warm=warm, clock=clock, **limits)
+        return replace(found, hurried=self.rough)

@@ -15,6 +15,8 @@ from ..deadline import is_over
 
 ROUND, LONGEST = 4, 16
 """Most steps of a round with contact, and without: near pairs are found again after a round."""
+HURRIED = 2
+"""Most steps of a first round that somebody waits for."""
 TOUCHING = 3
 """Most steps of the finest level with contact, relative to the budget's: blocked moves cost steps."""
 REST = 2.0
@@ -49,6 +51,7 @@ class Budget:
         least: Number of steps exempt from the deadline.
         touching: Most steps with contact, if more.
         near: Remaining move, in tolerances, below which a level in contact ends early; 0 for never.
+        hurried: Whether somebody waits for the end of the first round.
     """
 
     steps: int
@@ -59,6 +62,7 @@ class Budget:
     least: int = 0
     touching: int = 0
     near: float = 0.0
+    hurried: bool = False
 
     def for_round(self, *, first: bool, touching: bool, shrunk: float) -> Budget:
         """The budget of a round.
@@ -68,7 +72,7 @@ class Budget:
             touching: Whether there is contact.
             shrunk: Factor of the tolerance: a metric with contact underestimates moves.
         """
-        steps = min(ROUND if touching else LONGEST, self.steps)
+        steps = min(HURRIED if self.hurried and first else ROUND if touching else LONGEST, self.steps)
         once = {} if first else {"rest": 1.0, "least": 0}
         return replace(self, steps=steps, tolerance=shrunk * self.tolerance, **once)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
 from pxr import Sdf, Usd, UsdGeom
 
 from ...errors import SchemaError, StageError, UsageError
@@ -17,6 +18,7 @@ from ..schema import COLLIDER, COLLIDER_API, GARMENT, GARMENT_API, SIDES, Proper
 from ..stage import open_stage
 from ..view import root_over
 from .atomic import ASSET_PATHS, prepare_target
+from .paint import author_painted
 
 
 def tag(
@@ -28,6 +30,7 @@ def tag(
     preset: str | None = None,
     side: str | None = None,
     values: Mapping[str, Mapping[str, float]] | None = None,
+    painted: Mapping[str, Mapping[str, np.ndarray]] | None = None,
     asset_paths: str = "relative",
     overwrite: bool = False,
 ) -> Path:
@@ -42,6 +45,7 @@ def tag(
         preset: Name of a fabric to author on the garments, or None.
         side: Side of the colliders for the cloth, one of `SIDES`, or None.
         values: Values to author after the preset's, by the garment's prim path and the schema's short names.
+        painted: Maps to author, values of each authored point, shape (V,), by the same names.
         asset_paths: "relative" or "absolute": form of the shot's path in the layer.
         overwrite: Whether an existing file may be replaced.
 
@@ -76,6 +80,7 @@ def tag(
         authored = {} if preset is None else every_fabric_value(PRESETS[preset])
         for name, value in (authored | dict((values or {}).get(str(prim.GetPath()), {}))).items():
             _author_over(spec, prim, GARMENT[name], value)
+        author_painted(spec, prim, (painted or {}).get(str(prim.GetPath()), {}))
     for prim in solid:
         spec = _applied(root, prim, COLLIDER_API)
         if side is not None:

@@ -1,0 +1,113 @@
+"""Painting: a brush that changes a map on the cage's vertices where it touches the refined cloth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from ..solver.mesh.topology import PolygonMesh, adjacency
+
+PAINT, SMOOTH = "paint", "smooth"
+
+
+@dataclass
+class Brush:
+    """A brush.
+
+    Attributes:
+        radius: How far it reaches [m].
+        value: The value that it paints.
+        strength: How far one touch goes towards it, 0 to 1.
+        mode: `PAINT`, or `SMOOTH`: towards the mean of the neighbours.
+        mirrored: Whether the other side is painted too, mirrored in the rest shape.
+    """
+
+    radius: float
+    value: float = 0.0
+    strength: float = 0.5
+    mode: str = PAINT
+    mirrored: bool = False
+
+
+@dataclass
+class Stroke:
+    """A map under the brush.
+
+    Attributes:
+        garment: Prim path.
+        name: The map's short name.
+        values: On the cage's vertices, shape (V,).
+    """
+
+    garment: str
+    name: str
+    values: np.ndarray
+    _mirror: np.ndarray | None = field(default=None, repr=False)
+
+    def touch(
+        self,
+        brush: Brush,
+        at: np.ndarray,
+        points: np.ndarray,
+        *,
+        mesh: PolygonMesh,
+        rest: np.ndarray,
+        right: np.ndarray,
+    ) -> None:
+        """Change the values near a place.
+
+        Args:
+            brush: The brush.
+            at: The place [m], shape (3,).
+            points: Positions of the cage's vertices [m], shape (V, 3).
+            mesh: The cage.
+            rest: Its rest positions [m], shape (V, 3).
+            right: Direction across which it is mirrored, shape (3,).
+        """
+        near = np.clip(1.0 - np.linalg.norm(points - at, axis=1) / brush.radius, 0.0, 1.0)
+        if brush.mirrored:
+            if self._mirror is None:
+                self._mirror = mirrored(rest, right)
+            near = np.maximum(near, near[self._mirror])
+        weight = brush.strength * near * near * (3.0 - 2.0 * near)
+        towards = brush.value if brush.mode == PAINT else neighbour_mean(mesh, self.values)
+        self.values = self.values + weight * (towards - self.values)
+
+
+def mirrored(rest: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """For each vertex the one nearest to its mirror image across the middle of the rest shape, shape (V,)."""
+    at = rest @ right
+    image = rest + np.outer(at.max() + at.min() - 2.0 * at, right)
+    return np.asarray(cKDTree(rest).query(image)[1])
+
+
+def neighbour_mean(mesh: PolygonMesh, values: np.ndarray) -> np.ndarray:
+    """Mean of each vertex's neighbours along edges; its own value where it has none, shape (V,)."""
+    ends = np.stack([mesh.indices, mesh.indices[mesh.next_corner]], axis=1)
+    near = adjacency(ends, mesh.vertex_count)
+    count = np.asarray(near.sum(axis=1)).ravel()
+    return np.where(count > 0, near @ values / np.maximum(count, 1.0), values)
+
+
+def hit(origin: np.ndarray, along: np.ndarray, points: np.ndarray, triangles: np.ndarray) -> np.ndarray | None:
+    """The first place [m] where a ray meets a mesh, shape (3,); None where it meets none.
+
+    Args:
+        origin: Where the ray starts [m], shape (3,).
+        along: Its direction, shape (3,).
+        points: Positions [m], shape (V, 3).
+        triangles: Shape (T, 3).
+    """
+    a, b, c = (points[triangles[:, corner]] for corner in range(3))
+    one, two, start = b - a, c - a, origin - a
+    across = np.cross(along, two)
+    volume = (one * across).sum(axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        first = (start * across).sum(axis=1) / volume
+        turned = np.cross(start, one)
+        second = (turned @ along) / volume
+        distance = (two * turned).sum(axis=1) / volume
+    meets = (first >= 0) & (second >= 0) & (first + second <= 1) & (distance > 0)
+    return origin + distance[meets].min() * along if meets.any() else None

@@ -1,0 +1,132 @@
+"""Maps of solved cloth: a number at each fine vertex, and the colour that shows it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from ..solver.frame.refiner import Refiner
+from ..solver.scene import Frame
+from ..usd.schema import GARMENT
+from .brush import Stroke
+from .session import TuneSession
+from .takes import Shown
+from .values import MAPS, on_fine
+
+PLAIN = "none"
+LOW, MIDDLE, HIGH = np.array([[36, 64, 142], [222, 222, 218], [178, 24, 43]], float)
+"""Colours, sRGB, of the least value, of the value that changes nothing, and of the largest."""
+MOST_STRAIN, MOST_DISTANCE = 5.0, 10.0
+"""Ends of the colour bar [%], [mm]."""
+
+
+@dataclass(frozen=True)
+class Map:
+    """How a map is found and coloured.
+
+    Attributes:
+        name: What the page calls it.
+        unit: Of its values.
+        ends: Values in the full colours; grey is at ``middle``.
+        middle: The value that changes nothing.
+        find: Finds the values of a solver's garment, by number, in a frame at fine positions [m].
+    """
+
+    name: str
+    unit: str
+    ends: tuple[float, float]
+    middle: float
+    find: Callable[[Refiner, Frame, int, np.ndarray], np.ndarray]
+
+    def colors(self, values: np.ndarray) -> np.ndarray:
+        """Colours of values, shape (V,): bytes, shape (V, 4)."""
+        low, high = (abs(end - self.middle) for end in self.ends)
+        away = np.nan_to_num(values) - self.middle
+        rates = [1.0 / side if side > 0 else 0.0 for side in (low, high)]
+        amount = np.clip(away * np.where(away > 0, rates[1], rates[0]), -1.0, 1.0)[:, None]
+        colors = MIDDLE + np.where(amount > 0, amount * (HIGH - MIDDLE), -amount * (LOW - MIDDLE))
+        return np.concatenate([colors, np.full_like(amount, 255.0)], axis=1).round().astype(np.uint8)
+
+
+def stretches(refiner: Refiner, frame: Frame, index: int, points: np.ndarray) -> np.ndarray:
+    """Strains of a garment at fine positions: along the warp, along the weft, and the least in the surface [%].
+
+    Means over the faces of each vertex, by their rest areas, shape (V, 3); eased cloth is longer than the rest shape.
+    """
+    group = refiner.group_of((index,))
+    level = group.levels[-1].eased([frame.garments[index].fabric])
+    corners = torch.as_tensor(points, dtype=level.dtype)[level.membrane.long().cpu()]
+    sides = torch.stack([corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]], dim=2)
+    along = sides @ level.membrane_inverse.cpu().reshape(-1, 2, 2)
+    gram = along.transpose(1, 2) @ along
+    warp, weft, cross = gram[:, 0, 0], gram[:, 1, 1], gram[:, 0, 1]
+    least = 0.5 * (warp + weft) - ((0.5 * (warp - weft)) ** 2 + cross**2).sqrt()
+    strains = 100.0 * (torch.stack([warp, weft, least.clamp_min(0.0)], dim=1).sqrt() - 1.0)
+    area = level.membrane_area.cpu()
+    total, weight = torch.zeros(len(points), 3), torch.zeros(len(points), 1)
+    for corner in level.membrane.long().cpu().T:
+        total.index_add_(0, corner, (area[:, None] * strains).to(total))
+        weight.index_add_(0, corner, area[:, None].to(weight))
+    return (total / weight.clamp_min(1e-30)).numpy()
+
+
+def distances(refiner: Refiner, frame: Frame, index: int, points: np.ndarray) -> np.ndarray:
+    """Distance of a garment's fine positions to the nearest body that it feels [mm], shape (V,); infinite without."""
+    least = torch.full((len(points),), np.inf, dtype=torch.float64)
+    for each in refiner.touching((index,), frame):
+        x = torch.as_tensor(points - each.surface.origin, dtype=torch.float64)
+        least = torch.minimum(least, each.surface.closest(x, torch.full_like(least, np.inf)).distance.cpu())
+    return 1e3 * least.numpy()
+
+
+def crossings(refiner: Refiner, frame: Frame, index: int, points: np.ndarray) -> np.ndarray:
+    """1 at fine vertices that belong to cloth that crosses cloth or a body, else 0, shape (V,)."""
+    found = refiner.heat(index, points)
+    return np.zeros(len(points)) if found is None else np.maximum(found["crossing"], found["penetration"] > 0)
+
+
+MEASURED = {
+    each.name: each
+    for each in (
+        Map("strain along warp", "%", (-MOST_STRAIN, MOST_STRAIN), 0.0, lambda *at: stretches(*at)[:, 0]),
+        Map("strain along weft", "%", (-MOST_STRAIN, MOST_STRAIN), 0.0, lambda *at: stretches(*at)[:, 1]),
+        Map("compression", "%", (-MOST_STRAIN, 0.0), 0.0, lambda *at: np.minimum(stretches(*at)[:, 2], 0.0)),
+        Map("distance to bodies", "mm", (0.0, MOST_DISTANCE), MOST_DISTANCE, distances),
+        Map("crossings", "", (0.0, 1.0), 0.0, crossings),
+    )
+}
+"""Maps that are measured in the solved cloth. Compression is what is left in the plane: shorter folds than the level's
+edges can show would take it up."""
+NAMES = (PLAIN, *MEASURED, *MAPS)
+"""Every map, the painted ones by the schema's short names."""
+
+
+def painted_map(name: str, largest: float) -> Map:
+    """How a painted map is coloured, whose values reach ``largest``; its values come from the session."""
+    row = GARMENT[name]
+    middle = float(row.fallback or 0.0)
+    ends = (min(row.minimum or 0.0, middle - 1.0), max(largest, middle + 1.0))
+    return Map(name, row.unit, ends, middle, lambda refiner, frame, index, points: np.zeros(len(points)))
+
+
+def find_map(
+    session: TuneSession, shown: Shown, index: int, name: str, *, stroke: Stroke | None = None
+) -> tuple[Map, np.ndarray] | None:
+    """A map of a garment, by number, and its values at the fine vertices, shape (V,); None for `PLAIN`.
+
+    A ``stroke`` stands in for the session's map.
+    """
+    points = shown.points[index]
+    if name == PLAIN or points is None:
+        return None
+    if name in MEASURED:
+        refiner = session.solver.refiner
+        return MEASURED[name], MEASURED[name].find(refiner, shown.frame, index, points)
+    garment = session.garments[index]
+    under = stroke is not None and (stroke.garment, stroke.name) == (garment, name)
+    painted = stroke.values if stroke is not None and under else session.painted(garment, name)
+    values = on_fine(painted, session.refinements[index])
+    return painted_map(name, float(values.max(initial=0.0))), values

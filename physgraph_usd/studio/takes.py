@@ -1,0 +1,135 @@
+"""Solved frames that are kept: to be played, to go on from, and to compare with."""
+
+from __future__ import annotations
+
+import time as clock
+from collections.abc import Callable, Sequence
+from copy import copy
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from ..solver.scene import Frame, State
+from ..usd.read.reader import Shot
+from .setting import Setting
+from .solver import FrameSolver
+
+MOST_BYTES = 1 << 30
+"""Memory for the frames of a range."""
+KEPT_PER_POINT = 120
+"""Bytes that a solved frame keeps for a vertex: its position, and what the next frame starts from."""
+FRESH, STALE, MISSING = "fresh", "stale", "missing"
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """A solved frame.
+
+    Attributes:
+        frame: The input: cages, values and bodies.
+        points: Fine positions of each garment [m], world space; None for one without a sample here.
+        telemetry: The solver's figures of each garment, as in a report's frame.
+        seconds: Wall time of reading and solving.
+        settled: Whether the frame is solved as ``refine`` solves it.
+    """
+
+    frame: Frame
+    points: tuple[np.ndarray | None, ...]
+    telemetry: tuple[dict[str, Any], ...]
+    seconds: float
+    settled: bool
+
+    @staticmethod
+    def of(frame: Frame, state: State, *, seconds: float, settled: bool) -> Shown:
+        """A frame and the solver's result."""
+        return Shown(frame, state.points, tuple(map(dict, state.telemetry)), seconds, settled)
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """The state that a frame is solved from.
+
+    Attributes:
+        setting: What is tried.
+        shot: The shot read with it.
+        solver: The solver, where its cloth stands; copied for each frame.
+    """
+
+    setting: Setting
+    shot: Shot
+    solver: FrameSolver
+
+    def at(self, time: float | None, cancelled: Callable[[], bool] = lambda: False, *, cold: bool = False) -> Take:
+        """A frame with this setting, solved from here, or from its cage.
+
+        Raises:
+            SolveError: A term of the potential is not finite.
+            StageError: The frame cannot be read.
+        """
+        solver, began = copy(self.solver), clock.perf_counter()
+        if cold:
+            solver.feel(contact=self.setting.contact)
+        state = solver.solve(self.shot, time, cancelled=cancelled)
+        seconds = clock.perf_counter() - began
+        shown = Shown.of(self.shot.frame(time), state, seconds=seconds, settled=not cancelled())
+        return Take(replace(self, solver=solver), shown)
+
+
+@dataclass(frozen=True, eq=False)
+class Take:
+    """A solved frame, and where its cloth stands, to go on from."""
+
+    start: Start
+    shown: Shown
+
+    @property
+    def setting(self) -> Setting:
+        """The setting that it was solved with."""
+        return self.start.setting
+
+
+class Takes:
+    """The frames of a shot that were solved in order, by time code and setting; the oldest go where memory ends."""
+
+    def __init__(self) -> None:
+        """Hold no frame."""
+        self._kept: dict[tuple[float, Setting], Take] = {}
+
+    def fresh(self, time: float | None, setting: Setting) -> Take | None:
+        """The take of a frame with a setting, or None."""
+        return None if time is None else self._kept.get((time, setting))
+
+    def states(self, times: Sequence[float], setting: Setting) -> list[str]:
+        """Of each frame `FRESH`, `STALE` where it was solved with other settings alone, or `MISSING`."""
+        solved = {time for time, _ in self._kept}
+        return [FRESH if (time, setting) in self._kept else STALE if time in solved else MISSING for time in times]
+
+    def solve_next(self, times: Sequence[float], start: Start, cancelled: Callable[[], bool]) -> float | None:
+        """Solve the first frame of a range that is not fresh, from the frame before it.
+
+        Args:
+            times: The range, in order; its first frame is solved as a run's.
+            start: The setting, and a solver at its levels.
+            cancelled: Asked before each step: whether to stop there; such a frame is not kept.
+
+        Returns:
+            The frame's time code, whether it is kept or cancelled; None where all that memory holds are fresh.
+        """
+        room, setting = self.room(start.solver), start.setting
+        lacking = next((k for k in range(min(len(times), room)) if not self.fresh(times[k], setting)), None)
+        if lacking is None:
+            return None
+        time, before = times[lacking], self.fresh(times[lacking - 1], setting) if lacking else None
+        take = (start if before is None else before.start).at(time, cancelled, cold=before is None)
+        if take.shown.settled:
+            self._kept[time, setting] = take
+            for old in list(self._kept)[: -2 * room]:
+                del self._kept[old]
+        return time
+
+    @staticmethod
+    def room(solver: FrameSolver) -> int:
+        """How many frames of one setting memory holds; there is room for two settings."""
+        count = sum(chain[-1].mesh.vertex_count for chain in solver.refinements if chain)
+        return max(1, MOST_BYTES // (2 * KEPT_PER_POINT * max(count, 1)))

@@ -1,0 +1,91 @@
+"""Time: the frame, the range that is solved in the background, and playing it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+from .desk import Desk, put
+from .loop import SolveLoop
+from .session import TuneSession
+from .takes import FRESH, MISSING, STALE
+
+COLORS = {FRESH: "#1a7f37", STALE: "#d9a441", MISSING: "#d5d9de"}
+PLAY, PAUSE = "Play", "Pause"
+
+
+class TimePanel:
+    """The controls of time; nothing where the shot has one frame."""
+
+    def __init__(self, desk: Desk) -> None:
+        """Add the controls."""
+        self._desk, gui = desk, desk.gui
+        self._times = desk.session.codes
+        self.loop: SolveLoop | None = None
+        if len(self._times) < 2:
+            return
+        first, last = self._times[0], self._times[-1]
+        step = min(b - a for a, b in pairwise(self._times))
+        self._frame = gui.add_slider(
+            "Frame", first, last, step, desk.session.time or first, hint="A sample's time code."
+        )
+        desk.on(self._frame, lambda session, value: session.set_time(nearest(self._times, value)))
+        self._bar = gui.add_html("")
+        self._range = gui.add_multi_slider("Range", first, last, step, (first, last), hint="What is solved and played.")
+        desk.on(self._range, lambda session, value: self._set_span())
+        solving = "The range is solved in the background, in order, as refine solves it."
+        self._solving = desk.on(
+            gui.add_checkbox("Solve range", False, hint=solving), lambda session, value: self._set_span()
+        )
+        self._play = gui.add_button(PLAY, hint="Each frame of the range once it is solved. Key: space.")
+        desk.press(self._play, self.play)
+        for label, key, way in (("Frame before", "J", -1), ("Next frame", "L", 1)):
+            command = gui.add_command(label, hotkey=key)
+            command.on_trigger(lambda _, way=way: desk.ask(lambda session: self._step(session, way)))
+        gui.add_command("Play or pause", hotkey="space").on_trigger(lambda _: desk.ask(self.play))
+        self.update()
+
+    def update(self) -> None:
+        """Write the frame, and which frames of the range are solved with the present values."""
+        if len(self._times) < 2:
+            return
+        session, playing = self._desk.session, self.loop is not None and self.loop.playing
+        put(self._frame, value=session.time)
+        put(self._play, label=PAUSE if playing else PLAY)
+        states = session.takes.states(self._times, session.setting)
+        put(self._bar, content=bar_of(self._times, states, at=session.time))
+
+    def play(self, session: TuneSession) -> None:
+        """Play the range, or pause."""
+        if self.loop is not None and len(self._times) > 1:
+            self.loop.playing = not self.loop.playing
+            self._set_span()
+
+    def _step(self, session: TuneSession, way: int) -> None:
+        if self.loop is not None:
+            self.loop.playing = False
+        at = self._times.index(nearest(self._times, session.time or self._times[0])) + way
+        session.set_time(self._times[at % len(self._times)])
+
+    def _set_span(self) -> None:
+        if self.loop is not None:
+            first, last = self._range.value
+            self.loop.span = (first, last) if self._solving.value or self.loop.playing else None
+
+
+def nearest(times: Sequence[float], time: float) -> float:
+    """The sample that is nearest to a time code."""
+    return min(times, key=lambda each: abs(each - time))
+
+
+def bar_of(times: Sequence[float], states: Sequence[str], *, at: float | None) -> str:
+    """A strip of the shot's frames as HTML: green is solved, amber solved with other values, grey not solved."""
+    parts = "".join(
+        f"<i style='flex:1;background:{COLORS[state]};{'border-top:3px solid #1f2933' if time == at else ''}'></i>"
+        for time, state in zip(times, states, strict=True)
+    )
+    fresh, stale = states.count(FRESH), states.count(STALE)
+    words = f"{fresh} of {len(times)} frames solved" + (f", {stale} with other values" if stale else "")
+    strip = f"<div style='display:flex;height:9px;margin:0 1em;gap:1px'>{parts}</div>"
+    text = f"<div id='takes' style='margin:0.1em 1.4em;font-size:0.75em;color:#5b6470'>{words}</div>"
+    return strip + text

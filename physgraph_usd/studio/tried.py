@@ -1,0 +1,95 @@
+"""A shot read with what an artist tries on it, and the layer that keeps it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from ..shot.untagged import AUTO, open_with_colliders
+from ..usd.read.garment import read_painted
+from ..usd.read.reader import Shot, open_shot
+from ..usd.schema import GARMENT
+from ..usd.write.paint import painted_layer
+from ..usd.write.tag import tag
+from .setting import Setting
+
+
+class TriedShot:
+    """A shot file and what is tried on it; the file is never edited.
+
+    Attributes:
+        opened: The shot as authored.
+        named: Garments and colliders as commands take them; the first may be empty.
+    """
+
+    def __init__(self, shot: str | Path, *, garments: Sequence[str], colliders: Sequence[str]) -> None:
+        """Open a shot; arguments are those of `TuneSession`.
+
+        Raises:
+            StageError: The shot cannot be read.
+        """
+        self.opened = open_with_colliders(shot, garments=garments, colliders=colliders)
+        named = self.opened.colliders if AUTO in colliders else tuple(colliders)
+        self.named = tuple(garments), tuple(named)
+        # Maps, the shot read with them, and their layer, which the stage does not keep.
+        self._painted: tuple[object, Shot, object] = ({}, self.opened, None)
+
+    def close(self) -> None:
+        """Let go of the stages."""
+        for shot in {id(each): each for each in (self.opened, self._painted[1])}.values():
+            shot.close()
+
+    def read(self, setting: Setting) -> Shot:
+        """The shot with a setting.
+
+        Raises:
+            UsageError: A value cannot be used.
+            SchemaError: A painted value is outside its limits.
+        """
+        texts = [
+            f"{path}.{GARMENT[name].name}={value!r}"
+            for path, values in setting.values.items()
+            for name, value in values.items()
+        ]
+        return self._with_maps(setting.painted).with_values(texts)
+
+    def painted(self, setting: Setting, index: int, name: str) -> np.ndarray:
+        """A painted map of a garment, by number, on the vertices of its cage, shape (V,)."""
+        source = self.opened.sources[index]
+        values = setting.map_of(str(source.path), name)
+        if values is None:
+            prim = self.opened.stage.GetPrimAtPath(source.path)
+            values = source.weld.joined(read_painted(prim, name, source.weld.apart.vertex_count)[0])
+        return values
+
+    def save(self, setting: Setting, out: Path, *, overwrite: bool) -> Path:
+        """Write a layer over the shot with a setting's values and maps, as `tag` does.
+
+        Raises:
+            UsageError: The layer's name is one of the shot's files, or its suffix is unknown.
+            StageError: A garment lies in an instance.
+            LayerError: It cannot be written.
+        """
+        garments = [str(source.path) for source in self.opened.sources]
+        given = {"values": setting.values, "painted": self._authored(setting.painted), "overwrite": overwrite}
+        return tag(self.opened.path, out, garments=garments, colliders=self.named[1], **given)
+
+    def _authored(self, painted: Mapping[str, Mapping[str, np.ndarray]]) -> dict[str, dict[str, np.ndarray]]:
+        """Maps of the cages' vertices on the authored points."""
+        welds = {str(source.path): source.weld for source in self.opened.sources}
+        return {
+            path: {name: welds[path].split(values) for name, values in maps.items()} for path, maps in painted.items()
+        }
+
+    def _with_maps(self, painted: Mapping[str, Mapping[str, np.ndarray]]) -> Shot:
+        """The shot with painted maps, opened again where they changed."""
+        if not painted:
+            return self.opened
+        if self._painted[0] is not painted:
+            layer = painted_layer(self.opened.stage, self._authored(painted))
+            garments = [str(source.path) for source in self.opened.sources]
+            shot = open_shot(self.opened.view.open(over=[layer]), garments=garments, colliders=self.named[1])
+            self._painted = painted, shot, layer
+        return self._painted[1]

@@ -1,0 +1,190 @@
+"""An artist's trials on a shot: values, fabrics, painted maps and levels, with undo."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import UsageError
+from ..solver.fabric import PRESETS
+from ..solver.resolution import choose_levels, sample_frames
+from ..usd.read.reader import Shot
+from ..usd.schema import AUTO_LEVEL, FABRIC, GARMENT, fabric_values
+from .setting import History, Setting
+from .tried import TriedShot
+from .values import MAPS, TUNABLES
+
+
+class Tuning:
+    """A shot and the settings tried on it; nothing is solved here.
+
+    Attributes:
+        garments: Prim paths of the garments.
+        times: The shot's time codes; (None,) where it has no samples.
+        time: The one that is looked at.
+        shot: The shot read with the present setting.
+        history: The settings so far.
+    """
+
+    def __init__(self, shot: str | Path, *, garments: Sequence[str], colliders: Sequence[str]) -> None:
+        """Open a shot at its first frame; arguments are those of `TuneSession`.
+
+        Raises:
+            StageError: The shot cannot be read.
+        """
+        self._tried = TriedShot(shot, garments=garments, colliders=colliders)
+        self.shot: Shot = self._tried.opened
+        scene = self.shot.scene
+        self.garments = tuple(garment.path for garment in scene.garments)
+        self.times: tuple[float | None, ...] = scene.times or (None,)
+        self.time = self.times[0]
+        frames = sample_frames(self.shot.every_time, self.shot.frame)
+        levels = tuple(choice.level for choice in choose_levels(scene, frames))
+        # A level that is chosen from the fabric would be chosen anew from what is tried.
+        chosen = zip(scene.garments, levels, strict=True)
+        values = {g.path: {"refine:level": float(k)} for g, k in chosen if g.level == AUTO_LEVEL}
+        self.history = History(Setting(levels, values=values))
+
+    @property
+    def setting(self) -> Setting:
+        """The present setting."""
+        return self.history.now
+
+    @property
+    def codes(self) -> tuple[float, ...]:
+        """The shot's time codes; () where it has no samples."""
+        return tuple(time for time in self.times if time is not None)
+
+    def codes_in(self, span: tuple[float, float] | None) -> list[float]:
+        """The time codes from the first to the last of a range; none without a range."""
+        return [time for time in self.codes if span and span[0] <= time <= span[1]]
+
+    def value(self, garment: str, name: str) -> float | None:
+        """A tunable value of a garment in the frame, SI; None where nothing gives one."""
+        return TUNABLES[name].read(self.shot.frame(self.time).garments[self._index(garment)])
+
+    def tries(self, garment: str, name: str) -> bool:
+        """Whether a value was tried, and may differ from the shot's."""
+        return name in self.setting.values.get(garment, {})
+
+    def painted(self, garment: str, name: str) -> np.ndarray:
+        """A map of `MAPS` on the vertices of a garment's cage, shape (V,)."""
+        return self._tried.painted(self.setting, self._index(garment), name)
+
+    def set_value(self, garment: str, name: str, value: float) -> None:
+        """Try a value [SI] on a garment in every frame, as a layer holds it.
+
+        Raises:
+            UsageError: The garment or the name is unknown, or the value is outside its limits.
+        """
+        if name not in TUNABLES:
+            raise UsageError(f"unknown value '{name}'; known values: {', '.join(TUNABLES)}")
+        self._try(garment, self._values(garment) | _rounded({name: value}), TUNABLES[name].label, joins=True)
+
+    def reset(self, garment: str, name: str) -> None:
+        """Take a value from the shot again, where it was tried.
+
+        Raises:
+            UsageError: The garment is unknown.
+        """
+        values = {each: value for each, value in self._values(garment).items() if each != name}
+        self._try(garment, values, f"{GARMENT[name].label} as authored")
+
+    def set_as_authored(self, garment: str) -> None:
+        """Take a garment's values and maps from the shot again; its level stays.
+
+        Raises:
+            UsageError: The garment is unknown.
+        """
+        values = {name: value for name, value in self._values(garment).items() if name not in TUNABLES}
+        painted = {path: maps for path, maps in self.setting.painted.items() if path != garment}
+        self._try(garment, values, "all as authored", painted=painted)
+
+    def set_preset(self, garment: str, preset: str) -> None:
+        """Try a fabric's values in place of those that were tried.
+
+        Raises:
+            UsageError: The garment or the fabric is unknown.
+        """
+        if preset not in PRESETS:
+            raise UsageError(f"unknown preset '{preset}'; known presets: {', '.join(sorted(PRESETS))}")
+        self.set_fabric(garment, fabric_values(PRESETS[preset]), preset)
+
+    def set_fabric(self, garment: str, values: Mapping[str, float], name: str) -> None:
+        """Try values in place of the fabric's that were tried; ``name`` is what undo calls them.
+
+        Raises:
+            UsageError: The garment is unknown, or a value cannot be used.
+        """
+        kept = {each: value for each, value in self._values(garment).items() if GARMENT[each].group != FABRIC}
+        self._try(garment, kept | _rounded(values), name)
+
+    def paint(self, garment: str, name: str, values: np.ndarray) -> None:
+        """Try a painted map of `MAPS` on a garment, a value for each vertex of its cage, shape (V,).
+
+        Raises:
+            UsageError: The garment or the map is unknown.
+            SchemaError: A value is outside the map's limits.
+        """
+        if name not in MAPS:
+            raise UsageError(f"unknown map '{name}'; known maps: {', '.join(MAPS)}")
+        maps = {**self.setting.painted.get(garment, {}), name: np.array(values, np.float32)}
+        painted = {**self.setting.painted, garment: maps}
+        self._try(garment, self._values(garment), GARMENT[name].label, painted=painted)
+
+    def set_level(self, garment: str, level: int) -> None:
+        """Try another number of subdivisions.
+
+        Raises:
+            UsageError: The garment is unknown, or the level is outside its limits.
+        """
+        index = self._index(garment)
+        if level < 0:
+            raise UsageError(f"level {level}: give 0 or more")
+        levels = tuple(level if k == index else each for k, each in enumerate(self.setting.levels))
+        values = {**self._values(garment), "refine:level": float(level)}
+        self._try(garment, values, GARMENT["refine:level"].label, levels=levels)
+
+    def set_contact(self, on: bool) -> None:
+        """Let cloth feel bodies and cloth, or nothing."""
+        self._put(replace(self.setting, contact=on), "contact on" if on else "contact off")
+
+    def undo(self) -> None:
+        """Take the last change back."""
+        self.shot = self._tried.read(self.history.after_undo())
+        self.history.undo()
+
+    def redo(self) -> None:
+        """Make the change again that was taken back last."""
+        self.shot = self._tried.read(self.history.after_redo())
+        self.history.redo()
+
+    def _index(self, garment: str) -> int:
+        if garment not in self.garments:
+            raise UsageError(f"no garment <{garment}>; garments: {', '.join(self.garments)}")
+        return self.garments.index(garment)
+
+    def _values(self, garment: str) -> dict[str, float]:
+        """The values tried on a garment."""
+        self._index(garment)
+        return dict(self.setting.values.get(garment, {}))
+
+    def _try(
+        self, garment: str, values: Mapping[str, float], change: str, *, joins: bool = False, **others: object
+    ) -> None:
+        """Go on to a garment's values, and ``others`` of the setting."""
+        setting = replace(self.setting, values={**self.setting.values, garment: values}, **others)
+        self._put(setting, change, joins=joins)
+
+    def _put(self, setting: Setting, change: str, *, joins: bool = False) -> None:
+        """Go on to a setting; one that cannot be used changes nothing."""
+        self.shot = self._tried.read(setting)
+        self.history.put(setting, change, joins=joins)
+
+
+def _rounded(values: Mapping[str, float]) -> dict[str, float]:
+    """Values as floats that a layer can hold."""
+    return {name: float(np.float32(value)) for name, value in values.items()}

@@ -1,0 +1,139 @@
+"""The values of a garment: a number box and a slider for each, presets, and what puts them back."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ..solver.fabric import PRESETS
+from ..usd.schema import CONTACT, FABRIC, GARMENT, REFINEMENT
+from .desk import Desk, put
+from .session import TuneSession
+from .values import TUNABLES, Tunable
+
+AS_AUTHORED, OWN_VALUES, LAST, OWN = "as authored", "own values", "last session", "own: "
+FINEST = 0.002
+"""Step of a slider, in its length."""
+RESET, EVERYTHING = "reset ...", "everything"
+STYLE = """<style>
+div:has(> .value) + div .mantine-NumberInput-root, div:has(> .value) + div .mantine-Slider-markLabel,
+div:has(> .value) + div > .mantine-Flex-root > div:first-child {display: none}
+div:has(> .value) {margin: -0.6em 0 -0.2em 0}
+</style>"""
+"""Under a number box a slider fills its row: its own number is a place on a logarithmic scale."""
+
+
+class ValuePanel:
+    """The controls of a garment's values."""
+
+    def __init__(self, desk: Desk) -> None:
+        """Add the controls."""
+        self._desk, gui = desk, desk.gui
+        self._rows: dict[str, tuple[Any, Any]] = {}
+        self._moved = ""  # The value under the artist's hand, whose controls are left alone.
+        gui.add_html(STYLE)
+        self._preset = gui.add_dropdown("Preset", self._presets(), initial_value=AS_AUTHORED)
+        desk.on(self._preset, self._choose)
+        self._reset = desk.on(gui.add_dropdown("Reset", (RESET,), hint="Takes the shot's value again."), self._put_back)
+        for group in dict.fromkeys(tunable.group for tunable in TUNABLES.values()):
+            with gui.add_folder(group):
+                self._build_group(group)
+        with gui.add_folder("Own presets"):
+            self._name = gui.add_text("Name", "", hint="For the fabric's values; kept beside the layer.")
+            desk.press(gui.add_button("Keep as preset"), self._keep_preset)
+
+    def update(self) -> None:
+        """Write the present values, but where the artist's hand is."""
+        moved, self._moved = self._moved, ""
+        session, garment = self._desk.session, self._desk.garment
+        for name, (number, slider) in self._rows.items():
+            if name != moved:
+                self._write(TUNABLES[name], number, slider)
+        tried = session.setting.values.get(garment, {})
+        put(self._reset, options=(RESET, *(TUNABLES[name].label for name in tried if name in TUNABLES), EVERYTHING))
+        put(self._reset, value=RESET)
+        put(self._level, value=min(session.setting.levels[self._desk.index], self._level.max))
+        put(self._contact, value=session.setting.contact)
+
+    def _build_group(self, group: str) -> None:
+        """A number box and a slider for each value of a display group, after the group's other controls."""
+        desk, gui = self._desk, self._desk.gui
+        if group == REFINEMENT:
+            row, now = GARMENT["refine:level"], desk.session.setting.levels[0]
+            most = int(max(row.soft or (0, now)))
+            level = gui.add_slider(
+                row.label, 0, most, 1, min(now, most), hint=f"Each makes four faces of one. {row.name}"
+            )
+            self._level = desk.on(level, lambda session, value: session.set_level(desk.garment, int(value)))
+        elif group == CONTACT:
+            contact = gui.add_checkbox("Contact", True, hint="With bodies and of cloth with cloth.")
+            self._contact = desk.on(contact, lambda session, value: session.set_contact(value))
+        for tunable in (each for each in TUNABLES.values() if each.group == group):
+            number = gui.add_number(tunable.title, 0.0, hint=tunable.hint)
+            gui.add_html("<div class='value'></div>")
+            slider = gui.add_slider(" ", 0.0, 1.0, FINEST, 0.5)
+            self._rows[tunable.name] = number, slider
+            desk.on(number, lambda session, value, of=tunable: self._typed(session, of, value))
+            desk.on(slider, lambda session, place, of=tunable: self._slid(session, of, place))
+            self._write(tunable, number, slider)
+
+    def _slid(self, session: TuneSession, tunable: Tunable, place: float) -> None:
+        self._try(session, tunable, tunable.at(place))
+        self._moved = tunable.name
+        self._write(tunable, self._rows[tunable.name][0], None)
+
+    def _typed(self, session: TuneSession, tunable: Tunable, number: float) -> None:
+        self._try(session, tunable, number / tunable.factor)
+        self._moved = tunable.name
+        self._write(tunable, None, self._rows[tunable.name][1])
+
+    def _try(self, session: TuneSession, tunable: Tunable, value: float) -> None:
+        session.set_value(self._desk.garment, tunable.name, value)
+        if GARMENT[tunable.name].group == FABRIC:
+            put(self._preset, value=OWN_VALUES)
+
+    def _write(self, tunable: Tunable, number: Any | None, slider: Any | None) -> None:
+        """Write a value into its number box and its slider, where given."""
+        value = self._desk.session.value(self._desk.garment, tunable.name)
+        if number is not None:
+            shown, decimals = tunable.shown(0.0 if value is None else value)
+            title = tunable.title if value is not None else f"{tunable.title}, not set"
+            put(number, label=title, precision=decimals, step=10.0**-decimals, value=shown)
+        if slider is not None:
+            put(slider, value=tunable.place(value if value is not None else tunable.ends[0]))
+
+    def _presets(self) -> tuple[str, ...]:
+        own = tuple(OWN + name for name in sorted(self._desk.notes.presets))
+        last = (LAST,) if self._desk.notes.looked.get("values") else ()
+        return (AS_AUTHORED, OWN_VALUES, *last, *own, *sorted(PRESETS))
+
+    def _choose(self, session: TuneSession, chosen: str) -> None:
+        garment, notes = self._desk.garment, self._desk.notes
+        if chosen == AS_AUTHORED:
+            session.set_as_authored(garment)
+        elif chosen == LAST:
+            for path, values in notes.looked["values"].items():
+                for name, value in values.items():
+                    if path in session.garments and name in TUNABLES:
+                        session.set_value(path, name, value)
+        elif chosen.startswith(OWN):
+            session.set_fabric(garment, notes.presets[chosen.removeprefix(OWN)], chosen)
+        elif chosen != OWN_VALUES:
+            session.set_preset(garment, chosen)
+
+    def _keep_preset(self, session: TuneSession) -> None:
+        name = self._name.value.strip() or "mine"
+        rows = (each for each in TUNABLES.values() if each.group == FABRIC)
+        values = {each.name: session.value(self._desk.garment, each.name) for each in rows}
+        self._desk.notes.presets[name] = {each: value for each, value in values.items() if value is not None}
+        self._desk.notes.save(self._desk.notes.looked)
+        self._preset.options = self._presets()
+        self._preset.value = OWN + name
+
+    def _put_back(self, session: TuneSession, label: str) -> None:
+        garment = self._desk.garment
+        if label == EVERYTHING:
+            session.set_as_authored(garment)
+            self._preset.value = AS_AUTHORED
+        for tunable in TUNABLES.values():
+            if tunable.label == label:
+                session.reset(garment, tunable.name)

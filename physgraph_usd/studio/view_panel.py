@@ -1,0 +1,80 @@
+"""How cloth is looked at: columns, a wipe, wires, maps, and A beside the present values."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, fields, replace
+from typing import Any
+
+from .desk import Desk, put
+from .maps import HIGH, LOW, MIDDLE, NAMES, Map
+from .picture import KEPT, SHOWS, View
+from .session import TuneSession
+
+
+class ViewPanel:
+    """The controls of the picture."""
+
+    def __init__(self, desk: Desk) -> None:
+        """Add the controls, and look as last time."""
+        self._desk, gui = desk, desk.gui
+        known = {each.name for each in fields(View)}
+        last = {name: value for name, value in desk.notes.looked.get("view", {}).items() if name in known}
+        view = View(**last)
+        desk.picture.view = view if view.show in SHOWS and view.map in NAMES else View()
+        view = desk.picture.view
+        self._controls: dict[str, Any] = {
+            "show": gui.add_dropdown("Show", tuple(SHOWS), initial_value=view.show),
+            "wiped": gui.add_checkbox("Wipe", view.wiped, hint="First and last at one place, split by the slider."),
+            "wipe": gui.add_slider("Wipe at", 0.0, 1.0, 0.01, view.wipe),
+            "wires": gui.add_checkbox("Wireframe", view.wires, hint="Key: G."),
+            "map": gui.add_dropdown("Map", NAMES, initial_value=view.map, hint="Colours of the refined cloth."),
+        }
+        for name, control in self._controls.items():
+            desk.on(control, lambda session, value, name=name: self.set(**{name: value}))
+        self._bar = gui.add_html("")
+        desk.press(gui.add_button("Keep as A", hint="Keeps values and cloth to compare with. Key: K."), self._keep)
+        desk.press(gui.add_button("Exchange A and B", hint="B is what is tuned. Key: X."), TuneSession.swap)
+        keys = {
+            "Wireframe": ("G", lambda session: self.set(wires=not desk.picture.view.wires)),
+            "Keep as A": ("K", self._keep),
+            "Exchange A and B": ("X", TuneSession.swap),
+        }
+        for label, (key, change) in keys.items():
+            gui.add_command(label, hotkey=key).on_trigger(lambda _, change=change: desk.ask(change))
+
+    def set(self, **changes: Any) -> None:
+        """Change how cloth is looked at, by the names of `View`."""
+        self._desk.picture.view = replace(self._desk.picture.view, **changes)
+        for name, value in changes.items():
+            put(self._controls[name], value=value)
+
+    def update(self) -> None:
+        """Write the colour bar of the map that is drawn."""
+        drawn = self._desk.picture.bar
+        put(self._bar, content="" if drawn is None else bar_of(drawn))
+
+    @property
+    def looked(self) -> dict[str, Any]:
+        """How cloth is looked at, as plain values."""
+        return asdict(self._desk.picture.view)
+
+    def _keep(self, session: TuneSession) -> None:
+        session.keep()
+        shows = next(name for name, columns in SHOWS.items() if KEPT in columns)
+        self.set(show=shows)
+
+
+def bar_of(drawn: Map) -> str:
+    """The colours of a map with the values at their ends, as HTML."""
+    (low, high), middle = drawn.ends, drawn.middle
+    stops = [(low, LOW)] if low < middle else []
+    stops += [(middle, MIDDLE)] + ([(high, HIGH)] if high > middle else [])
+    span = max(high - low, 1e-12)
+    colors = ",".join(
+        f"rgb({','.join(f'{c:.0f}' for c in color)}) {100 * (at - low) / span:.0f}%" for at, color in stops
+    )
+    strip = f"<div id='bar' style='height:9px;margin:0 1em;background:linear-gradient(to right,{colors})'></div>"
+    ends = "".join(f"<span>{at:g} {drawn.unit}</span>" for at, _ in stops)
+    return (
+        strip + f"<div style='display:flex;justify-content:space-between;margin:0 1.4em;font-size:0.75em'>{ends}</div>"
+    )

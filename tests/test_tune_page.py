@@ -1,0 +1,239 @@
+"""The page of `tune`, driven in a browser as an artist drives it."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("pxr", reason="shots are read with usd-core")
+pytest.importorskip("viser", reason="the page is served with viser")
+pytest.importorskip("PIL.Image", reason="screenshots are compared with pillow")
+
+from browser import served
+from PIL import Image
+from pxr import Usd
+from shots import CLOTH, cloth_shot
+
+from physgraph_usd.studio.page import TunePage
+from physgraph_usd.studio.session import TuneSession
+from physgraph_usd.usd.read.reader import open_shot
+
+pytestmark = pytest.mark.browser
+SETTLED = "settled: as refine solves it"
+PATIENCE_MS = 60000
+EMPTY = (60, 850)
+"""A place of the picture without cloth."""
+
+
+class Artist:
+    """Hands on a page."""
+
+    def __init__(self, page: Any) -> None:
+        self.page = page
+        self.settle()
+
+    def settle(self, undone: str = "") -> None:
+        """Wait until cloth is settled, after the change that undo would take back."""
+        if undone:
+            self.page.get_by_role("button", name=f"Undo {undone}", exact=True).wait_for(timeout=PATIENCE_MS)
+        self.page.get_by_text(SETTLED).wait_for(timeout=PATIENCE_MS)
+
+    def picture(self) -> np.ndarray:
+        self.page.wait_for_timeout(600)
+        whole = Image.open(io.BytesIO(self.page.screenshot()))
+        return np.asarray(whole.convert("RGB"), float)[250:, :1000]
+
+    def tab(self, name: str) -> None:
+        self.page.get_by_role("tab", name=name).click()
+
+    def number(self, title: str) -> Any:
+        """The input box behind a label."""
+        found = f"xpath=//label[normalize-space()='{title}']/following::input[not(@type='hidden')][1]"
+        return self.page.locator(found)
+
+    def type(self, title: str, number: str) -> None:
+        self.number(title).fill(number)
+        self.number(title).press("Enter")
+
+    def choose(self, title: str, option: str) -> None:
+        self.number(title).click()
+        self.page.get_by_role("option", name=option, exact=True).click()
+
+    def press(self, key: str) -> None:
+        """Press a key with the pointer in the picture."""
+        self.page.mouse.click(*EMPTY)
+        self.page.keyboard.press(key)
+
+    def slide(self, title: str, place: float) -> None:
+        """Drag a slider to a place, 0 to 1."""
+        thumb = self.number(title).locator("xpath=following::*[@role='slider'][1]")
+        thumb.scroll_into_view_if_needed()
+        track = thumb.locator("xpath=ancestor::*[contains(@class, 'Slider-track')][1]").bounding_box()
+        box, mouse = thumb.bounding_box(), self.page.mouse
+        mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+        mouse.down()
+        mouse.move(track["x"] + place * track["width"], box["y"] + box["height"] / 2, steps=5)
+        mouse.up()
+
+
+@contextmanager
+def tuned(shot: Path, **options: Any) -> Iterator[tuple[TuneSession, Artist]]:
+    """A session of a shot, its page, and an artist at it."""
+    with closing(TuneSession(shot, garments=[CLOTH], **options)) as session, closing(TunePage(session)) as page:
+        with served(page.url) as shown:
+            yield session, Artist(shown)
+
+
+@pytest.fixture
+def shot(tmp_path: Path) -> Path:
+    return cloth_shot(tmp_path / "sheet.usda", size=(8, 6))
+
+
+def test_values_are_slid_typed_undone_and_saved(shot: Path):
+    with tuned(shot) as (session, artist):
+        before = artist.picture()
+        artist.slide("Guide [N/m³]", 0.2)
+        artist.settle("Guide Stiffness")
+        slid = session.value(CLOTH, "guide:stiffness")
+        assert slid is not None
+        assert slid < 300.0
+        assert float(artist.number("Guide [N/m³]").input_value()) == pytest.approx(slid, rel=0.01)
+        assert np.abs(artist.picture() - before).mean() > 0.1
+        artist.type("Bending [µN·m]", "80")
+        artist.settle("Bending Stiffness")
+        assert session.value(CLOTH, "bendStiffness") == pytest.approx(8e-5)
+        artist.press("z")
+        artist.settle("Guide Stiffness")
+        assert session.value(CLOTH, "bendStiffness") != pytest.approx(8e-5)
+        artist.press("Shift+Z")
+        artist.settle("Bending Stiffness")
+        artist.number("Density [g/m²]").hover()
+        artist.page.get_by_text("hangs more heavily").wait_for()
+        artist.choose("Reset", "Guide Stiffness")
+        artist.settle("Guide Stiffness as authored")
+        assert session.value(CLOTH, "guide:stiffness") == 2000.0
+        save = artist.page.get_by_role("button", name="Save layer")
+        assert save.bounding_box()["y"] < 850
+        save.click()
+        artist.page.get_by_text("saved bendStiffness into").wait_for()
+        stage = Usd.Stage.Open(str(session.out))
+        prim = stage.GetPrimAtPath(CLOTH)
+        assert prim.GetAttribute("physgraph:material:bendStiffness").Get() == pytest.approx(8e-5)
+        assert not prim.GetAttribute("physgraph:guide:stiffness").HasAuthoredValue()
+
+
+def test_presets_camera_and_frame_outlive_a_restart(shot: Path):
+    with tuned(shot) as (session, artist):
+        artist.type("Bending [µN·m]", "80")
+        artist.settle("Bending Stiffness")
+        artist.type("Name", "stiff")
+        artist.page.get_by_role("button", name="Keep as preset").click()
+        artist.tab("Picture")
+        artist.choose("Show", "refined")
+        artist.press("l")
+        mouse = artist.page.mouse
+        mouse.move(*EMPTY)
+        mouse.down()
+        mouse.move(300, 700, steps=5)
+        mouse.up()
+        artist.settle()
+        turned, time = artist.picture(), session.time
+    assert time != session.times[0]
+    with tuned(shot) as (session, artist):
+        assert session.time == time
+        assert session.value(CLOTH, "bendStiffness") != pytest.approx(8e-5)
+        artist.choose("Preset", "own: stiff")
+        artist.settle("own: stiff")
+        assert session.value(CLOTH, "bendStiffness") == pytest.approx(8e-5)
+        assert np.abs(artist.picture() - turned).mean() < 3.0
+        other = artist.page.context.browser.new_page(viewport=artist.page.viewport_size)
+        other.goto(artist.page.url)
+        artist.page.close()
+        again = Artist(other)
+        assert float(again.number("Bending [µN·m]").input_value()) == 80.0
+        assert np.abs(again.picture() - turned).mean() < 3.0
+
+
+def test_a_range_is_solved_played_and_marked_stale(shot: Path):
+    with tuned(shot) as (session, artist):
+        count = len(session.times)
+        artist.number("Solve range").click()
+        artist.page.get_by_text(f"{count} of {count} frames solved").wait_for(timeout=PATIENCE_MS)
+        artist.press(" ")
+        artist.page.get_by_role("button", name="Pause").wait_for()
+        frames = set[str]()
+        for _ in range(40):
+            frames.add(artist.number("Frame").input_value())
+            artist.page.wait_for_timeout(50)
+        artist.press(" ")
+        artist.page.get_by_role("button", name="Play").wait_for()
+        assert len(frames) >= 2
+        artist.number("Solve range").click()
+        artist.type("Bending [µN·m]", "80")
+        artist.settle("Bending Stiffness")
+        artist.page.get_by_text(f"0 of {count} frames solved, {count} with other values").wait_for()
+
+
+def test_the_picture_wipes_maps_wires_and_compares(shot: Path):
+    with tuned(shot) as (session, artist):
+        side_by_side = artist.picture()
+        artist.tab("Picture")
+        artist.number("Wipe").click()
+        wiped = artist.picture()
+        assert np.abs(wiped - side_by_side).mean() > 1.0
+        artist.press("g")
+        wires = artist.picture()
+        assert np.abs(wires - wiped).mean() > 0.3
+        artist.press("g")
+        artist.choose("Map", "strain along weft")
+        artist.page.locator("#bar").wait_for()
+        assert np.abs(artist.picture() - wiped).mean() > 0.3
+        artist.choose("Map", "none")
+        artist.number("Wipe").click()
+        artist.press("k")
+        artist.tab("Values")
+        artist.type("Guide [N/m³]", "50")
+        artist.settle("Guide Stiffness")
+        artist.press("x")
+        artist.settle("A and B exchanged")
+        assert session.value(CLOTH, "guide:stiffness") == 2000.0
+
+
+def test_a_map_is_painted_with_the_mouse_and_saved(shot: Path):
+    with tuned(shot) as (session, artist):
+        artist.tab("Picture")
+        artist.choose("Show", "refined")
+        artist.tab("Paint")
+        artist.choose("Paint", "pin")
+        artist.page.wait_for_timeout(800)
+        before = artist.picture()
+        mouse = artist.page.mouse
+        for row in (420, 520):  # The second while the cloth still settles.
+            mouse.move(460, row)
+            mouse.down()
+            for step in range(10):
+                mouse.move(460 + 10 * step, row)
+                artist.page.wait_for_timeout(60)
+            mouse.up()
+        artist.settle("Pin")
+        held = session.painted(CLOTH, "pin")
+        assert 0 < (held > 0.3).sum() < len(held) // 2
+        cage = session.shot.frame(session.time).garments[0].points
+        assert np.ptp(cage[held > 0.3] @ [0.0, 1.0, 0.0]) > 0.25 * np.ptp(cage @ [0.0, 1.0, 0.0])
+        assert np.abs(artist.picture() - before).mean() > 0.1
+        artist.page.get_by_role("button", name="Save layer").click()
+        artist.page.get_by_text("saved pin into").wait_for()
+        with closing(open_shot(str(session.out))) as saved:
+            assert saved.scene.garments[0].pin == pytest.approx(held)
+        artist.choose("Paint", "off")
+        artist.press("z")
+        artist.press("z")
+        artist.page.get_by_role("button", name="Redo Pin", exact=True).wait_for(timeout=PATIENCE_MS)
+        artist.settle()
+        assert session.painted(CLOTH, "pin").max() == 0.0
