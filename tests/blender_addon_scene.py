@@ -227,6 +227,87 @@ def tick(label, escape_after=None, edit_mode=False):
     SEEN[label]["free"] = bpy.ops.physgraph.refine.poll()
 
 
+def live():
+    """Press "Live", and keep the process in mind."""
+    bpy.ops.physgraph.live()
+    shown = live_view().now_live()
+    globals()["process"] = shown and shown._process._process
+
+
+def live_view():
+    from bl_ext.user_default.physgraph_usd import live_view as module  # pyright: ignore[reportMissingImports]
+
+    return module
+
+
+def follow(label, state="settled", patience=100.0):
+    """Let Blender's timer tick until the live cloth is in a state; keep it, and the seconds until it first moved."""
+    began, first, seen = time.perf_counter(), None, live_points()
+    shown = live_view().now_live()
+    while time.perf_counter() - began < patience:
+        time.sleep(live_view().POLL_SECONDS / 10)
+        goes_on, now = live_view().tick(), live_points()
+        if (
+            first is None
+            and now.keys() == seen.keys()
+            and not all(np.array_equal(now[name], seen[name]) for name in now)
+        ):
+            first = time.perf_counter() - began
+        if not goes_on or (shown.state.startswith(state) and (first is not None or not seen)):
+            break
+    SEEN[label] = {"first": first, "seconds": time.perf_counter() - began, "state": shown.state}
+    SEEN[label] |= {"sent": dict(shown._known.values) if shown._known else {}}
+    SEEN[label] |= {"failure": live_view().last_failure(), "level": bpy.context.scene.physgraph.level}
+    for item in [item for item in bpy.data.objects if item.type == "MESH"]:
+        measure(item, f"{label}:{item.name}:{bpy.context.scene.frame_current}")
+
+
+def live_points():
+    """Positions of the live objects, by name."""
+    found = {}
+    for item in bpy.data.objects:
+        if item.name.endswith("_live"):
+            found[item.name] = np.empty(3 * len(item.data.vertices), np.float32)
+            item.data.vertices.foreach_get("co", found[item.name])
+    return found
+
+
+def go(frame):
+    """Go to a frame."""
+    bpy.context.scene.frame_set(frame)
+
+
+def push():
+    """Set a point that undo goes back to."""
+    bpy.ops.ed.undo_push(message="step")
+
+
+def undo():
+    """Undo."""
+    bpy.ops.ed.undo()
+
+
+def keep(label):
+    """Press "Keep"."""
+    SEEN[label] = sorted(bpy.ops.physgraph.keep())
+
+
+def kill():
+    """Kill the process."""
+    globals()["process"].kill()
+
+
+def press_escape():
+    """Press Esc."""
+    button, event = Button(live_view().PHYSGRAPH_OT_live), SimpleNamespace(type="ESC", value="PRESS")
+    assert button.modal(bpy.context, event) == {"CANCELLED"}
+
+
+def ended(label):
+    """The exit code of the process in mind."""
+    SEEN[label] = globals()["process"].wait(10.0)
+
+
 def unregister():
     """Disable the add-on."""
     bpy.ops.preferences.addon_disable(module=ADDON)

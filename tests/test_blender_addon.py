@@ -18,7 +18,7 @@ from physgraph_usd.solver.fabric import PRESETS
 
 ADDON = Path(__file__).parents[1] / "plugins" / "blender"
 SCENE = Path(__file__).with_name("blender_addon_scene.py")
-COAT, FINE, BODY = "Coat ä.001", "Coat ä.001_refined", "Body"
+COAT, FINE, LIVE, BODY = "Coat ä.001", "Coat ä.001_refined", "Coat ä.001_live", "Body"
 CELLS = 8
 QUICK = "--integrator quasi-newton --steps 4"
 
@@ -89,7 +89,7 @@ def story(program: str, tmp_path_factory: pytest.TempPathFactory) -> Seen:
 
 @pytest.fixture(scope="module")
 def odd(program: str, tmp_path_factory: pytest.TempPathFactory) -> Seen:
-    """An unsaved scene, once in metres and once in centimetres, refined at one frame, without colliders."""
+    """An unsaved scene in metres and one in centimetres, refined at one frame and then live, without colliders."""
     frame = {"scene_frames": False, "frame_start": 3, "frame_end": 3}
     both = [
         (
@@ -97,15 +97,20 @@ def odd(program: str, tmp_path_factory: pytest.TempPathFactory) -> Seen:
             step("choose", level=1, more=QUICK, **frame),
             step("refine", f"refined {label}"),
             step("look", label, 3),
+            step("choose", level=1, more="", use_bend=True, bend=20.0, **frame),
+            step("live"),
+            step("follow", f"live {label}"),
+            step("keep", f"kept {label}"),
+            step("look", f"kept {label}", 3),
         )
         for label, unit in (("m", 1.0), ("cm", 0.01))
     ]
     return run_job(tmp_path_factory.mktemp("odd"), *both[0], *both[1])
 
 
-def within_a_cage_edge(seen: Seen, label: str, frame: int) -> None:
+def within_a_cage_edge(seen: Seen, label: str, frame: int, *, name: str = FINE) -> None:
     """Each vertex on either side has one of the other nearer than the cage's longest edge."""
-    coarse, fine = seen.array(label, COAT, frame), seen.array(label, FINE, frame)
+    coarse, fine = seen.array(label, COAT, frame), seen.array(label, name, frame)
     faces = seen.array(label, COAT, frame, what="faces")
     edge = np.linalg.norm(coarse[faces] - coarse[np.roll(faces, 1, axis=1)], axis=2).max()
     assert np.max(cKDTree(coarse).query(fine)[0]) < edge
@@ -170,7 +175,11 @@ class TestRefinedInBlender:
         shown = {name for kind, *names in drawn if kind == "prop" for name in names}
         assert shown >= {"command", "preset", "use_stretch", "stretch", "use_bend", "bend", "level", "colliders"}
         assert shown >= {"scene_frames", "report", "hide_coarse", "more"}
-        assert [names for kind, *names in drawn if kind == "operator"] == [["physgraph.refine"], ["wm.path_open"]]
+        assert [names for kind, *names in drawn if kind == "operator"] == [
+            ["physgraph.refine"],
+            ["physgraph.live"],
+            ["wm.path_open"],
+        ]
 
     def test_a_scene_in_centimetres_is_as_large_as_in_metres(self, odd: Seen) -> None:
         apart = odd.array("cm", FINE, 3) / 100.0 - odd.array("m", FINE, 3)
@@ -239,3 +248,122 @@ def test_blender_stays_usable_while_the_command_runs(program: str, tmp_path: Pat
     assert FINE in seen["after"]["objects"]
     assert seen["failed"]["said"][-1][0] == "ERROR"
     assert "unknown integrator 'nonsense'" in seen["failed"]["said"][-1][1]
+
+
+@pytest.fixture(scope="module")
+def lively(program: str, tmp_path_factory: pytest.TempPathFactory) -> Seen:
+    """Live on a saved file: values, frames, a level and Keep; then four more ends."""
+    folder = tmp_path_factory.mktemp("live")
+    blend = str(folder / "shot.blend")
+    ends = (
+        (step("reopen", blend), step("select", COAT)),
+        (step("look", "on again"), step("press_escape")),
+        (step("kill"), step("follow", "killed"), step("draw", "drawn after"), step("look", "at last")),
+        (step("unregister"),),
+    )
+    return run_job(
+        folder,
+        step("scene", program, saved=blend),
+        step("look", "before"),
+        step("choose", "Bodies", level=-1, hide_coarse=True, report=True, use_guide=True, guide=1000.0),
+        step("go", 2),
+        step("live"),
+        step("draw", "drawn"),
+        step("follow", "first"),
+        step("look", "on"),
+        step("choose", "Bodies", use_bend=True, bend=200.0),
+        step("follow", "bent"),
+        step("push"),
+        step("choose", "Bodies", use_bend=True, bend=2000.0),
+        step("push"),
+        step("follow", "stiff"),
+        step("undo"),
+        step("follow", "undone"),
+        step("go", 3),
+        step("follow", "third"),
+        step("choose", "Bodies", level=1, preset="silk"),
+        step("follow", "other"),
+        step("keep", "kept"),
+        step("look", "after", 3),
+        *(
+            each
+            for k, end in enumerate(ends)
+            for each in (step("live"), step("follow", f"again {k}"), *end, step("ended", f"end {k}"))
+        ),
+    )
+
+
+class TestLive:
+    def test_the_cloth_lies_where_the_coarse_cloth_does(self, lively: Seen) -> None:
+        for label, frame in (("first", 2), ("bent", 2), ("third", 3), ("other", 3)):
+            assert lively.found[label]["state"] == "settled", lively.found[label]
+            within_a_cage_edge(lively, label, frame, name=LIVE)
+
+    def test_it_follows_values_and_frames(self, lively: Seen) -> None:
+        bent = lively.array("bent", LIVE, 2) - lively.array("first", LIVE, 2)
+        assert np.abs(bent).max() > 1e-3
+        assert np.abs(lively.array("third", LIVE, 3) - lively.array("bent", LIVE, 2)).max() > 0.1
+        assert lively.found["bent"]["first"] < 5.0
+
+    def test_it_follows_undo(self, lively: Seen) -> None:
+        bends = [lively.found[label]["sent"]["bendStiffness"] for label in ("bent", "stiff", "undone")]
+        assert bends == pytest.approx([200e-6, 2000e-6, 200e-6])
+        assert np.abs(lively.array("undone", LIVE, 2) - lively.array("stiff", LIVE, 2)).max() > 1e-3
+
+    def test_a_level_that_is_chosen_goes_onto_the_panel(self, lively: Seen) -> None:
+        level = lively.found["first"]["level"]
+        assert level > 1
+        assert len(lively.array("first", LIVE, 2)) == (2**level * CELLS + 1) ** 2
+        assert len(lively.array("other", LIVE, 3)) == (2 * CELLS + 1) ** 2
+
+    def test_other_objects_are_hidden_and_come_back(self, lively: Seen) -> None:
+        before, on = lively.found["before"]["objects"], lively.found["on"]["objects"]
+        assert set(on) - set(before) == {LIVE}
+        assert (on[COAT]["hidden"], on[LIVE]["collections"]) == (True, ["PhysGraph"])
+        assert not lively.found["after"]["objects"][FINE]["hidden"]
+        again = lively.found["on again"]["objects"]
+        assert {name: again[name]["hidden"] for name in (COAT, FINE, LIVE)} == {COAT: True, FINE: True, LIVE: False}
+        last = lively.found["at last"]["objects"]
+        assert {name: item["hidden"] for name, item in last.items() if name in (COAT, FINE, LIVE)} == {
+            COAT: False,
+            FINE: False,
+        }
+
+    def test_keep_refines_with_the_values_that_were_shown(self, lively: Seen) -> None:
+        assert lively.found["kept"] == ["FINISHED"]
+        objects = lively.found["after"]["objects"]
+        assert LIVE not in objects
+        assert objects[FINE]["points"] == (2 * CELLS + 1) ** 2
+        report = Path(lively.found["after"]["report"]).with_name("report.json")
+        garment = json.loads(report.read_text())["garments"][0]
+        assert garment["fabric"]["bend"] == pytest.approx(200e-6)
+        assert garment["fabric"]["stretch"] == PRESETS["silk"].stretch
+        assert garment["fabric"]["guide"] == 1000.0
+        assert garment["level"] == 1
+
+    def test_each_end_ends_the_process_and_removes_its_files(self, lively: Seen) -> None:
+        assert [lively.found[f"end {k}"] for k in range(4)] == [0, 0, -9, 0]
+        assert len(list((lively.folder / "physgraph").glob("*.coarse.usdc"))) == 1, "of Keep"
+
+    def test_the_panel_shows_the_buttons_and_why_it_ended(self, lively: Seen) -> None:
+        buttons = [names for kind, *names in lively.found["drawn"] if kind == "operator"]
+        assert buttons == [["physgraph.refine"], ["physgraph.live"], ["physgraph.keep"]]
+        after = lively.found["drawn after"]
+        assert ["operator", "physgraph.keep"] not in after
+        assert ["label"] in after
+        assert "ended" in lively.found["killed"]["failure"]
+
+
+def test_keep_gives_the_cloth_that_was_shown(odd: Seen) -> None:
+    """Of a single frame: in a range each frame follows from the one before."""
+    for label in ("m", "cm"):
+        shown, kept = odd.array(f"live {label}", LIVE, 3), odd.array(f"kept {label}", FINE, 3)
+        added = kept[: (CELLS + 1) ** 2] - odd.array(f"kept {label}", COAT, 3)
+        assert np.abs(kept - shown).max() < 1e-3 * np.abs(added).max()
+
+
+def test_live_in_centimetres_is_as_large_as_in_metres(odd: Seen) -> None:
+    apart = odd.array("live cm", LIVE, 3) / 100.0 - odd.array("live m", LIVE, 3)
+    moved = odd.array("live m", LIVE, 3)[: (CELLS + 1) ** 2] - odd.array("live m", COAT, 3)
+    assert np.abs(moved).max() > 5e-4
+    assert np.abs(apart).max() < 1e-2 * np.abs(moved).max()

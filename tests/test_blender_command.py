@@ -2,31 +2,26 @@
 
 from __future__ import annotations
 
-import importlib.util
 import sys
 import tomllib
 from pathlib import Path
 from types import ModuleType
 
 import pytest
+from blender import ADDON, addon_module
 
 import physgraph_usd
 from physgraph_usd import cli
+from physgraph_usd.studio.values import TUNABLES
+from physgraph_usd.usd.schema import GARMENT
 
-ADDON = Path(__file__).parents[1] / "plugins" / "blender"
 QUICK = "--integrator quasi-newton --steps 4"
 
 
 @pytest.fixture(scope="module")
 def command() -> ModuleType:
     """The add-on's module that needs no Blender."""
-    spec = importlib.util.spec_from_file_location("blender_addon_command", ADDON / "command.py")
-    assert spec
-    assert spec.loader
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
+    return addon_module("command")
 
 
 def test_the_manifest_agrees_with_the_package() -> None:
@@ -38,8 +33,8 @@ def test_the_manifest_agrees_with_the_package() -> None:
 
 def test_every_setting_arrives(command: ModuleType, tmp_path: Path) -> None:
     files = command.files_of_run(tmp_path, "shot", ["Coat"])
-    more = "--device cuda --weights 'my file'"
-    settings = command.Settings((-3, 5), preset="denim", stretch=30.0, bend=4.7e-6, level=-1, report=True, more=more)
+    more, values = "--device cuda --weights 'my file'", {"stretchStiffness": 30.0, "rest:weftEase": 4.7}
+    settings = command.Settings((-3, 5), preset="denim", values=values, level=-1, report=True, more=more)
     tag, refine = command.command_lines("pg", settings, files, garments=["/a", "/b"], colliders=["/c"])
     cloth = str(files.cloth)
     garments = ["--garment", "/a", "--garment", "/b"]
@@ -48,17 +43,40 @@ def test_every_setting_arrives(command: ModuleType, tmp_path: Path) -> None:
     assert refine[refine.index("--garment") :] == [
         *garments,
         *("--collider", "/c", "--frames", "-3:5", "--level", "auto"),
-        *("--set", "physgraph:material:stretchStiffness=30", "--set", "physgraph:material:bendStiffness=4.7e-06"),
+        *("--set", "stretchStiffness=30", "--set", "rest:weftEase=4.7"),
         *("--report", str(files.report), "--progress", "--no-keep-frames", "--device", "cuda", "--weights", "my file"),
     ]
 
 
 def test_the_command_understands_each_line(command: ModuleType, tmp_path: Path) -> None:
     files = command.files_of_run(tmp_path, "shot", ["Coat"])
-    settings = command.Settings((-3, 5), preset="denim", stretch=1.0, bend=1e-6, level=-1, report=True, more=QUICK)
+    settings = command.Settings((-3, 5), preset="denim", values={"density": 1.0}, level=-1, report=True, more=QUICK)
     for _, name, *words in command.command_lines("pg", settings, files, garments=["/a"], colliders=["/c"]):
         context = cli.main.commands[name].make_context(name, list(words))
         assert context.params["garments"] == ("/a",)
+
+
+def test_the_line_of_live_is_understood(command: ModuleType) -> None:
+    for more, device in (("", "cpu"), ("--workers 2 --device cuda", "cuda"), ("--device=cuda --workers 2", "cuda")):
+        settings = command.Settings((1, 5), more=more)
+        line = command.live_line("pg", settings, Path("a.usdc"), garments=["/a", "/b"], colliders=["/c"])
+        assert line[:3] == ["pg", "live", "a.usdc"]
+        given = cli.main.commands["live"].make_context("live", line[2:]).params
+        assert given["garments"] == ("/a", "/b")
+        assert given["colliders"] == ("/c",)
+        assert given["device"] == device
+
+
+def test_sliders_are_those_of_tune(command: ModuleType) -> None:
+    for slider in command.SLIDERS:
+        row, tuned = GARMENT[slider.name], TUNABLES[slider.name]
+        assert slider.factor == tuned.factor
+        assert slider.unit.replace(" ", "") == tuned.unit.replace("\N{MIDDLE DOT}", "").replace(
+            "\N{GREEK SMALL LETTER MU}", "\N{MICRO SIGN}"
+        )
+        assert slider.default / slider.factor == pytest.approx(row.fallback)
+        assert [each / slider.factor for each in slider.limits] == pytest.approx([row.minimum, row.maximum])
+        assert row.minimum <= slider.ends[0] / slider.factor < slider.ends[1] / slider.factor <= row.maximum
 
 
 def test_jersey_is_never_taken_in_silence(command: ModuleType) -> None:
@@ -66,7 +84,7 @@ def test_jersey_is_never_taken_in_silence(command: ModuleType) -> None:
     both = command.unsaid_warnings(command.Settings((1, 2)), lacking)
     assert [("stretchStiffness" in said, "bendStiffness" in said) for said in both] == [(True, True), (False, True)]
     assert "'Coat'" in both[0]
-    (left,) = command.unsaid_warnings(command.Settings((1, 2), bend=1e-5), lacking)
+    (left,) = command.unsaid_warnings(command.Settings((1, 2), values={"bendStiffness": 1e-5}), lacking)
     assert "stretchStiffness" in left
     assert "bendStiffness" not in left
 

@@ -23,6 +23,7 @@ from .options import (
     overwrite_option,
     scene_options,
     shot_argument,
+    together,
 )
 from .printing import outline, print_progress
 from .refine import refine
@@ -31,6 +32,15 @@ from .structure import DONE, FAILED, imports_uncollected
 from .types import FRAME_RANGE, PICTURE_SIZE
 
 PRIMS = "Prim path, glob or collection; repeatable."
+session_options = together(
+    click.option(
+        "-o", "--out", type=click.Path(path_type=Path), help="Layer to save into.  [default: SHOT.tuned.usda]"
+    ),
+    of_field("garments"),
+    of_field("colliders"),
+    of_field("device"),
+    overwrite_option,
+)
 
 
 @click.command()
@@ -117,12 +127,27 @@ def tag(shot: str, out: Path, *, garments: tuple[str, ...], colliders: tuple[str
 
 @click.command()
 @shot_argument
-@click.option("-o", "--out", type=click.Path(path_type=Path), help="Layer to save into.  [default: SHOT.tuned.usda]")
-@of_field("garments")
-@of_field("colliders")
-@of_field("device")
+@session_options
+def live(shot: str, **options: Any) -> None:
+    """Solve frames of SHOT for another program, which sends values as lines of JSON on standard input.
+
+    Each answer is a line of JSON on standard output; physgraph_usd/studio/live.py describes both. Ends with the input.
+    """
+    with signals_noted():
+        with imports_uncollected():
+            from ..studio.live import answers_alone, serve
+            from ..studio.session import TuneSession
+
+        with answers_alone() as stream, closing(TuneSession(shot, **options)) as session:
+            if session.warning:
+                click.echo(f"warning: {session.warning}", err=True)
+            serve(session, stream)
+
+
+@click.command()
+@shot_argument
+@session_options
 @click.option("--port", type=int, default=8080, help="Port on this machine; the next free one where it is taken.")
-@overwrite_option
 def tune(shot: str, *, port: int, **options: Any) -> None:
     """Show SHOT in the browser, with sliders for each garment's values; Save writes them as tag does.
 

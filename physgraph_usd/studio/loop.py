@@ -71,6 +71,11 @@ class SolveLoop:
         self._thread = threading.Thread(target=self._work, name="tune", daemon=True)
         self._thread.start()
 
+    @property
+    def runs(self) -> bool:
+        """Whether the thread has not ended."""
+        return self._thread.is_alive()
+
     def ask(self, change: Change) -> None:
         """Have a change made and its frame solved; returns at once."""
         with self._changed:

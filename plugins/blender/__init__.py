@@ -2,9 +2,9 @@
 
 import bpy
 
-from . import kept, panel, refine
+from . import kept, live_view, panel, refine
 
-CLASSES = (*kept.CLASSES, *refine.CLASSES, *panel.CLASSES)
+CLASSES = (*kept.CLASSES, *refine.CLASSES, *live_view.CLASSES, *panel.CLASSES)
 KEEPERS = (bpy.types.Object, bpy.types.Material)
 """Kinds of data that keep what a USD file said."""
 
@@ -18,6 +18,10 @@ def register() -> None:
     bpy.types.Object.physgraph_coarse = bpy.props.PointerProperty(
         type=bpy.types.Object, name="Coarse", description="The garment that this one was refined from"
     )
+    bpy.types.Object.physgraph_live = bpy.props.PointerProperty(
+        type=bpy.types.Object, name="Live Of", description="The garment that this one shows while Live is on"
+    )
+    live_view.register()
     for kind in KEEPERS:
         kind.physgraph_authored = bpy.props.StringProperty(
             name="Authored", description="What a USD file said of the cloth", options={"HIDDEN"}
@@ -27,7 +31,8 @@ def register() -> None:
 def unregister() -> None:
     """Take it back."""
     refine.stop()
-    del bpy.types.Object.physgraph_coarse, bpy.types.Scene.physgraph
+    live_view.unregister()
+    del bpy.types.Object.physgraph_coarse, bpy.types.Object.physgraph_live, bpy.types.Scene.physgraph
     for kind in KEEPERS:
         del kind.physgraph_authored
     for kind in reversed(CLASSES):

@@ -6,8 +6,10 @@ import os
 import re
 import shlex
 import subprocess
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import BinaryIO, NamedTuple
 from zlib import crc32
 
 PRESETS = ("paper", "silk", "cotton", "wool", "polyester", "denim", "jersey", "rib", "leather")
@@ -24,6 +26,60 @@ PATIENCE_SECONDS = 5.0
 """How long a command that was told to end may take to clear up."""
 
 
+class Slider(NamedTuple):
+    """A value on the panel.
+
+    Attributes:
+        key: Name of the panel's property; ``use_KEY`` switches it on.
+        name: The schema's short name.
+        label: Name that the artist sees.
+        unit: Unit on the panel.
+        factor: Times the SI value, it is the number on the panel.
+        default: Number on the panel before the artist changes it.
+        limits: Least and greatest number.
+        ends: Ends of the slider.
+        doc: Meaning.
+    """
+
+    key: str
+    name: str
+    label: str
+    unit: str
+    factor: float
+    default: float
+    limits: tuple[float, float]
+    ends: tuple[float, float]
+    doc: str
+
+
+_EASE = ("%", 1.0, 0.0, (-50.0, 100.0), (0.0, 10.0))
+SLIDERS = (
+    Slider("weft_ease", "rest:weftEase", "Weft Ease", *_EASE, "Length along the weft that the cage does not show"),
+    Slider("warp_ease", "rest:warpEase", "Warp Ease", *_EASE, "Length along the warp that the cage does not show"),
+    Slider(
+        "stretch", "stretchStiffness", "Stretch", "N/m", 1.0, 30.0, (1e-3, 1e9), (1.0, 2000.0),
+        "Stretch stiffness E h of the sheet",
+    ),
+    Slider(
+        "bend", "bendStiffness", "Bend", "\N{MICRO SIGN}N m", 1e6, 4.7, (0.0, 1e11), (0.0, 500.0),
+        "Bending stiffness D of the sheet",
+    ),
+    Slider(
+        "density", "density", "Density", "g/m\N{SUPERSCRIPT TWO}", 1e3, 187.0, (0.1, 1e8), (10.0, 2000.0),
+        "Mass per area",
+    ),
+    Slider(
+        "guide", "guide:stiffness", "Guide", "N/m\N{SUPERSCRIPT THREE}", 1.0, 2000.0, (0.0, 1e12), (10.0, 20000.0),
+        "How firmly the fine cloth follows the coarse animation",
+    ),
+    Slider(
+        "offset", "contact:offset", "Offset", "mm", 1e3, 2.0, (0.0, 1e4), (0.1, 30.0),
+        "Distance kept from colliders",
+    ),
+)  # fmt: skip
+"""The values on the panel, in its order: those of `physgraph-usd tune` that artists move most."""
+
+
 @dataclass(frozen=True)
 class Settings:
     """What the panel says.
@@ -31,8 +87,7 @@ class Settings:
     Attributes:
         frames: First and last frame.
         preset: A name of `PRESETS`, or "" for what the objects and their materials say.
-        stretch: Stretch stiffness [N/m] in place of the fabric's, or None.
-        bend: Bending stiffness [N m] in place of the fabric's, or None.
+        values: Values [SI] in place of the fabric's and of those authored, by the schema's short names.
         level: Subdivisions; -1 lets the command choose.
         report: Whether to write a page about the run.
         more: Further options of `physgraph-usd refine`, as in a shell.
@@ -40,8 +95,7 @@ class Settings:
 
     frames: tuple[int, int]
     preset: str = ""
-    stretch: float | None = None
-    bend: float | None = None
+    values: Mapping[str, float] = field(default_factory=dict)
     level: int = 2
     report: bool = False
     more: str = ""
@@ -112,13 +166,26 @@ def command_lines(
         shot = files.cloth
         lines.append([command, "tag", str(files.coarse), "-o", str(shot), *named, "--preset", settings.preset])
     named += [word for path in colliders for word in ("--collider", path)]
-    stiffness = {"stretchStiffness": settings.stretch, "bendStiffness": settings.bend}
-    given = [f"physgraph:material:{name}={value:.6g}" for name, value in stiffness.items() if value is not None]
     refine = [command, "refine", str(shot), "-o", str(files.layer), "--root", str(files.root), *named]
     refine += ["--frames", "{}:{}".format(*settings.frames), "--level", str(settings.level).replace("-1", "auto")]
-    refine += [word for value in given for word in ("--set", value)]
+    refine += [word for name, value in settings.values.items() for word in ("--set", f"{name}={value:.9g}")]
     refine += ["--report", str(files.report)] if settings.report else []
     return [*lines, [*refine, "--progress", "--no-keep-frames", *shlex.split(settings.more)]]
+
+
+def live_line(command: str, settings: Settings, shot: Path, *, garments: list[str], colliders: list[str]) -> list[str]:
+    """The command line of a process that solves frames of an exported shot; arguments are those of `command_lines`.
+
+    Of the further options it takes the device alone.
+
+    Raises:
+        ValueError: The further options end inside a quotation.
+    """
+    named = [word for path in garments for word in ("--garment", path)]
+    named += [word for path in colliders for word in ("--collider", path)]
+    words = shlex.split(settings.more.replace("--device=", "--device "))
+    device = words[words.index("--device") :][:2] if "--device" in words else []
+    return [command, "live", str(shot), *named, *device]
 
 
 def unsaid_warnings(settings: Settings, lacking: dict[str, list[str]]) -> list[str]:
@@ -128,8 +195,7 @@ def unsaid_warnings(settings: Settings, lacking: dict[str, list[str]]) -> list[s
         settings: What the panel says.
         lacking: Names of the stiffnesses that nothing gives, by the garment's object.
     """
-    on_panel = {"stretchStiffness": settings.stretch, "bendStiffness": settings.bend}
-    told = {item: [name for name in names if on_panel[name] is None] for item, names in lacking.items()}
+    told = {item: [name for name in names if name not in settings.values] for item, names in lacking.items()}
     return [
         f"nothing gives the {' and '.join(names)} of '{item}': jersey's is taken; choose a fabric, or author it"
         for item, names in told.items()
@@ -157,6 +223,22 @@ def warnings_in(text: str) -> list[str]:
 
 class CommandError(Exception):
     """The command could not be started, or failed; says what it said."""
+
+
+def start(line: list[str], *, stdin: int, stdout: int, stderr: BinaryIO) -> subprocess.Popen[bytes]:
+    """Start a command line; the streams are as `subprocess.Popen` takes them.
+
+    Raises:
+        CommandError: It cannot be started.
+    """
+    environment = {name: value for name, value in os.environ.items() if name not in OF_BLENDER}
+    try:
+        return subprocess.Popen(line, env=environment, stdin=stdin, stdout=stdout, stderr=stderr)
+    except OSError as error:
+        raise CommandError(
+            f"cannot run '{line[0]}': {error.strerror or error}. Install physgraph-usd in a Python of its own and "
+            "give the path of its command in Edit > Preferences > Add-ons > PhysGraph Cloth"
+        ) from error
 
 
 class Run:
@@ -227,18 +309,8 @@ class Run:
                 self._process.wait()
 
     def _start(self) -> subprocess.Popen[bytes]:
-        line = self._left.pop(0)
-        environment = {name: value for name, value in os.environ.items() if name not in OF_BLENDER}
-        try:
-            with self._log.open("ab") as log:
-                return subprocess.Popen(
-                    line, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=log, env=environment
-                )
-        except OSError as error:
-            raise CommandError(
-                f"cannot run '{line[0]}': {error.strerror or error}. Install physgraph-usd in a Python of its own and "
-                "give the path of its command in Edit > Preferences > Add-ons > PhysGraph Cloth"
-            ) from error
+        with self._log.open("ab") as log:
+            return start(self._left.pop(0), stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=log)
 
     def _text(self) -> str:
         return self._log.read_text(encoding="utf-8", errors="replace")

@@ -4,7 +4,8 @@
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, PointerProperty, StringProperty
 
-from .command import PRESETS, Settings
+from .command import PRESETS, SLIDERS, Settings
+from .live_view import PHYSGRAPH_OT_keep, PHYSGRAPH_OT_live, last_failure, now_live, send
 from .refine import PHYSGRAPH_OT_refine, now_running
 
 AS_AUTHORED = "AS_AUTHORED"
@@ -34,25 +35,14 @@ class PhysGraphPreferences(bpy.types.AddonPreferences):
 class PhysGraphSettings(bpy.types.PropertyGroup):
     """How a scene's garments are refined."""
 
-    preset: EnumProperty(name="Fabric", description="Fabric of the garments", items=FABRICS)
-    use_stretch: BoolProperty(name="Stretch", description="Give the stretch stiffness in place of the fabric's")
-    stretch: FloatProperty(
-        name="Stretch", description="Stretch stiffness E h of the sheet [N/m]", default=30.0, min=1e-3, soft_max=2000.0
-    )
-    use_bend: BoolProperty(name="Bend", description="Give the bending stiffness in place of the fabric's")
-    bend: FloatProperty(
-        name="Bend",
-        description="Bending stiffness D of the sheet [millionths of a N m]",
-        default=4.7,
-        min=0.0,
-        soft_max=500.0,
-    )
+    preset: EnumProperty(name="Fabric", description="Fabric of the garments", items=FABRICS, update=send)
     level: IntProperty(
         name="Subdivisions",
         description="Each makes four faces of one; -1 chooses by the fabric's folds",
         default=2,
         min=-1,
         max=5,
+        update=send,
     )
     scene_frames: BoolProperty(name="Scene's Frames", description="Refine the frames of the scene", default=True)
     frame_start: IntProperty(name="Start", description="First frame to refine", default=1)
@@ -73,12 +63,33 @@ class PhysGraphSettings(bpy.types.PropertyGroup):
         return Settings(
             frames=frames,
             preset="" if self.preset == AS_AUTHORED else self.preset,
-            stretch=self.stretch if self.use_stretch else None,
-            bend=self.bend * 1e-6 if self.use_bend else None,
+            values={
+                slider.name: getattr(self, slider.key) / slider.factor
+                for slider in SLIDERS
+                if getattr(self, f"use_{slider.key}")
+            },
             level=self.level,
             report=self.report,
             more=self.more,
         )
+
+
+for slider in SLIDERS:
+    PhysGraphSettings.__annotations__ |= {
+        f"use_{slider.key}": BoolProperty(
+            name=slider.label, description="Give this value in place of the fabric's or the authored one", update=send
+        ),
+        slider.key: FloatProperty(
+            name=slider.label,
+            description=f"{slider.doc} [{slider.unit}]",
+            default=slider.default,
+            min=slider.limits[0],
+            max=slider.limits[1],
+            soft_min=slider.ends[0],
+            soft_max=slider.ends[1],
+            update=send,
+        ),
+    }
 
 
 class PHYSGRAPH_PT_panel(bpy.types.Panel):
@@ -94,12 +105,12 @@ class PHYSGRAPH_PT_panel(bpy.types.Panel):
         settings, layout = context.scene.physgraph, self.layout
         layout.use_property_split, layout.use_property_decorate = True, False
         layout.prop(settings, "preset")
-        for name, unit in (("stretch", "N/m"), ("bend", "\N{MICRO SIGN}N m")):
-            row = layout.row(heading=f"{name.capitalize()} ({unit})")
-            row.prop(settings, f"use_{name}", text="")
+        for slider in SLIDERS:
+            row = layout.row(heading=f"{slider.label} ({slider.unit})")
+            row.prop(settings, f"use_{slider.key}", text="")
             value = row.row()
-            value.active = getattr(settings, f"use_{name}")
-            value.prop(settings, name, text="")
+            value.active = getattr(settings, f"use_{slider.key}")
+            value.prop(settings, slider.key, text="", slider=True)
         layout.prop(settings, "level")
         layout.prop(settings, "scene_frames")
         if not settings.scene_frames:
@@ -115,8 +126,20 @@ class PHYSGRAPH_PT_panel(bpy.types.Panel):
             layout.label(text="Esc cancels")
         else:
             layout.operator(PHYSGRAPH_OT_refine.bl_idname, icon="MOD_CLOTH")
+        _draw_live(layout.box())
         if settings.last_report:
             layout.operator("wm.path_open", text="Open Report").filepath = settings.last_report
+
+
+def _draw_live(box: bpy.types.UILayout) -> None:
+    """Draw the button "Live" and, while that is on, the button "Keep" and how far the cloth is."""
+    live = now_live()
+    box.operator(PHYSGRAPH_OT_live.bl_idname, text="Stop" if live else "Live", icon="PAUSE" if live else "PLAY")
+    if live:
+        box.operator(PHYSGRAPH_OT_keep.bl_idname, icon="CHECKMARK")
+    state = live.state if live else last_failure()
+    if state:
+        box.label(text=state)
 
 
 CLASSES = (PhysGraphPreferences, PhysGraphSettings, PHYSGRAPH_PT_panel)

@@ -3,17 +3,72 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import NamedTuple
 
 import bpy
 
-from .command import CommandError, Run, command_lines, files_of_run, unsaid_warnings
-from .shot import bring_back, export, selected_garments
+from .command import CommandError, Files, Run, Settings, command_lines, files_of_run, unsaid_warnings
+from .shot import Exported, bring_back, export, selected_garments
 
 FOLDER = "physgraph"
 """Name of the folder beside the .blend file."""
 POLL_SECONDS = 0.2
 FAILURES = (CommandError, OSError, RuntimeError, ValueError)
 """What exporting, running and importing may end with."""
+
+
+class Prepared(NamedTuple):
+    """An exported shot, ready for the command.
+
+    Attributes:
+        settings: What the panel says.
+        files: The files of the run.
+        written: Prim paths.
+        paths: Prim path of each garment by its object's number: undo makes new objects of the same numbers, and the
+            artist may rename them meanwhile.
+        command: The command.
+    """
+
+    settings: Settings
+    files: Files
+    written: Exported
+    paths: dict[int, str]
+    command: str
+
+
+def prepare(context: bpy.types.Context) -> Prepared:
+    """Export the selected garments and the colliders over the range of frames.
+
+    Raises:
+        OSError: The files cannot be written.
+        RuntimeError: Blender cannot export.
+        ValueError: A setting cannot be used.
+    """
+    panel = context.scene.physgraph
+    settings, bodies = panel.as_given(context.scene), _bodies(panel.colliders)
+    garments = [item for item in selected_garments(context) if item not in bodies]
+    if not garments:
+        raise ValueError("every selected mesh is in the collection of colliders; select a garment")
+    if settings.frames[0] > settings.frames[1]:
+        raise ValueError("frames {} to {}: the range ends before it starts".format(*settings.frames))
+    blend = Path(bpy.data.filepath)
+    folder = (blend.parent if bpy.data.is_saved else Path(bpy.app.tempdir)) / FOLDER
+    folder.mkdir(exist_ok=True)
+    files = files_of_run(folder, blend.stem or "untitled", [item.name for item in garments])
+    written = export(context, files.coarse, garments, colliders=bodies, frames=settings.frames)
+    paths = {item.session_uid: written.garments[item.name] for item in garments}
+    command = context.preferences.addons[__package__].preferences.command
+    command = bpy.path.abspath(command) if command.startswith("//") else command
+    return Prepared(settings, files, written, paths, command)
+
+
+def objects_of(paths: dict[int, str]) -> dict[bpy.types.Object, str]:
+    """Coarse objects that still exist, and their prim paths.
+
+    Args:
+        paths: Prim paths by the objects' numbers.
+    """
+    return {item: paths[item.session_uid] for item in bpy.data.objects if item.session_uid in paths}
 
 
 class Refinement:
@@ -28,32 +83,13 @@ class Refinement:
             RuntimeError: Blender cannot export.
             ValueError: A setting cannot be used.
         """
-        panel = context.scene.physgraph
-        settings, bodies = panel.as_given(context.scene), _bodies(panel.colliders)
-        garments = [item for item in selected_garments(context) if item not in bodies]
-        if not garments:
-            raise ValueError("every selected mesh is in the collection of colliders; select a garment")
-        if settings.frames[0] > settings.frames[1]:
-            raise ValueError("frames {} to {}: the range ends before it starts".format(*settings.frames))
-        blend = Path(bpy.data.filepath)
-        folder = (blend.parent if bpy.data.is_saved else Path(bpy.app.tempdir)) / FOLDER
-        folder.mkdir(exist_ok=True)
-        self.files = files_of_run(folder, blend.stem or "untitled", [item.name for item in garments])
+        settings, self.files, written, self._paths, command = prepare(context)
         if settings.report:
             self.files.report.mkdir()  # Where it is not there, the command takes ".report" for a kind of file.
-        written = export(context, self.files.coarse, garments, colliders=bodies, frames=settings.frames)
-        # Objects by number: undo makes new objects of the same numbers, and the artist may rename them meanwhile.
-        self._paths = {item.session_uid: written.garments[item.name] for item in garments}
         self._reported = settings.report
         self.unsaid = [] if settings.preset else unsaid_warnings(settings, written.lacking)
-        command = context.preferences.addons[__package__].preferences.command
-        lines = command_lines(
-            bpy.path.abspath(command) if command.startswith("//") else command,
-            settings,
-            self.files,
-            garments=list(written.garments.values()),
-            colliders=list(written.colliders.values()),
-        )
+        garments, colliders = list(written.garments.values()), list(written.colliders.values())
+        lines = command_lines(command, settings, self.files, garments=garments, colliders=colliders)
         self.run = Run(lines, self.files.log)
 
     def finish(self, context: bpy.types.Context) -> tuple[str, str]:
@@ -64,7 +100,7 @@ class Refinement:
             ValueError: The coarse objects are gone.
         """
         panel = context.scene.physgraph
-        found = {item: self._paths[item.session_uid] for item in bpy.data.objects if item.session_uid in self._paths}
+        found = objects_of(self._paths)
         if not found:
             raise ValueError(f"the coarse objects are gone; the cloth is in {self.files.root}")
         made = bring_back(context, self.files.root, found, hide=panel.hide_coarse)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import NamedTuple
@@ -14,6 +14,7 @@ from .kept import DATA_NAME, OBJECT_NAME, give_back, lacking
 COLLECTION = "PhysGraph"
 CACHE = "PhysGraph"
 """Name of the modifier that plays the refined points."""
+LEVEL = "physgraph:refine:level"
 SUBDIVIDING = {"SUBSURF", "MULTIRES"}
 
 
@@ -26,8 +27,19 @@ class Exported(NamedTuple):
 
 
 def coarse_of(item: bpy.types.Object) -> bpy.types.Object:
-    """The object that a refined one came from; any other object itself."""
-    return item.physgraph_coarse or item
+    """The object that a refined or a live one came from; any other object itself."""
+    return item.physgraph_live or item.physgraph_coarse or item
+
+
+def refined_of(scene: bpy.types.Scene, coarse: bpy.types.Object) -> bpy.types.Object | None:
+    """The refined object of a coarse object, or None."""
+    return next((item for item in scene.objects if item.physgraph_coarse == coarse), None)
+
+
+def metres_in(scene: bpy.types.Scene) -> float:
+    """Length of the scene's unit [m]."""
+    units = scene.unit_settings
+    return units.scale_length if units.system != "NONE" else 1.0
 
 
 def selected_garments(context: bpy.types.Context) -> list[bpy.types.Object]:
@@ -77,8 +89,7 @@ def export(
             author_blender_name=True,
             merge_parent_xform=False,
         )
-    units = context.scene.unit_settings
-    paths, unsaid = _finish_export(file, units.scale_length if units.system != "NONE" else 1.0)
+    paths, unsaid = _finish_export(file, metres_in(context.scene))
     missing = [item.name for item in (*garments, *colliders) if item.name not in paths]
     if missing:
         raise ValueError(f"Blender exported no mesh for {', '.join(missing)}; is there a face in it?")
@@ -112,6 +123,24 @@ def bring_back(
             coarse.hide_render = True
         made.append(fine)
     return made
+
+
+def author_level(file: Path, paths: Iterable[str], level: int) -> None:
+    """Write a number of subdivisions onto garments of an exported file; -1 lets the command choose."""
+    from pxr import Sdf, Usd
+
+    stage = Usd.Stage.Open(str(file))
+    for path in paths:
+        stage.GetPrimAtPath(path).CreateAttribute(LEVEL, Sdf.ValueTypeNames.Int, False).Set(level)
+    stage.GetRootLayer().Save()
+
+
+def collection_for_cloth(scene: bpy.types.Scene) -> bpy.types.Collection:
+    """The collection of refined and live objects; made if missing."""
+    collection = bpy.data.collections.get(COLLECTION) or bpy.data.collections.new(COLLECTION)
+    if collection not in scene.collection.children_recursive:
+        scene.collection.children.link(collection)
+    return collection
 
 
 @contextmanager
@@ -180,15 +209,12 @@ def _finish_export(file: Path, metres: float) -> tuple[dict[str, str], dict[str,
 
 def _refined_object(context: bpy.types.Context, coarse: bpy.types.Object) -> bpy.types.Object:
     """The refined object of a coarse one, in the collection for them; made where there is none."""
-    for item in context.scene.objects:
-        if item.physgraph_coarse == coarse:
-            return item
-    collection = bpy.data.collections.get(COLLECTION) or bpy.data.collections.new(COLLECTION)
-    if collection not in context.scene.collection.children_recursive:
-        context.scene.collection.children.link(collection)
+    there = refined_of(context.scene, coarse)
+    if there:
+        return there
     name = f"{coarse.name}_refined"
     fine = bpy.data.objects.new(name, bpy.data.meshes.new(name))
-    collection.objects.link(fine)
+    collection_for_cloth(context.scene).objects.link(fine)
     fine.parent = fine.physgraph_coarse = coarse
     return fine
 
