@@ -109,7 +109,6 @@ class Picture:
         self.right = np.array([0.0, 1.0, 0.0]) if abs(up[0]) > 0.9 else np.array([1.0, 0.0, 0.0])
         times = session.times[:: max(1, len(session.times) // SAMPLED)]
         drawn = [_everything(session.shot.frame(time)) for time in times]
-        self._drawn = drawn[0]
         self._across = max(np.ptp(each @ self.right) for each in drawn) + GAP * self.size
         self._handles: dict[str, tuple[object, Any]] = {}
         self.paintable = False
@@ -119,7 +118,7 @@ class Picture:
         server.initial_camera.position = max(1.4 * self.size, AWAY * self._across) * eye / np.linalg.norm(eye)
         server.initial_camera.look_at = (0.0, 0.0, 0.0)
         server.initial_camera.fov = np.radians(38.0)
-        self._light(up)
+        light(server.scene, drawn[0] - self.centre, right=self.right, up=up)
 
     def draw(self, shown: Shown, *, kept: Shown | None = None) -> None:
         """Draw a frame; ``kept`` is A's."""
@@ -268,28 +267,32 @@ class Picture:
             handle = self._scene.add_glb(name, _glb(points, sheet.triangles, colors))
         self._handles[name] = key, handle
 
-    def _light(self, up: np.ndarray) -> None:
-        """Floor, sky, and a key light from the left that rakes over folds; nothing that viser would fetch.
 
-        No shadows: on cloth their bands would look like wrinkles. And no grid: without a graphics card it would take
-        half of the time of a picture.
-        """
-        scene, size, front = self._scene, self.size, np.cross(self.right, up)
-        scene.configure_environment_map(None)
-        scene.configure_default_lights(enabled=False)
-        scene.set_background_image(np.full((2, 2, 3), SKY, np.uint8), format="png")
-        scene.add_light_hemisphere("sky", sky_color=(255, 255, 255), ground_color=(200, 196, 190), intensity=1.6)
-        lights = {"key": (-3.0, 2.0, 1.5, 2.6), "fill": (3.0, 0.5, 1.5, 0.5)}
-        for name, (across, above, before, intensity) in lights.items():
-            at = size * (across * self.right + above * up + before * front)
-            scene.add_light_directional(name, intensity=intensity, position=tuple(at.tolist()))
-        height = float((self._drawn @ up).min() - self.centre @ up) - 0.02 * size
-        wide = FLOOR_SIZE * size
-        corners = [
-            height * up + x * wide * self.right + y * wide * front for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))
-        ]
-        look: dict[str, Any] = {"color": FLOOR, "side": "double", "cast_shadow": False, "receive_shadow": False}
-        scene.add_mesh_simple("floor", np.asarray(corners, np.float32), np.array([[0, 1, 2], [0, 2, 3]]), **look)
+def light(scene: viser.SceneApi, drawn: np.ndarray, *, right: np.ndarray, up: np.ndarray) -> None:
+    """Set up floor, sky, and a key light from the left that rakes over folds; nothing that viser would fetch.
+
+    No shadows: on cloth their bands would look like wrinkles. And no grid: without a graphics card it would take half
+    of the time of a picture.
+
+    Args:
+        scene: The scene.
+        drawn: Points of all that is drawn, about the middle of the cloth [m], shape (N, 3).
+        right: Unit vector, shape (3,).
+        up: Unit vector, shape (3,).
+    """
+    size, front = float(np.linalg.norm(np.ptp(drawn, axis=0))), np.cross(right, up)
+    scene.configure_environment_map(None)
+    scene.configure_default_lights(enabled=False)
+    scene.set_background_image(np.full((2, 2, 3), SKY, np.uint8), format="png")
+    scene.add_light_hemisphere("sky", sky_color=(255, 255, 255), ground_color=(200, 196, 190), intensity=1.6)
+    lights = {"key": (-3.0, 2.0, 1.5, 2.6), "fill": (3.0, 0.5, 1.5, 0.5)}
+    for name, (across, above, before, intensity) in lights.items():
+        at = size * (across * right + above * up + before * front)
+        scene.add_light_directional(name, intensity=intensity, position=tuple(at.tolist()))
+    height, wide = float((drawn @ up).min()) - 0.02 * size, FLOOR_SIZE * size
+    corners = [height * up + x * wide * right + y * wide * front for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+    look: dict[str, Any] = {"color": FLOOR, "side": "double", "cast_shadow": False, "receive_shadow": False}
+    scene.add_mesh_simple("floor", np.asarray(corners, np.float32), np.array([[0, 1, 2], [0, 2, 3]]), **look)
 
 
 def mesh_of(pose: Pose) -> tuple[np.ndarray, np.ndarray] | None:

@@ -101,7 +101,8 @@ class Tuning:
         """
         values = {name: value for name, value in self._values(garment).items() if name not in TUNABLES}
         painted = {path: maps for path, maps in self.setting.painted.items() if path != garment}
-        self._try(garment, values, "all as authored", painted=painted)
+        others = {"painted": painted} if garment in self.setting.painted else {}
+        self._try(garment, values, "all as authored", **others)
 
     def set_preset(self, garment: str, preset: str) -> None:
         """Try a fabric's values in place of those that were tried.
