@@ -1,4 +1,4 @@
-"""Painting: a brush that changes a map on the cage's vertices where it touches the refined cloth."""
+"""Painting: a brush on the refined cloth changes a map on the cage's vertices."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ class Brush:
     """A brush.
 
     Attributes:
-        radius: How far it reaches [m].
-        value: The value that it paints.
-        strength: How far one touch goes towards it, 0 to 1.
+        radius: Radius [m].
+        value: Painted value.
+        strength: Fraction of the way to the value per touch, 0 to 1.
         mode: `PAINT`, or `SMOOTH`: towards the mean of the neighbours.
         mirrored: Whether the other side is painted too, mirrored in the rest shape.
     """
@@ -84,7 +84,7 @@ def mirrored(rest: np.ndarray, right: np.ndarray) -> np.ndarray:
 
 
 def neighbour_mean(mesh: PolygonMesh, values: np.ndarray) -> np.ndarray:
-    """Mean of each vertex's neighbours along edges; its own value where it has none, shape (V,)."""
+    """Mean over each vertex's neighbours, or the vertex's value without neighbours, shape (V,)."""
     ends = np.stack([mesh.indices, mesh.indices[mesh.next_corner]], axis=1)
     near = adjacency(ends, mesh.vertex_count)
     count = np.asarray(near.sum(axis=1)).ravel()
@@ -92,11 +92,11 @@ def neighbour_mean(mesh: PolygonMesh, values: np.ndarray) -> np.ndarray:
 
 
 def hit(origin: np.ndarray, along: np.ndarray, points: np.ndarray, triangles: np.ndarray) -> np.ndarray | None:
-    """The first place [m] where a ray meets a mesh, shape (3,); None where it meets none.
+    """The first intersection of a ray and a mesh [m], shape (3,); None without one.
 
     Args:
-        origin: Where the ray starts [m], shape (3,).
-        along: Its direction, shape (3,).
+        origin: Origin of the ray [m], shape (3,).
+        along: Direction, shape (3,).
         points: Positions [m], shape (V, 3).
         triangles: Shape (T, 3).
     """

@@ -1,4 +1,4 @@
-"""Session, picture and notes of a page, and the way to change them: shared by its panels."""
+"""Shared state of a page's panels: session, picture and notes."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from .session import TuneSession
 
 
 class Desk:
-    """A session, its picture and its notes, and the way to change them.
+    """Shared state of a page's panels.
 
     Attributes:
         gui: The page's controls, viser's.
         session: The session; it is changed through `ask` alone.
         picture: Its picture.
         notes: What is kept over a restart.
-        garment: The garment whose values are shown.
+        garment: Prim path of the garment in the panels.
         ask: Has the session changed by the thread that owns it.
     """
 
@@ -32,7 +32,7 @@ class Desk:
 
     @property
     def index(self) -> int:
-        """Number of the garment whose values are shown."""
+        """Number of the garment in the panels."""
         return self.session.garments.index(self.garment)
 
     def on(self, control: Any, change: Callable[[TuneSession, Any], None]) -> Any:
@@ -58,7 +58,7 @@ class Desk:
 
 
 def put(control: Any, **properties: Any) -> None:
-    """Set those properties of a control that differ: each that is set is sent to the browser."""
+    """Set a control's properties if different: each assignment is sent to the browser."""
     for name, value in properties.items():
         if getattr(control, name) != value:
             setattr(control, name, value)

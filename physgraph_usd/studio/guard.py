@@ -36,7 +36,7 @@ class Guard:
         self.token, self.is_asked = secrets.token_urlsafe(16), False
 
     def refusal(self, request: Request) -> str | None:
-        """Why a request, with its path and all headers, is refused; None where it is not."""
+        """The reason to refuse a request; None to accept."""
         hosts, origins = (request.headers.get_all(name) for name in ("Host", "Origin"))
         if len(hosts) != 1 or _name_of(hosts[0]) not in _NAMES:
             return "another host"
@@ -74,7 +74,7 @@ class Guard:
 
 
 def _name_of(host: str) -> str | None:
-    """The name in a Host header, without the port; None where it is no such header."""
+    """The name in a Host header, without the port; None for an invalid header."""
     try:
         return urlsplit(f"//{host}").hostname if "@" not in host and "/" not in host else None
     except ValueError:

@@ -77,7 +77,7 @@ class Answers:
         """Work has begun, which is no answer."""
 
     def solved(self) -> None:
-        """Another frame is solved, which is no answer."""
+        """Ignore a solved frame of the range."""
 
     def seen(self, points: Mapping[str, np.ndarray]) -> None:
         """Answer with a round."""

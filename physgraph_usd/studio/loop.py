@@ -1,4 +1,4 @@
-"""A thread that changes a session's values, solves its frame and plays its range, while the page answers."""
+"""The thread that changes and solves a session, and plays its range."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ class SolveLoop:
                 self._watcher.fail(error)
 
     def _change(self, asked: list[Change]) -> None:
-        """Make changes; one that cannot be made changes nothing."""
+        """Make changes; an invalid change has no effect."""
         for change in asked:
             try:
                 change(self._session)
@@ -113,7 +113,7 @@ class SolveLoop:
                 self._watcher.fail(error)
 
     def _solve(self) -> float:
-        """Solve the frame roughly; returns how long to wait for a change."""
+        """Solve the frame roughly; returns the time to wait for a change [s]."""
         self._watcher.busy("solving")
         rounds = list[None]()
 
@@ -127,7 +127,7 @@ class SolveLoop:
         return 0.0 if shown.settled else self._rest
 
     def _go_on(self) -> float | None:
-        """Settle the frame, or solve what else is looked at; returns how long to wait for a change."""
+        """Settle the frame, or solve A or the range; returns the time to wait for a change [s]."""
         shown = self._session.solve()
         if not shown.settled:
             self._watcher.busy("settling")
@@ -139,7 +139,7 @@ class SolveLoop:
         return 0.0
 
     def _play(self) -> float:
-        """Show the next frame of the range that is solved, or solve it; returns how long to wait for a change."""
+        """Show or solve the next frame of the range; returns the time to wait for a change [s]."""
         shown = self._session.step(self.span, self._is_wanted)
         if shown is None:
             self._watcher.solved()

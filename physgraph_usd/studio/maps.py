@@ -1,4 +1,4 @@
-"""Maps of solved cloth: a number at each fine vertex, and the colour that shows it."""
+"""Maps of solved cloth: numbers at fine vertices, and their colours."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def stretches(refiner: Refiner, frame: Frame, index: int, points: np.ndarray) ->
 
 
 def distances(refiner: Refiner, frame: Frame, index: int, points: np.ndarray) -> np.ndarray:
-    """Distance of a garment's fine positions to the nearest body that it feels [mm], shape (V,); infinite without."""
+    """Distance of a garment's fine positions to the nearest felt body [mm], shape (V,); infinite without bodies."""
     least = torch.full((len(points),), np.inf, dtype=torch.float64)
     for each in refiner.touching((index,), frame):
         x = torch.as_tensor(points - each.surface.origin, dtype=torch.float64)
@@ -83,7 +83,7 @@ def distances(refiner: Refiner, frame: Frame, index: int, points: np.ndarray) ->
 
 
 def crossings(refiner: Refiner, frame: Frame, index: int, points: np.ndarray) -> np.ndarray:
-    """1 at fine vertices that belong to cloth that crosses cloth or a body, else 0, shape (V,)."""
+    """1 at fine vertices in crossings with cloth or bodies, else 0, shape (V,)."""
     found = refiner.heat(index, points)
     return np.zeros(len(points)) if found is None else np.maximum(found["crossing"], found["penetration"] > 0)
 
@@ -105,7 +105,7 @@ NAMES = (PLAIN, *MEASURED, *MAPS)
 
 
 def painted_map(name: str, largest: float) -> Map:
-    """How a painted map is coloured, whose values reach ``largest``; its values come from the session."""
+    """Colours of a painted map with values up to ``largest``; the session has the values."""
     row = GARMENT[name]
     middle = float(row.fallback or 0.0)
     ends = (min(row.minimum or 0.0, middle - 1.0), max(largest, middle + 1.0))

@@ -33,11 +33,11 @@ POLL_SECONDS = 0.1
 
 
 class TunePage:
-    """A session in the browser, served to this machine alone.
+    """A session in the browser, for this machine only.
 
     Attributes:
-        url: Where the page is, with the secret that opens it.
-        loop: The thread that solves.
+        url: Address with the secret.
+        loop: The solving thread.
     """
 
     def __init__(self, session: TuneSession, *, port: int = 8080) -> None:
@@ -88,7 +88,7 @@ class TunePage:
         self._state.content = _badge(words, SETTLED if shown.settled else MOVING)
 
     def solved(self) -> None:
-        """Write which frames are solved, and draw A."""
+        """Update the strip of frames, or draw A."""
         if self.loop.playing:
             self._time.update()
         else:
@@ -99,7 +99,7 @@ class TunePage:
         self._state.content = _badge(str(error), WRONG)
 
     def _look_as(self, looked: Mapping[str, Any]) -> None:
-        """Garment, frame and camera as they were last."""
+        """Restore garment, frame and camera of the last session."""
         session = self._session
         if looked.get("garment") in session.garments:
             self._desk.garment = looked["garment"]
@@ -169,7 +169,7 @@ class TunePage:
 
 
 def serve(session: TuneSession, *, port: int = 8080, say: Callable[[str], None]) -> None:
-    """Serve a session's page until it is interrupted; ``say`` is called with its address."""
+    """Serve a session's page until interrupted; ``say`` is called with the address."""
     page = TunePage(session, port=port)
     say(page.url)
     try:

@@ -47,7 +47,7 @@ class PaintPanel:
             self._view.set(map=name)
 
     def attach(self) -> None:
-        """Have drags on the refined cloth that is drawn paint; without targets they turn the view."""
+        """Attach the brush to drags and clicks on the picture's targets."""
         for index, handle in self._desk.picture.targets.items():
             if self._attached.get(index) is not handle:
                 handle.on_drag("left")(lambda event, index=index: self._dragged(index, event))
@@ -67,7 +67,7 @@ class PaintPanel:
             self._desk.ask(self.lift)
 
     def touch(self, session: TuneSession, index: int, origin: np.ndarray, *, along: np.ndarray) -> None:
-        """Touch the refined cloth of a garment where a ray of the picture meets it."""
+        """Paint at the intersection of a ray of the picture and a garment's refined cloth."""
         garment, points = session.garments[index], session.solve().points[index]
         chain, cage = session.refinements[index], session.shot.scene.garments[index]
         if points is None or self._name == OFF:

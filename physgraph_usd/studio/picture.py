@@ -180,7 +180,7 @@ class Picture:
         return found.colors(values)
 
     def _sheet(self, shown: Shown, kept: Shown | None, index: int, column: str) -> Sheet | None:
-        """A garment as a column shows it, or None."""
+        """A garment's mesh in a column, or None."""
         cage, chain = self._session.shot.scene.garments[index], self._session.refinements[index]
         points = shown.points[index]
         if column == CAGE or not chain:
@@ -199,7 +199,7 @@ class Picture:
         return None if found is None or len(found) != count else Sheet(found, split, edges)
 
     def _wiped(self, sheet: Sheet, column: str, drawn: np.ndarray) -> Sheet:
-        """The part of a mesh on its side of the wipe, which goes over all that is drawn [m], shape (N, 3)."""
+        """The part of a mesh on one side of the wipe; ``drawn`` [m], shape (N, 3), gives the wipe's ends."""
         if not self.view.wiped or len(self.view.columns) < 2:
             return sheet
         low, high = (drawn @ self.right).min(), (drawn @ self.right).max()
@@ -213,7 +213,7 @@ class Picture:
         return replace(sheet, triangles=chosen(sheet.triangles), edges=chosen(sheet.edges))
 
     def _draw_wires(self, name: str, sheet: Sheet, *, at: np.ndarray) -> set[str]:
-        """Draw the edges of a mesh; returns their name."""
+        """Draw a mesh's edges; returns the node's name."""
         name, segments = f"{name}/wires", self._placed(sheet.points, at)[sheet.edges]
         known, handle = self._handles.pop(name, (None, None))
         if handle is not None and known == len(segments):
@@ -250,7 +250,7 @@ class Picture:
         colors: np.ndarray | None = None,
         opacity: float | None = None,
     ) -> None:
-        """Show a mesh under a name; only points are sent where that is enough."""
+        """Show a mesh under a name; of a known mesh only points are sent."""
         known, handle = self._handles.pop(name, (None, None))
         points = self._placed(sheet.points, at)
         kind = "plain" if colors is None else "colored"

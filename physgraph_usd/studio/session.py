@@ -31,7 +31,7 @@ class TuneSession(Tuning):
 
     Attributes:
         out: The layer that `save` writes.
-        solver: What solves the frame; it stands where the cloth is.
+        solver: The solver, with the last positions.
         takes: Frames of the shot that were solved in order.
         kept: The setting A that the present one is compared with, and its cloth; or None.
         warning: Bodies that the cloth touches and does not feel, in words, or "".
@@ -83,7 +83,7 @@ class TuneSession(Tuning):
         return self.solver.refinements
 
     def set_time(self, time: float | None) -> None:
-        """Go to a time code; cloth that was solved there with this setting is taken from `takes`.
+        """Go to a time code; a take of the present setting is used.
 
         Raises:
             UsageError: The shot has no sample there.
@@ -97,7 +97,7 @@ class TuneSession(Tuning):
             self._shown = take.setting, take.shown
 
     def keep(self) -> None:
-        """Keep the present setting and its cloth as A."""
+        """Store the present setting and its cloth as A."""
         shown = self.solve()
         self.kept = Take(Start(self.setting, self.shot, copy(self.solver)), shown)
 
@@ -130,7 +130,7 @@ class TuneSession(Tuning):
 
     @property
     def kept_shown(self) -> Shown | None:
-        """A's cloth in the present frame; None without A, or where that is not solved."""
+        """A's cloth in the present frame; None without A, or if unsolved."""
         if self.kept is None or self.kept.shown.frame.time == self.time:
             return None if self.kept is None else self.kept.shown
         return take.shown if (take := self.takes.fresh(self.time, self.kept.setting)) else None
@@ -152,9 +152,9 @@ class TuneSession(Tuning):
         return self._solve_next(self.codes_in(span), cancelled) is not None
 
     def step(self, span: tuple[float, float] | None, cancelled: Callable[[], bool] = lambda: False) -> Shown | None:
-        """Go to the next frame of a range, from its end to its start; arguments and errors are those of `go_on`.
+        """Go to the next frame of a range, in a cycle; arguments and errors as for `go_on`.
 
-        A frame that is not fresh is solved in order: then the first such frame is gone to.
+        Before a missing or stale frame, the first such frame of the range is solved and shown.
 
         Returns:
             The frame; None if solving it was cancelled.
@@ -176,7 +176,7 @@ class TuneSession(Tuning):
         return [present] if self.kept is None else [present, self.kept.start]
 
     def _solve_next(self, times: Sequence[float], cancelled: Callable[[], bool]) -> float | None:
-        """Solve the first frame of a range that is not fresh; returns its time code."""
+        """Solve a range's first missing or stale frame; returns the time code."""
         found = (self.takes.solve_next(times, start, cancelled) for start in self._starts() if times)
         return next((time for time in found if time is not None), None)
 
@@ -190,7 +190,7 @@ class TuneSession(Tuning):
         return join(words + ([] if self.setting.contact else ["--contact", "off", "--self-contact", "off"]))
 
     def save(self) -> Path:
-        """Write what is tried as a layer over the shot, as ``tag`` does; nothing else is ever written.
+        """Write values and maps as a layer over the shot, like ``tag``; no other file is written.
 
         Raises:
             UsageError: The layer's name is one of the shot's files, or its suffix is unknown.
@@ -203,7 +203,7 @@ class TuneSession(Tuning):
 
     @property
     def _known(self) -> Shown | None:
-        """The last result, where it is of the present setting and time."""
+        """The last result, if of the present setting and time; else None."""
         return self._shown[1] if self._shown is not None and self._shown[0] is self.setting else None
 
     def _show(self, seen: Seen, cancelled: Callable[[], bool], *, rough: bool) -> Shown:
@@ -216,7 +216,7 @@ class TuneSession(Tuning):
         return self._shown[1]
 
     def _prepare(self) -> None:
-        """Have a solver for the present setting: a new one where levels or maps changed, from where the cloth was."""
+        """Build a new solver if levels or maps changed, starting from the last positions."""
         setting, before = self.setting, self._solves
         if setting.levels != before.levels or setting.painted is not before.painted:
             old = self.solver

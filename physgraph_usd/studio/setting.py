@@ -9,12 +9,12 @@ from dataclasses import dataclass, field
 import numpy as np
 
 JOINED_SECONDS = 1.0
-"""Changes of one value that follow one another within this time are one step of undo, as a drag of a slider is."""
+"""Longest time between changes of one value in one step of undo, such as a drag."""
 
 
 @dataclass(frozen=True, eq=False)
 class Setting:
-    """Everything that undo brings back; equal to itself alone.
+    """Everything restored by undo; compared by identity.
 
     Attributes:
         levels: Subdivisions of each garment.
@@ -66,11 +66,11 @@ class History:
         self._last = now
 
     def after_undo(self) -> Setting:
-        """The setting that `undo` goes to; the present one where nothing is left to undo."""
+        """The setting after `undo`; the present one without an earlier step."""
         return self._steps[max(self._at - 1, 0)][0]
 
     def after_redo(self) -> Setting:
-        """The setting that `redo` goes to; the present one where nothing is left to redo."""
+        """The setting after `redo`; the present one without a next step."""
         return self._steps[min(self._at + 1, len(self._steps) - 1)][0]
 
     def undo(self) -> None:

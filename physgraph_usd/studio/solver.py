@@ -46,7 +46,7 @@ class FrameSolver:
         return bool(self._at)
 
     def go_on_from(self, other: FrameSolver) -> None:
-        """Start the next frame where another solver's cloth was; cold if it was never begun, or at other levels."""
+        """Start the next frame from another solver's last result, if at equal levels."""
         counts = [[len(chain) for chain in each.refinements] for each in (self, other)]
         if other.begun and counts[0] == counts[1]:
             self.refiner.go_on_from(other.refiner)
@@ -102,7 +102,7 @@ class FrameSolver:
         return found
 
     def _lead_in(self, shot: Shot, time: float | None) -> None:
-        """Begin in the middle of a shot, where its cage crosses, with the cage walked there, as a run does."""
+        """Begin in the middle of a shot with the cage advanced from an earlier frame, if the cage crosses."""
         earlier = [] if time is None else shot.times_until(time)
         found = cages_walked(shot.scene, self._settings, shot.frame, times=earlier, threads=cores())
         if found is not None:

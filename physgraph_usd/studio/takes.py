@@ -18,7 +18,7 @@ from .solver import FrameSolver
 MOST_BYTES = 1 << 30
 """Memory for the frames of a range."""
 KEPT_PER_POINT = 120
-"""Bytes that a solved frame keeps for a vertex: its position, and what the next frame starts from."""
+"""Bytes of a take per vertex: its position, and the solver's state."""
 FRESH, STALE, MISSING = "fresh", "stale", "missing"
 
 
@@ -48,12 +48,12 @@ class Shown:
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """The state that a frame is solved from.
+    """The start of a frame's solve.
 
     Attributes:
-        setting: What is tried.
-        shot: The shot read with it.
-        solver: The solver, where its cloth stands; copied for each frame.
+        setting: The setting.
+        shot: The shot, read with the setting.
+        solver: The solver with the start positions; copied for each frame.
     """
 
     setting: Setting
@@ -78,7 +78,7 @@ class Start:
 
 @dataclass(frozen=True, eq=False)
 class Take:
-    """A solved frame, and where its cloth stands, to go on from."""
+    """A solved frame, and the solver's state after it."""
 
     start: Start
     shown: Shown
@@ -90,7 +90,7 @@ class Take:
 
 
 class Takes:
-    """The frames of a shot that were solved in order, by time code and setting; the oldest go where memory ends."""
+    """Takes of a shot, solved in order, by time code and setting; the oldest are dropped at a limit of memory."""
 
     def __init__(self) -> None:
         """Hold no frame."""
@@ -101,12 +101,12 @@ class Takes:
         return None if time is None else self._kept.get((time, setting))
 
     def states(self, times: Sequence[float], setting: Setting) -> list[str]:
-        """Of each frame `FRESH`, `STALE` where it was solved with other settings alone, or `MISSING`."""
+        """For each frame: `FRESH`, `STALE` (solved with another setting only) or `MISSING`."""
         solved = {time for time, _ in self._kept}
         return [FRESH if (time, setting) in self._kept else STALE if time in solved else MISSING for time in times]
 
     def solve_next(self, times: Sequence[float], start: Start, cancelled: Callable[[], bool]) -> float | None:
-        """Solve the first frame of a range that is not fresh, from the frame before it.
+        """Solve a range's first missing or stale frame, from the frame before.
 
         Args:
             times: The range, in order; its first frame is solved as a run's.
@@ -130,6 +130,6 @@ class Takes:
 
     @staticmethod
     def room(solver: FrameSolver) -> int:
-        """How many frames of one setting memory holds; there is room for two settings."""
+        """Most takes of one setting, with room for two settings in memory."""
         count = sum(chain[-1].mesh.vertex_count for chain in solver.refinements if chain)
         return max(1, MOST_BYTES // (2 * KEPT_PER_POINT * max(count, 1)))

@@ -1,4 +1,4 @@
-"""Time: the frame, the range that is solved in the background, and playing it."""
+"""Controls of time: frame, range and playback."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ PLAY, PAUSE = "Play", "Pause"
 
 
 class TimePanel:
-    """The controls of time; nothing where the shot has one frame."""
+    """Controls of time, for a shot of several frames."""
 
     def __init__(self, desk: Desk) -> None:
         """Add the controls."""
@@ -74,7 +74,7 @@ class TimePanel:
 
 
 def nearest(times: Sequence[float], time: float) -> float:
-    """The sample that is nearest to a time code."""
+    """The sample nearest to a time code."""
     return min(times, key=lambda each: abs(each - time))
 
 

@@ -1,4 +1,4 @@
-"""A shot read with what an artist tries on it, and the layer that keeps it."""
+"""Reads a shot with an artist's setting, and saves the setting as a layer."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from .setting import Setting
 
 
 class TriedShot:
-    """A shot file and what is tried on it; the file is never edited.
+    """A shot file, read with different settings; the file is never edited.
 
     Attributes:
         opened: The shot as authored.
@@ -84,7 +84,7 @@ class TriedShot:
         }
 
     def _with_maps(self, painted: Mapping[str, Mapping[str, np.ndarray]]) -> Shot:
-        """The shot with painted maps, opened again where they changed."""
+        """The shot with painted maps, opened again after a change of the maps."""
         if not painted:
             return self.opened
         if self._painted[0] is not painted:

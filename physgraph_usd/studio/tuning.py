@@ -19,7 +19,7 @@ from .values import MAPS, TUNABLES
 
 
 class Tuning:
-    """A shot and the settings tried on it; nothing is solved here.
+    """A shot and the settings tried on it, without a solver.
 
     Attributes:
         garments: Prim paths of the garments.
@@ -55,7 +55,7 @@ class Tuning:
 
     @property
     def codes(self) -> tuple[float, ...]:
-        """The shot's time codes; () where it has no samples."""
+        """The shot's time codes; () for a shot without samples."""
         return tuple(time for time in self.times if time is not None)
 
     def codes_in(self, span: tuple[float, float] | None) -> list[float]:
@@ -63,7 +63,7 @@ class Tuning:
         return [time for time in self.codes if span and span[0] <= time <= span[1]]
 
     def value(self, garment: str, name: str) -> float | None:
-        """A tunable value of a garment in the frame, SI; None where nothing gives one."""
+        """A tunable value of a garment in the frame, SI; None if not set."""
         return TUNABLES[name].read(self.shot.frame(self.time).garments[self._index(garment)])
 
     def tries(self, garment: str, name: str) -> bool:
@@ -85,7 +85,7 @@ class Tuning:
         self._try(garment, self._values(garment) | _rounded({name: value}), TUNABLES[name].label, joins=True)
 
     def reset(self, garment: str, name: str) -> None:
-        """Take a value from the shot again, where it was tried.
+        """Return a value to the shot's.
 
         Raises:
             UsageError: The garment is unknown.
@@ -94,7 +94,7 @@ class Tuning:
         self._try(garment, values, f"{GARMENT[name].label} as authored")
 
     def set_as_authored(self, garment: str) -> None:
-        """Take a garment's values and maps from the shot again; its level stays.
+        """Return a garment's values and maps to the shot's; the level is kept.
 
         Raises:
             UsageError: The garment is unknown.
@@ -105,7 +105,7 @@ class Tuning:
         self._try(garment, values, "all as authored", **others)
 
     def set_preset(self, garment: str, preset: str) -> None:
-        """Try a fabric's values in place of those that were tried.
+        """Replace the tried fabric values by a preset's.
 
         Raises:
             UsageError: The garment or the fabric is unknown.
@@ -115,7 +115,7 @@ class Tuning:
         self.set_fabric(garment, fabric_values(PRESETS[preset]), preset)
 
     def set_fabric(self, garment: str, values: Mapping[str, float], name: str) -> None:
-        """Try values in place of the fabric's that were tried; ``name`` is what undo calls them.
+        """Replace the tried fabric values by others; ``name`` is the name of the step of undo.
 
         Raises:
             UsageError: The garment is unknown, or a value cannot be used.
@@ -137,7 +137,7 @@ class Tuning:
         self._try(garment, self._values(garment), GARMENT[name].label, painted=painted)
 
     def set_level(self, garment: str, level: int) -> None:
-        """Try another number of subdivisions.
+        """Set the number of subdivisions.
 
         Raises:
             UsageError: The garment is unknown, or the level is outside its limits.
@@ -154,12 +154,12 @@ class Tuning:
         self._put(replace(self.setting, contact=on), "contact on" if on else "contact off")
 
     def undo(self) -> None:
-        """Take the last change back."""
+        """Undo the last change."""
         self.shot = self._tried.read(self.history.after_undo())
         self.history.undo()
 
     def redo(self) -> None:
-        """Make the change again that was taken back last."""
+        """Redo the last undone change."""
         self.shot = self._tried.read(self.history.after_redo())
         self.history.redo()
 
@@ -181,11 +181,11 @@ class Tuning:
         self._put(setting, change, joins=joins)
 
     def _put(self, setting: Setting, change: str, *, joins: bool = False) -> None:
-        """Go on to a setting; one that cannot be used changes nothing."""
+        """Make a setting the present one; an invalid setting changes nothing."""
         self.shot = self._tried.read(setting)
         self.history.put(setting, change, joins=joins)
 
 
 def _rounded(values: Mapping[str, float]) -> dict[str, float]:
-    """Values as floats that a layer can hold."""
+    """Values rounded to single precision, as in a layer."""
     return {name: float(np.float32(value)) for name, value in values.items()}

@@ -1,4 +1,4 @@
-"""The values of a garment: a number box and a slider for each, presets, and what puts them back."""
+"""Controls of a garment's values: number boxes, sliders, presets and reset."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ div:has(> .value) + div .mantine-NumberInput-root, div:has(> .value) + div .mant
 div:has(> .value) + div > .mantine-Flex-root > div:first-child {display: none}
 div:has(> .value) {margin: -0.6em 0 -0.2em 0}
 </style>"""
-"""Under a number box a slider fills its row: its own number is a place on a logarithmic scale."""
+"""Hides the sliders' own numbers, which are places on a logarithmic scale."""
 
 
 class ValuePanel:
@@ -92,7 +92,7 @@ class ValuePanel:
             put(self._preset, value=OWN_VALUES)
 
     def _write(self, tunable: Tunable, number: Any | None, slider: Any | None) -> None:
-        """Write a value into its number box and its slider, where given."""
+        """Write a value into a number box and a slider, unless None."""
         value = self._desk.session.value(self._desk.garment, tunable.name)
         if number is not None:
             shown, decimals = tunable.shown(0.0 if value is None else value)

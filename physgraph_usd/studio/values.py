@@ -43,13 +43,13 @@ class Tunable:
 
     @property
     def title(self) -> str:
-        """The label without "Stiffness", which would not fit beside a number, and the unit, which says as much."""
+        """The label, shortened by "Stiffness" to fit beside a number box, and the unit."""
         short = self.label.removesuffix(" Stiffness")
         return f"{short} [{self.unit}]" if self.unit else short
 
     @property
     def hint(self) -> str:
-        """The effect that one sees, and its attribute."""
+        """Visible effect of the value, and the attribute's name."""
         return f"{SAYS[self.name]} {GARMENT[self.name].name}"
 
     @property
@@ -58,12 +58,12 @@ class Tunable:
         return GARMENT[self.name].soft or (0.0, 1.0)
 
     def shown(self, value: float) -> tuple[float, int]:
-        """A value as the page shows it, to three figures, and how many decimals that takes."""
+        """A value in the shown unit, rounded to three figures, and its number of decimals."""
         number = float(f"{value * self.factor:.3g}")
         return number, max(0, 2 - int(np.floor(np.log10(abs(number))))) if number else 0
 
     def place(self, value: float) -> float:
-        """The place of a value on the slider, 0 to 1; values beyond its ends are at them."""
+        """The place of a value on the slider, clamped to 0 to 1."""
         numbers = (*self.ends, value)
         low, high, at = np.log10(np.maximum(numbers, 1e-12)) if self.decades else numbers
         return float(np.clip((at - low) / (high - low), 0.0, 1.0))
@@ -116,7 +116,7 @@ SAYS = {
     "refine:detail": "Times the folds that were added; 0: a smooth surface.",
     "contact:offset": "Higher: cloth keeps farther off the bodies.",
 }
-"""The effect that one sees when a value changes, by the schema's short name."""
+"""Visible effect of each value, by the schema's short name."""
 
 MAPS = tuple(name for name, row in GARMENT.items() if row.group == PAINTED and name != "grain")
 """The painted maps that can be seen and painted, by the schema's short names."""
