@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import html
+import io
 from collections.abc import Callable, Mapping
-from contextlib import suppress
+from contextlib import redirect_stdout, suppress
 from pathlib import Path
 from time import sleep
 from typing import Any
@@ -63,7 +64,8 @@ class TunePage:
         looked = {"time": self._session.time, "garment": self._desk.garment, "camera": self._camera}
         with suppress(LayerError):  # A folder that cannot be written to; saving the layer has said so.
             self._desk.notes.save(looked | {"view": self._view.looked, "values": tried})
-        self._server.stop()
+        with redirect_stdout(io.StringIO()):  # The viewer's own words.
+            self._server.stop()
 
     def busy(self, what: str) -> None:
         """Say that work has begun."""

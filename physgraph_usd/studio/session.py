@@ -74,8 +74,10 @@ class TuneSession(Tuning):
         self.kept: Take | None = None
 
     def close(self) -> None:
-        """Let go of the stage."""
+        """Let go of the stage and of all solvers; the session cannot be used afterwards."""
         self._tried.close()
+        self.takes, self.kept, self._shown = Takes(), None, None
+        del self.solver
 
     @property
     def refinements(self) -> Sequence[Sequence[Refinement]]:
