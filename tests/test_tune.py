@@ -279,6 +279,14 @@ def test_a_drag_is_one_step_of_undo():
     assert steps == ["Pin", "Pin", "Density", "Density"]
 
 
+def test_a_value_told_twice_is_one_step_of_undo(session: TuneSession):
+    session.history._seconds = iter(range(0, 100, 10)).__next__
+    session.set_value(CLOTH, "density", 0.9)
+    session.set_value(CLOTH, "density", 0.9)
+    session.undo()
+    assert session.history.undone_next == ""
+
+
 def test_a_value_is_taken_from_the_shot_again(session: TuneSession):
     first = session.value(CLOTH, "density")
     session.set_value(CLOTH, "density", 0.9)

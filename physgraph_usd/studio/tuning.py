@@ -82,7 +82,9 @@ class Tuning:
         """
         if name not in TUNABLES:
             raise UsageError(f"unknown value '{name}'; known values: {', '.join(TUNABLES)}")
-        self._try(garment, self._values(garment) | _rounded({name: value}), TUNABLES[name].label, joins=True)
+        tried, given = self._values(garment), _rounded({name: value})
+        if tried.get(name) != given[name]:  # Pages tell a number twice: when it is typed, and when it is left.
+            self._try(garment, tried | given, TUNABLES[name].label, joins=True)
 
     def reset(self, garment: str, name: str) -> None:
         """Return a value to the shot's.
