@@ -103,8 +103,8 @@ class Tuning:
         """
         values = {name: value for name, value in self._values(garment).items() if name not in TUNABLES}
         painted = {path: maps for path, maps in self.setting.painted.items() if path != garment}
-        others = {"painted": painted} if garment in self.setting.painted else {}
-        self._try(garment, values, "all as authored", **others)
+        kept = painted if garment in self.setting.painted else self.setting.painted
+        self._try(garment, values, "all as authored", painted=kept)
 
     def set_preset(self, garment: str, preset: str) -> None:
         """Replace the tried fabric values by a preset's.
