@@ -25,6 +25,8 @@ from physgraph_usd.studio.values import MAPS, TUNABLES
 
 SECONDS = float(os.environ.get("PHYSGRAPH_TUNE_SECONDS", "120"))
 """How long the moves go on; 3600 for an hour."""
+TOO_WEAK = "the refined cloth "
+"""The beginning of what the solver says of values that cannot hold the cloth: it leaves its cage, or its size."""
 MOST_GROWTH = 150e6
 """Bytes by which memory may grow from a quarter of the time to the end."""
 
@@ -98,6 +100,7 @@ def test_random_moves_leave_memory_bounded_and_nothing_stale(tmp_path: Path):
         assert shown.frame.time == session.time
         assert shown.frame.garments[0].fabric == session.shot.frame(session.time).garments[0].fabric
     assert log.count > 10
-    assert log.errors == []
+    assert [error for error in log.errors if TOO_WEAK not in error] == []
     quarter = max(size for at, size in sizes if at < 0.3 * SECONDS)
-    assert sizes[-1][1] - quarter < MOST_GROWTH, [size // 10**6 for _, size in sizes[:: max(1, len(sizes) // 20)]]
+    print(f"{len(sizes)} moves, {len(log.errors)} too weak,", [size // 10**6 for _, size in sizes[:: len(sizes) // 20]])
+    assert sizes[-1][1] - quarter < MOST_GROWTH
