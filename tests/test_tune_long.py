@@ -102,5 +102,4 @@ def test_random_moves_leave_memory_bounded_and_nothing_stale(tmp_path: Path):
     assert log.count > 10
     assert [error for error in log.errors if TOO_WEAK not in error] == []
     quarter = max(size for at, size in sizes if at < 0.3 * SECONDS)
-    print(f"{len(sizes)} moves, {len(log.errors)} too weak,", [size // 10**6 for _, size in sizes[:: len(sizes) // 20]])
-    assert sizes[-1][1] - quarter < MOST_GROWTH
+    assert sizes[-1][1] - quarter < MOST_GROWTH, [size // 10**6 for _, size in sizes[:: len(sizes) // 20]]

@@ -93,8 +93,7 @@ class TuneSession(Tuning):
         if time not in self.times:
             raise UsageError(f"no sample at time code {time}; they run from {self.times[0]} to {self.times[-1]}")
         self.time, self._shown = time, None
-        take = self.takes.fresh(time, self.setting)
-        if take is not None:
+        if take := self.takes.fresh(time, self.setting):
             self.solver, self._solves = copy(take.start.solver), take.setting
             self._shown = take.setting, take.shown
 
@@ -213,15 +212,14 @@ class TuneSession(Tuning):
         self._prepare()
         rough = rough and self.solver.begun  # A first frame is as `refine` solves it.
         state = self.solver.solve(self.shot, self.time, rough=rough, seen=seen, cancelled=cancelled)
-        given = {"seconds": clock.perf_counter() - began, "settled": not (rough or cancelled())}
-        self._shown = self.setting, Shown.of(self.shot.frame(self.time), state, **given)
-        return self._shown[1]
+        shown = Shown.of(self.shot.frame(self.time), state, began=began, settled=not (rough or cancelled()))
+        self._shown = self.setting, shown
+        return shown
 
     def _prepare(self) -> None:
         """Build a new solver if levels or maps changed, starting from the last positions."""
-        setting, before = self.setting, self._solves
+        setting, before, old = self.setting, self._solves, self.solver
         if setting.levels != before.levels or setting.painted is not before.painted:
-            old = self.solver
             self.solver = FrameSolver(self.shot, setting.levels, contact=setting.contact, device=self._device)
             self.solver.go_on_from(old)
         if setting.contact != before.contact:

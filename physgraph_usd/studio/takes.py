@@ -41,8 +41,9 @@ class Shown:
     settled: bool
 
     @staticmethod
-    def of(frame: Frame, state: State, *, seconds: float, settled: bool) -> Shown:
-        """A frame and the solver's result."""
+    def of(frame: Frame, state: State, *, began: float, settled: bool) -> Shown:
+        """A frame and the solver's result; reading ``began`` at that `time.perf_counter` value."""
+        seconds = clock.perf_counter() - began
         return Shown(frame, state.points, tuple(map(dict, state.telemetry)), seconds, settled)
 
 
@@ -71,8 +72,7 @@ class Start:
         if cold:
             solver.feel(contact=self.setting.contact)
         state = solver.solve(self.shot, time, cancelled=cancelled)
-        seconds = clock.perf_counter() - began
-        shown = Shown.of(self.shot.frame(time), state, seconds=seconds, settled=not cancelled())
+        shown = Shown.of(self.shot.frame(time), state, began=began, settled=not cancelled())
         return Take(replace(self, solver=solver), shown)
 
 
