@@ -35,7 +35,7 @@ from physgraph_usd.studio.maps import HIGH, LOW, MEASURED, MIDDLE, stretches
 from physgraph_usd.studio.notes import Notes
 from physgraph_usd.studio.session import Shown, TuneSession
 from physgraph_usd.studio.setting import History, Setting
-from physgraph_usd.studio.takes import FRESH, STALE
+from physgraph_usd.studio.takes import FRESH, MOST_SETTINGS, STALE
 from physgraph_usd.usd.read.reader import open_shot
 from physgraph_usd.usd.write.tag import tag
 
@@ -228,6 +228,7 @@ class Log:
 def test_changes_during_a_solve_are_solved_once_and_then_settled(session: TuneSession):
     log = Log()
     loop = SolveLoop(session, log, rest_seconds=0.05)
+    loop.start()
     loop.ask(lambda own: own.set_value(CLOTH, "density", -1.0))
     for k in range(10):
         loop.ask(lambda own, k=k: own.set_value(CLOTH, "bendStiffness", STIFF * (k + 1)))
@@ -316,6 +317,31 @@ def test_a_and_b_are_exchanged_with_their_cloth(session: TuneSession):
     assert not session.go_on(None)
 
 
+def test_a_is_kept_when_it_is_settled(session: TuneSession):
+    session.keep()
+    assert session.kept_shown is not None
+    assert session.kept_shown.settled
+    session.set_time(session.times[1])
+    assert session.go_on(None, lambda: True)
+    assert session.kept_shown is None
+    assert session.go_on(None)
+    assert session.kept_shown is not None
+    assert session.kept_shown.settled
+
+
+def test_takes_of_few_settings_are_kept(session: TuneSession):
+    """Each held the levels and factors of its solver."""
+    span, solvers = (session.codes[0], session.codes[0]), list[weakref.ref[object]]()
+    for k in range(MOST_SETTINGS + 3):
+        session.paint(CLOTH, "bendScale", np.full_like(session.painted(CLOTH, "bendScale"), k + 1.0))
+        assert session.go_on(span)
+        solvers.append(weakref.ref(session.solver.refiner._cloth))
+    gc.collect()
+    assert sum(each() is not None for each in solvers) <= MOST_SETTINGS
+    session.undo()
+    assert session.takes.fresh(session.codes[0], session.setting) is not None
+
+
 def test_a_painted_map_is_solved_and_saved_as_a_primvar(session: TuneSession, tmp_path: Path):
     before = points(session.settle())
     held = session.painted(CLOTH, "pin")
@@ -365,6 +391,7 @@ def test_a_loop_plays_the_range_round_and_goes_on_with_changes(session: TuneSess
     log = Log()
     log.go.set()
     loop = SolveLoop(session, log, rest_seconds=0.01)
+    loop.start()
 
     def play(_: TuneSession) -> None:
         loop.span, loop.playing = (session.codes[0], session.codes[2]), True
@@ -398,7 +425,7 @@ def test_strains_are_of_the_stretched_cloth():
     found = stretches(refiner, frame_of(rest), 0, flat * [1.1, 0.95, 1.0])
     assert np.sort(found[:, :2], axis=1) == pytest.approx(np.array([[-5.0, 10.0]] * len(found)), abs=0.01)
     assert found[:, 2] == pytest.approx(np.full(len(found), -5.0), abs=0.01)
-    colors = MEASURED["strain along weft"].colors(np.array([-9.0, 0.0, 9.0]))
+    colors = MEASURED["strain along weft"][0].colors(np.array([-9.0, 0.0, 9.0]))
     assert colors[:, :3].tolist() == [LOW.tolist(), MIDDLE.tolist(), HIGH.tolist()]
 
 

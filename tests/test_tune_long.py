@@ -84,6 +84,7 @@ def test_random_moves_leave_memory_bounded_and_nothing_stale(tmp_path: Path):
     chance, log, process = random.Random(1), Log(), psutil.Process()
     with closing(TuneSession(cloth_shot(tmp_path / "sheet.usda", size=(16, 12)), garments=[CLOTH])) as session:
         loop = SolveLoop(session, log, rest_seconds=0.05)
+        loop.start()
         began, sizes = clock.monotonic(), list[tuple[float, int]]()
         while clock.monotonic() - began < SECONDS:
             loop.ask(lambda own: moved(own, loop, chance))

@@ -12,7 +12,7 @@ from ..solver.mesh.topology import PolygonMesh, adjacency
 PAINT, SMOOTH = "paint", "smooth"
 
 
-@dataclass
+@dataclass(frozen=True)
 class Brush:
     """A brush.
 
@@ -25,7 +25,7 @@ class Brush:
     """
 
     radius: float
-    value: float = 0.0
+    value: float
     strength: float = 0.5
     mode: str = PAINT
     mirrored: bool = False

@@ -6,7 +6,7 @@ import html
 from collections.abc import Callable
 from typing import Any
 
-from .loop import Change
+from .loop import Change, SolveLoop
 from .notes import Notes
 from .picture import Picture
 from .session import TuneSession
@@ -17,23 +17,26 @@ class Desk:
 
     Attributes:
         gui: The page's controls, viser's.
-        session: The session; it is changed through `ask` alone.
-        picture: Its picture.
-        notes: What is kept over a restart.
+        session: The session, owned by the loop's thread.
+        loop: The loop; changes of the session go through `SolveLoop.ask`.
+        picture: The picture.
+        notes: Presets and views kept over a restart.
         garment: Prim path of the garment in the panels.
-        ask: Has the session changed by the thread that owns it.
     """
 
-    def __init__(self, gui: Any, session: TuneSession, picture: Picture, notes: Notes) -> None:
-        """Begin with the first garment; ``ask`` is to be set before the page is used."""
-        self.gui, self.session, self.picture, self.notes = gui, session, picture, notes
+    def __init__(self, gui: Any, session: TuneSession, *, loop: SolveLoop, picture: Picture, notes: Notes) -> None:
+        """Begin with the first garment."""
+        self.gui, self.session, self.loop, self.picture, self.notes = gui, session, loop, picture, notes
         self.garment = session.garments[0]
-        self.ask: Callable[[Change], None] = lambda _: None
 
     @property
     def index(self) -> int:
         """Number of the garment in the panels."""
         return self.session.garments.index(self.garment)
+
+    def ask(self, change: Change) -> None:
+        """Have the session changed by the loop's thread."""
+        self.loop.ask(change)
 
     def on(self, control: Any, change: Callable[[TuneSession, Any], None]) -> Any:
         """Have the session changed when an artist, not the page, changes a control; returns the control.

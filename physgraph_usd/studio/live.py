@@ -144,6 +144,7 @@ def serve(session: TuneSession, stream: BinaryIO) -> None:
                     if loop is None:
                         change(session)
                         loop = SolveLoop(session, answers)
+                        loop.start()
                     else:
                         loop.ask(change)
                 except PhysGraphError as error:

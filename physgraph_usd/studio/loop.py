@@ -55,11 +55,11 @@ class SolveLoop:
     """
 
     def __init__(self, session: TuneSession, watcher: Watcher, *, rest_seconds: float = REST_SECONDS) -> None:
-        """Start the thread, which solves the session's frame at once.
+        """Prepare the thread.
 
         Args:
-            session: The session; from here on it is the thread's.
-            watcher: Receives the results.
+            session: The session; from `start` on it belongs to the thread.
+            watcher: Receiver of the results.
             rest_seconds: Time without a change before a frame is settled.
         """
         self._session, self._watcher, self._rest = session, watcher, rest_seconds
@@ -69,6 +69,9 @@ class SolveLoop:
         self._changed, self._closing = threading.Condition(), False
         self._due = 0.0  # When the next frame may be played.
         self._thread = threading.Thread(target=self._work, name="tune", daemon=True)
+
+    def start(self) -> None:
+        """Start the thread, which solves the session's frame at once."""
         self._thread.start()
 
     @property

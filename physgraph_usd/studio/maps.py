@@ -25,21 +25,19 @@ MOST_STRAIN, MOST_DISTANCE = 5.0, 10.0
 
 @dataclass(frozen=True)
 class Map:
-    """How a map is found and coloured.
+    """Colours of a map.
 
     Attributes:
         name: What the page calls it.
         unit: Of its values.
         ends: Values in the full colours; grey is at ``middle``.
         middle: The value that changes nothing.
-        find: Finds the values of a solver's garment, by number, in a frame at fine positions [m].
     """
 
     name: str
     unit: str
     ends: tuple[float, float]
     middle: float
-    find: Callable[[Refiner, Frame, int, np.ndarray], np.ndarray]
 
     def colors(self, values: np.ndarray) -> np.ndarray:
         """Colours of values, shape (V,): bytes, shape (V, 4)."""
@@ -88,14 +86,18 @@ def crossings(refiner: Refiner, frame: Frame, index: int, points: np.ndarray) ->
     return np.zeros(len(points)) if found is None else np.maximum(found["crossing"], found["penetration"] > 0)
 
 
-MEASURED = {
-    each.name: each
-    for each in (
-        Map("strain along warp", "%", (-MOST_STRAIN, MOST_STRAIN), 0.0, lambda *at: stretches(*at)[:, 0]),
-        Map("strain along weft", "%", (-MOST_STRAIN, MOST_STRAIN), 0.0, lambda *at: stretches(*at)[:, 1]),
-        Map("compression", "%", (-MOST_STRAIN, 0.0), 0.0, lambda *at: np.minimum(stretches(*at)[:, 2], 0.0)),
-        Map("distance to bodies", "mm", (0.0, MOST_DISTANCE), MOST_DISTANCE, distances),
-        Map("crossings", "", (0.0, 1.0), 0.0, crossings),
+Finder = Callable[[Refiner, Frame, int, np.ndarray], np.ndarray]
+"""Finds the values of a solver's garment, by number, in a frame at fine positions [m], shape (V, 3)."""
+
+_SIGNED = (-MOST_STRAIN, MOST_STRAIN)
+MEASURED: dict[str, tuple[Map, Finder]] = {
+    each.name: (each, find)
+    for each, find in (
+        (Map("strain along warp", "%", _SIGNED, 0.0), lambda *at: stretches(*at)[:, 0]),
+        (Map("strain along weft", "%", _SIGNED, 0.0), lambda *at: stretches(*at)[:, 1]),
+        (Map("compression", "%", (-MOST_STRAIN, 0.0), 0.0), lambda *at: np.minimum(stretches(*at)[:, 2], 0.0)),
+        (Map("distance to bodies", "mm", (0.0, MOST_DISTANCE), MOST_DISTANCE), distances),
+        (Map("crossings", "", (0.0, 1.0), 0.0), crossings),
     )
 }
 """Maps that are measured in the solved cloth. Compression is what is left in the plane: shorter folds than the level's
@@ -109,7 +111,7 @@ def painted_map(name: str, largest: float) -> Map:
     row = GARMENT[name]
     middle = float(row.fallback or 0.0)
     ends = (min(row.minimum or 0.0, middle - 1.0), max(largest, middle + 1.0))
-    return Map(name, row.unit, ends, middle, lambda refiner, frame, index, points: np.zeros(len(points)))
+    return Map(name, row.unit, ends, middle)
 
 
 def find_map(
@@ -123,8 +125,8 @@ def find_map(
     if name == PLAIN or points is None:
         return None
     if name in MEASURED:
-        refiner = session.solver.refiner
-        return MEASURED[name], MEASURED[name].find(refiner, shown.frame, index, points)
+        measured, find = MEASURED[name]
+        return measured, find(session.solver.refiner, shown.frame, index, points)
     garment = session.garments[index]
     under = stroke is not None and (stroke.garment, stroke.name) == (garment, name)
     painted = stroke.values if stroke is not None and under else session.painted(garment, name)

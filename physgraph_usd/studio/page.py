@@ -50,12 +50,11 @@ class TunePage:
         notes = Notes(session.out)
         self._session = session
         self._server, self.url = guarded_server(port=port, label="physgraph-usd tune")
-        self._desk = Desk(self._server.gui, session, Picture(self._server, session), notes)
+        self.loop, picture = SolveLoop(session, self), Picture(self._server, session)
+        self._desk = Desk(self._server.gui, session, loop=self.loop, picture=picture, notes=notes)
         self._look_as(notes.looked)
         self._build()
-        self.loop = SolveLoop(session, self)
-        self._desk.ask = self.loop.ask
-        self._time.loop = self.loop
+        self.loop.start()
 
     def close(self) -> None:
         """End the thread and the server, and write the notes."""

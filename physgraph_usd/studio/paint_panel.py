@@ -25,14 +25,13 @@ class PaintPanel:
         self._name, self._stroke = OFF, None
         self._attached: dict[int, Any] = {}  # Handles that have the callbacks.
         size = desk.picture.size
-        self.brush = Brush(radius=0.05 * size)
         choice = gui.add_dropdown(
             "Paint", (OFF, *MAPS), hint="Drag on the refined cloth; drag beside it to turn the view."
         )
         self._choice = desk.on(choice, self.choose)
         self._value = gui.add_number("Value", 0.0, step=0.01)
-        self._radius = gui.add_slider("Radius [m]", 0.005 * size, 0.3 * size, 0.001 * size, self.brush.radius)
-        self._strength = gui.add_slider("Strength", 0.05, 1.0, 0.05, self.brush.strength)
+        self._radius = gui.add_slider("Radius [m]", 0.005 * size, 0.3 * size, 0.001 * size, 0.05 * size)
+        self._strength = gui.add_slider("Strength", 0.05, 1.0, 0.05, 0.5)
         self._mode = gui.add_dropdown("Brush", (PAINT, SMOOTH))
         self._mirror = gui.add_checkbox("Mirror", False, hint="Paints the other side too, mirrored at rest.")
         flood = gui.add_button("Fill", hint="Gives every vertex the value.")
@@ -80,9 +79,9 @@ class PaintPanel:
         stroke = self._stroke
         if stroke is None or (stroke.garment, stroke.name) != (garment, self._name):
             stroke = Stroke(garment, self._name, session.painted(garment, self._name))
-        brush = self.brush
-        brush.radius, brush.strength, brush.value = self._radius.value, self._strength.value, self._limited()
-        brush.mode, brush.mirrored = self._mode.value, self._mirror.value
+        controls = self._radius, self._strength, self._mode, self._mirror
+        radius, strength, mode, mirrored = (each.value for each in controls)
+        brush = Brush(radius, self._limited(), strength=strength, mode=mode, mirrored=mirrored)
         where = {"mesh": cage.mesh, "rest": cage.rest, "right": self._desk.picture.right}
         stroke.touch(brush, at, points[: cage.mesh.vertex_count], **where)
         self._stroke = self._desk.picture.stroke = stroke

@@ -98,8 +98,8 @@ class TuneSession(Tuning):
             self._shown = take.setting, take.shown
 
     def keep(self) -> None:
-        """Store the present setting and its cloth as A."""
-        shown = self.solve()
+        """Store the present setting and its settled cloth as A."""
+        shown = self.settle()
         self.kept = Take(Start(self.setting, self.shot, copy(self.solver)), shown)
 
     def swap(self) -> None:
@@ -143,12 +143,11 @@ class TuneSession(Tuning):
             span: First and last time code to solve in order into `takes`, with A's setting too; None solves none.
             cancelled: As in `settle`.
 
-        Raises:
-            SolveError: A term of the potential is not finite.
-            StageError: A frame cannot be read.
+        Errors are those of `solve`.
         """
         if self.kept is not None and self.kept_shown is None:
-            self.kept = self.kept.start.at(self.time, cancelled)
+            take = self.kept.start.at(self.time, cancelled)
+            self.kept = take if take.shown.settled else self.kept
             return True
         return self._solve_next(self.codes_in(span), cancelled) is not None
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 JOINED_SECONDS = 1.0
-"""Longest time between changes of one value in one step of undo, such as a drag."""
+"""Longest pause between the changes of a drag, in one step of undo [s]."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,9 @@ from .setting import Setting
 from .solver import FrameSolver
 
 MOST_BYTES = 1 << 30
-"""Memory for the frames of a range."""
+"""Memory for the takes of all settings, without their solvers' levels and factors."""
+MOST_SETTINGS = 4
+"""Most settings with takes: the present one, A and steps of undo; each may have levels and factors of its own."""
 KEPT_PER_POINT = 120
 """Bytes of a take per vertex: its position, and the solver's state."""
 FRESH, STALE, MISSING = "fresh", "stale", "missing"
@@ -90,20 +92,20 @@ class Take:
 
 
 class Takes:
-    """Takes of a shot, solved in order, by time code and setting; the oldest are dropped at a limit of memory."""
+    """Takes of a shot, solved in order, of the settings solved last, by setting and time code."""
 
     def __init__(self) -> None:
-        """Hold no frame."""
-        self._kept: dict[tuple[float, Setting], Take] = {}
+        """Hold no take."""
+        self._kept: dict[Setting, dict[float, Take]] = {}
 
     def fresh(self, time: float | None, setting: Setting) -> Take | None:
         """The take of a frame with a setting, or None."""
-        return None if time is None else self._kept.get((time, setting))
+        return None if time is None else self._kept.get(setting, {}).get(time)
 
     def states(self, times: Sequence[float], setting: Setting) -> list[str]:
         """For each frame: `FRESH`, `STALE` (solved with another setting only) or `MISSING`."""
-        solved = {time for time, _ in self._kept}
-        return [FRESH if (time, setting) in self._kept else STALE if time in solved else MISSING for time in times]
+        fresh, solved = self._kept.get(setting, {}), {time for takes in self._kept.values() for time in takes}
+        return [FRESH if time in fresh else STALE if time in solved else MISSING for time in times]
 
     def solve_next(self, times: Sequence[float], start: Start, cancelled: Callable[[], bool]) -> float | None:
         """Solve a range's first missing or stale frame, from the frame before.
@@ -114,22 +116,27 @@ class Takes:
             cancelled: Asked before each step: whether to stop there; such a frame is not kept.
 
         Returns:
-            The frame's time code, whether it is kept or cancelled; None where all that memory holds are fresh.
+            The frame's time code, also if cancelled; None without such a frame among those that memory holds.
         """
-        room, setting = self.room(start.solver), start.setting
+        setting, room = start.setting, self._room(start.solver)
         lacking = next((k for k in range(min(len(times), room)) if not self.fresh(times[k], setting)), None)
         if lacking is None:
             return None
         time, before = times[lacking], self.fresh(times[lacking - 1], setting) if lacking else None
         take = (start if before is None else before.start).at(time, cancelled, cold=before is None)
         if take.shown.settled:
-            self._kept[time, setting] = take
-            for old in list(self._kept)[: -2 * room]:
-                del self._kept[old]
+            takes = self._kept.pop(setting, {})
+            self._kept[setting] = takes  # The last of the settings now.
+            takes.pop(time, None)
+            takes[time] = take
+            for old in list(takes)[:-room]:
+                del takes[old]
+            for other in list(self._kept)[:-MOST_SETTINGS]:
+                del self._kept[other]
         return time
 
     @staticmethod
-    def room(solver: FrameSolver) -> int:
-        """Most takes of one setting, with room for two settings in memory."""
+    def _room(solver: FrameSolver) -> int:
+        """Most takes of one setting."""
         count = sum(chain[-1].mesh.vertex_count for chain in solver.refinements if chain)
-        return max(1, MOST_BYTES // (2 * KEPT_PER_POINT * max(count, 1)))
+        return max(1, MOST_BYTES // (MOST_SETTINGS * KEPT_PER_POINT * max(count, 1)))

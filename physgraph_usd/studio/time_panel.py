@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from itertools import pairwise
 
 from .desk import Desk, put
-from .loop import SolveLoop
 from .session import TuneSession
 from .takes import FRESH, MISSING, STALE
 
@@ -21,7 +20,6 @@ class TimePanel:
         """Add the controls."""
         self._desk, gui = desk, desk.gui
         self._times = desk.session.codes
-        self.loop: SolveLoop | None = None
         if len(self._times) < 2:
             return
         first, last = self._times[0], self._times[-1]
@@ -49,7 +47,7 @@ class TimePanel:
         """Write the frame, and which frames of the range are solved with the present values."""
         if len(self._times) < 2:
             return
-        session, playing = self._desk.session, self.loop is not None and self.loop.playing
+        session, playing = self._desk.session, self._desk.loop.playing
         put(self._frame, value=session.time)
         put(self._play, label=PAUSE if playing else PLAY)
         states = session.takes.states(self._times, session.setting)
@@ -57,20 +55,17 @@ class TimePanel:
 
     def play(self, session: TuneSession) -> None:
         """Play the range, or pause."""
-        if self.loop is not None and len(self._times) > 1:
-            self.loop.playing = not self.loop.playing
-            self._set_span()
+        self._desk.loop.playing = not self._desk.loop.playing
+        self._set_span()
 
     def _step(self, session: TuneSession, way: int) -> None:
-        if self.loop is not None:
-            self.loop.playing = False
+        self._desk.loop.playing = False
         at = self._times.index(nearest(self._times, session.time or self._times[0])) + way
         session.set_time(self._times[at % len(self._times)])
 
     def _set_span(self) -> None:
-        if self.loop is not None:
-            first, last = self._range.value
-            self.loop.span = (first, last) if self._solving.value or self.loop.playing else None
+        loop, (first, last) = self._desk.loop, self._range.value
+        loop.span = (first, last) if self._solving.value or loop.playing else None
 
 
 def nearest(times: Sequence[float], time: float) -> float:

@@ -1,4 +1,4 @@
-"""The terms of one level that last as long as the materials, and their metric."""
+"""Terms of one level for one set of materials, and the metric of the terms."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ from ..scene import Garment, GarmentFrame
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """Elastic terms that depend on some of the fabrics' values.
+    """Elastic terms of fabrics.
 
     Attributes:
-        fabrics: Fabrics with those values, and the defaults of all others.
+        fabrics: The fabrics, with values of no effect on the terms set to constants.
         level: The level, with the rest lengths of these fabrics.
         terms: The terms.
     """
@@ -48,12 +48,12 @@ class Part:
 
 @dataclass(frozen=True, eq=False)
 class Lent:
-    """The results of other materials that new ones may use.
+    """Metric and elastic terms of the previous materials, for use with new materials.
 
     Attributes:
-        metric: Their metric.
-        stiffness: Diagonal of their Hessian at rest [N/m].
-        in_plane, bending: Their elastic terms.
+        metric: Factorised rest Hessian.
+        stiffness: Diagonal of the Hessian at rest [N/m], shape (V,).
+        in_plane, bending: Elastic terms.
     """
 
     metric: Metric
@@ -72,7 +72,7 @@ class LevelForces:
         garments: The garments.
         frames: Values of the garments at one time code.
         gravity: [m/s^2], shape (3,).
-        lent: Results of other materials: their metric for `rough_metric`, and terms that are the same here; or None.
+        lent: Metric of previous materials for `rough_metric`, and terms to reuse for equal fabrics; or None.
     """
 
     plain: Level
@@ -124,7 +124,7 @@ class LevelForces:
 
     @cached_property
     def rough_metric(self) -> Metric:
-        """The metric, or the lent one scaled to the diagonal of these terms, which needs no factorisation."""
+        """The lent metric, scaled to the new diagonal without a factorisation; `metric` without a lent one."""
         if self.lent is None or self._factorised:
             return self.metric
         return self.lent.metric.scaled(self._stiffness / self.lent.stiffness)
@@ -168,7 +168,7 @@ class LevelForces:
         return "metric" in self.__dict__
 
     def lends(self) -> Lent | None:
-        """The results for other materials' `lent`; their metric is these terms' own, if factorised."""
+        """Metric and terms for the next materials; the lent metric again, if none was factorised here."""
         if self._factorised:
             return Lent(self.metric, self._stiffness, self._in_plane, self._bending)
         return None if self.lent is None else replace(self.lent, in_plane=self._in_plane, bending=self._bending)
