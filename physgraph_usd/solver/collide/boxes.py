@@ -122,6 +122,7 @@ class Boxes:
         parts: Boxes of the parts, in blocks [m].
         radius: Search distance of each cluster [m].
         asked: True for clusters with a queried vertex.
+        met: True for clusters that no axis separates from some other.
         low: Least corner of each cluster's paths, less the search distance [m].
         high: Greatest corner of each cluster's paths, plus the search distance [m].
     """
@@ -130,6 +131,7 @@ class Boxes:
     parts: wp.array(dtype=wp.float32)
     radius: wp.array(dtype=wp.float32)
     asked: wp.array(dtype=wp.bool)
+    met: wp.array(dtype=wp.bool)
     low: wp.array(dtype=wp.vec3f)
     high: wp.array(dtype=wp.vec3f)
 
@@ -206,6 +208,7 @@ def bound_clusters(first: wp.int32, parts: Topology, query: Query, boxes: Boxes)
     radius = WIDER * (radius + wp.float64(0.5) * query.floor)
     boxes.radius[i] = wp.float32(radius)
     boxes.asked[i] = asked == 1
+    boxes.met[i] = False
     low, high = wp.min(low, to_low) - wp.vec3d(radius), wp.max(high, to_high) + wp.vec3d(radius)
     boxes.low[i] = wp.vec3f(lower(low[0]), lower(low[1]), lower(low[2]))
     boxes.high[i] = wp.vec3f(upper(high[0]), upper(high[1]), upper(high[2]))
@@ -221,9 +224,11 @@ def put_part(boxes: Boxes, query: Query, k: wp.int32, c: wp.vec3i):
 
 
 @wp.kernel
-def bound_parts(first: wp.int32, parts: Topology, query: Query, which: wp.array(dtype=wp.int32), boxes: Boxes):
-    """Boxes of the parts of some clusters."""
-    i = which[first + wp.tid()]
+def bound_parts(first: wp.int32, parts: Topology, query: Query, boxes: Boxes):
+    """Boxes of the parts of the clusters that met another."""
+    i = first + wp.tid()
+    if not boxes.met[i]:
+        return
     for kind in range(3):
         row = kind * (parts.clusters + 1) + i
         for k in range(LANES * parts.first[row], LANES * parts.first[row + 1]):
@@ -239,7 +244,7 @@ def boxes_for(topology: Any, device: str) -> Any:
         setattr(boxes, name, wp.array(np.tile(block, size), dtype=wp.float32, device=device))
     boxes.low, boxes.high = (wp.empty(count, dtype=wp.vec3f, device=device) for _ in range(2))
     boxes.radius = wp.empty(count, dtype=wp.float32, device=device)
-    boxes.asked = wp.empty(count, dtype=wp.bool, device=device)
+    boxes.asked, boxes.met = (wp.empty(count, dtype=wp.bool, device=device) for _ in range(2))
     return boxes
 
 

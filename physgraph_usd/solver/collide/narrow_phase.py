@@ -18,11 +18,13 @@ WITHIN = wp.constant(wp.float64(20.0))
 """Largest distance of a body's edges and vertices from cloth that they push, in plays, of which an edge has twenty."""
 ALL = wp.constant(8)
 """Most blocks compared at a time."""
+KINDS = wp.constant(3)
+"""Kinds of pairs of two clusters: parts of the first with faces of the second, the reverse, and edges with edges."""
 
 
 @wp.struct
 class Found:
-    """Output of a search: start and count of each cluster pair's pairs of parts, and the fields of `Pairs`."""
+    """Output of a search: start and count of each task's pairs of parts, and the fields of `Pairs`."""
 
     begin: wp.array(dtype=wp.int32)
     count: wp.array(dtype=wp.int32)
@@ -162,14 +164,21 @@ def search_kind(
     i: wp.int32,
     j: wp.int32,
     count: wp.int32,
+    share: wp.int32,
+    shares_of: wp.int32,
 ):
-    """Write pairs of a cluster's parts of one kind and another's of a second; returns the number of pairs so far."""
+    """Write pairs of a cluster's parts of one kind and another's of a second; returns the number of pairs so far.
+
+    Of the cluster's parts, only those are taken whose numbers divided by `shares_of` leave `share`.
+    """
     room, size = boxes.radius[i] + boxes.radius[j], parts.clusters + 1
     for b in range(parts.first[first * size + i], parts.first[first * size + i + 1], ALL):
         near = boxes_near(boxes.clusters, j, boxes.parts, b, blocks_left(parts, first, i, b), room)
         while near != wp.uint64(0):
             k = LANES * b + lowest_bit(near)
             near = without_lowest(near)
+            if k % shares_of != share:
+                continue
             p = parts.parts[k]
             if not (boxes.asked[j] or query.asked[p[0]] or query.asked[p[1]] or query.asked[p[2]]):
                 continue
@@ -185,20 +194,31 @@ def search_kind(
 
 @wp.kernel
 def find_pairs(
-    start: wp.int32, parts: Topology, clusters: wp.array(dtype=wp.vec2i), query: Query, boxes: Boxes, found: Found
+    start: wp.int32,
+    parts: Topology,
+    clusters: wp.array(dtype=wp.vec2i),
+    tasks: wp.int32,
+    query: Query,
+    boxes: Boxes,
+    found: Found,
 ):
-    """Pairs of parts of each two clusters, counted even without room."""
-    n = start + wp.tid()
+    """Pairs of parts of each two clusters, counted even without room, in one task or in a task for each kind and share.
+
+    With several tasks for two clusters, their number is a multiple of `KINDS`.
+    """
+    task = start + wp.tid()
+    n, own = task // tasks, task % tasks
     i, j = clusters[n][0], clusters[n][1]
-    if found.begin[n + 1] == found.begin[n]:
-        return
-    one, other = wp.where(query.kind == CROSSING, EDGE, VERTEX), FACE
-    count = search_kind(parts, query, boxes, found, n, one, other, i, j, 0)
-    if i != j:
-        count = search_kind(parts, query, boxes, found, n, one, other, j, i, count)
-    if query.kind != CROSSING:
-        count = search_kind(parts, query, boxes, found, n, EDGE, EDGE, i, j, count)
-    found.count[n] = count
+    share, shares_of = own // KINDS, wp.max(tasks // KINDS, 1)
+    kind = wp.where(tasks == 1, -1, own % KINDS)
+    one, other, count = wp.where(query.kind == CROSSING, EDGE, VERTEX), FACE, wp.int32(0)
+    if kind <= 0:
+        count = search_kind(parts, query, boxes, found, task, one, other, i, j, count, share, shares_of)
+    if i != j and (kind < 0 or kind == 1):
+        count = search_kind(parts, query, boxes, found, task, one, other, j, i, count, share, shares_of)
+    if query.kind != CROSSING and (kind < 0 or kind == 2):
+        count = search_kind(parts, query, boxes, found, task, EDGE, EDGE, i, j, count, share, shares_of)
+    found.count[task] = count
 
 
 @wp.kernel

@@ -19,7 +19,7 @@ from torch import Tensor
 from ..mesh.kernels import KERNELS
 from ..mesh.threads import argument, run
 from .boxes import CROSSING, MOVE, MOVE_NEAR, NEAR, Boxes, Query, bound_clusters, bound_parts, boxes_near, query_of
-from .narrow_phase import Found, check_pairs, find_pairs
+from .narrow_phase import KINDS, Found, check_pairs, find_pairs
 from .pairs import NearAt, Pairs, Reach
 from .parts import Parts
 from .topology import LANES, Topology
@@ -29,7 +29,9 @@ wp.set_module_options(KERNELS)
 CLUSTERS = 32
 """Room for pairs of clusters per cluster before these are counted."""
 PAIRS, LEAST, MOST = 2**19, 16, 64
-"""Room for pairs of parts, shared by pairs of clusters, and its bounds for each; what has no room is searched twice."""
+"""Room for pairs of parts, shared by tasks, and its bounds for each; what has no room is searched twice."""
+TASKS = {"cpu": 1, "cuda": 4 * KINDS}
+"""Tasks of a pair of clusters, each with a kind of pairs and every fourth part: CUDA has more threads."""
 
 
 @wp.kernel
@@ -59,6 +61,55 @@ def find_clusters(
                     out[i * room + n] = j
                 n += 1
     count[i] = n
+
+
+@wp.kernel
+def list_clusters(
+    first: wp.int32,
+    room: wp.int32,
+    boxes: Boxes,
+    found: wp.array(dtype=wp.int32),
+    count: wp.array(dtype=wp.int32),
+    end: wp.array(dtype=wp.int32),
+    pairs: wp.array(dtype=wp.vec2i),
+):
+    """Write each cluster's pairs from `end` less `count` on, in order: the tree's depends on the pose it was built in."""
+    i = first + wp.tid()
+    if count[i] > 0:
+        boxes.met[i] = True
+    for n in range(count[i]):
+        j = found[i * room + n]
+        k = wp.int32(n)
+        boxes.met[j] = True
+        while k > 0 and found[i * room + k - 1] > j:
+            found[i * room + k] = found[i * room + k - 1]
+            k -= 1
+        found[i * room + k] = j
+    for n in range(count[i]):
+        pairs[end[i] - count[i] + n] = wp.vec2i(i, found[i * room + n])
+
+
+@wp.kernel
+def gather_pairs(
+    first: wp.int32,
+    room: wp.int32,
+    corners: wp.array(dtype=wp.vec4i),
+    value: wp.array(dtype=wp.float64),
+    face: wp.array(dtype=wp.bool),
+    end: wp.array(dtype=wp.int32),
+    out_corners: wp.array(dtype=wp.vec4i),
+    out_value: wp.array(dtype=wp.float64),
+    out_face: wp.array(dtype=wp.bool),
+):
+    """Write the pairs of each task, from the end of the task before to its own."""
+    i = first + wp.tid()
+    begin = wp.int32(0)
+    if i > 0:
+        begin = end[i - 1]
+    for n in range(end[i] - begin):
+        out_corners[begin + n] = corners[i * room + n]
+        out_value[begin + n] = value[i * room + n]
+        out_face[begin + n] = face[i * room + n]
 
 
 def near_parts(
@@ -155,81 +206,80 @@ def _search(parts: Parts, query: Any) -> Pairs:
     query.clusters = table.clusters if len(query.start) > parts.level.vertex_count else table.cloth_clusters
     if not query.clusters:
         return Pairs.empty(0, parts.level.device)
-    tree = parts.tree
-    _launch(parts, bound_clusters, query.clusters, query, parts.boxes)
-    tree.refit()
-    clusters = _near_clusters(parts, query, tree)
+    clusters = _near_clusters(parts, query, parts.tree)
     if not len(clusters):
         return Pairs.empty(0, clusters.device)
-    which = torch.zeros(parts.topology.clusters, dtype=torch.bool, device=clusters.device)
-    which[clusters.reshape(-1).long()] = True
-    active = torch.nonzero(which).squeeze(1).int()
-    _launch(parts, bound_parts, len(active), query, argument(active), parts.boxes)
+    _launch(parts, bound_parts, query.clusters, parts.topology, query, parts.boxes)
     return _pairs_of(parts, clusters, query)
 
 
 def _blocking_among(pairs: Pairs, parts: Parts, query: Any) -> Pairs:
     """The pairs that block a query's move."""
     value = torch.empty_like(pairs.value)
-    inputs = [query, argument(pairs.corners, wp.vec4i), argument(pairs.face), argument(value)]
+    inputs = [parts.topology, query, argument(pairs.corners, wp.vec4i), argument(pairs.face), argument(value)]
     _launch(parts, check_pairs, len(value), *inputs)
     return Pairs(pairs.corners, value, pairs.face).where(value < 1.0)
 
 
 def _near_clusters(parts: Parts, query: Any, tree: wp.Bvh) -> Int[Tensor, "pairs 2"]:
-    """Pairs of clusters that no axis separates at both ends, int32."""
+    """Pairs of clusters that no axis separates at both ends, sorted, int32; bounds the clusters."""
     size, room, device = query.clusters, CLUSTERS, parts.level.device
+    _launch(parts, bound_clusters, size, parts.topology, query, parts.boxes)
+    tree.refit()
     while True:
-        slots = torch.empty((size, room), dtype=torch.int32, device=device)
+        slots = torch.empty(size * room, dtype=torch.int32, device=device)
         count = torch.empty(size, dtype=torch.int32, device=device)
-        inputs = [query, parts.boxes, tree.id, room, argument(slots.view(-1)), argument(count)]
+        inputs = [parts.topology, query, parts.boxes, tree.id, room, argument(slots), argument(count)]
         _launch(parts, find_clusters, size, *inputs)
-        most = int(count.max())
+        end = count.cumsum(dim=0, dtype=torch.int32)
+        total, most = torch.stack([end[-1], count.max()]).tolist()
         if most <= room:
             break
         room = most
-    total = int(count.sum())
-    first = torch.arange(size, dtype=torch.int32, device=device).repeat_interleave(count, output_size=total)
-    second = slots.view(-1)[_used(torch.arange(size, device=device) * room, count, total)]
-    order = torch.argsort(first.long() * size + second)  # Not the tree's, which the pose decides in which it was built.
-    return torch.stack([first[order], second[order]], dim=1)
+    out = torch.empty((total, 2), dtype=torch.int32, device=device)
+    inputs = [argument(slots), argument(count), argument(end), argument(out, wp.vec2i)]
+    _launch(parts, list_clusters, size, room, parts.boxes, *inputs)
+    return out
 
 
 def _pairs_of(parts: Parts, clusters: Int[Tensor, "clusters 2"], query: Any) -> Pairs:
     """The pairs of parts in pairs of clusters; what has no room is searched again, now that it is counted."""
-    size, device = len(clusters), clusters.device
-    room = min(max(PAIRS // size, LEAST), MOST)
-    begin = torch.arange(size + 1, dtype=torch.int32, device=device) * room
-    found, count = _write(parts, clusters, query, begin)
-    kept = torch.where(count <= room, count, 0)
-    found = found.where(_used(begin[:-1], kept, int(kept.sum())))
-    over = torch.nonzero(count > room).squeeze(1)
-    if not len(over):
-        return found
-    begin = torch.nn.functional.pad(count[over].cumsum(dim=0, dtype=torch.int32), (1, 0))
-    return found.joined(_write(parts, clusters[over], query, begin)[0])
-
-
-def _used(begin: Int[Tensor, " rows"], count: Int[Tensor, " rows"], total: int) -> Int[Tensor, " total"]:
-    """Places in use: ``count`` of each row, from ``begin`` on."""
-    before = begin - (count.cumsum(dim=0) - count)
-    return before.repeat_interleave(count, output_size=total) + torch.arange(total, device=count.device)
+    size, tasks = len(clusters), TASKS[clusters.device.type]
+    room = min(max(PAIRS // (size * tasks), LEAST), MOST)
+    begin = torch.arange(0, (size * tasks + 1) * room, room, dtype=torch.int32, device=clusters.device)
+    found, count = _write(parts, clusters, query, begin, size * tasks * room)
+    count = count.reshape(size, tasks)
+    fits = (count <= room).all(dim=1)
+    end = torch.where(fits.unsqueeze(1), count, 0).reshape(-1).cumsum(dim=0, dtype=torch.int32)
+    total, fitting = torch.stack([end[-1].long(), fits.sum()]).tolist()
+    out = Pairs.empty(total, clusters.device)
+    _launch(parts, gather_pairs, size * tasks, room, *_arguments(found), argument(end), *_arguments(out))
+    if fitting == size:
+        return out
+    over = torch.nonzero(~fits).squeeze(1)
+    begin = torch.nn.functional.pad(count[over].reshape(-1).cumsum(dim=0, dtype=torch.int32), (1, 0))
+    return out.joined(_write(parts, clusters[over], query, begin, int(begin[-1]))[0])
 
 
 def _write(
-    parts: Parts, clusters: Int[Tensor, "clusters 2"], query: Any, begin: Int[Tensor, " bounds"]
-) -> tuple[Pairs, Int[Tensor, " clusters"]]:
-    """The pairs of parts of each two clusters from given places on, and their number."""
-    count = torch.zeros(len(clusters), dtype=torch.int32, device=clusters.device)
-    out, found = Pairs.empty(int(begin[-1]), clusters.device), Found()
+    parts: Parts, clusters: Int[Tensor, "clusters 2"], query: Any, begin: Int[Tensor, " bounds"], room: int
+) -> tuple[Pairs, Int[Tensor, " tasks"]]:
+    """The pairs of parts of each task from given places on, with room for all, and their number."""
+    tasks, out, found = TASKS[clusters.device.type], Pairs.empty(room, clusters.device), Found()
+    count = torch.zeros(len(clusters) * tasks, dtype=torch.int32, device=clusters.device)
     found.begin, found.count = wp.from_torch(begin), wp.from_torch(count)
     found.corners = wp.from_torch(out.corners, dtype=wp.vec4i)
     found.value, found.face = wp.from_torch(out.value), wp.from_torch(out.face)
-    inputs = [argument(clusters.contiguous(), wp.vec2i), query, parts.boxes, found]
-    _launch(parts, find_pairs, len(clusters), *inputs)
+    inputs = [parts.topology, argument(clusters, wp.vec2i), tasks, query, parts.boxes, found]
+    _launch(parts, find_pairs, len(clusters) * tasks, *inputs)
     return out, count
+
+
+def _arguments(pairs: Pairs) -> list[Any]:
+    """The fields of pairs as arguments of a kernel."""
+    return [argument(pairs.corners, wp.vec4i), argument(pairs.value), argument(pairs.face)]
 
 
 def _launch(parts: Parts, kernel: wp.Kernel, size: int, *inputs: object) -> None:
     """Run a kernel over clusters or pairs of clusters."""
-    run(kernel, size, [parts.topology, *inputs], device=parts.level.device, threads=parts.level.threads)
+    run(kernel, size, inputs, device=parts.level.device, threads=parts.level.threads)
