@@ -1,6 +1,6 @@
 """How long an artist waits in `tune`: from a move of a slider to the first new cloth, and to the settled cloth.
 
-    python -m benchmarks.tune [--moves 20] [--shot NAME]... [--folder SHOTS] [--page]
+    python -m benchmarks.tune [--moves 20] [--shot NAME]... [--folder SHOTS] [--device cuda] [--page]
     python -m benchmarks.tune --pictures docs
 
 Moves six sliders of a frame in the middle of each shot to random places, one after another, with contact; real shots
@@ -38,16 +38,19 @@ CHOSEN = ("skirt", "dancer", "layers")
 @click.option("--moves", default=20, show_default=True)
 @click.option("--shot", "names", multiple=True, default=CHOSEN, show_default=True, help="Samples.")
 @click.option("--folder", type=click.Path(path_type=Path), help="The real shots, which we may not ship.")
+@click.option("--device", default="cpu", show_default=True, help="Where to solve: cpu, cuda or auto.")
 @click.option("--page", is_flag=True, help="In a browser.")
 @click.option("--pictures", type=click.Path(path_type=Path), help="Write the pictures and the film into its folders.")
-def main(moves: int, names: Sequence[str], folder: Path | None, *, page: bool, pictures: Path | None) -> None:
+def main(
+    moves: int, names: Sequence[str], folder: Path | None, *, device: str, page: bool, pictures: Path | None
+) -> None:
     """Print what each shot takes, or write the pictures."""
     if pictures is not None:
         return draw(pictures)
     head = ["vertices", "first cloth, median [s]", "longest", "settled, median [s]", "longest"]
     say(table(["shot", *head], []))
     with tempfile.TemporaryDirectory() as made:
-        for name, session in sessions(names, folder, Path(made)):
+        for name, session in sessions(names, folder, Path(made), device=device):
             session.set_time(session.times[len(session.times) // 2])
             count = sum(len(points) for points in session.settle().points if points is not None)
             chance = random.Random(1)
@@ -58,14 +61,16 @@ def main(moves: int, names: Sequence[str], folder: Path | None, *, page: bool, p
             session.close()
 
 
-def sessions(names: Sequence[str], folder: Path | None, made: Path) -> Iterator[tuple[str, TuneSession]]:
+def sessions(
+    names: Sequence[str], folder: Path | None, made: Path, *, device: str = "cpu"
+) -> Iterator[tuple[str, TuneSession]]:
     """Shots, opened."""
     for name in (each for each in SAMPLES if each in names):
-        yield name, TuneSession(write_sample(name, made), out=made / f"{name}.tuned.usda")
+        yield name, TuneSession(write_sample(name, made), out=made / f"{name}.tuned.usda", device=device)
     for name, (garments, bodies, _) in REAL.items() if folder is not None else ():
         if folder is not None and (folder / name).exists():
             out = made / f"{Path(name).stem}.tuned.usda"
-            yield name, TuneSession(folder / name, garments=garments, colliders=bodies, out=out)
+            yield name, TuneSession(folder / name, garments=garments, colliders=bodies, out=out, device=device)
 
 
 def in_session(session: TuneSession, tried: Sequence[tuple[Tunable, float]], _: int) -> list[tuple[float, float]]:

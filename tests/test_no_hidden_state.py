@@ -34,6 +34,9 @@ ALLOWED = {
     "frame/group.py Group._built: _integrators": "of the method",
     "frame/scene_frame.py SceneCloth.group: _groups": "one a set of garments solved together",
     "frame/level_forces.py LevelForces.lasting_system: _lasting": "of the materials, and aimed anew in each frame",
+    "frame/touched.py TouchedSystems.of: _kept": "of the materials, with pairs and stiffness taken anew in each round",
+    "contact/metric.py HeldMetric.renew: _rough": "of a lasting system, taken anew in each round",
+    "contact/metric.py HeldMetric.renew: stiff": "of a lasting system, taken anew in each round",
     # What goes on from frame to frame, or from one place to the next.
     "contact/broad_phase.py Bodies.forget: _meshes": "hierarchies are refitted from pose to pose",
     "contact/broad_phase.py Bodies.pose: _bounds": "the frame's poses",

@@ -8,9 +8,13 @@ from dataclasses import replace
 
 import pytest
 import torch
-from cloth import FABRIC, GUIDE, finest_system, group_of, sheet, wave
+from cloth import FABRIC, GUIDE, finest_system, frame_of, group_of, sheet, wave
+from test_self_contact import gaps_of
 
+from physgraph_usd.solver.contact.metric import HeldMetric
 from physgraph_usd.solver.fabric import Fabric
+from physgraph_usd.solver.forces.base import ForceModule
+from physgraph_usd.solver.forces.self_contact import SelfContact
 from physgraph_usd.solver.frame.problem import LevelProblem, Problem
 from physgraph_usd.solver.frame.solve import solve_frame
 from physgraph_usd.solver.frame.values import FrameInput
@@ -128,3 +132,26 @@ def test_systems_that_last_solve_each_frame_as_fresh_ones_do(integrator: str, mo
             points.append(solved.points[0])
         results.append(points)
     assert [a.tobytes() for a in results[0]] == [b.tobytes() for b in results[1]]
+
+
+def test_contact_in_the_buffers_of_a_lasting_system_is_the_same_contact():
+    """In rounds with more pairs than before and with fewer, in one room and in another."""
+    mesh, rest = sheet(6, 5)
+    group, frame = group_of(mesh, rest, level=2, dtype=torch.float64), frame_of(wave(rest))
+    lasting, coarse = group.forces_for(frame.garments)[-1], group.cage(frame.garments).points
+    alone, x = lasting.lasting_system(coarse), lasting.level.base.apply(coarse)
+    kept = set[System]()
+    for count, seed in ((40, 0), (60, 1), (20, 2), (300, 3)):
+        term = SelfContact(lasting.level, gaps_of(x, count, lack=1e-3, seed=seed))
+        metric = HeldMetric(lasting.metric, 3.0 * term.diagonal(x))
+        assert isinstance(alone.field, ForceModule)
+        expected = lasting.system_in(alone.field.joined_by((term,)), metric)
+        system = lasting.touched.of(alone, (term,), metric)
+        kept.add(system.recorded)
+        for found in (system, system.recorded):
+            for one, other in zip(found.energy_and_force(x), expected.energy_and_force(x), strict=True):
+                assert one == pytest.approx(other, rel=1e-12)
+            force = expected.energy_and_force(x)[1]
+            assert torch.allclose(found.apply_short_inverse(force), expected.apply_short_inverse(force), rtol=1e-12)
+            assert torch.allclose(found.rest_diagonal_columns, expected.rest_diagonal_columns, rtol=1e-12)
+    assert len(kept) == 2

@@ -30,8 +30,9 @@ CLUSTERS = 32
 """Room for pairs of clusters per cluster before these are counted."""
 PAIRS, LEAST, MOST = 2**19, 16, 64
 """Room for pairs of parts, shared by tasks, and its bounds for each; what has no room is searched twice."""
-TASKS = {"cpu": 1, "cuda": 4 * KINDS}
-"""Tasks of a pair of clusters, each with a kind of pairs and every fourth part: CUDA has more threads."""
+TASKS, THREADS = 4 * KINDS, 2**18
+"""Tasks of a pair of clusters on CUDA, each with a kind of pairs and every fourth part, and threads that run at once:
+with more pairs of clusters, a single task of each has less to do."""
 
 
 @wp.kernel
@@ -73,7 +74,7 @@ def list_clusters(
     end: wp.array(dtype=wp.int32),
     pairs: wp.array(dtype=wp.vec2i),
 ):
-    """Write each cluster's pairs from `end` less `count` on, in order: the tree's depends on the pose it was built in."""
+    """Write each cluster's pairs up to `end`, sorted: the tree's order depends on the pose in which it was built."""
     i = first + wp.tid()
     if count[i] > 0:
         boxes.met[i] = True
@@ -244,10 +245,11 @@ def _near_clusters(parts: Parts, query: Any, tree: wp.Bvh) -> Int[Tensor, "pairs
 
 def _pairs_of(parts: Parts, clusters: Int[Tensor, "clusters 2"], query: Any) -> Pairs:
     """The pairs of parts in pairs of clusters; what has no room is searched again, now that it is counted."""
-    size, tasks = len(clusters), TASKS[clusters.device.type]
+    size = len(clusters)
+    tasks = _tasks(size, cuda=clusters.is_cuda)
     room = min(max(PAIRS // (size * tasks), LEAST), MOST)
     begin = torch.arange(0, (size * tasks + 1) * room, room, dtype=torch.int32, device=clusters.device)
-    found, count = _write(parts, clusters, query, begin, size * tasks * room)
+    found, count = _write(parts, clusters, query, begin, size * tasks * room, tasks=tasks)
     count = count.reshape(size, tasks)
     fits = (count <= room).all(dim=1)
     end = torch.where(fits.unsqueeze(1), count, 0).reshape(-1).cumsum(dim=0, dtype=torch.int32)
@@ -258,14 +260,25 @@ def _pairs_of(parts: Parts, clusters: Int[Tensor, "clusters 2"], query: Any) -> 
         return out
     over = torch.nonzero(~fits).squeeze(1)
     begin = torch.nn.functional.pad(count[over].reshape(-1).cumsum(dim=0, dtype=torch.int32), (1, 0))
-    return out.joined(_write(parts, clusters[over], query, begin, int(begin[-1]))[0])
+    return out.joined(_write(parts, clusters[over], query, begin, int(begin[-1]), tasks=tasks)[0])
+
+
+def _tasks(size: int, *, cuda: bool) -> int:
+    """Number of tasks of each of some pairs of clusters."""
+    return TASKS if cuda and TASKS * size <= THREADS else 1
 
 
 def _write(
-    parts: Parts, clusters: Int[Tensor, "clusters 2"], query: Any, begin: Int[Tensor, " bounds"], room: int
+    parts: Parts,
+    clusters: Int[Tensor, "clusters 2"],
+    query: Any,
+    begin: Int[Tensor, " bounds"],
+    room: int,
+    *,
+    tasks: int,
 ) -> tuple[Pairs, Int[Tensor, " tasks"]]:
     """The pairs of parts of each task from given places on, with room for all, and their number."""
-    tasks, out, found = TASKS[clusters.device.type], Pairs.empty(room, clusters.device), Found()
+    out, found = Pairs.empty(room, clusters.device), Found()
     count = torch.zeros(len(clusters) * tasks, dtype=torch.int32, device=clusters.device)
     found.begin, found.count = wp.from_torch(begin), wp.from_torch(count)
     found.corners = wp.from_torch(out.corners, dtype=wp.vec4i)

@@ -54,6 +54,17 @@ class HeldMetric:
         self._rough = three_columns(ROUGH / (own + stiff))
         self._last: tuple[Tensor, int, Tensor] | None = None
 
+    def renew(self, other: HeldMetric) -> None:
+        """Take the stiffness of another metric of the level, in the tensors that recorded steps read."""
+        self.stiff.copy_(other.stiff)
+        self._rough.copy_(other._rough)
+        for name in ("before", "after"):
+            getattr(self._held, name).copy_(getattr(other._held, name))
+
+    def copied(self) -> HeldMetric:
+        """A metric of equal stiffness, in other tensors."""
+        return HeldMetric(self._plain, self.stiff.clone())
+
     def serves(self, stiff: Float[Tensor, " vertices"]) -> bool:
         """True if K contains enough of the given stiffness [N/m]."""
         return float((stiff - self.stiff).clamp_min(0.0).sum()) <= MISSING * float(stiff.sum())
@@ -80,10 +91,10 @@ class HeldMetric:
 
         return solve
 
-    def held(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"] | None:
-        """R H0^-1 R F [m], the measure of the remaining move, for the last solved force; None for any other force."""
+    def held(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
+        """R H0^-1 R F [m], the measure of the remaining move; known for the force solved for last."""
         if self._last is None or self._last[0] is not force or self._last[1] != force._version:
-            return None
+            return self._held(force)
         return self._last[2]
 
     def short(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:

@@ -216,9 +216,8 @@ class Elements:
         dtype, device, threads = level.dtype, level.device, level.threads
         starts, slots = incidence(corners, level.vertex_count)
         # Not `contiguous`: an empty tensor keeps strides that Warp refuses.
-        packed = wp.from_torch(
-            corners.clone(memory_format=torch.contiguous_format), dtype=wp.types.vector(length=width, dtype=wp.int32)
-        )
+        corners = corners.clone(memory_format=torch.contiguous_format)
+        packed = wp.from_torch(corners, dtype=wp.types.vector(length=width, dtype=wp.int32))
         self.energy = torch.zeros(self.count, dtype=dtype, device=device)
         # One more row: the gather reads four numbers at once.
         self.corner_force = torch.zeros((self.count * width + 1, 3), dtype=dtype, device=device)[:-1]
@@ -234,6 +233,19 @@ class Elements:
         inputs = [wp.from_torch(starts), wp.from_torch(slots), buffers[1], x]
         gather = cast(wp.Kernel, _gather_corners_at_once) if single else _GATHER[dtype]
         self._gather = Launch(gather, level.vertex_count, inputs, device=device, threads=threads)
+
+    def renew(self, corners: Int[Tensor, "elements corners"], parameters: Sequence[Tensor]) -> None:
+        """Take other elements, at most as many, in the buffers that recorded steps read; without parameters, none acts.
+
+        Arguments are as for the constructor.
+        """
+        known, starts, slots, values = self._tensors
+        first, order = incidence(corners, len(starts) - 1)
+        starts.copy_(first)
+        for mine, other in zip((known, slots, *values), (corners, order, *parameters), strict=True):
+            mine[: len(other)].copy_(other)
+        for mine in values:
+            mine[len(corners) :].zero_()
 
     def evaluate(
         self, x: Float[Tensor, "vertices 3"], force: Float[Tensor, "vertices 3"], given: Mapping[int, Any] | None = None

@@ -14,6 +14,7 @@ Pairs, weights and normals are constant during the life of the term, so the ener
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import Any
 
 import scipy.sparse as sp
@@ -21,6 +22,7 @@ import torch
 import warp as wp
 from jaxtyping import Float, Int
 from torch import Tensor
+from torch.nn.functional import pad
 
 from ..level import Level
 from ..mesh.kernels import KERNELS
@@ -51,6 +53,13 @@ class PairConstraints:
         """Both sets of pairs combined."""
         return PairConstraints(
             *(torch.cat([getattr(self, each.name), getattr(other, each.name)]) for each in fields(self))
+        )
+
+    def padded(self, count: int) -> PairConstraints:
+        """These pairs and more of no effect, up to a number."""
+        more = count - len(self.corners)
+        return PairConstraints(
+            *(pad(each, (0, 0, 0, more) if each.ndim == 2 else (0, more)) for each in vars(self).values())
         )
 
     def vectors(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "gaps 3"]:
@@ -91,6 +100,12 @@ def _keep_apart(
 _KEEP_APART = element_overloads(_keep_apart, width=4, parameters=2, vector_parameters=4)
 
 
+def _parameters(gaps: PairConstraints) -> list[Tensor]:
+    """The arrays of the kernel."""
+    along = [(gaps.weight[:, i : i + 1] * gaps.normal).contiguous() for i in range(4)]
+    return [*along, gaps.offset, gaps.stiffness]
+
+
 class SelfContact:
     """Springs keeping pairs of material points apart.
 
@@ -102,8 +117,16 @@ class SelfContact:
     def __init__(self, level: Level, gaps: PairConstraints, name: str = "self_contact") -> None:
         """Take the pairs."""
         self.gaps, self.name, self._level = gaps, name, level
-        along = [(gaps.weight[:, i : i + 1] * gaps.normal).contiguous() for i in range(4)]
-        self._elements = Elements(_KEEP_APART, gaps.corners, [*along, gaps.offset, gaps.stiffness], level=level)
+
+    @cached_property
+    def _elements(self) -> Elements:
+        """The pairs as elements, built on first use: recorded steps have their own."""
+        return Elements(_KEEP_APART, self.gaps.corners, _parameters(self.gaps), level=self._level)
+
+    def renew(self, gaps: PairConstraints) -> None:
+        """Take other pairs, at most as many, in the buffers that recorded steps read."""
+        self._elements.renew(gaps.corners, _parameters(gaps))
+        self.gaps = gaps
 
     def add_force(self, x: Float[Tensor, "vertices 3"], force: Float[Tensor, "vertices 3"]) -> Float[Tensor, ""]:
         """Add the force [N] in place and return the energy [J]."""

@@ -24,6 +24,7 @@ from ..integrate.saddle import facets
 from ..level import Level
 from ..mesh.stencil import Stencil
 from ..scene import Garment, GarmentFrame
+from .touched import TouchedSystems
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,7 +121,8 @@ class LevelForces:
     def metric(self) -> Metric:
         """The factorised rest Hessian of all terms."""
         matrix = on_edges(self._module.rest_matrix(), self.level.springs.cpu().numpy())
-        return Metric(matrix, free=self.level.free, dtype=self.level.dtype)
+        like = None if self.lent is None else self.lent.metric
+        return Metric(matrix, free=self.level.free, dtype=self.level.dtype, like=like)
 
     @cached_property
     def rough_metric(self) -> Metric:
@@ -203,10 +205,18 @@ class LevelForces:
         metric = self.rough_metric if rough else self.metric
         return self.system_in(ForceModule(forces, remembers=True), metric)
 
-    def system_in(self, field: ForceField, metric: Preconditioner | None = None, *, lasting: bool = False) -> System:
-        """The system of the level in any field, with the level's metric by default."""
+    def system_in(
+        self,
+        field: ForceField,
+        metric: Preconditioner | None = None,
+        *,
+        lasting: bool = False,
+        recorded: System | None = None,
+    ) -> System:
+        """The system of the level in any field, with the level's metric by default; options are as for `System`."""
         level, metric = self.level, self.metric if metric is None else metric
-        return System(field, metric, free=level.free, spacing=level.spacing, level=level, lasting=lasting)
+        place = {"free": level.free, "spacing": level.spacing, "level": level}
+        return System(field, metric, **place, lasting=lasting, recorded=recorded)
 
     def lasting_system(
         self,
@@ -238,6 +248,11 @@ class LevelForces:
             stiffness, predicted = tie
             tether.aim(predicted, stiffness)
         return system
+
+    @cached_property
+    def touched(self) -> TouchedSystems:
+        """Lasting systems with contact."""
+        return TouchedSystems(self.level, self.system_in)
 
     @cached_property
     def _lasting(self) -> dict[tuple[bool, bool], tuple[System, Guide, Tether | None, Tensor | None]]:

@@ -77,8 +77,10 @@ class LevelProblem:
         field, metric = self.alone.field, self.alone.metric
         assert isinstance(field, ForceModule)
         assert isinstance(metric, Metric)
-        joined = field.joined_by(touched)
         held = view.metric(metric, touched, x, known=None if last is None else last.metric)
+        if self.alone.lasting and view.seam is None:
+            return self.lasting.touched.of(self.alone, touched, held)
+        joined = field.joined_by(touched)
         return self.lasting.system_in(joined if view.seam is None else SewnForces(joined, view.seam), held)
 
 
@@ -162,7 +164,7 @@ class Problem:
         module = lasting.module(self.aim, angles)
         tie = None if self.tether is None or self.start.detailed is None else (self.tether, self.start.detailed)
         # Recorded steps of a level on CUDA are reused in the next frame.
-        recorded = lasting.level.device != "cpu"
+        recorded = lasting.level.device != "cpu" and not settings.rough
         alone = (
             lasting.lasting_system(self.aim, tie, rest_angle=angles)
             if recorded

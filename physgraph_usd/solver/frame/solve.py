@@ -159,5 +159,5 @@ def _went_up(reports: list[LevelReport]) -> bool:
 
 def _smooth_move(system: System, carry: Carry, report: LevelReport) -> float:
     """The remaining move of the smooth part at the end of a round, in local edge lengths."""
-    held = system.metric.held(carry.force) if isinstance(system.metric, HeldMetric) else None
-    return report.remaining_move if held is None else system.remaining_move(held)
+    metric = system.metric
+    return system.remaining_move(metric.held(carry.force)) if isinstance(metric, HeldMetric) else report.remaining_move

@@ -70,7 +70,7 @@ class LearnedMetric:
     def step(self, system: System, carry: Carry) -> Carry:
         """One step along the network's combination."""
         if self.records(system):
-            return self._recording(system).step(carry)
+            return self._recording(system.recorded).step(system, carry)
         move = self.propose(system, carry)
         return self._reached(system, carry, carry.x + move, move)
 

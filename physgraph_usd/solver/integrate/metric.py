@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -56,13 +57,21 @@ class Metric:
         entries: Number of the matrix's entries.
     """
 
-    def __init__(self, matrix: sp.csr_matrix, *, free: Bool[Tensor, "vertices 1"], dtype: torch.dtype) -> None:
+    def __init__(
+        self,
+        matrix: sp.csr_matrix,
+        *,
+        free: Bool[Tensor, "vertices 1"],
+        dtype: torch.dtype,
+        like: Metric | None = None,
+    ) -> None:
         """Factorise a scalar Hessian at rest.
 
         Args:
             matrix: Symmetric positive semi-definite [N/m], shape (V, V).
             free: False at fixed vertices, whose rows become identity rows.
             dtype: Scalar type of the right-hand sides.
+            like: A metric whose order of elimination serves again on CUDA if its matrix has the same pattern; or None.
         """
         self._free, self._matrix = free.squeeze(1), matrix
         self._mask = three_columns(self._free.to(dtype))
@@ -71,7 +80,10 @@ class Metric:
         couplings = sp.csr_matrix(keep @ (matrix - sp.diags(matrix.diagonal())) @ keep)
         couplings.eliminate_zeros()
         self.entries, device = couplings.nnz + couplings.shape[0], str(free.device)
-        self._factors = DeviceFactors(couplings, dtype, device) if free.is_cuda else HostFactors(couplings, dtype)
+        known = None if like is None else like._factors
+        self._factors = (
+            DeviceFactors(couplings, dtype, device, like=known) if free.is_cuda else HostFactors(couplings, dtype)
+        )
         self._hold(torch.as_tensor(matrix.diagonal(), device=free.device))
 
     def plus(self, springs: Float[Tensor, " vertices"]) -> Metric:
@@ -118,13 +130,30 @@ class Metric:
 
     def between(self, factor: Float[Tensor, "vertices 1"]) -> Solver:
         """The solve of R H0^-1 R F [m], R a diagonal, in as few passes as for H0^-1 F."""
-        before, after = self._scaled * factor, self._mask * factor
-        return lambda force: self._solver(force * before).mul_(after)
+        return Between(self._solver, self._scaled * factor, self._mask * factor)
 
     def stiffened(self, stiffness: Float[Tensor, " vertices"]) -> Solver:
         """R H0^-1 R, as in `Preconditioner`."""
         diagonal = self.diagonal.to(stiffness)
         return self.between((diagonal / torch.maximum(diagonal, stiffness)).sqrt().unsqueeze(1))
+
+
+@dataclass(frozen=True, eq=False)
+class Between:
+    """A solve between two diagonals [m]: after * (solver of before * F).
+
+    Attributes:
+        solver: The solve between.
+        before, after: The diagonals, shape (V, 3).
+    """
+
+    solver: Solver
+    before: Float[Tensor, "vertices 3"]
+    after: Float[Tensor, "vertices 3"]
+
+    def __call__(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
+        """The solution [m]."""
+        return self.solver(force * self.before).mul_(self.after)
 
 
 class MergedMetric(Metric):
@@ -218,8 +247,15 @@ def _of_scipy(matrix: sp.coo_matrix) -> Solver:
 class DeviceFactors:
     """Factors of such matrices on CUDA; only the first factorisation passes through the host."""
 
-    def __init__(self, couplings: sp.csr_matrix, dtype: torch.dtype, device: str) -> None:
-        """Find the positions of the off-diagonal couplings, shape (V, V)."""
+    def __init__(
+        self,
+        couplings: sp.csr_matrix,
+        dtype: torch.dtype,
+        device: str,
+        *,
+        like: HostFactors | DeviceFactors | None = None,
+    ) -> None:
+        """Find the positions of the off-diagonal couplings, shape (V, V); the order is that of a like pattern."""
         count, each = couplings.shape[0], sp.coo_matrix(couplings)
         rows, columns = (np.concatenate([ends, np.arange(count)]) for ends in (each.row, each.col))
         order = np.lexsort((columns, rows))
@@ -228,7 +264,10 @@ class DeviceFactors:
         values = np.concatenate([each.data, np.zeros(count)])[order]
         self._values = torch.as_tensor(values, device=device)
         self._diagonal = torch.as_tensor(np.flatnonzero(rows[order] == columns[order]), device=device)
-        self._elimination, self._dtype = Elimination(pattern, device=device), dtype
+        self._rows, self._dtype = (pattern.indptr, pattern.indices), dtype
+        known = like if isinstance(like, DeviceFactors) else None
+        same = known is not None and all(map(np.array_equal, known._rows, self._rows))
+        self._elimination = known._elimination if known is not None and same else Elimination(pattern, device=device)
 
     def factorised(self, scale: float, diagonal: Float[Tensor, " vertices"]) -> Solver:
         """The solve of scale * couplings + diagonal."""

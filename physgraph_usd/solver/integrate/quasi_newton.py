@@ -127,7 +127,8 @@ class QuasiNewton:
         """The carry after a step's first trial; None if the trial is not good enough."""
         secants = carry.memory.secants
         known = Memory(carry.force, (carry.memory.image, carry.memory.image), secants)
-        after = self._recordings.of(system, lambda: _Trial(system)).step(replace(carry, memory=known))
+        trial = self._recordings.of(system.recorded, lambda: _Trial(system.recorded))
+        after = trial.step(system, replace(carry, memory=known))
         if after.preconditioned is None:
             return None
         if after.mover != _MISLED:

@@ -40,8 +40,8 @@ SECANTS = 5
 """Secants kept."""
 MOST_GARMENTS = 8
 """Most garments solved together with recorded steps: each garment has separate scalar products."""
-KEPT = 6
-"""Recordings kept: enough for the levels of one or two garments."""
+KEPT = 12
+"""Recordings kept: enough for the levels of one or two garments, with contact and without."""
 WORTH = 6
 """Least number of steps for recording a system used only once: recording costs as much as four steps."""
 COMBINED, FIELDS = 3 * SECANTS + 2, 3 * SECANTS + 6
@@ -107,13 +107,14 @@ class Recording:
         self._graph: torch.cuda.CUDAGraph | None = None
         self._loaded = False
 
-    def step(self, carry: Carry) -> Carry:
-        """One step."""
+    def step(self, system: System, carry: Carry) -> Carry:
+        """One step of a system with the values of the recorded one."""
         step = carry.memory.step
         torch.stack(self._fields_of(carry), out=self._fields)
         self._step.fill_(step)
+        solves = system.metric_solves
         self._run()
-        self._system.evaluations += 1
+        system.evaluations, system.metric_solves = system.evaluations + 1, solves + 1
         after = self._carry_of(self._after.clone(), step + 1)
         assert self._scalars_after is not None
         energy, remaining, *others = self._scalars_after.tolist()  # One wait for all.
@@ -169,9 +170,7 @@ class Recording:
                 graph.capture_end()
             torch.cuda.current_stream().wait_stream(side)
             self._graph = graph
-            self._system.metric_solves -= 1  # Recording is no solve.
         self._graph.replay()
-        self._system.metric_solves += 1
 
     def _advance(self) -> None:
         """The kernels of a step, as for an unrecorded step, between buffers."""
@@ -220,7 +219,7 @@ class Recordings(Generic[RecordingT]):
 
 def pays(system: System) -> bool:
     """Whether recording a system's steps is worthwhile: on CUDA, for a reused system or many steps."""
-    return system.spacing.is_cuda and (system.lasting or system.expected >= WORTH)
+    return system.spacing.is_cuda and (system.recorded.lasting or system.expected >= WORTH)
 
 
 @functools.cache
