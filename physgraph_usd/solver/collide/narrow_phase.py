@@ -165,11 +165,11 @@ def search_kind(
     j: wp.int32,
     count: wp.int32,
     share: wp.int32,
-    shares_of: wp.int32,
+    bits: wp.int32,
 ):
     """Write pairs of a cluster's parts of one kind and another's of a second; returns the number of pairs so far.
 
-    Of the cluster's parts, only those are taken whose numbers divided by `shares_of` leave `share`.
+    Of the cluster's parts, only those are taken whose numbers have the given share in their last bits.
     """
     room, size = boxes.radius[i] + boxes.radius[j], parts.clusters + 1
     for b in range(parts.first[first * size + i], parts.first[first * size + i + 1], ALL):
@@ -177,7 +177,7 @@ def search_kind(
         while near != wp.uint64(0):
             k = LANES * b + lowest_bit(near)
             near = without_lowest(near)
-            if k % shares_of != share:
+            if k & bits != share:
                 continue
             p = parts.parts[k]
             if not (boxes.asked[j] or query.asked[p[0]] or query.asked[p[1]] or query.asked[p[2]]):
@@ -204,20 +204,20 @@ def find_pairs(
 ):
     """Pairs of parts of each two clusters, counted even without room, in one task or in a task for each kind and share.
 
-    With several tasks for two clusters, their number is a multiple of `KINDS`.
+    With several tasks for two clusters, their number is a power of two times `KINDS`.
     """
     task = start + wp.tid()
     n, own = task // tasks, task % tasks
     i, j = clusters[n][0], clusters[n][1]
-    share, shares_of = own // KINDS, wp.max(tasks // KINDS, 1)
+    share, bits = own // KINDS, wp.max(tasks // KINDS, 1) - 1
     kind = wp.where(tasks == 1, -1, own % KINDS)
     one, other, count = wp.where(query.kind == CROSSING, EDGE, VERTEX), FACE, wp.int32(0)
     if kind <= 0:
-        count = search_kind(parts, query, boxes, found, task, one, other, i, j, count, share, shares_of)
+        count = search_kind(parts, query, boxes, found, task, one, other, i, j, count, share, bits)
     if i != j and (kind < 0 or kind == 1):
-        count = search_kind(parts, query, boxes, found, task, one, other, j, i, count, share, shares_of)
+        count = search_kind(parts, query, boxes, found, task, one, other, j, i, count, share, bits)
     if query.kind != CROSSING and (kind < 0 or kind == 2):
-        count = search_kind(parts, query, boxes, found, task, EDGE, EDGE, i, j, count, share, shares_of)
+        count = search_kind(parts, query, boxes, found, task, EDGE, EDGE, i, j, count, share, bits)
     found.count[task] = count
 
 
