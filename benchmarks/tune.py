@@ -36,7 +36,7 @@ CHOSEN = ("skirt", "dancer", "layers")
 
 @click.command()
 @click.option("--moves", default=20, show_default=True)
-@click.option("--shot", "names", multiple=True, default=CHOSEN, show_default=True, help="Samples.")
+@click.option("--shot", "names", multiple=True, default=CHOSEN, help="Samples; real shots by first letters.")
 @click.option("--folder", type=click.Path(path_type=Path), help="The real shots, which we may not ship.")
 @click.option("--device", default="cpu", show_default=True, help="Where to solve: cpu, cuda or auto.")
 @click.option("--page", is_flag=True, help="In a browser.")
@@ -67,8 +67,8 @@ def sessions(
     """Shots, opened."""
     for name in (each for each in SAMPLES if each in names):
         yield name, TuneSession(write_sample(name, made), out=made / f"{name}.tuned.usda", device=device)
-    for name, (garments, bodies, _) in REAL.items() if folder is not None else ():
-        if folder is not None and (folder / name).exists():
+    for name, (garments, bodies, _) in REAL.items():
+        if folder is not None and (folder / name).exists() and name.startswith(tuple(names)):
             out = made / f"{Path(name).stem}.tuned.usda"
             yield name, TuneSession(folder / name, garments=garments, colliders=bodies, out=out, device=device)
 
