@@ -1,13 +1,14 @@
 """Two or more checkouts side by side, in turns: time of a warm frame, energy and crossings, shot by shot.
 
     python -m benchmarks.versions OTHER... [--shot NAME]... [--folder SHOTS] [--frames 8] [--turns 1] [--level 2]
+        [--device cuda]
     python -m benchmarks.versions --cores      this version on several cores, and by several processes
 
-Each OTHER is a checkout of another version. Every shot is refined by each of them and by this one in turn, on one core,
-in a process of its own, by the command that a user gives. Prints a row a shot: of each version the milliseconds of a
-warm frame on the wall as its report has them (prepared, solved and measured; the median over frames, the least over
-turns), the mean energy of warm frames without the tether's, and crossings of all frames with bodies and with cloth;
-then the time and the energy of this version over each other's.
+Each OTHER is a checkout of another version. Every shot is refined by each of them and by this one in turn, on one core
+or a card, in a process of its own, by the command that a user gives. Prints a row a shot: of each version the
+milliseconds of a warm frame on the wall as its report has them (prepared, solved and measured; the median over frames,
+the least over turns), the mean energy of warm frames without the tether's, and crossings of all frames with bodies and
+with cloth; then the time and the energy of this version over each other's.
 """
 
 from __future__ import annotations
@@ -61,9 +62,12 @@ class Cost:
 @click.option("--frames", default=8, show_default=True, help="Frames of each; 0 for whole shots.")
 @click.option("--turns", default=1, show_default=True, help="How often each version refines each shot.")
 @click.option("--level", default=2, show_default=True)
+@click.option("--device", default="cpu", show_default=True, help="Where to solve: cpu, cuda or auto.")
 @click.option("--cores", is_flag=True, help="This version alone, samples on several cores, instead.")
 @click.option("--core", default=0, show_default=True, help="The core that all run on.")
-def main(others: Sequence[Path], folder: Path | None, names: Sequence[str], cores: bool, **numbers: int) -> None:
+def main(
+    others: Sequence[Path], folder: Path | None, names: Sequence[str], *, device: str, cores: bool, **numbers: int
+) -> None:
     """Print what each version takes for each shot."""
     if cores:
         compare(names or ("dancer", "skirt"), turns=numbers["turns"], level=numbers["level"])
@@ -75,7 +79,7 @@ def main(others: Sequence[Path], folder: Path | None, names: Sequence[str], core
     say(table(["shot", *head], []))
     with tempfile.TemporaryDirectory() as made:
         for name, given in shots(names, folder, Path(made), numbers["frames"]):
-            asked = [*given, "--level", str(numbers["level"])]
+            asked = [*given, "--level", str(numbers["level"]), "--device", device]
             turns = range(numbers["turns"])
             runs = [[taken(tree, asked, Path(made), numbers["core"]) for tree in trees] for _ in turns]
             best = [min(each, key=lambda cost: cost.warm) for each in zip(*runs, strict=True)]
