@@ -1,7 +1,7 @@
 """Search of a level's cloth: near pairs, pairs that come too near on straight paths, and crossings.
 
-Every search is complete and keeps nothing: boxes of all clusters at both ends of the move, pairs of clusters that no
-axis separates at both ends, and their parts in the same way.
+Every search is complete and keeps nothing. It bounds all clusters at both ends of the move, finds pairs of clusters
+not separated by an axis at both ends, and treats the parts of these clusters in the same way.
 """
 
 # Warp's kernels are typed by values that only Warp reads.
@@ -29,10 +29,10 @@ wp.set_module_options(KERNELS)
 CLUSTERS = 32
 """Room for pairs of clusters per cluster before these are counted."""
 PAIRS, LEAST, MOST = 2**19, 16, 64
-"""Room for pairs of parts, shared by tasks, and its bounds for each; what has no room is searched twice."""
+"""Room for pairs of parts: of all tasks, and least and most of a task. Without enough room a search runs twice."""
 TASKS, THREADS = 4 * KINDS, 2**18
-"""Tasks of a pair of clusters on CUDA, each with a kind of pairs and every fourth part, and threads that run at once:
-with more pairs of clusters, a single task of each has less to do."""
+"""Tasks of a pair of clusters on CUDA, each with one kind of pairs and every fourth part; and threads running at once.
+With more pairs of clusters than threads, a single task per pair is faster: tasks repeat box tests."""
 
 
 @wp.kernel
@@ -46,7 +46,8 @@ def find_clusters(
     out: wp.array(dtype=wp.int32),
     count: wp.array(dtype=wp.int32),
 ):
-    """Clusters that no axis keeps away from each queried one at both ends, each pair once; counted without room too."""
+    """Clusters not separated from each queried cluster by an axis at both ends; each pair once, counted even without
+    room."""
     i, j, n = first + wp.tid(), wp.int32(0), wp.int32(0)
     if boxes.asked[i]:
         around = wp.bvh_query_aabb(tree, boxes.low[i], boxes.high[i])
@@ -74,7 +75,7 @@ def list_clusters(
     end: wp.array(dtype=wp.int32),
     pairs: wp.array(dtype=wp.vec2i),
 ):
-    """Write each cluster's pairs up to `end`, sorted: the tree's order depends on the pose in which it was built."""
+    """Write the pairs of each cluster up to `end`, sorted: the order in the tree depends on the pose at its making."""
     i = first + wp.tid()
     if count[i] > 0:
         boxes.met[i] = True
@@ -102,7 +103,7 @@ def gather_pairs(
     out_value: wp.array(dtype=wp.float64),
     out_face: wp.array(dtype=wp.bool),
 ):
-    """Write the pairs of each task, from the end of the task before to its own."""
+    """Write the pairs of each task, from the end of the previous task on."""
     i = first + wp.tid()
     begin = wp.int32(0)
     if i > 0:
@@ -121,7 +122,7 @@ def near_parts(
     asked: Bool[Tensor, " vertices"] | None = None,
     inside: Bool[Tensor, " vertices"] | None = None,
 ) -> NearAt:
-    """All near pairs that contain cloth at x [m], but not of cloth inside a body with bodies.
+    """All near pairs with cloth at x [m], without pairs of bodies and cloth inside a body.
 
     Arguments are as for `blocking_pairs`. Positions of the cloth alone give pairs of the cloth alone, in all searches.
     """
@@ -141,20 +142,19 @@ def blocking_pairs(
     inside: Bool[Tensor, " vertices"] | None = None,
     near: NearAt | None = None,
 ) -> Pairs:
-    """All pairs of parts that no plane keeps apart on straight paths (`separation`), some of them twice.
+    """All pairs of parts not kept apart by a plane on straight paths (`separation`), some of them twice.
 
-    With near pairs at the start, only these are checked, and other pairs of vertices that move too far for parts that
-    are not near (`NearAt.leaving`).
+    Given near pairs at the start, checks only near pairs, and pairs of vertices with large moves (`NearAt.leaving`).
 
     Args:
         parts: The parts.
         start: Positions [m].
         end: End positions [m].
         floor: Gap that pairs keep [m]; a pair that is already closer keeps most of its distance.
-        asked: Vertices of which each pair must contain at least one.
+        asked: Queried vertices; each pair contains at least one.
         tangle: The tangle of each vertex, int32, -1 outside tangles; pairs inside a single tangle are skipped; or None.
-        inside: Cloth vertices inside a body, whose pairs with bodies are skipped; or None.
-        near: All near pairs at the start that contain cloth and may block; None if unknown.
+        inside: Cloth vertices inside a body, without pairs with bodies; or None.
+        near: All near pairs with cloth at the start; None if unknown.
     """
     given = {"kind": MOVE, "floor": floor, "asked": asked, "tangle": tangle, "inside": inside}
     start, end = start.double(), end.double()
@@ -176,9 +176,9 @@ def blocking_and_near(
     floor: float,
     asked: Bool[Tensor, " vertices"] | None = None,
 ) -> tuple[Pairs, NearAt]:
-    """All pairs that block a move, and all near pairs at its end, by one search.
+    """All pairs blocking a move, and all near pairs at the end of the move, by one search.
 
-    Arguments are as for `blocking_pairs`; ``asked`` contains all vertices that may move, and is all cloth when None.
+    Arguments are as for `blocking_pairs`; ``asked`` contains all vertices able to move, and is all cloth when None.
     """
     asked = _of_cloth(parts, start) if asked is None else asked
     given = {"radius": reach.radius.double(), "play": reach.play.double(), "half": reach.half, "floor": floor}
@@ -190,7 +190,7 @@ def blocking_and_near(
 def piercing_edges(
     parts: Parts, x: Float[Tensor, "vertices 3"], asked: Bool[Tensor, " vertices"] | None = None
 ) -> Int[Tensor, "crossings 2"]:
-    """Indices of each edge and face that cross at x [m], sorted; clusters without an asked vertex may be left out."""
+    """Indices of each crossing edge and face at x [m], sorted; clusters without a queried vertex may be left out."""
     asked = _of_cloth(parts, x) if asked is None else asked
     found = _search(parts, query_of(x.double(), kind=CROSSING, asked=asked)).corners[:, :2].long()
     return found[torch.argsort(found[:, 0] * max(parts.faces, 1) + found[:, 1])]
@@ -215,7 +215,7 @@ def _search(parts: Parts, query: Any) -> Pairs:
 
 
 def _blocking_among(pairs: Pairs, parts: Parts, query: Any) -> Pairs:
-    """The pairs that block a query's move."""
+    """The pairs blocking a query's move."""
     value = torch.empty_like(pairs.value)
     inputs = [parts.topology, query, argument(pairs.corners, wp.vec4i), argument(pairs.face), argument(value)]
     _launch(parts, check_pairs, len(value), *inputs)
@@ -223,7 +223,7 @@ def _blocking_among(pairs: Pairs, parts: Parts, query: Any) -> Pairs:
 
 
 def _near_clusters(parts: Parts, query: Any, tree: wp.Bvh) -> Int[Tensor, "pairs 2"]:
-    """Pairs of clusters that no axis separates at both ends, sorted, int32; bounds the clusters."""
+    """Pairs of clusters not separated by an axis at both ends, sorted, int32; bounds the clusters."""
     size, room, device = query.clusters, CLUSTERS, parts.level.device
     _launch(parts, bound_clusters, size, parts.topology, query, parts.boxes)
     tree.refit()
@@ -244,7 +244,7 @@ def _near_clusters(parts: Parts, query: Any, tree: wp.Bvh) -> Int[Tensor, "pairs
 
 
 def _pairs_of(parts: Parts, clusters: Int[Tensor, "clusters 2"], query: Any) -> Pairs:
-    """The pairs of parts in pairs of clusters; what has no room is searched again, now that it is counted."""
+    """The pairs of parts in pairs of clusters; pairs of clusters without enough room are searched again."""
     size = len(clusters)
     tasks = _tasks(size, cuda=clusters.is_cuda)
     room = min(max(PAIRS // (size * tasks), LEAST), MOST)
@@ -277,7 +277,7 @@ def _write(
     *,
     tasks: int,
 ) -> tuple[Pairs, Int[Tensor, " tasks"]]:
-    """The pairs of parts of each task from given places on, with room for all, and their number."""
+    """The pairs of parts of each task from given places on, and the number of pairs of each task."""
     out, found = Pairs.empty(room, clusters.device), Found()
     count = torch.zeros(len(clusters) * tasks, dtype=torch.int32, device=clusters.device)
     found.begin, found.count = wp.from_torch(begin), wp.from_torch(count)
