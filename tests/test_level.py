@@ -81,3 +81,19 @@ def test_triangles_without_area_and_those_that_repeat_are_no_cloth():
     level = level_of(more, np.vstack([triangles, extra]))
     assert len(level.triangles) == len(triangles)
     assert not bool(level.free[len(points)])
+
+
+@pytest.mark.parametrize("kind", ["quads", "triangles"])
+@pytest.mark.parametrize("turn", [0.4, 0.8, 1.2])
+def test_a_folded_cage_keeps_its_lengths(kind: str, turn: float):
+    """Along the fold and across it; cloth that is too long along a fold crumples there."""
+    mesh, flat = grid(8, 8, kind)
+    away = flat[:, 0] - 0.5 * (flat[:, 0].min() + flat[:, 0].max())
+    rest = np.stack([np.cos(turn) * away, flat[:, 1], -np.sin(turn) * np.abs(away)], axis=1)
+    garments = [garment_of(mesh, rest)]
+    level = build_levels(garments, refine_garments(garments, [2]), dtype=torch.float64)[-1]
+    ends, length = level.rest[level.springs.long()], level.spring_length  # Of the cage, flat between its edges.
+    along, row = (ends[:, :, 0].abs() < 1e-9).all(dim=1), ends[:, 0, 1].sub(ends[:, 1, 1]).abs() < 1e-9
+    assert float(length[along].sum()) == pytest.approx(np.ptp(flat[:, 1]), rel=0.02)
+    assert float(length[row].sum()) == pytest.approx(float((ends[:, 1] - ends[:, 0]).norm(dim=1)[row].sum()), rel=0.02)
+    assert float(level.membrane_area.sum()) == pytest.approx(float(np.prod(np.ptp(flat[:, :2], axis=0))), rel=0.01)

@@ -52,7 +52,7 @@ class Level:
         index: 0 is the cage.
         spans: Vertex range of each garment.
         rest: Rest positions [m], shape (V, 3), linear between the cage's. Lengths, areas and angles at rest are of
-            the smoothly subdivided cage, scaled to the area that the cage has there.
+            the smoothly subdivided cage, stretched to the cage's mean lengths around each cage vertex.
         triangles: Corner vertices of the surface that collides; a quad is two, shape (T, 3).
         edges: Their sides, shape (E, 2).
         springs: End vertices of the elastic springs, every edge among them, shape (S, 2).
@@ -243,7 +243,7 @@ class _GarmentLevel:
     vertex_count: int
     rest: np.ndarray
     smooth_rest: np.ndarray
-    size: np.ndarray
+    metric: np.ndarray
     triangles: np.ndarray
     edges: np.ndarray
     elements: ElasticElements
@@ -275,7 +275,7 @@ def _garment_level(garment: Garment, whole: Sequence[Refinement], index: int) ->
         vertex_count=mesh.vertex_count,
         rest=rest,
         smooth_rest=smooth_rest,
-        size=_size(linear, elements, rest, smooth_rest),
+        metric=_metric_of(linear, elements, rest, smooth_rest),
         triangles=split.triangles,
         edges=edges_of(split.triangles, mesh.vertex_count).vertices,
         elements=elements,
@@ -309,10 +309,14 @@ def _carried(
     return mesh, face, creases, {"linear": linear, "smooth": smoothing} | steps
 
 
-def _size(linear: sp.csr_matrix, elements: ElasticElements, rest: np.ndarray, smooth_rest: np.ndarray) -> np.ndarray:
-    """Lengths of the cloth over those of its smooth rest surface, shape (V,).
+def _metric_of(
+    linear: sp.csr_matrix, elements: ElasticElements, rest: np.ndarray, smooth_rest: np.ndarray
+) -> np.ndarray:
+    """The metric S of the cloth on the smooth rest surface, shape (V, 3, 3): a vector d is (d.S d)^1/2 long.
 
-    Smooth subdivision makes a curved cage smaller. Round each cage vertex the cloth has the area of the cage.
+    Smooth subdivision shortens a curved cage, across a fold but not along the fold. S gives the cage's lengths,
+    averaged around each cage vertex; along the normal S is 1. With areas kept but not lengths, cloth would be too long
+    along folds, and crumple.
 
     Args:
         linear: Linear map from the cage, shape (V, C).
@@ -320,9 +324,38 @@ def _size(linear: sp.csr_matrix, elements: ElasticElements, rest: np.ndarray, sm
         rest: The cage's rest positions on the mesh, linearly [m], shape (V, 3).
         smooth_rest: The same smoothly [m].
     """
-    round_cage, smoothed = (linear.T @ vertex_areas(x, elements.membrane, elements.share) for x in (rest, smooth_rest))
-    known = smoothed > 0
-    return np.asarray(linear @ np.sqrt(np.where(known, round_cage / np.where(known, smoothed, 1.0), 1.0)))
+    triangles, count = elements.membrane, len(rest)
+    cage, surface = ((x[triangles[:, 1:]] - x[triangles[:, :1]]).mT for x in (rest, smooth_rest))  # T 3 2
+    area = triangle_areas(smooth_rest, triangles)
+    known = area > 1e-9 * (surface**2).sum(axis=(1, 2))
+    gram = np.where(known[:, None, None], surface.mT @ surface, np.eye(2))
+    dual = surface @ np.linalg.inv(gram)
+    normal = np.cross(surface[:, :, 0], surface[:, :, 1]) / np.where(known, 2.0 * area, 1.0)[:, None]
+    tensor = dual @ (cage.mT @ cage) @ dual.mT + normal[:, :, None] * normal[:, None, :]
+    tensor[~known] = np.eye(3)
+    weight, places = np.repeat(elements.share * area, 3), (triangles.ravel(), np.arange(3 * len(triangles)) // 3)
+    around = linear.T @ sp.csr_matrix((weight, places), shape=(count, len(triangles)))
+    total, mean = np.asarray(around.sum(axis=1)), np.asarray(around @ tensor.reshape(-1, 9))
+    mean = np.where(total > 0, mean / np.where(total > 0, total, 1.0), np.eye(3).ravel())
+    return np.asarray(linear @ mean).reshape(-1, 3, 3)
+
+
+def _in_cloth(vectors: np.ndarray, metric: np.ndarray) -> np.ndarray:
+    """Tangent vectors of the smooth rest surface in the cloth's lengths and angles: S^1/2 times the vectors.
+
+    Args:
+        vectors: Two sides of each triangle [m], and more vectors in the triangle's plane, shape (T, K, 3).
+        metric: S, shape (T, 3, 3).
+    """
+    first, normal = vectors[:, 0], np.cross(vectors[:, 0], vectors[:, 1])
+    second = np.cross(normal, first)
+    tiny = np.finfo(float).tiny
+    axes = np.stack([each / np.linalg.norm(each, axis=1, keepdims=True).clip(tiny) for each in (first, second)], axis=1)
+    plane = axes @ metric @ axes.mT
+    root = np.sqrt((plane[:, 0, 0] * plane[:, 1, 1] - plane[:, 0, 1] ** 2).clip(0.0))
+    trace = (plane[:, 0, 0] + plane[:, 1, 1] + 2.0 * root).clip(tiny)
+    plane += root[:, None, None] * np.eye(2)  # The square root of a 2 x 2 matrix, by Cayley and Hamilton.
+    return np.asarray((vectors @ axes.mT) @ plane / np.sqrt(trace)[:, None, None] @ axes)
 
 
 def vertex_normals(x: np.ndarray, triangles: np.ndarray) -> np.ndarray:
@@ -332,12 +365,6 @@ def vertex_normals(x: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     total = np.zeros_like(x)
     np.add.at(total, triangles, normal[:, None])
     return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), np.finfo(float).tiny)
-
-
-def vertex_areas(x: np.ndarray, triangles: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """A third of the areas that the triangles at each vertex stand for [m^2], shape (V,)."""
-    area = share * triangle_areas(x, triangles)
-    return np.bincount(triangles.ravel(), np.repeat(area, 3) / 3.0, len(x))
 
 
 def triangle_areas(x: np.ndarray, triangles: np.ndarray) -> np.ndarray:
@@ -432,17 +459,24 @@ def _measured(
 ) -> dict[str, np.ndarray]:
     """Every real-valued field of a level, under its name there."""
     springs, triangles, hinges = (elements[name] for name in ("springs", "membrane", "hinges"))
-    surface, size = (np.concatenate([getattr(part, name) for part in parts]) for name in ("smooth_rest", "size"))
+    surface, metric = (np.concatenate([getattr(part, name) for part in parts]) for name in ("smooth_rest", "metric"))
     share, twists = (np.concatenate([getattr(part.elements, name) for part in parts]) for name in ("share", "twists"))
     bent = np.concatenate([part.bent for part in parts])
-    inverse = triangle_inverse(surface, triangles, warp)
+    corners = surface[triangles]
+    vectors = np.concatenate([corners[:, 1:] - corners[:, :1], warp[:, None]], axis=1)
+    vectors = _in_cloth(vectors, metric[triangles].mean(axis=1))
+    corners[:, 0], corners[:, 1:] = 0.0, vectors[:, :2]
+    corners, apart = corners.reshape(-1, 3), np.arange(3 * len(triangles)).reshape(-1, 3)
+    sides = surface[springs[:, 1]] - surface[springs[:, 0]]
+    length = np.sqrt(np.einsum("sa,sab,sb->s", sides, metric[springs].mean(axis=1), sides).clip(0.0))
+    cloth = {"length": length, "area": share * triangle_areas(corners, apart)}
+    shape = rest_shape(surface, springs, triangles, share=share, hinges=hinges, twists=twists, bent=bent, **cloth)
     stretch, bend, pin = (
         np.concatenate([part.vertex_values[name] for part in parts]) for name in ("stretch_scale", "bend_scale", "pin")
     )
-    shape = rest_shape(surface, springs, triangles, share=share, hinges=hinges, twists=twists, bent=bent, size=size)
     return shape | {
         "rest": np.concatenate([part.rest for part in parts]),
-        "membrane_inverse": inverse / size[triangles].mean(axis=1, keepdims=True),
+        "membrane_inverse": triangle_inverse(corners, apart, vectors[:, 2]),
         "spring_scale": stretch[springs].mean(axis=1),
         "membrane_scale": stretch[triangles].mean(axis=1),
         "bend_scale": bend[hinges[:, :2]].mean(axis=1),
@@ -459,7 +493,8 @@ def rest_shape(
     hinges: np.ndarray,
     twists: np.ndarray,
     bent: np.ndarray,
-    size: np.ndarray,
+    length: np.ndarray,
+    area: np.ndarray,
 ) -> dict[str, np.ndarray]:
     """Lengths, areas and angles of the rest shape, under the names of `Level`'s fields.
 
@@ -476,14 +511,13 @@ def rest_shape(
         hinges: Shape (H, 6).
         twists: Whether a hinge is a quad's diagonal, shape (H,).
         bent: True where a hinge rests at the rest shape's angle, shape (H,).
-        size: Lengths of the cloth over those of the rest positions, shape (V,).
+        length: Length of each spring in the cloth [m], shape (S,).
+        area: Area that each triangle stands for in the cloth [m^2], shape (M,).
 
     Returns:
         spring_length, spring_area, membrane_area, hinge_shape, rest_angle, vertex_area, spacing.
     """
     count = len(rest)
-    area = share * triangle_areas(rest, membrane) * size[membrane].mean(axis=1) ** 2
-    length = np.linalg.norm(rest[springs[:, 1]] - rest[springs[:, 0]], axis=1) * size[springs].mean(axis=1)
     side = find_edges(springs, membrane[:, [[0, 1], [1, 2], [2, 0]]])
     factor = np.where((share < 1.0)[:, None], np.array(QUAD_SPRING)[[0, 0, 1]], 1.0)
     spring_area = np.bincount(side, (factor * area[:, None] / 3.0).ravel(), len(springs)) if len(springs) else length
