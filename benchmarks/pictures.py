@@ -177,7 +177,7 @@ def measured(shot: Path, time: float, refined: Sequence[Sequence[DrawnMesh]]) ->
     world = np.concatenate([each.points for each in frame.garments])
     origin, settings = world.mean(axis=0), ContactSettings()
     coarse = torch.as_tensor(world - origin, dtype=torch.float32)
-    touched = FrameBodies.begin(levels, touching, coarse, origin=origin, settings=settings) if touching else None
+    touched = FrameBodies.begin(levels[0], touching, coarse, origin=origin, settings=settings) if touching else None
     contact = FrameContact(
         levels,
         coarse,

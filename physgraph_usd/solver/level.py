@@ -325,13 +325,13 @@ def _metric_of(
         smooth_rest: The same smoothly [m].
     """
     triangles, count = elements.membrane, len(rest)
-    cage, surface = ((x[triangles[:, 1:]] - x[triangles[:, :1]]).mT for x in (rest, smooth_rest))  # T 3 2
+    cage, surface = (x[triangles[:, 1:]] - x[triangles[:, :1]] for x in (rest, smooth_rest))  # T 2 3
     area = triangle_areas(smooth_rest, triangles)
     known = area > 1e-9 * (surface**2).sum(axis=(1, 2))
-    gram = np.where(known[:, None, None], surface.mT @ surface, np.eye(2))
-    dual = surface @ np.linalg.inv(gram)
-    normal = np.cross(surface[:, :, 0], surface[:, :, 1]) / np.where(known, 2.0 * area, 1.0)[:, None]
-    tensor = dual @ (cage.mT @ cage) @ dual.mT + normal[:, :, None] * normal[:, None, :]
+    gram, lengths = (np.einsum("tac,tbc->tab", each, each) for each in (surface, cage))
+    dual = np.linalg.inv(np.where(known[:, None, None], gram, np.eye(2))) @ surface
+    normal = np.cross(surface[:, 0], surface[:, 1]) / np.where(known, 2.0 * area, 1.0)[:, None]
+    tensor = dual.swapaxes(1, 2) @ lengths @ dual + normal[:, :, None] * normal[:, None, :]
     tensor[~known] = np.eye(3)
     weight, places = np.repeat(elements.share * area, 3), (triangles.ravel(), np.arange(3 * len(triangles)) // 3)
     around = linear.T @ sp.csr_matrix((weight, places), shape=(count, len(triangles)))
@@ -351,11 +351,11 @@ def _in_cloth(vectors: np.ndarray, metric: np.ndarray) -> np.ndarray:
     second = np.cross(normal, first)
     tiny = np.finfo(float).tiny
     axes = np.stack([each / np.linalg.norm(each, axis=1, keepdims=True).clip(tiny) for each in (first, second)], axis=1)
-    plane = axes @ metric @ axes.mT
+    plane = axes @ metric @ axes.swapaxes(1, 2)
     root = np.sqrt((plane[:, 0, 0] * plane[:, 1, 1] - plane[:, 0, 1] ** 2).clip(0.0))
     trace = (plane[:, 0, 0] + plane[:, 1, 1] + 2.0 * root).clip(tiny)
     plane += root[:, None, None] * np.eye(2)  # The square root of a 2 x 2 matrix, by Cayley and Hamilton.
-    return np.asarray((vectors @ axes.mT) @ plane / np.sqrt(trace)[:, None, None] @ axes)
+    return np.asarray(vectors @ axes.swapaxes(1, 2) @ plane / np.sqrt(trace)[:, None, None] @ axes)
 
 
 def vertex_normals(x: np.ndarray, triangles: np.ndarray) -> np.ndarray:
