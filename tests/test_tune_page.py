@@ -217,9 +217,9 @@ def test_a_map_is_painted_with_the_mouse_and_saved(shot: Path):
         for row in (420, 520):  # The second while the cloth still settles.
             mouse.move(460, row)
             mouse.down()
-            for step in range(10):
-                mouse.move(460 + 10 * step, row)
-                artist.page.wait_for_timeout(60)
+            for step in range(20):  # As slowly as a busy machine draws.
+                mouse.move(460 + 5 * step, row)
+                artist.page.wait_for_timeout(100)
             mouse.up()
         artist.settle("Pin")
         held = session.painted(CLOTH, "pin")
