@@ -258,7 +258,7 @@ class _GarmentLevel:
 
 
 def _garment_level(garment: Garment, whole: Sequence[Refinement], index: int) -> _GarmentLevel:
-    """Carry one garment to a level, or to the end of its chain of refinements, at which it stays."""
+    """Carry one garment to a level, or to the end of a shorter chain of refinements."""
     chain = whole[:index]
     mesh, face, creases, maps = _carried(garment, chain, stays=index > len(chain))
     linear, smoothing = maps["linear"], maps["smooth"]
@@ -457,7 +457,7 @@ def _grain(parts: Sequence[_GarmentLevel], elements: dict[str, np.ndarray]) -> t
 def _measured(
     parts: Sequence[_GarmentLevel], elements: dict[str, np.ndarray], *, warp: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """Every real-valued field of a level, under its name there."""
+    """The real-valued fields of a level by name."""
     springs, triangles, hinges = (elements[name] for name in ("springs", "membrane", "hinges"))
     surface, metric = (np.concatenate([getattr(part, name) for part in parts]) for name in ("smooth_rest", "metric"))
     share, twists = (np.concatenate([getattr(part.elements, name) for part in parts]) for name in ("share", "twists"))

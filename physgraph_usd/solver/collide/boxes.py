@@ -122,7 +122,7 @@ class Boxes:
         parts: Boxes of the parts, in blocks [m].
         radius: Search distance of each cluster [m].
         asked: True for clusters with a queried vertex.
-        met: True for clusters that no axis separates from some other.
+        met: True for clusters in a pair that no axis separates.
         low: Least corner of each cluster's paths, less the search distance [m].
         high: Greatest corner of each cluster's paths, plus the search distance [m].
     """
@@ -225,7 +225,7 @@ def put_part(boxes: Boxes, query: Query, k: wp.int32, c: wp.vec3i):
 
 @wp.kernel
 def bound_parts(first: wp.int32, parts: Topology, query: Query, boxes: Boxes):
-    """Boxes of the parts of the clusters that met another."""
+    """Boxes of the parts of clusters marked in `Boxes.met`."""
     i = first + wp.tid()
     if not boxes.met[i]:
         return

@@ -169,7 +169,7 @@ def search_kind(
 ):
     """Write pairs of a cluster's parts of one kind and another's of a second; returns the number of pairs so far.
 
-    Of the cluster's parts, only those are taken whose numbers have the given share in their last bits.
+    The first cluster's parts are shared between tasks by the last bits of their numbers.
     """
     room, size = boxes.radius[i] + boxes.radius[j], parts.clusters + 1
     for b in range(parts.first[first * size + i], parts.first[first * size + i + 1], ALL):

@@ -32,7 +32,7 @@ PAIRS, LEAST, MOST = 2**19, 16, 64
 """Room for pairs of parts: of all tasks, and least and most of a task. Without enough room a search runs twice."""
 TASKS, THREADS = 4 * KINDS, 2**18
 """Tasks of a pair of clusters on CUDA, each with one kind of pairs and every fourth part; and threads running at once.
-With more pairs of clusters than threads, a single task per pair is faster: tasks repeat box tests."""
+With more tasks than threads, a single task per pair is faster: tasks repeat box tests."""
 
 
 @wp.kernel

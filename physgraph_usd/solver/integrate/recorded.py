@@ -108,7 +108,7 @@ class Recording:
         self._loaded = False
 
     def step(self, system: System, carry: Carry) -> Carry:
-        """One step of a system with the values of the recorded one."""
+        """One step of a system with the recorded system's values; counts evaluations and solves in the given system."""
         step = carry.memory.step
         torch.stack(self._fields_of(carry), out=self._fields)
         self._step.fill_(step)
