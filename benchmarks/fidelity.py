@@ -15,6 +15,7 @@ from __future__ import annotations
 import argparse
 import subprocess
 import tempfile
+import time as clock
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
@@ -55,6 +56,10 @@ STEPS = 40
 """Quasi-Newton steps an increment, at most."""
 SUBSTEPS = 20
 """Newton's steps a frame: with ten, a cage in silk had a quarter less curvature than with forty."""
+ITERATIONS = (4, 40)
+"""Its iterations of a step, and of the conjugate gradients in each: with ten of these a fine sheet falls too slowly."""
+APART = 3e-3
+"""Distance that its cloth keeps to itself [m]."""
 OURS, NEWTON = ("curtain", "sleeve", "skirt", "flag"), ("curtain", "flag", "ball", "elbow")
 """Scenes by who simulates them."""
 BANDS = (0.3, 0.15, 0.08, 0.04, 0.02)
@@ -131,6 +136,12 @@ def simulated(stage: Stage, fabric: Fabric, subdivisions: int, *, frames: int) -
         yield x.double().numpy()
 
 
+def area_of(level: Level) -> float:
+    """Area at rest [m^2]."""
+    corners = level.rest.double().numpy()[level.triangles.numpy()]
+    return float(0.5 * np.linalg.norm(np.cross(*(corners[:, 1:] - corners[:, :1]).swapaxes(0, 1)), axis=1).sum())
+
+
 def panel_of(stage: Stage, level: Level) -> np.ndarray:
     """Each triangle laid flat with its weft along x and its warp along y [m], shape (T, 3, 2)."""
     rest, triangles = level.rest.double().numpy(), level.triangles.numpy()
@@ -141,15 +152,17 @@ def panel_of(stage: Stage, level: Level) -> np.ndarray:
     return np.stack([-np.einsum("tcx,tx->tc", spans, across), np.einsum("tcx,tx->tc", spans, warp)], axis=2)
 
 
-def problem_of(stage: Stage, fabric: Fabric, subdivisions: int, *, frames: int) -> dict[str, np.ndarray]:
+def problem_of(
+    stage: Stage, fabric: Fabric, subdivisions: int, *, frames: int, substeps: int = SUBSTEPS
+) -> dict[str, np.ndarray]:
     """What `benchmarks/newton_cloth.py` is given: stiffnesses that correspond, and where held vertices and bodies are.
 
     Its membrane has the fabric's along weft, warp and in shear, no contraction across; its bending, alike in all
     directions, has the warp's.
     """
-    level, step = level_at(garment_of(stage, subdivisions), subdivisions), 1.0 / (RATE * SUBSTEPS)
+    level, step = level_at(garment_of(stage, subdivisions), subdivisions), 1.0 / (RATE * substeps)
     held = np.flatnonzero(level.from_coarse @ stage.held.astype(float) > 1.0 - 1e-6)
-    times = step * np.arange(1, frames * SUBSTEPS + 1)
+    times = step * np.arange(1, frames * substeps + 1)
     poses = [[body.pose(time) for body in stage.bodies] for time in times]
     weft = fabric.stretch if fabric.weft_stretch is None else fabric.weft_stretch
     return {
@@ -161,11 +174,14 @@ def problem_of(stage: Stage, fabric: Fabric, subdivisions: int, *, frames: int) 
         "density": np.array(fabric.density),
         "held": held,
         "targets": np.array([(level.from_coarse @ stage.motion(time))[held] for time in times]),
-        "substeps": np.array(SUBSTEPS),
+        "substeps": np.array(substeps),
         "step": np.array(step),
+        "iterations": np.array(ITERATIONS),
+        "apart": np.array(APART),
+        "spacing": np.array(np.sqrt(2.0 * area_of(level) / len(level.triangles))),
         "capsules": np.array([(body.radius, body.half) for body in stage.bodies]).reshape(-1, 2),
-        "middles": np.array([[pose.centre for pose in each] for each in poses]),
-        "turns": np.array([[pose.turn for pose in each] for each in poses]),
+        "middles": np.array([[pose.centre for pose in each] for each in poses]).reshape(len(times), -1, 3),
+        "turns": np.array([[pose.turn for pose in each] for each in poses]).reshape(len(times), -1, 3, 3),
     }
 
 
@@ -173,16 +189,23 @@ def refined(
     stage: Stage, fabric: Fabric, cages: Sequence[np.ndarray], subdivisions: int, *, touches: bool = False
 ) -> list[np.ndarray]:
     """Positions of each frame [m], shape (V, 3), of the cages refined as a shot is."""
+    return [points for points, _ in timed(stage, fabric, cages, subdivisions, touches=touches)]
+
+
+def timed(
+    stage: Stage, fabric: Fabric, cages: Sequence[np.ndarray], subdivisions: int, *, touches: bool, device: str = "cpu"
+) -> Iterator[tuple[np.ndarray, float]]:
+    """Positions of each frame [m], shape (V, 3), of the cages refined as a shot is, and milliseconds of each."""
     kinds = [body.pose(0.0).kind for body in stage.bodies]
     colliders = tuple(Collider(f"/Body{number}", kind) for number, kind in enumerate(kinds)) if touches else ()
     garment = garment_of(stage, subdivisions, touches=touches)
-    refiner = Refiner(Scene((garment,), GRAVITY, (), colliders), SolveSettings())
-    found = []
+    refiner = Refiner(Scene((garment,), GRAVITY, (), colliders), SolveSettings(), device=device)
     for n, cage in enumerate(cages):
         poses: tuple[ShapePose, ...] = tuple(body.pose((n + 1) / RATE) for body in stage.bodies) if touches else ()
-        state = refiner.solve(Frame(float(n), (GarmentFrame(cage, fabric),), poses))
-        found += [points for points in state.points if points is not None]
-    return found
+        began = clock.perf_counter()
+        (points,) = refiner.solve(Frame(float(n), (GarmentFrame(cage, fabric),), poses)).points
+        assert points is not None  # The garment is in every frame.
+        yield points, 1e3 * (clock.perf_counter() - began)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,22 +1,26 @@
-"""A sheet simulated by Newton's Style3D solver: run by a Python that has ``newton``.
+"""A sheet simulated by Newton's Style3D or VBD solver: run by a Python that has ``newton``.
 
-    python benchmarks/newton_cloth.py problem.npz result.npz
+    python benchmarks/newton_cloth.py problem.npz result.npz [--solver vbd]
 
-The solver, its membrane (Baraff and Witkin 1998), its bending (Bergou et al. 2006), its contact and friction are
-Newton's; of ours are the mesh, the numbers of the fabric, and where held vertices and bodies are. Imports nothing of
+The solver, its membrane, its bending, its contact and friction are Newton's; of ours are the mesh, the numbers of the
+fabric, and where held vertices and bodies are. On CUDA two steps are recorded once and replayed. Imports nothing of
 this package.
 
 What the problem holds, with V vertices, T triangles, H held vertices and S steps: ``points`` [m], shape (V, 3);
 ``triangles``, (T, 3); ``panel``, material coordinates [m] of the triangles' corners, (T, 3, 2); ``stretch``, stiffness
 along weft and warp and in shear [N/m], (3,); ``bend`` [N m] and ``density`` [kg/m^2]; ``held``, (H,), and
-``targets`` [m], (S, H, 3); ``substeps`` and ``step`` [s]; ``capsules``, (C, 2), radius and half length [m], and
-``poses``, (S, C, 7), positions [m] and quaternions x, y, z, w, the capsule's axis along its z. A capsule of no length
-is a ball.
+``targets`` [m], (S, H, 3); ``substeps`` and ``step`` [s]; ``iterations`` of a step, and of the conjugate gradients in
+each, (2,); ``apart``, the distance [m] that cloth keeps to itself; ``spacing``, between parallel edges [m];
+``capsules``, (C, 2), radius and half length [m], and ``middles`` [m], (S, C, 3), and ``turns``, (S, C, 3, 3), of them,
+the capsule's axis along its z. A capsule of no length is a ball. S is even.
 """
 
+# Warp's kernels are typed by values that only Warp reads.
+# pyright: reportInvalidTypeForm=false
 from __future__ import annotations
 
 import argparse
+import time
 from typing import Any
 
 import newton  # pyright: ignore[reportMissingImports]
@@ -26,38 +30,89 @@ from newton.solvers import style3d  # pyright: ignore[reportMissingImports]
 
 wp.config.quiet = True  # pyright: ignore[reportAttributeAccessIssue]
 CYLINDER = 3.0
-"""Energy of their quadratic bending over D k^2 / 2 for a sheet of squares, halved by diagonals, that is bent along the
-sides of its squares; along one diagonal it is three times that."""
-ITERATIONS, LINEAR = 4, 40
-"""Iterations of a step and of the conjugate gradients in each: with ten of these a fine sheet falls too slowly."""
+"""Energy of Style3D's quadratic bending over D k^2 / 2 for a sheet of squares, halved by diagonals, that is bent along
+the sides of its squares; along one diagonal it is three times that."""
 FRICTION, CONTACT = 0.3, 10.0
 """Coefficient, and stiffness of what touches a body [N/m]."""
 RADIUS = 2e-3
 """Distance from a body at which cloth is pushed off [m]."""
+STILL: dict[str, Any] = {"pos": wp.vec3(0.0), "rot": wp.quat_identity(), "vel": wp.vec3(0.0), "particle_radius": RADIUS}
 
 
-def build(problem: Any, device: str) -> Any:
-    """The problem's sheet and bodies as a model."""
-    builder = newton.ModelBuilder(up_axis=newton.Axis.Z)
+@wp.kernel
+def place(
+    step: wp.array(dtype=wp.int32),
+    held: wp.array(dtype=wp.int32),
+    targets: wp.array2d(dtype=wp.vec3),
+    points: wp.array(dtype=wp.vec3),
+    next_points: wp.array(dtype=wp.vec3),
+):
+    """Held vertices to where a step has them."""
+    i = wp.tid()
+    points[held[i]] = targets[step[0], i]
+    next_points[held[i]] = targets[step[0], i]
+
+
+@wp.kernel
+def pose(
+    step: wp.array(dtype=wp.int32),
+    poses: wp.array2d(dtype=wp.transform),
+    bodies: wp.array(dtype=wp.transform),
+    next_bodies: wp.array(dtype=wp.transform),
+):
+    """Bodies to where a step has them."""
+    i = wp.tid()
+    bodies[i] = poses[step[0], i]
+    next_bodies[i] = poses[step[0], i]
+
+
+@wp.kernel
+def count(step: wp.array(dtype=wp.int32)):
+    """On to the next step."""
+    step[0] = step[0] + 1
+
+
+def add_style3d(builder: Any, problem: Any) -> None:
+    """The sheet with Style3D's membrane (Baraff and Witkin 1998) and bending (Bergou et al. 2006)."""
     newton.solvers.SolverStyle3D.register_custom_attributes(builder)
-    stiffness = float(problem["bend"]) / CYLINDER
     style3d.add_cloth_mesh(
         builder,
-        pos=wp.vec3(0.0),
-        rot=wp.quat_identity(),
-        vel=wp.vec3(0.0),
+        **STILL,
         vertices=problem["points"].tolist(),
         indices=problem["triangles"].ravel().tolist(),
         density=float(problem["density"]),
         panel_verts=problem["panel"].reshape(-1, 2).tolist(),
         panel_indices=list(range(problem["triangles"].size)),
         tri_aniso_ke=wp.vec3(*problem["stretch"].tolist()),
-        edge_aniso_ke=wp.vec3(stiffness),
-        particle_radius=RADIUS,
+        edge_aniso_ke=wp.vec3(float(problem["bend"]) / CYLINDER),
     )
-    for (radius, half), pose in zip(problem["capsules"], poses(problem, 0), strict=True):
-        body = builder.add_body(xform=wp.transform(*pose), is_kinematic=True)
+
+
+def add_vbd(builder: Any, problem: Any) -> None:
+    """The sheet with VBD's neo-Hookean membrane, as stiff as weft and warp on average, and bending by angles."""
+    builder.add_cloth_mesh(
+        **STILL,
+        scale=1.0,
+        vertices=problem["points"].tolist(),
+        indices=problem["triangles"].ravel().tolist(),
+        density=float(problem["density"]),
+        tri_ke=0.25 * float(problem["stretch"][:2].sum()),
+        tri_ka=0.0,
+        tri_kd=0.0,
+        edge_ke=float(problem["bend"]) / float(problem["spacing"]),
+        edge_kd=0.0,
+    )
+
+
+def build(problem: Any, solver: str, device: str) -> Any:
+    """The problem's sheet and bodies as a model."""
+    builder = newton.ModelBuilder(up_axis=newton.Axis.Z)
+    {"style3d": add_style3d, "vbd": add_vbd}[solver](builder, problem)
+    for (radius, half), at in zip(problem["capsules"], poses(problem)[0], strict=True):
+        body = builder.add_body(xform=wp.transform(*at), is_kinematic=True)
         builder.add_shape_capsule(body, radius=float(radius), half_height=float(half))
+    if solver == "vbd":
+        builder.color(include_bending=True)
     model = builder.finalize(device=device)
     flags = model.particle_flags.numpy()
     flags[problem["held"]] &= ~int(newton.ParticleFlags.ACTIVE)
@@ -67,50 +122,98 @@ def build(problem: Any, device: str) -> Any:
     return model
 
 
-def poses(problem: Any, step: int) -> np.ndarray:
-    """Where bodies are in a step: positions [m] and quaternions x, y, z, w, shape (C, 7)."""
+def solver_of(model: Any, problem: Any, solver: str) -> Any:
+    """The solver, which keeps cloth apart from itself."""
+    iterations, linear = map(int, problem["iterations"])
+    apart = float(problem["apart"])
+    if solver == "style3d":
+        config = newton.solvers.SolverStyle3D.Config(iterations=iterations, linear_iterations=linear)
+        made = newton.solvers.SolverStyle3D(model, config=config)
+        made.collision.radius = apart
+        return made
+    return newton.solvers.SolverVBD(
+        model,
+        iterations=iterations,
+        integrate_with_external_rigid_solver=True,
+        particle_enable_self_contact=True,
+        particle_self_contact_margin=apart,
+        particle_self_contact_gap=apart,
+        particle_vertex_contact_buffer_size=64,
+        particle_edge_contact_buffer_size=128,
+    )
+
+
+def poses(problem: Any) -> np.ndarray:
+    """Where bodies are in each step: positions [m] and quaternions x, y, z, w, shape (S, C, 7)."""
     made: Any = wp.quat_from_matrix
-    turns = [made(wp.mat33(*each.ravel())) for each in problem["turns"][step]]
-    return np.array([[*middle, *turn] for middle, turn in zip(problem["middles"][step], turns, strict=True)])
+    turns = [[[*made(wp.mat33(*turn.ravel()))] for turn in each] for each in problem["turns"]]
+    return np.concatenate([problem["middles"], np.reshape(turns, (*problem["middles"].shape[:2], 4))], axis=2)
 
 
-def place(state: Any, problem: Any, step: int) -> None:
-    """Held vertices and bodies to where a step has them."""
-    points = state.particle_q.numpy()
-    points[problem["held"]] = problem["targets"][step]
-    state.particle_q.assign(points)
-    if len(problem["capsules"]):
-        state.body_q.assign(poses(problem, step).astype(np.float32))
+class Simulation:
+    """A problem on a device; two steps at a time."""
 
+    def __init__(self, problem: Any, solver: str, device: str) -> None:
+        """Build it."""
+        self.model = build(problem, solver, device)
+        self.solver, self.seconds = solver_of(self.model, problem, solver), float(problem["step"])
+        self.states = (self.model.state(), self.model.state())
+        self.control, self.pipeline = self.model.control(), newton.CollisionPipeline(self.model)
+        self.contacts = self.pipeline.contacts()
+        self.number = wp.zeros(1, dtype=wp.int32, device=device)
+        self.held = wp.array(problem["held"], dtype=wp.int32, device=device)
+        self.targets = wp.array(problem["targets"], dtype=wp.vec3, ndim=2, device=device)
+        self.poses = wp.array(poses(problem), dtype=wp.transform, ndim=2, device=device)
+        self.graph: Any = None
 
-def simulate(problem: Any, device: str) -> np.ndarray:
-    """Positions of each frame [m], shape (F, V, 3)."""
-    model = build(problem, device)
-    config = newton.solvers.SolverStyle3D.Config(iterations=ITERATIONS, linear_iterations=LINEAR)
-    solver = newton.solvers.SolverStyle3D(model, config=config)
-    state, after, control = model.state(), model.state(), model.control()
-    pipeline = newton.CollisionPipeline(model)
-    contacts, frames = pipeline.contacts(), []
-    for step in range(len(problem["targets"])):
-        place(state, problem, step)
-        place(after, problem, step)
-        pipeline.collide(state, contacts)
-        state.clear_forces()
-        solver.step(state, after, control, contacts, float(problem["step"]))
-        state, after = after, state
-        if (step + 1) % int(problem["substeps"]) == 0:
-            frames.append(state.particle_q.numpy().copy())
-    return np.array(frames)
+    def step(self, here: Any, there: Any) -> None:
+        """One step from a state into another."""
+        device = here.particle_q.device
+        given = [self.number, self.held, self.targets, here.particle_q, there.particle_q]
+        wp.launch(place, dim=len(self.held), inputs=given, device=device)
+        if self.poses.size:
+            given = [self.number, self.poses, here.body_q, there.body_q]
+            wp.launch(pose, dim=self.poses.shape[1], inputs=given, device=device)
+        wp.launch(count, dim=1, inputs=[self.number], device=device)
+        self.pipeline.collide(here, self.contacts)
+        here.clear_forces()
+        self.solver.step(here, there, self.control, self.contacts, self.seconds)
+
+    def twice(self) -> None:
+        """Two steps, back into the state that they began in."""
+        self.step(*self.states)
+        self.step(*self.states[::-1])
+
+    def frame(self, steps: int) -> np.ndarray:
+        """Positions [m] after an even number of steps, shape (V, 3)."""
+        for _ in range(steps // 2):
+            if self.graph is not None:
+                wp.capture_launch(self.graph)
+                continue
+            self.twice()
+            if self.states[0].particle_q.device.is_cuda:
+                with wp.ScopedCapture(device=self.states[0].particle_q.device) as capture:
+                    self.twice()
+                self.graph = capture.graph
+        return self.states[0].particle_q.numpy().copy()
 
 
 def main() -> None:
-    """Simulate and write positions."""
+    """Simulate and write positions of each frame [m], shape (F, V, 3), and milliseconds of each."""
     parser = argparse.ArgumentParser()
     parser.add_argument("problem")
     parser.add_argument("result")
+    parser.add_argument("--solver", choices=["style3d", "vbd"], default="style3d")
     parser.add_argument("--device", default="cuda" if wp.is_cuda_available() else "cpu")
     given = parser.parse_args()
-    np.savez(given.result, frames=simulate(np.load(given.problem), given.device), newton=newton.__version__)
+    problem = dict(np.load(given.problem))
+    simulation = Simulation(problem, given.solver, given.device)
+    frames, spent = [], []
+    for _ in range(len(problem["targets"]) // int(problem["substeps"])):
+        began = time.perf_counter()
+        frames.append(simulation.frame(int(problem["substeps"])))
+        spent.append(1e3 * (time.perf_counter() - began))
+    np.savez(given.result, frames=frames, milliseconds=spent, newton=newton.__version__)
 
 
 if __name__ == "__main__":

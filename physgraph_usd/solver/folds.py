@@ -13,8 +13,7 @@ to folds longer than the cage's edges. Two wavelengths follow.
 The second governs what a mesh shows: a few steps from a cage leave the folds about as they began, and stiff cloth
 (denim) begins in shorter ones than soft (jersey), though settled in 300 steps it has the smoother folds. So D is raised
 to Y e (5 h / 2 pi)^2 on edges of h. The strain e is the least at which a start lets cloth buckle at all: it asks for
-the least stiffness. With ten times that, coarse levels iron folds out that settled cloth keeps, and end higher
-(`python -m benchmarks.unresolved`).
+the least stiffness, so that coarse levels keep the folds of settled cloth.
 """
 
 from __future__ import annotations
