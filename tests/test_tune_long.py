@@ -41,7 +41,7 @@ class Log:
     def __init__(self) -> None:
         self.errors: list[str] = []
         self.last: Shown | None = None
-        self.count = 0
+        self.count = self.shows = 0
 
     def busy(self, what: str) -> None:
         """Nothing is kept."""
@@ -51,6 +51,7 @@ class Log:
 
     def show(self, shown: Shown) -> None:
         self.last = shown
+        self.shows += 1
 
     def solved(self) -> None:
         self.count += 1
@@ -101,14 +102,21 @@ def test_random_moves_leave_memory_bounded_and_nothing_stale(tmp_path: Path, mon
             loop.ask(lambda own: moved(own, loop, chance))
             clock.sleep(chance.choice([0.01, 0.05, 0.3, 1.0]))
             sizes.append((clock.monotonic() - began, process.memory_info().rss))
-        loop.ask(lambda _: setattr(loop, "playing", False))
+        stopped = list[int]()
+
+        def stop(_: TuneSession) -> None:
+            loop.playing = False
+            stopped.append(log.shows)
+
+        loop.ask(stop)
         end = clock.monotonic() + 120.0
-        while log.last is None or not log.last.settled or session.solve() is not log.last:
+        while not stopped or log.shows == stopped[0] or log.last is None or not log.last.settled:
             assert clock.monotonic() < end
             clock.sleep(0.1)
         loop.close()
         gc.collect()
         shown = log.last
+        assert session.solve() is shown
         assert shown.frame.time == session.time
         assert shown.frame.garments[0].fabric == session.shot.frame(session.time).garments[0].fabric
     assert log.count > 10

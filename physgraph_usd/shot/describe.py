@@ -19,12 +19,13 @@ from ..solver.strain import StrainedPart, strained_parts
 from ..usd.read.find import GRAVITY_OPTION
 from ..usd.read.reader import Shot
 from ..usd.read.survey import survey
+from ..usd.read.targets import DETAIL, FOLLOW, Target
 from ..usd.schema import GARMENT
 from ..usd.stage import GarmentSource
 from ..usd.times import within
 from ..usd.view import Stage
 from .estimate import cannot_fit, estimate
-from .notes import of_fabrics, of_slack
+from .notes import of_fabrics, of_slack, of_trims
 from .options import RefineOptions
 from .report import RefineReport, of_a_kind
 from .untagged import FAR, Candidate, command_of, find_candidates, proposal, rest_options
@@ -51,7 +52,8 @@ def begin_report(report: RefineReport, opened: Shot, options: RefineOptions) -> 
         _garment(*part)
         | {"colliders": _felt(opened, part[0])}
         | {"velocities": "written anew, as the shot has them" if part[1].velocities else written}
-        for part in parts
+        | {"bound": [_bound(target) for target in opened.targets if target.garment == index]}
+        for index, part in enumerate(parts)
     ]
     report.estimate = estimate(opened.scene.garments, **_run(opened, report, options)).plain()
     known = _strained(opened, report, frames)
@@ -64,7 +66,9 @@ def begin_report(report: RefineReport, opened: Shot, options: RefineOptions) -> 
     beside = [each for each in candidates if each.is_taken]
     known += _unfelt(report, beside) if options.contact != "off" else []
     known += _across(opened, frames, beside)
-    report.note(*of_slack([garment.path for garment in opened.scene.garments], choices), *of_fabrics(opened))
+    follow = {each.path: each.follows for each in candidates if each.follows}
+    slack = of_slack([garment.path for garment in opened.scene.garments], choices)
+    report.note(*slack, *of_fabrics(opened), *of_trims(follow))
     report.modelled = _modelled(opened, report, options)
     report.left_out = _left_out(opened, report)
     report.variants = list(opened.selections)
@@ -214,6 +218,18 @@ def _garment(garment: Garment, source: GarmentSource, frame: GarmentFrame, choic
         "apart_from": dict(source.apart_from),
         "skinned": source.skinned,
         "pinned_points": int((garment.pin > 0).sum()),
+    }
+
+
+def _bound(target: Target) -> dict[str, Any]:
+    """What follows a garment, as plain values."""
+    return {
+        "path": str(target.path),
+        "points": len(target.points),
+        "rigid_parts": target.parts,
+        "distance_mm": round(1e3 * target.distance, 2),
+        "pose": "default" if target.time is None else f"{target.time:g}",
+        "mode": DETAIL if target.detail else FOLLOW,
     }
 
 

@@ -39,6 +39,20 @@ def of_slack(garments: Sequence[str], choices: Sequence[LevelChoice]) -> list[st
     return [f"{', '.join(tight)}: {words}"]
 
 
+def of_trims(found: Mapping[str, str]) -> list[str]:
+    """A note of meshes that could follow garments.
+
+    Args:
+        found: For each mesh that lies on a garment and moves with it, the garment.
+    """
+    if not found:
+        return []
+    cloth = ", ".join(f"<{path}>" for path in dict.fromkeys(found.values()))
+    stay, them = ("stays as it is", "it") if len(found) == 1 else ("stay as they are", "them")
+    listed, options = ", ".join(f"<{path}>" for path in found), join(options_of("--bind", found))
+    return [f"{listed} {stay} beside the refined {cloth}; {options} carries {them} along"]
+
+
 def of_fabrics(shot: Shot) -> list[str]:
     """A note for each preset whose name appears in garments without authored fabric values.
 

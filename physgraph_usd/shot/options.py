@@ -77,6 +77,7 @@ class RefineOptions:
         flag="collider",
         metavar="PATH|auto",
     )
+    bind: Sequence[str] = _scene((), f"Mesh, curves or points that follow the nearest garment{LIST}.", metavar="PATH")
     level: int | None = _scene(
         None,
         "Subdivisions; each makes four faces of one; auto (in Python -1) chooses.  [default: each garment's own]",

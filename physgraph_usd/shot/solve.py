@@ -43,6 +43,7 @@ def open_for(shot: str | Stage, options: RefineOptions) -> Shot:
         shot,
         garments=options.garments,
         colliders=options.colliders,
+        bind=options.bind,
         frames=options.frames if options.preroll is None else None,
         level=options.level,
         overrides=options.overrides,

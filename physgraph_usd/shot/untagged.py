@@ -54,12 +54,14 @@ class Candidate:
         shares: For each touching garment, the fraction of its vertices inside or near the mesh, in the first examined
             frame with contact; empty for a mesh left out.
         pose: Pose of the mesh in the first frame with contact, or None.
+        follows: Path of the garment on which the mesh lies and with which it moves, or "".
     """
 
     path: str
     reason: str
     shares: Mapping[str, float] = field(default_factory=dict)
     pose: Pose | None = None
+    follows: str = ""
 
     @property
     def is_taken(self) -> bool:
@@ -112,7 +114,7 @@ def _judged(
             seen = [(index, pose), *poses]
             if _moves_with(garment, [(frames[k].garments[most], each) for k, each in seen]):
                 why = f"it lies on <{garment.path}> and moves with it: a trim, or the garment's own skin"
-                return Candidate(path, why)
+                return Candidate(path, why, follows=garment.path)
             where = f"{fractions[most]:.0%} of <{garment.path}> is inside or within {1e3 * NEAR:.0f} mm"
             shares = {g.path: fraction for g, fraction in zip(garments, fractions, strict=True) if fraction}
             return Candidate(path, where + at_time(frames[index].time), shares, pose)
@@ -194,11 +196,22 @@ def proposal(shot: str | Stage, meshes: Sequence[str], frames: tuple[float, floa
         return ""
 
 
-def command_of(shot: str, garments: Iterable[str], colliders: Iterable[str], *, rest: Sequence[str]) -> str:
-    """The command to refine a shot's garments with colliders; ``rest``: the result of `rest_options`."""
+def command_of(
+    shot: str, garments: Iterable[str], colliders: Iterable[str], *, bind: Iterable[str] = (), rest: Sequence[str]
+) -> str:
+    """The command to refine a shot's garments with colliders and what follows them.
+
+    Args:
+        shot: The shot.
+        garments: Paths of the garments.
+        colliders: Paths of the colliders.
+        bind: Paths of what follows garments.
+        rest: The result of `rest_options`.
+    """
     out = str(Path(shot).with_suffix(".refined.usdc"))
-    words = ["physgraph-usd", "refine", shot, "-o", out, *rest]
-    return join([*words, *options_of("--garment", garments), *options_of("--collider", colliders)])
+    named = {"--garment": garments, "--collider": colliders, "--bind": bind}
+    options = [word for name, values in named.items() for word in options_of(name, values)]
+    return join(["physgraph-usd", "refine", shot, "-o", out, *rest, *options])
 
 
 def rest_options(strained: Iterable[tuple[str, Sequence[StrainedPart]]]) -> list[str]:

@@ -218,6 +218,11 @@ PROPERTIES: tuple[Property, ...] = (
         "Excluded Prims", CONTACT,
     ),
     Property(
+        GARMENT_API, "physgraph:bind:targets", "rel", None, "", None, None,
+        "Meshes, curves and points that follow the refined cloth: render meshes, trims, piping, buttons.",
+        "Bound Prims", REFINEMENT,
+    ),
+    Property(
         GARMENT_API, "physgraph:seam:tolerance", "float", 0.0, "m", 0.0, 1.0,
         "Distance within which open borders are sewn together; 0 sews borders at one place." + SI,
         "Seam Tolerance", REST, (0.0, 5e-3), uniform=True,

@@ -15,6 +15,7 @@ SAMPLES: dict[str, str] = {
     "sleeve": "a triangulated tube, compressed by a fifth and twisted",
     "skirt": "a flared skirt on turning hips, with a collider",
     "tshirt": "quads with UVs, two materials and skinning that shows the armpit artefact",
+    "trims": "the T-shirt with a render mesh that has thickness, buttons and piping",
     "flag": "quads in the wind, pinned on one edge, no collider",
     "dancer": "a dress with a wide skirt on a person who turns on one foot",
     "frozen": "a cloth draped over a table, twelve equal samples",

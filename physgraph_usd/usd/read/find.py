@@ -60,6 +60,7 @@ def find_colliders(
     garments: Sequence[Usd.Prim],
     wanted: Sequence[str] = (),
     *,
+    without: Sequence[Sdf.Path] = (),
     overrides: Sequence[Override] = (),
 ) -> list[Usd.Prim]:
     """Find the gprims garments may collide with, in stage order.
@@ -71,13 +72,14 @@ def find_colliders(
         garments: The garments; never colliders.
         wanted: As for ``find_garments``; empty: the targets of the garments' ``physgraph:colliders``, and for garments
             without targets every prim with PhysGraphColliderAPI or UsdPhysics' CollisionAPI.
+        without: Prims that are never colliders, beside the garments.
         overrides: Values of ``--set``.
 
     Raises:
         AbsentError: When a named collider does not exist.
     """
     felt = [_colliders_named(stage, wanted, overrides)] if wanted else felt_by(stage, garments, overrides=overrides)
-    chosen = {path for paths in felt for path in paths} - {prim.GetPath() for prim in garments}
+    chosen = {path for paths in felt for path in paths} - {*without, *(prim.GetPath() for prim in garments)}
     return [prim for prim in traverse(stage) if prim.GetPath() in chosen]
 
 

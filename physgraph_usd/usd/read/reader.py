@@ -16,6 +16,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from copy import copy
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 from pxr import Sdf, Usd
@@ -58,10 +59,11 @@ from .find import (
 )
 from .garment import GarmentReader, Request, is_visible, read_garment, samples_of, seam_tolerance
 from .materials import find_values
-from .placement import to_metres
+from .placement import place, to_metres
 from .rest import AUTO
 from .seams import sewn_garments
 from .skinning import Bake
+from .targets import Bound, Target, find_bound, read_targets
 from .timing import timing_notices
 
 
@@ -77,6 +79,7 @@ class Shot:
         sources: Place of each garment on the stage, in the scene's order.
         colliders: Paths of the collider prims found.
         selections: Active variant selections the garments depend on, as paths `/World/coat{fit=loose}`.
+        bound: What is to follow the garments; `targets` are read from it.
         warnings: Warnings for the user; grows as frames are read.
         metres_per_unit: Length of one stage unit [m].
         gravity_source: Source of gravity's direction, in words.
@@ -97,6 +100,7 @@ class Shot:
         self.colliders: tuple[str, ...] = ()
         self.selections: tuple[str, ...] = ()
         self.unsaved: tuple[str, ...] = ()
+        self.bound: tuple[Bound, ...] = ()
         self.warnings: list[Notice] = []
         self.metres_per_unit, self.gravity_source = request.units.metres, request.units.gravity_source
         times = merge(time for reader in readers for time in reader.source.times)
@@ -128,6 +132,30 @@ class Shot:
         """
         reader = self._readers[index]
         return reader.weld.joined(reader.points.read(time, reader.edges)[0])
+
+    def cage(self, index: int, time: float | None) -> np.ndarray:
+        """A garment's coarse points [m] in world space at a time code, by number, shape (V, 3), float64.
+
+        Raises:
+            GarmentError: The points are broken.
+        """
+        return place(self.local(index, time), self.to_metres(index, time))
+
+    @cached_property
+    def targets(self) -> list[Target]:
+        """What follows the garments in its bind pose, each after what it is bound to.
+
+        Raises:
+            GarmentError: A target lies too far from its garment, changes its topology, or cannot be placed.
+            SchemaError: An attribute is invalid.
+        """
+        pairs = zip(self.sources, self.scene.garments, strict=True)
+        # The first sample of the whole shot: the pose must not depend on the frame range.
+        firsts = [min((*source.times, *source.left_out), default=None) for source in self.sources]
+        garments = [(source.path, garment.mesh, first) for (source, garment), first in zip(pairs, firsts, strict=True)]
+        given = {"metres": self.metres_per_unit, "skinned": [*self._request.bake.skinned]}
+        with pxr_errors(f"cannot read {self.path}"):
+            return read_targets(self.stage, self.bound, garments, cage=self.cage, **given)
 
     def times_until(self, last: float) -> list[float]:
         """Time codes with a sample of any garment, including outside the frame range, up to ``last``, in order."""
@@ -203,6 +231,7 @@ def open_shot(
     overrides: Sequence[str] = (),
     rest_frame: float | str | None = None,
     gravity: str | None = None,
+    bind: Sequence[str] = (),
     skip_invisible: bool = False,
 ) -> Shot:
     """Open a shot for refining.
@@ -219,6 +248,8 @@ def open_shot(
         rest_frame: Time code whose points are the rest shape of every garment, or "auto" for a shape fitted to the
             whole shot; both override authored rest shapes. None: the authored shape, or else a fitted shape.
         gravity: Axis of the stage along which gravity pulls, one of `AXES`; None: the stage's gravity.
+        bind: Meshes, curves and points that follow the nearest garment, named as garments are; beside those that
+            garments name.
         skip_invisible: Leave out garments invisible at all their time codes.
 
     Returns:
@@ -243,7 +274,8 @@ def open_shot(
         check_metadata(stage)
         prims = _find(stage, garments, notices)
         refuse_refined(stage, [prim.GetPath() for prim in prims])
-        found = find_colliders(stage, prims, colliders, overrides=asked)
+        bound = find_bound(stage, prims, bind)
+        found = find_colliders(stage, prims, colliders, without=[each.path for each in bound], overrides=asked)
         disabled = disabled_colliders(stage, prims, colliders, overrides=asked)
         check_overrides(asked, *([prim.GetPath() for prim in each] for each in (prims, [*found, *disabled])))
         for prim in (*prims, *found):
@@ -258,11 +290,13 @@ def open_shot(
         bake = Bake(stage)
         request = Request(units, bake, frames, level, asked, rest_frame, assumed)
         bodies = [prim.GetPath() for prim in found]
-        readers = _read(stage, prims, request, bodies=bodies, notices=notices, skip_invisible=skip_invisible)
+        moved = [*bodies, *(each.path for each in bound)]
+        readers = _read(stage, prims, request, bodies=moved, notices=notices, skip_invisible=skip_invisible)
         readers, solids = _link(stage, readers, bodies, wanted=colliders, request=request, notices=notices)
         opened = Shot(path, stage, view, request=request, readers=readers, bodies=_with_sides(stage, readers, solids))
+        opened.bound = tuple(bound)
         notices += _timing(stage, readers, solids, bake=bake)
-        read = [*(source.path for source in opened.sources), *bodies, *bake.prims()]
+        read = [*(source.path for source in opened.sources), *moved, *bake.prims()]
         opened.selections = selections(map(stage.GetPrimAtPath, read))
     opened.unsaved = unsaved
     opened.colliders = tuple(str(path) for path in bodies)

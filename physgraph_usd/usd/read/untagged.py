@@ -41,6 +41,7 @@ def unnamed_meshes(
     """
     in_shot = {*shot.colliders, *(garment.path for garment in shot.scene.garments)}
     in_shot |= {path for source in shot.sources for path in source.apart_from}
+    in_shot |= {str(each.path) for each in shot.bound}
     with pxr_errors(f"cannot read {shot.path}"), quiet():
         meshes = [prim for prim in traverse(shot.stage) if UsdGeom.Mesh(prim) and str(prim.GetPath()) not in in_shot]
         unfit = {prim: _why_left(prim, times) for prim in meshes}

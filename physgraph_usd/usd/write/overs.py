@@ -122,12 +122,13 @@ def edit_schemas(
     spec.SetInfo("apiSchemas", edits)
 
 
-def open_instances(stream: LayerStream, source: GarmentSource) -> list[Notice]:
-    """Make the instances containing a garment editable, with one notice each."""
+def open_instances(stream: LayerStream, path: Sdf.Path, roots: Sequence[Sdf.Path]) -> list[Notice]:
+    """Make the instances containing a prim editable, with one notice each."""
     notices = []
-    for root in source.instance_roots:
-        stream.prim(root).SetInfo("instanceable", False)
-        notices.append(Notice(str(root), None, f"no longer instanceable, so that <{source.path}> can be refined"))
+    for root in roots:
+        if stream.prim(root).GetInfo("instanceable") is not False or not stream.prim(root).HasInfo("instanceable"):
+            stream.prim(root).SetInfo("instanceable", False)
+            notices.append(Notice(str(root), None, f"no longer instanceable, so that <{path}> can be refined"))
     return notices
 
 

@@ -80,7 +80,7 @@ class PlainMesh:
         indices: Vertices of the face corners, shape (C,).
         points: Default positions, the rest shape of a garment [stage units], shape (V, 3).
         look: Material of all faces outside the subsets.
-        role: ``garment``, ``collider`` or ``prop``.
+        role: ``garment``, ``collider``, ``trim``, which the first garment binds, or ``prop``.
         samples: Positions at the stage's times, shape (T, V, 3), or None.
         transforms: Local matrices (column vectors) at the stage's times, shape (T, 4, 4), or None.
         uv: Texture coordinates, or None.

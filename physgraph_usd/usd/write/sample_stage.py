@@ -39,6 +39,7 @@ def write_stage(record: PlainStage, path: Path, *, overwrite: bool = False) -> P
         _write_skeleton(stage, record, record.skeleton)
     for mesh in record.meshes:
         _write_mesh(stage, record, mesh)
+    _write_bound(root, record)
     return export_layer(layer, path)
 
 
@@ -131,6 +132,14 @@ def _write_garment(prim: Usd.Prim, mesh: PlainMesh) -> None:
         prim.CreateAttribute(name, whole, False, Sdf.VariabilityUniform).Set(mesh.level)
     for name, value in ({} if mesh.fabric is None else fabric_values(mesh.fabric)).items():
         prim.CreateAttribute(f"physgraph:material:{name}", Sdf.ValueTypeNames.Float, False).Set(value)
+
+
+def _write_bound(root: Usd.Prim, record: PlainStage) -> None:
+    """Bind the trims to the first garment."""
+    paths = [root.GetPath().AppendChild(mesh.name) for mesh in record.meshes if mesh.role == "trim"]
+    garment = next((mesh.name for mesh in record.meshes if mesh.role == "garment"), None)
+    if paths and garment is not None:
+        root.GetChild(garment).CreateRelationship("physgraph:bind:targets", False).SetTargets(paths)
 
 
 def _write_skeleton(stage: Usd.Stage, record: PlainStage, skeleton: Skeleton) -> None:

@@ -49,7 +49,7 @@ def refuse_not_finite(values: np.ndarray, place: str) -> None:
         raise LayerError(f"{place}: value {first} is {values[first].tolist()}, not finite")
 
 
-def _set_sample(stream: LayerStream, path: Sdf.Path, values: np.ndarray, time: float | None) -> None:
+def set_sample(stream: LayerStream, path: Sdf.Path, values: np.ndarray, time: float | None) -> None:
     """Author solved values; all solved values enter the layer here, checked to be finite."""
     refuse_not_finite(values, f"<{path}>" + at_time(time))
     kind = Vt.FloatArray if values.ndim == 1 else Vt.Vec3fArray
@@ -74,11 +74,12 @@ class PointTrack:
         self,
         stream: LayerStream,
         target: Sdf.Path,
-        normals: VertexNormals,
+        normals: VertexNormals | None,
         *,
         rest: np.ndarray | None,
         still: bool,
         rate: float | None,
+        margin: float = 0.0,
         own: Callable[[float | None], np.ndarray | None] = lambda _: None,
         absent: Sequence[float] = (),
     ) -> None:
@@ -87,17 +88,19 @@ class PointTrack:
         Args:
             stream: The layer.
             target: Prim to author on.
-            normals: Normals of local points.
+            normals: Normals of local points; None leaves normals alone.
             rest: Local points for the default time, shape (V, 3); if None, the first sample's points.
             still: Whether the garment's input has no samples: only a default is written until the cloth moves.
             rate: Time codes per second for velocities; None leaves velocities out.
+            margin: Distance by which the extent exceeds the points, such as half the width of curves.
             own: The shot's velocities at a time code [units/s], shape (V, 3), float32; None without velocities.
             absent: Time codes to block, ascending: the garment is absent.
         """
-        self._stream, self._normals = stream, normals
+        self._stream, self._normals, self._margin = stream, normals, np.float32(margin)
         self._paths = {name: target.AppendProperty(name) for name in TYPES}
         stream.attribute(self._paths["points"], TYPES["points"])
-        stream.attribute(self._paths["normals"], TYPES["normals"], interpolation=UsdGeom.Tokens.vertex)
+        if normals is not None:
+            stream.attribute(self._paths["normals"], TYPES["normals"], interpolation=UsdGeom.Tokens.vertex)
         stream.attribute(self._paths["extent"], TYPES["extent"])
         self._rest, self._still, self._rate, self._own = rest, still, rate, own
         self._absent = list(absent)
@@ -146,7 +149,7 @@ class PointTrack:
             if self._still and self._rate is not None and (velocity := self._own(time)) is not None:
                 self._set_velocity(None, velocity)
         if time is None:
-            self.box = extent_of(points)
+            self.box = self._extent(points)
             return
         self._take(_Sample(time, points), moved=self._last is None or not np.array_equal(points, self._last.points))
 
@@ -160,7 +163,7 @@ class PointTrack:
                 self._emit(sample)
             return
         if last is None:
-            self.box = extent_of(sample.points)
+            self.box = self._extent(sample.points)
         elif self._still:
             self._still = False
             self._emit(last)
@@ -205,7 +208,8 @@ class PointTrack:
             self._end_stretch()
             self._last = self._matrix = None
             blocked = self._absent.pop(0)
-            for name in ("points", "normals", "extent", *(["velocities"] if self._rate is not None else [])):
+            optional = {"normals": self._normals is not None, "velocities": self._rate is not None}
+            for name in ("points", "extent", *(name for name, there in optional.items() if there)):
                 self._block(name, blocked)
 
     def _block(self, name: str, time: float) -> None:
@@ -214,10 +218,15 @@ class PointTrack:
 
     def _author(self, time: float | None, points: np.ndarray) -> None:
         """Author points, normals and extent at one time."""
-        self.box = extent_of(points)
-        values = {"points": points, "normals": self._normals(points), "extent": self.box}
+        self.box = self._extent(points)
+        values = {"points": points, "extent": self.box}
+        values |= {} if self._normals is None else {"normals": self._normals(points)}
         for name, value in values.items():
-            _set_sample(self._stream, self._paths[name], value, time)
+            set_sample(self._stream, self._paths[name], value, time)
+
+    def _extent(self, points: np.ndarray) -> np.ndarray:
+        """Least and greatest corner with the margin, shape (2, 3), float32."""
+        return extent_of(points) + np.array([[-self._margin], [self._margin]], np.float32)
 
     def _author_velocity(self, at: _Sample, before: _Sample, after: _Sample) -> None:
         """Author the velocity of a sample by finite differences [units/s], or the shot's own for an isolated sample."""
@@ -231,7 +240,7 @@ class PointTrack:
 
     def _set_velocity(self, time: float | None, velocity: np.ndarray) -> None:
         self._stream.attribute(self._paths["velocities"], TYPES["velocities"])
-        _set_sample(self._stream, self._paths["velocities"], np.ascontiguousarray(velocity, np.float32), time)
+        set_sample(self._stream, self._paths["velocities"], np.ascontiguousarray(velocity, np.float32), time)
 
 
 def to_local(world: np.ndarray, to_metres: np.ndarray, path: str, time: float | None) -> np.ndarray:
@@ -318,7 +327,7 @@ class HeatTrack:
         return self._target.AppendProperty(PREFIX + name)
 
     def _set(self, name: str, time: float | None, values: np.ndarray) -> None:
-        _set_sample(self._stream, self._path(name), values, time)
+        set_sample(self._stream, self._path(name), values, time)
 
 
 class ModelHints:

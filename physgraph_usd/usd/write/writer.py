@@ -26,6 +26,7 @@ from ..read.reader import Shot
 from ..stage import Notice, at_time, first_value, pxr_errors, value_at
 from ..times import within
 from . import overs
+from .bound import Followers
 from .normals import VertexNormals
 from .overs import author_used_values
 from .primvars import FineMap, carry_primvars, carry_subsets
@@ -80,7 +81,7 @@ class LayerWriter:
         self._shot, self._mode, self._time = shot, mode, -np.inf
         self._velocities, self._open = velocities, True
         self._record = {"mode": mode} | dict(provenance or {})
-        self._times, self._meshes = times, dict[int, _RefinedMesh]()
+        self._times, self._meshes, self._bound = times, dict[int, _RefinedMesh](), dict[int, Followers]()
         self.notices: list[Notice] = []
         with ExitStack() as stack:
             self._stream = stack.enter_context(LayerStream(out, overwrite=overwrite))
@@ -98,8 +99,11 @@ class LayerWriter:
                 absent = self._shot.sources[index].absent
                 absent = absent if self._times is None else within(absent, (self._times[0], self._times[-1]))
                 mesh = _RefinedMesh(self._stream, self._shot, index, steps=refinements[index], absent=absent, **options)
-                self.notices += mesh.notices
                 self._meshes[index] = mesh
+                moves = {"absent": absent, "velocities": self._velocities}
+                bound = Followers(self._stream, self._shot, index, steps=refinements[index], **moves)
+                self._bound[index] = bound
+                self.notices += [*mesh.notices, *bound.notices]
 
     def write(
         self,
@@ -138,6 +142,7 @@ class LayerWriter:
                 different = True if changed is None else bool(changed[index])
                 how = {"changed": different, "cut": bool(cuts) and cuts[index]}
                 mesh.write(time, array, (heat[index] if heat else None) or {}, **how)
+                self._bound[index].write(time, array, **how)
         self._time = np.inf if time is None else time
 
     @property
@@ -159,7 +164,10 @@ class LayerWriter:
         for mesh in self._meshes.values():
             mesh.finish()
             self.notices += mesh.unknown_velocities()
+        for bound in self._bound.values():
+            bound.finish()
         facts = _facts(self._shot, self.targets, self._stream.target)
+        facts["bound"] = [str(path) for bound in self._bound.values() for path in bound.paths] or None
         if self._times is not None:
             count = len(self._shot.scene.times)
             left = f"{count - len(self._times)} of the shot's {count} frames"
@@ -229,7 +237,7 @@ class _RefinedMesh:
         counts = np.asarray(first_value(UsdGeom.Mesh(prim).GetFaceVertexCountsAttr()))
         steps, self._weld = source.weld.subdivided(len(steps))
         fine = FineMap(source.weld.apart, steps, counts, source.kept_faces)
-        self.notices = overs.open_instances(stream, source)
+        self.notices = overs.open_instances(stream, source.path, source.instance_roots)
         self.target = target = overs.make_sibling(stream, prim) if sibling else source.path
         overs.author_topology(stream, target, prim, fine)
         overs.author_unskinned(stream, target, prim, skinned=source.skinned)

@@ -1,0 +1,286 @@
+"""What hangs on a garment follows its refined cloth: buttons, piping, points, render meshes, and trims of trims."""
+
+from __future__ import annotations
+
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pytest
+from layers import errors, open_over, world_metres
+from numpy.typing import ArrayLike
+from pxr import Gf, Sdf, Usd, UsdGeom, Vt
+from shots import CLOTH, EDGE, cloth_shot, only, refine, run
+from stages import sheet_faces, sheet_points, vec3
+
+from physgraph_usd.errors import AbsentError, GarmentError, SchemaError
+from physgraph_usd.lab.samples.shapes import ellipsoid
+from physgraph_usd.shot.stitch import stitch
+from physgraph_usd.solver.mesh.bind import closest
+from physgraph_usd.solver.mesh.subdivide import smooth, subdivide
+from physgraph_usd.solver.mesh.topology import PolygonMesh
+from physgraph_usd.solver.rigid import best_motion
+from physgraph_usd.usd.read.reader import open_shot
+from physgraph_usd.usd.read.targets import TARGETS
+
+BUTTON, PIPING, BEADS = "/World/button", "/World/piping", "/World/beads"
+SIZE = (6, 4)
+LATE = 4.0
+
+
+def bind(stage: Usd.Stage, *paths: str, to: str = CLOTH) -> None:
+    stage.GetPrimAtPath(to).CreateRelationship(TARGETS).SetTargets([Sdf.Path(path) for path in paths])
+
+
+def beside(stage: Usd.Stage, path: str, middle: ArrayLike, *, radius: float = 0.1, moves: bool = False) -> UsdGeom.Mesh:
+    """A closed ball beside the sheet, in its units; one that moves has samples of its own."""
+    solid = ellipsoid(np.full(3, radius), np.asarray(middle, float), (8, 6))
+    mesh = UsdGeom.Mesh.Define(stage, path)
+    mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(solid.counts.astype(np.int32)))
+    mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(solid.indices.astype(np.int32)))
+    mesh.CreatePointsAttr(vec3(solid.points))
+    return mesh
+
+
+def on_sheet(x: float, y: float, above: float = 0.0) -> np.ndarray:
+    """A place on the sheet's default points, whose vertices lie at whole numbers."""
+    points = sheet_points(None, SIZE).reshape(SIZE[1] + 1, SIZE[0] + 1, 3)
+    return points[int(y), int(x)] + np.array([0.0, 0.0, above])
+
+
+@pytest.fixture
+def shot(tmp_path: Path) -> Path:
+    """A waving sheet with a button, a curve along one side and a few points, which stand still."""
+    path = cloth_shot(tmp_path / "shot.usda")
+    stage = Usd.Stage.Open(str(path))
+    beside(stage, BUTTON, on_sheet(3, 2, 0.12))
+    curve = UsdGeom.BasisCurves.Define(stage, PIPING)
+    curve.CreatePointsAttr(vec3(sheet_points(None, SIZE)[: SIZE[0] + 1] + np.array([0, 0, 0.02], np.float32)))
+    curve.CreateCurveVertexCountsAttr([SIZE[0] + 1])
+    curve.CreateTypeAttr("linear")
+    curve.CreateWidthsAttr([0.04])
+    UsdGeom.Points.Define(stage, BEADS).CreatePointsAttr(vec3(sheet_points(None, SIZE)[8:11]))
+    bind(stage, BUTTON, PIPING, BEADS)
+    stage.Save()
+    return path
+
+
+def cloth_at(stage: Usd.Stage, time: float) -> tuple[np.ndarray, np.ndarray]:
+    """Points [m] and triangles of the refined cloth."""
+    mesh = UsdGeom.Mesh(stage.GetPrimAtPath(CLOTH))
+    counts, indices = mesh.GetFaceVertexCountsAttr().Get(time), mesh.GetFaceVertexIndicesAttr().Get(time)
+    points = world_metres(stage, CLOTH, time)
+    return points, PolygonMesh(np.asarray(counts), np.asarray(indices), len(points)).triangulate(points).triangles
+
+
+def distances(stage: Usd.Stage, path: str, time: float) -> np.ndarray:
+    """Distance of a prim's points from the refined cloth [m]."""
+    return closest(world_metres(stage, path, time), *cloth_at(stage, time)).distance
+
+
+def test_a_button_stays_a_button_and_curves_and_points_lie_on_the_cloth(shot: Path, tmp_path: Path):
+    out = tmp_path / "out.usda"
+    refine(shot, out)
+    stage = open_over(shot, out)
+    first, later = (world_metres(stage, BUTTON, time) for time in (1.0, LATE))
+    motion = best_motion(first, later)
+    assert np.linalg.norm(motion(first) - later, axis=1).max() < 1e-6
+    assert np.linalg.norm(later - first, axis=1).min() > 0.1 * EDGE
+    for time in (1.0, LATE):
+        assert distances(stage, BUTTON, time).min() < 0.1 * EDGE
+        assert distances(stage, PIPING, time).max() < 0.08 * EDGE
+        assert distances(stage, BEADS, time).max() < 0.08 * EDGE
+    assert not errors(out, shot)
+
+
+def test_the_layer_holds_what_moves_and_nothing_else_of_a_target(shot: Path, tmp_path: Path):
+    out = tmp_path / "out.usda"
+    refine(shot, out)
+    layer = Sdf.Layer.FindOrOpen(str(out))
+    assert {name for path in (BUTTON, PIPING, BEADS) for name in layer.GetPrimAtPath(path).properties.keys()} == {
+        "points",
+        "extent",
+    }
+    assert layer.customLayerData["physgraph"]["bound"] == [BUTTON, PIPING, BEADS]
+    stage = open_over(shot, out)
+    curve = UsdGeom.BasisCurves(stage.GetPrimAtPath(PIPING))
+    extent, points = (np.array(each.Get(LATE)) for each in (curve.GetExtentAttr(), curve.GetPointsAttr()))
+    np.testing.assert_allclose(extent, [points.min(axis=0) - 0.02, points.max(axis=0) + 0.02], atol=1e-6)
+
+
+@pytest.mark.parametrize("placed", ["turned", "mirrored", "scaled"])
+def test_the_same_trim_below_another_transform_goes_to_the_same_place(shot: Path, tmp_path: Path, placed: str):
+    refine(shot, tmp_path / "plain.usda")
+    expected = world_metres(open_over(shot, tmp_path / "plain.usda"), BUTTON, LATE)
+    stage = Usd.Stage.Open(str(shot))
+    matrix = {
+        "turned": Gf.Matrix4d().SetRotate(Gf.Rotation(Gf.Vec3d(1, 2, 3), 70)),
+        "mirrored": Gf.Matrix4d().SetScale(Gf.Vec3d(-1, 1, 1)),
+        "scaled": Gf.Matrix4d().SetScale(Gf.Vec3d(0.01, 2.0, 30.0)),
+    }[placed]
+    mesh = UsdGeom.Mesh(stage.GetPrimAtPath(BUTTON))
+    points = np.asarray(mesh.GetPointsAttr().Get()) @ np.linalg.inv(np.array(matrix))[:3, :3]
+    mesh.AddTransformOp().Set(matrix)
+    mesh.GetPointsAttr().Set(vec3(points))
+    stage.Save()
+    refine(shot, tmp_path / "out.usda")
+    found = world_metres(open_over(shot, tmp_path / "out.usda"), BUTTON, LATE)
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+
+
+def test_normals_turn_with_their_points_per_corner_too(shot: Path, tmp_path: Path):
+    stage = Usd.Stage.Open(str(shot))
+    mesh = UsdGeom.Mesh(stage.GetPrimAtPath(BUTTON))
+    points, corners = np.asarray(mesh.GetPointsAttr().Get()), np.asarray(mesh.GetFaceVertexIndicesAttr().Get())
+    outward = points - points.mean(axis=0)
+    outward /= np.linalg.norm(outward, axis=1, keepdims=True)
+    normals = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar("normals", Sdf.ValueTypeNames.Normal3fArray, "faceVarying")
+    normals.Set(vec3(outward))
+    normals.SetIndices(Vt.IntArray.FromNumpy(corners))
+    stage.Save()
+    refine(shot, tmp_path / "out.usda")
+    over = open_over(shot, tmp_path / "out.usda")
+    moved = np.asarray(UsdGeom.Mesh(over.GetPrimAtPath(BUTTON)).GetPointsAttr().Get(LATE))
+    turn = best_motion(points.astype(float), moved.astype(float)).turn
+    found = UsdGeom.PrimvarsAPI(over.GetPrimAtPath(BUTTON)).GetPrimvar("normals").ComputeFlattened(LATE)
+    np.testing.assert_allclose(np.asarray(found), (outward @ turn.T)[corners], atol=1e-5)
+
+
+def test_what_moves_on_its_own_follows_the_cloth_or_adds_the_wrinkle(tmp_path: Path):
+    """With ``detail`` the target's own motion stays, and only refined less smoothly subdivided cloth is added."""
+    path = cloth_shot(tmp_path / "shot.usda")
+    stage = Usd.Stage.Open(str(path))
+    mesh = UsdGeom.Mesh.Define(stage, "/World/patch")
+    mesh.CreateFaceVertexCountsAttr([4])
+    mesh.CreateFaceVertexIndicesAttr([0, 1, 2, 3])
+    corners = [SIZE[0] + 2, SIZE[0] + 3, 2 * SIZE[0] + 4, 2 * SIZE[0] + 3]
+    for time in (1.0, LATE):
+        mesh.CreatePointsAttr().Set(vec3(sheet_points(time, SIZE)[corners] + np.array([0, 0, 0.01], np.float32)), time)
+    bind(stage, "/World/patch")
+    stage.Save()
+    refine(path, tmp_path / "follow.usda")
+    stage.GetPrimAtPath("/World/patch").CreateAttribute("physgraph:bind:mode", Sdf.ValueTypeNames.Token).Set("detail")
+    stage.Save()
+    refine(path, tmp_path / "detail.usda")
+    own = world_metres(Usd.Stage.Open(str(path)), "/World/patch", LATE)
+    follow, detail = (
+        world_metres(open_over(path, tmp_path / f"{mode}.usda"), "/World/patch", LATE) for mode in ("follow", "detail")
+    )
+    cage = PolygonMesh(*sheet_faces("quads", SIZE), len(sheet_points(None, SIZE)))
+    before = EDGE * (smooth(cage, subdivide(cage)) @ sheet_points(LATE, SIZE).astype(float))
+    fine, _ = cloth_at(open_over(path, tmp_path / "detail.usda"), LATE)
+    wrinkle = (fine - before)[corners]
+    assert np.linalg.norm(wrinkle, axis=1).max() > 0.02 * EDGE
+    np.testing.assert_allclose(detail - own, wrinkle, atol=0.02 * EDGE)
+    assert np.linalg.norm(follow - fine[corners], axis=1).max() < 0.1 * EDGE
+
+
+def test_a_trim_of_a_trim_follows_it(shot: Path, tmp_path: Path):
+    stage = Usd.Stage.Open(str(shot))
+    beside(stage, "/World/stitch", on_sheet(3, 2, 0.25), radius=0.02)
+    bind(stage, "/World/stitch", to=BUTTON)
+    stage.Save()
+    refine(shot, tmp_path / "out.usda")
+    over = open_over(shot, tmp_path / "out.usda")
+    for time in (1.0, LATE):
+        middles = [world_metres(over, each, time).mean(axis=0) for each in (BUTTON, "/World/stitch")]
+        assert np.linalg.norm(middles[1] - middles[0]) == pytest.approx(0.13 * EDGE, rel=0.02)
+
+
+def test_the_option_binds_to_the_nearest_garment_as_the_relationship_does(shot: Path, tmp_path: Path):
+    refine(shot, tmp_path / "named.usda")
+    stage = Usd.Stage.Open(str(shot))
+    stage.GetPrimAtPath(CLOTH).RemoveProperty(TARGETS)
+    stage.Save()
+    assert run("refine", shot, "-o", tmp_path / "bind.usda", "--level", 1, "--steps", 6, *[
+        word for path in (BUTTON, PIPING, BEADS) for word in ("--bind", path)
+    ]).exit_code == 0  # fmt: skip
+    for path in (BUTTON, PIPING, BEADS):
+        layers = [Sdf.Layer.FindOrOpen(str(tmp_path / name)) for name in ("named.usda", "bind.usda")]
+        first, second = (layer.QueryTimeSample(Sdf.Path(f"{path}.points"), LATE) for layer in layers)
+        assert first == second
+
+
+def test_chunks_processes_and_a_part_of_the_shot_place_targets_alike(shot: Path, tmp_path: Path):
+    spans = (1.0, 3.0), (4.0, 6.0)
+    for number, span in enumerate(spans):
+        refine(shot, tmp_path / f"part{number}", frames=span, preroll=0, temporal="off")
+    stitch([tmp_path / "part1", tmp_path / "part0"], tmp_path / "joined.usda")
+    refine(shot, tmp_path / "two.usda", workers=2, temporal="off")
+    refine(shot, tmp_path / "late.usda", frames=spans[1], temporal="off")
+    layers = [Sdf.Layer.FindOrOpen(str(tmp_path / f"{name}.usda")) for name in ("joined", "two", "late")]
+    for path in (BUTTON, PIPING, BEADS):
+        first, *others = (layer.QueryTimeSample(Sdf.Path(f"{path}.points"), LATE) for layer in layers)
+        assert all(first == other for other in others)
+
+
+def test_what_follows_is_no_body_though_it_is_tagged_as_one(shot: Path):
+    stage = Usd.Stage.Open(str(shot))
+    stage.GetPrimAtPath(BUTTON).AddAppliedSchema("PhysGraphColliderAPI")
+    stage.Save()
+    with closing(open_shot(shot)) as opened:
+        assert opened.colliders == ()
+
+
+def test_inspect_proposes_what_lies_on_the_cloth_and_moves_with_it(tmp_path: Path):
+    path = cloth_shot(tmp_path / "shot.usda")
+    stage = Usd.Stage.Open(str(path))
+    mesh = beside(stage, BUTTON, on_sheet(3, 2, 0.03), radius=0.02)
+    points, shift = np.asarray(mesh.GetPointsAttr().Get()), sheet_points(None, SIZE)
+    for time in (1.0, 2.0, 3.0, 4.0, 5.0, 6.0):
+        row = 2 * (SIZE[0] + 1) + 3
+        mesh.GetPointsAttr().Set(vec3(points + sheet_points(time, SIZE)[row] - shift[row]), time)
+    stage.Save()
+    assert f"--bind {BUTTON} carries it along" in run("inspect", path).output
+    assert "carries" not in run("inspect", path, "--bind", BUTTON).output
+
+
+def spread(stage: Usd.Stage) -> None:
+    beside(stage, "/World/far", (3.0, 2.0, 9.0))
+    bind(stage, "/World/far")
+
+
+def twice(stage: Usd.Stage) -> None:
+    bind(stage, BEADS, to=BUTTON)
+
+
+def changing(stage: Usd.Stage) -> None:
+    mesh = UsdGeom.Mesh(stage.GetPrimAtPath(BUTTON))
+    points = np.asarray(mesh.GetPointsAttr().Get())
+    mesh.GetPointsAttr().Set(vec3(points), 1.0)
+    mesh.GetPointsAttr().Set(vec3(points[:-1]), 2.0)
+
+
+def cloth_itself(stage: Usd.Stage) -> None:
+    bind(stage, CLOTH, to=BUTTON)
+
+
+def missing(stage: Usd.Stage) -> None:
+    bind(stage, "/World/nothing")
+
+
+def odd_mode(stage: Usd.Stage) -> None:
+    stage.GetPrimAtPath(BUTTON).CreateAttribute("physgraph:bind:mode", Sdf.ValueTypeNames.Token).Set("glue")
+
+
+@pytest.mark.parametrize(
+    ("broken", "kind", "words"),
+    [
+        (spread, GarmentError, "</World/far>: lies up to"),
+        (twice, GarmentError, f"<{BEADS}>: is bound to <{CLOTH}> and to <{BUTTON}>"),
+        (changing, GarmentError, f"<{BUTTON}> at time code 2: its topology changes"),
+        (cloth_itself, GarmentError, f"<{CLOTH}>: is a garment, and bound to <{BUTTON}>"),
+        (missing, AbsentError, "no prim at </World/nothing>"),
+        (odd_mode, SchemaError, f"<{BUTTON}>.physgraph:bind:mode is 'glue'"),
+    ],
+)
+def test_what_cannot_follow_is_named_before_anything_is_written(
+    shot: Path, tmp_path: Path, broken: object, kind: type[Exception], words: str
+):
+    stage = Usd.Stage.Open(str(shot))
+    assert callable(broken)
+    broken(stage)
+    stage.Save()
+    with pytest.raises(kind, match=words.replace("(", r"\(")):
+        refine(shot, tmp_path / "out.usda")
+    assert only(tmp_path, "shot.usda")
