@@ -14,6 +14,7 @@ from shots import CLOTH, EDGE, cloth_shot, only, refine, run
 from stages import sheet_faces, sheet_points, vec3
 
 from physgraph_usd.errors import AbsentError, GarmentError, SchemaError
+from physgraph_usd.lab.samples import trims
 from physgraph_usd.lab.samples.shapes import ellipsoid
 from physgraph_usd.shot.stitch import stitch
 from physgraph_usd.solver.mesh.bind import closest
@@ -22,6 +23,7 @@ from physgraph_usd.solver.mesh.topology import PolygonMesh
 from physgraph_usd.solver.rigid import best_motion
 from physgraph_usd.usd.read.reader import open_shot
 from physgraph_usd.usd.read.targets import TARGETS
+from physgraph_usd.usd.write.sample_stage import write_stage
 
 BUTTON, PIPING, BEADS = "/World/button", "/World/piping", "/World/beads"
 SIZE = (6, 4)
@@ -65,11 +67,11 @@ def shot(tmp_path: Path) -> Path:
     return path
 
 
-def cloth_at(stage: Usd.Stage, time: float) -> tuple[np.ndarray, np.ndarray]:
+def cloth_at(stage: Usd.Stage, time: float, path: str = CLOTH) -> tuple[np.ndarray, np.ndarray]:
     """Points [m] and triangles of the refined cloth."""
-    mesh = UsdGeom.Mesh(stage.GetPrimAtPath(CLOTH))
+    mesh = UsdGeom.Mesh(stage.GetPrimAtPath(path))
     counts, indices = mesh.GetFaceVertexCountsAttr().Get(time), mesh.GetFaceVertexIndicesAttr().Get(time)
-    points = world_metres(stage, CLOTH, time)
+    points = world_metres(stage, path, time)
     return points, PolygonMesh(np.asarray(counts), np.asarray(indices), len(points)).triangulate(points).triangles
 
 
@@ -284,3 +286,29 @@ def test_what_cannot_follow_is_named_before_anything_is_written(
     with pytest.raises(kind, match=words.replace("(", r"\(")):
         refine(shot, tmp_path / "out.usda")
     assert only(tmp_path, "shot.usda")
+
+
+@pytest.mark.timeout(300)
+def test_the_sample_keeps_thickness_area_and_buttons(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """The T-shirt's render mesh stands still in the shot; the middle of its faces lies on the refined cloth."""
+    monkeypatch.setattr(trims, "FINE", 2)
+    shot = write_stage(trims.build(), tmp_path / "trims.usdc")
+    refine(shot, tmp_path / "out.usdc", level=2, frames=(12.0, 13.0))
+    stage = open_over(shot, tmp_path / "out.usdc")
+    skin = np.asarray(UsdGeom.Mesh(stage.GetPrimAtPath("/TrimsShot/Render")).GetPointsAttr().Get(13.0), float)
+    outer, inner = np.split(skin, 2)
+    apart = np.linalg.norm(outer - inner, axis=1) / trims.THICKNESS
+    assert np.quantile(np.abs(apart - 1.0), 0.99) < 0.05
+    faces = np.asarray(UsdGeom.Mesh(stage.GetPrimAtPath("/TrimsShot/Render")).GetFaceVertexIndicesAttr().Get())
+    sheet = faces.reshape(-1, 4)[(faces.reshape(-1, 4) < len(outer)).all(axis=1)]
+    middle = 0.5 * (outer + inner)
+    area = np.linalg.norm(np.cross(*(middle[sheet[:, k + 2]] - middle[sheet[:, k]] for k in (0, 1))), axis=1).sum() / 2
+    points, triangles = cloth_at(stage, 13.0, "/TrimsShot/Shirt")
+    corners = points[triangles]
+    cloth = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2
+    assert area == pytest.approx(cloth, rel=0.03)
+    buttons = UsdGeom.Mesh(stage.GetPrimAtPath("/TrimsShot/Buttons")).GetPointsAttr()
+    codes = Usd.TimeCode.Default(), Usd.TimeCode(13.0)
+    before, after = (np.split(np.asarray(buttons.Get(code), float), trims.BUTTONS) for code in codes)
+    for first, then in zip(before, after, strict=True):
+        assert np.linalg.norm(best_motion(first, then)(first) - then, axis=1).max() < 1e-5

@@ -222,7 +222,7 @@ def _garment(garment: Garment, source: GarmentSource, frame: GarmentFrame, choic
 
 
 def _bound(target: Target) -> dict[str, Any]:
-    """What follows a garment, as plain values."""
+    """A target of a garment, as plain values."""
     return {
         "path": str(target.path),
         "points": len(target.points),

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from copy import copy
 from dataclasses import replace
@@ -79,7 +79,7 @@ class Shot:
         sources: Place of each garment on the stage, in the scene's order.
         colliders: Paths of the collider prims found.
         selections: Active variant selections the garments depend on, as paths `/World/coat{fit=loose}`.
-        bound: What is to follow the garments; `targets` are read from it.
+        bound: Prims that are to follow the garments; `targets` reads them.
         warnings: Warnings for the user; grows as frames are read.
         metres_per_unit: Length of one stage unit [m].
         gravity_source: Source of gravity's direction, in words.
@@ -143,7 +143,7 @@ class Shot:
 
     @cached_property
     def targets(self) -> list[Target]:
-        """What follows the garments in its bind pose, each after what it is bound to.
+        """Prims that follow the garments, in the bind pose, each after the prim that it is bound to.
 
         Raises:
             GarmentError: A target lies too far from its garment, changes its topology, or cannot be placed.
@@ -280,10 +280,7 @@ def open_shot(
         check_overrides(asked, *([prim.GetPath() for prim in each] for each in (prims, [*found, *disabled])))
         for prim in (*prims, *found):
             refuse_missing_arcs(prim, notices)
-        named = [*colliders] or colliders_of(prims)
-        notices += disabled.values() if named else ()
-        notices += purpose_notices([*prims, *found], [*garments, *named])
-        notices += authored_faults(prims, found)
+        notices += _of_prims(prims, found, disabled, named=[garments, [*colliders] or colliders_of(prims)])
         units, odd = read_units(stage)
         units = with_gravity(units, prims, gravity)
         assumed = root_metadata(stage, "metersPerUnit") is None
@@ -303,6 +300,19 @@ def open_shot(
     read_notices = [notice for reader in readers for notice in reader.notices]
     opened.warnings.extend(dict.fromkeys([*notices, *odd, *read_notices]))
     return opened
+
+
+def _of_prims(
+    prims: Sequence[Usd.Prim],
+    found: Sequence[Usd.Prim],
+    disabled: Mapping[Usd.Prim, Notice],
+    *,
+    named: Sequence[Sequence[str]],
+) -> list[Notice]:
+    """Notices of garments and colliders; named are the garments and the colliders named."""
+    notices = [*(disabled.values() if named[1] else ())]
+    notices += purpose_notices([*prims, *found], [each for names in named for each in names])
+    return notices + authored_faults(prims, found)
 
 
 def _check_options(frames: tuple[float, float] | None, level: int | None, rest_frame: float | str | None) -> None:

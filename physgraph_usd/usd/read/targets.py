@@ -83,7 +83,7 @@ class Bound:
 
 
 def find_bound(stage: Usd.Stage, garments: Sequence[Usd.Prim], wanted: Sequence[str]) -> list[Bound]:
-    """What follows garments, each after what it is bound to.
+    """Prims bound to garments, each after the prim that it is bound to.
 
     Args:
         stage: The stage.
@@ -114,7 +114,7 @@ def find_bound(stage: Usd.Stage, garments: Sequence[Usd.Prim], wanted: Sequence[
 
 
 def _below(stage: Usd.Stage, prim: Usd.Prim) -> list[Bound]:
-    """What a garment's or target's relationship names."""
+    """Prims named by a garment's or target's relationship."""
     named = [path for item in targets_of(prim, TARGETS) for path in find_paths(stage, str(item), UsdGeom.PointBased)]
     return [Bound(path, prim.GetPath()) for path in dict.fromkeys(named)]
 
@@ -132,7 +132,7 @@ def read_targets(
 
     Args:
         stage: The stage, skinning baked.
-        bound: From `find_bound`; what is bound to garments that are not refined is left out.
+        bound: From `find_bound`; prims bound to garments that are not refined are left out.
         garments: Path, mesh and first time code of each garment.
         cage: Places the garments.
         metres: Length of one stage unit [m].

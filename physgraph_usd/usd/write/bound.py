@@ -25,7 +25,7 @@ _FIRST = Usd.TimeCode.EarliestTime()
 
 
 class Followers:
-    """What follows one garment, each after what it is bound to.
+    """The targets of one garment, each after the prim that it is bound to.
 
     Attributes:
         notices: Properties changed, with the reason.
