@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from layers import errors, open_over, world_metres
 from numpy.typing import ArrayLike
-from pxr import Gf, Sdf, Usd, UsdGeom, Vt
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
 from shots import CLOTH, EDGE, cloth_shot, only, refine, run
 from stages import sheet_faces, sheet_points, vec3
 
 from physgraph_usd.errors import AbsentError, GarmentError, SchemaError
-from physgraph_usd.lab.samples import trims
+from physgraph_usd.lab.samples import trims, tshirt
 from physgraph_usd.lab.samples.shapes import ellipsoid
 from physgraph_usd.shot.stitch import stitch
 from physgraph_usd.solver.mesh.bind import closest
@@ -187,6 +188,39 @@ def test_a_trim_of_a_trim_follows_it(shot: Path, tmp_path: Path):
     for time in (1.0, LATE):
         middles = [world_metres(over, each, time).mean(axis=0) for each in (BUTTON, "/World/stitch")]
         assert np.linalg.norm(middles[1] - middles[0]) == pytest.approx(0.13 * EDGE, rel=0.02)
+
+
+def test_a_trim_inside_an_instance_follows_the_cloth_of_that_instance(shot: Path, tmp_path: Path):
+    crowd = tmp_path / "crowd.usda"
+    stage = Usd.Stage.CreateNew(str(crowd))
+    UsdGeom.SetStageMetersPerUnit(stage, EDGE)
+    UsdGeom.SetStageUpAxis(stage, "Y")
+    for number in (0, 1):
+        prim = UsdGeom.Xform.Define(stage, f"/crowd{number}")
+        prim.AddTranslateOp().Set(Gf.Vec3d(20.0 * number, 0.0, 0.0))
+        prim.GetPrim().GetReferences().AddReference(str(shot), "/World")
+        prim.GetPrim().SetInstanceable(True)
+    stage.Save()
+    refine(crowd, tmp_path / "out.usda")
+    over = open_over(crowd, tmp_path / "out.usda")
+    places = [world_metres(over, f"/crowd{number}/button", LATE) for number in (0, 1)]
+    np.testing.assert_allclose(places[1] - places[0], np.tile([20.0 * EDGE, 0.0, 0.0], (len(places[0]), 1)), atol=1e-5)
+    assert np.linalg.norm(places[0] - world_metres(over, "/crowd0/button", 1.0), axis=1).min() > 0.1 * EDGE
+
+
+def test_a_skinned_trim_is_not_skinned_twice(tmp_path: Path):
+    plain = tshirt.build()
+    shirt = plain.meshes[0]
+    own = {"name": "Patch", "role": "trim", "fabric": None, "subsets": (), "points": shirt.points * 1.001}
+    shot = write_stage(replace(plain, meshes=(*plain.meshes, replace(shirt, **own))), tmp_path / "shot.usdc")
+    refine(shot, tmp_path / "out.usdc", frames=(12.0, 13.0))
+    stage = open_over(shot, tmp_path / "out.usdc")
+    patch = stage.GetPrimAtPath("/TshirtShot/Patch")
+    before = np.asarray(UsdGeom.Mesh(patch).GetPointsAttr().Get(13.0))
+    UsdSkel.BakeSkinning(UsdSkel.Root(stage.GetPrimAtPath("/TshirtShot")), Gf.Interval(12, 13))
+    np.testing.assert_array_equal(np.asarray(UsdGeom.Mesh(patch).GetPointsAttr().Get(13.0)), before)
+    points, triangles = cloth_at(stage, 13.0, "/TshirtShot/Shirt")
+    assert np.quantile(closest(before.astype(float), points, triangles).distance, 0.99) < 6e-3
 
 
 def test_the_option_binds_to_the_nearest_garment_as_the_relationship_does(shot: Path, tmp_path: Path):
