@@ -223,6 +223,11 @@ PROPERTIES: tuple[Property, ...] = (
         "Bound Prims", REFINEMENT,
     ),
     Property(
+        GARMENT_API, "physgraph:shell:thickness", "float", 0.0, "m", 0.0, 1.0,
+        "Thickness of a closed shell that is written in place of the refined sheet; 0 writes the sheet." + SI,
+        "Shell Thickness", REFINEMENT, (0.0, 0.01), uniform=True,
+    ),
+    Property(
         GARMENT_API, "physgraph:seam:tolerance", "float", 0.0, "m", 0.0, 1.0,
         "Distance within which open borders are sewn together; 0 sews borders at one place." + SI,
         "Seam Tolerance", REST, (0.0, 5e-3), uniform=True,

@@ -115,6 +115,7 @@ class GarmentSource:
         subsets: Faces of the cage in each GeomSubset, by name.
         weld: The mesh as authored and as solved, without holes.
         words: Words in the names of the prim, its parent, its materials, and subsets covering most of the mesh.
+        shell: Thickness of the shell that is written in place of a sheet [m]; 0 for the sheet.
     """
 
     path: Sdf.Path
@@ -131,6 +132,7 @@ class GarmentSource:
     subsets: dict[str, np.ndarray] = field(default_factory=dict)
     words: tuple[str, ...] = ()
     absent: tuple[float, ...] = ()
+    shell: float = 0.0
 
     @property
     def left_out_words(self) -> str:

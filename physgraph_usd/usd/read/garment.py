@@ -139,8 +139,7 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], samples: Samples, re
     matrix = to_metres(prim, request.units.metres, first)
     animation = _animation(prim, points, request, edges=edges, every=every, times=times)
     rest, weld = _rest_and_weld(prim, cage.mesh, animation, request, matrix=matrix)
-    bent, odd = rests_bent(prim)
-    absent = within(samples.absent, request.frames)
+    (bent, odd), absent = rests_bent(prim), within(samples.absent, request.frames)
     notices = [*samples.notices(str(prim.GetPath()), absent), *cage.notices, *odd, *placement]
     values = find_values(prim, request.units, request.overrides)
     constants, of_constants = _constants(prim, request)
@@ -156,8 +155,8 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], samples: Samples, re
         grain=grain,
         **constants | pieces | painted,
     )
-    size = _size_notices(garment.path, animation.first, request)
-    notices += [*rest.notices, *odd_pieces, *size, *_unit_notices(prim, matrix, request)]
+    notices += [*rest.notices, *odd_pieces, *_size_notices(garment.path, animation.first, request)]
+    notices += [*_unit_notices(prim, matrix, request), *values.notices]
     source = GarmentSource(
         *(prim.GetPath(), cage.kept_faces, weld, prim.GetPath() in request.bake.skinned, tuple(roots), times),
         {"rest": rest.source, "grain": lies} | values.sources | of_constants,
@@ -167,8 +166,9 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], samples: Samples, re
         velocities=has_velocities(prim, points.count),
         subsets=(subsets := _subsets(prim, cage.kept_faces[weld.faces])),
         words=_words(prim, [name for name, faces in subsets.items() if 2 * len(faces) > len(weld.faces)]),
+        shell=_length(prim, "shell:thickness", request.overrides),
     )
-    return GarmentReader(garment, source, values, points, edges, weld, [*notices, *values.notices])
+    return GarmentReader(garment, source, values, points, edges, weld, notices)
 
 
 def _animation(
@@ -268,7 +268,12 @@ def _rest_and_weld(
 
 def seam_tolerance(prim: Usd.Prim, overrides: Sequence[Override]) -> float:
     """Distance within which a garment's open borders are sewn [m]."""
-    return float(find_value(prim, GARMENT["seam:tolerance"], overrides).at(None) or 0.0)
+    return _length(prim, "seam:tolerance", overrides)
+
+
+def _length(prim: Usd.Prim, name: str, overrides: Sequence[Override]) -> float:
+    """A length that cannot be animated [m]; 0 where nothing gives it."""
+    return float(find_value(prim, GARMENT[name], overrides).at(None) or 0.0)
 
 
 def _rest(prim: Usd.Prim, weld: Weld, animation: Animation, request: Request, *, matrix: np.ndarray) -> Rest:

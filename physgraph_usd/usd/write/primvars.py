@@ -18,6 +18,7 @@ from ...solver.mesh.attributes import (
     vertex_subset,
     vertex_values,
 )
+from ...solver.mesh.shell import Shell
 from ...solver.mesh.subdivide import Refinement, compose
 from ...solver.mesh.topology import PolygonMesh
 from ..stage import Notice, timecode
@@ -158,7 +159,13 @@ class FineMap:
     """Map from a garment's authored arrays to its fine mesh, made once for each garment."""
 
     def __init__(
-        self, cage: PolygonMesh, refinements: Sequence[Refinement], counts: np.ndarray, kept: np.ndarray
+        self,
+        cage: PolygonMesh,
+        refinements: Sequence[Refinement],
+        counts: np.ndarray,
+        kept: np.ndarray,
+        *,
+        shell: Shell | None = None,
     ) -> None:
         """Prepare the map.
 
@@ -167,9 +174,11 @@ class FineMap:
             refinements: Coarse to fine; empty if the fine mesh is the cage.
             counts: Authored corners per face, shape (F,), including dropped faces.
             kept: Numbers of the authored faces in the cage, shape (F_cage,).
+            shell: Shell of the refined sheet that is the fine mesh; None if the sheet is.
         """
-        self.cage = cage
-        self.fine = refinements[-1].mesh if refinements else cage
+        self.cage, self._shell = cage, shell
+        self.sheet = refinements[-1].mesh if refinements else cage
+        self.fine = self.sheet if shell is None else shell.mesh
         self._refinements = tuple(refinements)
         self._kept = np.asarray(kept, np.int64)
         self._face_count = len(counts)
@@ -177,18 +186,24 @@ class FineMap:
 
     @cached_property
     def stencil(self) -> sparse.csr_matrix | None:
-        """Stencil from coarse to fine vertices; None at level 0."""
-        return compose(self._refinements) if self._refinements else None
+        """Stencil from coarse to fine vertices; None if these are the same."""
+        found = compose(self._refinements) if self._refinements else None
+        if self._shell is None:
+            return found
+        whole = sparse.identity(self.cage.vertex_count, format="csr") if found is None else found
+        return whole[self._shell.vertex]
 
     @cached_property
     def nearest_vertex(self) -> np.ndarray:
         """Coarse vertex of each fine vertex, shape (V_fine,)."""
-        return vertex_values(self._refinements, np.arange(self.cage.vertex_count))
+        found = vertex_values(self._refinements, np.arange(self.cage.vertex_count))
+        return found if self._shell is None else found[self._shell.vertex]
 
     @cached_property
     def parent_face(self) -> np.ndarray:
         """Authored face of each fine face, shape (F_fine,)."""
-        return self._kept[uniform_values(self._refinements, np.arange(self.cage.face_count))]
+        found = self._kept[uniform_values(self._refinements, np.arange(self.cage.face_count))]
+        return found if self._shell is None else found[self._shell.face]
 
     @cached_property
     def kept_corners(self) -> np.ndarray:
@@ -202,7 +217,8 @@ class FineMap:
         """Authored corner of each fine corner, shape (C_fine,)."""
         corners = np.arange(len(self.kept_corners))
         indices, values = corner_values(self._refinements, self.cage.counts, corners, corners)
-        return self.kept_corners[values[indices]]
+        found = self.kept_corners[values[indices]]
+        return found if self._shell is None else found[self._shell.corner]
 
     def count(self, interpolation: str) -> int:
         """Number of authored elements of an interpolation; ValueError for an interpolation independent of topology."""
@@ -262,6 +278,7 @@ class FineMap:
         """Refine values on corners along their own topology, preserving seams."""
         coarse = self.kept_corners if indices is None else np.asarray(indices)[self.kept_corners]
         fine, refined = corner_values(self._refinements, self.cage.counts, coarse.astype(np.int32), values)
+        fine = fine if self._shell is None else fine[self._shell.corner]
         return (refined[fine], None) if indices is None else (refined, fine.astype(np.int32))
 
     def subset(self, element: str, indices: np.ndarray, *, exclusive: bool = False) -> np.ndarray:
@@ -285,14 +302,22 @@ class FineMap:
         if len(indices) and not 0 <= indices.min() <= indices.max() < limit:
             raise ValueError(f"has {element} indices from {indices.min()} to {indices.max()}; the mesh has {limit}")
         if element == "face":
-            return face_subset(self._refinements, np.flatnonzero(np.isin(self._kept, indices)))
+            found = face_subset(self._refinements, np.flatnonzero(np.isin(self._kept, indices)))
+            return found if self._shell is None else _behind(self._shell.face, found)
         if element == "point" and exclusive:
             return np.flatnonzero(np.isin(self.nearest_vertex, indices)).astype(np.int32)
         if element == "point":
-            return vertex_subset(self._refinements, indices)
+            found = vertex_subset(self._refinements, indices)
+            return found if self._shell is None else _behind(self._shell.vertex, found)
         if element == "edge":
-            return edge_subset(self._refinements, indices.reshape(-1, 2)).reshape(-1)
+            found = edge_subset(self._refinements, indices.reshape(-1, 2)).reshape(-1)
+            return found if self._shell is None else np.concatenate([found, found + self.sheet.vertex_count])
         raise ValueError(f"has elements of type {element!r}; known: edge, face, point")
+
+
+def _behind(parents: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+    """Numbers of the elements whose parent is chosen, int32."""
+    return np.flatnonzero(np.isin(parents, chosen)).astype(np.int32)
 
 
 def to_numpy(value: Any) -> tuple[np.ndarray, bool]:

@@ -17,6 +17,7 @@ import numpy as np
 from pxr import Sdf, Usd, UsdGeom
 
 from ...errors import LayerError, UsageError
+from ...solver.mesh.shell import Shell
 from ...solver.mesh.subdivide import Refinement
 from .. import provenance
 from ..check.validate import check_layer
@@ -236,7 +237,9 @@ class _RefinedMesh:
         prim, span = shot.stage.GetPrimAtPath(source.path), (times[0], times[-1]) if times else None
         counts = np.asarray(first_value(UsdGeom.Mesh(prim).GetFaceVertexCountsAttr()))
         steps, self._weld = source.weld.subdivided(len(steps))
-        fine = FineMap(source.weld.apart, steps, counts, source.kept_faces)
+        sheet, sides = steps[-1].mesh if steps else source.weld.apart, self._weld.sides
+        self._shell = Shell.of(sheet, self._weld.number) if source.shell else None
+        fine = FineMap(source.weld.apart, steps, counts, source.kept_faces, shell=self._shell)
         self.notices = overs.open_instances(stream, source.path, source.instance_roots)
         self.target = target = overs.make_sibling(stream, prim) if sibling else source.path
         overs.author_topology(stream, target, prim, fine)
@@ -245,8 +248,11 @@ class _RefinedMesh:
         self.notices += carry_subsets(stream, target, prim, fine, span=span)
         self.notices += overs.author_rest_points(stream, target, prim, fine)
         left = UsdGeom.Mesh(prim).GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded
-        rest = None if source.skinned or not source.times else _refined_default(prim, fine)
-        normals = VertexNormals(fine.fine, left_handed=left, welded=self._weld.sides)
+        rest = None if source.skinned or self._shell or not source.times else _refined_default(prim, fine)
+        self._sheet_normals = VertexNormals(sheet, left_handed=left, welded=sides)
+        normals = self._sheet_normals
+        if self._shell is not None:
+            normals = VertexNormals(fine.fine, left_handed=left, welded=np.concatenate([sides, sides + len(sides)]))
         rate = shot.stage.GetTimeCodesPerSecond() if velocities or source.velocities else None
         self.notices += overs.speed_notices(prim, written=rate is not None)
         moves = {"rate": rate, "own": partial(_own_velocities, prim, fine), "absent": absent}
@@ -260,10 +266,15 @@ class _RefinedMesh:
         self, time: float | None, points: np.ndarray, heat: Mapping[str, np.ndarray], *, changed: bool, cut: bool
     ) -> None:
         """Write one time code; arguments as in `LayerWriter.write`."""
-        points = self._weld.split(points)
-        self._track.write(time, points, self._shot.to_metres(self._index, time), changed=changed, cut=cut)
+        points, to_world = self._weld.split(points), self._shot.to_metres(self._index, time)
+        maps = {name: self._weld.split(values) for name, values in heat.items()}
+        if self._shell is not None:
+            thickness = self._shot.sources[self._index].shell * np.sign(np.linalg.det(to_world[:3, :3]))
+            points = self._shell.thickened(points, self._sheet_normals(points), thickness)
+            maps = {name: values[self._shell.vertex] for name, values in maps.items()}
+        self._track.write(time, points, to_world, changed=changed, cut=cut)
         self._hints.write(time, self._track.box)
-        self._heat.write(time, {name: self._weld.split(values) for name, values in heat.items()})
+        self._heat.write(time, maps)
 
     def check(self, points: np.ndarray | None, heat: Mapping[str, np.ndarray], time: float | None) -> None:
         """Refuse points and heat maps of the wrong shape."""
