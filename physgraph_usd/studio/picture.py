@@ -15,6 +15,7 @@ from ..solver.colliders.pose import MeshPose, Pose
 from ..solver.mesh.topology import PolygonMesh
 from ..solver.scene import Frame
 from ..usd.read.bodies import tessellated
+from ..usd.read.hung import Hung
 from .brush import Stroke
 from .maps import PLAIN, Map, find_map
 from .session import TuneSession
@@ -30,7 +31,7 @@ SHOWS: dict[str, tuple[str, ...]] = {
 }
 """Columns of each choice, from left to right."""
 COLORS = {CAGE: (201, 160, 110), SUBDIVISION: (168, 160, 150), KEPT: (150, 170, 140), FINE: (122, 150, 190)}
-BODY, FLOOR, SKY, WIRE = (150, 150, 150), (186, 188, 192), (226, 228, 231), (40, 44, 52)
+TRIM, BODY, FLOOR, SKY, WIRE = (176, 168, 140), (150, 150, 150), (186, 188, 192), (226, 228, 231), (40, 44, 52)
 """Colours, sRGB."""
 FLOOR_SIZE = 12.0
 """Half of the floor's width, in the size of what is drawn."""
@@ -111,6 +112,7 @@ class Picture:
         drawn = [_everything(session.shot.frame(time)) for time in times]
         self._across = max(np.ptp(each @ self.right) for each in drawn) + GAP * self.size
         self._handles: dict[str, tuple[object, Any]] = {}
+        self._hung: dict[int, tuple[int, Hung]] = {}
         self.paintable = False
         self.targets: dict[int, Any] = {}
         server.scene.set_up_direction(up)
@@ -130,6 +132,7 @@ class Picture:
                 at = self._offset(place, len(columns))
                 for index in range(len(shown.points)):
                     named |= self._draw_garment(shown, kept, index, column=column, at=at)
+                    named |= self._draw_trims(shown, index, at=at) if column == FINE else set()
                 if not (self.view.wiped and place):
                     named |= self._draw_bodies(shown.frame, column, at=at)
             for name in self._handles.keys() - named:
@@ -228,16 +231,28 @@ class Picture:
             self._handles[name] = len(segments), handle
         return {name}
 
-    def _draw_bodies(self, frame: Frame, column: str, *, at: np.ndarray) -> set[str]:
-        """Draw the bodies in a column; returns the names of what is drawn."""
-        named = set[str]()
-        for index, pose in enumerate(frame.colliders):
-            mesh = None if pose is None else mesh_of(pose)
-            if mesh is not None:
-                name = f"body/{column}/{index}"
-                self._place(name, Sheet(*mesh, np.empty((0, 2), int)), BODY, at=at)
+    def _draw_trims(self, shown: Shown, index: int, *, at: np.ndarray) -> set[str]:
+        """Draw the meshes that hang on a refined garment; returns the names of what is drawn."""
+        points, steps, named = shown.points[index], self._session.refinements[index], set[str]()
+        if points is None:
+            return named
+        if index not in self._hung or self._hung[index][0] != len(steps):
+            self._hung[index] = len(steps), Hung(self._session.shot, index, steps)
+        for placed in self._hung[index][1].at(shown.frame.time, points):
+            if placed.target.mesh is not None:
+                name, mesh = f"trim/{index}/{placed.target.path}", placed.target.mesh
+                sheet = Sheet(placed.points, mesh.triangulate(placed.target.points).triangles, np.empty((0, 2), int))
+                self._place(name, self._wiped(sheet, FINE, _everything(shown.frame)), TRIM, at=at)
                 named.add(name)
         return named
+
+    def _draw_bodies(self, frame: Frame, column: str, *, at: np.ndarray) -> set[str]:
+        """Draw the bodies in a column; returns the names of what is drawn."""
+        found = {f"body/{column}/{index}": mesh_of(pose) for index, pose in enumerate(frame.colliders) if pose}
+        drawn = {name: mesh for name, mesh in found.items() if mesh is not None}
+        for name, mesh in drawn.items():
+            self._place(name, Sheet(*mesh, np.empty((0, 2), int)), BODY, at=at)
+        return {*drawn}
 
     def _place(
         self,

@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import reduce
 
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom
-from scipy import sparse
 
-from ...errors import LayerError
-from ...solver.mesh.bind import Binding, Follower
-from ...solver.mesh.subdivide import Refinement, smooth
-from ...solver.mesh.topology import PolygonMesh
+from ...solver.mesh.bind import Follower
+from ...solver.mesh.subdivide import Refinement
+from ..read.hung import Hung, Placed
 from ..read.placement import to_metres
 from ..read.reader import Shot
-from ..read.targets import Target, points_at, roots_of
-from ..stage import Notice, at_time
+from ..read.targets import Target, roots_of
 from . import overs
 from .stream import LayerStream
 from .track import ModelHints, PointTrack, set_sample
@@ -24,8 +20,8 @@ from .track import ModelHints, PointTrack, set_sample
 _FIRST = Usd.TimeCode.EarliestTime()
 
 
-class Followers:
-    """The targets of one garment, each after the prim that it is bound to.
+class BoundTracks:
+    """The targets of one garment during writing.
 
     Attributes:
         notices: Properties changed, with the reason.
@@ -41,7 +37,7 @@ class Followers:
         absent: Sequence[float],
         velocities: bool,
     ) -> None:
-        """Bind to the smoothly subdivided cage and author what does not change.
+        """Bind the targets and author what does not change.
 
         Args:
             stream: The layer.
@@ -51,68 +47,31 @@ class Followers:
             absent: Time codes at which it is absent.
             velocities: Whether velocities are authored for all.
         """
-        garment, targets = shot.scene.garments[index], [each for each in shot.targets if each.garment == index]
-        self._shot, self._index = shot, index
-        self._smooth = _smooth_map(garment.mesh, steps) if targets else None
-        self._fine = steps[-1].mesh if steps else garment.mesh
-        self._tracks: dict[Sdf.Path, _BoundTrack] = {}
-        self.notices: list[Notice] = []
-        for target in targets:
-            surface, mesh = self._surface_of(target)
-            triangles = mesh.triangulate(surface).triangles
-            binding = Binding.of(target.points, surface, triangles, rigid=target.rigid)
-            still = not shot.sources[index].times
-            given = {"still": still, "absent": absent, "velocities": velocities}
-            self._tracks[target.path] = track = _BoundTrack(stream, shot, target, binding, **given)
-            self.notices += track.notices
+        self._hung = Hung(shot, index, steps)
+        given = {"still": not shot.sources[index].times, "absent": absent, "velocities": velocities}
+        self._tracks = [_BoundTrack(stream, shot, target, **given) for target in self._hung.targets]
+        self.notices = [notice for track in self._tracks for notice in track.notices]
 
     @property
     def paths(self) -> list[Sdf.Path]:
         """Paths of the targets."""
-        return [*self._tracks]
-
-    def _surface_of(self, target: Target) -> tuple[np.ndarray, PolygonMesh]:
-        """Bind pose [m] and faces of what a target is bound to."""
-        if target.on is None:
-            return self._smoothed(target.time), self._fine
-        parent = self._tracks[target.on].target
-        assert parent.mesh is not None
-        return parent.points, parent.mesh
-
-    def _smoothed(self, time: float | None) -> np.ndarray:
-        """The smoothly subdivided cage [m] at a time code, shape (V, 3)."""
-        cage = self._shot.cage(self._index, time)
-        return cage if self._smooth is None else self._smooth @ cage
+        return [target.path for target in self._hung.targets]
 
     def write(self, time: float | None, points: np.ndarray, *, changed: bool, cut: bool) -> None:
         """Write one time code; points are those of the refined garment [m], world space, shape (V, 3)."""
-        placed: dict[Sdf.Path, np.ndarray] = {}
-        before = np.zeros((0, 3))
-        if any(track.target.detail for track in self._tracks.values()):
-            before = self._smoothed(time)
-        for path, track in self._tracks.items():
-            surface = points if track.target.on is None else placed[track.target.on]
-            cloth = track.target.detail and track.target.on is None
-            placed[path] = track.write(time, surface, before if cloth else None, changed=changed, cut=cut)
+        for track, placed in zip(self._tracks, self._hung.at(time, points), strict=True):
+            track.write(time, placed, changed=changed, cut=cut)
 
     def finish(self) -> None:
         """Author pending samples at the end."""
-        for track in self._tracks.values():
+        for track in self._tracks:
             track.finish()
-
-
-def _smooth_map(mesh: PolygonMesh, steps: Sequence[Refinement]) -> sparse.csr_matrix | None:
-    """The smooth map from a cage to its fine mesh, shape (V, C); None at level 0."""
-    meshes = [mesh, *(step.mesh for step in steps)]
-    maps = [smooth(parent, step) for parent, step in zip(meshes, steps, strict=False)]
-    return reduce(lambda product, one: one @ product, maps[1:], maps[0]) if maps else None
 
 
 class _BoundTrack:
     """One target during writing.
 
     Attributes:
-        target: The target.
         notices: Properties changed, with the reason.
     """
 
@@ -121,7 +80,6 @@ class _BoundTrack:
         stream: LayerStream,
         shot: Shot,
         target: Target,
-        binding: Binding,
         *,
         still: bool,
         absent: Sequence[float],
@@ -129,47 +87,26 @@ class _BoundTrack:
     ) -> None:
         """Author what does not change, and start the track."""
         prim, path = shot.stage.GetPrimAtPath(target.path), target.path
-        self.target, self._binding, self._shot, self._prim = target, binding, shot, prim
+        shape = UsdGeom.PointBased(prim)
+        self._metres, self._prim = shot.metres_per_unit, prim
         self.notices = overs.open_instances(stream, path, roots_of(shot.stage, target))
         overs.author_unskinned(stream, path, prim, skinned=target.skinned)
-        authored = UsdGeom.PointBased(prim).GetVelocitiesAttr().HasAuthoredValue()
+        authored = shape.GetVelocitiesAttr().HasAuthoredValue()
         rate = shot.stage.GetTimeCodesPerSecond() if velocities or authored else None
-        if UsdGeom.PointBased(prim).GetAccelerationsAttr().HasAuthoredValue():
+        if shape.GetAccelerationsAttr().HasAuthoredValue():
             stream.block(path.AppendProperty("accelerations"), Sdf.ValueTypeNames.Vector3fArray)
         moves = {"rate": rate, "absent": absent, "still": still, "margin": _half_width(prim)}
         self._track = PointTrack(stream, path, None, rest=_default_points(prim, len(target.points)), **moves)
         self._normals = _TurnedNormals.of(stream, shot, target)
-        purpose = UsdGeom.Imageable(prim).ComputePurpose()
-        self._hints = ModelHints(stream, shot.stage, path, purpose=purpose)
+        self._hints = ModelHints(stream, shot.stage, path, purpose=UsdGeom.Imageable(prim).ComputePurpose())
 
-    def write(
-        self, time: float | None, surface: np.ndarray, before: np.ndarray | None, *, changed: bool, cut: bool
-    ) -> np.ndarray:
-        """Write one time code, and return the points [m] in world space.
-
-        Args:
-            time: The time code.
-            surface: Positions of what it is bound to [m].
-            before: The smoothly subdivided cage [m] where only the difference to it is added, else None.
-            changed: False when the cloth is known to equal the previous sample's.
-            cut: Whether the cloth jumps here.
-        """
-        follower = self._binding.at(surface)
-        points, to_world = follower.points, to_metres(self._prim, self._shot.metres_per_unit, time)
-        if before is not None:
-            points = self._own(time) + points - self._binding.at(before).points
-        self._track.write(time, points, to_world, changed=changed or before is not None, cut=cut)
+    def write(self, time: float | None, placed: Placed, *, changed: bool, cut: bool) -> None:
+        """Write one time code; ``changed`` and ``cut`` are those of the cloth, as in `PointTrack.write`."""
+        to_world = to_metres(self._prim, self._metres, time)
+        self._track.write(time, placed.points, to_world, changed=changed or placed.target.detail, cut=cut)
         self._hints.write(time, self._track.box)
         if self._normals is not None:
-            self._normals.write(time, follower, to_world)
-        return points
-
-    def _own(self, time: float | None) -> np.ndarray:
-        """The target's own points [m] at a time code."""
-        points = points_at(self._prim, self._shot.metres_per_unit, time)
-        if points is None or len(points) != len(self.target.points):
-            raise LayerError(f"<{self.target.path}>{at_time(time)}: has no points of its own")
-        return points
+            self._normals.write(time, placed.follower, to_world)
 
     def finish(self) -> None:
         """Author pending samples at the end."""
