@@ -17,9 +17,11 @@ pytest.importorskip("PIL.Image", reason="screenshots are compared with pillow")
 
 from browser import served
 from PIL import Image
-from pxr import Usd
+from pxr import Usd, UsdGeom
 from shots import CLOTH, cloth_shot
+from stages import vec3
 
+from physgraph_usd.lab.samples.shapes import ellipsoid
 from physgraph_usd.studio.page import TunePage
 from physgraph_usd.studio.session import TuneSession
 from physgraph_usd.usd.read.reader import open_shot
@@ -237,3 +239,24 @@ def test_a_map_is_painted_with_the_mouse_and_saved(shot: Path):
         artist.page.get_by_role("button", name="Redo Pin", exact=True).wait_for(timeout=PATIENCE_MS)
         artist.settle()
         assert session.painted(CLOTH, "pin").max() == 0.0
+
+
+def warm(picture: np.ndarray) -> int:
+    """Pixels of the refined side that are not blue, as refined cloth is."""
+    right = picture[:, picture.shape[1] // 2 :]
+    return int((right[:, :, 0] > right[:, :, 2] + 10.0).sum())
+
+
+def test_a_trim_is_drawn_on_the_refined_cloth(shot: Path):
+    with tuned(shot) as (_, artist):
+        before = warm(artist.picture())
+    stage = Usd.Stage.Open(str(shot))
+    ball = UsdGeom.Mesh.Define(stage, "/World/ball")
+    solid = ellipsoid(np.array([1.0, 1.0, 0.3]), np.array([4.0, 3.0, 0.4]), (16, 10))
+    ball.CreateFaceVertexCountsAttr(solid.counts.tolist())
+    ball.CreateFaceVertexIndicesAttr(solid.indices.tolist())
+    ball.CreatePointsAttr(vec3(solid.points))
+    stage.GetPrimAtPath(CLOTH).CreateRelationship("physgraph:bind:targets").SetTargets(["/World/ball"])
+    stage.Save()
+    with tuned(shot) as (_, artist):
+        assert warm(artist.picture()) > before + 2000

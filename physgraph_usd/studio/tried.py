@@ -31,6 +31,7 @@ class TriedShot:
             StageError: The shot cannot be read.
         """
         self.opened = open_with_colliders(shot, garments=garments, colliders=colliders)
+        _ = self.opened.targets  # Refused here, not while a picture is drawn.
         named = self.opened.colliders if AUTO in colliders else tuple(colliders)
         self.named = tuple(garments), tuple(named)
         # Maps, the shot read with them, and their layer, which the stage does not keep.
