@@ -250,6 +250,23 @@ def test_chunks_processes_and_a_part_of_the_shot_place_targets_alike(shot: Path,
         assert all(first == other for other in others)
 
 
+def test_validate_names_a_target_that_does_not_fit_its_mesh(shot: Path, tmp_path: Path):
+    refine(shot, tmp_path / "out.usda")
+    layer = Sdf.Layer.FindOrOpen(str(tmp_path / "out.usda"))
+    points = np.array(layer.QueryTimeSample(f"{BUTTON}.points", LATE))
+    layer.SetTimeSample(f"{BUTTON}.points", LATE, vec3(points[:-3]))
+    points[0] = np.nan
+    layer.SetTimeSample(f"{BUTTON}.points", 5.0, vec3(points))
+    layer.Save()
+    found = "\n".join(errors(tmp_path / "out.usda", shot))
+    assert f"{BUTTON}.faceVertexIndices" in found
+    assert f"{BUTTON}.points" in found
+    stage = Usd.Stage.Open(str(shot))
+    stage.RemovePrim(BEADS)
+    stage.Save()
+    assert f"{BEADS}" in "\n".join(errors(tmp_path / "out.usda", shot))
+
+
 def test_what_follows_is_no_body_though_it_is_tagged_as_one(shot: Path):
     stage = Usd.Stage.Open(str(shot))
     stage.GetPrimAtPath(BUTTON).AddAppliedSchema("PhysGraphColliderAPI")

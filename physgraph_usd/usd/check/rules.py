@@ -323,6 +323,12 @@ RULES: tuple[Callable[[Fine], Iterator[Problem]], ...] = (
 )
 
 
+BOUND_RULES = (points, skinning)
+"""Rules for curves and points that follow a garment."""
+BOUND_MESH_RULES = (topology, *BOUND_RULES, extent)
+"""Rules for meshes that follow a garment: their topology is the shot's, which the samples have to fit."""
+
+
 def _error(message: str, path: str = "/", time: float | None = None) -> Problem:
     """An error."""
     return Problem("error", path, time, message)
@@ -380,14 +386,14 @@ def same_metadata(layer: Sdf.Layer, shot: Usd.Stage) -> Iterator[Problem]:
             yield _error(f"{key} is {found!r}; the shot has {expected!r}")
 
 
-def is_mesh(path: str, composed: Usd.Stage) -> str:
-    """The reason for a path without an editable mesh, or ""."""
+def is_mesh(path: str, composed: Usd.Stage, kind: type[UsdGeom.PointBased] = UsdGeom.Mesh) -> str:
+    """The reason for a path without an editable prim of a kind, or ""."""
     prim = composed.GetPrimAtPath(path)
     if not prim:
         return "is not on the stage: the layer is not over the shot that it was made from"
     if prim.IsInstanceProxy():
         return "lies in an instance, where overs are ignored; its instance root must be instanceable = false"
-    return "" if UsdGeom.Mesh(prim) else f"is of type {prim.GetTypeName() or 'none'}, not Mesh"
+    return "" if kind(prim) else f"is of type {prim.GetTypeName() or 'none'}, not {kind.__name__}"
 
 
 def against_shot(layer: Sdf.Layer, coarse: Usd.Prim, target: Sdf.Path) -> Iterator[Problem]:

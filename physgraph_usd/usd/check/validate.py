@@ -8,13 +8,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pxr import Sdf, Usd
+from pxr import Sdf, Usd, UsdGeom
 
 from ...errors import LayerError
 from ..provenance import read_record, recorded_shot
 from ..stage import USD_ERRORS, bad_rate, is_there, open_layer, paths_in, pxr_errors, quiet
 from ..view import StageView
 from .rules import (
+    BOUND_MESH_RULES,
+    BOUND_RULES,
     LAYER_RULES,
     RULES,
     Fine,
@@ -78,9 +80,9 @@ def check_layer(layer: Sdf.Layer, shot: StageView | None, *, samples: int | None
     problems = [replace(problem, rule=rule.__name__) for rule in LAYER_RULES for problem in rule(layer)]
     if shot is None:
         return problems
-    paths = _garments(layer)
+    paths, bound = _garments(layer), [str(path) for path in (read_record(layer) or {}).get("bound") or ()]
     # Only the garments are composed: the surrounding set may be large.
-    mask = Usd.StagePopulationMask([path for name in paths for path in {name, _coarse_path(layer, name)}])
+    mask = Usd.StagePopulationMask([*bound, *(path for name in paths for path in {name, _coarse_path(layer, name)})])
     with quiet():
         problems += _named("same_variants", same_variants(layer, shot, [_coarse_path(layer, name) for name in paths]))
         composed, alone = shot.open(over=[layer], mask=mask), shot.open(mask=mask)
@@ -94,15 +96,28 @@ def check_layer(layer: Sdf.Layer, shot: StageView | None, *, samples: int | None
         problems += _check_garment(composed.GetPrimAtPath(path), layer, samples, coarse=coarse)
         if coarse:
             problems += _named("against_shot", against_shot(layer, coarse, Sdf.Path(path)))
+    for path in bound:
+        fault = is_mesh(path, composed, UsdGeom.PointBased)
+        fine = None if fault else Fine(composed.GetPrimAtPath(path), layer, _times(layer, path, samples))
+        if fine is None:
+            problems.append(Problem("error", path, None, fault, "composition"))
+            continue
+        for rule in BOUND_MESH_RULES if UsdGeom.Mesh(fine.prim) else BOUND_RULES:
+            problems += _named(rule.__name__, rule(fine))
     return problems
+
+
+def _times(layer: Sdf.Layer, path: str, samples: int | None) -> tuple[float | None, ...]:
+    """The default and time codes of a prim's points to check, spread over the range."""
+    written = times_with_values(layer, f"{path}.points")
+    if samples is not None and len(written) > samples:
+        written = [written[i] for i in np.linspace(0, len(written) - 1, samples).astype(int)]
+    return (None, *written)
 
 
 def _check_garment(prim: Usd.Prim, layer: Sdf.Layer, samples: int | None, *, coarse: Usd.Prim) -> Iterator[Problem]:
     """Run the rules for one garment; subsets already faulty in the shot give a warning."""
-    written = times_with_values(layer, str(prim.GetPath().AppendProperty("points")))
-    if samples is not None and len(written) > samples:
-        written = [written[i] for i in np.linspace(0, len(written) - 1, samples).astype(int)]
-    fine = Fine(prim, layer, (None, *written))
+    fine = Fine(prim, layer, _times(layer, str(prim.GetPath()), samples))
     in_shot = bool(coarse) and any(subsets(Fine(coarse, layer, (None,))))
     for rule in RULES:
         for problem in _named(rule.__name__, rule(fine)):

@@ -14,6 +14,7 @@ from ..read.placement import to_metres
 from ..read.reader import Shot
 from ..read.targets import Target, roots_of
 from . import overs
+from .primvars import hide_influences
 from .stream import LayerStream
 from .track import ModelHints, PointTrack, set_sample
 
@@ -91,6 +92,7 @@ class _BoundTrack:
         self._metres, self._prim = shot.metres_per_unit, prim
         self.notices = overs.open_instances(stream, path, roots_of(shot.stage, target))
         overs.author_unskinned(stream, path, prim, skinned=target.skinned)
+        hide_influences(stream, path, prim)
         authored = shape.GetVelocitiesAttr().HasAuthoredValue()
         rate = shot.stage.GetTimeCodesPerSecond() if velocities or authored else None
         if shape.GetAccelerationsAttr().HasAuthoredValue():

@@ -63,6 +63,14 @@ def carry_primvars(
     return notices
 
 
+def hide_influences(stream: LayerStream, target: Sdf.Path, prim: Usd.Prim) -> None:
+    """Block joint influences of a prim whose points are skinned already."""
+    for name in STALE[1:]:
+        primvar = UsdGeom.PrimvarsAPI(prim).GetPrimvar(name)
+        if primvar and primvar.HasAuthoredValue():
+            _hide(stream, target, primvar)
+
+
 def _numbers_points(primvar: UsdGeom.Primvar) -> bool:
     """Whether a primvar holds a unique whole number per point, such as ids."""
     if primvar.GetInterpolation() not in (UsdGeom.Tokens.vertex, UsdGeom.Tokens.varying):
