@@ -4,8 +4,8 @@
 
 Refines some frames up to the time code that is drawn, at level 2. For samples about contact it prints what each panel
 says: free vertices deeper than 0.1 mm in the body, edges through faces of cloth and body, and of cloth and cloth, all
-measured by what the report measures with. The coarse panel's are those of the upsampled cage. The T-shirt is drawn by
-`preview`.
+measured by what the report measures with. The coarse panel's are those of the upsampled cage. The T-shirt and its trims
+are drawn by `preview`.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ SHOWN = {
     "crossing": Shown(6.0, (0.0, 0.84, 0.0), (0.3, 0.28, 0.2), (78.0, 2.0), NO_BODY),
 }
 """The pictures of contact by sample."""
-PREVIEWED = {"tshirt": (24.0, 36.0)}
+PREVIEWED = {"tshirt": (24.0, 36.0), "trims": (8.0, 14.0)}
 """First frame and the one drawn by `preview`, by sample."""
 
 
