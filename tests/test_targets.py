@@ -344,7 +344,13 @@ def test_the_sample_keeps_thickness_area_and_buttons(tmp_path: Path, monkeypatch
     """The T-shirt's render mesh stands still in the shot; the middle of its faces lies on the refined cloth."""
     monkeypatch.setattr(trims, "FINE", 2)
     shot = write_stage(trims.build(), tmp_path / "trims.usdc")
-    refine(shot, tmp_path / "out.usdc", level=2, frames=(12.0, 13.0))
+    report = refine(shot, tmp_path / "out.usdc", level=2, frames=(12.0, 13.0))
+    assert 0.5 < report.estimate["layer_mb"] / ((tmp_path / "out.usdc").stat().st_size / 1e6) < 2.0
+    assert [(each["path"], each["rigid_parts"]) for each in report.garments[0]["bound"]] == [
+        ("/TrimsShot/Render", 0),
+        ("/TrimsShot/Buttons", 5),
+        ("/TrimsShot/Piping", 0),
+    ]
     stage = open_over(shot, tmp_path / "out.usdc")
     skin = np.asarray(UsdGeom.Mesh(stage.GetPrimAtPath("/TrimsShot/Render")).GetPointsAttr().Get(13.0), float)
     outer, inner = np.split(skin, 2)

@@ -55,7 +55,8 @@ def begin_report(report: RefineReport, opened: Shot, options: RefineOptions) -> 
         | {"bound": [_bound(target) for target in opened.targets if target.garment == index]}
         for index, part in enumerate(parts)
     ]
-    report.estimate = estimate(opened.scene.garments, **_run(opened, report, options)).plain()
+    bound = sum(len(target.points) for target in opened.targets)
+    report.estimate = estimate(opened.scene.garments, **_run(opened, report, options), bound=bound).plain()
     known = _strained(opened, report, frames)
     candidates = find_candidates(opened)
     report.candidates = {

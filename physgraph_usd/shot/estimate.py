@@ -19,6 +19,8 @@ PER_VERTEX = 6.5e3
 """Memory per fine vertex, including coarser levels, forces, metric and hierarchies [bytes]."""
 LAYER_ONCE, LAYER_FRAME = 60.0, 24.0
 """Data per fine vertex in a layer: faces, UVs and the default once; points and normals per sample [bytes]."""
+PER_BOUND, BOUND_FRAME = 1e3, 12.0
+"""Memory per point that follows a garment, and its data per sample [bytes]."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +46,9 @@ class Estimate:
         }
 
 
-def estimate(garments: Sequence[Garment], levels: Sequence[int], *, frames: int = 1, workers: int = 1) -> Estimate:
+def estimate(
+    garments: Sequence[Garment], levels: Sequence[int], *, frames: int = 1, workers: int = 1, bound: int = 0
+) -> Estimate:
     """Estimate a run.
 
     Args:
@@ -52,11 +56,13 @@ def estimate(garments: Sequence[Garment], levels: Sequence[int], *, frames: int 
         levels: Number of subdivisions of each.
         frames: Number of time codes.
         workers: Processes that share the frames.
+        bound: Points that follow the garments.
     """
     vertices = sum(fine_count(garment.mesh, level) for garment, level in zip(garments, levels, strict=True))
     processes = min(workers, max(frames, 1))
     memory = (PROCESS + PER_VERTEX * vertices) * processes + (PROCESS if processes > 1 else 0.0)
-    return Estimate(vertices, memory, vertices * (LAYER_ONCE + LAYER_FRAME * frames))
+    layer = vertices * (LAYER_ONCE + LAYER_FRAME * frames) + bound * BOUND_FRAME * (frames + 1)
+    return Estimate(vertices, memory + PER_BOUND * bound, layer)
 
 
 def cannot_fit(
