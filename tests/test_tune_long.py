@@ -27,8 +27,8 @@ from physgraph_usd.studio.values import MAPS, TUNABLES
 
 SECONDS = float(os.environ.get("PHYSGRAPH_TUNE_SECONDS", "120"))
 """How long the moves go on; 3600 for an hour."""
-TOO_WEAK = "the refined cloth "
-"""The beginning of what the solver says of values that cannot hold the cloth: it leaves its cage, or its size."""
+TOO_WEAK = ("the refined cloth ", "nothing holds it up but a guide")
+"""Errors of values that cannot hold the cloth: it leaves its cage, or its size, or would fall."""
 MOST_GROWTH = 150e6
 """Bytes by which memory may grow from a quarter of the time to the end, beside `LEFT_BEHIND`."""
 LEFT_BEHIND = 24
@@ -120,6 +120,6 @@ def test_random_moves_leave_memory_bounded_and_nothing_stale(tmp_path: Path, mon
         assert shown.frame.time == session.time
         assert shown.frame.garments[0].fabric == session.shot.frame(session.time).garments[0].fabric
     assert log.count > 10
-    assert [error for error in log.errors if TOO_WEAK not in error] == []
+    assert {error for error in log.errors if not any(weak in error for weak in TOO_WEAK)} == set()
     quarter = max(size for at, size in sizes if at < 0.3 * SECONDS)
     assert sizes[-1][1] - quarter < MOST_GROWTH + LEFT_BEHIND * sum(factors)
