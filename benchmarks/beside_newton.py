@@ -40,9 +40,9 @@ SIMULATED: dict[str, dict[str, Any]] = {
 }
 """Steps of a frame of 1/24 s and iterations in each, as in Newton's own examples (VBD: ten, not four)."""
 APART = 0.25
-"""Distance that their cloth keeps to itself, over the spacing of the mesh."""
+"""Contact distance of cloth in Newton's solvers, relative to the mesh's spacing."""
 WARM, COUNTED = 2, 4
-"""Frames before those that are timed; frames from one in which crossings are counted to the next."""
+"""Untimed frames at the start; stride of the frames in which crossings are counted."""
 PAGE = Path("benchmarks/results/newton.md")
 TEXT = """# Beside Newton's solvers on one mesh
 
@@ -114,7 +114,7 @@ def runs(python: str, stage: Stage, subdivisions: int, *, frames: int, device: s
 
 
 def stretch(level: Level, x: np.ndarray) -> float:
-    """99th percentile over edges of their length over the rest length, less one [%]."""
+    """99th percentile of the edges' strain [%]."""
     first, second = level.springs.numpy().T
     rest = np.linalg.norm(level.rest.double().numpy()[first] - level.rest.double().numpy()[second], axis=1)
     return float(100.0 * (np.percentile(np.linalg.norm(x[first] - x[second], axis=1) / rest, 99.0) - 1.0))

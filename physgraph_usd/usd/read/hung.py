@@ -1,4 +1,4 @@
-"""Places targets by the refined cloth on which they hang."""
+"""Places targets on refined cloth."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ class Placed:
 
     Attributes:
         target: The target.
-        points: Its points [m], world space, shape (N, 3).
-        follower: The binding with its surface there, which turns normals.
+        points: Points [m], world space, shape (N, 3).
+        follower: The binding at the refined surface, to turn normals.
     """
 
     target: Target
@@ -34,10 +34,10 @@ class Placed:
 
 
 class Hung:
-    """The targets of one garment, each after the prim that it is bound to.
+    """The bound targets of one garment.
 
     Attributes:
-        targets: The targets.
+        targets: The targets, each after its parent target.
     """
 
     def __init__(self, shot: Shot, index: int, steps: Sequence[Refinement]) -> None:

@@ -1,4 +1,4 @@
-"""Finds what follows refined garments: render meshes, trims, curves and points named by ``physgraph:bind:targets``."""
+"""Finds targets of ``physgraph:bind:targets``: render meshes, trims, curves and points that follow refined garments."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ FAR = 0.1
 SMALL = 0.05
 """Largest diagonal of a closed piece that is rigid unasked, relative to the garment's diagonal."""
 ASKED = 2_000
-"""Most points of a target that choose its garment and its bind pose."""
+"""Most points of a target compared to choose garment and bind pose."""
 OTHER = 2.0
 """Times by which the less likely pose must be closer: the default of what moves, the first sample of what stands."""
 
@@ -40,7 +40,7 @@ class Target:
     Attributes:
         path: Prim path.
         garment: Number of the garment.
-        on: The mesh that it is bound to, itself a target; None for the cloth.
+        on: Parent target, a mesh; None for the cloth.
         time: Time code of the bind pose; None for the default.
         points: Positions in the bind pose [m], world space, shape (N, 3).
         mesh: Faces; None for curves and points.
@@ -71,11 +71,11 @@ class Target:
 
 @dataclass(frozen=True)
 class Bound:
-    """A prim that is to follow another.
+    """A prim to be bound.
 
     Attributes:
         path: Prim path.
-        on: The garment or target named for it; None where the nearest garment is to be found.
+        on: Garment or parent target; None for the nearest garment.
     """
 
     path: Sdf.Path
@@ -83,7 +83,7 @@ class Bound:
 
 
 def find_bound(stage: Usd.Stage, garments: Sequence[Usd.Prim], wanted: Sequence[str]) -> list[Bound]:
-    """Prims bound to garments, each after the prim that it is bound to.
+    """Prims bound to garments, each after its parent.
 
     Args:
         stage: The stage.
@@ -128,7 +128,7 @@ def read_targets(
     metres: float,
     skinned: Sequence[Sdf.Path],
 ) -> list[Target]:
-    """Read what follows garments, in the pose in which it lies closest.
+    """Read targets in the closest bind pose.
 
     Args:
         stage: The stage, skinning baked.
@@ -214,7 +214,7 @@ def _placed(prim: Usd.Prim, pose: _Pose, on: Sdf.Path | None, *, skinned: bool) 
 
 
 def _on_target(prim: Usd.Prim, parent: Target, metres: float, *, skinned: bool) -> Target:
-    """A target bound to another target, in that one's bind pose."""
+    """A target bound to a parent target, in the parent's bind pose."""
     if parent.mesh is None:
         message, remedy = f"is bound to <{parent.path}>, which has no faces", "bind it to a mesh"
         raise GarmentError(str(prim.GetPath()), message, remedy=remedy)

@@ -1,4 +1,4 @@
-"""Writes what follows a garment: points, normals and velocities of targets, frame after frame."""
+"""Writes targets, frame after frame: points, normals, extents and velocities."""
 
 from __future__ import annotations
 
@@ -38,14 +38,14 @@ class BoundTracks:
         absent: Sequence[float],
         velocities: bool,
     ) -> None:
-        """Bind the targets and author what does not change.
+        """Bind the targets and author constant properties.
 
         Args:
             stream: The layer.
             shot: The shot.
             index: Number of the garment.
-            steps: Its refinements, coarse to fine.
-            absent: Time codes at which it is absent.
+            steps: The garment's refinements, coarse to fine.
+            absent: Time codes at which the garment is absent.
             velocities: Whether velocities are authored for all.
         """
         self._hung = Hung(shot, index, steps)
@@ -86,7 +86,7 @@ class _BoundTrack:
         absent: Sequence[float],
         velocities: bool,
     ) -> None:
-        """Author what does not change, and start the track."""
+        """Author constant properties, and start the track."""
         prim, path = shot.stage.GetPrimAtPath(target.path), target.path
         shape = UsdGeom.PointBased(prim)
         self._metres, self._prim = shot.metres_per_unit, prim
@@ -116,7 +116,7 @@ class _BoundTrack:
 
 
 class _TurnedNormals:
-    """Authored normals of a target, which turn with it; their interpolation stays."""
+    """Authored normals of a target, turned with the points; the interpolation stays."""
 
     def __init__(self, stream: LayerStream, path: Sdf.Path, normals: np.ndarray, owner: np.ndarray) -> None:
         """Take normals in world space in the bind pose, shape (M, 3), and the point of each."""
