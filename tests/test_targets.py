@@ -250,6 +250,20 @@ def test_chunks_processes_and_a_part_of_the_shot_place_targets_alike(shot: Path,
         assert all(first == other for other in others)
 
 
+def test_targets_have_velocities_where_cloth_has_and_are_blocked_with_it(shot: Path, tmp_path: Path):
+    stage = Usd.Stage.Open(str(shot))
+    UsdGeom.Mesh(stage.GetPrimAtPath(CLOTH)).GetPointsAttr().Set(Sdf.ValueBlock(), 6.0)
+    stage.Save()
+    refine(shot, tmp_path / "out.usda", velocities=True)
+    layer = Sdf.Layer.FindOrOpen(str(tmp_path / "out.usda"))
+    before, now, after = (np.asarray(layer.QueryTimeSample(f"{BUTTON}.points", time)) for time in (3.0, LATE, 5.0))
+    velocity = np.asarray(layer.QueryTimeSample(f"{BUTTON}.velocities", LATE))
+    np.testing.assert_allclose(velocity, (after - before) * 24.0 / 2.0, atol=1e-3)
+    assert np.abs(now - before).max() > 0.01
+    for name in ("points", "velocities", "extent"):
+        assert isinstance(layer.QueryTimeSample(f"{BUTTON}.{name}", 6.0), Sdf.ValueBlock)
+
+
 def test_validate_names_a_target_that_does_not_fit_its_mesh(shot: Path, tmp_path: Path):
     refine(shot, tmp_path / "out.usda")
     layer = Sdf.Layer.FindOrOpen(str(tmp_path / "out.usda"))
@@ -316,9 +330,21 @@ def odd_mode(stage: Usd.Stage) -> None:
     stage.GetPrimAtPath(BUTTON).CreateAttribute("physgraph:bind:mode", Sdf.ValueTypeNames.Token).Set("glue")
 
 
+def not_finite(stage: Usd.Stage) -> None:
+    points = np.array(UsdGeom.Points(stage.GetPrimAtPath(BEADS)).GetPointsAttr().Get())
+    points[1] = np.nan
+    UsdGeom.Points(stage.GetPrimAtPath(BEADS)).GetPointsAttr().Set(vec3(points))
+
+
+def empty(stage: Usd.Stage) -> None:
+    UsdGeom.Points(stage.GetPrimAtPath(BEADS)).GetPointsAttr().Set(Vt.Vec3fArray())
+
+
 @pytest.mark.parametrize(
     ("broken", "kind", "words"),
     [
+        (not_finite, GarmentError, f"<{BEADS}> at time code 1: point 1 is not finite"),
+        (empty, GarmentError, f"<{BEADS}>: has no points"),
         (spread, GarmentError, "</World/far>: lies up to"),
         (twice, GarmentError, f"<{BEADS}>: is bound to <{CLOTH}> and to <{BUTTON}>"),
         (changing, GarmentError, f"<{BUTTON}> at time code 2: its topology changes"),

@@ -153,6 +153,9 @@ def read_targets(
         named = [number for path, number in numbers.items() if path == each.on]
         nearest = range(len(garments)) if each.on is None else named
         poses = [pose for number in nearest for pose in _poses(prim, number, garments, cage=cage, metres=metres)]
+        if not poses and nearest:
+            remedy = "author its points, or leave it out of the bound prims"
+            raise GarmentError(str(each.path), "has no points where the garment has its first sample", remedy=remedy)
         if not poses:
             continue
         best = min(poses, key=lambda pose: pose.away)
@@ -228,11 +231,20 @@ def _on_target(prim: Usd.Prim, parent: Target, metres: float, *, skinned: bool) 
 
 
 def points_at(prim: Usd.Prim, metres: float, time: float | None) -> np.ndarray | None:
-    """World positions [m] of a prim's points at a time code, shape (N, 3), float64; None without points."""
+    """World positions [m] of a prim's points at a time code, shape (N, 3), float64; None without points.
+
+    Raises:
+        GarmentError: A point is not finite, or the prim cannot be placed.
+    """
     value = UsdGeom.PointBased(prim).GetPointsAttr().Get(timecode(time))
     if value is None or not len(value):
         return None
-    return place(np.asarray(value, np.float64), to_metres(prim, metres, time))
+    points = place(np.asarray(value, np.float64), to_metres(prim, metres, time))
+    if not np.isfinite(points).all():
+        first = int(np.argwhere(~np.isfinite(points))[0][0])
+        remedy = "mend its points, or leave it out of the bound prims"
+        raise GarmentError(str(prim.GetPath()), f"point {first} is not finite", time=time, remedy=remedy)
+    return points
 
 
 def _check_topology(prim: Usd.Prim) -> None:
