@@ -42,28 +42,15 @@ STILL: dict[str, Any] = {"pos": wp.vec3(0.0), "rot": wp.quat_identity(), "vel": 
 @wp.kernel
 def place(
     step: wp.array(dtype=wp.int32),
-    held: wp.array(dtype=wp.int32),
-    targets: wp.array2d(dtype=wp.vec3),
-    points: wp.array(dtype=wp.vec3),
-    next_points: wp.array(dtype=wp.vec3),
+    which: wp.array(dtype=wp.int32),
+    targets: wp.array2d(dtype=Any),
+    here: wp.array(dtype=Any),
+    there: wp.array(dtype=Any),
 ):
-    """Held vertices to where a step has them."""
+    """Held vertices, or bodies, to where a step has them, in both states."""
     i = wp.tid()
-    points[held[i]] = targets[step[0], i]
-    next_points[held[i]] = targets[step[0], i]
-
-
-@wp.kernel
-def pose(
-    step: wp.array(dtype=wp.int32),
-    poses: wp.array2d(dtype=wp.transform),
-    bodies: wp.array(dtype=wp.transform),
-    next_bodies: wp.array(dtype=wp.transform),
-):
-    """Bodies to where a step has them."""
-    i = wp.tid()
-    bodies[i] = poses[step[0], i]
-    next_bodies[i] = poses[step[0], i]
+    here[which[i]] = targets[step[0], i]
+    there[which[i]] = targets[step[0], i]
 
 
 @wp.kernel
@@ -164,16 +151,16 @@ class Simulation:
         self.held = wp.array(problem["held"], dtype=wp.int32, device=device)
         self.targets = wp.array(problem["targets"], dtype=wp.vec3, ndim=2, device=device)
         self.poses = wp.array(poses(problem), dtype=wp.transform, ndim=2, device=device)
+        self.bodies = wp.array(np.arange(len(problem["capsules"])), dtype=wp.int32, device=device)
         self.graph: Any = None
 
     def step(self, here: Any, there: Any) -> None:
         """One step from a state into another."""
         device = here.particle_q.device
-        given = [self.number, self.held, self.targets, here.particle_q, there.particle_q]
-        wp.launch(place, dim=len(self.held), inputs=given, device=device)
-        if self.poses.size:
-            given = [self.number, self.poses, here.body_q, there.body_q]
-            wp.launch(pose, dim=self.poses.shape[1], inputs=given, device=device)
+        moved = [(self.held, self.targets, here.particle_q, there.particle_q)]
+        moved += [(self.bodies, self.poses, here.body_q, there.body_q)] if len(self.bodies) else []
+        for which, *arrays in moved:
+            wp.launch(place, dim=len(which), inputs=[self.number, which, *arrays], device=device)
         wp.launch(count, dim=1, inputs=[self.number], device=device)
         self.pipeline.collide(here, self.contacts)
         here.clear_forces()

@@ -6,9 +6,9 @@
 
 Each OTHER is a checkout of another version. Every shot is refined by each of them and by this one in turn, on one core
 or a card, in a process of its own, by the command that a user gives. Prints a row a shot: of each version the
-milliseconds of a warm frame on the wall as its report has them (prepared, solved and measured; the median over frames,
-the least over turns), the mean energy of warm frames without the tether's, and crossings of all frames with bodies and
-with cloth; then the time and the energy of this version over each other's.
+milliseconds of the first and of a warm frame on the wall as its report has them (prepared, solved and measured; warm,
+the median over frames, the least over turns), the mean energy of warm frames without the tether's, and crossings of all
+frames with bodies and with cloth; then the time and the energy of this version over each other's.
 """
 
 from __future__ import annotations
@@ -40,15 +40,16 @@ HERE = Path(__file__).resolve().parents[1]
 
 @dataclass(frozen=True)
 class Cost:
-    """A shot by one version: milliseconds of a warm frame, its energy [J], and crossings of all frames."""
+    """A shot by one version: milliseconds of the first and of a warm frame, its energy [J], crossings of all frames."""
 
+    first: float
     warm: float
     energy: float
     crossings: int
 
     def __str__(self) -> str:
         """A cell of the table."""
-        return f"{self.warm:,.0f} ms, {1e3 * self.energy:.4g} mJ, {self.crossings:,}"
+        return f"{self.first:,.0f}, {self.warm:,.0f} ms, {1e3 * self.energy:.4g} mJ, {self.crossings:,}"
 
     def over(self, other: Cost) -> str:
         """Ratios of time and energy."""
@@ -75,7 +76,7 @@ def main(
     if not others:
         raise click.UsageError("name a checkout of another version, or give --cores")
     trees = [*(other.resolve() for other in others), HERE]
-    head = [*(f"{tree.name}: warm frame, energy, crossings" for tree in trees), "time, energy over"]
+    head = [*(f"{tree.name}: first and warm frame, energy, crossings" for tree in trees), "time, energy over"]
     say(table(["shot", *head], []))
     with tempfile.TemporaryDirectory() as made:
         for name, given in shots(names, folder, Path(made), numbers["frames"]):
@@ -115,10 +116,10 @@ def taken(tree: Path, arguments: Sequence[str], made: Path, core: int) -> Cost:
     report = json.loads(Path(f"{out}.json").read_text("utf-8"))
     frames = [groups for frame in report["frames"] if (groups := groups_of(frame))]
     warm = frames[1:] or frames
-    milliseconds = [sum(sum(each["milliseconds"].values()) for each in groups) for groups in warm]
+    first, *later = [sum(sum(each["milliseconds"].values()) for each in groups) for groups in frames]
     energies = [sum(sum(each["energy_joules"]["output"].values()) for each in groups) for groups in warm]
     crossings = sum(left for groups in frames for each in groups for left in crossings_of(each.get("contact") or {}))
-    return Cost(statistics.median(milliseconds), statistics.mean(energies), crossings)
+    return Cost(first, statistics.median(later or [first]), statistics.mean(energies), crossings)
 
 
 def crossings_of(contact: dict[str, Any]) -> Iterator[int]:

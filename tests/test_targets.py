@@ -17,6 +17,7 @@ from stages import sheet_faces, sheet_points, vec3
 from physgraph_usd.errors import AbsentError, GarmentError, SchemaError
 from physgraph_usd.lab.samples import trims, tshirt
 from physgraph_usd.lab.samples.shapes import ellipsoid
+from physgraph_usd.shot.refine import inspect_shot
 from physgraph_usd.shot.stitch import stitch
 from physgraph_usd.solver.mesh.bind import closest
 from physgraph_usd.solver.mesh.subdivide import smooth, subdivide
@@ -140,11 +141,15 @@ def test_normals_turn_with_their_points_per_corner_too(shot: Path, tmp_path: Pat
     normals = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar("normals", Sdf.ValueTypeNames.Normal3fArray, "faceVarying")
     normals.Set(vec3(outward))
     normals.SetIndices(Vt.IntArray.FromNumpy(corners))
+    UsdGeom.Mesh(stage.GetPrimAtPath(CLOTH)).GetPointsAttr().Set(Sdf.ValueBlock(), 6.0)
     stage.Save()
     refine(shot, tmp_path / "out.usda")
     over = open_over(shot, tmp_path / "out.usda")
     moved = np.asarray(UsdGeom.Mesh(over.GetPrimAtPath(BUTTON)).GetPointsAttr().Get(LATE))
     turn = best_motion(points.astype(float), moved.astype(float)).turn
+    layer = Sdf.Layer.FindOrOpen(str(tmp_path / "out.usda"))
+    kinds = [type(layer.QueryTimeSample(f"{BUTTON}.primvars:normals", time)) for time in (LATE, 6.0)]
+    assert kinds == [Vt.Vec3fArray, Sdf.ValueBlock]
     found = UsdGeom.PrimvarsAPI(over.GetPrimAtPath(BUTTON)).GetPrimvar("normals").ComputeFlattened(LATE)
     np.testing.assert_allclose(np.asarray(found), (outward @ turn.T)[corners], atol=1e-5)
 
@@ -300,6 +305,29 @@ def test_inspect_proposes_what_lies_on_the_cloth_and_moves_with_it(tmp_path: Pat
     stage.Save()
     assert f"--bind {BUTTON} carries it along" in run("inspect", path).output
     assert "carries" not in run("inspect", path, "--bind", BUTTON).output
+
+
+def test_a_held_pose_writes_normals_as_often_as_points(tmp_path: Path):
+    path = cloth_shot(tmp_path / "shot.usda", frozen=True)
+    stage = Usd.Stage.Open(str(path))
+    mesh = beside(stage, BUTTON, on_sheet(3, 2, 0.12))
+    mesh.CreateNormalsAttr([(0.0, 0.0, 1.0)] * len(mesh.GetPointsAttr().Get()))
+    mesh.SetNormalsInterpolation("vertex")
+    bind(stage, BUTTON)
+    stage.Save()
+    refine(path, tmp_path / "out.usda")
+    layer = Sdf.Layer.FindOrOpen(str(tmp_path / "out.usda"))
+    times = [layer.ListTimeSamplesForPath(f"{BUTTON}.{name}") for name in ("points", "normals")]
+    assert times[0] == times[1]
+    assert len(times[0]) < 6
+
+
+def test_the_command_of_inspect_keeps_what_is_bound(shot: Path):
+    stage = Usd.Stage.Open(str(shot))
+    stage.GetPrimAtPath(CLOTH).RemoveProperty(TARGETS)
+    beside(stage, "/World/body", (3.0, 2.0, -2.0), radius=2.0)
+    stage.Save()
+    assert inspect_shot(shot, bind=[BUTTON])["command"].endswith(f"--collider /World/body --bind {BUTTON}")
 
 
 def spread(stage: Usd.Stage) -> None:

@@ -145,7 +145,7 @@ def _command(opened: Shot, report: RefineReport, options: RefineOptions) -> dict
     if not (unfelt or rest):
         return {}
     colliders = [*opened.colliders, *unfelt] if unfelt else options.colliders
-    return {"command": command_of(opened.path, options.garments, colliders, rest=rest)}
+    return {"command": command_of(opened.path, options.garments, colliders, bind=options.bind, rest=rest)}
 
 
 def describe_meshes(shot: str | Stage, problem: str, options: RefineOptions) -> dict[str, Any]:

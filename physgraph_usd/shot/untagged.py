@@ -199,13 +199,13 @@ def proposal(shot: str | Stage, meshes: Sequence[str], frames: tuple[float, floa
 def command_of(
     shot: str, garments: Iterable[str], colliders: Iterable[str], *, bind: Iterable[str] = (), rest: Sequence[str]
 ) -> str:
-    """The command to refine a shot's garments with colliders and what follows them.
+    """The command to refine a shot's garments with colliders and targets.
 
     Args:
         shot: The shot.
         garments: Paths of the garments.
         colliders: Paths of the colliders.
-        bind: Paths of what follows garments.
+        bind: Paths of targets.
         rest: The result of `rest_options`.
     """
     out = str(Path(shot).with_suffix(".refined.usdc"))

@@ -28,7 +28,7 @@ from .fabric import Fabric
 
 EDGES_PER_WAVE = 5.0
 FOLDING = 1e-3
-"""Compression at which cloth begins to fold: less it takes in its plane."""
+"""Compression at which cloth begins to fold; smaller compressions stay in its plane."""
 Edge = TypeVar("Edge", float, Float[Tensor, " hinges"])
 
 

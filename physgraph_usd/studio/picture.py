@@ -14,8 +14,8 @@ from trimesh.exchange.gltf import export_glb
 from ..solver.colliders.pose import MeshPose, Pose
 from ..solver.mesh.topology import PolygonMesh
 from ..solver.scene import Frame
+from ..usd.read.bindings import GarmentBindings
 from ..usd.read.bodies import tessellated
-from ..usd.read.hung import Hung
 from .brush import Stroke
 from .maps import PLAIN, Map, find_map
 from .session import TuneSession
@@ -112,7 +112,7 @@ class Picture:
         drawn = [_everything(session.shot.frame(time)) for time in times]
         self._across = max(np.ptp(each @ self.right) for each in drawn) + GAP * self.size
         self._handles: dict[str, tuple[object, Any]] = {}
-        self._hung: dict[int, tuple[int, Hung]] = {}
+        self._bindings: dict[int, tuple[int, GarmentBindings]] = {}
         self.paintable = False
         self.targets: dict[int, Any] = {}
         server.scene.set_up_direction(up)
@@ -236,9 +236,9 @@ class Picture:
         points, steps, named = shown.points[index], self._session.refinements[index], set[str]()
         if points is None:
             return named
-        if index not in self._hung or self._hung[index][0] != len(steps):
-            self._hung[index] = len(steps), Hung(self._session.shot, index, steps)
-        for placed in self._hung[index][1].at(shown.frame.time, points):
+        if index not in self._bindings or self._bindings[index][0] != len(steps):
+            self._bindings[index] = len(steps), GarmentBindings(self._session.shot, index, steps)
+        for placed in self._bindings[index][1].at(shown.frame.time, points):
             if placed.target.mesh is not None:
                 name, mesh = f"trim/{index}/{placed.target.path}", placed.target.mesh
                 sheet = Sheet(placed.points, mesh.triangulate(placed.target.points).triangles, np.empty((0, 2), int))

@@ -18,7 +18,7 @@ THICKNESS = 2.5e-3
 FINE = 3
 """Subdivisions from the garment to the render mesh."""
 BUTTONS, ACROSS, TALL = 5, 6e-3, 2.5e-3
-"""Number of buttons, their radius and their height [m]."""
+"""Number, radius [m] and height [m] of the buttons."""
 PIPING = 2e-3
 """Radius of the piping [m]."""
 

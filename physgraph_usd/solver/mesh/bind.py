@@ -30,6 +30,8 @@ NEAREST = 8
 """Triangles that are tested for the closest point, nearest by their centroids."""
 AT_ONCE = 50_000
 """Points searched at a time."""
+COLLINEAR = 1e-10
+"""Regularisation of a vertex's least squares, relative to the trace: its edges may lie on a line."""
 _TINY = 1e-30
 
 
@@ -105,16 +107,8 @@ def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 class SurfaceFrames:
     """Frames of a surface's vertices, which follow its deformation from a bind pose."""
 
-    def __init__(
-        self, bind: Float[np.ndarray, "vertices 3"], triangles: Int[np.ndarray, "triangles 3"], *, reach: float = 0.1
-    ) -> None:
-        """Prepare the gradients along two tangents of each vertex in the bind pose.
-
-        Args:
-            bind: Positions in the bind pose.
-            triangles: Triangles.
-            reach: Regularisation of vertices whose edges lie on a line, relative to their squared length.
-        """
+    def __init__(self, bind: Float[np.ndarray, "vertices 3"], triangles: Int[np.ndarray, "triangles 3"]) -> None:
+        """Prepare the gradients along two tangents of each vertex in the bind pose."""
         count = len(bind)
         normals = _normals(bind, triangles)
         axis = np.eye(3)[np.abs(normals).argmin(axis=1)]
@@ -126,7 +120,7 @@ class SurfaceFrames:
         squares = np.zeros((count, 2, 2))
         np.add.at(squares, here, flat[:, :, None] * flat[:, None])
         trace = np.einsum("ntt->n", squares)
-        squares += (1e-9 * trace + (trace <= 0))[:, None, None] * reach * np.eye(2)
+        squares += (COLLINEAR * trace + (trace <= 0))[:, None, None] * np.eye(2)
         slopes = np.linalg.solve(squares[here], flat[:, :, None])[:, :, 0]
         self._gradients = [_gradient(here, there, slope, count) for slope in slopes.T]
 

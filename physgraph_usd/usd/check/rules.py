@@ -115,7 +115,7 @@ def opinions_together(fine: Fine) -> Iterator[Problem]:
 
 
 def topology(fine: Fine) -> Iterator[Problem]:
-    """Counts, indices and points fit one another at every time."""
+    """Counts, indices and points match at every time."""
     for time in fine.times:
         fault = fine.topology_fault(time)
         if fault:
@@ -335,7 +335,7 @@ def _error(message: str, path: str = "/", time: float | None = None) -> Problem:
 
 
 def record(layer: Sdf.Layer) -> Iterator[Problem]:
-    """The layer records its garments and its shot."""
+    """The record names garments and shot."""
     found = read_record(layer)
     if found is None:
         yield _error('has no customLayerData["physgraph"]; is it a refined layer?')
@@ -386,7 +386,7 @@ def same_metadata(layer: Sdf.Layer, shot: Usd.Stage) -> Iterator[Problem]:
             yield _error(f"{key} is {found!r}; the shot has {expected!r}")
 
 
-def is_mesh(path: str, composed: Usd.Stage, kind: type[UsdGeom.PointBased] = UsdGeom.Mesh) -> str:
+def prim_fault(path: str, composed: Usd.Stage, kind: type[UsdGeom.PointBased] = UsdGeom.Mesh) -> str:
     """The reason for a path without an editable prim of a kind, or ""."""
     prim = composed.GetPrimAtPath(path)
     if not prim:

@@ -22,7 +22,7 @@ from .rules import (
     Fine,
     Problem,
     against_shot,
-    is_mesh,
+    prim_fault,
     same_metadata,
     same_variants,
     subsets,
@@ -88,7 +88,7 @@ def check_layer(layer: Sdf.Layer, shot: StageView | None, *, samples: int | None
         composed, alone = shot.open(over=[layer], mask=mask), shot.open(mask=mask)
     problems += _named("same_metadata", same_metadata(layer, alone))
     for path in paths:
-        fault = is_mesh(path, composed)
+        fault = prim_fault(path, composed)
         if fault:
             problems.append(Problem("error", path, None, fault, "composition"))
             continue
@@ -97,7 +97,7 @@ def check_layer(layer: Sdf.Layer, shot: StageView | None, *, samples: int | None
         if coarse:
             problems += _named("against_shot", against_shot(layer, coarse, Sdf.Path(path)))
     for path in bound:
-        fault = is_mesh(path, composed, UsdGeom.PointBased)
+        fault = prim_fault(path, composed, UsdGeom.PointBased)
         fine = None if fault else Fine(composed.GetPrimAtPath(path), layer, _times(layer, path, samples))
         if fine is None:
             problems.append(Problem("error", path, None, fault, "composition"))

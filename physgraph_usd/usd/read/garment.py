@@ -272,7 +272,7 @@ def seam_tolerance(prim: Usd.Prim, overrides: Sequence[Override]) -> float:
 
 
 def _length(prim: Usd.Prim, name: str, overrides: Sequence[Override]) -> float:
-    """A length that cannot be animated [m]; 0 where nothing gives it."""
+    """A length without animation [m]; 0 if unauthored."""
     return float(find_value(prim, GARMENT[name], overrides).at(None) or 0.0)
 
 

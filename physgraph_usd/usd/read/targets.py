@@ -13,7 +13,7 @@ from ...solver.mesh.bind import closest
 from ...solver.mesh.topology import PolygonMesh, edges_of, joined_by
 from ..stage import timecode
 from ..times import garment_times
-from .find import find_paths, instance_roots, targets_of
+from .find import find_paths, targets_of
 from .placement import place, to_metres
 
 TARGETS, RIGID, MODE = "physgraph:bind:targets", "physgraph:bind:rigid", "physgraph:bind:mode"
@@ -25,7 +25,7 @@ SMALL = 0.05
 """Largest diagonal of a closed piece that is rigid unasked, relative to the garment's diagonal."""
 ASKED = 2_000
 """Most points of a target compared to choose garment and bind pose."""
-OTHER = 2.0
+UNLIKELY = 2.0
 """Times by which the less likely pose must be closer: the default of what moves, the first sample of what stands."""
 
 
@@ -98,7 +98,7 @@ def find_bound(stage: Usd.Stage, garments: Sequence[Usd.Prim], wanted: Sequence[
     cloth = {prim.GetPath() for prim in garments}
     found = [each for prim in garments for each in _below(stage, prim)]
     listed = {each.path for each in found}
-    asked = dict.fromkeys(path for item in wanted for path in find_paths(stage, item, UsdGeom.PointBased, drawn=False))
+    asked = dict.fromkeys(path for item in wanted for path in find_paths(stage, item, UsdGeom.PointBased))
     found += [Bound(path, None) for path in asked if path not in listed | cloth]
     seen: dict[Sdf.Path, Sdf.Path | None] = {}
     for each in found:
@@ -109,7 +109,7 @@ def find_bound(stage: Usd.Stage, garments: Sequence[Usd.Prim], wanted: Sequence[
             message = f"is bound to <{seen[each.path]}> and to <{each.on}>"
             raise GarmentError(str(each.path), message, remedy=f"leave it in one {TARGETS}")
         seen[each.path] = each.on
-        found += _below(stage, stage.GetPrimAtPath(each.path))
+        found += _below(stage, stage.GetPrimAtPath(each.path))  # The loop reaches them too.
     return found
 
 
@@ -198,7 +198,7 @@ def _poses(
         some = points[:: max(len(points) // ASKED, 1)]
         away = float(closest(some, surface, triangles).distance.mean())
         size = float(np.linalg.norm(np.ptp(surface, axis=0)))
-        away *= OTHER if moves == (time is None) else 1.0
+        away *= UNLIKELY if moves == (time is None) else 1.0
         yield _Pose(number, time, points, surface, triangles, size, away)
 
 
@@ -309,8 +309,3 @@ def _mode(prim: Usd.Prim) -> str:
     if mode not in (FOLLOW, DETAIL):
         raise SchemaError(f"<{prim.GetPath()}>.{MODE} is {mode!r}; known: {FOLLOW}, {DETAIL}")
     return str(mode)
-
-
-def roots_of(stage: Usd.Stage, target: Target) -> tuple[Sdf.Path, ...]:
-    """Instances that contain a target, outermost first."""
-    return instance_roots(stage.GetPrimAtPath(target.path))

@@ -201,17 +201,21 @@ class FineMap:
         whole = sparse.identity(self.cage.vertex_count, format="csr") if found is None else found
         return whole[self._shell.vertex]
 
+    def _on_shell(self, element: str, values: np.ndarray) -> np.ndarray:
+        """Values on the vertices, faces or corners of the fine mesh, from values on the refined sheet's."""
+        return values if self._shell is None else values[getattr(self._shell, element)]
+
     @cached_property
     def nearest_vertex(self) -> np.ndarray:
         """Coarse vertex of each fine vertex, shape (V_fine,)."""
         found = vertex_values(self._refinements, np.arange(self.cage.vertex_count))
-        return found if self._shell is None else found[self._shell.vertex]
+        return self._on_shell("vertex", found)
 
     @cached_property
     def parent_face(self) -> np.ndarray:
         """Authored face of each fine face, shape (F_fine,)."""
         found = self._kept[uniform_values(self._refinements, np.arange(self.cage.face_count))]
-        return found if self._shell is None else found[self._shell.face]
+        return self._on_shell("face", found)
 
     @cached_property
     def kept_corners(self) -> np.ndarray:
@@ -226,7 +230,7 @@ class FineMap:
         corners = np.arange(len(self.kept_corners))
         indices, values = corner_values(self._refinements, self.cage.counts, corners, corners)
         found = self.kept_corners[values[indices]]
-        return found if self._shell is None else found[self._shell.corner]
+        return self._on_shell("corner", found)
 
     def count(self, interpolation: str) -> int:
         """Number of authored elements of an interpolation; ValueError for an interpolation independent of topology."""
@@ -286,7 +290,7 @@ class FineMap:
         """Refine values on corners along their own topology, preserving seams."""
         coarse = self.kept_corners if indices is None else np.asarray(indices)[self.kept_corners]
         fine, refined = corner_values(self._refinements, self.cage.counts, coarse.astype(np.int32), values)
-        fine = fine if self._shell is None else fine[self._shell.corner]
+        fine = self._on_shell("corner", fine)
         return (refined[fine], None) if indices is None else (refined, fine.astype(np.int32))
 
     def subset(self, element: str, indices: np.ndarray, *, exclusive: bool = False) -> np.ndarray:

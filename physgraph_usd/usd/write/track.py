@@ -36,10 +36,11 @@ _PURPOSES = ("default", "render", "proxy", "guide")
 
 @dataclass(frozen=True, eq=False)
 class _Sample:
-    """Local points at one time code, shape (V, 3), float32."""
+    """Local points at one time code, shape (V, 3), and given normals, shape (M, 3), or None; float32."""
 
     time: float
     points: np.ndarray
+    normals: np.ndarray | None = None
 
 
 def refuse_not_finite(values: np.ndarray, place: str) -> None:
@@ -49,7 +50,7 @@ def refuse_not_finite(values: np.ndarray, place: str) -> None:
         raise LayerError(f"{place}: value {first} is {values[first].tolist()}, not finite")
 
 
-def set_sample(stream: LayerStream, path: Sdf.Path, values: np.ndarray, time: float | None) -> None:
+def _set_sample(stream: LayerStream, path: Sdf.Path, values: np.ndarray, time: float | None) -> None:
     """Author solved values; all solved values enter the layer here, checked to be finite."""
     refuse_not_finite(values, f"<{path}>" + at_time(time))
     kind = Vt.FloatArray if values.ndim == 1 else Vt.Vec3fArray
@@ -80,6 +81,7 @@ class PointTrack:
         still: bool,
         rate: float | None,
         margin: float = 0.0,
+        given_normals: Sdf.Path | None = None,
         own: Callable[[float | None], np.ndarray | None] = lambda _: None,
         absent: Sequence[float] = (),
     ) -> None:
@@ -88,10 +90,11 @@ class PointTrack:
         Args:
             stream: The layer.
             target: Prim to author on.
-            normals: Normals of local points; None leaves normals alone.
+            normals: Computes normals of local points; None without.
             rest: Local points for the default time, shape (V, 3); if None, the first sample's points.
             still: Whether the garment's input has no samples: only a default is written until the cloth moves.
             rate: Time codes per second for velocities; None leaves velocities out.
+            given_normals: Attribute of normals given with each sample, authored by the caller; None without.
             margin: Distance by which the extent exceeds the points, such as half the width of curves.
             own: The shot's velocities at a time code [units/s], shape (V, 3), float32; None without velocities.
             absent: Time codes to block, ascending: the garment is absent.
@@ -102,6 +105,9 @@ class PointTrack:
         if normals is not None:
             stream.attribute(self._paths["normals"], TYPES["normals"], interpolation=UsdGeom.Tokens.vertex)
         stream.attribute(self._paths["extent"], TYPES["extent"])
+        self._has_normals = normals is not None or given_normals is not None
+        if given_normals is not None:
+            self._paths["normals"] = given_normals
         self._rest, self._still, self._rate, self._own = rest, still, rate, own
         self._absent = list(absent)
         self.unknown: list[float] = []
@@ -118,6 +124,7 @@ class PointTrack:
         points: np.ndarray,
         to_metres: np.ndarray,
         *,
+        normals: np.ndarray | None = None,
         changed: bool = True,
         cut: bool = False,
     ) -> None:
@@ -127,6 +134,7 @@ class PointTrack:
             time: Time code, or None for the default of a shot without samples.
             points: Fine points [m], world space, shape (V, 3).
             to_metres: Local space to world metres, shape (4, 4), for column vectors.
+            normals: Local normals, shape (M, 3), float32, for a track of given normals.
             changed: False when the world points are known to equal the previous sample's.
             cut: Whether the cloth jumps to this sample from the previous sample.
 
@@ -139,7 +147,7 @@ class PointTrack:
             self._end_stretch()
         same_matrix = self._matrix is not None and np.array_equal(self._matrix, to_metres)
         if not changed and same_matrix and self._last is not None and time is not None:
-            self._take(_Sample(time, self._last.points), moved=False)
+            self._take(_Sample(time, self._last.points, self._last.normals), moved=False)
             return
         self._matrix = to_metres
         points = to_local(points, to_metres, str(self._paths["points"].GetPrimPath()), time)
@@ -151,7 +159,8 @@ class PointTrack:
         if time is None:
             self.box = self._extent(points)
             return
-        self._take(_Sample(time, points), moved=self._last is None or not np.array_equal(points, self._last.points))
+        moved = self._last is None or not np.array_equal(points, self._last.points)
+        self._take(_Sample(time, points, normals), moved=moved)
 
     def _take(self, sample: _Sample, *, moved: bool) -> None:
         """Author a sample, and the end of the previous run; a sample equal to the previous sample extends the run."""
@@ -175,12 +184,12 @@ class PointTrack:
     def _end_run(self) -> None:
         """Author the last of a run of equal samples."""
         if self._run_end is not None and self._last is not None and not self._still:
-            self._emit(_Sample(self._run_end, self._last.points))
+            self._emit(_Sample(self._run_end, self._last.points, self._last.normals))
             self._run_end = None
 
     def _emit(self, sample: _Sample) -> None:
         """Author a sample, and the velocity of the sample before."""
-        self._author(sample.time, sample.points)
+        self._author(sample.time, sample.points, sample.normals)
         if self._rate is None:
             return
         self._queue.append(sample)
@@ -208,7 +217,7 @@ class PointTrack:
             self._end_stretch()
             self._last = self._matrix = None
             blocked = self._absent.pop(0)
-            optional = {"normals": self._normals is not None, "velocities": self._rate is not None}
+            optional = {"normals": self._has_normals, "velocities": self._rate is not None}
             for name in ("points", "extent", *(name for name, there in optional.items() if there)):
                 self._block(name, blocked)
 
@@ -216,13 +225,14 @@ class PointTrack:
         self._stream.attribute(self._paths[name], TYPES[name])
         self._stream.set(self._paths[name], Sdf.ValueBlock(), time=time)
 
-    def _author(self, time: float | None, points: np.ndarray) -> None:
-        """Author points, normals and extent at one time."""
+    def _author(self, time: float | None, points: np.ndarray, normals: np.ndarray | None = None) -> None:
+        """Author points, extent, and normals if given or computed, at one time."""
         self.box = self._extent(points)
         values = {"points": points, "extent": self.box}
-        values |= {} if self._normals is None else {"normals": self._normals(points)}
+        normals = normals if self._normals is None else self._normals(points)
+        values |= {} if normals is None else {"normals": normals}
         for name, value in values.items():
-            set_sample(self._stream, self._paths[name], value, time)
+            _set_sample(self._stream, self._paths[name], value, time)
 
     def _extent(self, points: np.ndarray) -> np.ndarray:
         """Least and greatest corner with the margin, shape (2, 3), float32."""
@@ -240,7 +250,7 @@ class PointTrack:
 
     def _set_velocity(self, time: float | None, velocity: np.ndarray) -> None:
         self._stream.attribute(self._paths["velocities"], TYPES["velocities"])
-        set_sample(self._stream, self._paths["velocities"], np.ascontiguousarray(velocity, np.float32), time)
+        _set_sample(self._stream, self._paths["velocities"], np.ascontiguousarray(velocity, np.float32), time)
 
 
 def to_local(world: np.ndarray, to_metres: np.ndarray, path: str, time: float | None) -> np.ndarray:
@@ -327,7 +337,7 @@ class HeatTrack:
         return self._target.AppendProperty(PREFIX + name)
 
     def _set(self, name: str, time: float | None, values: np.ndarray) -> None:
-        set_sample(self._stream, self._path(name), values, time)
+        _set_sample(self._stream, self._path(name), values, time)
 
 
 class ModelHints:

@@ -27,11 +27,11 @@ from ..read.reader import Shot
 from ..stage import Notice, at_time, first_value, pxr_errors, value_at
 from ..times import within
 from . import overs
-from .bound import BoundTracks
 from .normals import VertexNormals
 from .overs import author_used_values
 from .primvars import FineMap, carry_primvars, carry_subsets
 from .stream import LayerStream
+from .target_tracks import TargetTracks
 from .track import HeatTrack, ModelHints, PointTrack
 
 MODES = ("over", "sibling")
@@ -82,7 +82,7 @@ class LayerWriter:
         self._shot, self._mode, self._time = shot, mode, -np.inf
         self._velocities, self._open = velocities, True
         self._record = {"mode": mode} | dict(provenance or {})
-        self._times, self._meshes, self._bound = times, dict[int, _RefinedMesh](), dict[int, BoundTracks]()
+        self._times, self._meshes, self._bound = times, dict[int, _RefinedMesh](), dict[int, TargetTracks]()
         self.notices: list[Notice] = []
         with ExitStack() as stack:
             self._stream = stack.enter_context(LayerStream(out, overwrite=overwrite))
@@ -102,7 +102,7 @@ class LayerWriter:
                 mesh = _RefinedMesh(self._stream, self._shot, index, steps=refinements[index], absent=absent, **options)
                 self._meshes[index] = mesh
                 moves = {"absent": absent, "velocities": self._velocities}
-                bound = BoundTracks(self._stream, self._shot, index, steps=refinements[index], **moves)
+                bound = TargetTracks(self._stream, self._shot, index, steps=refinements[index], **moves)
                 self._bound[index] = bound
                 self.notices += [*mesh.notices, *bound.notices]
 

@@ -9,19 +9,20 @@ from pxr import Sdf, Usd, UsdGeom
 
 from ...solver.mesh.bind import Follower
 from ...solver.mesh.subdivide import Refinement
-from ..read.hung import Hung, Placed
+from ..read.bindings import GarmentBindings, PlacedTarget
+from ..read.find import instance_roots
 from ..read.placement import to_metres
 from ..read.reader import Shot
-from ..read.targets import Target, roots_of
+from ..read.targets import Target
 from . import overs
 from .primvars import hide_influences
 from .stream import LayerStream
-from .track import ModelHints, PointTrack, set_sample
+from .track import ModelHints, PointTrack
 
 _FIRST = Usd.TimeCode.EarliestTime()
 
 
-class BoundTracks:
+class TargetTracks:
     """The targets of one garment during writing.
 
     Attributes:
@@ -48,19 +49,19 @@ class BoundTracks:
             absent: Time codes at which the garment is absent.
             velocities: Whether velocities are authored for all.
         """
-        self._hung = Hung(shot, index, steps)
+        self._bindings = GarmentBindings(shot, index, steps)
         given = {"still": not shot.sources[index].times, "absent": absent, "velocities": velocities}
-        self._tracks = [_BoundTrack(stream, shot, target, **given) for target in self._hung.targets]
+        self._tracks = [_TargetTrack(stream, shot, target, **given) for target in self._bindings.targets]
         self.notices = [notice for track in self._tracks for notice in track.notices]
 
     @property
     def paths(self) -> list[Sdf.Path]:
         """Paths of the targets."""
-        return [target.path for target in self._hung.targets]
+        return [target.path for target in self._bindings.targets]
 
     def write(self, time: float | None, points: np.ndarray, *, changed: bool, cut: bool) -> None:
         """Write one time code; points are those of the refined garment [m], world space, shape (V, 3)."""
-        for track, placed in zip(self._tracks, self._hung.at(time, points), strict=True):
+        for track, placed in zip(self._tracks, self._bindings.at(time, points), strict=True):
             track.write(time, placed, changed=changed, cut=cut)
 
     def finish(self) -> None:
@@ -69,7 +70,7 @@ class BoundTracks:
             track.finish()
 
 
-class _BoundTrack:
+class _TargetTrack:
     """One target during writing.
 
     Attributes:
@@ -90,7 +91,7 @@ class _BoundTrack:
         prim, path = shot.stage.GetPrimAtPath(target.path), target.path
         shape = UsdGeom.PointBased(prim)
         self._metres, self._prim = shot.metres_per_unit, prim
-        self.notices = overs.open_instances(stream, path, roots_of(shot.stage, target))
+        self.notices = overs.open_instances(stream, path, instance_roots(prim))
         overs.author_unskinned(stream, path, prim, skinned=target.skinned)
         hide_influences(stream, path, prim)
         authored = shape.GetVelocitiesAttr().HasAuthoredValue()
@@ -98,17 +99,19 @@ class _BoundTrack:
         if shape.GetAccelerationsAttr().HasAuthoredValue():
             stream.block(path.AppendProperty("accelerations"), Sdf.ValueTypeNames.Vector3fArray)
         moves = {"rate": rate, "absent": absent, "still": still, "margin": _half_width(prim)}
-        self._track = PointTrack(stream, path, None, rest=_default_points(prim, len(target.points)), **moves)
         self._normals = _TurnedNormals.of(stream, shot, target)
+        given = None if self._normals is None else self._normals.path
+        rest = _default_points(prim, len(target.points))
+        self._track = PointTrack(stream, path, None, rest=rest, given_normals=given, **moves)
         self._hints = ModelHints(stream, shot.stage, path, purpose=UsdGeom.Imageable(prim).ComputePurpose())
 
-    def write(self, time: float | None, placed: Placed, *, changed: bool, cut: bool) -> None:
+    def write(self, time: float | None, placed: PlacedTarget, *, changed: bool, cut: bool) -> None:
         """Write one time code; ``changed`` and ``cut`` are those of the cloth, as in `PointTrack.write`."""
         to_world = to_metres(self._prim, self._metres, time)
-        self._track.write(time, placed.points, to_world, changed=changed or placed.target.detail, cut=cut)
+        normals = None if self._normals is None else self._normals.at(placed.follower, to_world)
+        moves = {"changed": changed or placed.target.detail, "cut": cut}
+        self._track.write(time, placed.points, to_world, normals=normals, **moves)
         self._hints.write(time, self._track.box)
-        if self._normals is not None:
-            self._normals.write(time, placed.follower, to_world)
 
     def finish(self) -> None:
         """Author pending samples at the end."""
@@ -116,11 +119,15 @@ class _BoundTrack:
 
 
 class _TurnedNormals:
-    """Authored normals of a target, turned with the points; the interpolation stays."""
+    """Authored normals of a target, turned with the points.
 
-    def __init__(self, stream: LayerStream, path: Sdf.Path, normals: np.ndarray, owner: np.ndarray) -> None:
-        """Take normals in world space in the bind pose, shape (M, 3), and the point of each."""
-        self._stream, self._path, self._normals, self._owner = stream, path, normals, owner
+    Attributes:
+        path: The attribute, normals or primvars:normals; the interpolation stays.
+    """
+
+    def __init__(self, path: Sdf.Path, normals: np.ndarray, owner: np.ndarray) -> None:
+        """Take normals in world space in the bind pose, shape (M, 3), and the point of each, shape (M,)."""
+        self.path, self._normals, self._owner = path, normals, owner
 
     @classmethod
     def of(cls, stream: LayerStream, shot: Shot, target: Target) -> _TurnedNormals | None:
@@ -140,13 +147,13 @@ class _TurnedNormals:
             stream.block(target.path.AppendProperty(f"{attribute.GetName()}:indices"), Sdf.ValueTypeNames.IntArray)
         stream.attribute(path, Sdf.ValueTypeNames.Normal3fArray, interpolation=kind)
         linear = np.linalg.inv(to_metres(prim, shot.metres_per_unit, target.time)[:3, :3])
-        return cls(stream, path, np.asarray(values, float) @ linear, owner)
+        return cls(path, np.asarray(values, float) @ linear, owner)
 
-    def write(self, time: float | None, follower: Follower, to_world: np.ndarray) -> None:
-        """Write one time code."""
+    def at(self, follower: Follower, to_world: np.ndarray) -> np.ndarray:
+        """Unit normals in local space, shape (M, 3), float32, by the matrix from local space to world metres."""
         turned = follower.turned(self._normals, self._owner) @ to_world[:3, :3]
         lengths = np.linalg.norm(turned, axis=1, keepdims=True)
-        set_sample(self._stream, self._path, (turned / np.maximum(lengths, 1e-30)).astype(np.float32), time)
+        return (turned / np.maximum(lengths, 1e-30)).astype(np.float32)
 
 
 def _owners(target: Target, interpolation: str) -> np.ndarray | None:

@@ -19,7 +19,7 @@ from .targets import Target, points_at
 
 
 @dataclass(frozen=True, eq=False)
-class Placed:
+class PlacedTarget:
     """A target at a time code.
 
     Attributes:
@@ -33,7 +33,7 @@ class Placed:
     follower: Follower
 
 
-class Hung:
+class GarmentBindings:
     """The bound targets of one garment.
 
     Attributes:
@@ -62,7 +62,7 @@ class Hung:
         cage = self._shot.cage(self._index, time)
         return cage if self._smooth is None else self._smooth @ cage
 
-    def at(self, time: float | None, cloth: np.ndarray) -> Iterator[Placed]:
+    def at(self, time: float | None, cloth: np.ndarray) -> Iterator[PlacedTarget]:
         """Place the targets by the refined cloth [m] at a time code, shape (V, 3).
 
         Raises:
@@ -76,7 +76,7 @@ class Hung:
             if target.detail and target.on is None:
                 points = self._own(target, time) + points - binding.at(self._smoothed(time)).points
             placed[target.path] = points
-            yield Placed(target, points, follower)
+            yield PlacedTarget(target, points, follower)
 
     def _own(self, target: Target, time: float | None) -> np.ndarray:
         """A target's own points [m] at a time code."""
