@@ -119,12 +119,19 @@ class LevelContact:
     def out_of_bodies(self, x: Placed) -> tuple[Placed, int]:
         """Positions moved safely out of bodies [m], x itself if no cloth had to move, and the number of passes.
 
-        Passes end once `STALLED` of them in a row left as much cloth in bodies; the best positions stay.
+        In all passes, a vertex moves no farther than the first pass wants and an edge's length: cloth pinched between
+        limbs, out of one and into the other in turns, would leave as spikes. Passes end once `STALLED` of them in a row
+        left as much cloth in bodies; the best positions stay.
         """
-        best, left, passes, stalled = x, self.cloth.in_bodies(x), 0, 0
+        view, start, reach = self.cloth, x, None
+        best, left, passes, stalled = x, view.in_bodies(x), 0, 0
         while any(left) and stalled < STALLED and not is_over():
-            x, passes, stalled = self.moved(x, self.cloth.pushed_out(x)), passes + 1, stalled + 1
-            now = self.cloth.in_bodies(x)
+            wanted = view.pushed_out(x)
+            shift = wanted - start
+            far = shift.norm(dim=1, keepdim=True)
+            reach = far + view.mesh.level.rest_length.mean() if reach is None else reach
+            x = self.moved(x, torch.where(far > reach, start + shift * (reach / far), wanted))
+            passes, stalled, now = passes + 1, stalled + 1, view.in_bodies(x)
             if now < left:
                 best, left, stalled = x, now, 0
         return best, passes
