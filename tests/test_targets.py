@@ -23,9 +23,11 @@ from physgraph_usd.solver.mesh.bind import closest
 from physgraph_usd.solver.mesh.subdivide import smooth, subdivide
 from physgraph_usd.solver.mesh.topology import PolygonMesh
 from physgraph_usd.solver.rigid import best_motion
+from physgraph_usd.studio.session import TuneSession
 from physgraph_usd.usd.read.reader import open_shot
 from physgraph_usd.usd.read.targets import TARGETS
 from physgraph_usd.usd.write.sample_stage import write_stage
+from physgraph_usd.usd.write.tag import tag
 
 BUTTON, PIPING, BEADS = "/World/button", "/World/piping", "/World/beads"
 SIZE = (6, 4)
@@ -110,6 +112,30 @@ def test_the_layer_holds_what_moves_and_nothing_else_of_a_target(shot: Path, tmp
     curve = UsdGeom.BasisCurves(stage.GetPrimAtPath(PIPING))
     extent, points = (np.array(each.Get(LATE)) for each in (curve.GetExtentAttr(), curve.GetPointsAttr()))
     np.testing.assert_allclose(extent, [points.min(axis=0) - 0.02, points.max(axis=0) + 0.02], atol=1e-6)
+
+
+def test_tag_names_what_follows_each_garment_beside_what_it_names_itself(shot: Path, tmp_path: Path):
+    stage = Usd.Stage.Open(str(shot))
+    bind(stage, BEADS)
+    stage.Save()
+    out = tag(shot, tmp_path / "tagged.usda", garments=[CLOTH], bind=["button", PIPING])
+    tagged = Usd.Stage.Open(str(out))
+    named = tagged.GetPrimAtPath(CLOTH).GetRelationship(TARGETS).GetTargets()
+    assert sorted(map(str, named)) == [BEADS, BUTTON, PIPING]
+    with closing(open_shot(str(out))) as opened:
+        assert sorted(str(target.path) for target in opened.targets) == [BEADS, BUTTON, PIPING]
+
+
+def test_a_tuned_layer_keeps_what_the_command_bound(shot: Path, tmp_path: Path):
+    stage = Usd.Stage.Open(str(shot))
+    stage.GetPrimAtPath(CLOTH).RemoveProperty(TARGETS)
+    stage.Save()
+    with closing(TuneSession(shot, garments=[CLOTH], bind=[BUTTON], out=tmp_path / "tuned.usda")) as session:
+        session.set_value(CLOTH, "bendStiffness", 1e-5)
+        assert f"--bind {BUTTON}" in session.command
+        saved = session.save()
+    with closing(open_shot(str(saved))) as opened:
+        assert [str(target.path) for target in opened.targets] == [BUTTON]
 
 
 @pytest.mark.parametrize("placed", ["turned", "mirrored", "scaled"])

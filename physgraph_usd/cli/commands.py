@@ -38,6 +38,7 @@ session_options = together(
     ),
     of_field("garments"),
     of_field("colliders"),
+    of_field("bind"),
     of_field("device"),
     overwrite_option,
 )
@@ -113,6 +114,7 @@ def inspect(ctx: click.Context, shot: str, *, as_json: bool, timed: bool, **opti
 @out_option("OUT", "Layer to write.")
 @of_field("garments", help=PRIMS)
 @of_field("colliders", help=PRIMS, metavar="PATH")
+@of_field("bind")
 @click.option("--preset", metavar="FABRIC", help=f"Fabric of the garments, or of all tagged: {', '.join(PRESETS)}.")
 @click.option("--side", metavar="SIDE", help="Side of the colliders: auto, winding, start, front or back.")
 @of_field("asset_paths")

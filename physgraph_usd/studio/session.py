@@ -43,6 +43,7 @@ class TuneSession(Tuning):
         *,
         garments: Sequence[str] = (),
         colliders: Sequence[str] = (),
+        bind: Sequence[str] = (),
         out: str | Path | None = None,
         device: str = "cpu",
         overwrite: bool = False,
@@ -53,6 +54,7 @@ class TuneSession(Tuning):
             shot: The shot file; never edited.
             garments: Prim paths, names, globs or collections; empty finds applied schemas.
             colliders: Bodies, as ``garments``.
+            bind: Meshes, curves or points that follow the nearest garment, as ``garments``.
             out: Layer to save into; ``<shot>.tuned.usda`` beside the shot when None.
             device: Where to compute: "cpu", "cuda" or "auto".
             overwrite: Whether a file there may be replaced.
@@ -65,7 +67,7 @@ class TuneSession(Tuning):
         self.out = Path(out) if out is not None else Path(shot).with_suffix(".tuned.usda")
         if self.out.exists() and not overwrite:
             raise UsageError(f"{self.out} exists; choose another name with -o, or replace it by --overwrite")
-        super().__init__(shot, garments=garments, colliders=colliders)
+        super().__init__(shot, garments=garments, colliders=colliders, bind=bind)
         self.warning = "".join(of_unfelt([each for each in find_candidates(self.shot) if each.is_taken]))
         self.solver = FrameSolver(self.shot, self.setting.levels, contact=True, device=self._device)
         self._solves = self.setting  # What the solver was made for, or solved last.
@@ -185,7 +187,7 @@ class TuneSession(Tuning):
         """The command that refines the whole shot with the saved layer."""
         words = ["physgraph-usd", "refine", str(self.out), "-o", str(self.out.with_suffix(".refined.usdc"))]
         words += [] if self._device == "cpu" else ["--device", self._device]
-        for option, paths in zip(("--garment", "--collider"), self._tried.named, strict=True):
+        for option, paths in zip(("--garment", "--collider", "--bind"), self._tried.named, strict=True):
             words += [word for path in paths for word in (option, path)]
         return join(words + ([] if self.setting.contact else ["--contact", "off", "--self-contact", "off"]))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -21,19 +22,21 @@ class TriedShot:
 
     Attributes:
         opened: The shot as authored.
-        named: Garments and colliders as commands take them; the first may be empty.
+        named: Garments, colliders and targets as commands take them.
     """
 
-    def __init__(self, shot: str | Path, *, garments: Sequence[str], colliders: Sequence[str]) -> None:
+    def __init__(
+        self, shot: str | Path, *, garments: Sequence[str], colliders: Sequence[str], bind: Sequence[str]
+    ) -> None:
         """Open a shot; arguments are those of `TuneSession`.
 
         Raises:
             StageError: The shot cannot be read.
         """
-        self.opened = open_with_colliders(shot, garments=garments, colliders=colliders)
+        self.opened = open_with_colliders(shot, garments=garments, colliders=colliders, bind=bind)
         _ = self.opened.targets  # Refused here, not while a picture is drawn.
         named = self.opened.colliders if AUTO in colliders else tuple(colliders)
-        self.named = tuple(garments), tuple(named)
+        self.named = tuple(garments), tuple(named), tuple(bind)
         # Maps, the shot read with them, and their layer, which the stage does not keep.
         self._painted: tuple[object, Shot, object] = ({}, self.opened, None)
 
@@ -73,9 +76,14 @@ class TriedShot:
             StageError: A garment lies in an instance.
             LayerError: It cannot be written.
         """
-        garments = [str(source.path) for source in self.opened.sources]
         given = {"values": setting.values, "painted": self._authored(setting.painted), "overwrite": overwrite}
-        return tag(self.opened.path, out, garments=garments, colliders=self.named[1], **given)
+        return tag(self.opened.path, out, **self._named, **given)
+
+    @property
+    def _named(self) -> dict[str, Any]:
+        """The garments that were found, the colliders and the targets, as options of `open_shot`."""
+        _, colliders, bind = self.named
+        return {"garments": [str(source.path) for source in self.opened.sources], "colliders": colliders, "bind": bind}
 
     def _authored(self, painted: Mapping[str, Mapping[str, np.ndarray]]) -> dict[str, dict[str, np.ndarray]]:
         """Maps of the cages' vertices on the authored points."""
@@ -90,7 +98,6 @@ class TriedShot:
             return self.opened
         if self._painted[0] is not painted:
             layer = painted_layer(self.opened.stage, self._authored(painted))
-            garments = [str(source.path) for source in self.opened.sources]
-            shot = open_shot(self.opened.view.open(over=[layer]), garments=garments, colliders=self.named[1])
+            shot = open_shot(self.opened.view.open(over=[layer]), **self._named)
             self._painted = painted, shot, layer
         return self._painted[1]

@@ -29,13 +29,15 @@ class Tuning:
         history: The settings so far.
     """
 
-    def __init__(self, shot: str | Path, *, garments: Sequence[str], colliders: Sequence[str]) -> None:
+    def __init__(
+        self, shot: str | Path, *, garments: Sequence[str], colliders: Sequence[str], bind: Sequence[str]
+    ) -> None:
         """Open a shot at its first frame; arguments are those of `TuneSession`.
 
         Raises:
             StageError: The shot cannot be read.
         """
-        self._tried = TriedShot(shot, garments=garments, colliders=colliders)
+        self._tried = TriedShot(shot, garments=garments, colliders=colliders, bind=bind)
         self.shot: Shot = self._tried.opened
         scene = self.shot.scene
         self.garments = tuple(garment.path for garment in scene.garments)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,8 @@ from ..files import LAYER_SUFFIXES, check_suffix, check_targets, files_of
 from ..lookup import USER_PROPERTIES, check_limits
 from ..provenance import asset_path, export_layer
 from ..read.find import find_colliders, find_garments
+from ..read.reader import open_shot
+from ..read.targets import TARGETS
 from ..schema import COLLIDER, COLLIDER_API, GARMENT, GARMENT_API, SIDES, Property, every_fabric_value
 from ..stage import open_stage
 from ..view import root_over
@@ -27,6 +30,7 @@ def tag(
     *,
     garments: Sequence[str] = (),
     colliders: Sequence[str] = (),
+    bind: Sequence[str] = (),
     preset: str | None = None,
     side: str | None = None,
     values: Mapping[str, Mapping[str, float]] | None = None,
@@ -42,6 +46,7 @@ def tag(
         garments: Prim paths, names, globs or collections of meshes; if empty and a preset is given, the tagged
             garments.
         colliders: Prim paths, names, globs or collections of surfaces.
+        bind: Meshes, curves or points that follow the nearest of the garments, named likewise.
         preset: Name of a fabric to author on the garments, or None.
         side: Side of the colliders for the cloth, one of `SIDES`, or None.
         values: Values to author after the preset's, by the garment's prim path and the schema's short names.
@@ -55,9 +60,10 @@ def tag(
     Raises:
         UsageError: Nothing was named, the preset or the side is unknown or not applicable, or the file exists.
         StageError: A named prim is missing, lies in an instance, or is no surface.
+        GarmentError: A prim cannot follow a garment.
         LayerError: The layer cannot be written.
     """
-    if not garments and not colliders and preset is None:
+    if not garments and not colliders and not bind and preset is None:
         raise UsageError("nothing to tag; name a garment or a collider")
     _check_word("preset", preset, sorted(PRESETS))
     _check_word("side", side, SIDES)
@@ -70,8 +76,9 @@ def tag(
     check_targets([("the layer", target)], files_of(shot))
     prepare_target(target, overwrite=overwrite)
     stage, _ = open_stage(str(shot))
-    cloth = find_garments(stage, garments) if garments or preset is not None else []
+    cloth = find_garments(stage, garments) if garments or bind or preset is not None else []
     solid = find_colliders(stage, cloth, colliders) if colliders else []
+    targets = _targets(str(shot), [str(prim.GetPath()) for prim in cloth], bind) if bind else {}
     root = root_over(stage.GetRootLayer(), [asset_path(shot, target.parent, absolute=asset_paths == "absolute")])
     for prim in (*cloth, *solid):
         _check_editable(prim)
@@ -81,11 +88,23 @@ def tag(
         for name, value in (authored | dict((values or {}).get(str(prim.GetPath()), {}))).items():
             _author_over(spec, prim, GARMENT[name], value)
         author_painted(spec, prim, (painted or {}).get(str(prim.GetPath()), {}))
+        if prim.GetPath() in targets:
+            Sdf.RelationshipSpec(spec, TARGETS, False).targetPathList.prependedItems = targets[prim.GetPath()]
     for prim in solid:
         spec = _applied(root, prim, COLLIDER_API)
         if side is not None:
             _author(spec, COLLIDER["collider:side"], side)
     return export_layer(root, target)
+
+
+def _targets(shot: str, garments: Sequence[str], bind: Sequence[str]) -> dict[Sdf.Path, list[Sdf.Path]]:
+    """The targets of each garment, with those it has."""
+    found: dict[Sdf.Path, list[Sdf.Path]] = {}
+    with closing(open_shot(shot, garments=garments, bind=bind)) as opened:
+        for target in opened.targets:
+            if target.on is None:
+                found.setdefault(opened.sources[target.garment].path, []).append(target.path)
+    return found
 
 
 def _check_word(what: str, word: str | None, words: Sequence[str]) -> None:
