@@ -11,14 +11,18 @@ from typing import Any
 
 import pytest
 from frame_solvers import as_named
-from shots import cloth_shot, command, faults, refine
+from pxr import Sdf, Usd, UsdGeom
+from shots import CLOTH, cloth_shot, command, faults, refine
+from stages import sheet_points, vec3
 
 from physgraph_usd.errors import PhysGraphError, UsageError
 from physgraph_usd.shot.farm import connected
 from physgraph_usd.shot.processes import result_of
+from physgraph_usd.usd.read.targets import TARGETS
 
 distributed = pytest.importorskip("distributed", reason="needs Dask (extra farm)")
 TIMES = tuple(float(time) for time in range(1, 49))
+BEADS = "/World/beads"
 NOWHERE = "tcp://127.0.0.1:9"
 
 
@@ -33,7 +37,13 @@ def cluster() -> Iterator[Any]:
 
 @pytest.fixture(scope="module")
 def shot(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return cloth_shot(tmp_path_factory.mktemp("farm") / "shot.usdc", times=TIMES)
+    """A waving sheet with beads that follow it."""
+    path = cloth_shot(tmp_path_factory.mktemp("farm") / "shot.usdc", times=TIMES)
+    stage = Usd.Stage.Open(str(path))
+    UsdGeom.Points.Define(stage, BEADS).CreatePointsAttr(vec3(sheet_points(None, (6, 4))[8:11]))
+    stage.GetPrimAtPath(CLOTH).CreateRelationship(TARGETS).SetTargets([BEADS])
+    stage.Save()
+    return path
 
 
 def layer_of(shot: Path, folder: Path, **options: Any) -> Path:
@@ -61,6 +71,7 @@ def test_h34_a_worker_that_is_killed_changes_no_byte(cluster: Any, shot: Path, t
     assert killed
     assert told == [(done, 48) for done in range(1, 49)]
     assert farmed.read_bytes() == local.read_bytes()
+    assert Sdf.Layer.FindOrOpen(str(farmed)).ListTimeSamplesForPath(f"{BEADS}.points") == list(TIMES)
     assert faults(farmed, shot) == []
     assert [file.name for file in farmed.parent.iterdir()] == ["fine.usdc"]
 
