@@ -22,11 +22,12 @@ def test_cloth_pinched_between_limbs_leaves_no_spikes(real_data: Path):
     Pushed out of the leg and out of the hip in turns, vertices were sent 45 cm away.
     """
     options = RefineOptions(garments=("/shot/tiered_dress",), colliders=("/shot/mannequin",), level=2)
-    shot = open_for(real_data / "shots" / "04_tiered_dress_kick_zup.usdc", options)
+    shot = open_for(str(real_data / "shots" / "04_tiered_dress_kick_zup.usdc"), options)
     scene = shot.scene
     refiner = Refiner(scene, options.solve_settings(), levels=[2])
     mesh = refine_garments(scene.garments, [2])[0][-1].mesh
     edges = edges_of(mesh.triangulate(None).triangles, mesh.vertex_count).vertices
-    solved = [refiner.solve(shot.frame(time)).points[0] for time in (49.0, 50.0)]
-    longest = [np.linalg.norm(x[edges[:, 0]] - x[edges[:, 1]], axis=1).max() for x in solved]
-    assert max(longest) < 0.2
+    for time in (49.0, 50.0):
+        x = refiner.solve(shot.frame(time)).points[0]
+        assert x is not None
+        assert np.linalg.norm(x[edges[:, 0]] - x[edges[:, 1]], axis=1).max() < 0.2

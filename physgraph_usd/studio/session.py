@@ -192,13 +192,7 @@ class TuneSession(Tuning):
         return join(words + ([] if self.setting.contact else ["--contact", "off", "--self-contact", "off"]))
 
     def save(self) -> Path:
-        """Write values and maps as a layer over the shot, like ``tag``; no other file is written.
-
-        Raises:
-            UsageError: The layer's name is one of the shot's files, or its suffix is unknown.
-            StageError: A garment lies in an instance.
-            LayerError: It cannot be written.
-        """
+        """Write values and maps as a layer over the shot, like ``tag``; raises as `TriedShot.save`."""
         written = self._tried.save(self.setting, self.out, overwrite=self._overwrite)
         self._overwrite = True  # It is this session's own from here on.
         return written
