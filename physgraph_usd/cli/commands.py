@@ -120,7 +120,7 @@ def inspect(ctx: click.Context, shot: str, *, as_json: bool, timed: bool, **opti
 @of_field("asset_paths")
 @overwrite_option
 def tag(shot: str, out: Path, *, garments: tuple[str, ...], colliders: tuple[str, ...], **options: Any) -> None:
-    """Mark garments and colliders of SHOT in a new layer, so that refine finds them."""
+    """Write a layer over SHOT that marks garments, colliders and targets for refine."""
     from ..usd.write.tag import tag as tag_shot
 
     values = {name: value for name, value in options.items() if value is not None}

@@ -44,5 +44,5 @@ def carried_bend(fabric: Fabric, edge: Edge) -> Edge:
 
 
 def raised_by(fabric: Fabric, edge: float) -> float:
-    """How many times its own bending stiffness a fabric has on edges of a length [m]; 1 where they carry its folds."""
+    """Factor of the bending stiffness on edges of a length [m]; 1 on edges short enough for the fabric's folds."""
     return max(1.0, carried_bend(fabric, edge) / fabric.bend) if fabric.bend > 0 else 1.0

@@ -192,7 +192,7 @@ class TuneSession(Tuning):
         return join(words + ([] if self.setting.contact else ["--contact", "off", "--self-contact", "off"]))
 
     def save(self) -> Path:
-        """Write values and maps as a layer over the shot, like ``tag``; raises as `TriedShot.save`."""
+        """Write values and maps as a layer over the shot, like ``tag``; raises UsageError, StageError or LayerError."""
         written = self._tried.save(self.setting, self.out, overwrite=self._overwrite)
         self._overwrite = True  # It is this session's own from here on.
         return written

@@ -119,9 +119,9 @@ class LevelContact:
     def out_of_bodies(self, x: Placed) -> tuple[Placed, int]:
         """Positions moved safely out of bodies [m], x itself if no cloth had to move, and the number of passes.
 
-        In all passes, a vertex moves no farther than the first pass wants and an edge's length: cloth pinched between
-        limbs, out of one and into the other in turns, would leave as spikes. Passes end once `STALLED` of them in a row
-        left as much cloth in bodies; the best positions stay.
+        In all passes together, a vertex moves at most the distance of its first push plus a mean edge: cloth pinched
+        between two limbs, pushed out of one into the other in turns, would form spikes. Passes end once `STALLED` of
+        them in a row left as much cloth in bodies; the best positions stay.
         """
         view, start, reach = self.cloth, x, None
         best, left, passes, stalled = x, view.in_bodies(x), 0, 0

@@ -279,7 +279,7 @@ def leftovers(fine: Fine) -> Iterator[Problem]:
 
 
 def velocities(fine: Fine) -> Iterator[Problem]:
-    """Velocities, where there are any, are this layer's and fit the points."""
+    """Authored velocities come from this layer and fit the points."""
     if not fine.prim.GetAttribute("velocities").HasAuthoredValue():
         return
     if fine.written("velocities") != fine.written("points"):
@@ -326,7 +326,7 @@ RULES: tuple[Callable[[Fine], Iterator[Problem]], ...] = (
 BOUND_RULES = (points, skinning)
 """Rules for curves and points that follow a garment."""
 BOUND_MESH_RULES = (topology, *BOUND_RULES, extent)
-"""Rules for meshes that follow a garment: their topology is the shot's, which the samples have to fit."""
+"""Rules for meshes that follow a garment; samples must fit the shot's topology."""
 
 
 def _error(message: str, path: str = "/", time: float | None = None) -> Problem:

@@ -1,4 +1,4 @@
-"""Tags garments and colliders of a shot, in a new layer over the shot."""
+"""Tags garments, colliders and targets of a shot, in a new layer over the shot."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def tag(
 
 
 def _targets(shot: str, garments: Sequence[str], bind: Sequence[str]) -> dict[Sdf.Path, list[Sdf.Path]]:
-    """The targets of each garment, with those it has."""
+    """Paths of all targets bound to the cloth, authored ones included, by garment."""
     found: dict[Sdf.Path, list[Sdf.Path]] = {}
     with closing(open_shot(shot, garments=garments, bind=bind)) as opened:
         for target in opened.targets:
