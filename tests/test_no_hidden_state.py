@@ -26,8 +26,6 @@ ALLOWED = {
     "contact/springs.py ClothSprings.near: _near": "of the positions asked for last, and of no others",
     "contact/springs.py ClothSprings.blocking: _near": "at the end of the move asked for last",
     "contact/cloth.py ClothView.remember: _looked": "what the last frame found at those positions",
-    "contact/metric.py HeldMetric.solve: _last": "of the force solved for last, and of no other",
-    "contact/metric.py HeldMetric.stiffened: _last": "of the force solved for last, and of no other",
     # Functions of topology or of materials.
     "contact/cloth.py ClothContact.mesh: _meshes": "of a level and what is sewn there",
     "frame/group.py Group.forces_for: _forces": "of the materials; of the last ones alone",

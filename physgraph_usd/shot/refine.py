@@ -11,7 +11,7 @@ from typing import Any
 
 from ..errors import LayerError, PhysGraphError, StageError, UsageError
 from ..interrupts import SIGNALLED, exit_code_of, signals_noted
-from ..solver.integrate.metric import FACTOR
+from ..solver.integrate.factors import FACTOR
 from ..solver.mesh.kernels import cards_for
 from ..usd.files import check_targets, files_of
 from ..usd.provenance import is_result_of, write_root

@@ -30,8 +30,10 @@ HARMLESS = 0.02
 """Fraction of the energy at the start below which the logarithm of the gap stops to reward."""
 TWINS = 1 / 3
 """Fraction of the iterations in which a second descent shows how differences grow; the weight makes up for the rest."""
-EVERY = 60.0
-"""Seconds between measurements on held-out patches."""
+EVERY = 120.0
+"""Seconds between measurements on held-out patches and rounds."""
+HELD_OUT = 10_000
+"""Seed of held-out patches and rounds, whatever the run's seed: runs are compared on equal ones."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +62,7 @@ class TrainConfig:
         rate: Adam's first rate; it falls to a hundredth along a cosine.
         clip: Largest norm of the gradient.
         average: Decay of the weights' running mean, which is the result.
-        held_out: Patches to measure on, of another seed.
+        held_out: Patches to measure on.
         rounds: Rounds of moving scenes with contact that it is trained on, beside the patches.
         start: Weights to begin with: "" none, "shipped" those that ship, or a file; in TOML
             relative to it; a larger network begins as they do.
@@ -278,12 +280,12 @@ Data = tuple[list[Patch], list[Round], list[Patch], list[Round]]
 def data_of(config: TrainConfig, *, workers: int | None = None) -> Data:
     """Patches and rounds of a configuration, the same for a seed with any number of processes."""
     workers = os.cpu_count() or 1 if workers is None else workers
-    held, other = config.held_out, 10_000 + config.seed
+    held = config.held_out
     patches = make_patches(config.patches, seed=config.seed, workers=min(workers, config.patches.count // 8))
-    rest = make_patches(replace(config.patches, count=held), seed=other, workers=min(workers, held // 4))
+    rest = make_patches(replace(config.patches, count=held), seed=HELD_OUT, workers=min(workers, held // 4))
     own = make_rounds(config.rounds, seed=config.seed, workers=workers) if config.rounds.scenes else []
-    few = replace(config.rounds, scenes=min(held, config.rounds.scenes))
-    return patches, own, rest, make_rounds(few, seed=other, workers=workers) if few.scenes else []
+    few = replace(config.rounds, scenes=config.rounds.held_out)
+    return patches, own, rest, make_rounds(few, seed=HELD_OUT, workers=workers) if few.scenes else []
 
 
 def _begun(config: TrainConfig) -> Physgraph | PaperNetwork:

@@ -23,6 +23,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from ...shot.solve import prepare_device
+from ...solver.contact.metric import HeldMetric
 from ...solver.contact.settings import ContactSettings
 from ...solver.fabric import Fabric
 from ...solver.forces.base import ForceModule
@@ -133,7 +134,7 @@ def with_bodies(
         assert isinstance(system.metric, Metric)
         stiff = 3.0 * torch.stack([term.diagonal(base) for term in terms]).sum(dim=0)
         field = ForceModule((*system.field.forces, *terms))
-        out.append(System(field, system.metric.plus(stiff), free=level.free, spacing=level.spacing, level=level))
+        out.append(System(field, HeldMetric(system.metric, stiff), free=level.free, spacing=level.spacing, level=level))
     return out
 
 

@@ -45,12 +45,14 @@ class RoundConfig:
 
     Attributes:
         scenes: Number of scenes; none are made at 0.
+        held_out: Number of scenes to measure on.
         share: Part of the iterations that descend rounds.
         reference_steps: Quasi-Newton steps behind the least energies known.
         most_vertices: Fine vertices beyond which a scene has one subdivision, not two.
     """
 
     scenes: int = 0
+    held_out: int = 0
     share: float = 0.5
     reference_steps: int = 80
     most_vertices: int = 4000

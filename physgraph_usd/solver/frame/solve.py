@@ -16,7 +16,7 @@ from torch import Tensor
 
 from ...errors import SolveError
 from ..contact.frame import LevelContact
-from ..contact.metric import SMOOTH, HeldMetric
+from ..contact.metric import SHRUNK, HeldMetric
 from ..deadline import is_over
 from ..forces.base import ForceModule
 from ..integrate.base import Carry, System
@@ -113,7 +113,7 @@ def solve_one_level(
         touched = touched or bool(terms)
         system = problem.system(view, terms, x, last=last)
         resume = carry if last is not None and system.has_same_metric(last) else None
-        shrunk = SMOOTH if isinstance(system.metric, HeldMetric) else 1.0
+        shrunk = SHRUNK if isinstance(system.metric, HeldMetric) else 1.0
         of_round = budget.for_round(first=not made, touching=bool(terms), shrunk=shrunk)
         carry, report = descend(system, integrator, x, level=level.index, budget=of_round, resume=resume)
         report.remaining_move = _smooth_move(system, carry, report)

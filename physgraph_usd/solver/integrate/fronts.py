@@ -79,7 +79,7 @@ class Batch:
         """The fronts, from the matrix's entries and the children's updates, whose last entry is zero."""
         count, side = len(self.rows), self.side
         flat = values.new_zeros(count * side * side)
-        flat[self.unit] = 1.0
+        flat.index_fill_(0, self.unit, 1.0)
         flat[self.target] = values[self.source]
         first = torch.arange(count, device=values.device).mul_(side * side)[:, None, None]
         for child in self.received:

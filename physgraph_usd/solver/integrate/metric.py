@@ -3,29 +3,20 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sp
 import torch
 from jaxtyping import Bool, Float
-from scipy.sparse.linalg import splu
 from torch import Tensor
 
-from ..mesh.stencil import Stencil, add_at, three_columns
+from ..mesh.stencil import Stencil, three_columns
 from .base import Solver
-from .multifrontal import DissectedSolver, Elimination
-
-try:
-    import cholespy
-except ImportError:  # Linux on ARM has no wheel.
-    cholespy = None
-
-FACTOR = "scipy" if cholespy is None else "cholespy"
-"""Library used for factors on the CPU."""
-REGULARISATION = 1e-7
-"""Regularisation of the diagonal, relative to its mean: keeps loose parts without a guide definite."""
+from .coarse import REGULARISATION, CoarseLevels
+from .factors import factors_of
 
 
 def on_edges(matrix: sp.csr_matrix, edges: np.ndarray) -> sp.csr_matrix:
@@ -54,7 +45,6 @@ class Metric:
 
     Attributes:
         diagonal: Diagonal of H0 [N/m], float64; 1 at fixed vertices, shape (V,).
-        entries: Number of the matrix's entries.
     """
 
     def __init__(
@@ -63,6 +53,7 @@ class Metric:
         *,
         free: Bool[Tensor, "vertices 1"],
         dtype: torch.dtype,
+        ups: Sequence[Stencil] = (),
         like: Metric | None = None,
     ) -> None:
         """Factorise a scalar Hessian at rest.
@@ -71,26 +62,51 @@ class Metric:
             matrix: Symmetric positive semi-definite [N/m], shape (V, V).
             free: False at fixed vertices, whose rows become identity rows.
             dtype: Scalar type of the right-hand sides.
+            ups: Linear map to each level from the next coarser one, finest first.
             like: A metric whose order of elimination serves again on CUDA if its matrix has the same pattern; or None.
         """
-        self._free, self._matrix = free.squeeze(1), matrix
+        self._free, self._matrix, self._ups, device = free.squeeze(1), matrix, tuple(ups), str(free.device)
         self._mask = three_columns(self._free.to(dtype))
         self._merged: MergedMetric | None = None
-        keep = sp.diags(self._free.cpu().numpy().astype(np.float64))
-        couplings = sp.csr_matrix(keep @ (matrix - sp.diags(matrix.diagonal())) @ keep)
-        couplings.eliminate_zeros()
-        self.entries, device = couplings.nnz + couplings.shape[0], str(free.device)
-        known = None if like is None else like._factors
-        self._factors = (
-            DeviceFactors(couplings, dtype, device, like=known) if free.is_cuda else HostFactors(couplings, dtype)
-        )
-        self._hold(torch.as_tensor(matrix.diagonal(), device=free.device))
+        self._unscaled: tuple[Metric, Tensor] | None = None
+        self._alike = None if like is None else like.__dict__.get("coarse", like._alike)
+        self._keep = sp.diags(self._free.cpu().numpy().astype(np.float64))
+        kept = sp.csr_matrix(self._keep @ matrix @ self._keep)
+        kept.eliminate_zeros()
+        pattern = sp.csr_matrix(abs(kept) + sp.identity(matrix.shape[0]))
+        self._factors = factors_of(pattern, dtype=dtype, device=device, like=None if like is None else like._factors)
+        stiffness = torch.as_tensor(matrix.diagonal(), device=device)
+        moved = stiffness[self._free].cpu().numpy()
+        # A unit mean diagonal keeps float32 pivots in range whatever the fabric and the level.
+        scale = 1.0 / float(moved.mean()) if (moved > 0).any() else 1.0
+        diagonal = torch.where(self._free, scale * stiffness + REGULARISATION, 1.0)
+        values = torch.as_tensor(scale * self._factors.taken(kept), device=device)
+        values[self._factors.diagonal] = diagonal
+        self._solver, self._scaled = self._factors.of(values), scale * self._mask
+        self.diagonal = torch.where(self._free, diagonal / scale, 1.0)
 
-    def plus(self, springs: Float[Tensor, " vertices"]) -> Metric:
-        """The metric of the same cloth held by springs of given stiffness [N/m], factorised anew."""
-        other = copy.copy(self)
-        other._hold(self._stiffness + springs.double())
-        return other
+    @cached_property
+    def coarse(self) -> CoarseLevels:
+        """The coarser levels."""
+        if self._unscaled is not None:
+            metric, stiffer = self._unscaled
+            return metric.coarse.scaled(stiffer)
+        kept, dtype = sp.csr_matrix(self._keep @ self._matrix @ self._keep), self._mask.dtype
+        device = str(self._mask.device)
+        return CoarseLevels(kept, self._ups, self._onto, dtype=dtype, device=device, like=self._alike)
+
+    @property
+    def _onto(self) -> sp.csr_matrix:
+        """Map from the level's vertices to the matrix's rows, for moves, shape (V, V)."""
+        return sp.csr_matrix(self._keep)
+
+    def gathered(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
+        """The forces on the matrix's rows."""
+        return force
+
+    def spread(self, move: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
+        """The moves of vertices, given those of the matrix's rows."""
+        return move
 
     def scaled(self, stiffer: Float[Tensor, " vertices"]) -> Metric:
         """R H0 R, R a diagonal, solved by the Cholesky factor of H0; its diagonal is that of H0 times given numbers.
@@ -99,8 +115,10 @@ class Metric:
             stiffer: R^2 at each vertex, positive.
         """
         other, root = copy.copy(self), three_columns(stiffer.to(self._mask).rsqrt())
+        other.__dict__.pop("coarse", None)
         other._scaled, other._mask = self._scaled * root, self._mask * root
         other.diagonal = torch.where(self._free, self.diagonal * stiffer.double(), 1.0)
+        other._unscaled = self, stiffer
         return other
 
     def merged(self, label: np.ndarray) -> MergedMetric:
@@ -110,19 +128,9 @@ class Metric:
             label: A number for each vertex, shape (V,).
         """
         if self._merged is None or not np.array_equal(self._merged.label, label):
-            self._merged = MergedMetric(self._matrix, label, free=self._free.unsqueeze(1), dtype=self._mask.dtype)
+            given = {"free": self._free.unsqueeze(1), "dtype": self._mask.dtype, "ups": self._ups}
+            self._merged = MergedMetric(self._matrix, label, **given)
         return self._merged
-
-    def _hold(self, stiffness: Float[Tensor, " vertices"]) -> None:
-        """Factorise with a diagonal [N/m]."""
-        self._stiffness = stiffness
-        moved = stiffness[self._free].cpu().numpy()
-        # A unit mean diagonal keeps float32 pivots in range whatever the fabric and the level.
-        scale = 1.0 / float(moved.mean()) if (moved > 0).any() else 1.0
-        diagonal = torch.where(self._free, scale * stiffness + REGULARISATION, 1.0)
-        self._solver = self._factors.factorised(scale, diagonal)
-        self._scaled = scale * self._mask
-        self.diagonal = torch.where(self._free, diagonal / scale, 1.0)
 
     def solve(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
         """H0^-1 F [m]; zero at fixed vertices."""
@@ -164,7 +172,13 @@ class MergedMetric(Metric):
     """
 
     def __init__(
-        self, matrix: sp.csr_matrix, label: np.ndarray, *, free: Bool[Tensor, "vertices 1"], dtype: torch.dtype
+        self,
+        matrix: sp.csr_matrix,
+        label: np.ndarray,
+        *,
+        free: Bool[Tensor, "vertices 1"],
+        dtype: torch.dtype,
+        ups: Sequence[Stencil],
     ) -> None:
         """Add up the rows and columns of each label, and factorise.
 
@@ -173,6 +187,7 @@ class MergedMetric(Metric):
             label: A number for each vertex, shape (V,).
             free: False at fixed vertices; one fixed vertex fixes the whole label.
             dtype: Scalar type of the right-hand sides.
+            ups: As in `Metric`.
         """
         _, first, group = np.unique(label, return_index=True, return_inverse=True)
         representative, count = first[group], len(label)
@@ -180,97 +195,31 @@ class MergedMetric(Metric):
         joined = sp.csr_matrix((np.ones(count), (representative, np.arange(count))), shape=(count, count))
         held = np.bincount(group, ~free[:, 0].cpu().numpy())[group] > 0
         device, moves = free.device, (representative == np.arange(count)) & ~held
-        self.label = label
+        self.label, self._joined = label, joined
         self._representative = torch.as_tensor(representative, device=device)
         self._sum = Stencil(joined, dtype=dtype, device=str(device))
-        self._members = torch.as_tensor(members[group], device=device).double()
-        super().__init__(
-            sp.csr_matrix(joined @ matrix @ joined.T),
-            free=torch.as_tensor(moves, device=device).unsqueeze(1),
-            dtype=dtype,
-        )
+        merged, free = sp.csr_matrix(joined @ matrix @ joined.T), torch.as_tensor(moves, device=device).unsqueeze(1)
+        super().__init__(merged, free=free, dtype=dtype, ups=ups)
+        self.diagonal = self.diagonal[self._representative] / torch.as_tensor(members[group], device=device)
 
-    def plus(self, springs: Float[Tensor, " vertices"]) -> Metric:
-        """The metric with added springs [N/m]; a spring on one vertex of a label holds all."""
-        return super().plus(add_at(torch.zeros_like(springs), self._representative, springs))
+    @property
+    def _onto(self) -> sp.csr_matrix:
+        """The mean over each label."""
+        members = sp.diags(1.0 / np.maximum(np.asarray(self._joined.sum(axis=1)).ravel(), 1.0))
+        return sp.csr_matrix(self._keep @ members @ self._joined)
+
+    def gathered(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
+        """Each label's total force."""
+        return self._sum.apply(force)
+
+    def spread(self, move: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
+        """The same move for all vertices of a label."""
+        return move[self._representative]
 
     def solve(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
         """H0^-1 of each label's total force [m], the same move for all vertices of the label."""
-        return super().solve(self._sum.apply(force))[self._representative]
+        return self.spread(super().solve(self.gathered(force)))
 
     def between(self, factor: Float[Tensor, "vertices 1"]) -> Solver:
         """The solve of R H0^-1 R F [m], with the forces of each label summed."""
         return lambda force: self.solve(force * factor).mul_(factor)
-
-    def _hold(self, stiffness: Float[Tensor, " vertices"]) -> None:
-        """Factorise with a diagonal [N/m], shared between the vertices of each label."""
-        super()._hold(stiffness)
-        self.diagonal = self.diagonal[self._representative] / self._members
-
-
-class HostFactors:
-    """Factors, on the CPU, of matrices with common couplings up to a factor and different diagonals."""
-
-    def __init__(self, couplings: sp.csr_matrix, dtype: torch.dtype) -> None:
-        """Keep the off-diagonal couplings, shape (V, V)."""
-        self._couplings, self._dtype = couplings, dtype
-
-    def factorised(self, scale: float, diagonal: Float[Tensor, " vertices"]) -> Solver:
-        """The solve of scale * couplings + diagonal."""
-        if not len(diagonal):
-            return torch.empty_like
-        matrix = sp.coo_matrix(scale * self._couplings + sp.diags(diagonal.numpy()))
-        return _of_scipy(matrix) if cholespy is None else _of_cholespy(cholespy, matrix, self._dtype)
-
-
-def _of_cholespy(module: Any, matrix: sp.coo_matrix, dtype: torch.dtype) -> Solver:
-    """The solve by a Cholesky factor."""
-    kind = module.CholeskySolverD if dtype == torch.float64 else module.CholeskySolverF
-    rows, columns = (torch.as_tensor(of.astype(np.int32)) for of in (matrix.row, matrix.col))
-    solver = kind(matrix.shape[0], rows, columns, torch.as_tensor(matrix.data), module.MatrixType.COO)
-
-    def solve(force: Tensor) -> Tensor:
-        out = torch.empty_like(force)
-        solver.solve(force.contiguous(), out)
-        return out
-
-    return solve
-
-
-def _of_scipy(matrix: sp.coo_matrix) -> Solver:
-    """The solve by an LU factor without pivoting, not needed for a positive definite matrix."""
-    options = {"SymmetricMode": True}
-    factor = splu(sp.csc_matrix(matrix), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
-    return lambda force: torch.as_tensor(factor.solve(force.double().numpy()), dtype=force.dtype)
-
-
-class DeviceFactors:
-    """Factors of such matrices on CUDA; only the first factorisation passes through the host."""
-
-    def __init__(
-        self,
-        couplings: sp.csr_matrix,
-        dtype: torch.dtype,
-        device: str,
-        *,
-        like: HostFactors | DeviceFactors | None = None,
-    ) -> None:
-        """Find the positions of the off-diagonal couplings, shape (V, V); the order is that of a like pattern."""
-        count, each = couplings.shape[0], sp.coo_matrix(couplings)
-        rows, columns = (np.concatenate([ends, np.arange(count)]) for ends in (each.row, each.col))
-        order = np.lexsort((columns, rows))
-        starts = np.searchsorted(rows[order], np.arange(count + 1))
-        pattern = sp.csr_matrix((np.ones(len(order)), columns[order], starts), shape=(count, count))
-        values = np.concatenate([each.data, np.zeros(count)])[order]
-        self._values = torch.as_tensor(values, device=device)
-        self._diagonal = torch.as_tensor(np.flatnonzero(rows[order] == columns[order]), device=device)
-        self._rows, self._dtype = (pattern.indptr, pattern.indices), dtype
-        known = like if isinstance(like, DeviceFactors) else None
-        same = known is not None and all(map(np.array_equal, known._rows, self._rows))
-        self._elimination = known._elimination if known is not None and same else Elimination(pattern, device=device)
-
-    def factorised(self, scale: float, diagonal: Float[Tensor, " vertices"]) -> Solver:
-        """The solve of scale * couplings + diagonal."""
-        values = scale * self._values
-        values[self._diagonal] = diagonal
-        return DissectedSolver(self._elimination, values, dtype=self._dtype).solve

@@ -25,6 +25,8 @@ around cuDSS stays empty, so steps could not be recorded.
 # pyright: reportIndexIssue=false, reportGeneralTypeIssues=false, reportAssignmentType=false
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -39,6 +41,7 @@ from ...errors import SolveError
 from ..mesh.kernels import KERNELS
 from ..mesh.stencil import SCALAR, VECTOR, vectors
 from ..mesh.threads import current_stream
+from .capture import captured
 from .dissection import dissect
 from .fronts import Tree, joined
 
@@ -46,6 +49,8 @@ wp.set_module_options(KERNELS)
 
 BLOCK = 64
 """Threads sharing a row's sum on CUDA."""
+Captured = tuple[Tensor, tuple[Tensor, Tensor, Tensor], Callable[[], None]]
+"""The buffers of a captured factorisation, for its matrix and for its results, and its replay."""
 
 
 class Elimination:
@@ -77,6 +82,7 @@ class Elimination:
             for each in (down, up)
         )
         self._sizes = int(tree.down_starts[-1]), int(tree.up_starts[-1])
+        self._captured: dict[torch.dtype, Captured | None] = {}
         self._depths = [
             (int(updates), [tree.batch(nodes, device=device) for nodes in tree.batches(begin, end)])
             for updates, (begin, end) in zip(tree.updates, pairwise(tree.stages.tolist()), strict=True)
@@ -85,6 +91,8 @@ class Elimination:
     def factor(self, values: Float[Tensor, " entries"], dtype: torch.dtype) -> tuple[Tensor, Tensor]:
         """The entries of the pass down and of the pass up, each with an unused last entry.
 
+        On CUDA the second factorisation is captured, and later ones replay it.
+
         Args:
             values: Entries of a positive definite matrix in the pattern's order, float64.
             dtype: Type of the result.
@@ -92,9 +100,39 @@ class Elimination:
         Raises:
             SolveError: The matrix is not positive definite.
         """
+        if dtype not in self._captured:
+            self._captured[dtype] = None
+            out = self._room(dtype)
+            self._eliminate(values, out)
+        else:
+            out = self._replayed(values, dtype)
+        down, up, failed = out
+        if bool(failed):
+            raise SolveError("the metric is not positive definite: a stiffness is negative or not finite")
+        return down, up
+
+    def _room(self, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
+        """Room for the entries of both passes, and a flag for a matrix not positive definite."""
         down, up = (torch.empty(size + 1, dtype=dtype, device=self.device) for size in self._sizes)
-        failed = torch.zeros((), dtype=torch.bool, device=self.device)
-        before = values.new_zeros(1)
+        return down, up, torch.zeros((), dtype=torch.bool, device=self.device)
+
+    def _replayed(self, values: Float[Tensor, " entries"], dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
+        """The results of a factorisation by the captured kernels; without a GPU, by the same calls."""
+        kept = self._captured[dtype]
+        if kept is None:
+            own, room = torch.empty_like(values), self._room(dtype)
+            run = partial(self._eliminate, own, room)
+            kept = own, room, captured(run, values.device).replay if values.is_cuda else run
+            self._captured[dtype] = kept
+        own, (down, up, failed), run = kept
+        own.copy_(values)
+        run()
+        return down.clone(), up.clone(), failed
+
+    def _eliminate(self, values: Float[Tensor, " entries"], out: tuple[Tensor, Tensor, Tensor]) -> None:
+        """Factorise into the given tensors, without waiting for the device."""
+        (down, up, failed), before = out, values.new_zeros(1)
+        failed.zero_()
         for size, batches in self._depths:
             updates = values.new_empty(size + 1)
             for batch in batches:
@@ -102,17 +140,14 @@ class Elimination:
                 inverse, info = _inverse(fronts[:, :inner, :inner])
                 failed |= info.any()
                 w = fronts[:, inner:, :inner] @ inverse
-                down[joined(batch.down, batch.columns[:, :inner], down)] = w.to(dtype)
+                down[joined(batch.down, batch.columns[:, :inner], down)] = w.to(down)
                 upward = torch.cat([inverse, -w.mT], dim=2)
-                up[joined(batch.rows, batch.columns, up)] = upward.to(dtype)
+                up[joined(batch.rows, batch.columns, up)] = upward.to(up)
                 updates[joined(batch.updates, batch.ranks, updates)] = (
                     fronts[:, inner:, inner:] - w @ fronts[:, :inner, inner:]
                 )
-            updates[-1] = 0.0
+            updates[-1:].zero_()
             before = updates
-        if bool(failed):
-            raise SolveError("the metric is not positive definite: a stiffness is negative or not finite")
-        return down, up
 
 
 def _inverse(matrices: Tensor) -> tuple[Tensor, Tensor]:
@@ -156,7 +191,12 @@ class DissectedSolver:
         self._inverse = torch.empty_like(self._order)
         self._inverse[self._order] = torch.arange(count, device=device)
 
-    def solve(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
+    def renew(self, other: DissectedSolver) -> None:
+        """Take the factor of another matrix of the same pattern, in the tensors of recorded solves."""
+        for own, its in zip(self._passes, other._passes, strict=True):
+            own.copy_(its)
+
+    def __call__(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
         """The solution for three right-hand sides at once."""
         torch.index_select(force, 0, self._order, out=self._state[: self._count])
         stream = current_stream(str(force.device)) if self._cuda else None

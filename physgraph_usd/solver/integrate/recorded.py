@@ -17,11 +17,8 @@ matrices, a kernel of one thread per garment and one more product replace the tw
 # pyright: reportReturnType=false
 from __future__ import annotations
 
-import functools
-import gc
 import math
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Generic, Protocol, TypeVar
 
@@ -32,6 +29,7 @@ from torch import Tensor
 from ..mesh.kernels import ALONE, KERNELS
 from ..mesh.threads import Launch
 from .base import Carry, System
+from .capture import captured
 from .secants import Dot, Secant
 
 wp.set_module_options(KERNELS)
@@ -162,14 +160,7 @@ class Recording:
             self._advance()
             return
         if self._graph is None:
-            graph, side = torch.cuda.CUDAGraph(), torch.cuda.Stream()
-            side.wait_stream(torch.cuda.current_stream())
-            with torch.cuda.stream(side), uncollected():
-                graph.capture_begin(pool=_anchor(self._fields.device).pool(), capture_error_mode="relaxed")
-                self._advance()
-                graph.capture_end()
-            torch.cuda.current_stream().wait_stream(side)
-            self._graph = graph
+            self._graph = captured(self._advance, self._fields.device)
         self._graph.replay()
 
     def _advance(self) -> None:
@@ -220,30 +211,6 @@ class Recordings(Generic[RecordingT]):
 def pays(system: System) -> bool:
     """Whether recording a system's steps is worthwhile: on CUDA, for a reused system or many steps."""
     return system.spacing.is_cuda and (system.recorded.lasting or system.expected >= WORTH)
-
-
-@functools.cache
-def _anchor(device: torch.device) -> torch.cuda.CUDAGraph:
-    """A permanent graph, to own the memory pool shared by all recordings on a device.
-
-    Recordings are replayed one after another and leave no data in the pool.
-    """
-    graph, one = torch.cuda.CUDAGraph(), torch.zeros((), device=device)
-    with torch.cuda.device(device), torch.cuda.graph(graph):
-        one.add_(1.0)
-    return graph
-
-
-@contextmanager
-def uncollected() -> Iterator[None]:
-    """Suspend the garbage collector, which might free an earlier frame's device memory: not allowed while recording."""
-    running = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if running:
-            gc.enable()
 
 
 @wp.func

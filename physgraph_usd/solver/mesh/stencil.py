@@ -5,6 +5,7 @@ Gathering keeps the order of each sum fixed, so a run repeats bit for bit on eit
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import Any, cast
 
 import numpy as np
@@ -126,6 +127,7 @@ class Stencil:
 
     Attributes:
         shape: (rows, columns).
+        matrix: The scipy matrix.
     """
 
     def __init__(self, matrix: sp.csr_matrix, *, dtype: torch.dtype, device: str, threads: int = 1) -> None:
@@ -139,6 +141,7 @@ class Stencil:
         """
         csr = sp.csr_matrix(matrix)
         csr.sort_indices()
+        self.matrix, self._made = csr, {"dtype": dtype, "device": device, "threads": threads}
         self.shape: tuple[int, int] = (csr.shape[0], csr.shape[1])
         self._empty = 0 in self.shape
         starts = wp.array(csr.indptr.astype(np.int32), dtype=wp.int32, device=device)
@@ -149,6 +152,15 @@ class Stencil:
         single = device == "cpu" and dtype == torch.float32
         gather = cast(wp.Kernel, _gather_rows_at_once) if single else _GATHER[dtype]
         self._launch = Launch(gather, self.shape[0], inputs, device=device, threads=threads)
+
+    def alike(self, matrix: sp.csr_matrix) -> Stencil:
+        """Another matrix, of equal type and on the same device."""
+        return Stencil(matrix, **self._made)
+
+    @cached_property
+    def transposed(self) -> Stencil:
+        """The transposed matrix."""
+        return self.alike(sp.csr_matrix(self.matrix.T))
 
     def apply(self, x: Float[Tensor, "columns 3"]) -> Float[Tensor, "rows 3"]:
         """The matrix times x."""

@@ -1,0 +1,142 @@
+"""The coarser levels of a metric: what the contact of the finest level is to each of them.
+
+    A_l = Z_l^T (H + K) Z_l = H_l + Z_l^T K Z_l
+
+| symbol | meaning |
+|---|---|
+| H | metric of the level that is solved, shape (V, V) |
+| Z_l | linear map from level l; l = 0 is the cage |
+| K | stiffness of what touches, a diagonal |
+
+Of the levels between, only the diagonal of A_l is needed; of the cage, all entries. Both are linear in K: one sparse
+product gives them all, and the cage's pattern stays the same, whatever touches.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ..mesh.stencil import Stencil, three_columns
+from .base import Solver
+from .factors import Factors, factors_of
+from .fronts import ranges
+from .multifrontal import DissectedSolver
+
+REGULARISATION = 1e-7
+"""Regularisation of a factorised diagonal, relative to its mean: keeps loose parts without a guide definite."""
+
+
+@dataclass(eq=False)
+class CageSolve:
+    """The solve of A_0.
+
+    Attributes:
+        solver: The solve of the scaled matrix.
+        scale: Its scale [m/N], a scalar.
+    """
+
+    solver: Solver
+    scale: Float[Tensor, ""]
+
+    def __call__(self, force: Float[Tensor, "cage 3"]) -> Float[Tensor, "cage 3"]:
+        """A_0^-1 F [m]."""
+        return self.solver(force * self.scale)
+
+    def renew(self, other: CageSolve) -> None:
+        """Take the values of another solve of equal pattern, in the tensors of recorded steps."""
+        if isinstance(self.solver, DissectedSolver) and isinstance(other.solver, DissectedSolver):
+            self.solver.renew(other.solver)
+        else:  # The CPU records nothing.
+            self.solver = other.solver
+        self.scale.copy_(other.scale)
+
+
+class CoarseLevels:
+    """The coarser levels of a metric, with any contact stiffness.
+
+    Attributes:
+        ups: Linear map to each level from the next coarser one, finest first; at the cage, from itself.
+    """
+
+    def __init__(
+        self,
+        matrix: sp.csr_matrix,
+        ups: Sequence[Stencil],
+        onto: sp.csr_matrix,
+        *,
+        dtype: torch.dtype,
+        device: str,
+        like: CoarseLevels | None = None,
+    ) -> None:
+        """Take a metric to its coarser levels.
+
+        Args:
+            matrix: H [N/m], zero at fixed vertices, shape (V, V).
+            ups: Linear map to each level from the next coarser one, finest first.
+            onto: Applied after the first map: zero at fixed vertices, shape (V, V).
+            dtype: Scalar type of forces.
+            device: "cpu" or a CUDA device.
+            like: Levels whose order of elimination serves again if the cage has the same pattern; or None.
+        """
+        first = ups[0].alike(onto @ ups[0].matrix) if ups else Stencil(onto, dtype=dtype, device=device)
+        self.ups = [first, *ups[1:]]
+        basis = sp.identity(matrix.shape[0], format="csr")
+        known, weights = list[np.ndarray](), list[sp.csr_matrix]()
+        for up in self.ups:
+            basis = sp.csr_matrix(basis @ up.matrix)
+            matrix = sp.csr_matrix(up.matrix.T @ matrix @ up.matrix)
+            known.append(matrix.diagonal())
+            weights.append(sp.csr_matrix(basis.multiply(basis).T))
+        apart = sp.diags((matrix.diagonal() <= 0).astype(np.float64))  # Identity rows where nothing moves.
+        pattern = sp.csr_matrix(abs(matrix) + abs(basis.T) @ abs(basis) + sp.identity(basis.shape[1]))
+        known_factors = None if like is None else like._factors
+        self._factors = factors_of(pattern, dtype=dtype, device=device, like=known_factors)
+        known[-1:], weights[-1:] = [self._factors.taken(matrix + apart)], [_squares(basis, self._factors)]
+        self._sizes = [len(each) for each in known]
+        self._known = torch.as_tensor(np.concatenate(known), device=device)
+        self._weights = Stencil(sp.csr_matrix(sp.vstack(weights)), dtype=torch.float64, device=device)
+        self._dtype = dtype
+
+    def held(self, stiff: Float[Tensor, " vertices"]) -> tuple[list[Tensor], CageSolve]:
+        """Diagonals of the levels between [N/m], finest first, and the solve of the cage, given K [N/m]."""
+        entries = self._known + self._weights.apply(three_columns(stiff.double()))[:, 0]
+        *between, cage = entries.split(self._sizes)
+        scale = cage[self._factors.diagonal].mean().reciprocal()
+        cage = cage * scale
+        cage[self._factors.diagonal] += REGULARISATION
+        return [each.to(stiff) for each in between], CageSolve(self._factors.of(cage), scale.to(stiff))
+
+    def forces(self, force: Float[Tensor, "vertices 3"]) -> list[Float[Tensor, "_ 3"]]:
+        """Z_l^T F of all levels, finest first [N]."""
+        out = [force]
+        for up in self.ups:
+            out.append(up.transposed.apply(out[-1]))
+        return out
+
+    def scaled(self, stiffer: Float[Tensor, " vertices"]) -> CoarseLevels:
+        """The levels of R H R, R^2 the given numbers: about so, with R's mean at each coarse vertex."""
+        other, ones = copy.copy(self), torch.ones_like(stiffer)
+        sums = (self.forces(three_columns(each.to(self._dtype))) for each in (stiffer, ones))
+        means = [(some[:, 0] / whole[:, 0]).nan_to_num(nan=1.0).double() for some, whole in zip(*sums, strict=True)]
+        entries = (means[-1][self._factors.rows] * means[-1][self._factors.columns]).sqrt()
+        other._known = self._known * torch.cat([*means[1:-1], entries])
+        return other
+
+
+def _squares(basis: sp.csr_matrix, cage: Factors) -> sp.csr_matrix:
+    """The linear map from a diagonal K to the entries of Z^T K Z, shape (entries, V)."""
+    counts = np.diff(basis.indptr)
+    vertex = np.repeat(np.arange(basis.shape[0]), counts)
+    left = np.repeat(np.arange(basis.nnz), counts[vertex])
+    right = ranges(basis.indptr[vertex], counts[vertex])
+    place = cage.places(basis.indices[left], basis.indices[right])
+    products = basis.data[left] * basis.data[right]
+    return sp.csr_matrix((products, (place, vertex[left])), shape=(len(cage.rows), basis.shape[0]))
