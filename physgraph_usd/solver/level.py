@@ -74,7 +74,7 @@ class Level:
         pin: Painted pin weight, shape (V,); fixed where it is 1.
         from_coarse: Linear map from the cage, shape (V, C).
         smooth_from_coarse: Smooth map from the cage, shape (V, C).
-        from_below: Linear map from the level below, None at the first level.
+        ups: Linear map to each level from the next coarser one, this level first; none at the first level.
         smooth_from_below: Smooth map from there, None at the first level.
         flat_from_below: Map onto the triangles of the level below, None at the first level.
         threads: Most threads that a kernel over the level uses on the CPU.
@@ -108,7 +108,7 @@ class Level:
     pin: Float[Tensor, " vertices"]
     from_coarse: sp.csr_matrix
     smooth_from_coarse: sp.csr_matrix
-    from_below: Stencil | None
+    ups: tuple[Stencil, ...]
     smooth_from_below: Stencil | None
     flat_from_below: Stencil | None
     threads: int = 1
@@ -150,6 +150,11 @@ class Level:
     def device(self) -> str:
         """Device of the tensors."""
         return str(self.rest.device)
+
+    @property
+    def from_below(self) -> Stencil | None:
+        """Linear map from the level below; None at the first level."""
+        return self.ups[0] if self.ups else None
 
     @property
     def vertex_count(self) -> int:
@@ -226,13 +231,15 @@ def build_levels(
     levels: list[Level] = []
     for index in range(depth + 1):
         parts = [_garment_level(g, chain, index) for g, chain in zip(garments, refinements, strict=True)]
-        below: list[Stencil | None] = [None] * 3
+        below: list[Stencil | None] = [None, None]
+        ups = tuple[Stencil, ...]()
         if index:
             maps = zip(*((part.linear_step, part.smooth_step, part.flat_step) for part in parts), strict=True)
             whole = [sp.csr_matrix(sp.block_diag(each)) for each in maps] or [sp.csr_matrix((0, 0))] * 3
-            below = [Stencil(each, dtype=dtype, device=device, threads=threads) for each in whole]
-            below[2] = below[2] if abs(whole[2] - whole[0]).sum() > 0 else below[0]
-        levels.append(_join(index, parts, below, dtype=dtype, device=device, threads=threads))
+            up, smooth, flat = (Stencil(each, dtype=dtype, device=device, threads=threads) for each in whole)
+            below = [smooth, flat if abs(whole[2] - whole[0]).sum() > 0 else up]
+            ups = (up, *levels[-1].ups)
+        levels.append(_join(index, parts, below, ups=ups, dtype=dtype, device=device, threads=threads))
     return tuple(levels)
 
 
@@ -395,6 +402,7 @@ def _join(
     parts: Sequence[_GarmentLevel],
     below: Sequence[Stencil | None],
     *,
+    ups: tuple[Stencil, ...],
     dtype: torch.dtype,
     device: str,
     threads: int,
@@ -423,9 +431,9 @@ def _join(
         **{n: torch.as_tensor(np.ascontiguousarray(a, dtype=np.int32), device=device) for n, a in whole.items()},
         from_coarse=sp.csr_matrix(sp.block_diag([part.linear for part in parts])),
         smooth_from_coarse=sp.csr_matrix(sp.block_diag([part.smooth for part in parts])),
-        from_below=below[0],
-        smooth_from_below=below[1],
-        flat_from_below=below[2],
+        ups=ups,
+        smooth_from_below=below[0],
+        flat_from_below=below[1],
         threads=threads,
         grain=LevelGrain(**tensors) if tensors else None,
     )

@@ -115,12 +115,10 @@ class Group:
         """The lasting terms of each level, new ones when a material changes."""
         key = tuple((frame.fabric, frame.guide) for frame in frames)
         if key not in self._forces:
-            ups = [level.from_below for level in self.levels if level.from_below is not None]
             known = [each for last in self._forces.values() for each in last] if self.settings.rough else []
             lent = [each.lends() for each in known] or [None] * len(self.levels)
-            given, made = (self.garments, tuple(frames), self.gravity), list[LevelForces]()
-            for level, guide_map, each in zip(self.levels, self.guide_maps, lent, strict=True):
-                made.append(LevelForces(level, guide_map, *given, ups=ups[: level.index][::-1], lent=each))
+            given, places = (self.garments, tuple(frames), self.gravity), zip(self.levels, self.guide_maps, strict=True)
+            made = [LevelForces(*place, *given, lent=each) for place, each in zip(places, lent, strict=True)]
             self._forces.clear()
             self._forces[key] = made
         return self._forces[key]

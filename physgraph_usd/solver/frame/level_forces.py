@@ -73,7 +73,6 @@ class LevelForces:
         garments: The garments.
         frames: Values of the garments at one time code.
         gravity: [m/s^2], shape (3,).
-        ups: Linear map to each level from the next coarser one, this level first.
         lent: Metric of previous materials for `rough_metric`, and terms to reuse for equal fabrics; or None.
     """
 
@@ -82,7 +81,6 @@ class LevelForces:
     garments: Sequence[Garment]
     frames: Sequence[GarmentFrame]
     gravity: np.ndarray
-    ups: Sequence[Stencil] = ()
     lent: Lent | None = None
 
     @property
@@ -124,7 +122,7 @@ class LevelForces:
         """The factorised rest Hessian of all terms."""
         matrix = on_edges(self._module.rest_matrix(), self.level.springs.cpu().numpy())
         like = None if self.lent is None else self.lent.metric
-        return Metric(matrix, free=self.level.free, dtype=self.level.dtype, ups=self.ups, like=like)
+        return Metric(matrix, free=self.level.free, dtype=self.level.dtype, ups=self.level.ups, like=like)
 
     @cached_property
     def rough_metric(self) -> Metric:

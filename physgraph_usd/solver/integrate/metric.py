@@ -213,7 +213,7 @@ class MergedMetric(Metric):
         return self._sum.apply(force)
 
     def spread(self, move: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
-        """The same move for all vertices of a label."""
+        """The move of each label, at all of its vertices."""
         return move[self._representative]
 
     def solve(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
