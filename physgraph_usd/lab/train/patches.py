@@ -46,7 +46,7 @@ from ..samples.shapes import quad_grid
 SHAPES = ("sheet", "tube", "dome")
 BORDERS = ("fixed", "one side", "free")
 HEIGHT = (-2.0, -0.9)
-"""Powers of ten between which the heights of a body's waves lie, in cage edges: it comes through its cloth by them."""
+"""Least and largest power of ten of the height of a body's waves, in cage edges: how far the body pierces the cloth."""
 WAVES = (0.5, 3.0)
 """A body's waves along a patch."""
 

@@ -100,7 +100,7 @@ class Round:
 
 
 class Watch:
-    """An integrator that notes where its rounds begin at the finest level, under which system."""
+    """Wraps an integrator and records system and start positions of each round at the finest level."""
 
     def __init__(self, inner: Integrator) -> None:
         """Watch an integrator."""
@@ -197,7 +197,7 @@ def system_of(rounds: Sequence[Round], *, device: str) -> System:
 
 
 def measured(each: Round, steps: int) -> Round | None:
-    """The round with the energies between which it moves, by so many quasi-Newton steps; None where it is at rest."""
+    """The round with its energies [J] at the start and after ``steps`` quasi-Newton steps; None at rest."""
     system, x = system_of([each], device="cpu"), torch.as_tensor(each.x)
     _, report = solve_level(system, QuasiNewton(), x, level=0, budget=Budget(steps))
     drop = report.energy_before - report.energy_after

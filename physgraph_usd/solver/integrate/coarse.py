@@ -1,4 +1,4 @@
-"""The coarser levels of a metric: what the contact of the finest level is to each of them.
+"""The coarser levels of a metric, with the Galerkin projection of the finest level's contact stiffness.
 
     A_l = Z_l^T (H + K) Z_l = H_l + Z_l^T K Z_l
 
@@ -40,7 +40,7 @@ class CageSolve:
 
     Attributes:
         solver: The solve of the scaled matrix.
-        scale: Its scale [m/N], a scalar.
+        scale: Scaled matrix over A_0 [m/N], a scalar.
     """
 
     solver: Solver
@@ -81,7 +81,7 @@ class CoarseLevels:
         Args:
             matrix: H [N/m], zero at fixed vertices, shape (V, V).
             ups: Linear map to each level from the next coarser one, finest first.
-            onto: Applied after the first map: zero at fixed vertices, shape (V, V).
+            onto: Projection of moves of the finest level, zero at fixed vertices, shape (V, V).
             dtype: Scalar type of forces.
             device: "cpu" or a CUDA device.
             like: Levels whose order of elimination serves again if the cage has the same pattern; or None.
@@ -122,7 +122,7 @@ class CoarseLevels:
         return out
 
     def scaled(self, stiffer: Float[Tensor, " vertices"]) -> CoarseLevels:
-        """The levels of R H R, R^2 the given numbers: about so, with R's mean at each coarse vertex."""
+        """Approximation of the levels of R H R, R^2 the given numbers: R^2 is averaged at each coarse vertex."""
         other, ones = copy.copy(self), torch.ones_like(stiffer)
         sums = (self.forces(three_columns(each.to(self._dtype))) for each in (stiffer, ones))
         means = [(some[:, 0] / whole[:, 0]).nan_to_num(nan=1.0).double() for some, whole in zip(*sums, strict=True)]

@@ -45,7 +45,7 @@ class Factors:
         return np.searchsorted(self._keys, rows.astype(np.int64) * self._count + columns)
 
     def taken(self, matrix: sp.csr_matrix) -> Float[np.ndarray, " entries"]:
-        """The entries of a matrix whose own pattern lies within this one."""
+        """Entries of a matrix with a smaller or equal pattern, in this pattern's order."""
         out, each = np.zeros(len(self._keys)), sp.coo_matrix(matrix)
         out[self.places(each.row, each.col)] = each.data
         return out

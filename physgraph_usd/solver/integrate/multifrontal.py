@@ -50,7 +50,7 @@ wp.set_module_options(KERNELS)
 BLOCK = 64
 """Threads sharing a row's sum on CUDA."""
 Captured = tuple[Tensor, tuple[Tensor, Tensor, Tensor], Callable[[], None]]
-"""The buffers of a captured factorisation, for its matrix and for its results, and its replay."""
+"""A captured factorisation: buffer of the matrix entries; buffers of both passes and of the failure flag; replay."""
 
 
 class Elimination:
