@@ -223,11 +223,17 @@ class ClothView:
         inside = none if looked.inside is None else looked.inside
         return inside, chords_of(self.mesh, looked.pierced, self.with_bodies(x), inside) if looked.pierced else None
 
-    def pushed_out(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
-        """As `LevelBodies.pushed_out`; x itself if no cloth is inside or through a body."""
+    def pushed_out(self, x: Float[Tensor, "vertices 3"], *, vertices: bool = False) -> Float[Tensor, "vertices 3"]:
+        """As `LevelBodies.pushed_out`; x itself if no cloth is inside or through a body.
+
+        Args:
+            x: Positions [m].
+            vertices: Whether edges and faces whose corners are outside stay.
+        """
         if self.bodies is None or not any(self.in_bodies(x)):
             return x
-        return self.bodies.pushed_out(x, *self._within(x))
+        inside, chords = self._within(x)
+        return self.bodies.pushed_out(x, inside, None if vertices else chords)
 
     def padded(self, some: Bool[Tensor, " vertices"] | None) -> Bool[Tensor, " all"] | None:
         """A mask of vertices with False for the bodies' corners."""

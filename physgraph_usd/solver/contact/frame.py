@@ -119,19 +119,37 @@ class LevelContact:
     def out_of_bodies(self, x: Placed) -> tuple[Placed, int]:
         """Positions moved safely out of bodies [m], x itself if no cloth had to move, and the number of passes.
 
+        First all cloth inside is moved until no fewer vertices and crossings are left, then the vertices inside alone:
+        an edge's way out may put a vertex inside.
+        """
+        whole, passes = self._moved_out(x, vertices=False)
+        out, more = self._moved_out(whole, vertices=True)
+        return out, passes + more
+
+    def _moved_out(self, start: Placed, *, vertices: bool) -> tuple[Placed, int]:
+        """Positions with less cloth in bodies [m], and the number of passes.
+
         In all passes together, a vertex moves at most the distance of its first push plus a mean edge: cloth pinched
         between two limbs, pushed out of one into the other in turns, would form spikes. Passes end once `STALLED` of
-        them in a row left as much cloth in bodies; the best positions stay.
+        them in a row left as much; the best positions stay.
+
+        Args:
+            start: Positions [m].
+            vertices: Whether only vertices inside are moved and counted, not edges and faces through a body.
         """
-        view, start, reach = self.cloth, x, None
-        best, left, passes, stalled = x, view.in_bodies(x), 0, 0
-        while any(left) and stalled < STALLED and not is_over():
-            wanted = view.pushed_out(x)
+        view, x, reach = self.cloth, start, None
+
+        def count(x: Placed) -> int:
+            return view.in_bodies(x)[0] if vertices else sum(view.in_bodies(x))
+
+        best, left, passes, stalled = x, count(x), 0, 0
+        while left and stalled < STALLED and not is_over():
+            wanted = view.pushed_out(x, vertices=vertices)
             shift = wanted - start
             far = shift.norm(dim=1, keepdim=True)
             reach = far + view.mesh.level.rest_length.mean() if reach is None else reach
             x = self.moved(x, torch.where(far > reach, start + shift * (reach / far), wanted))
-            passes, stalled, now = passes + 1, stalled + 1, view.in_bodies(x)
+            passes, stalled, now = passes + 1, stalled + 1, count(x)
             if now < left:
                 best, left, stalled = x, now, 0
         return best, passes

@@ -28,9 +28,10 @@ class RunawayError(SolveError):
 def solve_soundly(group: Group, frame: FrameInput, last: State | None) -> Solved:
     """Solve a frame, and once more from the cage if the result is unsound.
 
-    A result is unsound if cloth crosses, or if its energy is above the upsampled cage's energy without self contact
-    (the self contact energy is as large as the cage's own crossings are deep). The second result is used if fewer
-    crossings remain, or equally many and the first energy is above the cage's and the second is lower.
+    A result is unsound if cloth crosses cloth, or a body more often than the upsampled cage does, or if its energy is
+    above the upsampled cage's energy without self contact (the self contact energy is as large as the cage's own
+    crossings are deep). The second result is used if fewer crossings remain, or equally many and the first energy is
+    above the cage's and the second is lower.
 
     Args:
         group: Garments solved together.
@@ -80,9 +81,15 @@ def _is_better(fresh: Mapping[str, Any], solved: Mapping[str, Any]) -> bool:
 
 
 def _crossings(telemetry: Mapping[str, Any]) -> int:
-    """Crossings of cloth with cloth in a result, without given-up cloth: a start from the cage gives that up, too."""
-    after = telemetry.get("contact", {}).get("cloth", {}).get("after", {})
-    return int(after.get("crossings", 0) - after.get("given_up", 0))
+    """Crossings in a result: of cloth with cloth, and with each body beyond those of the upsampled cage.
+
+    Given-up cloth does not count: a start from the cage gives that up, too.
+    """
+    contact = telemetry.get("contact", {})
+    after = contact.get("cloth", {}).get("after", {})
+    bodies = contact.get("bodies", {}).values()
+    more = sum(max(each["after"]["crossings"] - each["before"]["crossings"], 0) for each in bodies)
+    return int(after.get("crossings", 0) - after.get("given_up", 0) + more)
 
 
 def _excess(telemetry: Mapping[str, Any], *, whole: bool = False) -> float:
