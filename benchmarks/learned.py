@@ -11,7 +11,7 @@ time to a gap of 3% over quasi-Newton's, as medians over shots and fabrics; on t
 together. Everything is guarded, without a spare integrator. Cards stand beside the weights (`physgraph-usd train`
 writes them). Samples are always there; real shots where PHYSGRAPH_DATA names their folder. No body pushes, but in
 rounds: there each weights' row has the force evaluations and the time to a gap of 3%, and the time of an evaluation,
-over quasi-Newton's, as geometric means over the rounds in which both come so far.
+over quasi-Newton's, as geometric means; a descent that does not come so far counts whole.
 """
 
 from __future__ import annotations
@@ -104,12 +104,17 @@ def parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 
 @dataclass(frozen=True)
-class Reach:
-    """A descent of a round to a gap of 3%: force evaluations, milliseconds, and whether it came so far."""
+class Walk:
+    """A descent of a round: energies [J] after each step, with the force evaluations and milliseconds so far."""
 
-    evaluations: int
-    milliseconds: float
-    far: bool
+    energies: list[float]
+    evaluations: list[int]
+    milliseconds: list[float]
+
+    def reach(self, aim: float) -> tuple[int, float, bool]:
+        """Evaluations and milliseconds to an energy [J], or all of them; and whether it came so far."""
+        place = next((k for k, energy in enumerate(self.energies) if energy <= aim), -1)
+        return self.evaluations[place], self.milliseconds[place], self.energies[place] <= aim
 
 
 def on_rounds(candidates: dict[Path, tuple[Any, dict[str, Any]]], device: str) -> None:
@@ -118,35 +123,38 @@ def on_rounds(candidates: dict[Path, tuple[Any, dict[str, Any]]], device: str) -
     held_out = replace(config, scenes=config.held_out)
     made = make_rounds(held_out, seed=HELD_OUT, workers=os.cpu_count() or 1)
     rounds = [each for each in made if each.touches]
-    theirs = [reach(each, QuasiNewton(), device) for each in rounds]
+    theirs = [walked(each, QuasiNewton(), device) for each in rounds]
     say("| weights | evaluations to 3% | time to 3% | time of an evaluation | rounds | come so far | quasi-Newton |")
     say("|---|---|---|---|---|---|---|")
     for file, (network, _) in candidates.items():
-        ours = [reach(each, Guard(integrator_of(network)), device) for each in rounds]
-        both = [pair for pair in zip(ours, theirs, strict=True) if pair[0].far and pair[1].far]
-        counts = statistics.geometric_mean(a.evaluations / b.evaluations for a, b in both)
-        times = statistics.geometric_mean(a.milliseconds / b.milliseconds for a, b in both)
-        cells = f"{counts:.2f} | {times:.2f} | {times / counts:.2f} | {len(rounds)}"
-        say(f"| {file.stem} | {cells} | {sum(each.far for each in ours)} | {sum(each.far for each in theirs)} |")
+        integrator = Guard(integrator_of(network))
+        pairs = [(walked(each, integrator, device), own) for each, own in zip(rounds, theirs, strict=True)]
+        found = [[way.reach(aim_of(each, pair)) for way in pair] for each, pair in zip(rounds, pairs, strict=True)]
+        counts, times = (statistics.geometric_mean(a[k] / b[k] for a, b in found) for k in (0, 1))
+        far = [sum(pair[side][2] for pair in found) for side in (0, 1)]
+        cells = f"{counts:.2f} | {times:.2f} | {times / counts:.2f} | {len(rounds)} | {far[0]} | {far[1]}"
+        say(f"| {file.stem} | {cells} |")
 
 
-def reach(each: Round, integrator: Integrator, device: str) -> Reach:
-    """A descent of a round to a gap of 3%, the faster of `REPEATS`; on the CPU its time is that of all threads."""
+def aim_of(each: Round, walks: Sequence[Walk]) -> float:
+    """The energy at a gap of 3% to the least that is known or was reached [J]."""
+    least = min(each.least, *(way.energies[-1] for way in walks))
+    return least + ENOUGH * (each.start - least)
+
+
+def walked(each: Round, integrator: Integrator, device: str) -> Walk:
+    """A descent of a round; on the CPU its time is that of all threads."""
+    system, x = system_of([each], device=device), torch.as_tensor(each.x, device=device)
+    integrator.step(system, integrator.start(system, x))  # Kernels are compiled, steps recorded.
     clock = time.process_time if device == "cpu" else time.perf_counter
-    found = []
-    for _ in range(REPEATS):
-        system, x = system_of([each], device=device), torch.as_tensor(each.x, device=device)
-        aim = each.least + ENOUGH * (each.start - each.least)
-        integrator.step(system, integrator.start(system, x))  # Launches are compiled, buffers made.
-        before, began = system.evaluations, clock()
-        carry = integrator.start(system, x)
-        while carry.energy > aim and system.evaluations - before <= MOST and carry.mover != "stayed":
-            carry = integrator.step(system, carry)
-        if x.is_cuda:
-            torch.cuda.synchronize()
-        count = max(system.evaluations - before - 1, 1)
-        found.append(Reach(count, 1e3 * (clock() - began), carry.energy <= aim))
-    return min(found, key=lambda made: made.milliseconds)
+    made, before, began = Walk([], [], []), system.evaluations, clock()
+    carry = integrator.start(system, x)
+    while system.evaluations - before <= MOST and carry.mover != "stayed":
+        carry = integrator.step(system, carry)
+        made.energies.append(carry.energy)
+        made.evaluations.append(system.evaluations - before - 1)
+        made.milliseconds.append(1e3 * (clock() - began))
+    return made
 
 
 def load(file: Path, device: str) -> tuple[Any, dict[str, Any]]:
