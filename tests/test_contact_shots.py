@@ -17,6 +17,7 @@ SHOTS: dict[str, tuple[list[str], list[str], tuple[float, float]]] = {
     "09_cesiumman_kilt/shot.usda": (["/shot/kilt"], ["Cesium_Man_2"], (36, 37)),
     "12_variants/b_winding_flipped_unflagged.usdc": (["/shot/shirt"], ["/shot/body"], (6, 7)),
 }
+DAB = "01_newton_shirt_dab_cm.usdc"
 FAST = ("08_sphere_spin_xformcollider.usdc",)
 SLOW = {name: [pytest.mark.slow] for name in SHOTS if name not in FAST}
 
@@ -56,6 +57,15 @@ def test_real_shots(real_data: Path, tmp_path: Path, name: str):
         shot, tmp_path / "fine.usdc", level=2, steps=12, frames=frames, garments=garments, colliders=colliders
     )
     assert len(check(report)) >= 2
+
+
+@pytest.mark.slow
+@pytest.mark.real_data
+def test_a_body_that_passes_through_warm_cloth_starts_the_frame_anew(real_data: Path, tmp_path: Path):
+    """In the dab, an arm passes through folds between it and the chest, where the cage stays outside."""
+    garments, colliders, _ = SHOTS[DAB]
+    named = {"garments": garments, "colliders": colliders, "frames": (1037, 1045)}
+    check(refine(real_data / "shots" / DAB, tmp_path / "fine.usdc", level=2, steps=12, **named))
 
 
 def test_why_contact_is_left_out_is_told(sample: Callable[[str], Path], tmp_path: Path):

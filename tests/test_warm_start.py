@@ -27,7 +27,7 @@ from physgraph_usd.solver.frame.refiner import Refiner
 from physgraph_usd.solver.frame.solve import solve_frame
 from physgraph_usd.solver.frame.start import STILL, Start, start_of, torn
 from physgraph_usd.solver.frame.values import Cage, FrameInput, Solved, State
-from physgraph_usd.solver.integrate.stop import NEAR, ROUND, TOUCHING
+from physgraph_usd.solver.integrate.stop import EARLY, NEAR, ROUND, TOUCHING
 from physgraph_usd.solver.level import refine_garments
 from physgraph_usd.solver.resolution import edge_strain
 from physgraph_usd.solver.scene import GarmentFrame
@@ -164,7 +164,7 @@ def test_a_warm_frame_is_done_early_only_near_rest(sample: Callable[[str], Path]
             steps.append(sum(each["steps"] for each in rounds))
             near = rounds[-1]["remaining_move"] < NEAR * RefineOptions().tolerance
             assert near or rounds[-1]["stopped"] == "stalled" or steps[-1] >= TOUCHING * 12
-    assert min(steps) == ROUND
+    assert min(steps) == EARLY * 12
     assert max(steps) > TOUCHING * ROUND
 
 

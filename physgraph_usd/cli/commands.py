@@ -190,7 +190,7 @@ def validate(layer: str, *, shot: str | None, as_json: bool) -> None:
 @out_option("DIR", "Folder to write into.")
 @overwrite_option
 def sample(name: str, out: Path, *, overwrite: bool) -> None:
-    """Write the sample shot NAME and print its path; an unknown name lists those there are."""
+    """Write the sample shot NAME and print its path; an unknown name lists all names."""
     from ..lab.samples import write_sample
 
     click.echo(write_sample(name, out, overwrite=overwrite))

@@ -115,7 +115,7 @@ class Level:
     grain: LevelGrain | None = None
 
     def eased(self, fabrics: Sequence[Fabric]) -> Level:
-        """The level with the rest lengths and areas that its garments' fabrics have; itself where none has ease."""
+        """The level with the rest lengths and areas of its garments' fabrics; this level if no fabric has ease."""
         if self.grain is None or not (self.grain.gathers or any(each.is_eased for each in fabrics)):
             return self
         ease = self.rest.new_tensor([[each.warp_ease, each.weft_ease] for each in fabrics])
@@ -387,7 +387,7 @@ def _is_rigid(garment: Garment, linear: sp.csr_matrix) -> np.ndarray:
 
 
 def _sound(split: TriangleSplit, rest: np.ndarray, *, rigid: np.ndarray) -> TriangleSplit:
-    """Without triangles of rigid parts, without rest area, or that repeat an earlier one: they are no cloth."""
+    """The triangles that are cloth: not rigid, not without rest area, and none twice."""
     corners = rest[split.triangles]
     sides = corners - np.roll(corners, 1, axis=1)
     area = 0.5 * np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)

@@ -176,7 +176,7 @@ class Patch:
         return with_bodies(systems, self.group.levels, coarse, [self.body])
 
     def begin(self, index: int) -> Tensor:
-        """The upsampled cage at a level [m], off the saddle where it is flat."""
+        """The upsampled cage at a level [m]; flat cloth is bent a little: a flat sheet is a saddle of the energy."""
         return torch.as_tensor(self.raw[index])
 
     def __getstate__(self) -> dict[str, Any]:

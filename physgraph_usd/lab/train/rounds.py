@@ -1,7 +1,7 @@
-"""Rounds with contact to train on: where they begin, noted while our own solver refines moving scenes.
+"""Rounds with contact to train on, recorded while our own solver refines generated scenes.
 
-A round is a level's system with what is near as it was found there (planes of bodies, pairs of cloth), tied to the last
-frame's detail where it is warm, and the positions that its steps begin at. All of it is plain arrays: rounds are made
+A round is a level's system with the near pairs found in it (planes of bodies, pairs of cloth), tied to the last frame's
+detail in a warm frame, and the positions at which its steps start. All of it is plain arrays: rounds are made
 in many processes and built again, many as one system, where they are needed.
 """
 

@@ -224,12 +224,7 @@ class ClothView:
         return inside, chords_of(self.mesh, looked.pierced, self.with_bodies(x), inside) if looked.pierced else None
 
     def pushed_out(self, x: Float[Tensor, "vertices 3"], *, vertices: bool = False) -> Float[Tensor, "vertices 3"]:
-        """As `LevelBodies.pushed_out`; x itself if no cloth is inside or through a body.
-
-        Args:
-            x: Positions [m].
-            vertices: Whether edges and faces whose corners are outside stay.
-        """
+        """As `LevelBodies.pushed_out`, or for vertices alone; x [m] itself if no cloth is inside or through a body."""
         if self.bodies is None or not any(self.in_bodies(x)):
             return x
         inside, chords = self._within(x)

@@ -21,8 +21,9 @@ TOUCHING = 3
 """Most steps of the finest level with contact, relative to the budget's: blocked moves cost steps."""
 REST = 2.0
 """Remaining move [tolerances] below which a warm frame makes no step."""
-NEAR, EARLY = 10.0, 1.0 / 3.0
-"""A warm frame in contact ends below this remaining move [tolerances] after this fraction of its steps, one round."""
+NEAR, EARLY = 10.0, 0.5
+"""A warm frame in contact ends below this remaining move [tolerances] after this fraction of its steps, which are its
+first round: a step costs far less than finding the near pairs again."""
 COARSE_STEPS, COARSE_TOLERANCE, COARSE_TIME = 4, 0.1, 0.3
 """Steps and tolerance of a coarse level, relative to the finest: coarse steps are cheap and shape the folds. And the
 fraction of its time that a level leaves to the coarser levels."""
@@ -72,7 +73,8 @@ class Budget:
             touching: Whether there is contact.
             shrunk: Factor of the tolerance: a metric with contact underestimates moves.
         """
-        steps = min(HURRIED if self.hurried and first else ROUND if touching else LONGEST, self.steps)
+        longest = max(ROUND, int(EARLY * self.steps)) if first and self.near else ROUND
+        steps = min(HURRIED if self.hurried and first else longest if touching else LONGEST, self.steps)
         once = {} if first else {"rest": 1.0, "least": 0}
         return replace(self, steps=steps, tolerance=shrunk * self.tolerance, **once)
 
