@@ -21,7 +21,7 @@ TOUCHING = 3
 """Most steps of the finest level with contact, relative to the budget's: blocked moves cost steps."""
 REST = 2.0
 """Remaining move [tolerances] below which a warm frame makes no step."""
-NEAR, EARLY = 10.0, 0.5
+NEAR, EARLY = 10.0, 5.0 / 12.0
 """A warm frame in contact ends below this remaining move [tolerances] after this fraction of its steps, which are its
 first round: a step costs far less than finding the near pairs again."""
 COARSE_STEPS, COARSE_TOLERANCE, COARSE_TIME = 4, 0.1, 0.3
