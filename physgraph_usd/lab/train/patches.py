@@ -180,7 +180,7 @@ class Patch:
         return torch.as_tensor(self.raw[index])
 
     def __getstate__(self) -> dict[str, Any]:
-        """Every field but those made on demand, which hold kernels."""
+        """The fields without `group` and `systems`: they hold kernels, and are made on demand."""
         return {name: value for name, value in self.__dict__.items() if name not in ("group", "systems")}
 
 

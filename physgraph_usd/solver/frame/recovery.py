@@ -91,7 +91,7 @@ def _crossings(telemetry: Mapping[str, Any]) -> int:
 
 
 def _through_bodies(telemetry: Mapping[str, Any]) -> int:
-    """Crossings with bodies in a result, beyond those of its upsampled cage with each."""
+    """Sum over bodies of the crossings that the result has more than its upsampled cage."""
     bodies = telemetry.get("contact", {}).get("bodies", {}).values()
     return sum(max(each["after"]["crossings"] - each["before"]["crossings"], 0) for each in bodies)
 

@@ -6,6 +6,7 @@ Every number of this decision is in this file. `Budget` holds the criteria of a 
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -32,7 +33,7 @@ UNTANGLINGS, WARM_UNTANGLINGS = 25, 4
 
 
 class Ended(Protocol):
-    """The part of a report that decides whether another round follows."""
+    """A round's steps, reason to stop and remaining move: what `Budget.ends` reads of a report."""
 
     steps: int
     stopped: str
@@ -73,8 +74,8 @@ class Budget:
             touching: Whether there is contact.
             shrunk: Factor of the tolerance: a metric with contact underestimates moves.
         """
-        longest = max(ROUND, int(EARLY * self.steps)) if first and self.near else ROUND
-        steps = min(HURRIED if self.hurried and first else longest if touching else LONGEST, self.steps)
+        longest = max(ROUND, math.ceil(EARLY * self.steps)) if first and self.near else ROUND
+        steps = min(HURRIED if self.hurried and first else longest if touching else LONGEST, LONGEST, self.steps)
         once = {} if first else {"rest": 1.0, "least": 0}
         return replace(self, steps=steps, tolerance=shrunk * self.tolerance, **once)
 
