@@ -7,13 +7,13 @@ import pytest
 import torch
 from brute import Soup, crossings
 from folds import EDGE, SHAPES, curved, folded, levels_of, named, placed, promise_of, square, strip, view_of
+from scenes import shot
 
 from physgraph_usd.solver.collide.crossings import Crossings
 from physgraph_usd.solver.collide.crossings import crossings as crossings_of
 from physgraph_usd.solver.contact.cloth import ClothView
 from physgraph_usd.solver.contact.cloth_mesh import ClothMesh
 from physgraph_usd.solver.contact.promise import Promise
-from physgraph_usd.solver.contact.tangles import Tangles
 from physgraph_usd.solver.forces.self_contact import PairConstraints, SelfContact
 from physgraph_usd.solver.level import Level, Placed
 
@@ -148,35 +148,35 @@ class TestMoves:
 
 
 class TestGivenUp:
-    """Tangles full of contours and wider than all rounds reach are given up before any round."""
+    """Pieces of cloth that are mostly tangled after all rounds at the cage of a cold frame are given up."""
 
     @staticmethod
-    def tangles(shape: str) -> tuple[Level, Tangles]:
-        """Two large sheets: waves that pass through one another at every edge, or one contour."""
+    def solved(*shapes: str) -> list[int]:
+        """Crossings given up in each frame; two large sheets cross everywhere, along one contour, or not at all."""
         garments = [named(square(SIZE), each) for each in "AB"]
-        level = levels_of(*garments, level=0, dtype=torch.float64)[0]
-        x = level.rest.clone()
-        half, noise = len(x) // 2, torch.as_tensor(np.random.default_rng(3).normal(size=(len(x), 1)))
-        x[half:] += 0.3 * EDGE * torch.tensor([1.0, 0.0, 0.7], dtype=x.dtype)
-        x[:, 1:2] += 0.3 * EDGE * noise if shape == "full" else 0.02 * EDGE * noise
-        if shape == "contour":
-            x[half:, 1] += 0.5 * x[half:, 0] + 0.1 * EDGE
-        mesh, found = found_in(level, x)
-        return level, Tangles.find(mesh, found, torch.zeros(len(x), dtype=torch.bool))
+        rest = np.asarray(garments[0].rest)
+        noise = np.random.default_rng(3).normal(size=len(rest))
+        cages = []
+        for time, shape in enumerate(shapes):
+            upper, lower = rest + 0.3 * EDGE * np.array([1.0, 0.0, 0.7]), rest.copy()
+            lower[:, 1] += (2.0 + 0.01 * time) * EDGE * noise if shape == "full" else 0.0
+            upper[:, 1] += {"full": 0.0, "contour": 0.5 * rest[:, 0] + 0.1 * EDGE, "apart": 0.5 * EDGE}[shape]
+            cages.append([lower, upper])
+        shown = shot(garments, cages)
+        solver = shown.refiner(level=1, steps=2)
+        told = [solver.solve(frame).telemetry[0] for frame in shown.frames]
+        return [each["contact"]["cloth"]["after"]["given_up"] if "contact" in each else 0 for each in told]
 
-    def test_waves_that_cross_everywhere_are_given_up(self):
-        level, tangles = self.tangles("full")
-        assert int(tangles.giving_up(None).sum()) > 0.9 * level.vertex_count
+    def test_waves_that_cross_everywhere_are_given_up_until_their_cages_are_apart(self):
+        first, second, last = self.solved("full", "full", "apart")
+        assert min(first, second) > SIZE**2
+        assert last == 0
 
     def test_one_contour_is_not(self):
-        assert not bool(self.tangles("contour")[1].giving_up(None).any())
+        assert self.solved("contour") == [0]
 
-    def test_what_the_last_frame_gave_up_stays_so_while_its_cage_crosses(self):
-        level, tangles = self.tangles("contour")
-        last = torch.zeros(level.vertex_count, dtype=torch.bool)
-        last[int(torch.nonzero(tangles.label >= 0)[0])] = True
-        assert bool(tangles.giving_up(last)[tangles.label >= 0].all())
-        assert not bool(tangles.giving_up(last & (tangles.label < 0)).any())
+    def test_what_the_last_frame_solved_is_not_given_up(self):
+        assert self.solved("apart", "full") == [0, 0]
 
 
 class TestSides:

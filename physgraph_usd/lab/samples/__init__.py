@@ -21,6 +21,7 @@ SAMPLES: dict[str, str] = {
     "frozen": "a cloth draped over a table, twelve equal samples",
     "armpit": "a T-shirt pinched between the side and an arm that goes down and up again",
     "layers": "trousers, a shirt over them and a belt over both, on a body that walks in place",
+    "overcoat": "a coat over a shirt, skinned apart: their cages cross a thousand times",
     "block": "a sheet dropped over a block, folding at its corners",
     "torus": "a sheet pulled through a torus by a grip on its middle",
     "hood": "a wide hood over a turning head, with a fold that lies on itself",

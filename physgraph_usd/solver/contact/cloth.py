@@ -82,8 +82,8 @@ class ClothView:
     Attributes:
         mesh: The level's mesh, sewn as in this frame.
         frame: The bodies of the frame, or None.
-        given_up: Mask of the vertices of tangles that are given up, None without such tangles. Parts whose vertices are
-            all given up are not searched for contact or crossings with one another.
+        given_up: Mask of the pieces of cloth that are given up; None for none. Parts whose vertices are all given up
+            are not searched for contact or crossings with one another.
         keeps_sides: True if moves are promised to add no crossings of cloth with cloth.
         came_near: True if parts were near one another in any call of `terms`; None before the first call.
     """

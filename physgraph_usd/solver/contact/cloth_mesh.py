@@ -70,6 +70,13 @@ class ClothMesh:
             vertices[self._second[given[self._first]]] = True
         return vertices
 
+    def pieces_with(self, vertices: Bool[Tensor, " vertices"], *, over: float) -> Bool[Tensor, " vertices"] | None:
+        """Mask of the connected pieces, also across seams, with over a fraction of the vertices; None for none."""
+        piece = torch.as_tensor(joined_by(self.parts.links.cpu().numpy(), len(vertices)), device=vertices.device).long()
+        share = torch.bincount(piece, vertices.double()) / torch.bincount(piece).clamp_min(1)
+        out = (share > over)[piece]
+        return out if bool(out.any()) else None
+
     def corners_of(self, crossings: Crossings) -> Int[Tensor, "crossings 5"]:
         """Vertices of the edge and of the face of each crossing."""
         return torch.cat([self.edges[crossings.edge], self.triangles[crossings.face]], dim=1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -75,21 +76,21 @@ class LevelContact:
 
     def comes_apart(self, x: Float[Tensor, "vertices 3"]) -> bool:
         """True if x has crossings in hopeful tangles."""
+        return self.hopeful(x) > 0
+
+    def hopeful(self, x: Float[Tensor, "vertices 3"]) -> int:
+        """Number of crossings in hopeful tangles at x [m]."""
         tangles = self.cloth.tangles(x)
-        return tangles is not None and not bool(tangles.hopeless.all())
+        return 0 if tangles is None else tangles.hopeful(self.cloth.crossings(x)).count
+
+    def tangled_pieces(self, x: Float[Tensor, "vertices 3"]) -> Bool[Tensor, " vertices"] | None:
+        """Mask of the connected pieces of cloth with most of their vertices in tangles at x [m]; None without any."""
+        tangles = self.cloth.tangles(x)
+        return None if tangles is None else self.cloth.mesh.pieces_with(tangles.label >= 0, over=0.5)
 
     def begun(self, x: Float[Tensor, "vertices 3"]) -> Placed:
         """Start positions of a level [m], seams closed. Crossings here come from the input or from the level below."""
         return Placed(self.closed(x))
-
-    def laid_back(self, x: Placed) -> Placed:
-        """Positions with cut-off pieces moved back to their side of the cloth [m], if fewer parts cross then."""
-        if not self.crosses(x):
-            return x
-        view = self.cloth
-        asked = None if view.given_up is None else ~view.given_up
-        out = drawn_apart(view.mesh, x, view.crossings(x), gap=view.gap, asked=asked)[0]
-        return x if out is x else Placed(self.closed(out))
 
     def remember(self, x: Float[Tensor, "vertices 3"]) -> None:
         """As `ClothView.remember`."""
@@ -168,7 +169,7 @@ class FrameContact:
         thickness: Sequence[float],
         settings: ContactSettings,
         seams: Sequence[Seam | None] = (),
-        lost: Bool[Tensor, " coarse"] | None = None,
+        given_up: Bool[Tensor, " coarse"] | None = None,
     ) -> None:
         """Take the frame.
 
@@ -180,9 +181,9 @@ class FrameContact:
             thickness: Thickness of each garment's cloth [m].
             settings: Contact settings, with the stiffness in SI.
             seams: The seam of each level, None for a level without seams; () for no seams at all.
-            lost: Mask of the cage's vertices that the last frame gave up; None for none.
+            given_up: Mask of the pieces of the cage that the last frame gave up; None for none.
         """
-        self._lost = lost
+        self._last_given_up = given_up
         self._levels, self._coarse, self._settings = tuple(levels), coarse, settings
         self._bodies, self._cloth, self._seams = bodies, cloth, seams
         self._thickness = torch.tensor(thickness, dtype=coarse.dtype, device=coarse.device)
@@ -196,6 +197,11 @@ class FrameContact:
         """
         return self._aimed[0]
 
+    @property
+    def untangled(self) -> Float[Tensor, "coarse 3"]:
+        """The cage with pieces moved back to their side of the cloth [m]: the start of a cold frame."""
+        return self._aimed[1]
+
     @cached_property
     def _cage(self) -> tuple[ClothMesh, Crossings, LevelBodies | None, Pierced | None, Tensor | None]:
         """The cage's mesh, crossings, view of the bodies, crossings with them, and vertices inside each."""
@@ -208,34 +214,49 @@ class FrameContact:
         inside = view.inside(self._coarse, pierced)
         return mesh, found, view, pierced, inside if bool(inside.any()) else None
 
-    @property
+    @cached_property
     def given_up(self) -> Bool[Tensor, " coarse"] | None:
-        """Mask of the cage's vertices in tangles that are given up; None without such tangles."""
-        return self._aimed[1]
+        """Mask of the pieces of the cage that the last frame gave up and that cross still; None for none.
+
+        What the last frame solved is never given up because the cage crosses there.
+        """
+        if self._last_given_up is None or not self.crossed:
+            return None
+        mesh, found, *_ = self._cage
+        tangled = Tangles.find(mesh, found, torch.zeros_like(self._last_given_up)).label >= 0
+        return mesh.pieces_with(self._last_given_up & tangled, over=0.0)
+
+    def after_cage(self, x: Float[Tensor, "coarse 3"]) -> FrameContact:
+        """This contact, where pieces that are mostly tangled in the cage x [m] of a cold frame are given up."""
+        lost = self.at(self._levels[0]).tangled_pieces(x)
+        if lost is None:
+            return self
+        out = copy(self)
+        out.given_up, out._views = lost, {}
+        return out
 
     @cached_property
-    def _aimed(self) -> tuple[Float[Tensor, "coarse 3"], Bool[Tensor, " coarse"] | None]:
-        """The cage followed by the fine cloth [m], and `given_up`."""
-        cage, out, seam = self._levels[0], self._coarse, self._seam_at(self._levels[0])
-        mesh, found, bodies, _, inside = self._cage
-        if bodies is not None and inside is not None:
-            out = repaired_cage(cage, out, bodies=bodies, inside=inside, mesh=mesh)
-        found, lost = found if out is self._coarse else crossings(mesh.parts, out), None
-        if found.count:
-            lost = Tangles.find(mesh, found, torch.zeros_like(cage.free[:, 0])).giving_up(self._lost)
-            lost = lost if bool(lost.any()) else None
-            out = self._drawn_apart(mesh, out, found, None if lost is None else ~lost)
-        return out if seam is None or out is self._coarse else seam.closed(out), lost
+    def _repaired(self) -> Float[Tensor, "coarse 3"]:
+        """The cage, repaired between overlapping parts of a body [m]."""
+        mesh, _, bodies, _, inside = self._cage
+        if bodies is None or inside is None:
+            return self._coarse
+        return repaired_cage(self._levels[0], self._coarse, bodies=bodies, inside=inside, mesh=mesh)
 
-    def _drawn_apart(
-        self, mesh: ClothMesh, x: Tensor, found: Crossings, asked: Bool[Tensor, " coarse"] | None
-    ) -> Float[Tensor, "coarse 3"]:
-        """The cage [m] without its crossings at vertices that are not given up, if all these can be removed."""
+    @cached_property
+    def _aimed(self) -> tuple[Float[Tensor, "coarse 3"], Float[Tensor, "coarse 3"]]:
+        """`aim` and `untangled`."""
+        seam, aim = self._seam_at(self._levels[0]), self._repaired
+        mesh, found, *_ = self._cage
+        found = found if aim is self._coarse else crossings(mesh.parts, aim)
+        asked = None if self.given_up is None else ~self.given_up
         if asked is not None:
             kept = asked[mesh.corners_of(found)].any(dim=1)
             found = Crossings(found.edge[kept], found.face[kept])
-        apart, left = drawn_apart(mesh, x, found, gap=float(self._thickness.mean()), asked=asked)
-        return apart if found.count and not left else x
+        apart, left = drawn_apart(mesh, aim, found, gap=float(self._thickness.mean()), asked=asked)
+        pair = (aim if left else apart), apart
+        aim, apart = (each if seam is None or each is self._coarse else seam.closed(each) for each in pair)
+        return aim, apart
 
     @property
     def swallowed(self) -> list[tuple[float, str]]:

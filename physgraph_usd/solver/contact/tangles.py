@@ -29,7 +29,6 @@ from torch import Tensor
 
 from ..collide.crossings import Crossings, Pierced
 from ..forces.self_contact import PairConstraints
-from ..integrate.stop import UNTANGLINGS
 from ..mesh.topology import joined_by
 from .bodies import Chords
 from .cloth_mesh import ClothMesh
@@ -38,9 +37,6 @@ TANGLED = 2
 """Rings around crossings that belong to a tangle."""
 OUT = 0.5
 """Relative move of a crossing edge and face in a round [mean edges]."""
-SURFACE = 0.5
-"""Crossings per vertex of a tangle that is no longer one contour. Two sheets that meet along one contour have 0.31 at
-every level."""
 GRAZING = 0.2
 """Least |N.E|: an edge almost parallel to the face would be moved far along the normal."""
 
@@ -85,28 +81,6 @@ class Tangles:
         before = torch.bincount(labels[corners[:, 0]].long(), minlength=len(numbers))
         hopeless = torch.bincount(labels[lost].long(), minlength=len(numbers)) > 0
         return Tangles(labels, before, hopeless, mesh)
-
-    def giving_up(self, last: Bool[Tensor, " vertices"] | None) -> Bool[Tensor, " vertices"]:
-        """Mask of the vertices of the cage's tangles that no rounds pull apart, or that the last frame gave up.
-
-        In a round, two sheets move past one another by `OUT` edges. Along one contour that is enough at any length. A
-        tangle full of contours (`SURFACE`) comes apart from its rim, so it may be no wider than all rounds reach from
-        both sides. A tangle stays given up until the cage no longer crosses there, so that cloth does not jump. A piece
-        of cloth that is mostly given up is given up whole.
-
-        Args:
-            last: Mask of the vertices that the last frame gave up, or None.
-        """
-        size = torch.bincount(self.label[self.label >= 0].long(), minlength=len(self.before))
-        hopeless = (self.before > SURFACE * size) & (size > (2.0 * OUT * UNTANGLINGS) ** 2)
-        if last is not None:
-            met = self.label[last & (self.label >= 0)].long()
-            hopeless |= torch.bincount(met, minlength=len(self.before)) > 0
-        lost = self._of(hopeless)
-        mesh = self._mesh
-        piece = torch.as_tensor(joined_by(mesh.parts.links.cpu().numpy(), len(lost)), device=lost.device).long()
-        share = torch.bincount(piece, lost.double()) / torch.bincount(piece)
-        return lost | (share > 0.5)[piece]
 
     def worse(self, crossings: Crossings) -> Bool[Tensor, " vertices"]:
         """Mask of the vertices of hopeful tangles with more crossings than before."""

@@ -143,7 +143,7 @@ class Group:
         cage: Cage,
         *,
         settings: ContactSettings | None = None,
-        lost: Bool[Tensor, " coarse"] | None = None,
+        given_up: Bool[Tensor, " coarse"] | None = None,
     ) -> FrameContact | None:
         """Contact of a frame's cloth, or None without possible contact.
 
@@ -151,7 +151,7 @@ class Group:
             frame: The frame.
             cage: Positions of the cages.
             settings: Contact settings; the group's own when None.
-            lost: As for `FrameContact`.
+            given_up: As for `FrameContact`.
         """
         settings = settings or self.settings.contact
         touching = frame.touching if settings.form != "off" else ()
@@ -163,7 +163,7 @@ class Group:
         place = {"origin": cage.origin, "settings": settings}
         bodies = FrameBodies.begin(self.levels[0], touching, cage.points, **place) if touching else None
         cloths = {"thickness": [each.thickness for each in fabrics], "settings": settings, "seams": self.seams}
-        cloths["lost"] = lost
+        cloths["given_up"] = given_up
         return FrameContact(self.levels, cage.points, bodies=bodies, cloth=self.cloth, **cloths)
 
     def upsampled(self, frames: Sequence[GarmentFrame]) -> list[np.ndarray]:

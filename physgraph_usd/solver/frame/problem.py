@@ -138,6 +138,13 @@ class Problem:
         return view.moved(self.before, warm, view.since(self.inside))
 
     @property
+    def _first_cage(self) -> Float[Tensor, "coarse 3"]:
+        """Start of the cage's level [m]: advanced from an earlier frame, or untangled."""
+        if self.walked is not None:
+            return self.walked
+        return self.aim if self.contact is None else self.contact.untangled
+
+    @property
     def finest(self) -> int:
         """Number of the finest level, equal to the number of subdivisions."""
         return len(self.forces) - 1
@@ -199,7 +206,7 @@ class Problem:
         linear, smooth = level.from_below, level.smooth_from_below
         first = below is None
         if below is None:  # Only the cage level starts from the advanced cages.
-            below = self.aim if index or self.walked is None else self.walked
+            below = self.aim if index else self._first_cage
         if first or linear is None or smooth is None:
             linear, smooth = level.base, level.smooth_base
         x = linear.apply(below)
@@ -226,7 +233,7 @@ def begin(group: Group, frame: FrameInput, last: State | None) -> Problem:
     moved = frame.moved if settings.temporal == "tether" else np.inf  # Only the tether slows the cloth down.
     reset = {"frames": group.moving_frames, "finest": forces[-1].level, "reset": settings.reset}
     start = start_of(known, cage, **reset, moved=moved, pace=1.0 if creases is None else creases.pace)
-    contact = group.contact(frame, cage, lost=None if known is None else known.given_up)
+    contact = group.contact(frame, cage, given_up=None if known is None else known.given_up)
     if contact is not None and last is not None and last.clean and before is not None:
         contact.at(group.levels[-1]).remember(before)
     problem = Problem(

@@ -75,7 +75,7 @@ def _unsound(telemetry: Mapping[str, Any]) -> str:
 
 def _is_better(fresh: Mapping[str, Any], solved: Mapping[str, Any]) -> bool:
     """Whether a second result replaces an unsound first one."""
-    crossings = _crossings(fresh), _crossings(solved)
+    crossings = _crossings(fresh, given_up=True), _crossings(solved, given_up=True)
     if crossings[0] != crossings[1]:
         return crossings[0] < crossings[1]
     bodies = _through_bodies(fresh), _through_bodies(solved)
@@ -84,10 +84,10 @@ def _is_better(fresh: Mapping[str, Any], solved: Mapping[str, Any]) -> bool:
     return _excess(solved) > 0.0 and _energy(fresh) < _energy(solved)
 
 
-def _crossings(telemetry: Mapping[str, Any]) -> int:
-    """Crossings of cloth with cloth in a result, without given-up cloth: a start from the cage gives that up, too."""
+def _crossings(telemetry: Mapping[str, Any], *, given_up: bool = False) -> int:
+    """Crossings of cloth with cloth in a result, with or without those of given-up cloth."""
     after = telemetry.get("contact", {}).get("cloth", {}).get("after", {})
-    return int(after.get("crossings", 0) - after.get("given_up", 0))
+    return int(after.get("crossings", 0) - (0 if given_up else after.get("given_up", 0)))
 
 
 def _through_bodies(telemetry: Mapping[str, Any]) -> int:

@@ -6,6 +6,7 @@ and makes rounds: contact is detected, the integrator steps, and cloth moves as 
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -15,7 +16,7 @@ import numpy as np
 from torch import Tensor
 
 from ...errors import SolveError
-from ..contact.frame import LevelContact
+from ..contact.frame import STALLED, LevelContact
 from ..contact.metric import SHRUNK, HeldMetric
 from ..deadline import is_over
 from ..forces.base import ForceModule
@@ -47,7 +48,8 @@ def solve_frame(group: Group, frame: FrameInput, last: State | None) -> Solved:
     refuse_swallowed(problem)
     prepared = time.perf_counter()
     try:
-        x, reports, module = None, list[LevelReport](), ForceModule(())
+        problem, reports = _with_cage_untangled(problem, since=prepared)
+        x, module = None, ForceModule(())
         for index in problem.levels:
             level = problem.level(index, since=prepared)
             if index == problem.finest and group.settings.shown is not None:
@@ -102,7 +104,7 @@ def solve_one_level(
         if problem.show is not None:
             problem.show(x)
         return x, [report], problem.module
-    x, reports = _untangle(problem, view, view.begun(x))
+    x, reports = _untangle(problem, view, view.begun(x), view.moved, most=WARM_UNTANGLINGS)
     if smoothing is not None:
         x = view.moved(x, x + smoothing) if level.index else x
         terms = view.terms(x)
@@ -134,21 +136,54 @@ def solve_one_level(
     return x, reports, ForceModule((*problem.module.forces, *terms))
 
 
-def _untangle(problem: LevelProblem, view: LevelContact, x: Placed) -> tuple[Placed, list[LevelReport]]:
-    """Rounds of few steps to shorten intersection contours: at the cage, and for crossings left from before."""
+def _with_cage_untangled(problem: Problem, *, since: float) -> tuple[Problem, list[LevelReport]]:
+    """A cold frame that starts at its untangled cage, and a report per round.
+
+    Pieces of cloth that are mostly tangled afterwards are given up.
+
+    Args:
+        problem: The frame.
+        since: Time at which the frame was ready to be solved [s].
+    """
+    contact = problem.contact
+    if contact is None or problem.warm or not contact.crossed:
+        return problem, []
+    level = problem.level(0, since=since)
+    view, start = level.view, problem.begun(0, None)[0]
+    assert view is not None
+    x, reports = _untangle(level, view, view.begun(start), view.drawn, most=UNTANGLINGS)
+    return replace(problem, contact=contact.after_cage(x), walked=x), reports
+
+
+def _untangle(
+    problem: LevelProblem, view: LevelContact, x: Placed, move: Callable[[Placed, Tensor], Placed], *, most: int
+) -> tuple[Placed, list[LevelReport]]:
+    """Rounds of few steps to shorten intersection contours.
+
+    Rounds end early if whole pieces of cloth are tangled, and would be still at the pace of the last `STALLED` rounds.
+
+    Args:
+        problem: The level.
+        view: Contact of the level's cloth.
+        x: Positions [m].
+        move: Moves the cloth to wanted positions [m] as far as is safe.
+        most: Most rounds.
+    """
     level, budget = problem.level, problem.budget
-    cold = level.index == 0
-    x = view.laid_back(x) if cold else x
     reports: list[LevelReport] = []
-    short = budget.for_untangling()
-    while len(reports) < (UNTANGLINGS if cold else WARM_UNTANGLINGS):
-        if is_over() or not view.comes_apart(x):
+    short, counts = budget.for_untangling(), [view.hopeful(x)]
+    for left in reversed(range(most)):
+        if is_over() or not counts[-1]:
             break
         terms = view.terms(x)
         system = problem.system(view, terms, x)
         wanted, report = solve_level(system, problem.untangler, x, level=level.index, budget=short)
-        x = view.drawn(x, wanted) if cold else view.moved(x, wanted)
+        x = move(x, wanted)
         reports.append(report)
+        counts.append(view.hopeful(x))
+        gone = counts[-1 - STALLED] - counts[-1] if len(counts) > STALLED else math.inf
+        if counts[-1] * STALLED > gone * left and view.tangled_pieces(x) is not None:
+            break
     return x, reports
 
 

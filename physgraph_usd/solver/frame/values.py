@@ -65,7 +65,7 @@ class State:
         fine: Fine positions [m], world space, float64, to continue from; None before the first solve.
         clean: Whether nothing crosses and is given up, neither garments solved together nor bodies.
         inside: Mask of the vertices inside a body, shape (V,); None if none is.
-        given_up: Mask of the cage vertices in tangles that are given up, shape (C,), bool; None without such tangles.
+        given_up: Mask of the pieces of the cage that are given up, shape (C,), bool; None for none.
         bent: Remembered bends of the finest hinges of each garment [rad], shape (H,), None for a garment without
             memory; () if no garment has creases.
         creeps: Whether creases still change, so that equal input gives a different frame.
