@@ -15,10 +15,8 @@ from ..level import Placed
 from .along import ApproachLimits, along
 from .cloth import ClothView
 from .safe_move import ROUNDS, safe_move
+from .tangles import TANGLED
 
-HALVINGS = 2
-"""Most halvings of a move with bodies. With one, half as many vertices more of shot 02 jump at level 1, in a fifth less
-time."""
 TRIES = 4
 """Most tries that hold only the worsened tangles to the promise, before all hopeful tangles are held."""
 
@@ -108,7 +106,7 @@ class Promise:
             met = view.springs.blocking(begin, end, aim, floor=self.floor, asked=view.asked)
         else:
             met = blocking_pairs(view.parts, begin, end, **options, asked=self._moving(begin, end), near=near)
-        x, proved = self._on(begin, end, met, options, dtype=aim.dtype, halvings=0 if since is None else HALVINGS)
+        x, proved = self._on(begin, end, met, options, dtype=aim.dtype, halved=since is not None)
         return Placed(aim if x is end else x[:count].to(aim)), proved
 
     def _moving(self, begin: Tensor, end: Tensor) -> Bool[Tensor, " all"]:
@@ -116,7 +114,7 @@ class Promise:
         return (end != begin).any(dim=1) if self.view.asked is None else self.view.asked
 
     def _on(
-        self, begin: Tensor, end: Tensor, met: Pairs, options: _Options, *, dtype: torch.dtype, halvings: int
+        self, begin: Tensor, end: Tensor, met: Pairs, options: _Options, *, dtype: torch.dtype, halved: bool
     ) -> tuple[Tensor, bool]:
         """Positions after a move of cloth and bodies, and whether all pairs with bodies are proved apart.
 
@@ -126,7 +124,7 @@ class Promise:
             met: Pairs that block the move.
             options: Options of the search.
             dtype: Type to which positions of the cloth are rounded.
-            halvings: How often a move that is not proved may be made in two halves: planes may turn once more.
+            halved: Whether vertices in or around pairs that stay blocked move in two halves: planes may turn once more.
         """
         view, parts, count = self.view, self.view.parts, self.view.parts.level.vertex_count
         if not len(met.value):
@@ -145,14 +143,15 @@ class Promise:
             if not len(met.value):
                 return ends, True
             planes = planes.joined(ApproachLimits.of(begin, ends, met, self.floor, corners=True))
-        if halvings:
-            middle = 0.5 * (begin + end)
-            middle[:count] = view.closed(middle[:count].to(dtype)).double()
-            proved = True
-            for aim in (middle, end):
-                met = blocking_pairs(parts, begin, aim, **options, asked=self._moving(begin, aim))
-                begin, one = self._on(begin, aim, met, options, dtype=dtype, halvings=halvings - 1)
-                proved = proved and one
+        if halved:  # Pairs of other vertices stay apart on both halves of their straight paths.
+            late, proved = _corners(met, torch.zeros_like(moves)), True
+            late[:count] = view.mesh.grown(late[:count], TANGLED)
+            late &= moves
+            last = torch.where(late.unsqueeze(1), end, ends)
+            for aim in (0.5 * (begin + last), last):
+                met = blocking_pairs(parts, begin, aim, **options, asked=late)
+                begin, one = self._on(begin, aim, met, options, dtype=dtype, halved=False)
+                late, proved = late | (begin != aim).any(dim=1), proved and one
             return begin, proved
         if not stand:  # Cloth that stays behind a body that moves on would be in the body.
             options = _Options(**options)
