@@ -49,10 +49,9 @@ class TestHeldPose:
         held = moves([at(count) for count in range(FRAMES)])
         monkeypatch.setattr(start, "slowing", never)
         free = moves([at(count) for count in range(FRAMES)])
-        assert held[0] == pytest.approx(free[0], rel=0.1), "the first frame that is held has only begun to slow down"
         assert free[0] > 5e-4
         assert free[8:].min() > 1e-5
-        assert held[8:].max() == pytest.approx(1e-6, rel=0.01), "it stays, but for the drift"
+        assert held.max() == pytest.approx(1e-6, rel=0.01), "it stays, but for the drift"
 
     @pytest.mark.parametrize("what", ["a body", "a corner of the cage", "what an artist sets"])
     def test_what_moves_or_is_set_anew_is_followed(self, monkeypatch: pytest.MonkeyPatch, what: str):

@@ -25,7 +25,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..level import Level
-from .start import SLOWER, SLOWEST
 from .values import FrameInput, State
 
 SHARE = 0.5
@@ -42,7 +41,7 @@ class Creases:
     Attributes:
         bent: Remembered bends [rad], shape (H,).
         rest_angle: Resulting rest angles of the hinges [rad], shape (H,).
-        pace: Slow-down rate of cloth in a held pose, relative to the usual, so that cloth rests once creases have set.
+        pace: As for `start_of`: cloth rests once creases have set.
     """
 
     bent: Float[Tensor, " hinges"]
@@ -78,7 +77,7 @@ def creases_of(level: Level, frame: FrameInput, last: State | None) -> Creases |
     before = (last.fine - last.fine.mean(dim=0)).to(known)
     angle = _wrapped(level.angles(before) - level.rest_angle)
     now = keeps[owner] * (known + rates[owner] * (angle - known))
-    pace = math.log(SLOWEST, SLOWER) * max(0.0, *passed) / (SET * max(times))
+    pace = max(0.0, *passed) / (SET * max(times))
     return Creases(now, level.rest_angle + SHARE * now, min(pace, 1.0))
 
 

@@ -248,7 +248,7 @@ def begin(group: Group, frame: FrameInput, last: State | None) -> Problem:
         walked=None if frame.walked is None else group.tensor(frame.walked - cage.origin),
         before=before,
         inside=None if last is None else last.inside,
-        tether=start.slowed * settings.tether if settings.temporal == "tether" else None,
+        tether=start.slowed * settings.tether * frame.rate**2 if settings.temporal == "tether" else None,
         creases=None if start.detailed is None else creases,
     )
     why = torn(forces[-1].level, problem.carried, cage.points) if problem.warm else ""

@@ -39,7 +39,7 @@ class SolveSettings:
         budget_ms: Time limit for solving a frame [ms], or None.
         frame_limit: Time limit after which a frame stops in its current state [s]; None for a multiple of usual frames.
         temporal: "tether", "warm" or "off".
-        tether: Tether stiffness [1/s^2].
+        tether: Tether stiffness over that of inertia in an implicit step of the time between samples, m / dt^2.
         reset: Thresholds for a cold start.
         contact: Contact settings.
         cancelled: Asked before each step whether the result is no longer needed; or None.
@@ -53,7 +53,7 @@ class SolveSettings:
     budget_ms: float | None = None
     frame_limit: float | None = None
     temporal: str = "tether"
-    tether: float = 2000.0
+    tether: float = 3.5
     reset: Reset = field(default_factory=Reset)
     contact: ContactSettings = field(default_factory=ContactSettings)
     cancelled: Callable[[], bool] | None = None

@@ -21,9 +21,9 @@ frame starts cold above both: a crumpled cage tears carried detail."""
 STILL = 0.02
 """Largest motion of cage and bodies between samples, in mean cage edges, for a held pose: slow settling is visible in a
 held pose, so the cloth is slowed down."""
-SLOWER, SLOWEST = 2.0, 2.0**8
-"""Growth of the tether stiffness per frame of a held pose, and the factor at which cloth rests: cloth has a third of a
-second to settle, later motion would be visible. Cloth with creases takes as long as creases need to set (`creases`)."""
+SLOWEST = 2.0**8
+"""Factor of the tether stiffness at which cloth rests: motion of cloth whose cage stands is visible. Cloth with creases
+rests once its creases have set (`creases`)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +67,7 @@ def start_of(
         finest: The finest level.
         reset: Thresholds for a cold start.
         moved: Largest motion of nearby bodies since [m]; infinite if more than poses changed.
-        pace: Slow-down rate of cloth in a held pose, relative to the usual.
+        pace: Fraction of its rest that cloth with creases comes to in a frame of a held pose; 1 without creases.
     """
     if state is None:
         return Start("cold")
@@ -105,9 +105,9 @@ def slowing(held: int, motion: float, pace: float = 1.0) -> tuple[int, float]:
     Args:
         held: Number of frames before.
         motion: Largest motion of a cage or body point since, in mean cage edges.
-        pace: Slow-down rate of cloth, relative to the usual.
+        pace: As for `start_of`.
     """
     if motion >= STILL:
         return 0, 1.0
     held += 1
-    return held, min(SLOWER ** min(pace * held, 64), SLOWEST, (STILL / max(motion, 1e-9)) ** 2)
+    return held, min(SLOWEST ** min(pace * held, 1.0), (STILL / max(motion, 1e-9)) ** 2)

@@ -37,6 +37,11 @@ class FrameInput:
     walked: np.ndarray | None = None
     elapsed: Sequence[float] = ()
 
+    @property
+    def rate(self) -> float:
+        """Samples per second since the start frame, the garments' least; 24 where no time is known."""
+        return 1.0 / (max(self.elapsed, default=0.0) or 1.0 / 24.0)
+
 
 @dataclass(frozen=True, eq=False)
 class Cage:
