@@ -11,8 +11,8 @@ import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
+from benchmarks.judge_shot import groups_of
 from benchmarks.rows import say, table
 from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.shot.processes import cores
@@ -58,9 +58,3 @@ def taken(arguments: Sequence[str], option: str, count: int) -> float:
             return time.perf_counter() - began
         frames = json.loads(Path(f"{out}.json").read_text("utf-8"))["frames"][1:]
         return statistics.median(sum(sum(each["milliseconds"].values()) for each in groups_of(f)) for f in frames)
-
-
-def groups_of(frame: dict[str, Any]) -> list[dict[str, Any]]:
-    """What a frame's report says of each group of garments that was solved; each garment of a group repeats it."""
-    solved = [each for each in frame["garments"] if each.get("energy_joules")]
-    return list({json.dumps([each["milliseconds"], each["energy_joules"]]): each for each in solved}.values())

@@ -1,132 +1,361 @@
-"""Two or more checkouts side by side, in turns: time of a warm frame, energy and crossings, shot by shot.
+"""A judge that knows its noise: this checkout beside others, over whole shots, with three ripples each.
 
-    python -m benchmarks.versions OTHER... [--shot NAME]... [--folder SHOTS] [--frames 8] [--turns 1] [--level 2]
-        [--device cuda]
-    python -m benchmarks.versions --cores      this version on several cores, and by several processes
+    python -m benchmarks.versions OTHER... [--folder SHOTS] [--jobs 16] [--json FIGURES.json] [--out TABLE.md]
+    python -m benchmarks.versions --from-json FIGURES.json      print again what was measured
+    python -m benchmarks.versions --cores                       this version on several cores, and by several processes
 
-Each OTHER is a checkout of another version. Every shot is refined by each of them and by this one in turn, on one core
-or a card, in a process of its own, by the command that a user gives. Prints a row a shot: of each version the
-milliseconds of the first and of a warm frame on the wall as its report has them (prepared, solved and measured; warm,
-the median over frames, the least over turns), the mean energy of warm frames without the tether's, and crossings of all
-frames with bodies and with cloth; then the time and the energy of this version over each other's.
+Each OTHER is a checkout of another version. Every shot is refined by each version with three ripples: invisible
+displacements of the cage by 0.15, 0.20 and 0.25% of its mean edge (`benchmarks.judge_shot`). Figures of one version
+that differ between ripples are noise, and a difference between versions counts only beyond the noise
+(`benchmarks.verdicts`). Times are processor times on the CPU, and the report's times on a card.
+
+Each run is a process of its own on a core of its own, with one thread. Long shots go first, and runs of one shot by
+all versions start side by side, so that they share the machine's load. With `--json`, finished runs are kept, and the
+same command goes on after an interruption; runs of changed code are made again.
+
+By default samples are whole shots at level 2, and with `--folder` so are the real shots, except: 02 and 04 are refined
+at level 1, because 02 takes 14 to 28 s a frame at level 2 and 04 about as long. Two versions take under ten minutes on
+sixteen cores. Runs that take more than `--limit` are stopped, and their row says so.
 """
 
 from __future__ import annotations
 
 import json
 import os
-import statistics
+import queue
+import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import click
 
+from benchmarks import judge_shot
 from benchmarks.contact_shots import REAL
 from benchmarks.contact_shots import SAMPLES as TOUCHING
-from benchmarks.cores import compare, groups_of
-from benchmarks.rows import say, table
+from benchmarks.cores import compare
+from benchmarks.judge_shot import Job
+from benchmarks.rows import code_of, say
+from benchmarks.verdicts import Band, bands, overall, shot_table
+from physgraph_usd.lab import samples
 from physgraph_usd.lab.samples import SAMPLES, write_sample
-from physgraph_usd.usd.read.reader import open_shot
 
-CHOSEN = ("sleeve", "skirt", "layers")
-"""Samples where no shot is named; with a folder, its shots too."""
 HERE = Path(__file__).resolve().parents[1]
+RIPPLES = (0.15, 0.20, 0.25)
+"""Displacements of the cage's vertices [% of the mean edge]: well below what a user can see."""
 
 
 @dataclass(frozen=True)
-class Cost:
-    """A shot by one version: milliseconds of the first and of a warm frame, its energy [J], crossings of all frames."""
+class Row:
+    """A shot to judge.
 
-    first: float
-    warm: float
-    energy: float
-    crossings: int
+    Attributes:
+        name: Name in the tables.
+        source: Name of the sample, or path of the real shot below the folder.
+        first: Number of the first frame.
+        busy: Number of the first frame when only some frames are refined, where cloth touches.
+        level: Subdivisions.
+        seconds: Rough time of one run [s], to start long runs first.
+    """
 
-    def __str__(self) -> str:
-        """A cell of the table."""
-        return f"{self.first:,.0f}, {self.warm:,.0f} ms, {1e3 * self.energy:.4g} mJ, {self.crossings:,}"
+    name: str
+    source: str
+    first: int = 0
+    busy: int = 0
+    level: int = 2
+    seconds: float = 60.0
 
-    def over(self, other: Cost) -> str:
-        """Ratios of time and energy."""
-        return f"{self.warm / other.warm:.3f}, {self.energy / other.energy:.4f}"
+
+SHOTS = (
+    Row("sleeve", "sleeve", seconds=10),
+    Row("skirt", "skirt", seconds=20),
+    Row("skirt@36", "skirt", first=35, busy=35, seconds=10),
+    Row("tshirt", "tshirt", seconds=150),
+    Row("layers", "layers", seconds=120),
+    Row("dancer", "dancer", seconds=30),
+    Row("overcoat", "overcoat", seconds=120),
+    Row("01", "01_newton_shirt_dab_cm.usdc", seconds=70),
+    Row("02", "02_makehuman_usdskel_dm.usdc", level=1, seconds=110),
+    Row("04", "04_tiered_dress_kick_zup.usdc", level=1, seconds=40),
+    Row("06", "06_torus_pull.usda", seconds=30),
+    Row("08", "08_sphere_spin_xformcollider.usdc", seconds=15),
+    Row("09", "09_cesiumman_kilt/shot.usda", seconds=70),
+    Row("10", "10_style3d_skirt_twist.usdc", seconds=12),
+)
+"""Shots that are judged by default; "skirt@36" is the skirt from time code 36 on, begun cold."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """One run: a job by a version, and what it depends on beside the job."""
+
+    row: str
+    version: str
+    tree: Path
+    code: str
+    job: Job
+
+    @property
+    def asked(self) -> dict[str, Any]:
+        """The run's identity in a file of figures: runs of equal identity have equal figures."""
+        job = asdict(self.job) | {"shot": Path(self.job.shot).name}
+        return {"row": self.row, "version": self.version, "code": self.code, "job": json.loads(json.dumps(job))}
 
 
 @click.command()
 @click.argument("others", nargs=-1, type=click.Path(exists=True, file_okay=False, path_type=Path))
 @click.option("--folder", type=click.Path(path_type=Path), help="The real shots, which we may not ship.")
-@click.option("--shot", "names", multiple=True, help="Only these: samples, or beginnings of real shots' names.")
-@click.option("--frames", default=8, show_default=True, help="Frames of each; 0 for whole shots.")
-@click.option("--turns", default=1, show_default=True, help="How often each version refines each shot.")
-@click.option("--level", default=2, show_default=True)
-@click.option("--device", default="cpu", show_default=True, help="Where to solve: cpu, cuda or auto.")
+@click.option("--shot", "names", multiple=True, help="Only these: names of rows, or of other samples.")
+@click.option(
+    "--frames", default=0, show_default=True, help="Most frames of each, from where cloth touches; 0 for all."
+)
+@click.option("--level", type=int, help="Subdivisions of all.  [default: 2, of 02 and 04 1]")
+@click.option("--device", default="cpu", show_default=True, help="Where to solve: cpu or cuda.")
+@click.option("--jobs", type=int, help="Runs at a time.  [default: number of cores, one on a card]")
+@click.option("--limit", default=300.0, show_default=True, help="Longest run [s].")
+@click.option("--json", "file", type=click.Path(path_type=Path), help="Keep raw figures here, and go on from them.")
+@click.option("--from-json", "made", type=click.Path(exists=True, path_type=Path), help="Print such a file only.")
+@click.option("--out", type=click.Path(path_type=Path), help="Write the tables here too.")
 @click.option("--cores", is_flag=True, help="This version alone, samples on several cores, instead.")
-@click.option("--core", default=0, show_default=True, help="The core that all run on.")
 def main(
-    others: Sequence[Path], folder: Path | None, names: Sequence[str], *, device: str, cores: bool, **numbers: int
+    others: Sequence[Path],
+    names: Sequence[str],
+    *,
+    made: Path | None,
+    out: Path | None,
+    cores: bool,
+    level: int | None,
+    **options: Any,
 ) -> None:
-    """Print what each version takes for each shot."""
+    """Judge this version beside others."""
     if cores:
-        compare(names or ("dancer", "skirt"), turns=numbers["turns"], level=numbers["level"])
+        compare(names or ("dancer", "skirt"), turns=1, level=2 if level is None else level)
         return
-    if not others:
-        raise click.UsageError("name a checkout of another version, or give --cores")
-    trees = [*(other.resolve() for other in others), HERE]
-    head = [*(f"{tree.name}: first and warm frame, energy, crossings" for tree in trees), "time, energy over"]
-    say(table(["shot", *head], []))
-    with tempfile.TemporaryDirectory() as made:
-        for name, given in shots(names, folder, Path(made), numbers["frames"]):
-            asked = [*given, "--level", str(numbers["level"]), "--device", device]
-            turns = range(numbers["turns"])
-            runs = [[taken(tree, asked, Path(made), numbers["core"]) for tree in trees] for _ in turns]
-            best = [min(each, key=lambda cost: cost.warm) for each in zip(*runs, strict=True)]
-            say(f"| {name} | {' | '.join(map(str, best))} | {'; '.join(best[-1].over(each) for each in best[:-1])} |")
+    if made is not None:
+        runs = json.loads(made.read_text("utf-8"))["runs"]
+    elif others:
+        runs = measured([*(other.resolve() for other in others), HERE], names, level=level, **options)
+    else:
+        raise click.UsageError("name a checkout of another version, or give --cores or --from-json")
+    text = tables(runs)
+    say(text)
+    if out is not None:
+        out.write_text(text + "\n", "utf-8")
 
 
-def shots(names: Sequence[str], folder: Path | None, made: Path, frames: int) -> Iterator[tuple[str, list[str]]]:
-    """Names of shots, and the arguments of `refine` for each."""
-    samples = [name for name in SAMPLES if name in (names or CHOSEN)]
-    cases = {name: (write_sample(name, made), [], [], TOUCHING.get(name, 0)) for name in samples}
-    for name, case in REAL.items() if folder is not None else ():
-        if folder is not None and (folder / name).exists() and (not names or name.startswith(tuple(names))):
-            cases[name] = (folder / name, *case)
-    for name, (file, garments, bodies, first) in cases.items():
-        given = [str(file), *(option for each in garments for option in ("--garment", each))]
-        given += [option for each in bodies for option in ("--collider", each)]
-        if frames:
-            times = open_shot(str(file), garments=garments, colliders=bodies).scene.times
-            chosen = times[max(min(first, len(times) - frames), 0) :][:frames]
-            given += ["--frames", f"{chosen[0]}:{chosen[-1]}"]
-        yield name, given
+def measured(
+    trees: Sequence[Path],
+    names: Sequence[str],
+    *,
+    folder: Path | None,
+    frames: int,
+    level: int | None,
+    device: str,
+    jobs: int | None,
+    limit: float,
+    file: Path | None,
+) -> list[dict[str, Any]]:
+    """Runs of all shots by all versions with all ripples, each as plain values."""
+    cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else list(range(os.cpu_count() or 1))
+    count = jobs or (len(cores) if device == "cpu" else 1)
+    with tempfile.TemporaryDirectory() as place:
+        rows = [replace(row, level=row.level if level is None else level) for row in chosen(names, folder)]
+        found = [job_of(row, Path(place), folder, frames) for row in rows]
+        tasks = tasks_of(trees, rows, [replace(job, device=device) for job in found])
+        known = kept_runs(file)
+        runs = [run for task in tasks if (run := known.get(json.dumps(task.asked))) is not None]
+        left = [task for task in tasks if json.dumps(task.asked) not in known]
+        if left:
+            warm_up(trees, device)
+        for run in run_all(left, [cores[k % len(cores)] for k in range(count)], limit=limit, place=Path(place)):
+            runs.append(run)
+            _note(f"{len(runs)} of {len(tasks)}: {run['row']}, {run['version']}, {run['job']['ripple']}%")
+            if file is not None:
+                file.write_text(json.dumps({"runs": runs}, indent=1), "utf-8")
+    order = {json.dumps(task.asked): k for k, task in enumerate(tasks)}
+    return sorted(runs, key=lambda run: order[identity(run)])
 
 
-def taken(tree: Path, arguments: Sequence[str], made: Path, core: int) -> Cost:
-    """Refine a shot by a version."""
-    out = made / f"{tree.name}.usdc"
-    command = ["taskset", "-c", str(core), sys.executable, "-m", "physgraph_usd", "refine", *arguments]
-    command += ["-o", str(out), "--report", f"{out}.json", "--overwrite"]
-    environment = os.environ | {"PYTHONPATH": str(tree), "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(command, cwd=tree, env=environment, capture_output=True, text=True, check=False)
-    if done.returncode not in (0, 3):
-        raise click.ClickException(f"{tree.name}: {done.stderr[-500:]}")
-    report = json.loads(Path(f"{out}.json").read_text("utf-8"))
-    frames = [groups for frame in report["frames"] if (groups := groups_of(frame))]
-    warm = frames[1:] or frames
-    first, *later = [sum(sum(each["milliseconds"].values()) for each in groups) for groups in frames]
-    energies = [sum(sum(each["energy_joules"]["output"].values()) for each in groups) for groups in warm]
-    crossings = sum(left for groups in frames for each in groups for left in crossings_of(each.get("contact") or {}))
-    return Cost(first, statistics.median(later or [first]), statistics.mean(energies), crossings)
+def _note(line: str) -> None:
+    """Tell the progress, on the error stream: tables alone go to the output."""
+    click.echo(line, err=True)
 
 
-def crossings_of(contact: dict[str, Any]) -> Iterator[int]:
-    """Crossings that are left with each body and with cloth."""
-    cloth = contact.get("cloth")
-    for each in [*(contact.get("bodies") or {}).values(), *([cloth] if cloth else [])]:
-        yield each["after"]["crossings"]
+def chosen(names: Sequence[str], folder: Path | None) -> list[Row]:
+    """The shots to judge. Missing samples and shots are named and left out."""
+    other = [Row(name, name, busy=TOUCHING.get(name, 0)) for name in SAMPLES]
+    by_name = {row.name: row for row in (*other, *SHOTS)}
+    asked = names or [row.name for row in SHOTS if folder is not None or row.source not in REAL]
+    rows = []
+    for name in asked:
+        row = by_name.get(name)
+        if row is None or not _is_there(row, folder):
+            _note(f"{name} is left out: there is no such sample or real shot")
+        else:
+            rows.append(replace(row, busy=max(row.busy, _first_contact(row))))
+    return rows
+
+
+def _is_there(row: Row, folder: Path | None) -> bool:
+    if row.source in REAL:
+        return folder is not None and (folder / row.source).exists()
+    return row.source in SAMPLES
+
+
+def _first_contact(row: Row) -> int:
+    """Number of the frame from which `benchmarks.contact_shots` looks at a shot."""
+    return REAL[row.source][2] if row.source in REAL else TOUCHING.get(row.source, 0)
+
+
+def job_of(row: Row, place: Path, folder: Path | None, frames: int) -> Job:
+    """The run of a shot without ripple; samples are written into a folder, once."""
+    first = row.busy if frames else row.first
+    if row.source in REAL:
+        garments, bodies, _ = REAL[row.source]
+        shot = (folder or Path()) / row.source
+        return Job(str(shot.resolve()), garments, bodies, first=first, count=frames, level=row.level)
+    file = place / f"{row.source}.usdc"
+    if not file.exists():
+        write_sample(row.source, place)
+    return Job(str(file), first=first, count=frames, level=row.level)
+
+
+def tasks_of(trees: Sequence[Path], rows: Sequence[Row], jobs: Sequence[Job]) -> list[Task]:
+    """All runs in the order in which they start: long shots first, versions of one shot side by side."""
+    names = [
+        f"{tree.name} ({k})" if tree.name in [t.name for t in trees[:k]] else tree.name for k, tree in enumerate(trees)
+    ]
+    shared = code_of(Path(samples.__file__).parent) + code_of(Path(judge_shot.__file__))
+    codes = [code_of(tree / "physgraph_usd") + shared for tree in trees]
+    pairs = sorted(zip(rows, jobs, strict=True), key=lambda pair: -pair[0].seconds)
+    return [
+        Task(row.name, name, tree, code, replace(job, ripple=ripple, seed=seed))
+        for row, job in pairs
+        for seed, ripple in enumerate(RIPPLES, 1)
+        for name, tree, code in zip(names, trees, codes, strict=True)
+    ]
+
+
+def identity(run: Mapping[str, Any]) -> str:
+    """The identity of a finished run, as `Task.asked` gives it."""
+    return json.dumps({name: run[name] for name in ("row", "version", "code", "job")})
+
+
+def kept_runs(file: Path | None) -> dict[str, dict[str, Any]]:
+    """Finished runs of a file of figures by identity; runs that failed are made again."""
+    if file is None or not file.exists():
+        return {}
+    runs = json.loads(file.read_text("utf-8"))["runs"]
+    return {identity(run): run for run in runs if "error" not in run}
+
+
+def warm_up(trees: Sequence[Path], device: str) -> None:
+    """Have each version compile its kernels, so that no measured run has to."""
+    for tree in trees:
+        command = [sys.executable, "-m", "physgraph_usd", "warm-up", "--device", device]
+        done = subprocess.run(command, cwd=tree, env=_environment(tree), capture_output=True, text=True, check=False)
+        if done.returncode:
+            raise click.ClickException(f"{tree.name}: {done.stderr[-500:]}")
+
+
+def _environment(tree: Path) -> dict[str, str]:
+    """Variables of a process that imports the package of a checkout and has one thread."""
+    return os.environ | {"PYTHONPATH": str(tree), "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+
+
+def run_all(
+    tasks: Sequence[Task], cores: Sequence[int | None], *, limit: float, place: Path
+) -> Iterator[dict[str, Any]]:
+    """Run tasks in order, one at a time on each core, and yield each run as it ends.
+
+    Args:
+        tasks: The tasks.
+        cores: Core of each process that runs at a time; None for any.
+        limit: Longest run [s].
+        place: Folder for the files of the runs.
+    """
+    free: queue.SimpleQueue[int | None] = queue.SimpleQueue()
+    for core in cores:
+        free.put(core)
+
+    def one(number: int, task: Task) -> dict[str, Any]:
+        core = free.get()
+        try:
+            return task.asked | run_one(task, core, limit=limit, files=place / f"run{number}")
+        finally:
+            free.put(core)
+
+    with ThreadPoolExecutor(len(cores)) as pool:
+        futures = [pool.submit(one, number, task) for number, task in enumerate(tasks)]
+        try:
+            for future in as_completed(futures):
+                yield future.result()
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+def run_one(task: Task, core: int | None, *, limit: float, files: Path) -> dict[str, Any]:
+    """The figures of a task, or the limit that it ran over, or its error."""
+    asked, figures = files.with_suffix(".job.json"), files.with_suffix(".figures.json")
+    asked.write_text(json.dumps(asdict(task.job)), "utf-8")
+    pinned = ["taskset", "-c", str(core)] if core is not None and shutil.which("taskset") else []
+    command = [*pinned, sys.executable, "-P", judge_shot.__file__, str(asked), str(figures)]
+    try:
+        done = subprocess.run(
+            command,
+            cwd=task.tree,
+            env=_environment(task.tree),
+            capture_output=True,
+            text=True,
+            timeout=limit,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        return {"over": limit}
+    if done.returncode:
+        return {"error": (done.stderr.strip().splitlines() or [f"exit code {done.returncode}"])[-1]}
+    return {"figures": json.loads(figures.read_text("utf-8"))}
+
+
+def tables(runs: Sequence[Mapping[str, Any]]) -> str:
+    """The tables in Markdown: over all shots, then shot by shot."""
+    versions = list(dict.fromkeys(run["version"] for run in runs))
+    shots = {name: [run for run in runs if run["row"] == name] for name in dict.fromkeys(run["row"] for run in runs)}
+    found = {name: {v: bands_of(each, v) for v in versions} for name, each in sorted(shots.items())}
+    *others, last = versions
+    parts = []
+    for other in others:
+        pairs = {name: (each[other], each[last]) for name, each in found.items()}
+        parts += [f"## {last} against {other}, over all shots", overall(pairs)]
+    parts += [f"{name}: {line}" for name, each in sorted(shots.items()) for line in odd_runs(each)]
+    parts.append("## Shot by shot: mean ± half the range of three ripples")
+    for name, each in found.items():
+        job = shots[name][0]["job"]
+        frames = f"frames {job['first'] + 1} to {job['first'] + job['count']}" if job["count"] else "whole"
+        frames = f"from frame {job['first'] + 1} on" if job["first"] and not job["count"] else frames
+        parts += [f"### {name} ({frames}, level {job['level']})", *odd_runs(shots[name]), shot_table(each)]
+    return "\n\n".join(parts)
+
+
+def bands_of(runs: Sequence[Mapping[str, Any]], version: str) -> dict[str, Band | None]:
+    """Bands of a version's figures in one shot; none if a run did not end."""
+    own = [run for run in runs if run["version"] == version]
+    return bands([run["figures"] for run in own]) if all("figures" in run for run in own) else {}
+
+
+def odd_runs(runs: Sequence[Mapping[str, Any]]) -> list[str]:
+    """A line for each run that did not end."""
+    lines = []
+    for run in runs:
+        if "figures" not in run:
+            why = f"over {run['over']:g} s" if "over" in run else f"failed: {run['error']}"
+            lines.append(f"{run['version']}, ripple {run['job']['ripple']:g}%: {why}")
+    return lines
 
 
 if __name__ == "__main__":

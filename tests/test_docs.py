@@ -120,7 +120,7 @@ def test_every_benchmark_is_named_by_a_page_and_every_name_is_a_benchmarks():
         file.parent.name if file.stem == "__main__" else file.stem
         for file in files
         if 'if __name__ == "__main__":' in file.read_text("utf-8")
-    } - {"newton_cloth"}  # `fidelity` runs it, by another Python.
+    } - {"newton_cloth", "judge_shot"}  # `fidelity` and `versions` run them, in processes of their own.
     text = "".join(page.read_text("utf-8") for page in (*PAGES, ROOT / "CONTRIBUTING.md"))
     assert set(re.findall(r"python -m benchmarks\.(\w+)", text)) == programs
     assert len(programs) <= MOST_PROGRAMS

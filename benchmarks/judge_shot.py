@@ -1,0 +1,249 @@
+"""One shot, rippled and refined once: the figures that `benchmarks.versions` and `benchmarks.numbers` compare.
+
+    PYTHONPATH=TREE python benchmarks/judge_shot.py JOB.json FIGURES.json
+
+Runs against the package of any checkout TREE, so this file imports that package, numpy and pxr only. A job names the
+shot, its garments and colliders, the first frame and number of frames, the level, the device and the ripple.
+
+A ripple is a layer over the shot. In the ripple layer each vertex of a garment is moved by a fraction of the garment's
+mean edge, in a random direction that is the same in every sample. No user could see a ripple, so figures that differ
+between ripples are noise.
+"""
+
+from __future__ import annotations
+
+import json
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pxr import Sdf, Usd, UsdGeom, Vt
+
+from physgraph_usd.shot.options import RefineOptions
+from physgraph_usd.shot.solve import ShotSolver, open_for
+from physgraph_usd.solver.mesh.subdivide import subdivide_times
+
+STILL = 0.01
+"""A cage stands where it moves less than this between two samples, in mean cage edges."""
+PERCENTILE = 99.0
+"""Percentile of the cloth's motion over a standing cage."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """One run of one shot.
+
+    Attributes:
+        shot: Path of the shot.
+        garments: Prim paths of the garments; empty for tagged garments.
+        colliders: Prim paths of the bodies; empty for tagged bodies.
+        first: Number of the first frame.
+        count: Number of frames; 0 for all.
+        level: Subdivisions of each garment.
+        device: "cpu" or "cuda".
+        ripple: Displacement of each cage vertex, in percent of the mean edge; 0 for the shot itself.
+        seed: Seed of the ripple's directions.
+    """
+
+    shot: str
+    garments: Sequence[str] = ()
+    colliders: Sequence[str] = ()
+    first: int = 0
+    count: int = 0
+    level: int = 2
+    device: str = "cpu"
+    ripple: float = 0.0
+    seed: int = 0
+
+    @property
+    def options(self) -> RefineOptions:
+        """Options of the run. Naming a report makes the solver measure contact; no report is written."""
+        return RefineOptions(
+            garments=tuple(self.garments),
+            colliders=tuple(self.colliders),
+            level=self.level,
+            device=self.device,
+            report=Path("report.json"),
+        )
+
+
+class Motion:
+    """Motion of the refined cloth relative to the upsampled cage, summed over frames.
+
+    Attributes:
+        jumps: Vertices whose motion between two samples differs from the cage's by more than a mean cage edge.
+    """
+
+    def __init__(self, garments: Sequence[Any], level: int) -> None:
+        """Subdivide the cages of a scene's garments."""
+        self._chains = [subdivide_times(garment.mesh, level) for garment in garments]
+        self._edges = [_mean_rest_edge(garment) for garment in garments]
+        self._last: list[tuple[np.ndarray, np.ndarray] | None] = [None] * len(garments)
+        self._still: list[np.ndarray] = []
+        self.jumps = 0
+
+    def add(self, cages: Sequence[np.ndarray], points: Sequence[np.ndarray | None]) -> None:
+        """Take the next frame: cage and fine positions of each garment [m]; None for a garment without a sample."""
+        for index, (cage, fine) in enumerate(zip(cages, points, strict=True)):
+            before, now = self._last[index], None if fine is None else (fine, self._upsampled(index, cage))
+            self._last[index] = now
+            if before is None or now is None:
+                continue
+            carried = now[1] - before[1]
+            own = np.linalg.norm(now[0] - before[0] - carried, axis=1)
+            self.jumps += int((own > self._edges[index]).sum())
+            self._still.append(own[np.linalg.norm(carried, axis=1) < STILL * self._edges[index]])
+
+    @property
+    def still(self) -> float | None:
+        """99th percentile of the cloth's own motion between two samples where the cage stands [mm]; None without."""
+        found = np.concatenate(self._still) if self._still else np.empty(0)
+        return 1e3 * float(np.percentile(found, PERCENTILE)) if len(found) else None
+
+    def _upsampled(self, index: int, points: np.ndarray) -> np.ndarray:
+        for refinement in self._chains[index]:
+            points = np.asarray(refinement.linear @ points)
+        return points
+
+
+def _mean_rest_edge(garment: Any) -> float:
+    """Mean rest length of a garment's cage edges [m]."""
+    edges = garment.mesh.half_edges.edges
+    return float(np.linalg.norm(garment.rest[edges[:, 0]] - garment.rest[edges[:, 1]], axis=1).mean())
+
+
+def judged(job: Job) -> dict[str, float | None]:
+    """Refine a shot and return the run's figures by name, as listed in `benchmarks.verdicts`.
+
+    Raises:
+        PhysGraphError: The shot cannot be read.
+        ValueError: A frame could not be solved.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        file = job.shot
+        if job.ripple:
+            opened = open_for(file, job.options)
+            prims = [str(source.path) for source in opened.sources]
+            opened.close()
+            file = str(rippled(Path(file), prims, Path(folder) / "ripple.usdc", size=job.ripple / 100.0, seed=job.seed))
+        shot = open_for(file, job.options)
+        garments = shot.scene.garments
+        solver = ShotSolver(file, [job.level] * len(garments), job.options, opened=shot)
+        times = list(shot.scene.times)[job.first :][: job.count or None]
+        motion, frames, spent = Motion(garments, job.level), [], []
+        for outcome, milliseconds in _timed(solver(times)):
+            if error := outcome.record.get("error"):
+                raise ValueError(f"frame {outcome.time:g}: {error}")
+            motion.add([each.points for each in shot.frame(outcome.time).garments], outcome.points)
+            frames.append(groups_of(outcome.record))
+            spent.append(milliseconds)
+        shot.close()
+    return _figures(frames, spent, job) | {"jumps": motion.jumps, "still": motion.still}
+
+
+def _timed(outcomes: Iterable[Any]) -> Iterator[tuple[Any, float]]:
+    """Each frame with the processor time spent on reading and solving the frame [ms]."""
+    began = time.process_time()
+    for outcome in outcomes:
+        yield outcome, 1e3 * (time.process_time() - began)
+        began = time.process_time()
+
+
+def _figures(frames: Sequence[list[dict[str, Any]]], spent: Sequence[float], job: Job) -> dict[str, float | None]:
+    """Figures of a run from the report of each frame and the processor time of each frame [ms].
+
+    A frame solved on a card costs little processor time, so its time is the report's. Frames reused from an equal
+    frame count for nothing.
+    """
+    if job.device != "cpu":
+        spent = [sum(sum(each["milliseconds"].values()) for each in groups) for groups in frames]
+    pairs = [(groups, milliseconds) for groups, milliseconds in zip(frames, spent, strict=True) if groups]
+    warm = pairs[1:] or pairs
+    contact = [each.get("contact") or {} for groups, _ in pairs for each in groups]
+    bodies = [body["after"] for each in contact for body in (each.get("bodies") or {}).values()]
+    cloth = [each["cloth"]["after"] for each in contact if each.get("cloth")]
+    return {
+        "warm": statistics.median(milliseconds for _, milliseconds in warm),
+        "first": pairs[0][1],
+        "energy": 1e3 * statistics.mean(sum(map(_energy, groups)) for groups, _ in warm),
+        "cloth": sum(each["crossings"] for each in cloth),
+        "bodies": sum(each["crossings"] for each in bodies),
+        "inside": sum(each["inside"] for each in bodies),
+        "remaining": max(each["levels"][-1]["remaining_move"] for groups, _ in pairs for each in groups),
+    }
+
+
+def _energy(group: dict[str, Any]) -> float:
+    """Energy of the refined cloth without the tether's [J]."""
+    return sum(value for name, value in group["energy_joules"]["output"].items() if name != "tether")
+
+
+def groups_of(frame: dict[str, Any]) -> list[dict[str, Any]]:
+    """Entries of a frame's report, one per group of garments solved together; each garment of a group repeats its."""
+    solved = [each for each in frame["garments"] if each.get("energy_joules")]
+    return list({json.dumps([each["milliseconds"], each["energy_joules"]]): each for each in solved}.values())
+
+
+def rippled(shot: Path, prims: Sequence[str], out: Path, *, size: float, seed: int) -> Path:
+    """Write a layer that sublayers a shot and moves the points of some meshes, and return the layer's path.
+
+    Args:
+        shot: Path of the shot.
+        prims: Prim paths of the meshes.
+        out: Path of the layer to write.
+        size: Displacement of each vertex, in mean edges of the mesh's first sample.
+        seed: Seed of the random directions.
+    """
+    below = Sdf.Layer.FindOrOpen(str(shot))
+    layer = Sdf.Layer.CreateNew(str(out))
+    for key in below.pseudoRoot.ListInfoKeys():
+        if key not in ("subLayers", "subLayerOffsets"):
+            layer.pseudoRoot.SetInfo(key, below.pseudoRoot.GetInfo(key))
+    layer.subLayerPaths.append(str(shot.resolve()))
+    stage = Usd.Stage.Open(layer)
+    random = np.random.default_rng(seed)
+    for prim in prims:
+        _move_points(UsdGeom.Mesh(stage.GetPrimAtPath(prim)), size, random)
+    layer.Save()
+    return out
+
+
+def _move_points(mesh: UsdGeom.Mesh, size: float, random: np.random.Generator) -> None:
+    """Author displaced points at the default and at every sample; skinned meshes have a default only."""
+    points = mesh.GetPointsAttr()
+    codes = [*map(Usd.TimeCode, points.GetTimeSamples()), Usd.TimeCode.Default()]
+    # All samples are read before one is written: the first written sample hides those of the layers below.
+    values = {code: np.asarray(value, np.float64) for code in codes if (value := points.Get(code))}
+    first = next(iter(values.values()))
+    offset = random.normal(size=first.shape)
+    offset *= size * _mean_edge(mesh, first) / np.linalg.norm(offset, axis=1, keepdims=True)
+    for code, value in values.items():
+        if value.shape == offset.shape:
+            points.Set(Vt.Vec3fArray.FromNumpy((value + offset).astype(np.float32)), code)
+
+
+def _mean_edge(mesh: UsdGeom.Mesh, points: np.ndarray) -> float:
+    """Mean length of the sides of a mesh's faces, in stage units."""
+    code = Usd.TimeCode.EarliestTime()
+    counts = np.asarray(mesh.GetFaceVertexCountsAttr().Get(code))
+    indices = np.asarray(mesh.GetFaceVertexIndicesAttr().Get(code))
+    following = np.arange(1, len(indices) + 1)
+    ends = np.cumsum(counts)
+    following[ends - 1] = ends - counts
+    return float(np.linalg.norm(points[indices] - points[indices[following]], axis=1).mean())
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Run a job file and write its figures."""
+    job = Job(**json.loads(Path(arguments[0]).read_text("utf-8")))
+    Path(arguments[1]).write_text(json.dumps(judged(job)), "utf-8")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
