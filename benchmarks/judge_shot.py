@@ -133,11 +133,9 @@ def judged(job: Job) -> dict[str, float | None]:
             opened.close()
             file = str(rippled(Path(file), prims, Path(folder) / "ripple.usdc", size=job.ripple / 100.0, seed=job.seed))
         shot = open_for(file, job.options)
-        garments = shot.scene.garments
-        solver = ShotSolver(file, [job.level] * len(garments), job.options, opened=shot)
-        times = list(shot.scene.times)[job.first :][: job.count or None]
-        motion, frames, spent = Motion(garments, job.level), [], []
-        for outcome, milliseconds in _timed(solver(times)):
+        motion, frames, spent = Motion(shot.scene.garments, job.level), [], []
+        solver = ShotSolver(file, [job.level] * len(shot.scene.garments), job.options, opened=shot)
+        for outcome, milliseconds in _timed(solver(list(shot.scene.times)[job.first :][: job.count or None])):
             if error := outcome.record.get("error"):
                 raise ValueError(f"frame {outcome.time:g}: {error}")
             motion.add([each.points for each in shot.frame(outcome.time).garments], outcome.points)
@@ -150,8 +148,8 @@ def judged(job: Job) -> dict[str, float | None]:
 def _timed(outcomes: Iterable[Any]) -> Iterator[tuple[Any, float]]:
     """Each frame with the processor time spent on reading and solving the frame [ms]."""
     began = time.process_time()
-    for outcome in outcomes:
-        yield outcome, 1e3 * (time.process_time() - began)
+    for each in outcomes:
+        yield each, 1e3 * (time.process_time() - began)
         began = time.process_time()
 
 
@@ -190,6 +188,17 @@ def groups_of(frame: dict[str, Any]) -> list[dict[str, Any]]:
     return list({json.dumps([each["milliseconds"], each["energy_joules"]]): each for each in solved}.values())
 
 
+def layer_over(shot: Path, out: Path) -> Sdf.Layer:
+    """Create an empty layer that sublayers a shot and has the shot's stage metadata."""
+    below = Sdf.Layer.FindOrOpen(str(shot))
+    layer = Sdf.Layer.CreateNew(str(out))
+    for key in below.pseudoRoot.ListInfoKeys():
+        if key not in ("subLayers", "subLayerOffsets"):
+            layer.pseudoRoot.SetInfo(key, below.pseudoRoot.GetInfo(key))
+    layer.subLayerPaths.append(str(shot.resolve()))
+    return layer
+
+
 def rippled(shot: Path, prims: Sequence[str], out: Path, *, size: float, seed: int) -> Path:
     """Write a layer that sublayers a shot and moves the points of some meshes, and return the layer's path.
 
@@ -200,12 +209,7 @@ def rippled(shot: Path, prims: Sequence[str], out: Path, *, size: float, seed: i
         size: Displacement of each vertex, in mean edges of the mesh's first sample.
         seed: Seed of the random directions.
     """
-    below = Sdf.Layer.FindOrOpen(str(shot))
-    layer = Sdf.Layer.CreateNew(str(out))
-    for key in below.pseudoRoot.ListInfoKeys():
-        if key not in ("subLayers", "subLayerOffsets"):
-            layer.pseudoRoot.SetInfo(key, below.pseudoRoot.GetInfo(key))
-    layer.subLayerPaths.append(str(shot.resolve()))
+    layer = layer_over(shot, out)
     stage = Usd.Stage.Open(layer)
     random = np.random.default_rng(seed)
     for prim in prims:
@@ -221,11 +225,16 @@ def _move_points(mesh: UsdGeom.Mesh, size: float, random: np.random.Generator) -
     # All samples are read before one is written: the first written sample hides those of the layers below.
     values = {code: np.asarray(value, np.float64) for code in codes if (value := points.Get(code))}
     first = next(iter(values.values()))
-    offset = random.normal(size=first.shape)
-    offset *= size * _mean_edge(mesh, first) / np.linalg.norm(offset, axis=1, keepdims=True)
+    offset = offsets(mesh, first, size, random)
     for code, value in values.items():
         if value.shape == offset.shape:
             points.Set(Vt.Vec3fArray.FromNumpy((value + offset).astype(np.float32)), code)
+
+
+def offsets(mesh: UsdGeom.Mesh, points: np.ndarray, size: float, random: np.random.Generator) -> np.ndarray:
+    """A displacement of a given size [mean edges] in a random direction for each vertex, in stage units."""
+    found = random.normal(size=points.shape)
+    return found * (size * _mean_edge(mesh, points) / np.linalg.norm(found, axis=1, keepdims=True))
 
 
 def _mean_edge(mesh: UsdGeom.Mesh, points: np.ndarray) -> float:

@@ -1,0 +1,209 @@
+"""Effects of numbers beyond the noise of ripples, and the page of `benchmarks.numbers` about them."""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from benchmarks.constants import ROUND_CONTACT, Number, counts
+from benchmarks.rows import table
+from benchmarks.verdicts import BETTER, EQUAL, WORSE, Values
+
+BASE_RIPPLES = 9
+"""Ripples of the solver as it is: its means enter every comparison."""
+ERRORS, LEAST = 3.0, 0.01
+"""Standard errors, and relative difference, beyond which a difference counts."""
+TIME_NOISE = 0.02
+"""Least relative standard deviation of times."""
+SHOWN = {
+    "energy": "energy",
+    "warm": "warm frame",
+    "first": "first frame",
+    "crossings": "crossings",
+    "jumps": "jumps",
+    "still": "still motion",
+}
+"""Figures of the table; crossings are those of cloth with cloth and with bodies."""
+COUNTS, TIMES = ("crossings", "jumps"), ("warm", "first")
+INTRODUCTION = """\
+Written by `python -m benchmarks.numbers`, whose head says how. Mean change over the scenes at half and at double a
+number: energy, times and still motion (of cloth whose cage stands) in percent; crossings and jumps in counts per run,
+summed over the scenes. In brackets the scenes where the change is more than three standard errors of the ripples'
+noise, + for worse and - for better. Less is better everywhere."""
+
+
+def key_of(scene: str, number: Number | None, kind: str) -> str:
+    """Identity of a variant in a file of figures; `kind` is "half", "double", or "base" with a number."""
+    if number is None:
+        return f"{scene}: {kind}"
+    return f"{scene}: {number.file} {number.label} {kind} {number.variants[kind]:g}"
+
+
+@dataclass(frozen=True)
+class Change:
+    """What a variant does to a figure of a scene.
+
+    Attributes:
+        relative: Difference of the means over the mean of the solver as it is; of counts, the difference itself.
+        verdict: Better, worse or equal within the noise.
+    """
+
+    relative: float
+    verdict: str
+
+
+def figures_of(run: Values) -> dict[str, float | None]:
+    """The table's figures of a run."""
+    return dict(run) | {"crossings": (run["cloth"] or 0) + (run["bodies"] or 0)}
+
+
+def noise_of(runs: Sequence[Sequence[Values]], base: Sequence[Values]) -> dict[str, float]:
+    """Standard deviation over ripples of each figure of a scene.
+
+    Args:
+        runs: Runs of each variant that has several.
+        base: Runs of the solver as it is.
+    """
+    noise = {}
+    for name in SHOWN:
+        own = _known(base, name)
+        groups = [own] if name in TIMES else [own, *(_known(each, name) for each in runs)]
+        variances = sorted(statistics.variance(each) for each in groups if len(each) > 1)
+        kept = variances[: max(1, len(variances) - len(variances) // 10)]
+        least = max(1.0, abs(statistics.fmean(own))) if name in COUNTS and own else 0.0
+        if name in TIMES and own:
+            least = (TIME_NOISE * statistics.fmean(own)) ** 2
+        noise[name] = math.sqrt(max(least, statistics.fmean(kept) if kept else 0.0))
+    return noise
+
+
+def _known(runs: Sequence[Values], name: str) -> list[float]:
+    return [value for run in runs if (value := figures_of(run).get(name)) is not None]
+
+
+def change_of(name: str, runs: Sequence[Values], base: Sequence[Values], noise: float) -> Change | None:
+    """What a variant does to a figure; None if the scene has no such figure."""
+    now, before = _known(runs, name), _known(base, name)
+    if not now or not before:
+        return None
+    if len(runs) == 1:
+        before = before[:1]
+        if name in TIMES:
+            return Change(0.0, EQUAL)
+    mean = statistics.fmean(before)
+    difference = statistics.fmean(now) - mean
+    relative = difference if name in COUNTS else difference / abs(mean) if mean else 0.0
+    error = noise * math.sqrt(1.0 / len(now) + 1.0 / len(before))
+    if abs(difference) <= max(ERRORS * error, LEAST * abs(mean)):
+        return Change(relative, EQUAL)
+    return Change(relative, BETTER if difference < 0 else WORSE)
+
+
+class Effects:
+    """Effects of variants in all scenes.
+
+    Attributes:
+        scenes: Names of the scenes.
+    """
+
+    def __init__(self, found: Mapping[str, Any], scenes: Sequence[str]) -> None:
+        """Measure the noise of each scene in all its variants."""
+        self.scenes, self._found = list(scenes), found
+        self._base = {name: [found[f"{name}: base {k}"][0] for k in range(BASE_RIPPLES)] for name in scenes}
+        self._noise = {
+            name: noise_of([each for key, each in found.items() if _is_changed(key, name, each)], self._base[name])
+            for name in scenes
+        }
+
+    def runs(self, number: Number, kind: str) -> dict[str, Any]:
+        """Runs of a variant in each scene, or the reason why there are none."""
+        return {name: self._found[key_of(name, number, kind)] for name in self.scenes}
+
+    def changes(self, number: Number, kind: str) -> dict[str, dict[str, Change]]:
+        """Changes of each figure in each scene; scenes without effect and failed runs are left out."""
+        found = {}
+        for scene, runs in self.runs(number, kind).items():
+            if not isinstance(runs, str) and len(runs) > 1:
+                base, noise = self._base[scene], self._noise[scene]
+                each = {name: change_of(name, runs, base, noise[name]) for name in SHOWN}
+                found[scene] = {name: change for name, change in each.items() if change is not None}
+        return found
+
+    def failures(self, number: Number, kind: str) -> dict[str, str]:
+        """Reasons of failed runs by scene."""
+        return {scene: runs for scene, runs in self.runs(number, kind).items() if isinstance(runs, str)}
+
+    def touched(self, number: Number) -> list[str]:
+        """Scenes where a variant of a number is better or worse, or fails."""
+        found = set()
+        for kind in number.variants:
+            found |= set(self.failures(number, kind))
+            for scene, changes in self.changes(number, kind).items():
+                if any(change.verdict != EQUAL for change in changes.values()):
+                    found.add(scene)
+        return [scene for scene in self.scenes if scene in found]
+
+    def kind_of(self, number: Number) -> str:
+        """A number's class, from "no effect here" to "several scenes"."""
+        if not number.variants:
+            return f"fixed: {number.fixed or 'zero'}"
+        if touched := self.touched(number):
+            return f"only {touched[0]} needs it" if len(touched) == 1 else "several scenes"
+        moves = any(self.changes(number, kind) for kind in number.variants)
+        return "equal within the noise" if moves else "no effect here"
+
+
+def _is_changed(key: str, scene: str, runs: Any) -> bool:
+    """Whether a file's entry is a variant of a scene with several ripples."""
+    return key.startswith(f"{scene}: ") and not isinstance(runs, str) and len(runs) > 1
+
+
+def page(numbers: Sequence[Number], found: Mapping[str, Any], scenes: Sequence[str]) -> str:
+    """The page in Markdown: a table of all variants, then numbers by class."""
+    effects = Effects(found, scenes)
+    rows = [row for number in numbers for row in rows_of(number, effects)]
+    head = ["file", "number", "value", "at", *SHOWN.values(), "effect"]
+    classes: dict[str, list[str]] = {}
+    for number in numbers:
+        classes.setdefault(effects.kind_of(number), []).append(f"`{number.file} {number.label}`")
+    lists = [f"**{kind}** ({len(each)}): {', '.join(each)}" for kind, each in sorted(classes.items())]
+    return "\n\n".join(
+        ["# What each number of the solver does", INTRODUCTION, table(head, rows), "## By class", *lists]
+    )
+
+
+def rows_of(number: Number, effects: Effects) -> Iterator[list[str]]:
+    """A row per variant of a number; one row for a number that cannot be changed."""
+    name = [number.file, f"`{number.label}`", f"{number.value:g}"]
+    if not number.variants:
+        yield [*name, "-", *["-"] * len(SHOWN), number.fixed or "zero"]
+    for kind, value in number.variants.items():
+        changes, failures = effects.changes(number, kind), effects.failures(number, kind)
+        cells = [_cell(key, {scene: each[key] for scene, each in changes.items() if key in each}) for key in SHOWN]
+        failed = "; ".join(f"fails in {scene}: {reason[:60]}" for scene, reason in failures.items())
+        some = any(change.verdict != EQUAL for each in changes.values() for change in each.values())
+        effect = "" if some else "equal within the noise" if changes else "" if failures else "no effect here"
+        yield [*name, f"{kind}: {value:g}", *cells, failed or effect]
+
+
+def _cell(figure: str, changes: Mapping[str, Change]) -> str:
+    """Mean change of a figure over scenes, or the sum of counts, and the scenes where the change exceeds the noise."""
+    if not changes:
+        return ""
+    values = [each.relative for each in changes.values()]
+    text = f"{sum(values):+.3g}" if figure in COUNTS else f"{100.0 * statistics.fmean(values):+.1f}%"
+    signs = {WORSE: "+", BETTER: "-"}
+    named = [f"{signs[each.verdict]}{scene}" for scene, each in changes.items() if each.verdict != EQUAL]
+    return f"{text} ({', '.join(named)})" if named else text
+
+
+def counted(numbers: Sequence[Number]) -> str:
+    """Numbers by room, those round contact, and of the whole solver."""
+    rooms = counts(numbers)
+    rows = [[room, count] for room, count in sorted(rooms.items(), key=lambda each: -each[1])]
+    rows += [["round contact: " + " + ".join(ROUND_CONTACT), sum(rooms[each] for each in ROUND_CONTACT)]]
+    rows += [["solver", len(numbers)]]
+    return "## Numbers by room\n\n" + table(["room", "numbers"], rows)
