@@ -89,12 +89,12 @@ def change_of(name: str, runs: Sequence[Values], base: Sequence[Values], noise: 
     now, before = _known(runs, name), _known(base, name)
     if not now or not before:
         return None
-    if len(runs) == 1:
-        before = before[:1]
-        if name in TIMES:
-            return Change(0.0, EQUAL)
-    mean = statistics.fmean(before)
-    difference = statistics.fmean(now) - mean
+    if now == before[: len(now)]:
+        return Change(0.0, EQUAL)
+    # Times have outliers, where another process took the cache.
+    centre = statistics.median if name in TIMES else statistics.fmean
+    mean = centre(before)
+    difference = centre(now) - mean
     relative = difference if name in COUNTS else difference / abs(mean) if mean else 0.0
     error = noise * math.sqrt(1.0 / len(now) + 1.0 / len(before))
     if abs(difference) <= max(ERRORS * error, LEAST * abs(mean)):
@@ -147,13 +147,28 @@ class Effects:
         return [scene for scene in self.scenes if scene in found]
 
     def kind_of(self, number: Number) -> str:
-        """A number's class, from "no effect here" to "several scenes"."""
+        """A number's class, from "no effect here" to "matters in several scenes"."""
         if not number.variants:
             return f"fixed: {number.fixed or 'zero'}"
         if touched := self.touched(number):
-            return f"only {touched[0]} needs it" if len(touched) == 1 else "several scenes"
-        moves = any(self.changes(number, kind) for kind in number.variants)
-        return "equal within the noise" if moves else "no effect here"
+            return f"matters in {touched[0]} only" if len(touched) == 1 else "matters in several scenes"
+        moved = any(self.moves(number, kind) for kind in number.variants)
+        return "equal within the noise" if moved else "no effect here"
+
+    def improves(self, number: Number, kind: str) -> bool:
+        """Whether a variant is better in a figure of a scene, and worse in none."""
+        changes = [change for each in self.changes(number, kind).values() for change in each.values()]
+        verdicts = {change.verdict for change in changes}
+        return BETTER in verdicts and WORSE not in verdicts and not self.failures(number, kind)
+
+    def moves(self, number: Number, kind: str) -> bool:
+        """Whether a variant changes any figure of any scene but times."""
+        return any(
+            change.relative
+            for changes in self.changes(number, kind).values()
+            for name, change in changes.items()
+            if name not in TIMES
+        )
 
 
 def _is_changed(key: str, scene: str, runs: Any) -> bool:
@@ -169,10 +184,13 @@ def page(numbers: Sequence[Number], found: Mapping[str, Any], scenes: Sequence[s
     classes: dict[str, list[str]] = {}
     for number in numbers:
         classes.setdefault(effects.kind_of(number), []).append(f"`{number.file} {number.label}`")
+    better = [(number, kind) for number in numbers for kind in number.variants if effects.improves(number, kind)]
+    if better:
+        names = [f"`{number.file} {number.label}` at {kind}" for number, kind in better]
+        classes["better in something and worse in nothing"] = names
     lists = [f"**{kind}** ({len(each)}): {', '.join(each)}" for kind, each in sorted(classes.items())]
-    return "\n\n".join(
-        ["# What each number of the solver does", INTRODUCTION, table(head, rows), "## By class", *lists]
-    )
+    title = "# What each number of the solver does"
+    return "\n\n".join([title, INTRODUCTION, table(head, rows), "## By class", *lists])
 
 
 def rows_of(number: Number, effects: Effects) -> Iterator[list[str]]:
@@ -185,7 +203,8 @@ def rows_of(number: Number, effects: Effects) -> Iterator[list[str]]:
         cells = [_cell(key, {scene: each[key] for scene, each in changes.items() if key in each}) for key in SHOWN]
         failed = "; ".join(f"fails in {scene}: {reason[:60]}" for scene, reason in failures.items())
         some = any(change.verdict != EQUAL for each in changes.values() for change in each.values())
-        effect = "" if some else "equal within the noise" if changes else "" if failures else "no effect here"
+        within = "equal within the noise" if effects.moves(number, kind) else "no effect here"
+        effect = "" if some or failures else within
         yield [*name, f"{kind}: {value:g}", *cells, failed or effect]
 
 

@@ -166,10 +166,10 @@ def test_effects_beyond_the_noise_are_told_from_those_within():
             found[f"{place} BAD {kind} {value}"] = "ValueError: no"
     effects = Effects(found, ["a", "b"])
     assert [effects.kind_of(each) for each in (worse, equal, idle, bad, fixed)] == [
-        "only a needs it",
+        "matters in a only",
         "equal within the noise",
         "no effect here",
-        "several scenes",
+        "matters in several scenes",
         "fixed: in a kernel",
     ]
     lines = page([worse, equal, idle, bad, fixed], found, ["a", "b"]).splitlines()
