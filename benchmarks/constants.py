@@ -171,7 +171,7 @@ def _fields(tree: ast.Module) -> Iterator[tuple[str, float]]:
 
 
 def _imports(module: str, tree: ast.Module) -> set[tuple[str, str]]:
-    """Module and name of each name that a module imports from another."""
+    """Source module and name of each imported name."""
     found = set()
     for node in tree.body:
         if isinstance(node, ast.ImportFrom):

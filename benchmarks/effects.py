@@ -13,7 +13,7 @@ from benchmarks.rows import table
 from benchmarks.verdicts import BETTER, EQUAL, WORSE, Values
 
 BASE_RIPPLES = 9
-"""Ripples of the solver as it is: its means enter every comparison."""
+"""Ripples of the unchanged solver, more than of variants: every comparison uses their mean."""
 ERRORS, LEAST = 3.0, 0.01
 """Standard errors, and relative difference, beyond which a difference counts."""
 TIME_NOISE = 0.02

@@ -79,7 +79,7 @@ class Band:
 
 
 def bands(runs: Sequence[Values]) -> dict[str, Band | None]:
-    """The band of each figure over the runs of one shot by one version."""
+    """Bands of all figures, from runs of one version with several ripples."""
     return {name: Band.of([run.get(name) for run in runs]) for name in FIGURES}
 
 

@@ -92,7 +92,15 @@ SHOTS = (
 
 @dataclass(frozen=True)
 class Task:
-    """One run: a job by a version, and what it depends on beside the job."""
+    """A job by one version.
+
+    Attributes:
+        row: Name of the row.
+        version: Name of the version.
+        tree: Checkout of the version.
+        code: Hash of the code of the version, the samples and the judge.
+        job: The job.
+    """
 
     row: str
     version: str
@@ -226,7 +234,7 @@ def job_of(row: Row, place: Path, folder: Path | None, frames: int) -> Job:
 
 
 def tasks_of(trees: Sequence[Path], rows: Sequence[Row], jobs: Sequence[Job]) -> list[Task]:
-    """All runs in the order in which they start: long shots first, versions of one shot side by side."""
+    """All runs in starting order: long shots first, all versions of a shot side by side."""
     names = [
         f"{tree.name} ({k})" if tree.name in [t.name for t in trees[:k]] else tree.name for k, tree in enumerate(trees)
     ]
@@ -255,16 +263,20 @@ def kept_runs(file: Path | None) -> dict[str, dict[str, Any]]:
 
 
 def warm_up(trees: Sequence[Path], device: str) -> None:
-    """Have each version compile its kernels, so that no measured run has to."""
-    for tree in trees:
+    """Compile the kernels of each version before the measured runs."""
+
+    def one(tree: Path) -> None:
         command = [sys.executable, "-m", "physgraph_usd", "warm-up", "--device", device]
         done = subprocess.run(command, cwd=tree, env=_environment(tree), capture_output=True, text=True, check=False)
         if done.returncode:
             raise click.ClickException(f"{tree.name}: {done.stderr[-500:]}")
 
+    with ThreadPoolExecutor() as pool:
+        list(pool.map(one, trees))
+
 
 def _environment(tree: Path) -> dict[str, str]:
-    """Variables of a process that imports the package of a checkout and has one thread."""
+    """Environment of a process with one thread and the package of a checkout."""
     return os.environ | {"PYTHONPATH": str(tree), "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 
 
@@ -300,7 +312,7 @@ def run_all(
 
 
 def run_one(task: Task, core: int | None, *, limit: float, files: Path) -> dict[str, Any]:
-    """The figures of a task, or the limit that it ran over, or its error."""
+    """Run a task in a process: its figures, its limit if time ran out, or its error."""
     asked, figures = files.with_suffix(".job.json"), files.with_suffix(".figures.json")
     asked.write_text(json.dumps(asdict(task.job)), "utf-8")
     pinned = ["taskset", "-c", str(core)] if core is not None and shutil.which("taskset") else []
