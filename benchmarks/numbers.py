@@ -11,7 +11,7 @@ standard deviation over ripples, pooled over all variants without the tenth that
 counts of chance do, and times by 2%. A difference is said where it exceeds three standard errors and 1%: one
 comparison in 370 does by chance. A variant whose first ripple gives equal figures to the bit, in about the same time,
 has no effect in the scene, and its other ripples are left out.
-All numbers take about 9,000 core seconds; with `--json` an interrupted command goes on.
+All numbers take about 10,000 core seconds, by an estimate; with `--json` an interrupted command goes on.
 
 Scenes are a few frames at level 1: a skirt whose cage crosses itself, a pinched T-shirt, three garments, a coat
 over a shirt, a dancer, and a folded sleeve whose cage stands but for movements of 0.1% of an edge, as in noise.
@@ -92,7 +92,7 @@ class Variant:
 @click.option("--only", "names", multiple=True, help="Only numbers of this name.")
 @click.option("--scene", "scenes", multiple=True, help="Only these scenes.")
 @click.option("--jobs", type=int, help="Processes.  [default: number of cores]")
-@click.option("--limit", default=120.0, show_default=True, help="Longest variant of a scene [s].")
+@click.option("--limit", default=240.0, show_default=True, help="Longest variant of a scene [s].")
 @click.option("--json", "file", type=click.Path(path_type=Path), help="Keep raw figures here, and go on from them.")
 @click.option("--out", type=click.Path(path_type=Path), help="Write the tables here too.")
 @click.option("--count", "only_count", is_flag=True, help="Print numbers by room only.")
