@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ from folds import (
     strip,
     view_of,
 )
+from meshes import grid
 from shots import refine
 
 from physgraph_usd.solver.collide.crossings import crossings
@@ -148,6 +150,45 @@ def test_seams_stay_closed_on_a_body(options: dict[str, Any]):
         assert gap_of(answer.points[0], base_of(cloth[0], cage, 1)) < 1e-7
         after = next(iter(answer.telemetry[0]["contact"]["bodies"].values()))["after"]
         assert after["inside"] == 0
+
+
+HEM = 8
+"""Edges of a hem along x, at y = 0; the cloth above it has the first vertices."""
+
+
+def on_a_hem(pieces: Sequence[Sequence[tuple[float, float]]]) -> Cloth:
+    """A sheet with a hem, and faces hanging from it, with corners at places (along the hem, above it) in edges."""
+    mesh, points = grid(HEM, 1)
+    number = len(points) + np.arange(sum(map(len, pieces)))
+    counts, indices = np.append(mesh.counts, [len(piece) for piece in pieces]), np.append(mesh.indices, number)
+    corners = np.array([(x, y, 0.0) for piece in pieces for x, y in piece])
+    return PolygonMesh(counts, indices, len(points) + len(number)), EDGE * np.concatenate([points, corners])
+
+
+STRAPS = {
+    "a strip between two points": [[(3.2, -1.0), (3.6, -1.0), (3.6, 0.0), (3.2, 0.0)]],
+    "a tip in an edge": [[(1.8, -1.0), (3.0, -1.0), (2.4, 0.0)]],
+    "a strip over two edges": [[(2.7, -1.0), (3.4, -1.0), (3.4, 0.0), (2.7, 0.0)]],
+    "a fringe": [[(k + 0.2, -2.0), (k + 0.6, -2.0), (k + 0.6, 0.0), (k + 0.2, 0.0)] for k in range(HEM)],
+}
+
+
+@pytest.mark.parametrize("level", [0, 1, 2])
+@pytest.mark.parametrize("name", STRAPS)
+def test_a_strap_sewn_on_between_two_points_of_a_border_stays_on_it(name: str, level: int):
+    """No two vertices of the cage are at one place: each sewn corner lies within an edge of a hem that is bent."""
+    mesh, points = on_a_hem(STRAPS[name])
+    bent = points + 0.5 * EDGE * np.sin(20.0 * points[:, :1]) * [0.0, 0.0, 1.0]
+    solver = refiner_with(sewn([named((mesh, points))], points), level=level)
+    x = solver.solve(frame_with([bent])).points[0]
+    at, strap = base_of(mesh, points, level), base_of(mesh, np.arange(len(points)) > 2 * HEM + 1, level) > 0.5
+    on_hem = np.abs(at[:, 1]) < 1e-9
+    hem, ends = np.flatnonzero(on_hem & ~strap), np.flatnonzero(on_hem & strap)
+    hem = x[hem[np.argsort(at[hem, 0])]]
+    along = (hem[:-1] + np.linspace(0.0, 1.0, 65)[:, None, None] * np.diff(hem, axis=0)).reshape(-1, 3)
+    away = np.linalg.norm(x[ends][:, None] - along, axis=2).min(axis=1)
+    assert len(ends) >= len(STRAPS[name])
+    assert away.max() < 0.01 * EDGE / 2**level
 
 
 def test_a_box_of_sewn_faces_settles():

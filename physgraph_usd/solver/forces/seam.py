@@ -60,7 +60,8 @@ class Seam:
             (leads.astype(float), (group, np.arange(len(sewn)))), shape=(group.max(initial=-1) + 1, len(sewn))
         )
         mean = sp.csr_matrix(sp.diags(1.0 / np.asarray(member.sum(axis=1)).ravel()) @ member)[group]
-        first = np.asarray(member.argmax(axis=1)).ravel()[group]
+        leading = np.flatnonzero(leads)  # Each group has one, and without groups there is none.
+        first = leading[np.unique(group[leading], return_index=True)[1]][group]
         device, dtype = level.device, level.dtype
         self._place, self._first = (torch.as_tensor(each, device=device) for each in (sewn, first))
         self._free = level.free[self._place]
