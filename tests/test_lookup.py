@@ -16,6 +16,7 @@ from physgraph_usd.solver.fabric import PRESETS
 from physgraph_usd.usd.lookup import check_overrides, parse_overrides
 from physgraph_usd.usd.read.materials import Values, find_values
 from physgraph_usd.usd.read.reader import open_shot
+from physgraph_usd.usd.schema import NAMESPACE, PROPERTIES, RETIRED
 from physgraph_usd.usd.stage import read_units
 
 BEND = "physgraph:material:bendStiffness"
@@ -120,6 +121,12 @@ def test_what_is_out_of_limits_is_refused_by_name(stage: Usd.Stage, value: float
             "may mean stretchStiffness, weftStretchStiffness, shearStiffness, bendStiffness, weftBendStiffness",
         ),
         ("offset=0.1", "may mean contact:offset, collider:offset; write one"),
+        (
+            "contact:layer=2",
+            "physgraph:contact:layer is no attribute any more: the order of layers is found .*leave it",
+        ),
+        ("</World/rig/cloth>.physgraph:contact:layer=2", "is no attribute any more"),
+        ("layer=2", "is no attribute any more"),
         ("side=left", "must be one of auto, winding, start, front, back"),
         ("bendStiffness=soft", "cannot use"),
         ("bendStiffness=-1", r"must be finite and in \[0, 100000\]"),
@@ -160,6 +167,18 @@ def test_misspelt_attributes_are_named_with_the_nearest_that_exists(stage: Usd.S
         f"</World/rig/cloth>: primvars:physgraph:bendscale {said} did you mean primvars:physgraph:bendScale?",
         f"</World>: userProperties:physgraph:material:densty {said} did you mean physgraph:material:density?",
     ]
+
+
+@pytest.mark.parametrize("name", ["physgraph:contact:layer", "userProperties:physgraph:contact:layer"])
+def test_a_retired_attribute_is_told_with_what_replaced_it(stage: Usd.Stage, name: str) -> None:
+    author(cloth(stage), name, 1, kind="int")
+    instead = "the order of layers is found in the animation, not authored; it can be removed"
+    assert told(stage) == [f"</World/rig/cloth>: {name} is no attribute any more: {instead}"]
+
+
+def test_retired_names_are_those_of_no_attribute() -> None:
+    assert not RETIRED.keys() & {row.name for row in PROPERTIES}
+    assert all(name.startswith(NAMESPACE) for name in RETIRED)
 
 
 def test_a_connection_is_followed_one_step(stage: Usd.Stage) -> None:

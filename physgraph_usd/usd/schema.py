@@ -41,6 +41,8 @@ for other pieces the side of the coarse cloth.
 """
 AXES = ("X", "Y", "Z", "-X", "-Y", "-Z")
 """Directions along the stage's axes."""
+RETIRED = {"physgraph:contact:layer": "the order of layers is found in the animation, not authored"}
+"""Attributes of earlier versions by full name, each with what replaced it."""
 _JERSEY = PRESETS["jersey"]
 
 
@@ -316,7 +318,7 @@ def find_property(text: str) -> Property:
     """Find a garment's or collider's property by full name, without ``physgraph:`` and ``material:``, or by last word.
 
     Raises:
-        UsageError: When the name is unknown or ambiguous; the message lists the names.
+        UsageError: When the name is unknown, retired or ambiguous; the message lists the names.
     """
     rows = GARMENT | COLLIDER
     for row in rows.values():
@@ -328,6 +330,9 @@ def find_property(text: str) -> Property:
         return meant[0]
     if len(meant) > 1:
         raise UsageError(f"attribute {text!r} may mean {', '.join(row.short for row in meant)}; write one of them out")
+    for name, instead in RETIRED.items():
+        if text in {name, name.removeprefix(NAMESPACE), name.rpartition(":")[2]}:
+            raise UsageError(f"{name} is no attribute any more: {instead}; leave it out")
     near = nearest_property(text, rows.values())
     hint = f"did you mean {near.short}? " if near else ""
     raise UsageError(f"unknown attribute {text!r}; {hint}known attributes: {', '.join(sorted(rows))}")

@@ -8,7 +8,7 @@ import numpy as np
 from pxr import Usd, UsdGeom
 
 from ..lookup import USER_PROPERTIES, bound_materials, connected, find_value, is_within, nearest, with_ancestors
-from ..schema import COLLIDER_API, GARMENT_API, MATERIAL, PROPERTIES, Property, nearest_property
+from ..schema import COLLIDER_API, GARMENT_API, MATERIAL, PROPERTIES, RETIRED, Property, nearest_property
 from ..stage import Notice
 from ..write.track import HEAT, PREFIX
 from .materials import ON_MATERIAL
@@ -67,6 +67,8 @@ def _fault(name: str, *, material: bool) -> str:
     """The reason for not reading a property of our namespace, or ""."""
     if name in _NAMES:
         return "is not read on a material; author it on the garment" if material and MATERIAL not in name else ""
+    if name in RETIRED:
+        return f"is no attribute any more: {RETIRED[name]}; it can be removed"
     near = nearest_property(name, PROPERTIES)
     hint = f"did you mean {near.name}?" if near else "docs/attributes.md lists all"
     return "" if name in _WRITTEN | _BLENDERS else f"is no attribute that refining reads; {hint}"
