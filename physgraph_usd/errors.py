@@ -8,14 +8,28 @@
     |   `-- SchemaError     an attribute has an unusable type or value
     |-- SolveError          the solver met a state it cannot continue from
     |-- WeightsError        a network's weights are missing, damaged or of another version
-    `-- LayerError          the output layer cannot be written or is invalid
+    |-- LayerError          the output layer cannot be written or is invalid
+    `-- UnexpectedError     any other exception: a fault of the program
 
 A message gives the value, the place and the choices, in one line each; `counted` puts numbers of things into words.
 """
 
 from __future__ import annotations
 
-from typing import Any
+import re
+import traceback
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any, Self
+
+LONGEST_TEXT = 300
+"""Most characters of an unexpected exception's text in a message."""
+MOST_NAMED = 3
+"""Most prims named in the message of an unexpected exception."""
+_OF_PACKAGE = re.compile(r'File ".*physgraph_usd[\\/](.+)", line (\d+), in (\S+)')
+"""A line of a traceback in this package."""
 
 
 class PhysGraphError(Exception):
@@ -83,6 +97,125 @@ class WeightsError(PhysGraphError):
 
 class LayerError(PhysGraphError):
     """The output layer cannot be written, or failed validation."""
+
+
+class UnexpectedError(PhysGraphError):
+    """An exception that the program did not raise on purpose.
+
+    Args:
+        kind: Name of the exception's class.
+        text: Text of the exception.
+        place: Where it was raised.
+        trace: The traceback.
+    """
+
+    def __init__(self, kind: str, text: str, *, place: Place | None = None, trace: str = "") -> None:
+        """Compose the message, in one line, from place, exception and remedy."""
+        self.kind, self.text, self.trace = kind, " ".join(text.split())[:LONGEST_TEXT], trace
+        self.place = Place() if place is None else place
+        what = f"unexpected {kind}: {self.text}" + (f" ({self.place.code})" if self.place.code else "")
+        super().__init__(f"{self.place.named()}{what}; {self._remedy()}")
+
+    def _remedy(self) -> str:
+        options = ["--frames"] * (self.place.time is not None) + ["--garment"] * bool(self.place.prims)
+        leave_out = f"{' or '.join(options)} can leave out where it happens, " if options else ""
+        return f"this is a fault of the program: {leave_out}--debug prints the traceback for a report of it"
+
+    @classmethod
+    def of(cls, error: BaseException, *, time: float | None = None) -> Self:
+        """Describe an exception; ``time`` is the time code if the exception has none."""
+        trace = "".join(traceback.format_exception(error))
+        return cls(type(error).__name__, str(error), place=place_of(error, time=time), trace=trace)
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where an exception was raised.
+
+    Attributes:
+        prims: Paths of the prims at work.
+        time: The time code at work, or None if unknown.
+        code: File, line and function of this package, such as "solver/level.py, line 7, in build".
+    """
+
+    prims: tuple[str, ...] = ()
+    time: float | None = None
+    code: str = ""
+
+    def named(self) -> str:
+        """The beginning of a message, such as "</World/Coat> at time code 3: "; "" if nothing is known."""
+        named, more = ", ".join(f"<{path}>" for path in self.prims[:MOST_NAMED]), len(self.prims) - MOST_NAMED
+        prims = f"{named} and {more:,} more" if more > 0 else named
+        parts = [prims] * bool(prims) + ([] if self.time is None else [f"at time code {self.time:g}"])
+        return f"{' '.join(parts)}: " if parts else ""
+
+
+class At(AbstractContextManager[None]):
+    """Notes prims and time code on exceptions raised inside the block, for `place_of`; inner blocks go first."""
+
+    def __init__(self, *, prims: tuple[str, ...] = (), time: float | None = None) -> None:
+        """Take what is at work in the block."""
+        self._at = {"prims": prims} if prims else {}
+        self._at |= {} if time is None else {"time": time}
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Note the place; the exception goes on."""
+        if error is not None:
+            vars(error)["physgraph_at"] = self._at | vars(error).get("physgraph_at", {})
+
+
+def place_of(error: BaseException, *, time: float | None = None) -> Place:
+    """Where an exception was raised, in this process or in another.
+
+    Args:
+        error: The exception.
+        time: The time code if the exception has none.
+    """
+    if isinstance(error, UnexpectedError):
+        return error.place
+    at = vars(error).get("physgraph_at", {})
+    if isinstance(error, GarmentError):
+        at = at | {"prims": (error.path,)} | ({} if error.time is None else {"time": error.time})
+    lines = _OF_PACKAGE.findall("".join(traceback.format_exception(error)))
+    own = [(file.replace("\\", "/"), line, name) for file, line, name in lines if "site-packages" not in file]
+    code = "{}, line {}, in {}".format(*own[-1]) if own else ""
+    return Place(tuple(at.get("prims", ())), at.get("time", time), code)
+
+
+def named(error: BaseException, *, time: float | None = None) -> PhysGraphError:
+    """An exception as an error of this tree; an error of the disk gives file and reason.
+
+    Args:
+        error: The exception.
+        time: The time code if the exception has none.
+    """
+    if isinstance(error, PhysGraphError):
+        return error
+    if isinstance(error, OSError) and error.strerror:
+        return PhysGraphError(f"{error.filename or 'cannot read or write'}: {error.strerror}")
+    return UnexpectedError.of(error, time=time)
+
+
+@contextmanager
+def exceptions_named(besides: tuple[type[Exception], ...] = ()) -> Iterator[None]:
+    """Convert exceptions raised inside the block to errors of this tree, with one line for the user and the traceback.
+
+    For the ends of a process: the command line, and a worker, whose exceptions may not travel to the parent.
+
+    Args:
+        besides: Exceptions to let through.
+
+    Raises:
+        PhysGraphError: The block raised an exception.
+    """
+    try:
+        yield
+    except (PhysGraphError, *besides):
+        raise
+    except Exception as error:
+        raise named(error) from error
 
 
 NOTICE = 25

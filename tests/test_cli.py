@@ -153,7 +153,7 @@ class TestRefine:
     def test_every_option_is_one_of_the_call(self) -> None:
         from physgraph_usd.shot.options import RefineOptions
 
-        own = {"shots", "out", "summary", "config", "verbose", "log_file", "seam_bound", "openjd"}
+        own = {"shots", "out", "summary", "config", "verbose", "log_file", "seam_bound", "openjd", "debug"}
         declared = {parameter.name for parameter in refine.params} - own
         assert declared == {field.name for field in fields(RefineOptions)} - {"sources"}
 

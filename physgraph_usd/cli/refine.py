@@ -19,7 +19,7 @@ from ..interrupts import exit_code_of as signal_code_of
 from .options import HEADINGS, out_option, run_options, together, under
 from .printing import LOGGER, Output, say
 from .show_file import values_for
-from .structure import DONE, FAILED, GroupedCommand, imports_uncollected
+from .structure import DONE, FAILED, GroupedCommand, errors_named, imports_uncollected, show_trace
 
 if TYPE_CHECKING:
     from ..shot.options import RefineOptions
@@ -119,6 +119,8 @@ def _refine_each(jobs: Sequence[Job], output: Output, *, summary: Path | None) -
                 rows.append(row_of(shot, layer, done))
                 if isinstance(done, PhysGraphError):
                     failed.append(done)
+                    if output.several:
+                        show_trace(done)
                 else:
                     say(done.to_json() if done.out is None else str(done.out))
     except (KeyboardInterrupt, SystemExit) as error:
@@ -175,9 +177,11 @@ def _solved(jobs: Sequence[Job], output: Output) -> Generator[RefineReport | Phy
 
     if not output.several:
         try:
-            yield _refine_shown(*jobs[0], output=output)
+            with errors_named():
+                done = _refine_shown(*jobs[0], output=output)
         except PhysGraphError as error:
-            yield error
+            done = error
+        yield done
         return
     workers = max(options.workers for *_, options in jobs)
     refine = partial(_refine_logged, output=output, alone=workers == 1)

@@ -49,7 +49,7 @@ def values_for(ctx: click.Context, shot: str, known: click.Command) -> tuple[dic
     file = find_show_file(shot, ctx.params.get("config"))
     table = {} if file is None else _read(file, known)
     values, sources = {}, {}
-    for param in ctx.command.params:
+    for param in (each for each in ctx.command.params if each.expose_value):
         name, key = str(param.name), _key(param)
         if ctx.get_parameter_source(name) not in (ParameterSource.DEFAULT, None):
             values[name], sources[name] = ctx.params[name], "command line"

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import errno
 import gc
 import os
 import signal
 import sys
+import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, Never
 
 import click
 
-from ..errors import PhysGraphError
+from ..errors import PhysGraphError, UnexpectedError, exceptions_named
 from ..interrupts import SIGNALLED, importing
 
 DONE, FAILED = 0, 1
@@ -21,31 +21,81 @@ EXTRAS = {"pxr": "usd", "PIL": "preview", "matplotlib": "chart", "plotly": "char
 """Which extra brings a module that only some commands need."""
 
 
+DEBUG = "physgraph_usd.debug"
+"""Key of ``--debug`` in the context of a command."""
+
+
 class Commands(click.Group):
-    """A group whose commands end with ``error: ...`` and the error's exit code instead of a traceback."""
+    """A group whose commands end with ``error: ...`` and the error's exit code; a traceback only with ``--debug``."""
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run the chosen command; an error of our tree, or one of the disk or of memory, becomes one line on stderr."""
-        from ..shot.processes import memory_is_named
-
+        """Run the chosen command; whatever it raises becomes one line on stderr."""
         _open_closed_streams()
         try:
-            with memory_is_named():
+            with errors_named():
                 return super().invoke(ctx)
-        except KeyboardInterrupt:
+        except KeyboardInterrupt as error:
+            _let_go(error)
             click.echo("interrupted", err=True)
             ctx.exit(SIGNALLED + signal.SIGINT)
         except PhysGraphError as error:
+            show_trace(error)
+            _let_go(error)
             _leave(ctx, str(error), error.exit_code)
-        except OSError as error:
-            if error.errno == errno.EPIPE:
-                raise
-            _leave(ctx, f"{error.filename or 'cannot read or write'}: {error.strerror}", FAILED)
+
+    def add_command(self, cmd: click.Command, name: str | None = None) -> None:
+        """Add a command, with the option ``--debug``."""
+        cmd.params.append(_debug_option())
+        super().add_command(cmd, name)
+
+
+def _debug_option() -> click.Option:
+    def keep(ctx: click.Context, _param: click.Parameter, value: bool) -> None:
+        ctx.meta[DEBUG] = value
+
+    return Option(
+        ["--debug"],
+        is_flag=True,
+        expose_value=False,
+        callback=keep,
+        heading="Messages",
+        help="Print the traceback of an error too.",
+    )
+
+
+@contextmanager
+def errors_named() -> Iterator[None]:
+    """Convert exceptions, other than click's and that of a closed pipe, to errors with one line for the user.
+
+    Raises:
+        PhysGraphError: The block raised an exception.
+    """
+    from ..shot.processes import memory_is_named
+
+    of_click = (click.ClickException, click.Abort, click.exceptions.Exit, BrokenPipeError)
+    with exceptions_named(besides=of_click), memory_is_named():
+        try:
+            yield
         except ModuleNotFoundError as error:
             missing = (error.name or "").partition(".")[0]
             if missing not in EXTRAS:
                 raise
-            _leave(ctx, f"{missing} is not installed: pip install 'physgraph-usd[{EXTRAS[missing]}]'", FAILED)
+            install = f"{missing} is not installed: pip install 'physgraph-usd[{EXTRAS[missing]}]'"
+            raise PhysGraphError(install) from error
+
+
+def _let_go(error: BaseException | None) -> None:
+    """Free what the frames of tracebacks hold: nanobind complains on stderr of factors that live to the very end."""
+    while error is not None:
+        traceback.clear_frames(error.__traceback__)
+        error = error.__cause__ or error.__context__
+
+
+def show_trace(error: PhysGraphError) -> None:
+    """Print the traceback of an error on stderr, with ``--debug`` only."""
+    if click.get_current_context().meta.get(DEBUG):
+        trace = error.trace if isinstance(error, UnexpectedError) else "".join(traceback.format_exception(error))
+        click.echo(trace, err=True, nl=False)
 
 
 def _open_closed_streams() -> None:

@@ -210,7 +210,7 @@ def _collect(
                 _lost(time)
             continue
         if over:
-            result_of(owner, at="" if time is None else f" at time code {time:g}")
+            result_of(owner, time=time)
             latest = latest or clock.monotonic() + LATE_SECONDS
             if clock.monotonic() > latest:
                 _lost(time)

@@ -12,14 +12,13 @@ import signal
 import sys
 import threading
 import time
-import traceback
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor, ThreadPoolExecutor, wait
 from functools import partial
 from multiprocessing.context import BaseContext
 from typing import Any
 
-from ..errors import PhysGraphError, SolveError
+from ..errors import PhysGraphError, SolveError, exceptions_named, named
 from ..interrupts import exit_code_of, leave_if_asked, signals_noted
 
 POLL_SECONDS = 0.02
@@ -122,19 +121,19 @@ def wait_for(future: Future[Any]) -> None:
         wait([future], POLL_SECONDS)
 
 
-def result_of(future: Future[Any], *, at: str = "") -> Any:
+def result_of(future: Future[Any], *, time: float | None = None) -> Any:
     """Wait for a call's result.
 
     Args:
         future: The call.
-        at: Work of the call at its end, for the message, such as " at time code 5".
+        time: Time code of the call's work at its end, for the message.
 
     Raises:
-        PhysGraphError: Raised or returned by the function; an unforeseen error is converted, with the traceback on
-            stderr.
+        PhysGraphError: Raised or returned by the function; other exceptions are converted by `named`.
         SolveError: The process died, or a farm dropped the call.
     """
     wait_for(future)
+    at = "" if time is None else f" at time code {time:g}"
     if future.cancelled():
         raise SolveError(f"a call was cancelled{at}: the farm's scheduler is gone, or dropped the call")
     error = future.exception()
@@ -146,8 +145,7 @@ def result_of(future: Future[Any], *, at: str = "") -> Any:
     if isinstance(error, BrokenExecutor) and error.__cause__ is None:
         remedy = "if memory ran out, use fewer --workers or a lower --level"
         raise SolveError(f"a worker process died{at}; {remedy}")
-    traceback.print_exception(error)
-    raise PhysGraphError(f"unexpected {type(error).__name__}: {error}") from error
+    raise named(error, time=time) from error
 
 
 @contextlib.contextmanager
@@ -179,7 +177,7 @@ def _begin(card: str | None, threads: int) -> None:
 def _answer(function: Callable[..., Any], *args: Any) -> Any:
     """Call a function in a worker process; a signal ends the process once the function has cleaned up."""
     try:
-        with signals_noted(), memory_is_named():
+        with signals_noted(), exceptions_named(), memory_is_named():
             answer = function(*args)
     except SystemExit as error:
         os._exit(exit_code_of(error) or 1)

@@ -5,8 +5,10 @@ from __future__ import annotations
 import dataclasses
 import time as clock
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
+from functools import partial
 from pathlib import Path
+from types import TracebackType
 from typing import Any
 
 from ..errors import LayerError, PhysGraphError, StageError, UsageError
@@ -138,10 +140,13 @@ def running(
     out: Path | None = None,
     on_report: Callable[[RefineReport], None] | None = None,
 ) -> Iterator[tuple[Shot, RefineReport]]:
-    """Open a shot and begin its report; a failed or interrupted run writes the report if requested."""
+    """Open a shot and begin its report; a run ended by a signal or any exception writes the report if requested."""
     report = RefineReport(shot_name(shot), None, options.plain(), options.value_sources())
     began = clock.perf_counter()
-    try:
+    with ExitStack() as ends:
+        if on_report is not None:
+            ends.callback(on_report, report)
+        ends.push(partial(_record_end, report, options, out))
         with signals_noted(), memory_is_named(), closing(open_for(shot, options)) as opened:
             warnings = begin_report(report, opened, options)
             report.seconds["open"] = clock.perf_counter() - began
@@ -149,20 +154,25 @@ def running(
                 raise large
             report.warn(*warnings, *([] if FACTOR == "cholespy" else [WARNINGS["slower"]()]))
             yield opened, report
-    except PhysGraphError as error:
-        report.error = str(error)
-        if not isinstance(error, UsageError):
-            _write_failure(report, options)
-        raise
-    except (KeyboardInterrupt, SystemExit) as error:
-        if (code := exit_code_of(error)) is not None:
-            kept = None if out is None else kept_for(out)
-            report.signal, report.error = code - SIGNALLED, f"interrupted, {kept or 'no frame is kept'}"
-            _write_failure(report, options)
-        raise
-    finally:
-        if on_report is not None:
-            on_report(report)
+
+
+def _record_end(
+    report: RefineReport,
+    options: RefineOptions,
+    out: Path | None,
+    kind: type[BaseException] | None,
+    error: BaseException | None,
+    trace: TracebackType | None,
+) -> None:
+    """Record the exception or signal that ends a run, and write the report if requested; the exception goes on."""
+    if isinstance(error, Exception):
+        report.fail(error)
+    elif (code := exit_code_of(error)) is not None:
+        kept = None if out is None else kept_for(out)
+        report.signal, report.error = code - SIGNALLED, f"interrupted, {kept or 'no frame is kept'}"
+    else:
+        return
+    _write_failure(report, options)
 
 
 def refine_shots(

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from ..errors import named, place_of
 from ..interrupts import SIGNALLED
 from ..usd.write.atomic import write_text
 from ..version import __version__
@@ -77,6 +78,7 @@ class RefineReport:
         seconds: Wall time of each stage [s].
         peak_memory_mb: Peak resident memory of this process [MB]; None if the system does not tell.
         error: Error that ended the run; "" for a complete run.
+        failure: Class of the error, place and exit code; None for a complete or interrupted run.
         signal: Number of the signal that interrupted the run; None for none.
         skipped: Whether an existing layer was kept unchanged.
     """
@@ -101,12 +103,13 @@ class RefineReport:
     seconds: dict[str, float] = field(default_factory=dict)
     peak_memory_mb: float | None = None
     error: str = ""
+    failure: dict[str, Any] | None = None
     signal: int | None = None
     skipped: bool = False
 
     @property
     def exit_code(self) -> int:
-        """0 done, 1 failed, 3 done in part, 128 plus the signal's number if the run was interrupted.
+        """0 done, 1 failed, 2 wrong usage, 3 done in part, 128 plus the signal's number if the run was interrupted.
 
         A run is done in part if some frames failed or some garment was not solved in a frame. A strict run is also done
         in part if some frames did not settle, or more than a tenth of the input's crossings remain.
@@ -114,7 +117,7 @@ class RefineReport:
         if self.signal is not None:
             return SIGNALLED + self.signal
         if self.error:
-            return FAILED
+            return FAILED if self.failure is None else self.failure["exit_code"]
         if not self.failed:
             unsolved = any(entry.get("error") for entry in self.unsettled)
             return IN_PART if unsolved or (self.strict and (self.unsettled or self.leaves_crossings)) else DONE
@@ -143,6 +146,18 @@ class RefineReport:
         entries = list(zip(paths, frame.get("garments", ()), strict=False))
         alone = [entry for path, entry in entries if is_first(path, entry)]
         return [entry["contact"] for entry in alone if entry.get("contact")]
+
+    def fail(self, error: Exception) -> None:
+        """Record the error that ends the run."""
+        ours, place = named(error), place_of(error)
+        self.error = str(ours)
+        self.failure = {
+            "kind": getattr(ours, "kind", type(error).__name__),
+            "prims": list(place.prims),
+            "time": place.time,
+            "code": place.code,
+            "exit_code": ours.exit_code,
+        }
 
     def warn(self, *warnings: str) -> None:
         """Add new warnings, merge warnings of a kind about several prims, and log them."""

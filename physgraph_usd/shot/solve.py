@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from ..errors import SolveError, StageError
+from ..errors import At, SolveError, StageError
 from ..interrupts import leave_if_asked
 from ..solver.frame.lead_in import cages_walked
 from ..solver.frame.refiner import Refiner
@@ -81,9 +81,10 @@ class ShotSolver:
         for time in times:
             began = clock.perf_counter()
             try:
-                frame = shot.frame(time)
-                read_ms = round(1e3 * (clock.perf_counter() - began), 3)
-                state = refiner.solve(frame, sampled_at(shot, time))
+                with At(time=time):
+                    frame = shot.frame(time)
+                    read_ms = round(1e3 * (clock.perf_counter() - began), 3)
+                    state = refiner.solve(frame, sampled_at(shot, time))
                 record = {"time": time, "read_ms": read_ms, "garments": list(state.telemetry)}
                 outcome = Outcome(time, state.points, state.reused, record, state.heat)
             except (SolveError, StageError) as error:

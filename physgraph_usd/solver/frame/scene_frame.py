@@ -9,7 +9,7 @@ from functools import reduce
 import numpy as np
 import torch
 
-from ...errors import GarmentError, SolveError
+from ...errors import At, GarmentError, SolveError
 from ..contact.bodies import Touching
 from ..contact.broad_phase import Bodies, TouchingGroups, bounds_of, reach_of
 from ..contact.heat import body_crossings, penetration_map
@@ -190,7 +190,8 @@ class SceneFrame:
             if not any(asked[index] for index in part):
                 continue
             try:
-                found |= zip(part, self._answer(part, near, same=same), strict=True)
+                with At(prims=tuple(self.cloth.scene.garments[index].path for index in part)):
+                    found |= zip(part, self._answer(part, near, same=same), strict=True)
             except SolveError as error:
                 unsolved[part] = error
         if unsolved and not found:
