@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import json
 import platform
+import subprocess
 import sys
 import time
 import warnings
@@ -162,12 +163,30 @@ def row(case: Case, names: list[str], cells: Cells | None = None) -> tuple[list[
     return [held for held, _ in found + columns], f"{head} {once} | {' | '.join(shown)} |"
 
 
+def commit() -> str:
+    """The commit of this checkout, and whether its code was changed since; "no commit" outside of a repository."""
+    root = Path(__file__).resolve().parents[2]
+    asked = (["rev-parse", "--short=10", "HEAD"], ["status", "--porcelain", "--", "physgraph_usd", "tests/stability"])
+    ran = [subprocess.run(["git", *line], cwd=root, capture_output=True, text=True, check=False) for line in asked]
+    head, changed = (each.stdout.strip() for each in ran)
+    return f"{head or 'no commit'}{', with changes' if changed else ''}"
+
+
+def cells_of(page: str) -> dict[tuple[str, str], bool]:
+    """Whether each measured cell of a page passed, by case and column."""
+    rows = [[part.strip() for part in line.strip("|").split("|")] for line in page.splitlines() if line.startswith("|")]
+    (head, _, *cases), first = rows, rows[0].index("all")
+    cells = {(row[0], name): text for row in cases for name, text in zip(head[first:], row[first:], strict=True)}
+    return {key: text.startswith("pass") for key, text in cells.items() if text.startswith(("pass", "**fail**"))}
+
+
 TEXT = """# Stability
 
-Where methods fail, case by case. Written by `python -m tests.stability.report{form}` in {minutes:.0f} minutes of
-processor time ({machine}; float64 unless a case says otherwise, float32 where something is touched). {long} The
-measurements are in `report_solver.py`, `report_contact.py` and `report_stages.py` beside it; the tests in that folder
-hold `quasi-newton` to bounds. What a test there expects to fail fails here too, with its figure.
+Where methods fail, case by case, at commit {commit}. Written by `python -m tests.stability.report{form}` in
+{minutes:.0f} minutes of processor time ({machine}; float64 unless a case says otherwise, float32 where something is
+touched). {long} The measurements are in `report_solver.py`, `report_contact.py` and `report_stages.py` beside
+it; the tests in that folder hold `quasi-newton` to bounds. What a test there expects to fail fails here too, with its
+figure.
 
 A cell says whether the case passed and what was measured. "all" is for what no method decides; n/a means that the case
 does not concern the column. `adam`, `gd` and the learned `physgraph` and `physgraph-paper` are guarded; `quasi-newton`,
@@ -217,6 +236,7 @@ def main(chosen: tuple[int, ...], short: bool, fresh: bool, out: Path) -> None:
     figures = {"passed": sum(every), "measured": len(every), "own": sum(own), "all_own": len(own)}
     form, long = (" --short", f"With `{SLOW}`, without --short, it takes about {LONG_MINUTES}.") if short else ("", "")
     words = {"form": form, "long": long, "minutes": cells.seconds / 60.0, "machine": f"{platform.machine()}, CPU"}
+    words["commit"] = commit()
     out.write_text(TEXT.format(table=table, **words, **figures), encoding="utf-8")
     click.echo(out)
 

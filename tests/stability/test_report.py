@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from functools import partial
 from pathlib import Path
 
@@ -31,6 +32,46 @@ def test_a_cell_that_is_known_is_not_measured_again(tmp_path: Path):
     assert len(calls) == 1
     report.Cells(file).get(7, "two", measure)
     assert len(calls) == 2
+
+
+ANEW = (
+    (11, "physgraph"),
+    (11, "adam"),
+    (13, "physgraph"),
+    (15, "adam"),
+    (17, "physgraph"),
+)
+"""Cells that take half a second each, two of them failed: turned cloth far away, wrinkles, a crumpled ball, pins."""
+
+
+@pytest.mark.parametrize(("number", "method"), ANEW)
+def test_the_page_says_what_this_code_does(number: int, method: str):
+    """If this fails the page is of another version: make it anew, and look at each cell that changed."""
+    measure = report.CASES[number - 1].by_method
+    assert measure is not None
+    held, text = report.cell(partial(measure, method))
+    assert report.cells_of(report.PAGE.read_text("utf-8"))[f"S{number}", method] == held, text
+
+
+def test_the_page_counts_its_cells_and_names_its_commit():
+    page = report.PAGE.read_text("utf-8")
+    cells = report.cells_of(page)
+    counted = re.search(r"^(\d+) of (\d+) measured cells pass", page, re.MULTILINE)
+    assert counted is not None
+    assert (int(counted[1]), int(counted[2])) == (sum(cells.values()), len(cells))
+    assert re.search(r"case by case, at commit [0-9a-f]{7,}(, with changes)?\.", page)
+
+
+def test_a_page_is_read_cell_by_cell():
+    names = ["one", "two"]
+    results = {"one": Result(True, "0 of 7"), "two": Result(False, "7 of 7")}
+    case = report.Case(3, "what", "bound", by_method=results.__getitem__)
+    held, line = report.row(case, names)
+    assert report.cells_of(f"| case | what | passes | all | one | two |\n|---|---|---|---|---|---|\n{line}\n") == {
+        ("S3", "one"): True,
+        ("S3", "two"): False,
+    }
+    assert held == [True, False]
 
 
 BEYOND = {
