@@ -12,6 +12,8 @@ import pytest
 
 OF_VIEWER = "Unable to preventDefault inside passive event listener invocation."
 """What the viewer's own code complains of when a mesh is dragged."""
+PATIENCE_MS = 120_000
+"""How long something must not have happened before a test gives up; nothing else depends on it."""
 NAMES = ("chromium", "chromium-browser", "google-chrome")
 
 
@@ -65,6 +67,7 @@ def _browser() -> Iterator[Any]:
 
 def _watch(page: Any, said: list[str], *, own: tuple[str, ...]) -> None:
     """Note errors, and what is asked for elsewhere."""
+    page.set_default_timeout(PATIENCE_MS)
     page.on("pageerror", lambda error: said.append(str(error)))
     page.on("request", lambda asked: None if asked.url.startswith(own) else said.append(asked.url))
 

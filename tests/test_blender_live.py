@@ -25,7 +25,7 @@ from physgraph_usd.studio.live import changes_in
 from physgraph_usd.studio.session import TuneSession
 from physgraph_usd.studio.values import TUNABLES
 
-PATIENCE_SECONDS = 60.0
+PATIENCE_SECONDS = 180.0
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from time import perf_counter
+from time import process_time
 
 import numpy as np
 import pytest
@@ -85,9 +85,9 @@ def test_a_warning_names_the_frame(tmp_path: Path, scale: float):
 def test_a_collapsed_frame_is_told_of_and_counts_as_unsettled(tmp_path: Path, when: float, frozen: bool):
     shot = cloth_shot(tmp_path / "shot.usdc", broken={when: 1e-3}, frozen=frozen)
     whole = cloth_shot(tmp_path / "whole.usdc", frozen=frozen)
-    began = perf_counter()
+    began = process_time()
     report = refine(shot, tmp_path / "fine.usdc", strict=True)
-    assert perf_counter() - began < 60.0
+    assert process_time() - began < 60.0
     (warning,) = (each for each in report.warnings if each.startswith(f"<{CLOTH}> at time code {when:g}: "))
     assert "0.1% of its rest shape's size" in warning
     assert "--frames" in warning

@@ -8,7 +8,6 @@ import pickle
 import subprocess
 import sys
 import sysconfig
-import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import fields
@@ -77,11 +76,12 @@ class TestInstalled:
         assert sum("no sample is written at time code 2" in line for line in said) == 1
 
     def test_help_answers_at_once(self, script: Path) -> None:
+        """In processor time, which other programs on the machine change little."""
         seconds = []
         for _ in range(5):
-            start = time.perf_counter()
+            start = sum(os.times()[2:4])
             subprocess.run([script, "--help"], capture_output=True, check=True)
-            seconds.append(time.perf_counter() - start)
+            seconds.append(sum(os.times()[2:4]) - start)
         assert min(seconds) < 0.5
 
 

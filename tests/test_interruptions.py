@@ -24,6 +24,8 @@ from physgraph_usd.usd.write.atomic import HOST
 
 TIMES = tuple(float(t) for t in range(1, 41))
 LINE = ("--level", "2", "--steps", "4", "--temporal", "off")
+PATIENCE_SECONDS = 180.0
+"""How long something must not have happened before a test gives up; nothing else depends on it."""
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +54,7 @@ def running(shot: Path, out: Path, *extra: str, **options: Any) -> Iterator[subp
     """A run that has begun to write, in a process group of its own."""
     process = begun("refine", shot, "-o", out, *LINE, *extra, start_new_session=True, **options)
     try:
-        limit = time.monotonic() + 60
+        limit = time.monotonic() + PATIENCE_SECONDS
         while process.poll() is None and len(finished(out)) < 3 and time.monotonic() < limit:
             time.sleep(0.002)
         yield process
@@ -121,7 +123,7 @@ def test_a_worker_that_is_killed_is_named_by_its_frame_and_costs_no_finished_one
         workers = [worker for server in psutil.Process(process.pid).children() for worker in server.children()]
         assert len(workers) == 2
         workers[0].kill()
-        error = process.communicate(timeout=60)[1]
+        error = process.communicate(timeout=PATIENCE_SECONDS)[1]
     assert process.returncode == 1, error
     assert "error: a worker process died at time code" in error.splitlines()[-1]
     assert "if memory ran out, use fewer --workers or a lower --level" in error.splitlines()[-1]
@@ -162,7 +164,7 @@ def test_a_polite_signal_keeps_finished_frames_and_says_so(
     report, summary = tmp_path / "report.json", tmp_path / "summary.json"
     with running(shot, out, "--workers", workers, "--report", str(report), "--summary", str(summary)) as process:
         process.send_signal(number)
-        code = process.wait(timeout=30)
+        code = process.wait(timeout=PATIENCE_SECONDS)
     assert code == 128 + number
     assert [file.name for file in out.parent.iterdir()] == [frames_folder(out).name]
     assert all(file.name == "run.json" or file in finished(out) for file in frames_folder(out).iterdir())
@@ -235,7 +237,7 @@ def test_a_second_run_leaves_the_frames_of_the_first_alone(shot: Path, whole: by
         assert there
         assert finished(out) == there
         first.send_signal(signal.SIGCONT)
-        assert first.wait(timeout=60) == 0
+        assert first.wait(timeout=PATIENCE_SECONDS) == 0
     assert out.read_bytes() == whole
     assert [file.name for file in out.parent.iterdir()] == [out.name]
 
@@ -273,7 +275,7 @@ def test_a_signal_leaves_no_empty_folder(shot: Path, tmp_path: Path, number: sig
         while process.poll() is None and not out.exists():
             time.sleep(0.002)
         process.send_signal(number)
-        assert process.wait(timeout=30) != 0
+        assert process.wait(timeout=PATIENCE_SECONDS) != 0
     finally:
         process.kill()
     assert sorted(file.name for file in tmp_path.iterdir()) == ["other.usdc", "summary.json"]
@@ -285,7 +287,7 @@ def test_a_killed_run_with_workers_leaves_no_process(shot: Path, tmp_path: Path)
         workers = psutil.Process(process.pid).children()
         process.kill()
         process.wait()
-        assert not psutil.wait_procs(workers, timeout=30)[1], "workers outlive the run"
+        assert not psutil.wait_procs(workers, timeout=PATIENCE_SECONDS)[1], "workers outlive the run"
 
 
 @pytest.mark.parametrize(

@@ -409,7 +409,7 @@ def test_a_loop_plays_the_range_round_and_goes_on_with_changes(session: TuneSess
     assert log.errors == []
 
 
-def wait_for(happened: Callable[[], bool], seconds: float = 60.0) -> None:
+def wait_for(happened: Callable[[], bool], seconds: float = 180.0) -> None:
     end = clock.monotonic() + seconds
     while not happened():
         assert clock.monotonic() < end

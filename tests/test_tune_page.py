@@ -15,7 +15,7 @@ pytest.importorskip("pxr", reason="shots are read with usd-core")
 pytest.importorskip("viser", reason="the page is served with viser")
 pytest.importorskip("PIL.Image", reason="screenshots are compared with pillow")
 
-from browser import served
+from browser import PATIENCE_MS, served
 from PIL import Image
 from pxr import Usd, UsdGeom
 from shots import CLOTH, cloth_shot
@@ -24,11 +24,14 @@ from stages import vec3
 from physgraph_usd.lab.samples.shapes import ellipsoid
 from physgraph_usd.studio.page import TunePage
 from physgraph_usd.studio.session import TuneSession
+from physgraph_usd.studio.values import TUNABLES
 from physgraph_usd.usd.read.reader import open_shot
 
 pytestmark = pytest.mark.browser
 SETTLED = "settled: as refine solves it"
-PATIENCE_MS = 60000
+POLL_MS = 50
+FRAMES = "() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))"
+"""Waits until the browser has drawn twice: once may be under way."""
 EMPTY = (60, 850)
 """A place of the picture without cloth."""
 
@@ -40,16 +43,36 @@ class Artist:
         self.page = page
         self.settle()
 
-    def settle(self, undone: str = "") -> None:
-        """Wait until cloth is settled, after the change that undo would take back."""
-        if undone:
-            self.page.get_by_role("button", name=f"Undo {undone}", exact=True).wait_for(timeout=PATIENCE_MS)
-        self.page.get_by_text(SETTLED).wait_for(timeout=PATIENCE_MS)
+    def until(self, happened: Callable[[], Any], what: str) -> Any:
+        """Wait until something has happened; returns what it gives."""
+        for _ in range(PATIENCE_MS // POLL_MS):
+            if found := happened():
+                return found
+            self.page.wait_for_timeout(POLL_MS)
+        pytest.fail(f"never: {what}")
 
-    def picture(self) -> np.ndarray:
-        self.page.wait_for_timeout(600)
-        whole = Image.open(io.BytesIO(self.page.screenshot()))
-        return np.asarray(whole.convert("RGB"), float)[250:, :1000]
+    def settle(self, undone: str = "") -> None:
+        """Wait until cloth is settled, after the change that undo would take back.
+
+        Without a change the page may still say so of what was before: wait for the session, too.
+        """
+        if undone:
+            self.page.get_by_role("button", name=f"Undo {undone}", exact=True).wait_for()
+        self.page.get_by_text(SETTLED).wait_for()
+
+    def picture(self, holds: Callable[[np.ndarray], object] = lambda _: True) -> np.ndarray:
+        """The picture, once something holds of it and it stands still: twice the same in a row."""
+        last = np.zeros(0)
+
+        def found() -> list[np.ndarray]:
+            nonlocal last
+            self.page.evaluate(FRAMES)
+            whole = Image.open(io.BytesIO(self.page.screenshot()))
+            now = np.asarray(whole.convert("RGB"), float)[250:, :1000]
+            stands, last = np.array_equal(now, last), now
+            return [now] if stands and holds(now) else []
+
+        return self.until(found, "the picture stands still and shows what is waited for")[0]
 
     def tab(self, name: str) -> None:
         self.page.get_by_role("tab", name=name).click()
@@ -59,14 +82,9 @@ class Artist:
         found = f"xpath=//label[normalize-space()='{title}']/following::input[not(@type='hidden')][1]"
         return self.page.locator(found)
 
-    def shown(self, title: str, value: Callable[[], float | None]) -> float:
-        """The session's value, once the box shows it: a drag's last event may come after a first settling."""
-        for _ in range(PATIENCE_MS // 200):
-            found = value()
-            if found is not None and float(self.number(title).input_value()) == pytest.approx(found, rel=0.01):
-                return found
-            self.page.wait_for_timeout(200)
-        pytest.fail(f"the box shows {self.number(title).input_value()}, not {value()}")
+    def shows(self, title: str, value: float | None) -> bool:
+        """Whether a number box shows a value."""
+        return float(self.number(title).input_value()) == pytest.approx(value, rel=0.01)
 
     def type(self, title: str, number: str) -> None:
         self.number(title).fill(number)
@@ -81,8 +99,8 @@ class Artist:
         self.page.mouse.click(*EMPTY)
         self.page.keyboard.press(key)
 
-    def slide(self, title: str, place: float) -> None:
-        """Drag a slider to a place, 0 to 1."""
+    def slide(self, title: str, place: float) -> float:
+        """Drag a slider to a place, 0 to 1; returns the place where its thumb is let go."""
         thumb = self.number(title).locator("xpath=following::*[@role='slider'][1]")
         thumb.scroll_into_view_if_needed()
         track = thumb.locator("xpath=ancestor::*[contains(@class, 'Slider-track')][1]").bounding_box()
@@ -91,6 +109,7 @@ class Artist:
         mouse.down()
         mouse.move(track["x"] + place * track["width"], box["y"] + box["height"] / 2, steps=5)
         mouse.up()
+        return float(thumb.get_attribute("aria-valuenow"))
 
 
 @contextmanager
@@ -109,11 +128,13 @@ def shot(tmp_path: Path) -> Path:
 def test_values_are_slid_typed_undone_and_saved(shot: Path):
     with tuned(shot) as (session, artist):
         before = artist.picture()
-        artist.slide("Guide [N/m³]", 0.2)
-        artist.settle("Guide Stiffness")
-        slid = artist.shown("Guide [N/m³]", lambda: session.value(CLOTH, "guide:stiffness"))
+        slid = TUNABLES["guide:stiffness"].at(artist.slide("Guide [N/m³]", 0.2))
         assert slid < 300.0
-        assert np.abs(artist.picture() - before).mean() > 0.1
+        arrived = "the last place of the drag is the session's value, and the box shows it"
+        artist.until(lambda: session.value(CLOTH, "guide:stiffness") == pytest.approx(slid), arrived)
+        artist.settle("Guide Stiffness")
+        artist.until(lambda: artist.shows("Guide [N/m³]", slid), arrived)
+        artist.picture(lambda now: np.abs(now - before).mean() > 0.1)
         artist.type("Bending [µN·m]", "80")
         artist.settle("Bending Stiffness")
         assert session.value(CLOTH, "bendStiffness") == pytest.approx(8e-5)
@@ -145,44 +166,43 @@ def test_presets_camera_and_frame_outlive_a_restart(shot: Path):
         artist.page.get_by_role("button", name="Keep as preset").click()
         artist.tab("Picture")
         artist.choose("Show", "refined")
-        artist.press("l")
+        straight = artist.picture()
         mouse = artist.page.mouse
         mouse.move(*EMPTY)
         mouse.down()
         mouse.move(300, 700, steps=5)
         mouse.up()
+        artist.picture(lambda now: np.abs(now - straight).mean() > 1.0)
+        artist.press("l")
+        artist.until(lambda: session.time != session.times[0], "the next frame")
         artist.settle()
         turned, time = artist.picture(), session.time
-    assert time != session.times[0]
     with tuned(shot) as (session, artist):
         assert session.time == time
         assert session.value(CLOTH, "bendStiffness") != pytest.approx(8e-5)
         artist.choose("Preset", "own: stiff")
         artist.settle("own: stiff")
         assert session.value(CLOTH, "bendStiffness") == pytest.approx(8e-5)
-        assert np.abs(artist.picture() - turned).mean() < 3.0
+        artist.picture(lambda now: np.abs(now - turned).mean() < 3.0)
         other = artist.page.context.browser.new_page(viewport=artist.page.viewport_size)
         other.goto(artist.page.url)
         artist.page.close()
         again = Artist(other)
-        assert float(again.number("Bending [µN·m]").input_value()) == 80.0
-        assert np.abs(again.picture() - turned).mean() < 3.0
+        again.until(lambda: again.shows("Bending [µN·m]", 80.0), "the box of another page shows the value")
+        again.picture(lambda now: np.abs(now - turned).mean() < 3.0)
 
 
 def test_a_range_is_solved_played_and_marked_stale(shot: Path):
     with tuned(shot) as (session, artist):
         count = len(session.times)
         artist.number("Solve range").click()
-        artist.page.get_by_text(f"{count} of {count} frames solved").wait_for(timeout=PATIENCE_MS)
+        artist.page.get_by_text(f"{count} of {count} frames solved").wait_for()
         artist.press(" ")
         artist.page.get_by_role("button", name="Pause").wait_for()
-        frames = set[str]()
-        for _ in range(40):
-            frames.add(artist.number("Frame").input_value())
-            artist.page.wait_for_timeout(50)
+        first = artist.number("Frame").input_value()
+        artist.until(lambda: artist.number("Frame").input_value() != first, "another frame is played")
         artist.press(" ")
         artist.page.get_by_role("button", name="Play").wait_for()
-        assert len(frames) >= 2
         artist.number("Solve range").click()
         artist.type("Bending [µN·m]", "80")
         artist.settle("Bending Stiffness")
@@ -194,15 +214,14 @@ def test_the_picture_wipes_maps_wires_and_compares(shot: Path):
         side_by_side = artist.picture()
         artist.tab("Picture")
         artist.number("Wipe").click()
-        wiped = artist.picture()
-        assert np.abs(wiped - side_by_side).mean() > 1.0
+        wiped = artist.picture(lambda now: np.abs(now - side_by_side).mean() > 1.0)
         artist.press("g")
-        wires = artist.picture()
-        assert np.abs(wires - wiped).mean() > 0.3
+        artist.picture(lambda now: np.abs(now - wiped).mean() > 0.3)
         artist.press("g")
+        artist.picture(lambda now: np.abs(now - wiped).mean() < 0.1)
         artist.choose("Map", "strain along weft")
         artist.page.locator("#bar").wait_for()
-        assert np.abs(artist.picture() - wiped).mean() > 0.3
+        artist.picture(lambda now: np.abs(now - wiped).mean() > 0.3)
         artist.choose("Map", "none")
         artist.number("Wipe").click()
         artist.press("k")
@@ -220,22 +239,26 @@ def test_a_map_is_painted_with_the_mouse_and_saved(shot: Path):
         artist.choose("Show", "refined")
         artist.tab("Paint")
         artist.choose("Paint", "pin")
-        artist.page.wait_for_timeout(800)
+        artist.page.locator("#bar").wait_for(state="attached")  # The map is drawn, and with it what the brush meets.
         before = artist.picture()
-        mouse = artist.page.mouse
+        mouse, up = artist.page.mouse, session.shot.frame(session.time).garments[0].points @ [0.0, 1.0, 0.0]
         for row in (420, 520):  # The second while the cloth still settles.
             mouse.move(460, row)
             mouse.down()
-            for step in range(20):  # As slowly as a busy machine draws.
+            for step in range(20):
                 mouse.move(460 + 5 * step, row)
-                artist.page.wait_for_timeout(100)
+                artist.page.evaluate(FRAMES)
             mouse.up()
+
+        def height() -> float:
+            held = session.painted(CLOTH, "pin") > 0.3
+            return float(np.ptp(up[held])) if held.any() else 0.0
+
+        artist.until(lambda: height() > 0.25 * np.ptp(up), "both strokes are in the map")
         artist.settle("Pin")
         held = session.painted(CLOTH, "pin")
         assert 0 < (held > 0.3).sum() < len(held) // 2
-        cage = session.shot.frame(session.time).garments[0].points
-        assert np.ptp(cage[held > 0.3] @ [0.0, 1.0, 0.0]) > 0.25 * np.ptp(cage @ [0.0, 1.0, 0.0])
-        assert np.abs(artist.picture() - before).mean() > 0.1
+        artist.picture(lambda now: np.abs(now - before).mean() > 0.1)
         artist.page.get_by_role("button", name="Save layer").click()
         artist.page.get_by_text("saved pin into").wait_for()
         with closing(open_shot(str(session.out))) as saved:
@@ -243,9 +266,8 @@ def test_a_map_is_painted_with_the_mouse_and_saved(shot: Path):
         artist.choose("Paint", "off")
         artist.press("z")
         artist.press("z")
-        artist.page.get_by_role("button", name="Redo Pin", exact=True).wait_for(timeout=PATIENCE_MS)
-        artist.settle()
-        assert session.painted(CLOTH, "pin").max() == 0.0
+        artist.page.get_by_role("button", name="Redo Pin", exact=True).wait_for()
+        artist.until(lambda: session.painted(CLOTH, "pin").max() == 0.0, "both strokes are undone")
 
 
 def warm(picture: np.ndarray) -> int:
@@ -266,4 +288,4 @@ def test_a_trim_is_drawn_on_the_refined_cloth(shot: Path):
     stage.GetPrimAtPath(CLOTH).CreateRelationship("physgraph:bind:targets").SetTargets(["/World/ball"])
     stage.Save()
     with tuned(shot) as (_, artist):
-        assert warm(artist.picture()) > before + 2000
+        artist.picture(lambda now: warm(now) > before + 2000)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine
 from typing import Any
 
 from .loop import Change, SolveLoop
@@ -46,6 +46,7 @@ class Desk:
             change: Called with the session and the control's value.
         """
 
+        @in_order
         def moved(event: Any) -> None:
             if event.client is not None:
                 value = control.value
@@ -56,8 +57,23 @@ class Desk:
 
     def press(self, button: Any, change: Change) -> Any:
         """Have the session changed when a button is pressed; returns the button."""
-        button.on_click(lambda _: self.ask(change))
+        button.on_click(in_order(lambda _: self.ask(change)))
         return button
+
+
+def in_order(call: Callable[[Any], None]) -> Callable[[Any], Coroutine[Any, Any, None]]:
+    """A callback that viser calls in the order of the browser's events.
+
+    Plain functions run in a pool of threads, which promises no order: the end of a drag could come before its last place.
+
+    Args:
+        call: The callback; returns at once.
+    """
+
+    async def called(event: Any) -> None:
+        call(event)
+
+    return called
 
 
 def put(control: Any, **properties: Any) -> None:

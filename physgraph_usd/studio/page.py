@@ -14,7 +14,7 @@ import numpy as np
 
 from ..errors import LayerError, PhysGraphError
 from ..interrupts import leave_if_asked
-from .desk import Desk, put, small
+from .desk import Desk, in_order, put, small
 from .guard import guarded_server
 from .loop import SolveLoop
 from .notes import Notes
@@ -113,7 +113,7 @@ class TunePage:
             if self._camera:
                 for name, value in self._camera.items():
                     setattr(client.camera, name, value)
-            client.camera.on_update(self._look_from)
+            client.camera.on_update(in_order(self._look_from))
 
     def _look_from(self, camera: Any) -> None:
         found = {name: getattr(camera, name) for name in ("position", "look_at", "up_direction")}
@@ -150,11 +150,13 @@ class TunePage:
         self._history = gui.add_button_group("History", (UNDO, REDO), hint="Keys: Z, and shift with Z.")
 
         @self._history.on_click
+        @in_order
         def _(event: Any) -> None:
             desk.ask(TuneSession.undo if event.target.value.startswith(UNDO) else TuneSession.redo)
 
-        gui.add_command("Undo", hotkey="Z").on_trigger(lambda _: desk.ask(TuneSession.undo))
-        gui.add_command("Redo", hotkey="Z", modifier="shift").on_trigger(lambda _: desk.ask(TuneSession.redo))
+        gui.add_command("Undo", hotkey="Z").on_trigger(in_order(lambda _: desk.ask(TuneSession.undo)))
+        redo = gui.add_command("Redo", hotkey="Z", modifier="shift")
+        redo.on_trigger(in_order(lambda _: desk.ask(TuneSession.redo)))
 
     def _write_history(self) -> None:
         history = self._session.history

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..usd.schema import GARMENT
 from .brush import PAINT, SMOOTH, Brush, Stroke, hit
-from .desk import Desk
+from .desk import Desk, in_order
 from .session import TuneSession
 from .values import MAPS
 from .view_panel import ViewPanel
@@ -49,8 +49,8 @@ class PaintPanel:
         """Attach the brush to drags and clicks on the picture's targets."""
         for index, handle in self._desk.picture.targets.items():
             if self._attached.get(index) is not handle:
-                handle.on_drag("left")(lambda event, index=index: self._dragged(index, event))
-                handle.on_click(lambda event, index=index: self._clicked(index, event))
+                handle.on_drag("left")(in_order(lambda event, index=index: self._dragged(index, event)))
+                handle.on_click(in_order(lambda event, index=index: self._clicked(index, event)))
         self._attached = dict(self._desk.picture.targets)
 
     def _clicked(self, index: int, event: Any) -> None:

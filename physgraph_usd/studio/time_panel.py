@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from itertools import pairwise
 
-from .desk import Desk, put
+from .desk import Desk, in_order, put
 from .session import TuneSession
 from .takes import FRESH, MISSING, STALE
 
@@ -39,8 +39,8 @@ class TimePanel:
         desk.press(self._play, self.play)
         for label, key, way in (("Frame before", "J", -1), ("Next frame", "L", 1)):
             command = gui.add_command(label, hotkey=key)
-            command.on_trigger(lambda _, way=way: desk.ask(lambda session: self._step(session, way)))
-        gui.add_command("Play or pause", hotkey="space").on_trigger(lambda _: desk.ask(self.play))
+            command.on_trigger(in_order(lambda _, way=way: desk.ask(lambda session: self._step(session, way))))
+        gui.add_command("Play or pause", hotkey="space").on_trigger(in_order(lambda _: desk.ask(self.play)))
         self.update()
 
     def update(self) -> None:

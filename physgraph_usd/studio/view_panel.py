@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, fields, replace
 from typing import Any
 
-from .desk import Desk, put
+from .desk import Desk, in_order, put
 from .maps import HIGH, LOW, MIDDLE, NAMES, Map
 from .picture import KEPT, SHOWS, View
 from .session import TuneSession
@@ -40,7 +40,7 @@ class ViewPanel:
             "Exchange A and B": ("X", TuneSession.swap),
         }
         for label, (key, change) in keys.items():
-            gui.add_command(label, hotkey=key).on_trigger(lambda _, change=change: desk.ask(change))
+            gui.add_command(label, hotkey=key).on_trigger(in_order(lambda _, change=change: desk.ask(change)))
 
     def set(self, **changes: Any) -> None:
         """Change how cloth is looked at, by the names of `View`."""
