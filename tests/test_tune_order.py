@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import asyncio
 from collections.abc import Callable, Coroutine, Iterator
+from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -16,7 +17,7 @@ pytest.importorskip("viser", reason="the page is served with viser")
 from physgraph_usd.studio.desk import Desk
 
 STUDIO = Path(__file__).parents[1] / "physgraph_usd" / "studio"
-TAKERS = {"on_update", "on_click", "on_drag", "on_trigger"}
+TAKERS = {"on_update", "on_click", "on_drag", "on_trigger", "on_client_connect"}
 """What viser is given callbacks by."""
 
 
@@ -57,12 +58,21 @@ def test_changes_of_a_control_are_asked_in_order_with_the_value_at_the_time():
     assert seen == [*range(100), "pressed"]
 
 
+def is_taker(node: ast.AST) -> bool:
+    """Whether viser is given a callback by calling this; `on_drag` is called with a button first."""
+    taker = node.func if isinstance(node, ast.Call) else node
+    return isinstance(taker, ast.Attribute) and taker.attr in TAKERS
+
+
 def given(tree: ast.AST) -> Iterator[tuple[int, str]]:
-    """Line and source of each callback that viser is given."""
+    """Line and source of each callback that viser is given, or of the decorator under viser's."""
     for node in ast.walk(tree):
-        if isinstance(node, ast.Call) and node.args:
-            taker = node.func.func if isinstance(node.func, ast.Call) else node.func
-            if isinstance(taker, ast.Attribute) and taker.attr in TAKERS and not isinstance(node.args[0], ast.Constant):
+        if isinstance(node, ast.FunctionDef):
+            for first, second in pairwise([*node.decorator_list, ast.Constant("none")]):
+                if is_taker(first):
+                    yield node.lineno, ast.unparse(second) + "("
+        if isinstance(node, ast.Call) and node.args and is_taker(node.func):
+            if not isinstance(node.args[0], ast.Constant):
                 yield node.lineno, ast.unparse(node.args[0])
 
 
@@ -72,5 +82,5 @@ def test_viser_is_given_no_callback_that_its_pool_of_threads_would_call_in_any_o
         for file in sorted(STUDIO.glob("*.py"))
         for line, source in given(ast.parse(file.read_text(encoding="utf-8")))
     ]
-    assert len(found) >= 9
+    assert len(found) >= 11
     assert [each for each in found if not each[2].startswith("in_order(") and each[2] != "moved"] == []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -45,11 +46,11 @@ class Artist:
 
     def until(self, happened: Callable[[], Any], what: str) -> Any:
         """Wait until something has happened; returns what it gives."""
-        for _ in range(PATIENCE_MS // POLL_MS):
-            if found := happened():
-                return found
+        end = time.monotonic() + 1e-3 * PATIENCE_MS
+        while not (found := happened()):
+            assert time.monotonic() < end, f"never: {what}"
             self.page.wait_for_timeout(POLL_MS)
-        pytest.fail(f"never: {what}")
+        return found
 
     def settle(self, undone: str = "") -> None:
         """Wait until cloth is settled, after the change that undo would take back.
@@ -72,7 +73,7 @@ class Artist:
             stands, last = np.array_equal(now, last), now
             return [now] if stands and holds(now) else []
 
-        return self.until(found, "the picture stands still and shows what is waited for")[0]
+        return self.until(found, "the picture stands still, and shows what is waited for")[0]
 
     def tab(self, name: str) -> None:
         self.page.get_by_role("tab", name=name).click()
@@ -176,9 +177,9 @@ def test_presets_camera_and_frame_outlive_a_restart(shot: Path):
         artist.press("l")
         artist.until(lambda: session.time != session.times[0], "the next frame")
         artist.settle()
-        turned, time = artist.picture(), session.time
+        turned, frame = artist.picture(), session.time
     with tuned(shot) as (session, artist):
-        assert session.time == time
+        assert session.time == frame
         assert session.value(CLOTH, "bendStiffness") != pytest.approx(8e-5)
         artist.choose("Preset", "own: stiff")
         artist.settle("own: stiff")

@@ -64,7 +64,7 @@ class Desk:
 def in_order(call: Callable[[Any], None]) -> Callable[[Any], Coroutine[Any, Any, None]]:
     """A callback that viser calls in the order of the browser's events.
 
-    Plain functions run in a pool of threads, which promises no order: the end of a drag could come before its last place.
+    Plain functions run in a pool of threads, which promises no order: a drag could end before its last place.
 
     Args:
         call: The callback; returns at once.

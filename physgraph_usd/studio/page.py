@@ -107,13 +107,17 @@ class TunePage:
         if looked.get("time") in session.times:
             session.set_time(looked["time"])
         self._camera: dict[str, list[float]] | None = looked.get("camera")
+        self._server.on_client_connect(in_order(self._welcome))
 
-        @self._server.on_client_connect
-        def _(client: Any) -> None:
-            if self._camera:
-                for name, value in self._camera.items():
-                    setattr(client.camera, name, value)
-            client.camera.on_update(in_order(self._look_from))
+    def _welcome(self, client: Any) -> None:
+        """Set the camera of a browser that connects, between two of its messages.
+
+        A message in between would undo a part on viser's side, and viser sends no part that it takes for known.
+        """
+        if self._camera:
+            for name, value in self._camera.items():
+                setattr(client.camera, name, value)
+        client.camera.on_update(in_order(self._look_from))
 
     def _look_from(self, camera: Any) -> None:
         found = {name: getattr(camera, name) for name in ("position", "look_at", "up_direction")}
