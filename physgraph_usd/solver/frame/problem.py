@@ -233,7 +233,7 @@ def begin(group: Group, frame: FrameInput, last: State | None) -> Problem:
     moved = frame.moved if settings.temporal == "tether" else np.inf  # Only the tether slows the cloth down.
     reset = {"frames": group.moving_frames, "finest": forces[-1].level, "reset": settings.reset}
     start = start_of(known, cage, **reset, moved=moved, pace=1.0 if creases is None else creases.pace)
-    contact = group.contact(frame, cage, given_up=None if known is None else known.given_up)
+    contact = group.contact(frame, cage, given_up=frame.given_up if known is None else known.given_up)
     if contact is not None and last is not None and last.clean and before is not None:
         contact.at(group.levels[-1]).remember(before)
     problem = Problem(

@@ -28,6 +28,7 @@ class FrameInput:
         moved: Largest motion of the surfaces since the last frame [m]; infinite if more than poses changed.
         walked: World positions of cages advanced from an earlier frame [m], shape (C, 3), for a cold start; or None.
         elapsed: Time since each garment's start frame [s]; () for a cold start.
+        given_up: As `State.given_up`, for a start from the cage.
     """
 
     garments: Sequence[GarmentFrame]
@@ -36,6 +37,7 @@ class FrameInput:
     moved: float = np.inf
     walked: np.ndarray | None = None
     elapsed: Sequence[float] = ()
+    given_up: Bool[Tensor, " coarse"] | None = None
 
     @property
     def rate(self) -> float:
