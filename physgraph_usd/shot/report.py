@@ -31,7 +31,7 @@ _ALSO, _DIFFERS = re.compile(r"; also (?:at|in) .*$"), re.compile(r"<[^>]*>|[-+]
 _FRAME: dict[str, Any] = {"time": None, "read_ms": None, "garments": [], "error": ""}
 _GARMENT: dict[str, Any] = dict.fromkeys(
     (
-        "start", "levels", "milliseconds", "energy_joules", "strain", "sharp_folds", "contact", "near",
+        "start", "levels", "milliseconds", "energy_joules", "strain", "sharp_folds", "remaining_mm", "contact", "near",
         "together", "collapsed", "broken_before", "jumped_from", "not_solved", "time_limit",
     )
 )  # fmt: skip

@@ -26,6 +26,7 @@ SIZE = (1280, 640)
 PLOTS = (
     ("energy", "Energy by term [mJ]"),
     ("strain", "Extension of the edges: median, 99th percentile and largest [%]"),
+    ("remaining", "Move that the end of the solve leaves: RMS [mm]"),
     ("inside", "Vertices inside bodies"),
     ("depth", "Deepest vertex inside bodies [mm]"),
     ("crossings", "Edges through faces"),
@@ -82,8 +83,23 @@ def _head(report: RefineReport) -> str:
     return (
         f"<h1>{html.escape(Path(report.shot).name)}</h1>"
         f"<p id='verdict'>{html.escape(verdict(report))}</p>"
-        f"<p class='note'>Written to {html.escape(str(report.out))}.{memory}</p>"
+        f"<p class='note'>Written to {html.escape(str(report.out))}.{memory}{_largest_remaining(report)}</p>"
     )
+
+
+def _largest_remaining(report: RefineReport) -> str:
+    """A sentence on the frame whose solve was ended farthest from rest; "" if no frame was solved."""
+    left = [
+        (each["remaining_mm"], frame["time"])
+        for frame in report.frames
+        for each in frame.get("garments", ())
+        if each.get("remaining_mm") is not None
+    ]
+    if not left:
+        return ""
+    most, time = max(left, key=lambda each: each[0])
+    place = "the only frame" if time is None else f"time code {time:g}"
+    return f" The end of a frame's solve leaves a move of at most {most:.2g} mm (RMS over the cloth), in {place}."
 
 
 def _warnings(report: RefineReport) -> str:

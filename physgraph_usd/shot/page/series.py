@@ -26,6 +26,7 @@ class Series:
         path: The garment.
         energy: Energy by term, and of the upsampled input [mJ].
         strain: Size of the edges' extension [%].
+        remaining: RMS move that the end of the solve leaves [mm].
         inside: Vertices inside bodies, before and after.
         depth: Depth of the deepest vertex [mm], before and after.
         crossings: Edges through faces, of bodies and of cloth, before and after.
@@ -36,6 +37,7 @@ class Series:
     path: str
     energy: dict[str, Line] = field(default_factory=dict)
     strain: dict[str, Line] = field(default_factory=dict)
+    remaining: dict[str, Line] = field(default_factory=dict)
     inside: dict[str, Line] = field(default_factory=dict)
     depth: dict[str, Line] = field(default_factory=dict)
     crossings: dict[str, Line] = field(default_factory=dict)
@@ -65,6 +67,8 @@ def _series_of(entry: dict[str, Any], frame: dict[str, Any]) -> dict[str, dict[s
         lines_of["energy"] |= {"total": 1e3 * sum(output.values()), "upsampled input": 1e3 * sum(given.values())}
     if "strain" in entry:
         lines_of["strain"] = {name: 100.0 * value for name, value in entry["strain"].items()}
+    if entry.get("remaining_mm") is not None:
+        lines_of["remaining"] = {"remaining move": entry["remaining_mm"]}
     contact = entry.get("contact", {})
     bodies = contact.get("bodies", {}).values()
     for when in ("before", "after"):

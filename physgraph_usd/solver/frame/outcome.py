@@ -95,6 +95,7 @@ def telemetry_of(problem: Problem, x: Tensor, module: ForceModule, *, reports: S
         "energy_joules": {"input": module.energies(base), "output": module.energies(x)},
         "sharp_folds": sharp_folds(finest, x),
         "strain": edge_strain(finest, x),
+        "remaining_mm": round(1e3 * float(finest.spacing.mean()) * reports[-1].remaining_move, 4) if reports else 0.0,
         "start": problem.start.why,
     }
 
