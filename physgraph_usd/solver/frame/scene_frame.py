@@ -228,11 +228,12 @@ class SceneFrame:
         origin = origin_of(part, self.frame, memories, near=near, edge=self._edge(part), gap=self.gap)
         cage = None if origin.state is not None else self._cage_walked(part)
         elapsed = origin.elapsed(self.frame.time, self.cloth.scene.seconds)
+        at = None if self.frame.time is None else float(self.frame.time)
         while True:
             touching = self.cloth.touching(part, frames, near, origin=origin)
             moved = origin.moved(part, self.frame, near, self.cloth.scene.gravity)
             walked = None if cage is None else cage[0]
-            given = FrameInput(frames, self.frame.time, touching, moved, walked=walked, elapsed=elapsed)
+            given = FrameInput(frames, at, touching, moved, walked=walked, elapsed=elapsed)
             try:
                 solved = solve_soundly(group, given, origin.state)
             except RunawayError as error:
