@@ -157,8 +157,7 @@ class Promise:
             options = _Options(**options)
             options["inside"] = torch.arange(len(moves), device=moves.device) < count
         asked = _corners(met, torch.zeros_like(moves))
-        moved = safe_move(begin, ends, parts, **options, asked=asked, dtype=dtype)
-        return moved.x, stand
+        return safe_move(begin, ends, parts, **options, asked=asked, dtype=dtype), stand
 
 
 def _corners(met: Pairs, others: Bool[Tensor, " vertices"]) -> Bool[Tensor, " vertices"]:

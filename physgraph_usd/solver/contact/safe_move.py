@@ -5,14 +5,12 @@ at ``start``. Then every such pair has a positive distance at the result of `saf
 that ``start`` did not have: a plane keeps each pair apart on the straight path between the two positions, as rounded
 (`collide.separation`), so no pair can have changed sides. The theorem holds for any wanted positions.
 
-Exempt are pairs that touch at the start (distance 0), and pairs with all vertices in a single given tangle. If the
-start is in double precision and the wanted positions in single, gaps below single precision's rounding cannot be
-returned, and are not promised.
+Exempt are pairs that touch at the start (distance 0), and pairs with all vertices in a single
+given tangle. If the start is in double precision and the wanted positions in single, gaps below single precision's
+rounding cannot be returned, and are not promised.
 """
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -32,24 +30,6 @@ STRAINS, LEAST = 0.5, 0.01
 is negligible. Without the limit shot 02 needs twice the rounds (53 for 24 in frame 18) and keeps crossings."""
 
 
-@dataclass(frozen=True, eq=False)
-class Moved:
-    """Result of a move.
-
-    Attributes:
-        x: Positions [m], shape (V, 3).
-        share: Fraction of its displacement that each vertex has moved, in [0, 1], shape (V,), float64.
-    """
-
-    x: Placed
-    share: Float[Tensor, " vertices"]
-
-    @property
-    def short(self) -> Bool[Tensor, " vertices"]:
-        """Mask of the vertices that did not reach their wanted position."""
-        return self.share < 1.0
-
-
 def safe_move(
     start: Float[Tensor, "vertices 3"],
     wanted: Float[Tensor, "vertices 3"],
@@ -60,7 +40,7 @@ def safe_move(
     inside: Bool[Tensor, " vertices"] | None = None,
     asked: Bool[Tensor, " vertices"] | None = None,
     dtype: torch.dtype | None = None,
-) -> Moved:
+) -> Placed:
     """Move vertices towards wanted positions as far as a plane keeps each pair of parts apart.
 
     Corners of blocked pairs move as far as the plane at the start allows. Pairs with changed vertices are then checked
@@ -79,7 +59,7 @@ def safe_move(
         dtype: Type to which positions of the cloth are rounded; None for the type of the wanted positions.
 
     Returns:
-        Positions, ``wanted`` itself if no pair is blocked, and the fraction that each vertex moved.
+        Positions [m], ``wanted`` itself if no pair is blocked.
     """
     at = start.double()
     way = wanted.double() - at
@@ -101,7 +81,7 @@ def safe_move(
         asked = share < known
         moved = (at + share.unsqueeze(1) * way).to(dtype).to(wanted)
         x = torch.where((share < 1.0).unsqueeze(1), moved, wanted)
-    return Moved(Placed(x), share)
+    return Placed(x)
 
 
 def _spread(share: Tensor, way: Tensor, parts: Parts) -> Float[Tensor, " vertices"]:
