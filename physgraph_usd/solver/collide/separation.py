@@ -24,6 +24,9 @@ wp.set_module_options(KERNELS)
 TIGHT = 0.9
 """Fraction of its distance kept by a pair already below the floor, and fraction of the safe path that is used."""
 
+TOUCHES = 1e-12
+"""Distance up to which parts touch [m]: nearer, double precision does not tell the side."""
+
 LEAST = wp.constant(wp.float64(1.0 / 16.0))
 """Least fraction of the path for which a plane is tried."""
 
@@ -108,7 +111,7 @@ def safe_fraction(
     """
     one, zero = wp.float64(1.0), wp.vec3d()
     distance = distance_of(face, zero, b, c, d)
-    if distance <= wp.float64(0.0):
+    if distance <= wp.float64(TOUCHES):
         return one
     keep = kept_of(distance, floor)
     time, step = wp.float64(0.0), wp.float64(1.0)

@@ -247,11 +247,8 @@ class ClothView:
         looked, at = self.look(x), self.with_bodies(x)
         inside = None if looked.inside is None else self.padded(looked.inside.any(dim=0))
         near = self.springs.find(at, self.springs.near(x, at, asked=self.asked, inside=inside).pairs)
-        near, with_body = self.springs.sided(near, self.exempt(x))
+        near, with_body, touching = self.springs.sided(near, self.exempt(x))
         pushes = self.springs.constraints(near.where(with_body), at, self._settings.stiffness)
-        touching = self.springs.on_bodies(near.where(with_body))
-        if bool(touching.any()):
-            self._looked = replace(looked, touching=touching.any(dim=0))
         if self.bodies is not None and (any(self.in_bodies(x)) or bool(touching.any())):
             inside, chords = self._within(x)
             pushes = pushes.with_more(self.bodies.pulls(x, inside | touching, chords))

@@ -26,7 +26,6 @@ class Look:
         tangles: These with the cloth around them; None without crossings and given-up cloth.
         pierced: Crossings of cloth and bodies; None without bodies.
         inside: The vertices inside each body, shape (B, V); None if none is.
-        touching: Mask of the vertices exactly on a body, shape (V,); None if none is.
     """
 
     x: Tensor
@@ -35,7 +34,6 @@ class Look:
     tangles: Tangles | None
     pierced: Pierced | None = None
     inside: Tensor | None = None
-    touching: Tensor | None = None
 
     @staticmethod
     def clean(x: Tensor) -> Look:
@@ -49,9 +47,8 @@ class Look:
         return inside, 0 if self.pierced is None else self.pierced.count
 
     def exempt(self, mesh: ClothMesh) -> Bool[Tensor, " vertices"] | None:
-        """Mask of the cloth inside, through or on a body; None if none is."""
+        """Mask of the cloth inside or through a body; None if none is."""
         if self.pierced is None or not any(self.in_bodies):
-            return self.touching
+            return None
         some = mesh.grown(mesh.crossed(self.pierced.crossings), BESIDE)
-        some = some if self.inside is None else some | self.inside.any(dim=0)
-        return some if self.touching is None else some | self.touching
+        return some if self.inside is None else some | self.inside.any(dim=0)

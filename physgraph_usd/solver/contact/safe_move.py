@@ -5,7 +5,7 @@ at ``start``. Then every such pair has a positive distance at the result of `saf
 that ``start`` did not have: a plane keeps each pair apart on the straight path between the two positions, as rounded
 (`collide.separation`), so no pair can have changed sides. The theorem holds for any wanted positions.
 
-Exempt are pairs that touch at the start (distance 0), and pairs with all vertices in a single
+Exempt are pairs that touch at the start (`TOUCHES` of `collide.separation`), and pairs with all vertices in a single
 given tangle. If the start is in double precision and the wanted positions in single, gaps below single precision's
 rounding cannot be returned, and are not promised.
 """

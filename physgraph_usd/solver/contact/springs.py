@@ -232,25 +232,21 @@ class ClothSprings:
 
     def sided(
         self, near: NearSprings, exempt: Bool[Tensor, " all"] | None
-    ) -> tuple[NearSprings, Bool[Tensor, " springs"]]:
-        """Springs that know their side, and a mask of those with bodies.
+    ) -> tuple[NearSprings, Bool[Tensor, " springs"], Bool[Tensor, "bodies vertices"]]:
+        """Springs that know their side, a mask of those with bodies, and the vertices on each body's faces.
 
-        Where cloth goes through a body (`exempt`), the shortest vector between edges, or from the body's vertices, may
-        point either way; from a vertex outside to a face it points out.
+        Where cloth goes through a body (`exempt`) or lies on it, the shortest vector between edges, or from the body's
+        vertices, may point either way; from a vertex outside to a face it points out. Springs of vertices on a face
+        have no direction.
         """
-        corners, count = near.near.corners.long(), self._mesh.level.vertex_count
-        with_body = corners.amax(dim=1) >= count
-        if exempt is None:
-            return near, with_body
-        of_vertex = near.near.face & (corners[:, 0] < count)
-        kept = ~with_body | of_vertex | ~exempt[corners].any(dim=1)
-        return near.where(kept), with_body[kept]
-
-    def on_bodies(self, near: NearSprings) -> Bool[Tensor, "bodies vertices"]:
-        """The vertices on the faces of each body; no shortest vector tells where they belong, but the face's normal."""
-        count, pairs = self._mesh.level.vertex_count, near.near
-        on = pairs.face & (pairs.way.norm(dim=1) < ON_SURFACE) & (pairs.corners[:, 0] < count)
-        corners = pairs.corners[on].long()
+        pairs, count = near.near, self._mesh.level.vertex_count
+        corners = pairs.corners.long()
+        with_body, of_vertex = corners.amax(dim=1) >= count, pairs.face & (corners[:, 0] < count)
+        touching = with_body & (pairs.way.norm(dim=1) < ON_SURFACE)
         out = torch.zeros((len(self._keep) - self._cloths, count), dtype=torch.bool, device=corners.device)
-        out[self.owner[corners[:, 3]].long() - self._cloths, corners[:, 0]] = True
-        return out
+        on = corners[touching & of_vertex]
+        out[self.owner[on[:, 3]].long() - self._cloths, on[:, 0]] = True
+        either = torch.nn.functional.pad(out.any(dim=0), (0, len(self.owner) - count))
+        either = either if exempt is None else either | exempt
+        kept = ~with_body | (~touching & (of_vertex | ~either[corners].any(dim=1)))
+        return near.where(kept), with_body[kept], out
