@@ -65,3 +65,36 @@ def test_they_turn_with_the_cloth():
     energy_there, force_there = evaluate(turned, moved)
     assert energy_there == pytest.approx(energy, rel=1e-9)
     assert apart(force_there, force @ turn.T) < 1e-9
+
+
+class TestRoom:
+    """Constraints on one vertex 1 mm above a floor that wants 3 mm."""
+
+    X = torch.tensor([[0.0, 1e-3, 0.0], [1.0, 0.0, 0.0]], dtype=torch.float64)
+
+    def depths(self, normal: list[float], offset: float, *, side: float = 1.0) -> list[float]:
+        """Depths of the floor's constraint and of another once both share the room [m]."""
+        normals = torch.tensor([[0.0, 1.0, 0.0], normal], dtype=torch.float64)
+        offsets, one = torch.tensor([3e-3, offset], dtype=torch.float64), torch.ones(2, dtype=torch.float64)
+        corners, weight = torch.zeros((2, 4), dtype=torch.int32), torch.zeros((2, 4), dtype=torch.float64)
+        weight[:, 0] = torch.tensor([1.0, side])
+        both = PairConstraints(corners, weight, normals, offsets, one).sharing_room(self.X)
+        return (both.offset - (both.normal * both.vectors(self.X)).sum(dim=1)).tolist()
+
+    def test_a_ceiling_too_low_leaves_the_vertex_the_middle(self):
+        """The ceiling at 2 mm wants 3 mm, too: the vertex is in the middle and nothing pushes."""
+        assert self.depths([0.0, -1.0, 0.0], 1e-3) == pytest.approx([0.0, 0.0], abs=1e-12)
+
+    def test_the_vertex_may_be_the_second_point(self):
+        """A vertex of the ceiling over the cloth: the vector between them points up."""
+        assert self.depths([0.0, 1.0, 0.0], 1e-3, side=-1.0) == pytest.approx([0.0, 0.0], abs=1e-12)
+        assert self.depths([0.0, -1.0, 0.0], 5e-3, side=-1.0)[0] == pytest.approx(2e-3, abs=1e-12)
+
+    def test_whichever_side_the_vertex_is_on(self):
+        """The ceiling at 1 mm below the floor: the middle is 1.5 mm lower, and only the ceiling pushes."""
+        assert self.depths([0.0, -1.0, 0.0], 4e-3) == pytest.approx([-1.5e-3, 1.5e-3], abs=1e-12)
+
+    @pytest.mark.parametrize(("normal", "offset"), [([0.0, -1.0, 0.0], -4e-3), ([0.6, 0.8, 0.0], 5e-3)])
+    def test_what_does_not_contradict_stays(self, normal: list[float], offset: float):
+        """A high ceiling, and a wall that leans the same way."""
+        assert self.depths(normal, offset)[0] == pytest.approx(2e-3, abs=1e-12)

@@ -1,4 +1,4 @@
-"""S17, S29, S30: pins in bodies, bodies that jump with the cloth, and bodies that pass to and fro through it."""
+"""S17, S21, S23, S29, S30: pins in bodies, cloth without room, bodies that jump with the cloth or pass through it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 from bodies import Soup, ball, box, together
-from cloth import Answer
+from cloth import Answer, base_of
 from folds import EDGE, frame_with, named, refiner_with, square
 
 from physgraph_usd.solver.colliders.pose import MeshPose, ShapePose
@@ -56,6 +56,29 @@ def jaws(gap: float, kind: str) -> tuple[Any, ...]:
 
 
 KINDS = {"capsules": ["capsule"] * 2, "boxes": ["mesh"] * 2, "one": ["mesh"]}
+
+
+class TestNoRoom:
+    """S21, S23."""
+
+    @pytest.mark.parametrize("kind", KINDS)
+    def test_s21_cloth_between_jaws_comes_to_rest(self, kind: str):
+        """Half a millimetre apart, a quarter of what both keep together: the cloth lies in the middle."""
+        found = [
+            refiner_with([named(SHEET)], KINDS[kind], steps=steps).solve(frame_with([REST], *jaws(5e-4, kind)))
+            for steps in (25, 50)
+        ]
+        assert np.abs(found[1].points[0] - found[0].points[0]).max() < 1e-3
+        assert all(body["inside"] + body["crossings"] == 0 for body in bodies(found[1]))
+
+    @pytest.mark.parametrize("above", [0.0, 1e-8, -1e-8])
+    def test_s23_cloth_on_a_face_rises(self, above: float):
+        """Exactly on the face, and above or below it by the rounding of single precision."""
+        cage = REST + np.array([0.0, 0.1 + above, 0.0])
+        answer = refiner_with([named(SHEET)], ["mesh"]).solve(frame_with([cage], box((0.6, 0.2, 0.6))))
+        lifted = answer.points[0] - base_of(SHEET[0], cage, 1)
+        assert lifted[:, 1].min() > 2e-4
+        assert np.abs(lifted[:, [0, 2]]).max() < 1e-4
 
 
 def needles() -> Soup:

@@ -209,6 +209,17 @@ class LevelBodies:
         kept = torch.nonzero(~stays).squeeze(1)
         return which[kept], normal[kept], depth[kept]
 
+    def _vertices_beside(
+        self, index: int, x: Tensor, some: Tensor
+    ) -> tuple[Int[Tensor, " some"], Float[Tensor, "some 3"], Float[Tensor, " some"]]:
+        """Vertices of some that are near a body and outside; directions from the body; negative distances [m]."""
+        which = torch.nonzero(some & self._feels(index)).squeeze(1)
+        surface, at = self.frame.touching[index].surface, x[which] + self.frame.shifts[index]
+        found = surface.closest(at, torch.full_like(at[:, 0], self.frame.longest))
+        kept = torch.nonzero(found.distance.isfinite() & (found.distance > ON_SURFACE)).squeeze(1)
+        far = found.distance[kept]
+        return which[kept], (at[kept] - found.point[kept]) / far.unsqueeze(1), -far
+
     def pinched(
         self, x: Float[Tensor, "vertices 3"], inside: Bool[Tensor, "bodies vertices"]
     ) -> Bool[Tensor, " vertices"]:
@@ -236,7 +247,8 @@ class LevelBodies:
         """
         found = []
         for index, own in enumerate(inside):
-            which, normal, depth = self._vertices_out(index, x, own)
+            outs = self._vertices_out(index, x, own), self._vertices_beside(index, x, inside.any(dim=0) & ~own)
+            which, normal, depth = (torch.cat(each) for each in zip(*outs, strict=True))
             corners = which.unsqueeze(1).expand(-1, 4)
             weight = torch.zeros_like(x[:1, :1]).repeat(len(which), 4)
             weight[:, 0] = 1.0
@@ -272,7 +284,7 @@ class LevelBodies:
         self, x: Float[Tensor, "vertices 3"], inside: Bool[Tensor, "bodies vertices"], chords: Chords | None = None
     ) -> Float[Tensor, "vertices 3"]:
         """Positions with cloth inside bodies moved out to the clearance [m]; arguments are as for `pulls`."""
-        out = self.pulls(x, inside, chords, share=self.frame.settings.clearance)
+        out = self.pulls(x, inside, chords, share=self.frame.settings.clearance).sharing_room(x)
         lack = out.penetration(x).double()
         limits = ApproachLimits(out.corners, out.weight.double(), out.normal.double(), -lack)
         free, threads = self.level.free, self.level.threads

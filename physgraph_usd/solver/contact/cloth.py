@@ -252,6 +252,7 @@ class ClothView:
         if self.bodies is not None and (any(self.in_bodies(x)) or bool(touching.any())):
             inside, chords = self._within(x)
             pushes = pushes.with_more(self.bodies.pulls(x, inside | touching, chords))
+        pushes = pushes.sharing_room(x)
         gaps = self._gaps(x, near.where(~with_body), at)
         found, tangles = looked.crossings, looked.tangles
         found = found if tangles is None else tangles.hopeful(found)

@@ -13,7 +13,7 @@ Pairs, weights and normals are constant during the life of the term, so the ener
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any
 
@@ -54,6 +54,28 @@ class PairConstraints:
         return PairConstraints(
             *(torch.cat([getattr(self, each.name), getattr(other, each.name)]) for each in fields(self))
         )
+
+    def sharing_room(self, x: Float[Tensor, "vertices 3"]) -> PairConstraints:
+        """The constraints, with contradicting goals lowered so that cloth without room rests in the middle.
+
+        At each vertex, the deepest constraint at x [m] is compared with the constraints against its normal.
+        """
+        if not len(self.corners):
+            return self
+        corners, depth = self.corners.long(), self.offset - (self.normal * self.vectors(x)).sum(dim=1)
+        depth, directions = depth.unsqueeze(1).expand(-1, 4), self.weight.sign().unsqueeze(2) * self.normal.unsqueeze(1)
+
+        def largest(value: Tensor) -> Tensor:
+            value = torch.where(self.weight != 0, value, 0).reshape(-1)
+            return value.new_zeros(len(x)).scatter_reduce(0, corners.reshape(-1), value, "amax")
+
+        deepest = largest(depth)
+        place = torch.arange(depth.numel(), device=x.device).reshape(-1, 4)
+        axis = directions.reshape(-1, 3)[largest(torch.where(depth == deepest[corners], place, 0))]
+        along = (directions * axis[corners]).sum(dim=2)
+        share = along.square()  # The wider a wedge is, the more of a way out it leaves.
+        lack = largest(torch.where(along < 0, 0.5 * share, 0.0) * (depth + deepest[corners]))
+        return replace(self, offset=self.offset - (self.weight.abs() * share * lack[corners]).sum(dim=1))
 
     def padded(self, count: int) -> PairConstraints:
         """These pairs and more of no effect, up to a number."""
