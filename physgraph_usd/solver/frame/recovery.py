@@ -28,11 +28,11 @@ class RunawayError(SolveError):
 def solve_soundly(group: Group, frame: FrameInput, last: State | None) -> Solved:
     """Solve a frame, and once more from the cage if the result is unsound.
 
-    A result is unsound if cloth crosses cloth, or a body more often than the upsampled cage does, or if its energy is
+    A result is unsound if cloth crosses cloth, or a body that the upsampled cage does not cross, or if its energy is
     above the upsampled cage's energy without self contact (the self contact energy is as large as the cage's own
-    crossings are deep). The second result is used if it has fewer crossings of cloth with cloth. If it has as many:
-    if the first alone crosses bodies more often than the cage does (a few crossings less are no reason to change the
-    folds); or if neither does, the first energy is above the cage's, and the second is lower.
+    crossings are deep). The second result is used if it has fewer crossings of cloth with cloth. If it has as many: if
+    the first alone crosses such a body; or if neither does, the first energy is above the cage's, and the second is
+    lower. Bodies that the cage crosses are left out, since a start from the cage crosses them too.
 
     Args:
         group: Garments solved together.
@@ -92,9 +92,9 @@ def _crossings(telemetry: Mapping[str, Any], *, given_up: bool = False) -> int:
 
 
 def _through_bodies(telemetry: Mapping[str, Any]) -> int:
-    """Sum over bodies of the crossings that the result has more than its upsampled cage."""
+    """Crossings of a result with bodies that the upsampled cage does not cross."""
     bodies = telemetry.get("contact", {}).get("bodies", {}).values()
-    return sum(max(each["after"]["crossings"] - each["before"]["crossings"], 0) for each in bodies)
+    return sum(each["after"]["crossings"] for each in bodies if not each["before"]["crossings"])
 
 
 def _excess(telemetry: Mapping[str, Any], *, whole: bool = False) -> float:
