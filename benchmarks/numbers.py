@@ -11,10 +11,11 @@ standard deviation over ripples, pooled over all variants without the tenth that
 counts of chance do, and times by 2%. A difference is said where it exceeds three standard errors and 1%: one
 comparison in 370 does by chance. A variant whose first ripple gives equal figures to the bit, in about the same time,
 has no effect in the scene, and its other ripples are left out.
-All numbers take about 10,000 core seconds, by an estimate; with `--json` an interrupted command goes on.
+With `--json` an interrupted command goes on.
 
-Scenes are a few frames at level 1: a skirt whose cage crosses itself, a pinched T-shirt, three garments, a coat
-over a shirt, a dancer, and a folded sleeve whose cage stands but for movements of 0.1% of an edge, as in noise.
+Scenes are a few frames at level 1: a coat over a shirt whose cages cross, a dancer, trims sewn on a garment, cloth
+pulled over a torus and over a block, cloth pinched by an armpit, a cage that crosses itself, and a folded sleeve
+whose cage stands but for movements of 0.1% of an edge, as in noise.
 """
 
 from __future__ import annotations
@@ -48,11 +49,13 @@ from physgraph_usd.usd.read.reader import open_shot
 HERE = Path(__file__).resolve().parents[1]
 ROOMS = ("contact", "collide", "frame", "integrate")
 SCENES = {
-    "tshirt": ("tshirt", 30, 2),
-    "skirt": ("skirt", 35, 5),
-    "overcoat": ("overcoat", 6, 3),
-    "layers": ("layers", 6, 3),
+    "overcoat": ("overcoat", 6, 2),
     "dancer": ("dancer", 20, 5),
+    "trims": ("trims", 5, 3),
+    "torus": ("torus", 15, 3),
+    "armpit": ("armpit", 11, 3),
+    "crossing": ("crossing", 0, 3),
+    "block": ("block", 7, 3),
     "still": ("sleeve", 23, 4),
 }
 """Sample, number of the first frame and number of frames of each scene; long scenes first."""
