@@ -119,18 +119,17 @@ def simulated(stage: Stage, fabric: Fabric, subdivisions: int, *, frames: int) -
     terms = (*elastic_terms(level, [fabric]), *body_terms(level, [fabric], gravity=GRAVITY))
     h = 1.0 / (RATE * INCREMENTS)
     x = torch.as_tensor(level.from_coarse @ stage.rest).to(level.rest)
-    inertia = Tether(level, torch.tensor([fabric.density]), h**-2, x.clone())
-    terms = (*terms, inertia)
-    module = ForceModule(terms)
+    density = torch.tensor([fabric.density])
+    module = ForceModule((*terms, Tether(level, density, h**-2, x)))
     metric = Metric(module.rest_matrix(), free=level.free, dtype=level.dtype)
     velocity, free = torch.zeros_like(x), level.free
     for frame in range(frames):
         for increment in range(INCREMENTS):
             time = (frame * INCREMENTS + increment + 1) * h
             moved = torch.as_tensor(level.from_coarse @ stage.motion(time)).to(x)
-            inertia.aim(x + h * velocity, h**-2)
+            inertia = Tether(level, density, h**-2, x + h * velocity)
             start = torch.where(free, x + h * velocity, moved)
-            system = System(ForceModule(terms), metric, free=free, spacing=level.spacing, level=level)
+            system = System(ForceModule((*terms, inertia)), metric, free=free, spacing=level.spacing, level=level)
             after, _ = solve_level(system, QuasiNewton(), start, level=0, budget=Budget(STEPS, 1e-3))
             velocity, x = (after - x) / h, after
         yield x.double().numpy()

@@ -145,8 +145,7 @@ def aim_of(each: Round, walks: Sequence[Walk]) -> float:
 def walked(each: Round, integrator: Integrator, device: str) -> Walk:
     """A descent of a round; on the CPU its time is that of all threads."""
     system, x = system_of([each], device=device), torch.as_tensor(each.x, device=device)
-    system.expected = MOST
-    integrator.step(system, integrator.start(system, x))  # Kernels are compiled, steps recorded.
+    integrator.step(system, integrator.start(system, x))  # Kernels are compiled.
     clock = time.process_time if device == "cpu" else time.perf_counter
     made, before, began = Walk([], [], []), system.evaluations, clock()
     carry = integrator.start(system, x)

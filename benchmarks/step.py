@@ -19,6 +19,7 @@ import math
 import statistics
 import time
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -88,7 +89,7 @@ def timed(device: str, most: int, paper_most: int) -> Iterator[dict[str, Any]]:
         assert system.level is not None
         force = system.energy_and_force(x)[1]
         line: dict[str, Any] = {"edges": len(system.level.edges)}
-        line["forces"] = milliseconds(forces_of(system, x), device)
+        line["forces"] = milliseconds(partial(system.energy_and_force, x), device)
         line["metric solve"] = milliseconds(lambda s=system, f=force: s.apply_metric_inverse(f), device)
         for name, build in METHOD.items():
             late = name == THEIRS and size > paper_most
@@ -140,21 +141,6 @@ def sheet(edges: int, device: str) -> tuple[System, torch.Tensor]:
     points = rest * [0.9, 1.0, 1.0] + 0.004 * np.sin(40.0 * rest[:, :1]) * [0, 0, 1.0]
     systems, x = group.systems([GarmentFrame(points, PRESETS["jersey"])])
     return systems[0], x
-
-
-def forces_of(system: System, x: torch.Tensor) -> Callable[[], object]:
-    """A force evaluation; on CUDA recorded once and replayed, as `physgraph` does it."""
-    if not x.is_cuda:
-        return lambda: system.energy_and_force(x)
-    system.field.energy_and_force(x)
-    graph, side = torch.cuda.CUDAGraph(), torch.cuda.Stream()
-    side.wait_stream(torch.cuda.current_stream())
-    with torch.cuda.stream(side):
-        graph.capture_begin(capture_error_mode="relaxed")
-        system.field.energy_and_force(x)
-        graph.capture_end()
-    torch.cuda.current_stream().wait_stream(side)
-    return graph.replay
 
 
 def stepped(integrator: Integrator, system: System, x: torch.Tensor, *, device: str) -> float:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 from pathlib import Path
 from typing import Any
 
@@ -23,10 +22,7 @@ from physgraph_usd.solver.contact.metric import HeldMetric
 from physgraph_usd.solver.frame.group import Group
 from physgraph_usd.solver.frame.solve import solve_frame
 from physgraph_usd.solver.frame.values import FrameInput
-from physgraph_usd.solver.integrate.fused import fused_physgraph
-from physgraph_usd.solver.integrate.learned import LearnedMetric
 from physgraph_usd.solver.integrate.metric import Metric
-from physgraph_usd.solver.integrate.network import VECTORS, Physgraph, PhysgraphConfig
 from physgraph_usd.solver.integrate.weights import random_network, shipped_network
 from physgraph_usd.solver.level import refine_garments
 from physgraph_usd.solver.mesh.topology import PolygonMesh
@@ -79,22 +75,6 @@ def test_s33_a_solved_frame_agrees_and_repeats() -> None:
     here, there, again = answers
     assert there.tobytes() == again.tobytes()
     assert np.abs(here - there).max() < 1e-3 * EDGE / 4
-
-
-@pytest.mark.parametrize("vectors", [("secant", "metric1", "move1", "diagonal"), VECTORS])
-def test_replayed_steps_are_the_same_steps(vectors: tuple[str, ...]) -> None:
-    """Eight steps of a network: recorded and replayed against one by one."""
-    one, frames = cloth("cuda", torch.float32)
-    systems, coarse = one.systems(frames)
-    system, x = systems[-1], one.levels[-1].base.apply(coarse)
-    network = random_network(PhysgraphConfig(vectors, width=16), seed=3, scale=0.1)
-    assert isinstance(network, Physgraph)
-    plain, replayed = LearnedMetric(network, record=False), LearnedMetric(network)
-    a, b = plain.start(system, x), replayed.start(system, x)
-    for _ in range(8):
-        a, b = plain.step(system, a), replayed.step(system, b)
-        assert float((a.x - b.x).abs().max()) < 1e-3 * float(system.spacing.mean())
-        assert b.energy == pytest.approx(a.energy, rel=1e-3)
 
 
 @pytest.mark.parametrize("latent", [32, 128])
@@ -170,28 +150,6 @@ def test_samples_are_refined_alike(tmp_path: Path, sample: str, integrator: str)
         size = np.ptp(points["cpu"][path], axis=(0, 1)).max()
         apart = np.median(np.linalg.norm(found - points["cpu"][path], axis=-1))
         assert apart < 2e-3 * size or sample in ("layers", "crossing")
-
-
-def test_a_recording_keeps_what_it_writes_to() -> None:
-    """Others may use up the cache of networks that are laid out, and the memory of those that it drops."""
-    one, frames = cloth("cuda", torch.float32, integrator="physgraph", steps=8)
-    first = solve_frame(one, FrameInput(frames), None).points[0]
-    fused_physgraph.cache_clear()
-    gc.collect()
-    torch.cuda.empty_cache()
-    waste = [torch.full((1 << k,), 7.0, device="cuda") for k in range(8, 24) for _ in range(4)]
-    again = solve_frame(one, FrameInput(frames), None).points[0]
-    assert np.array_equal(first, again)
-    assert all(bool((each == 7.0).all()) for each in waste)
-
-
-def test_cloth_that_comes_near_after_the_first_steps(tmp_path: Path) -> None:
-    """The level's first steps are recorded, those among what is near are not: the one goes on where the other was."""
-    stage, out = write_sample("sleeve", tmp_path), tmp_path / "out.usda"
-    options = ["--device", "cuda", "--integrator", "physgraph", "--frames", "24", "--level", "2", "--steps", "2"]
-    result = CliRunner().invoke(main, ["refine", str(stage), "-o", str(out), *options])
-    assert result.exit_code == 0, result.output
-    assert all(np.isfinite(points).all() for points in points_of(out).values())
 
 
 def test_creases_agree_and_repeat(tmp_path: Path) -> None:

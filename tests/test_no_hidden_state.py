@@ -22,7 +22,6 @@ ALLOWED = {
     "contact/broad_phase.py Bodies._posed: _surfaces": "of a pose, until the next one",
     "contact/cloth.py ClothView.look: _looked": "of the positions asked for last, and of no others",
     "contact/cloth.py ClothView.terms: came_near": "of the frame's report alone",
-    "contact/cloth.py ClothView.terms: _looked": "of the positions asked for last, and of no others",
     "contact/springs.py ClothSprings.near: _near": "of the positions asked for last, and of no others",
     "contact/springs.py ClothSprings.blocking: _near": "at the end of the move asked for last",
     "contact/cloth.py ClothView.remember: _looked": "what the last frame found at those positions",
@@ -31,10 +30,6 @@ ALLOWED = {
     "frame/group.py Group.forces_for: _forces": "of the materials; of the last ones alone",
     "frame/group.py Group._built: _integrators": "of the method",
     "frame/scene_frame.py SceneCloth.group: _groups": "one a set of garments solved together",
-    "frame/level_forces.py LevelForces.lasting_system: _lasting": "of the materials, and aimed anew in each frame",
-    "frame/touched.py TouchedSystems.of: _kept": "of the materials, with pairs and stiffness taken anew in each round",
-    "contact/metric.py HeldMetric.renew: _rough": "of a lasting system, taken anew in each round",
-    "contact/metric.py HeldMetric.renew: stiff": "of a lasting system, taken anew in each round",
     # What goes on from frame to frame, or from one place to the next.
     "contact/broad_phase.py Bodies.forget: _meshes": "hierarchies are refitted from pose to pose",
     "contact/broad_phase.py Bodies.pose: _bounds": "the frame's poses",

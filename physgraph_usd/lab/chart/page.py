@@ -24,7 +24,6 @@ from .words import (
     advice,
     changes,
     figures,
-    label,
     percent,
     settings,
     styles,
@@ -153,7 +152,7 @@ def _trace(chart: Chart, name: str, style: Style, *, field: str) -> go.Scatter:
     points = chart.curve(name)
     labels = ["<br>".join([settings(p), *figures(p, touches=bool(chart.panels))]) for p in points]
     values = [max(p.gap, FLOOR) if field == "gap" else getattr(p, field) for p in points]
-    return _scatter(label(chart, name), points, values, style, labels=labels, sign=name, spread=field == "gap")
+    return _scatter(name, points, values, style, labels=labels, sign=name, spread=field == "gap")
 
 
 def _warm(chart: Chart, name: str, style: Style) -> go.Scatter:
@@ -164,7 +163,7 @@ def _warm(chart: Chart, name: str, style: Style) -> go.Scatter:
         for p in points
     ]
     heights = [max(p.gap, FLOOR) for p in points]
-    return _scatter(label(chart, name), points, heights, style, labels=labels, sign=name, spread=True)
+    return _scatter(name, points, heights, style, labels=labels, sign=name, spread=True)
 
 
 def _scatter(
@@ -205,7 +204,7 @@ def _legend(chart: Chart) -> str:
     style = styles(chart)
     buttons = []
     for name in chart.methods:
-        own, shown = style[name], html.escape(label(chart, name))
+        own, shown = style[name], html.escape(name)
         look = f"border-top:3px {'dashed' if own.dashed else 'solid'} {own.colour}"
         drawn = f"<i style='{look}'></i>{shown}"
         buttons.append(f"<button type=button aria-pressed=true data-method='{shown}'>{drawn}</button>")
@@ -231,7 +230,7 @@ def _lead(chart: Chart) -> str:
     sentences = [each for each in (advice(chart), warm_advice(chart)) if each]
     times = chart.times_to(JUDGED)
     if times:
-        order = ", ".join(f"{label(chart, name)} {ms:.0f} ms" for name, ms in list(times.items())[:4])
+        order = ", ".join(f"{name} {ms:.0f} ms" for name, ms in list(times.items())[:4])
         sentences.append(f"First to 3%: {order}.")
     if chart.busy:
         sentences.append(f"Warning: {chart.busy}.")

@@ -15,7 +15,7 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter, Symmetr
 
 from .measure import DEFAULT, JUDGED, SMOOTH, UPSAMPLED
 from .table import Chart, Point, WarmPoint
-from .words import ABOVE, BASELINE, FAR, FRONT, Change, Style, advice, changes, label, percent, styles, title
+from .words import ABOVE, BASELINE, FAR, FRONT, Change, Style, advice, changes, percent, styles, title
 
 FLOOR = 1e-4
 """Least gap that is drawn: Phi* itself is known no better."""
@@ -84,7 +84,7 @@ def _curves(axes: Axes, chart: Chart, style: dict[str, Style]) -> None:
     )
     for name in chart.methods:
         points = chart.curve(name)
-        _line(axes, label(chart, name), points, style[name], [max(p.gap, FLOOR) for p in points], alone=name)
+        _line(axes, name, points, style[name], [max(p.gap, FLOOR) for p in points], alone=name)
         _spread(axes, points, style[name])
     axes.set(xscale="log", yscale="log", xlabel="milliseconds a frame", title="Cold frames, contact on")
     axes.set_ylabel(ABOVE)
@@ -108,7 +108,7 @@ def _warm(axes: Axes, chart: Chart, style: dict[str, Style]) -> None:
     for name in dict.fromkeys(each.method for each in chart.warm):
         points = sorted((each for each in chart.warm if each.method == name), key=lambda each: each.steps)
         drawn = style.get(name, Style(BASELINE, dashed=False))
-        _line(axes, label(chart, name), points, drawn, [max(p.gap, FLOOR) for p in points], alone=name)
+        _line(axes, name, points, drawn, [max(p.gap, FLOOR) for p in points], alone=name)
         _spread(axes, points, drawn)
     axes.set(xscale="log", yscale="log", xlabel="milliseconds a frame", title="Warm frames")
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))

@@ -18,8 +18,6 @@ OUTSIDE = ("#e6007e", "#7fa800", "#5a2d0c")
 """Colours of solvers outside."""
 BASELINE = "#6e6e6e"
 FRONT = "#e9dfc0"
-RECORDED = ("quasi-newton", "physgraph")
-"""Integrators whose steps are recorded once on CUDA and replayed."""
 
 
 @dataclass(frozen=True)
@@ -93,12 +91,6 @@ ABOVE = "energy above the best known, percent of what solving gains"
 """The axis of gaps, in words."""
 
 
-def label(chart: Chart, name: str) -> str:
-    """A method as legends name it: on a card the steps of some are recorded."""
-    own = name.partition(",")[0].removesuffix("-flat")
-    return f"{name} (recorded)" if chart.about.get("device", "cpu") != "cpu" and own in RECORDED else name
-
-
 def advice(chart: Chart) -> str:
     """Which method to take, in a sentence."""
     place = chart.default_place()
@@ -110,7 +102,7 @@ def advice(chart: Chart) -> str:
     known = {point.method: point for point in chart.points}[place["fastest"]]
     asked = f" (--integrator {known.integrator})" if known.method == known.integrator in INTEGRATORS else ""
     return (
-        f"Take {label(chart, place['fastest'])}{asked} for single frames like these: refine's default comes to {left}, "
+        f"Take {place['fastest']}{asked} for single frames like these: refine's default comes to {left}, "
         f"{place['ratio']:.1f} times the {place['fastest_ms']:.0f} ms in which that gets as low."
     )
 
@@ -125,7 +117,7 @@ def warm_advice(chart: Chart) -> str:
     words = f"Frames begun where the last one ended take it {own.ms:.0f} ms and end at {percent(own.gap, digits=2)}"
     if best is None or best.ms * TOLERANCE >= own.ms:
         return f"{words}; nothing else is as low sooner."
-    return f"{words}; {label(chart, best.method)} with {best.steps} steps is as low in {best.ms:.0f} ms."
+    return f"{words}; {best.method} with {best.steps} steps is as low in {best.ms:.0f} ms."
 
 
 def settings(point: Point) -> str:

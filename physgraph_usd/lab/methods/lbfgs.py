@@ -10,8 +10,7 @@ from torch import Tensor
 
 from ...solver.integrate.base import Carry, System
 from ...solver.integrate.quasi_newton import SHORTENED, backtrack
-from ...solver.integrate.recorded import SECANTS
-from ...solver.integrate.secants import Secant, dot, secant_direction
+from ...solver.integrate.secants import SECANTS, Secant, dot, secant_direction
 
 
 @dataclass(frozen=True, eq=False)

@@ -56,18 +56,6 @@ class HeldMetric:
         between, self._cage = plain.coarse.held(plain.gathered(three_columns(stiff))[:, 0])
         self._middle = [three_columns(MIDDLE / each.clamp_min(tiny)) for each in between]
 
-    def renew(self, other: HeldMetric) -> None:
-        """Take the stiffness of another metric of the level, in the tensors that recorded steps read."""
-        self.stiff.copy_(other.stiff)
-        self._rough.copy_(other._rough)
-        self._cage.renew(other._cage)
-        for own, its in zip(self._middle, other._middle, strict=True):
-            own.copy_(its)
-
-    def copied(self) -> HeldMetric:
-        """A metric of equal stiffness, in other tensors."""
-        return HeldMetric(self._plain, self.stiff.clone())
-
     def serves(self, stiff: Float[Tensor, " vertices"]) -> bool:
         """True if K contains enough of the given stiffness [N/m]."""
         return float((stiff - self.stiff).clamp_min(0.0).sum()) <= MISSING * float(stiff.sum())

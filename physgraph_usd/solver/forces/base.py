@@ -43,7 +43,7 @@ class Force(Protocol):
 
 
 class _Last:
-    """The last result of constant terms, on the CPU only: on CUDA recorded steps write into tensors unseen."""
+    """The last result of constant terms."""
 
     def __init__(self) -> None:
         """Start without a result."""
@@ -58,8 +58,7 @@ class _Last:
 
     def keep(self, x: Tensor, energy: Tensor, force: Tensor) -> None:
         """Remember a result."""
-        if not x.is_cuda:
-            self._asked, self._answer = (x, x._version), (energy, force.clone())
+        self._asked, self._answer = (x, x._version), (energy, force.clone())
 
 
 class ForceModule:
@@ -233,19 +232,6 @@ class Elements:
         inputs = [wp.from_torch(starts), wp.from_torch(slots), buffers[1], x]
         gather = cast(wp.Kernel, _gather_corners_at_once) if single else _GATHER[dtype]
         self._gather = Launch(gather, level.vertex_count, inputs, device=device, threads=threads)
-
-    def renew(self, corners: Int[Tensor, "elements corners"], parameters: Sequence[Tensor]) -> None:
-        """Take other elements, at most as many, in the buffers that recorded steps read; without parameters, none acts.
-
-        Arguments are as for the constructor.
-        """
-        known, starts, slots, values = self._tensors
-        first, order = incidence(corners, len(starts) - 1)
-        starts.copy_(first)
-        for mine, other in zip((known, slots, *values), (corners, order, *parameters), strict=True):
-            mine[: len(other)].copy_(other)
-        for mine in values:
-            mine[len(corners) :].zero_()
 
     def evaluate(
         self, x: Float[Tensor, "vertices 3"], force: Float[Tensor, "vertices 3"], given: Mapping[int, Any] | None = None

@@ -98,11 +98,6 @@ class Guide:
         guide._target = self._map.average.apply(guide._base)
         return guide
 
-    def aim(self, coarse: Float[Tensor, "coarse 3"]) -> None:
-        """Change the target to new coarse positions [m] in place, also for every holder and recording of this term."""
-        self._base.copy_(self._level.base.apply(coarse))
-        self._target.copy_(self._map.average.apply(self._base))
-
     def add_force(self, x: Float[Tensor, "vertices 3"], force: Float[Tensor, "vertices 3"]) -> Float[Tensor, ""]:
         """Add the force [N] in place and return the energy [J]."""
         lag = self._map.average.apply(x) - self._target

@@ -22,7 +22,6 @@ import torch
 import warp as wp
 from jaxtyping import Float, Int
 from torch import Tensor
-from torch.nn.functional import pad
 
 from ..level import Level
 from ..mesh.kernels import KERNELS
@@ -76,13 +75,6 @@ class PairConstraints:
         share = along.square()  # The wider a wedge is, the more of a way out it leaves.
         lack = largest(torch.where(along < 0, 0.5 * share, 0.0) * (depth + deepest[corners]))
         return replace(self, offset=self.offset - (self.weight.abs() * share * lack[corners]).sum(dim=1))
-
-    def padded(self, count: int) -> PairConstraints:
-        """These pairs and more of no effect, up to a number."""
-        more = count - len(self.corners)
-        return PairConstraints(
-            *(pad(each, (0, 0, 0, more) if each.ndim == 2 else (0, more)) for each in vars(self).values())
-        )
 
     def vectors(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "gaps 3"]:
         """From the second point to the first [m]."""
@@ -142,13 +134,8 @@ class SelfContact:
 
     @cached_property
     def _elements(self) -> Elements:
-        """The pairs as elements, built on first use: recorded steps have their own."""
+        """The pairs as elements, built on first use."""
         return Elements(_KEEP_APART, self.gaps.corners, _parameters(self.gaps), level=self._level)
-
-    def renew(self, gaps: PairConstraints) -> None:
-        """Take other pairs, at most as many, in the buffers that recorded steps read."""
-        self._elements.renew(gaps.corners, _parameters(gaps))
-        self.gaps = gaps
 
     def add_force(self, x: Float[Tensor, "vertices 3"], force: Float[Tensor, "vertices 3"]) -> Float[Tensor, ""]:
         """Add the force [N] in place and return the energy [J]."""

@@ -51,13 +51,6 @@ class Tether:
         self._pull = three_columns(self._weight)
         self.predicted, self.stiffness = predicted, stiffness
 
-    def aim(self, predicted: Float[Tensor, "vertices 3"], stiffness: float) -> None:
-        """Tie to new positions [m], with a new stiffness [1/s^2], in place."""
-        self.predicted.copy_(predicted)
-        self.stiffness = stiffness
-        self._weight.copy_(stiffness * self._density * self._area)
-        self._pull.copy_(self._weight.unsqueeze(1))
-
     def add_force(self, x: Float[Tensor, "vertices 3"], force: Float[Tensor, "vertices 3"]) -> Float[Tensor, ""]:
         """Add the force [N] in place and return the energy [J]."""
         stray = x - self.predicted

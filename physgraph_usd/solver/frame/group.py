@@ -55,7 +55,7 @@ class Group:
     followers: Followers
     cloth: ClothContact
     seams: list[Seam | None]
-    # The lasting terms of the last materials only; and integrators with their recordings.
+    # The lasting terms of the last materials only.
     _forces: dict[tuple[object, ...], list[LevelForces]] = field(default_factory=dict)
     _integrators: dict[Callable[[], Integrator], Integrator] = field(default_factory=dict)
 
@@ -214,7 +214,7 @@ class Group:
         """
         modules, coarse = self.modules(frames)
         pairs = zip(self.forces_for(frames), modules, strict=True)
-        return [own.system_in(module, lasting=True) for own, module in pairs], coarse
+        return [own.system_in(module) for own, module in pairs], coarse
 
     def potential(
         self, frames: Sequence[GarmentFrame], touching: Sequence[Touching] = ()

@@ -24,7 +24,6 @@ from ..integrate.saddle import facets
 from ..level import Level
 from ..mesh.stencil import Stencil
 from ..scene import Garment, GarmentFrame
-from .touched import TouchedSystems
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,64 +199,21 @@ class LevelForces:
         *,
         rough: bool = False,
     ) -> System:
-        """The system of a frame without contact, given its terms; the tie as in `lasting_system`."""
+        """The system of a frame without contact.
+
+        Args:
+            module: The terms.
+            tie: Stiffness [1/s^2] and predicted positions [m] of a tether, or None.
+            rough: Whether to use `rough_metric`.
+        """
         forces = module.forces if tie is None else (*module.forces, self.tether(*tie))
         metric = self.rough_metric if rough else self.metric
         return self.system_in(ForceModule(forces, remembers=True), metric)
 
-    def system_in(
-        self,
-        field: ForceField,
-        metric: Preconditioner | None = None,
-        *,
-        lasting: bool = False,
-        recorded: System | None = None,
-    ) -> System:
-        """The system of the level in any field, with the level's metric by default; options are as for `System`."""
+    def system_in(self, field: ForceField, metric: Preconditioner | None = None) -> System:
+        """The system of the level in any field, with the level's metric by default."""
         level, metric = self.level, self.metric if metric is None else metric
-        place = {"free": level.free, "spacing": level.spacing, "level": level}
-        return System(field, metric, **place, lasting=lasting, recorded=recorded)
-
-    def lasting_system(
-        self,
-        coarse: Float[Tensor, "coarse 3"],
-        tie: tuple[float, Float[Tensor, "vertices 3"]] | None = None,
-        *,
-        rest_angle: Float[Tensor, " hinges"] | None = None,
-    ) -> System:
-        """The system of a frame without contact: reused in every frame, with new targets.
-
-        Recorded steps remain valid in the next frame.
-
-        Args:
-            coarse: Recentred coarse positions [m].
-            tie: Stiffness [1/s^2] and predicted positions [m] of a tether, or None.
-            rest_angle: Rest angles [rad], to replace the terms' own.
-        """
-        kind = tie is not None, rest_angle is not None
-        if kind not in self._lasting:
-            guide, angles = self.guide.retarget(coarse), None if rest_angle is None else rest_angle.clone()
-            tether = None if tie is None else self.tether(tie[0], tie[1].clone())
-            field = ForceModule((*self._resting_at(angles), guide, *([] if tether is None else [tether])))
-            self._lasting[kind] = self.system_in(field, lasting=True), guide, tether, angles
-        system, guide, tether, angles = self._lasting[kind]
-        guide.aim(coarse)
-        if rest_angle is not None and angles is not None:
-            angles.copy_(rest_angle)
-        if tie is not None and tether is not None:
-            stiffness, predicted = tie
-            tether.aim(predicted, stiffness)
-        return system
-
-    @cached_property
-    def touched(self) -> TouchedSystems:
-        """Lasting systems with contact."""
-        return TouchedSystems(self.level, self.system_in)
-
-    @cached_property
-    def _lasting(self) -> dict[tuple[bool, bool], tuple[System, Guide, Tether | None, Tensor | None]]:
-        """Systems returned by `lasting_system`, by presence of a tie and of rest angles."""
-        return {}
+        return System(field, metric, free=level.free, spacing=level.spacing, level=level)
 
     def tether(self, stiffness: float, predicted: Float[Tensor, "vertices 3"]) -> Tether:
         """The tie to predicted positions [m], of stiffness [1/s^2]."""

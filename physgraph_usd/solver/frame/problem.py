@@ -78,8 +78,6 @@ class LevelProblem:
         assert isinstance(field, ForceModule)
         assert isinstance(metric, Metric)
         held = view.metric(metric, touched, x, known=None if last is None else last.metric)
-        if self.alone.lasting and view.seam is None:
-            return self.lasting.touched.of(self.alone, touched, held)
         joined = field.joined_by(touched)
         return self.lasting.system_in(joined if view.seam is None else SewnForces(joined, view.seam), held)
 
@@ -170,13 +168,7 @@ class Problem:
         angles = self.creases.rest_angle if self.creases is not None and index == self.finest else None
         module = lasting.module(self.aim, angles)
         tie = None if self.tether is None or self.start.detailed is None else (self.tether, self.start.detailed)
-        # Recorded steps of a level on CUDA are reused in the next frame.
-        recorded = lasting.level.device != "cpu" and not settings.rough
-        alone = (
-            lasting.lasting_system(self.aim, tie, rest_angle=angles)
-            if recorded
-            else lasting.system(module, tie, rough=settings.rough)
-        )
+        alone = lasting.system(module, tie, rough=settings.rough)
         budget = settings.budget(self.finest - index, since, warm=self.warm)
         if self.creases is not None:  # The stopping measure misses fading creases.
             budget = replace(budget, near=0.0, rest=0.0 if self.start.held else budget.rest)

@@ -65,9 +65,6 @@ class System:
         free: False at fixed vertices, shape (V, 1).
         spacing: Mean rest edge length at each vertex [m], shape (V,).
         level: The level's mesh, or None.
-        lasting: Whether the system is reused, in the next frame or for another descent.
-        recorded: The system whose steps are recorded for this one: itself, or a lasting one with equal values.
-        expected: Most steps to be made; recording pays for many steps or a lasting system.
         field: The forces.
         metric: H0.
         evaluations: Number of force evaluations so far.
@@ -83,12 +80,8 @@ class System:
         free: Bool[Tensor, "vertices 1"],
         spacing: Float[Tensor, " vertices"],
         level: Level | None = None,
-        lasting: bool = False,
-        recorded: System | None = None,
     ) -> None:
         """Combine a force field with its metric and mask."""
-        self.lasting, self.expected = lasting, 0
-        self.recorded = self if recorded is None else recorded
         self.field, self.metric = field, metric
         self.free, self.spacing, self.level = free, spacing, level
         self._all_free = bool(free.all())
@@ -150,11 +143,6 @@ class System:
     def rest_diagonal_columns(self) -> Float[Tensor, "vertices 3"]:
         """`rest_diagonal` [N/m], in each of three columns."""
         return three_columns(self.rest_diagonal)
-
-    def renew(self, other: Preconditioner) -> None:
-        """Take the diagonal of another metric of the level, in the tensors that recorded steps read."""
-        self.rest_diagonal.copy_(other.diagonal)
-        self.rest_diagonal_columns.copy_(self.rest_diagonal.unsqueeze(1))
 
     @cached_property
     def _per_edge(self) -> Float[Tensor, "vertices 3"]:

@@ -28,7 +28,6 @@ from ..mesh.stencil import Stencil, three_columns
 from .base import Solver
 from .factors import Factors, factors_of
 from .fronts import ranges
-from .multifrontal import DissectedSolver
 
 REGULARISATION = 1e-7
 """Regularisation of a factorised diagonal, relative to its mean: keeps loose parts without a guide definite."""
@@ -49,14 +48,6 @@ class CageSolve:
     def __call__(self, force: Float[Tensor, "cage 3"]) -> Float[Tensor, "cage 3"]:
         """A_0^-1 F [m]."""
         return self.solver(force * self.scale)
-
-    def renew(self, other: CageSolve) -> None:
-        """Take the values of another solve of equal pattern, in the tensors of recorded steps."""
-        if isinstance(self.solver, DissectedSolver) and isinstance(other.solver, DissectedSolver):
-            self.solver.renew(other.solver)
-        else:  # The CPU records nothing.
-            self.solver = other.solver
-        self.scale.copy_(other.scale)
 
 
 class CoarseLevels:

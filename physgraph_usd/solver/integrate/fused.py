@@ -91,7 +91,7 @@ class FusedPhysgraph:
         bases: Sequence[Float[Tensor, "vertices 3"]],
         spacing: Float[Tensor, " vertices"],
         reach: Float[Tensor, " vertices"],
-        step: int | Tensor,
+        step: int,
         *,
         frame: Callable[[], VertexFrame],
     ) -> Float[Tensor, "vertices 3"]:
@@ -101,7 +101,7 @@ class FusedPhysgraph:
             bases: The vectors named by `bases` [m].
             spacing: Mean rest edge at each vertex [m].
             reach: The spacing, and 0 at fixed vertices [m].
-            step: Number of previous steps, a scalar on the device while steps are recorded.
+            step: Number of previous steps.
             frame: Gives the surroundings of the vertices; called only if parts need them.
         """
         torch.stack(list(bases), out=self._rows[: len(self.bases)])

@@ -27,12 +27,13 @@ from .base import Carry, System
 from .eight_vertices import EightPhysgraph
 from .fused import FusedPhysgraph, fused_physgraph
 from .network import Physgraph
-from .recorded import MOST_GARMENTS, Memory, Recording, Recordings, pays
-from .secants import Dot, dot, secant_direction
+from .secants import Dot, Memory, dot, secant_direction
 from .vertex_frame import VertexFrame
 
 NetworkT = TypeVar("NetworkT", bound=nn.Module)
 
+MOST_GARMENTS = 8
+"""Most garments whose scalar products are summed one by one, in a fixed order."""
 LONGEST = 5.0
 """Longest move of a vertex in a step, in edge lengths."""
 
@@ -42,18 +43,16 @@ class LearnedMetric:
 
     name = "physgraph"
 
-    def __init__(self, network: Physgraph, *, fuse: bool = True, record: bool = True) -> None:
+    def __init__(self, network: Physgraph, *, fuse: bool = True) -> None:
         """Keep the network.
 
         Args:
             network: The network.
             fuse: Use the kernels of `fused` if no gradient is needed.
-            record: On CUDA, record a step and replay the recording.
         """
         self._network = network
         self._trained = not any(parameter.requires_grad for parameter in network.parameters())
-        self._fuse, self._record = fuse and self._trained, record and self._trained
-        self._recordings = Recordings[Recording]()
+        self._fuse = fuse and self._trained
 
     def start(self, system: System, x: Float[Tensor, "vertices 3"]) -> Carry:
         """Evaluate x with an empty memory; the network runs in the system's precision."""
@@ -69,8 +68,6 @@ class LearnedMetric:
 
     def step(self, system: System, carry: Carry) -> Carry:
         """One step along the network's combination."""
-        if self.records(system):
-            return self._recording(system.recorded).step(system, carry)
         move = self.propose(system, carry)
         return self._reached(system, carry, carry.x + move, move)
 
@@ -97,18 +94,11 @@ class LearnedMetric:
         spacing = system.spacing
         return fused_physgraph(self._network, len(spacing), LONGEST, device=str(spacing.device), threads=threads)
 
-    def _combined(
-        self,
-        carry: Carry,
-        *,
-        system: System,
-        fused: FusedPhysgraph | EightPhysgraph | None,
-        secant: Callable[[Carry], Tensor] | None = None,
-    ) -> Tensor:
-        """The network's combination of vectors [m]; a recording provides its own L-BFGS direction."""
+    def _combined(self, carry: Carry, *, system: System, fused: FusedPhysgraph | EightPhysgraph | None) -> Tensor:
+        """The network's combination of vectors [m]."""
         names, step = self._network.config.vectors, carry.memory.step
         frame = cache(lambda: VertexFrame(level_of(system), carry.x))
-        whole = partial(_vector, system=system, carry=carry, secant=secant or _secant_direction)
+        whole = partial(_vector, system=system, carry=carry)
         if fused is not None:
             return fused(vectors_of(fused.bases, whole, frame=frame), system.spacing, system.reach, step, frame=frame)
         stacked = torch.stack(vectors_of(names, whole, frame=frame), dim=1)  # V N 3
@@ -119,23 +109,8 @@ class LearnedMetric:
     def _dot(self, system: System) -> Dot:
         """The scalar product: returns numbers if waiting for numbers costs nothing."""
         alone = system.level is None or len(system.level.spans) == 1
-        waits = alone and self._trained and not system.spacing.is_cuda and not self.records(system)
+        waits = alone and self._trained and not system.spacing.is_cuda
         return dot if waits else partial(garment_dot, system.level)
-
-    def records(self, system: System) -> bool:
-        """Whether a system's steps are recorded: on CUDA, once trained, for a reused system or many steps."""
-        few = system.level is None or len(system.level.spans) <= MOST_GARMENTS
-        return self._record and few and pays(system)
-
-    def _recording(self, system: System) -> Recording:
-        """The recording of a system's steps."""
-
-        def make() -> Recording:
-            # A recording keeps its kernels' buffers alive: the shared cache may drop them.
-            propose = partial(self._combined, system=system, fused=self._fused(system))
-            return Recording(system, propose, dot=self._dot(system))
-
-        return self._recordings.of(system, make)
 
 
 def _secant_direction(carry: Carry) -> Tensor:
@@ -144,11 +119,11 @@ def _secant_direction(carry: Carry) -> Tensor:
     return secant_direction(carry.force, carry.preconditioned, carry.memory.secants)
 
 
-def _vector(name: str, *, system: System, carry: Carry, secant: Callable[[Carry], Tensor]) -> Tensor:
+def _vector(name: str, *, system: System, carry: Carry) -> Tensor:
     """One of `network.WHOLE` [m]; zero if the history is too short."""
     memory: Memory = carry.memory
     if name == "secant":
-        return secant(carry)
+        return _secant_direction(carry)
     if name.startswith("diagonal"):
         return (memory.force if name == "diagonal1" else carry.force) / system.rest_diagonal_columns
     if name.startswith("metric"):

@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from jaxtyping import Float, Int
@@ -73,14 +72,12 @@ class Physgraph(nn.Module):
         nn.init.zeros_(self.decode.weight)
         nn.init.zeros_(self.decode.bias)
 
-    def forward(
-        self, vectors: Float[Tensor, "vertices vectors 3"], step: int | Tensor
-    ) -> Float[Tensor, "vertices vectors"]:
+    def forward(self, vectors: Float[Tensor, "vertices vectors 3"], step: int) -> Float[Tensor, "vertices vectors"]:
         """Coefficients of the vectors.
 
         Args:
             vectors: The configuration's vectors, in local edge lengths.
-            step: Number of previous steps, a scalar on the device while steps are recorded.
+            step: Number of previous steps.
         """
         square = vectors.square().sum(dim=2)  # V N
         size = (square @ self._mean + FLOOR**2).sqrt()  # V K
@@ -166,6 +163,6 @@ def in_rows(names: Sequence[str]) -> tuple[tuple[str, ...], tuple[int, ...], Par
     return wholes, smoothed, tuple(place(*each) for each in split)
 
 
-def clock_of(step: int | Tensor) -> Any:
+def clock_of(step: int) -> float:
     """The number of steps made, as a feature."""
-    return torch.log1p(step) - 1.5 if isinstance(step, Tensor) else math.log1p(step) - 1.5
+    return math.log1p(step) - 1.5

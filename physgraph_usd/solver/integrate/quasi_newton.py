@@ -11,7 +11,7 @@ as there are secants, because an opening triangle would otherwise remain slow.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -20,8 +20,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from .base import Carry, Solver, System
-from .recorded import SECANTS, Memory, Recording, Recordings, pays
-from .secants import Secant, dot, secant_direction
+from .secants import SECANTS, Secant, dot, secant_direction
 
 ARMIJO = 1e-4
 MAX_BACKTRACKS = 12
@@ -66,15 +65,9 @@ class QuasiNewton:
 
     name = "quasi-newton"
 
-    def __init__(self, *, history: int = SECANTS, record: bool = True) -> None:
-        """Choose the memory.
-
-        Args:
-            history: Number of secants kept.
-            record: On CUDA, record a step on H0 and replay the recording.
-        """
+    def __init__(self, *, history: int = SECANTS) -> None:
+        """Choose the memory: the number of secants kept."""
         self._history = history
-        self._record, self._recordings = record and history == SECANTS, Recordings[_Trial]()
 
     def start(self, system: System, x: Float[Tensor, "vertices 3"]) -> Carry:
         """Evaluate x with an empty memory."""
@@ -96,9 +89,6 @@ class QuasiNewton:
         present state's stiffness.
         """
         memory = self._softened(system, carry) if carry.memory.stiff >= self._history else carry.memory
-        tried = self._replayed(system, carry) if memory.inverse is None and self.records(system) else None
-        if tried is not None:
-            return tried
         direction = secant_direction(carry.force, memory.image, memory.secants)
         slope = dot(carry.force, direction)
         if not slope > 0:
@@ -118,22 +108,6 @@ class QuasiNewton:
         if newest.curvature < math.inf:
             secants = (*secants, newest)[-self._history :]
         return self._carry(x, energy, force, _Memory(secants, memory.inverse, image, memory.stiff + bool(memory.stiff)))
-
-    def records(self, system: System) -> bool:
-        """Whether a system's steps are recorded."""
-        return self._record and pays(system)
-
-    def _replayed(self, system: System, carry: Carry) -> Carry | None:
-        """The carry after a step's first trial; None if the trial is not good enough."""
-        secants = carry.memory.secants
-        known = Memory(carry.force, (carry.memory.image, carry.memory.image), secants)
-        trial = self._recordings.of(system.recorded, lambda: _Trial(system.recorded))
-        after = trial.step(system, replace(carry, memory=known))
-        if after.preconditioned is None:
-            return None
-        if after.mover != _MISLED:
-            secants = tuple(replace(each, dot=dot) for each in after.memory.secants[-len(secants) - 1 :])
-        return replace(after, mover=self.name, memory=_Memory(secants, None, after.preconditioned))
 
     def _begin(self, system: System, x: Tensor, energy: float, force: Tensor, *, inverse: Solver | None) -> Carry:
         image = system.apply_metric_inverse(force, inverse)
@@ -183,35 +157,6 @@ class _Memory:
     image: Tensor
     stiff: int = 0
     shortened: bool = False
-
-
-_MISLED = "misled"
-"""Mover name of a trial with a useless secant."""
-
-
-class _Trial(Recording):
-    """The first trial of a step on CUDA."""
-
-    def __init__(self, system: System) -> None:
-        super().__init__(system, lambda carry, *, secant: secant(carry), dot=_tensor_dot, together=True)
-
-    def _measures(self, before: Carry, after: Carry, move: Tensor) -> list[Tensor]:
-        slopes = [_tensor_dot(each.force, move) for each in (before, after)]
-        return [*slopes, after.memory.secants[-1].curvature]
-
-    def _judged(self, before: Carry, after: Carry, measures: Sequence[float]) -> Carry:
-        slope, end, curvature = measures
-        if not (slope > 0 and _is_enough(before, after.energy, slope, lambda: end)):
-            return replace(after, preconditioned=None)
-        return after if curvature < math.inf else after.moved_by(_MISLED)
-
-    def _image(self, force: Tensor) -> Tensor:
-        return self._system.apply_metric_inverse(force)
-
-
-def _tensor_dot(a: Tensor, b: Tensor) -> Tensor:
-    """The scalar product of two fields, without waiting for the number."""
-    return torch.dot(a.reshape(-1), b.reshape(-1))
 
 
 def _is_enough(

@@ -23,6 +23,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from .base import Carry
+
+SECANTS = 5
+"""Secants kept."""
 Dot = Callable[[Tensor, Tensor], Any]
 """The scalar product of two fields: a float, or a tensor of one number per garment, at each vertex of the garment."""
 
@@ -50,6 +54,30 @@ class Secant:
         if isinstance(curvature, Tensor):
             return torch.where((curvature > floor) & (size > 0), curvature, math.inf)
         return curvature if curvature > floor and size > 0 else math.inf
+
+
+@dataclass(frozen=True, eq=False)
+class Memory:
+    """The past of a step.
+
+    Attributes:
+        force: Force one step ago [N].
+        images: H0^-1 F one and two steps ago [m].
+        secants: The last `SECANTS`, oldest first.
+        step: Number of steps made.
+    """
+
+    force: Tensor
+    images: tuple[Tensor, Tensor]
+    secants: tuple[Secant, ...] = ()
+    step: int = 0
+
+    def after(self, carry: Carry, move: Tensor, force: Tensor, image: Tensor, *, dot: Dot) -> Memory:
+        """The memory after a displacement [m] from a carry with this memory; force [N] and image [m] are at the end."""
+        assert carry.preconditioned is not None
+        newest = Secant(move, carry.force - force, carry.preconditioned - image, dot)
+        images = (carry.preconditioned, self.images[0])
+        return Memory(carry.force, images, (*self.secants, newest)[-SECANTS:], self.step + 1)
 
 
 def secant_direction(

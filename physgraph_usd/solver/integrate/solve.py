@@ -84,7 +84,6 @@ def descend(
     """
     began, before = time.perf_counter(), system.counted
     report = LevelReport(level, x.shape[0])
-    system.expected = budget.steps
     carry = integrator.start(system, x) if resume is None else resumed(integrator, system, resume)
     _require_finite(carry, level)
     report.energy_before = carry.energy
