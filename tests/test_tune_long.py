@@ -20,7 +20,7 @@ import torch
 from shots import CLOTH, cloth_shot
 
 from physgraph_usd.solver.fabric import PRESETS
-from physgraph_usd.solver.integrate.factors import HostFactors
+from physgraph_usd.solver.integrate.factors import Factors
 from physgraph_usd.studio.loop import SolveLoop
 from physgraph_usd.studio.session import Shown, TuneSession
 from physgraph_usd.studio.values import MAPS, TUNABLES
@@ -87,13 +87,13 @@ def moved(session: TuneSession, loop: SolveLoop, chance: random.Random) -> None:
 @pytest.mark.timeout(SECONDS + 300)
 def test_random_moves_leave_memory_bounded_and_nothing_stale(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     chance, log, process, factors = random.Random(1), Log(), psutil.Process(), list[int]()
-    factorised = HostFactors.of
+    factorised = Factors.of
 
-    def counted(own: HostFactors, values: torch.Tensor) -> Any:
+    def counted(own: Factors, values: torch.Tensor) -> Any:
         factors.append(len(values))
         return factorised(own, values)
 
-    monkeypatch.setattr(HostFactors, "of", counted)
+    monkeypatch.setattr(Factors, "of", counted)
     with closing(TuneSession(cloth_shot(tmp_path / "sheet.usda", size=(16, 12)), garments=[CLOTH])) as session:
         loop = SolveLoop(session, log, rest_seconds=0.05)
         loop.start()

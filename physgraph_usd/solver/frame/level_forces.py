@@ -120,8 +120,7 @@ class LevelForces:
     def metric(self) -> Metric:
         """The factorised rest Hessian of all terms."""
         matrix = on_edges(self._module.rest_matrix(), self.level.springs.cpu().numpy())
-        like = None if self.lent is None else self.lent.metric
-        return Metric(matrix, free=self.level.free, dtype=self.level.dtype, ups=self.level.ups, like=like)
+        return Metric(matrix, free=self.level.free, dtype=self.level.dtype, ups=self.level.ups)
 
     @cached_property
     def rough_metric(self) -> Metric:

@@ -26,8 +26,7 @@ from torch import Tensor
 
 from ..mesh.stencil import Stencil, three_columns
 from .base import Solver
-from .factors import Factors, factors_of
-from .fronts import ranges
+from .factors import Factors
 
 REGULARISATION = 1e-7
 """Regularisation of a factorised diagonal, relative to its mean: keeps loose parts without a guide definite."""
@@ -65,7 +64,6 @@ class CoarseLevels:
         *,
         dtype: torch.dtype,
         device: str,
-        like: CoarseLevels | None = None,
     ) -> None:
         """Take a metric to its coarser levels.
 
@@ -75,7 +73,6 @@ class CoarseLevels:
             onto: Projection of moves of the finest level, zero at fixed vertices, shape (V, V).
             dtype: Scalar type of forces.
             device: "cpu" or a CUDA device.
-            like: Levels whose order of elimination serves again if the cage has the same pattern; or None.
         """
         first = ups[0].alike(onto @ ups[0].matrix) if ups else Stencil(onto, dtype=dtype, device=device)
         self.ups = [first, *ups[1:]]
@@ -88,8 +85,7 @@ class CoarseLevels:
             weights.append(sp.csr_matrix(basis.multiply(basis).T))
         apart = sp.diags((matrix.diagonal() <= 0).astype(np.float64))  # Identity rows where nothing moves.
         pattern = sp.csr_matrix(abs(matrix) + abs(basis.T) @ abs(basis) + sp.identity(basis.shape[1]))
-        known_factors = None if like is None else like._factors
-        self._factors = factors_of(pattern, dtype=dtype, device=device, like=known_factors)
+        self._factors = Factors(pattern, dtype=dtype, device=device)
         known[-1:], weights[-1:] = [self._factors.taken(matrix + apart)], [_squares(basis, self._factors)]
         self._sizes = [len(each) for each in known]
         self._known = torch.as_tensor(np.concatenate(known), device=device)
@@ -131,3 +127,9 @@ def _squares(basis: sp.csr_matrix, cage: Factors) -> sp.csr_matrix:
     place = cage.places(basis.indices[left], basis.indices[right])
     products = basis.data[left] * basis.data[right]
     return sp.csr_matrix((products, (place, vertex[left])), shape=(len(cage.rows), basis.shape[0]))
+
+
+def ranges(starts: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """Concatenation of the ranges starts[i], starts[i] + 1, ..., each with counts[i] numbers."""
+    before = np.cumsum(counts) - counts
+    return np.repeat(starts - before, counts) + np.arange(int(counts.sum()))

@@ -1,4 +1,4 @@
-"""Factors of symmetric positive definite matrices of one pattern, on the CPU or CUDA."""
+"""Factors of symmetric positive definite matrices of one pattern, by cholespy on the CPU or CUDA, else by scipy."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from scipy.sparse.linalg import splu
 from torch import Tensor
 
 from .base import Solver
-from .multifrontal import DissectedSolver, Elimination
 
 try:
     import cholespy
@@ -20,7 +19,7 @@ except ImportError:  # Linux on ARM has no wheel.
     cholespy = None
 
 FACTOR = "scipy" if cholespy is None else "cholespy"
-"""Library used for factors on the CPU."""
+"""Library used for factors."""
 
 
 class Factors:
@@ -31,8 +30,9 @@ class Factors:
         diagonal: Numbers of the diagonal's entries, shape (V,).
     """
 
-    def __init__(self, pattern: sp.csr_matrix, *, device: str) -> None:
-        """Number the entries of a symmetric pattern with a full diagonal, shape (V, V)."""
+    def __init__(self, pattern: sp.csr_matrix, *, dtype: torch.dtype, device: str) -> None:
+        """Number the entries of a symmetric pattern with a full diagonal, shape (V, V); dtype is the forces'."""
+        self._dtype = dtype
         pattern.sort_indices()
         self._count, columns = pattern.shape[0], pattern.indices.astype(np.int64)
         rows = np.repeat(np.arange(self._count), np.diff(pattern.indptr))
@@ -52,24 +52,11 @@ class Factors:
 
     def of(self, values: Float[Tensor, " entries"]) -> Solver:
         """The solve of a matrix with these entries, float64."""
-        raise NotImplementedError
-
-
-class HostFactors(Factors):
-    """Factors on the CPU."""
-
-    def __init__(self, pattern: sp.csr_matrix, dtype: torch.dtype) -> None:
-        """Take a pattern, as in `factors_of`."""
-        super().__init__(pattern, device="cpu")
-        self._dtype = dtype
-
-    def of(self, values: Float[Tensor, " entries"]) -> Solver:
-        """The solve of a matrix with these entries, float64."""
         if not self._count:
             return torch.empty_like
         if cholespy is None:
-            place, shape = (self.rows.numpy(), self.columns.numpy()), (self._count, self._count)
-            return _of_scipy(sp.coo_matrix((values.numpy(), place), shape=shape))
+            place, shape = (self.rows.cpu().numpy(), self.columns.cpu().numpy()), (self._count, self._count)
+            return _of_scipy(sp.coo_matrix((values.cpu().numpy(), place), shape=shape))
         return _of_cholespy(cholespy, values, self.rows.int(), self.columns.int(), self._dtype)
 
 
@@ -90,31 +77,4 @@ def _of_scipy(matrix: sp.coo_matrix) -> Solver:
     """The solve by an LU factor without pivoting, not needed for a positive definite matrix."""
     options = {"SymmetricMode": True}
     factor = splu(sp.csc_matrix(matrix), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
-    return lambda force: torch.as_tensor(factor.solve(force.double().numpy()), dtype=force.dtype)
-
-
-class DeviceFactors(Factors):
-    """Factors on CUDA; only the first factorisation passes through the host."""
-
-    def __init__(self, pattern: sp.csr_matrix, dtype: torch.dtype, device: str, *, like: Factors | None = None) -> None:
-        """Find an order of elimination for a pattern, or take that of a like pattern."""
-        super().__init__(pattern, device=device)
-        self._dtype, known = dtype, like if isinstance(like, DeviceFactors) else None
-        same = known is not None and np.array_equal(known._keys, self._keys)
-        self._elimination = known._elimination if known is not None and same else Elimination(pattern, device=device)
-
-    def of(self, values: Float[Tensor, " entries"]) -> DissectedSolver:
-        """The solve of a matrix with these entries, float64."""
-        return DissectedSolver(self._elimination, values, dtype=self._dtype)
-
-
-def factors_of(pattern: sp.csr_matrix, *, dtype: torch.dtype, device: str, like: Factors | None = None) -> Factors:
-    """Factors of the matrices of a pattern.
-
-    Args:
-        pattern: Symmetric pattern with a full diagonal, shape (V, V).
-        dtype: Scalar type of the right-hand sides.
-        device: "cpu" or a CUDA device.
-        like: Factors whose order of elimination serves again on CUDA if their pattern is the same; or None.
-    """
-    return HostFactors(pattern, dtype) if device == "cpu" else DeviceFactors(pattern, dtype, device, like=like)
+    return lambda force: torch.as_tensor(factor.solve(force.double().cpu().numpy())).to(force)

@@ -16,7 +16,7 @@ from torch import Tensor
 from ..mesh.stencil import Stencil, three_columns
 from .base import Solver
 from .coarse import REGULARISATION, CoarseLevels
-from .factors import factors_of
+from .factors import Factors
 
 
 def on_edges(matrix: sp.csr_matrix, edges: np.ndarray) -> sp.csr_matrix:
@@ -54,7 +54,6 @@ class Metric:
         free: Bool[Tensor, "vertices 1"],
         dtype: torch.dtype,
         ups: Sequence[Stencil] = (),
-        like: Metric | None = None,
     ) -> None:
         """Factorise a scalar Hessian at rest.
 
@@ -63,18 +62,16 @@ class Metric:
             free: False at fixed vertices, whose rows become identity rows.
             dtype: Scalar type of the right-hand sides.
             ups: Linear map to each level from the next coarser one, finest first.
-            like: A metric whose order of elimination serves again on CUDA if its matrix has the same pattern; or None.
         """
         self._free, self._matrix, self._ups, device = free.squeeze(1), matrix, tuple(ups), str(free.device)
         self._mask = three_columns(self._free.to(dtype))
         self._merged: MergedMetric | None = None
         self._unscaled: tuple[Metric, Tensor] | None = None
-        self._alike = None if like is None else like.__dict__.get("coarse", like._alike)
         self._keep = sp.diags(self._free.cpu().numpy().astype(np.float64))
         kept = sp.csr_matrix(self._keep @ matrix @ self._keep)
         kept.eliminate_zeros()
         pattern = sp.csr_matrix(abs(kept) + sp.identity(matrix.shape[0]))
-        self._factors = factors_of(pattern, dtype=dtype, device=device, like=None if like is None else like._factors)
+        self._factors = Factors(pattern, dtype=dtype, device=device)
         stiffness = torch.as_tensor(matrix.diagonal(), device=device)
         moved = stiffness[self._free].cpu().numpy()
         # A unit mean diagonal keeps float32 pivots in range whatever the fabric and the level.
@@ -93,7 +90,7 @@ class Metric:
             return metric.coarse.scaled(stiffer)
         kept, dtype = sp.csr_matrix(self._keep @ self._matrix @ self._keep), self._mask.dtype
         device = str(self._mask.device)
-        return CoarseLevels(kept, self._ups, self._onto, dtype=dtype, device=device, like=self._alike)
+        return CoarseLevels(kept, self._ups, self._onto, dtype=dtype, device=device)
 
     @property
     def _onto(self) -> sp.csr_matrix:
