@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 from bodies import ball, distances, tube
-from cloth import sheet
 from layers import COAT, TIMES, errors, fine_points, make_shot, open_over, refine_all
 from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 from shots import CLOTH, cloth_shot, faults, refine
@@ -19,8 +18,7 @@ from physgraph_usd.errors import LayerError
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.solver.colliders.mesh import MeshBody
 from physgraph_usd.solver.colliders.pose import MeshPose
-from physgraph_usd.solver.contact.heat import body_crossings, penetration_map
-from physgraph_usd.solver.mesh.topology import edges_of
+from physgraph_usd.solver.contact.heat import penetration_map
 from physgraph_usd.usd.check.validate import validate_layer
 from physgraph_usd.usd.read.reader import open_shot
 from physgraph_usd.usd.write.writer import LayerWriter
@@ -43,29 +41,6 @@ class TestPenetration:
         (surface,) = MeshBody(side=side, device="cpu", threads=1).pose(MeshPose(*tube(around=256)))
         found = penetration_map([surface], np.array([[0.08, 0.0, 0.0]]))
         assert found[0] == pytest.approx(depth, abs=0.1)
-
-
-class TestCrossings:
-    def test_a_sheet_through_a_mesh_marks_what_crosses(self):
-        """A level sheet through a ball: its edges between inside and outside, and nothing away from the surface."""
-        x, faces = level_sheet()
-        soup = ball(0.2, level=3)
-        (surface,) = MeshBody(device="cpu", threads=1).pose(MeshPose(*soup))
-        edges = edges_of(faces, len(x)).vertices
-        found = body_crossings([surface], x, edges, triangles=faces)
-        radius = np.linalg.norm(x, axis=1)[edges]
-        through = (radius.min(axis=1) < 0.199) & (radius.max(axis=1) > 0.2)
-        assert through.sum() > 20
-        assert found[edges[through].ravel()].all()
-        away = np.abs(np.linalg.norm(x, axis=1) - 0.2) > 0.075
-        assert away.sum() > 80
-        assert not found[away].any()
-
-
-def level_sheet() -> tuple[np.ndarray, np.ndarray]:
-    """Points and triangles of a sheet in a plane through the origin."""
-    mesh, rest = sheet(12, 12, 0.05)
-    return rest - rest.mean(axis=0) + 1e-3, np.asarray(mesh.triangulate(None).triangles)
 
 
 def write(shot_file: Path, out: Path, heat: Mapping[Any, dict[str, Any] | None], **options: object) -> Path:

@@ -12,6 +12,7 @@ import torch
 from ...solver.collide.crossings import crossings
 from ...solver.collide.parts import Parts
 from ...solver.frame.scene_frame import SceneCloth
+from ...solver.frame.settings import SolveSettings
 from ...solver.level import Level, build_levels, hinge_geometry, refine_garments
 from ...solver.mesh.elements import hinges_of
 from ...solver.scene import recentred
@@ -114,7 +115,10 @@ def _faults(report: RefineReport, shot: Shot, time: float | None, points: Sequen
     found = crossings(Parts(level, every), torch.as_tensor(np.concatenate(points) - origin, dtype=torch.float32))
     crossing = np.zeros(level.vertex_count, bool)
     crossing[level.edges.numpy()[found.edge.numpy()]] = True
-    heat = [cloth.heat(i, each, crossing[span]) for i, (each, span) in enumerate(zip(points, level.spans, strict=True))]
+    heat = [
+        cloth.heat(i, each, crossing[span], SolveSettings())
+        for i, (each, span) in enumerate(zip(points, level.spans, strict=True))
+    ]
     return [(each["penetration"] > 0) + 1.0 * (each["crossing"] > 0) for each in heat]
 
 

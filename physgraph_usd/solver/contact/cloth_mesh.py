@@ -45,7 +45,7 @@ class ClothMesh:
         edges, triangles, count = level.edges.cpu().numpy(), level.triangles.cpu().numpy(), level.vertex_count
         label = joined_by(sewn, count) if len(sewn) else None
         self.level, self._garments = level, len(level.spans)
-        self.parts, self._solids = Parts(level, meets, label, solids=solids), solids
+        self.parts = Parts(level, meets, label, solids=solids)
         self.pieces = joined_by(edges, count)
         self.beside = _across(adjacency(edges, count), label)
         start = count

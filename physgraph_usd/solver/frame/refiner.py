@@ -217,7 +217,7 @@ class Refiner:
         """A garment's depth in bodies and its crossings in the last frame; None without positions [m]."""
         memory = self._memories[index]
         crossing = memory.last.crossing if memory.solved and memory.last is not None else None
-        return None if points is None else self._cloth.heat(index, points, crossing)
+        return None if points is None else self._cloth.heat(index, points, crossing, self._settings)
 
     def _is_gap(self, time: float | None) -> bool:
         """Whether the time since the last frame is too long to start from it."""

@@ -15,7 +15,6 @@ from ..contact.broad_phase import Bodies, TouchingGroups, bounds_of, reach_of
 from ..contact.heat import body_crossings, penetration_map
 from ..deadline import is_over
 from ..level import refine_garments
-from ..mesh.topology import edges_of
 from ..rigid import AT_REST
 from ..scene import Frame, GarmentFrame, Scene, out_of_bounds
 from ..strain import has_collapsed, size_left, strayed
@@ -116,21 +115,20 @@ class SceneCloth:
         motion = AT_REST if origin is None else origin.motion
         return self.bodies.touching(near, offsets, before=known, motion=motion)
 
-    def heat(self, index: int, points: np.ndarray, crossing: np.ndarray | None) -> dict[str, np.ndarray]:
+    def heat(
+        self, index: int, points: np.ndarray, crossing: np.ndarray | None, settings: SolveSettings
+    ) -> dict[str, np.ndarray]:
         """Depth of a garment inside bodies with overlapping bounds, pushing or not, and crossings of cloth.
 
         Args:
             index: Number of the garment.
             points: World positions [m], shape (V, 3).
             crossing: Whether each vertex belongs to cloth that crosses cloth, shape (V,); None for no vertex.
+            settings: Settings of the solve.
         """
-        garment, chain = self.scene.garments[index], self.refinements[index]
-        near = self.bodies.near(garment, bounds_of(points), 0.0)
+        near = self.bodies.near(self.scene.garments[index], bounds_of(points), 0.0)
         surfaces = [each.surface for each in self.bodies.touching(near, [[0.0] * len(near)])]
-        finest, rest = (chain[-1].mesh, None) if chain else (garment.mesh, garment.rest)
-        triangles = finest.triangulate(rest).triangles
-        edges = edges_of(triangles, len(points)).vertices
-        crosses = body_crossings(surfaces, points, edges, triangles=triangles, device=self._device)
+        crosses = body_crossings(self.group((index,), settings).levels[-1], surfaces, points)
         crosses = crosses if crossing is None else crosses | crossing
         depth = penetration_map(surfaces, points, device=self._device)
         return {"penetration": depth, "crossing": crosses.astype(np.float32)}
