@@ -7,8 +7,7 @@ import pytest
 import torch
 from bodies import around, ball, box, distances, endless, flipped, signed, split, surfaces, together, tube
 
-from physgraph_usd.solver.colliders.mesh import Faces, MeshBody, MeshSurface
-from physgraph_usd.solver.colliders.overlap import overlapping
+from physgraph_usd.solver.colliders.mesh import Faces, MeshBody, MeshSurface, overlapping
 from physgraph_usd.solver.colliders.pose import MeshPose, ShapePose, moved_rigidly
 from physgraph_usd.solver.colliders.primitives import ShapeSurface
 from physgraph_usd.usd.read.bodies import tessellated

@@ -138,7 +138,7 @@ def test_a_number_without_effect_takes_one_run_and_one_with_an_effect_three(
     found = run_variant(stop, base, 100.0)
     assert len(found) == 3
     assert found[0]["energy"] != base["energy"]
-    rounds = Variant("sheet", jobs, named(numbers, "contact/safe_move.py", "ROUNDS"), "double")
+    rounds = Variant("sheet", jobs, named(numbers, "contact/promise.py", "ROUNDS"), "double")
     monkeypatch.setattr("benchmarks.numbers.TIME_MATTERS", 1e9)
     assert [each["energy"] for each in run_variant(rounds, base, 100.0)] == [base["energy"]]
     assert run_variant(rounds, None, 1e-3).startswith("TimeoutError")

@@ -14,7 +14,7 @@ from folds import named
 from scipy.spatial import Delaunay
 
 from physgraph_usd.solver.collide.parts import Parts
-from physgraph_usd.solver.contact.safe_move import safe_move
+from physgraph_usd.solver.contact.promise import safe_move
 from physgraph_usd.solver.level import Level, build_levels
 from physgraph_usd.solver.mesh.topology import PolygonMesh
 

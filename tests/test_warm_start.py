@@ -19,12 +19,11 @@ from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.refine import refine_shot
 from physgraph_usd.solver.contact.settings import ContactSettings
-from physgraph_usd.solver.frame import recovery
+from physgraph_usd.solver.frame import solve as frame_solve
 from physgraph_usd.solver.frame.group import Group
 from physgraph_usd.solver.frame.lead_in import lead_in
-from physgraph_usd.solver.frame.recovery import RunawayError, solve_soundly
 from physgraph_usd.solver.frame.refiner import Refiner
-from physgraph_usd.solver.frame.solve import solve_frame
+from physgraph_usd.solver.frame.solve import RunawayError, solve_frame, solve_soundly
 from physgraph_usd.solver.frame.start import STILL, Start, start_of, torn
 from physgraph_usd.solver.frame.values import Cage, FrameInput, Solved, State
 from physgraph_usd.solver.integrate.stop import EARLY, NEAR, ROUND, TOUCHING
@@ -226,7 +225,7 @@ def stand_in(monkeypatch: pytest.MonkeyPatch, warm: tuple[int, float], cold: tup
         nothing = torch.zeros(0, 3)
         return Solved([np.zeros((0, 3))], State(nothing, nothing, torch.zeros(0, 3, 3)), told, [])
 
-    monkeypatch.setattr(recovery, "solve_frame", solve)
+    monkeypatch.setattr(frame_solve, "solve_frame", solve)
     return made
 
 

@@ -16,12 +16,11 @@ from torch import Tensor
 
 from .fabric import Fabric
 from .grain import SHORTEST, LevelGrain, axes, edge_cosines
-from .mesh.creases import crease_mask, creases_of, halves_of
 from .mesh.defects import FLAT
 from .mesh.elements import QUAD_SPRING, ElasticElements, elastic_elements
 from .mesh.lengths import ANGLES, LENGTHS, NORMALS, ElementValues
 from .mesh.stencil import Stencil
-from .mesh.subdivide import Refinement, on_triangles, smooth, subdivide_times
+from .mesh.subdivide import Refinement, crease_mask, creases_of, halves_of, on_triangles, smooth, subdivide_times
 from .mesh.topology import PolygonMesh, TriangleSplit, edges_of, find_edges
 from .scene import Garment
 

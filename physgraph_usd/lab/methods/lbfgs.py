@@ -9,8 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ...solver.integrate.base import Carry, System
-from ...solver.integrate.quasi_newton import SHORTENED, backtrack
-from ...solver.integrate.secants import SECANTS, Secant, dot, secant_direction
+from ...solver.integrate.quasi_newton import SECANTS, SHORTENED, Secant, backtrack, dot, secant_direction
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,13 +17,12 @@ from ..contact.frame import FrameContact
 from ..contact.settings import ContactSettings
 from ..forces.base import ForceModule
 from ..forces.guide import GuideMap
-from ..forces.seam import Seam
+from ..forces.seam import Seam, level_seams
 from ..integrate.base import Integrator, System
 from ..integrate.quasi_newton import QuasiNewton
 from ..level import Level, Placed, build_levels, unhindered
 from ..mesh.subdivide import Refinement
 from ..scene import Garment, GarmentFrame, recentred
-from ..seams import level_seams
 from .from_cage import Followers, MovingFrames
 from .level_forces import LevelForces
 from .settings import SolveSettings

@@ -20,8 +20,8 @@ from ..scene import Frame, GarmentFrame, Scene, out_of_bounds
 from ..strain import has_collapsed, size_left, strayed
 from .group import Group
 from .history import Memory, Origin, SolvedFrame, is_same, jumped_from, origin_of
-from .recovery import RunawayError, solve_soundly
 from .settings import SolveSettings
+from .solve import RunawayError, solve_soundly
 from .values import FrameInput, split
 
 

@@ -27,7 +27,7 @@ from .base import Carry, System
 from .eight_vertices import EightPhysgraph
 from .fused import FusedPhysgraph, fused_physgraph
 from .network import Physgraph
-from .secants import Dot, Memory, dot, secant_direction
+from .quasi_newton import Dot, Memory, dot, secant_direction
 from .vertex_frame import VertexFrame
 
 NetworkT = TypeVar("NetworkT", bound=nn.Module)

@@ -2,7 +2,7 @@
 
 Exporters split a garment at its seams, and draw a sheet twice to show both sides. Bending forces, smooth surfaces and
 normals need a face on each side of an edge. Therefore coincident open edges are joined in pairs, and only the first of
-coincident faces is solved. Edges with more than two coincident copies stay apart: `seams` sews them.
+coincident faces is solved. Edges with more than two coincident copies stay apart: `forces.seam` sews them.
 """
 
 from __future__ import annotations

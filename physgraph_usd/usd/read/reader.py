@@ -23,7 +23,7 @@ from pxr import Sdf, Usd
 
 from ...errors import AbsentError, SchemaError, StageError, UsageError
 from ...interrupts import leave_if_asked
-from ...solver.colliders.choose_side import choose_side
+from ...solver.colliders.orient import choose_side
 from ...solver.colliders.pose import MeshPose
 from ...solver.scene import Frame, Scene, refuse_falling, refuse_far
 from ..lookup import check_limits, check_overrides, is_on, parse_overrides
