@@ -86,7 +86,6 @@ def solve_in_chunks(
 
     Args:
         solver: Solves time codes in order.
-        times: The time codes.
         frames: Folder of the results; frames in ``frames.kept`` are read from the folder.
         workers: Number of chunks.
         only: Numbers of the time codes to solve; None for all.
@@ -131,7 +130,6 @@ def finished_frames(
     """Yield the frames of chunks in order; if two chunks hold a frame, the later chunk's result is the ``lead``.
 
     Args:
-        frames: The frames of the chunks.
         times: Time codes of the shot.
         numbers: Numbers of the frames to yield.
         preroll: Frames solved before each chunk.

@@ -38,8 +38,6 @@ def begin_report(report: RefineReport, opened: Shot, options: RefineOptions) -> 
 
     Args:
         report: An empty report.
-        opened: The shot.
-        options: The run's options.
 
     Returns:
         Warnings for the user.
@@ -325,7 +323,6 @@ def _touching(opened: Shot) -> list[str]:
 
 
 def _felt(opened: Shot, garment: Garment) -> list[str]:
-    """Paths of the colliders felt by a garment."""
     return [opened.scene.colliders[index].path for index in garment.colliders]
 
 

@@ -52,7 +52,6 @@ def estimate(
     """Estimate a run.
 
     Args:
-        garments: The garments.
         levels: Number of subdivisions of each.
         frames: Number of time codes.
         workers: Processes that share the frames.
@@ -76,7 +75,6 @@ def cannot_fit(
     """The error naming a run too large for memory and the largest level to fit, or None if the run fits.
 
     Args:
-        garments: The garments.
         levels: Number of subdivisions of each.
         frames: Number of time codes.
         workers: Processes that share the frames.

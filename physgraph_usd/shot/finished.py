@@ -42,7 +42,6 @@ def finished(shot: str | Path, out: Path, options: RefineOptions) -> RefineRepor
 
     Args:
         shot: Input file.
-        out: Its layer.
         options: With ``skip_existing``, an existing layer is kept. With ``resume``, the layer is kept if all outputs
             exist and the layer's record names the same inputs.
     """

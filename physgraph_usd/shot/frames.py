@@ -94,7 +94,6 @@ class Kept:
     """Finished frames of an incomplete run.
 
     Attributes:
-        folder: Folder of the frames.
         frames: Number of finished frames.
         of: Number of frames of the run.
     """
@@ -157,7 +156,6 @@ class Finished:
     """Finished frames in a folder, read-only.
 
     Attributes:
-        folder: The folder.
         kept: Numbers of the complete frames.
     """
 
@@ -328,7 +326,6 @@ class FrameFolder(Finished):
 
         Args:
             index: Number of the frame.
-            outcome: The result.
             seam: Number of the frame whose pre-roll the result belongs to, or None.
             joined: Whether the result is the frame as joined with that pre-roll.
 

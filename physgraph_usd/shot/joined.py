@@ -134,12 +134,7 @@ class Movable(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class SafeMover:
-    """Moves the cloth of a shot without new intersections or vertices in bodies, as `Mover` requires.
-
-    Attributes:
-        cloth: The cloth.
-        paths: Path of each garment.
-    """
+    """Moves the cloth of a shot without new intersections or vertices in bodies, as `Mover` requires."""
 
     cloth: Movable
     paths: Sequence[str]

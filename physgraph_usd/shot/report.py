@@ -60,7 +60,6 @@ class RefineReport:
     Attributes:
         shot: Input file.
         out: Layer written, or None after a dry run.
-        options: The options used.
         option_sources: Origin of each option's value: "command line", a file, "default", or "given" from Python.
         estimate: Expected cost, from `Estimate.plain`.
         garments: Per garment: path, counts, level and reason, material values and their sources.

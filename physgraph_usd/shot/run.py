@@ -84,7 +84,6 @@ class Run:
     Attributes:
         shot: The shot, open.
         out: The layer to write, or None for a layer in memory.
-        options: Options of the run.
         report: The report, with the garments filled in.
         joins: Chunks to join into the layer instead of solving; None to solve.
     """

@@ -16,7 +16,6 @@ class Unsettled:
     """A garment's frame that did not settle.
 
     Attributes:
-        level: The unsettled level.
         remaining_move: RMS of H0^-1 F at the level, in local edge lengths; None if the frame was not solved.
         stopped: Reason for the end of the steps, as in `LevelReport`, or `COLLAPSED`, `LIMITED` or `UNSOLVED`.
         size: Size of a collapsed cage relative to its rest shape.

@@ -131,7 +131,6 @@ def time_frames(shot: Shot, options: RefineOptions, levels: list[int]) -> dict[s
 
     Args:
         shot: The shot; up to three frames in the middle are solved: one cold, then two warm.
-        options: Options of a run.
         levels: Subdivisions of each garment.
     """
     device = prepare_device(options.device)

@@ -43,7 +43,6 @@ class Seam:
 
     Attributes:
         after: Time code of the first frame after the seam.
-        path: The garment.
         rms: Largest increase of a frame's move, RMS over the vertices, in mean fine edge lengths.
         largest: Largest increase of a single vertex's move, in mean fine edge lengths.
         frames: Number of joined frames; 0 if the cloth jumps.
@@ -69,7 +68,6 @@ class _Chunk:
     """A chunk's folder.
 
     Attributes:
-        folder: The folder.
         run: The record of the run.
     """
 
@@ -295,7 +293,6 @@ def _opened_shot(part: _Chunk, shot: str | Path | None) -> Iterator[Shot]:
 
 
 def _joins(parts: Sequence[_Chunk], opened: Shot, bound: float, **more: Any) -> _Joins:
-    """Chunks of an open shot, to be joined."""
     garments = opened.scene.garments
     meshes = fine_meshes(garments, refine_garments(garments, parts[0].run["levels"]))
     return _Joins(parts, meshes, [str(source.path) for source in opened.sources], bound, **more)

@@ -24,7 +24,6 @@ class Row:
 
     Attributes:
         shot: Input file.
-        layer: Output layer.
         state: "done", "in part", "failed", "skipped" (the layer existed), "interrupted" (with frames kept) or "not
             done" (the batch was interrupted before a frame of the shot).
         exit_code: Exit code of the shot, or None if not done.
@@ -32,7 +31,6 @@ class Row:
         failed_frames: Time codes without a sample.
         seconds_a_frame: Wall time [s], or None without frames.
         crossings: Edges through faces in the result, in all frames; None if not measured.
-        warnings: Warnings for the user.
         error: The error, or "".
     """
 
@@ -53,7 +51,6 @@ def row_of(shot: str | Path, layer: Path, done: RefineReport | PhysGraphError | 
 
     Args:
         shot: Input file.
-        layer: Output layer.
         done: The report, the error, or None if the batch was interrupted.
     """
     if done is None:
@@ -94,7 +91,6 @@ def write_summary(path: Path, rows: Sequence[Row], *, exit_code: int) -> None:
     """Write rows as JSON, whole or not at all.
 
     Args:
-        path: The file.
         rows: A row per shot.
         exit_code: The exit code of the batch.
 

@@ -49,7 +49,6 @@ class Candidate:
     """A mesh that is neither a garment nor a collider.
 
     Attributes:
-        path: The mesh.
         reason: Why `AUTO` takes or leaves the mesh.
         shares: For each touching garment, the fraction of its vertices inside or near the mesh, in the first examined
             frame with contact; empty for a mesh left out.
@@ -177,7 +176,6 @@ def proposal(shot: str | Stage, meshes: Sequence[str], frames: tuple[float, floa
     """The command for a shot without tags: open meshes lying on closed meshes are the garments.
 
     Args:
-        shot: The shot.
         meshes: Open meshes of the shot, the largest first.
         frames: First and last time code, or None.
 
@@ -202,9 +200,6 @@ def command_of(
     """The command to refine a shot's garments with colliders and targets.
 
     Args:
-        shot: The shot.
-        garments: Paths of the garments.
-        colliders: Paths of the colliders.
         bind: Paths of targets.
         rest: The result of `rest_options`.
     """
@@ -243,8 +238,6 @@ def _fraction_at(body: MeshBody, pose: Pose, cage: np.ndarray) -> float:
     """Fraction of a cage's vertices inside a body's closed part, or near the body.
 
     Args:
-        body: The body.
-        pose: Pose of the body.
         cage: Positions of the cage [m], shape (V, 3).
 
     Returns:

@@ -31,7 +31,6 @@ def across_gravity(scene: Scene, frames: Sequence[Frame], beside: Sequence[Candi
     axis, in the frames and in the rest shape: the rest shape of a lying person stands.
 
     Args:
-        scene: The scene.
         frames: A few of its frames.
         beside: Bodies touched by garments but not used as colliders.
     """

@@ -195,7 +195,6 @@ def refine_garments(garments: Sequence[Garment], levels: Sequence[int]) -> list[
     """Subdivide each garment's cage.
 
     Args:
-        garments: The garments.
         levels: Number of subdivisions of each.
 
     Returns:
@@ -220,7 +219,6 @@ def build_levels(
         garments: Garments solved together.
         refinements: Their refinements, as `refine_garments` gives them.
         dtype: Scalar type of the tensors.
-        device: Their device.
         threads: Most threads that a kernel uses on the CPU.
 
     Returns:
@@ -244,8 +242,6 @@ def build_levels(
 
 @dataclass(frozen=True, eq=False)
 class _GarmentLevel:
-    """One garment at one level, in numpy."""
-
     vertex_count: int
     rest: np.ndarray
     smooth_rest: np.ndarray

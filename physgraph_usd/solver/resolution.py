@@ -91,7 +91,6 @@ def choose_levels(scene: Scene, frames: Sequence[Frame]) -> list[LevelChoice]:
     """Take each garment's own level, or for `AUTO` the least that resolves its wrinkles.
 
     Args:
-        scene: The scene.
         frames: A few of its frames.
 
     Returns:

@@ -120,7 +120,6 @@ class GarmentFrame:
 
     Attributes:
         points: Coarse positions [m], world space, shape (V, 3), float64.
-        fabric: Fabric at this time.
         guide: Guide stiffness [N/m^3].
         detail: Gain of the added detail, 1 writes the solution itself.
         offset: Distance kept from colliders [m].

@@ -59,7 +59,6 @@ def strained_parts(
     """Find the parts that are larger, or smaller, than at rest by more than a tenth in most frames.
 
     Args:
-        garment: The garment.
         frames: Positions of its cage [m], each of shape (V, 3).
         subsets: Faces of each named subset of the cage.
         up: Away from where gravity pulls, shape (3,), of any length.

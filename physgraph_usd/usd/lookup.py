@@ -30,8 +30,6 @@ class Override:
 
     Attributes:
         prim: Prim path at or above the affected garments or colliders; "/" means all.
-        row: The attribute.
-        value: The value.
     """
 
     prim: Sdf.Path
@@ -44,7 +42,6 @@ class Found:
     """A value and its source.
 
     Attributes:
-        row: The attribute.
         source: The source in words, for the report.
         attribute: The authored attribute, or None for a constant.
         constant: The value when there is no attribute; None without any value.

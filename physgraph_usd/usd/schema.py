@@ -62,7 +62,6 @@ class Property:
             overflow. The stiffest preset is some hundred times the softest; paint may go a hundred times farther.
         doc: Meaning, for the schema's documentation.
         label: Display name.
-        group: Display group.
         soft: Usual range for artists, for sliders; None for non-numeric properties. A value outside is accepted with a
             warning.
         uniform: Whether the property cannot be animated.

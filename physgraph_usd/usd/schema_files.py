@@ -79,7 +79,6 @@ def _property(row: Property) -> str:
 
 
 def _class(schema: str, *, generated: bool) -> str:
-    """One schema in usda."""
     applies = ", ".join(f'"{name}"' for name in APPLIES_TO[schema])
     custom = f'        token[] apiSchemaCanOnlyApplyTo = [{applies}]\n        token apiSchemaType = "singleApply"\n'
     custom = f"    customData = {{\n{custom}    }}\n"
@@ -125,7 +124,6 @@ def attribute_table() -> str:
 
 
 def _table_row(row: Property) -> str:
-    """One property as a line of Markdown."""
     kind = f"uniform {row.type}" if row.uniform else row.type
     unit = ", ".join(part for part in (row.unit, _ends(row, row.minimum, row.maximum) or ", ".join(row.tokens)) if part)
     soft = _ends(row, *(row.soft or (None, None)))

@@ -101,7 +101,6 @@ class GarmentSource:
     """The place of one garment on its stage; same order as ``Scene.garments``.
 
     Attributes:
-        path: Prim path.
         kept_faces: Authored faces kept by the garment (no holes, three corners or more), order kept, int32.
         skinned: Whether the points came from baking UsdSkel skinning.
         instance_roots: Prims to author as ``instanceable = false`` in the output.
@@ -387,7 +386,6 @@ def composition_problems(stage: Usd.Stage, warnings: Sequence[str]) -> list[tupl
     """Arcs not followed by USD, each with a flag: True for a missing file or prim, False for a circle or damage.
 
     Args:
-        stage: The stage.
         warnings: USD's diagnostics during opening, used if USD is too old to list composition errors.
     """
     errors = getattr(stage, "GetCompositionErrors", None)

@@ -23,7 +23,6 @@ class StageView:
         session: A copy of the session layer.
         muted: Identifiers of muted layers.
         load: Rules for loading payloads.
-        population: Prims on the stage.
         context: Context of asset paths, an ``Ar.ResolverContext``.
         interpolation: Interpolation between samples.
     """

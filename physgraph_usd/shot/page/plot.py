@@ -104,7 +104,6 @@ def _ticks(low: float, high: float) -> list[float]:
 
 
 def _frame(ticks: Sequence[float], times: Sequence[float], across: Axis, up: Axis) -> str:
-    """Grid and numbers."""
     rows = "".join(
         f"<line class='grid' x1='{LEFT}' x2='{WIDTH - RIGHT}' y1='{up.at(t):.1f}' y2='{up.at(t):.1f}'/>"
         f"<text x='{LEFT - 6}' y='{up.at(t) + 4:.1f}' text-anchor='end'>{t:.6g}</text>"
@@ -119,7 +118,6 @@ def _frame(ticks: Sequence[float], times: Sequence[float], across: Axis, up: Axi
 
 
 def _line(values: Sequence[float | None], times: Sequence[float], across: Axis, up: Axis, *, colour: str) -> str:
-    """One line, broken at missing values."""
     parts: list[list[str]] = [[]]
     for time, value in zip(times, values, strict=True):
         if value is None:

@@ -175,7 +175,6 @@ class Pictures:
         return points[((points >= low - margin) & (points <= high + margin)).all(axis=1)]
 
     def _sides(self, code: float | None) -> list[list[DrawnMesh]]:
-        """The meshes of each panel at a time code."""
         sides = [stage.meshes(code) for stage in self._stages]
         faces = {mesh.path: mesh.mesh.face_count for mesh in sides[-1] if mesh.path in self._refined}
         coarse = [mesh.subdivided(faces.get(mesh.path, faces.get(f"{mesh.path}_refined", 0))) for mesh in sides[0]]

@@ -61,7 +61,6 @@ def page(report: RefineReport, series: Sequence[Series], pictures: str = "") -> 
     """The page as HTML.
 
     Args:
-        report: The report.
         series: Lines of every garment.
         pictures: The pictures, as HTML.
     """
@@ -135,7 +134,6 @@ def _pictures(report: RefineReport, shot: Shot) -> str:
 
 
 def _figure(picture: Any, caption: str) -> str:
-    """A picture inside the page."""
     stream = io.BytesIO()
     picture.save(stream, "PNG", compress_level=1)
     data = base64.b64encode(stream.getvalue()).decode("ascii")
@@ -146,7 +144,6 @@ def _figure(picture: Any, caption: str) -> str:
 
 
 def _times(report: RefineReport) -> str:
-    """Wall time of each stage."""
     rows = [(name, f"{seconds:.2f}") for name, seconds in report.seconds.items()]
     return "<h2>Time</h2>" + table("time", ("stage", "seconds"), rows, numbers=[1])
 

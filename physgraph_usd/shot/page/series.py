@@ -23,7 +23,6 @@ class Series:
     """One garment over time.
 
     Attributes:
-        path: The garment.
         energy: Energy by term, and of the upsampled input [mJ].
         strain: Size of the edges' extension [%].
         remaining: RMS move that the end of the solve leaves [mm].
@@ -91,9 +90,7 @@ def add_jerk(series: Sequence[Series], report: RefineReport, shot: Shot, layer: 
 
     Args:
         series: Lines of every garment; jerk is added for each run of four consecutive samples.
-        report: The run's report.
         shot: The shot, open.
-        layer: The written layer.
     """
     written = RefinedLayer(layer)
     chains = refine_garments(shot.scene.garments, [garment["level"] for garment in report.garments])

@@ -30,7 +30,6 @@ class Worst:
     """A place in refined cloth.
 
     Attributes:
-        time: Time code.
         path: Prim of the refined mesh.
         vertex: Number of the vertex.
         reason: Description of the fault.

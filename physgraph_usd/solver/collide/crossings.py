@@ -42,7 +42,6 @@ def crossings(
     """All edges that pass through a face to which they are neither connected nor sewn.
 
     Args:
-        parts: The parts.
         x: Positions [m].
         asked: Mask of vertices; each crossing has one of these among its corners. All vertices when None.
     """
@@ -84,7 +83,6 @@ def all_crossings(
     """As `crossings`, and the crossings of cloth and bodies.
 
     Args:
-        parts: The parts.
         x: Positions of the cloth and of the bodies' corners [m].
         asked: Mask of vertices; crossings of parts in clusters without any may be missing. All of the cloth when None.
     """

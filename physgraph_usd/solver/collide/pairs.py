@@ -64,7 +64,6 @@ class NearAt:
     """All near pairs at some positions.
 
     Attributes:
-        pairs: The pairs.
         reach: The search radii.
     """
 

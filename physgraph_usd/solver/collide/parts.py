@@ -26,7 +26,6 @@ class Parts:
     """The vertices, edges and faces of a level that can come near one another.
 
     Attributes:
-        level: The level.
         topology: Warp struct of the parts by cluster.
         links: Connected vertices: edges and sewn pairs, shape (N, 2), int64.
         lengths: Lengths of the links at rest, 0 if sewn [m], shape (N,), float64.
@@ -47,7 +46,6 @@ class Parts:
         """Gather the clusters.
 
         Args:
-            level: The level.
             meets: True for pairs in contact of garments, then bodies, symmetric, shape (G + B, G + B), bool.
             label: Vertices with equal labels are sewn together, or equal; None for no seams, shape (V,).
             solids: Bodies, whose vertices follow the cloth's in all positions.

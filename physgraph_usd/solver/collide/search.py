@@ -147,7 +147,6 @@ def blocking_pairs(
     Given near pairs at the start, checks only near pairs, and pairs of vertices with large moves (`NearAt.leaving`).
 
     Args:
-        parts: The parts.
         start: Positions [m].
         end: End positions [m].
         floor: Gap that pairs keep [m]; a pair that is already closer keeps most of its distance.
@@ -197,12 +196,10 @@ def piercing_edges(
 
 
 def _of_cloth(parts: Parts, x: Tensor) -> Bool[Tensor, " vertices"]:
-    """Mask of the cloth's vertices."""
     return torch.arange(len(x), device=x.device) < parts.level.vertex_count
 
 
 def _search(parts: Parts, query: Any) -> Pairs:
-    """The pairs of parts of a query."""
     table = parts.topology
     query.clusters = table.clusters if len(query.start) > parts.level.vertex_count else table.cloth_clusters
     if not query.clusters:
@@ -215,7 +212,6 @@ def _search(parts: Parts, query: Any) -> Pairs:
 
 
 def _blocking_among(pairs: Pairs, parts: Parts, query: Any) -> Pairs:
-    """The pairs blocking a query's move."""
     value = torch.empty_like(pairs.value)
     inputs = [parts.topology, query, argument(pairs.corners, wp.vec4i), argument(pairs.face), argument(value)]
     _launch(parts, check_pairs, len(value), *inputs)
@@ -289,7 +285,6 @@ def _write(
 
 
 def _arguments(pairs: Pairs) -> list[Any]:
-    """The fields of pairs as arguments of a kernel."""
     return [argument(pairs.corners, wp.vec4i), argument(pairs.value), argument(pairs.face)]
 
 

@@ -54,11 +54,9 @@ def topology_of(level: Level, meets: np.ndarray, label: np.ndarray, *, size: int
     A face belongs to the cluster of its first corner, an edge to that of one of its faces.
 
     Args:
-        level: The level.
         meets: True for pairs in contact of garments, then bodies, symmetric, shape (G + B, G + B), bool.
         label: Cloth vertices with equal labels are sewn together, or equal, shape (V,).
         size: Most vertices of a cluster.
-        solids: The bodies.
     """
     rest, edges, faces, garment, label = _with_solids(level, label, solids)
     cloths = len(level.spans)

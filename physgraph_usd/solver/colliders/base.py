@@ -112,7 +112,6 @@ class Surface(Protocol):
         """Mask of the points inside; all False for open surfaces.
 
         Args:
-            x: Points.
             parts: Least number of overlapping parts of the surface that contain a point.
         """
         ...

@@ -419,7 +419,6 @@ def overlapping(mesh: wp.Mesh, faces: Int[Tensor, " faces"], *, threads: int = 1
     """Mask of the faces that pass through other faces of the mesh.
 
     Args:
-        mesh: The mesh.
         faces: Indices of the faces to test.
         threads: Most threads on the CPU.
     """

@@ -186,5 +186,4 @@ def _distinct(met: Pairs, count: int) -> Int[Tensor, " pairs"]:
 
 
 def _vectors(x: Tensor) -> Any:
-    """Vectors as a Warp argument."""
     return argument(x.contiguous(), wp.vec3d)

@@ -71,9 +71,7 @@ def drawn_apart(
     """Move cut-off pieces back to their side, as long as the number of crossings falls.
 
     Args:
-        mesh: The cloth of one level.
         x: Positions [m].
-        start: Crossings at x.
         gap: Largest final distance from the penetrated cloth [m]; replaced by a fraction of an edge if fewer parts
             cross then.
         asked: As for `crossings`.
@@ -121,10 +119,6 @@ def _gone_through(mesh: ClothMesh, found: Crossings, x: Tensor) -> _Through:
 
 def pieces_of(mesh: ClothMesh, found: Crossings) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Connected pieces into which contours cut the cloth.
-
-    Args:
-        mesh: The cloth.
-        found: Crossings.
 
     Returns:
         The piece of each vertex; True for pieces that are cut off (smaller than the largest piece of their connected
@@ -245,7 +239,6 @@ def displacements_to(
     """Displacements from the closest point of a set of faces to each query vertex [m], float64; 0 for empty sets.
 
     Args:
-        level: The level.
         x: Positions [m].
         asked: Indices of the query vertices.
         which: The row of each query vertex's set.

@@ -56,7 +56,6 @@ class FrameBodies:
     """Bodies of a group in one frame.
 
     Attributes:
-        touching: The surfaces.
         shifts: From the group's coordinates to each surface's [m], shape (3,).
         points: Corners of all surfaces in the group's coordinates [m], shape (B, 3), float64.
         before: Corners in the start frame [m], shape (B, 3); None if unknown.
@@ -85,8 +84,6 @@ class FrameBodies:
         """Place the bodies.
 
         Args:
-            cage: Level of the cage.
-            touching: The surfaces.
             coarse: Cage positions [m], recentred.
             origin: World position of the group's origin [m], shape (3,).
             settings: Contact settings, with the stiffness in SI.
@@ -118,8 +115,6 @@ class LevelBodies:
     """One level's view of the bodies.
 
     Attributes:
-        level: The level.
-        frame: The bodies.
         pieces: Piece of each vertex of the uncut cloth, shape (V,).
         lost: For each body, a mask of the cloth between its overlapping parts, shape (V,); None if not asked for.
     """

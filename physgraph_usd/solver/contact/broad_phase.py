@@ -35,7 +35,6 @@ class TouchingGroups:
         """Measure the cages.
 
         Args:
-            garments: The garments.
             together: False solves every garment apart.
         """
         self._garments, self._together = tuple(garments), together
@@ -134,7 +133,6 @@ class Bodies:
         """Indices of the garment's colliders with bounds that meet the given bounds.
 
         Args:
-            garment: The garment.
             bounds: Least and greatest corner [m], world space, shape (2, 3).
             margin: Largest distance between the bounds beyond the collider's own offset [m].
         """
@@ -165,7 +163,6 @@ class Bodies:
         """Posed surfaces of colliders.
 
         Args:
-            indices: Indices of the colliders.
             before: Poses of all colliders in the start frame; () if unknown.
             motion: Motion of the start frame since.
             offsets: For each garment, the distance kept from each collider [m]; None if the garment ignores the

@@ -40,7 +40,6 @@ class ClothContact:
 
         Args:
             levels: Levels of the group, cage first.
-            garments: The garments.
         """
         self.meets = np.array([[_meet(a, b) for b in garments] for a in garments], dtype=bool)
         self._meshes: dict[int, tuple[tuple[object, ...], ClothMesh]] = {}
@@ -49,9 +48,7 @@ class ClothContact:
         """A level's mesh with the given seam and bodies; cached while these stay equal.
 
         Args:
-            level: The level.
             seam: Sewn vertices; None without seams.
-            bodies: The bodies of the frame, or None.
             itself: False for cloth that is in contact with bodies only.
         """
         sewn = np.zeros((0, 2), np.int64) if seam is None else seam.pairs
@@ -105,11 +102,9 @@ class ClothView:
 
         Args:
             lasting: Contact data of the shot.
-            level: The level.
             base: The upsampled cage [m]; distances between parts in the cage are not widened.
             thickness: Thickness of each garment [m].
             settings: Contact settings, in SI.
-            bodies: The bodies of the frame, or None.
             seam: Sewn vertices, which stay together; None without seams.
             given_up: As the attribute.
             doubtful: Mask of the vertices that the cage places near what crosses in it; None if unknown.

@@ -22,7 +22,6 @@ class ClothMesh:
     """The faces and edges of a level, sewn at pairs of vertices.
 
     Attributes:
-        level: The level.
         edges: Ends of the edges of the cloth, then of the bodies, int64.
         parts: Table of vertex, edge and face pairs that may be in contact.
         triangles: Corners of the faces of the cloth, then of the bodies, int64.
@@ -37,10 +36,8 @@ class ClothMesh:
         """Build the adjacency.
 
         Args:
-            level: The level.
             meets: True for pairs in contact of garments, then bodies, symmetric, shape (G + B, G + B), bool.
             sewn: Pairs of vertices merged by a seam.
-            solids: The bodies.
         """
         edges, triangles, count = level.edges.cpu().numpy(), level.triangles.cpu().numpy(), level.vertex_count
         label = joined_by(sewn, count) if len(sewn) else None

@@ -174,10 +174,8 @@ class FrameContact:
         """Take the frame.
 
         Args:
-            levels: Levels of the group.
             coarse: Cage positions [m], recentred.
             bodies: The bodies, or None without bodies.
-            cloth: The group's cloth.
             thickness: Thickness of each garment's cloth [m].
             settings: Contact settings, with the stiffness in SI.
             seams: The seam of each level, None for a level without seams; () for no seams at all.
@@ -296,7 +294,6 @@ class FrameContact:
         return mesh.grown(some, 1)
 
     def _seam_at(self, level: Level) -> Seam | None:
-        """The seam of a level."""
         return self._seams[level.index] if self._seams else None
 
     def finish(self, x: Placed) -> tuple[Placed, dict[str, object]]:

@@ -44,7 +44,6 @@ def body_crossings(level: Level, surfaces: Sequence[Surface], points: np.ndarray
     """Mask of the corners of cloth edges and faces that cross a body, shape (V,), bool.
 
     Args:
-        level: The level of the cloth.
         surfaces: The posed bodies.
         points: World positions [m], shape (V, 3), float64.
     """

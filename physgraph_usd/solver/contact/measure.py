@@ -53,8 +53,6 @@ def penetration(
     """Measure one garment group against one surface.
 
     Args:
-        surface: The surface.
-        level: The level of x.
         x: Positions in the surface's coordinates [m].
         inside: The vertices inside.
         longest: Way out from between overlapping parts above which a vertex counts as pinched [m].
@@ -87,7 +85,6 @@ def depths(
     """Length of the way out of a closed surface for each vertex [m], 0 outside, and a mask of the pinched vertices.
 
     Args:
-        surface: The surface.
         x: Positions in the surface's coordinates [m].
         inside: The vertices inside.
         longest: Way out from between overlapping parts above which a vertex counts as pinched [m].

@@ -45,7 +45,6 @@ class HeldMetric:
         """Add a contact stiffness.
 
         Args:
-            plain: The level's metric.
             stiff: K [N/m].
         """
         self.stiff, self._plain = stiff, plain

@@ -140,7 +140,6 @@ class Promise:
             begin: Positions of cloth and bodies [m], float64.
             end: Wanted positions [m]; those of bodies are reached.
             met: Pairs that block the move.
-            options: Options of the search.
             dtype: Type to which positions of the cloth are rounded.
             halved: Whether vertices in or around pairs that stay blocked move in two halves: planes may turn once more.
         """
@@ -179,7 +178,6 @@ class Promise:
 
 
 def _corners(met: Pairs, others: Bool[Tensor, " vertices"]) -> Bool[Tensor, " vertices"]:
-    """Mask of the corners of pairs and of other vertices."""
     asked = others.clone()
     asked[met.corners.long().reshape(-1)] = True
     return asked

@@ -35,11 +35,9 @@ def repaired_cage(
     """The cage with the cloth between overlapping body parts as a taut membrane, pushed outside where possible.
 
     Args:
-        cage: Level of the cage.
         x: Cage positions [m].
         bodies: The cage's view of the bodies.
         inside: The vertices inside each body.
-        mesh: Mesh of the cage.
 
     Returns:
         Positions [m]; x itself if no vertex is pinched.

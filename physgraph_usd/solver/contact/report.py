@@ -60,7 +60,6 @@ def _of_bodies(bodies: LevelBodies, before: Tensor, first: Look, x: Tensor, last
 
 
 def _penetration(bodies: LevelBodies, index: int, x: Tensor, look: Look, *, lost: Tensor | None) -> Penetration:
-    """Penetration of the cloth into one body."""
     inside = torch.zeros_like(bodies.level.free[:, 0]) if look.inside is None else look.inside[index]
     count = 0 if look.pierced is None else int((look.pierced.body == index).sum())
     known = {"longest": bodies.frame.longest, "lost": lost, "crossings": count}

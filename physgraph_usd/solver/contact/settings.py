@@ -46,7 +46,6 @@ class ContactSettings:
         """Settings with stiffnesses in SI [N/m^3].
 
         Args:
-            cage: Level of the cage.
             stretch: Stretch stiffness of the cloth [N/m].
         """
         per_area = stretch / float(cage.spacing.mean()) ** 2

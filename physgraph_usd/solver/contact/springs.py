@@ -92,7 +92,6 @@ class NearSprings:
     """Near pairs and their offsets.
 
     Attributes:
-        near: The pairs.
         offset: Distance that each pair keeps [m], shape (N,).
     """
 
@@ -132,10 +131,8 @@ class ClothSprings:
         """Take the frame.
 
         Args:
-            mesh: The level's mesh.
             base: The upsampled cage [m]; distances between parts in the cage are not widened.
             thickness: Thickness of each garment [m].
-            bodies: The bodies of the frame, or None.
         """
         level, none = mesh.level, base.new_zeros((0, 3)).double()
         points = none if bodies is None else bodies.points
@@ -219,7 +216,6 @@ class ClothSprings:
         """The springs as constraints of the contact force; a body's part of a pair is constant.
 
         Args:
-            springs: The springs.
             x: Positions of cloth and bodies [m], float64.
             stiffness: Stiffness by area [N/m^3].
         """

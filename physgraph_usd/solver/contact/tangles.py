@@ -61,8 +61,6 @@ class Tangles:
         """Tangles: connected components of the crossings and the cloth within `TANGLED` rings.
 
         Args:
-            mesh: The cloth.
-            crossings: The crossings.
             given_up: Mask of the vertices that are given up; these and all tangles they reach are one tangle.
         """
         corners = mesh.corners_of(crossings)
@@ -99,7 +97,6 @@ class Tangles:
         return Crossings(crossings.edge[kept], crossings.face[kept])
 
     def _of(self, some: Bool[Tensor, " tangles"]) -> Bool[Tensor, " vertices"]:
-        """Mask of the vertices of the selected tangles."""
         return some[self.label.clamp_min(0).long()] & (self.label >= 0)
 
 
@@ -109,8 +106,6 @@ def ways_out(
     """Direction of each crossing's edge relative to its face that shortens the contour, and the crossing's coordinates.
 
     Args:
-        mesh: The cloth.
-        crossings: Crossings at x.
         x: Positions [m].
 
     Returns:
@@ -147,8 +142,6 @@ def gaps_out(
     """Constraints that draw crossing edges out of their faces by at most a step.
 
     Args:
-        mesh: The cloth.
-        crossings: Crossings at x.
         x: Positions [m].
         step: Relative move of the edge and the face [m].
         stiffness: k_c [N/m^3].
@@ -173,7 +166,6 @@ def chords_of(
     """The middle of the crossings of each edge and face of the cloth whose corners and neighbours are outside a body.
 
     Args:
-        mesh: The cloth and the bodies.
         pierced: Crossings of cloth and bodies at x.
         x: Positions of cloth and bodies [m].
         inside: The vertices inside each body.

@@ -32,8 +32,6 @@ def bending_term(level: Level, fabrics: Sequence[Fabric], *, raised: Sequence[bo
     """The bending of the cloth.
 
     Args:
-        level: The level.
-        fabrics: Fabric of each garment.
         raised: For each garment, whether bending stiffness is raised at edges too long for the garment's folds; None
             for no garment.
     """
@@ -48,8 +46,6 @@ def body_terms(level: Level, fabrics: Sequence[Fabric], *, gravity: np.ndarray) 
     """The terms proportional to the cloth's mass.
 
     Args:
-        level: The level.
-        fabrics: Fabric of each garment.
         gravity: [m/s^2], shape (3,).
     """
     return (Gravity(level, _each(level, [fabric.density for fabric in fabrics]), gravity),)

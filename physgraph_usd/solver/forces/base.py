@@ -72,7 +72,6 @@ class ForceModule:
         """Keep the terms in order; the order fixes the rounding of the sum.
 
         Args:
-            forces: The terms.
             remembers: Whether the last result is reused at the same positions: for constant terms.
         """
         self.forces = tuple(forces)
@@ -174,9 +173,7 @@ class Elements:
 
         Args:
             kernels: For each scalar type, a kernel of (first, x, corners, *parameters, energy, corner_force).
-            corners: Corner vertices.
             parameters: The kernel's own arrays.
-            level: The level.
             eight: A kernel of the same, of `eight_elements`, used on the CPU in single precision.
         """
         self.count, width = corners.shape
@@ -226,7 +223,6 @@ def element_overloads(
 
     Args:
         kernel: Kernel of (first, x, corners, parameters..., energy, corner_force) with generic arrays.
-        width: Corners of an element.
         parameters: Number of scalar arrays before energy.
         vector_parameters: Number of arrays of vectors before the scalar arrays.
         quad_parameters: Number of arrays of four values before the arrays of vectors.

@@ -240,7 +240,6 @@ class Bending:
         """Weigh the hinges of a level.
 
         Args:
-            level: The level.
             rigidity: Bending stiffness D of each garment [N m]; along the warp if the weft's differs.
             weft: Bending stiffness along the weft [N m]; None if equal to the warp's, or without grain.
             least: Least bending stiffness of each hinge [N m]; None for no bound.

@@ -36,7 +36,6 @@ class Gravity:
         """Weigh the vertices of a level.
 
         Args:
-            level: The level.
             density: Areal density of each garment [kg/m^2].
             gravity: Acceleration [m/s^2], shape (3,).
         """

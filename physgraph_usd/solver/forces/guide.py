@@ -72,7 +72,6 @@ class Guide:
         """Weigh the ties of a level; `retarget` sets the coarse positions.
 
         Args:
-            level: The level.
             guide_map: Averaging operator of the level.
             stiffness: k_g s_c at each coarse vertex [N/m^3].
         """

@@ -142,7 +142,6 @@ class Membrane:
         """Weigh the triangles of a level.
 
         Args:
-            level: The level.
             youngs: 2D Young's modulus of each garment along the warp [N/m]; zero for garments of edge springs.
             shear: Shear stiffness of each garment [N/m]; zero for garments of edge springs.
             weft: 2D Young's modulus of each garment along the weft [N/m]; None if equal to the warp's.
@@ -238,10 +237,6 @@ def shape_gradients(level: Level) -> Float[Tensor, "triangles 3 2"]:
 
 def in_plane_terms(level: Level, fabrics: Sequence[Fabric]) -> tuple[Force, ...]:
     """Edge springs for the garments with a suitable fabric, the membrane for the others.
-
-    Args:
-        level: The level.
-        fabrics: Fabric of each garment.
 
     Returns:
         The terms needed by some garment; each term is zero on the garments of the opposite kind.

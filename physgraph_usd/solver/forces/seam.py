@@ -43,7 +43,6 @@ class Seam:
         """Group the vertices.
 
         Args:
-            level: The level.
             pairs: Coincident vertices, possibly repeated, shape (N, 2).
             between: Vertices lying on edges. The ends of the edges do not lie on edges themselves.
         """

@@ -115,7 +115,6 @@ _KEEP_APART = element_overloads(_keep_apart, width=4, parameters=2, vector_param
 
 
 def _parameters(gaps: PairConstraints) -> list[Tensor]:
-    """The arrays of the kernel."""
     along = [(gaps.weight[:, i : i + 1] * gaps.normal).contiguous() for i in range(4)]
     return [*along, gaps.offset, gaps.stiffness]
 
@@ -124,7 +123,6 @@ class SelfContact:
     """Springs keeping pairs of material points apart.
 
     Attributes:
-        gaps: The pairs.
         name: Name of the term in reports.
     """
 

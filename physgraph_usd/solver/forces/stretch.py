@@ -68,7 +68,6 @@ class Stretch:
         """Weigh the springs of a level.
 
         Args:
-            level: The level.
             youngs: 2D Young's modulus of each garment [N/m].
         """
         modulus = youngs.to(level.rest)[level.spring_garment.long()] * level.spring_scale

@@ -40,7 +40,6 @@ class Tether:
         """Tie a level to predicted positions.
 
         Args:
-            level: The level.
             density: Areal density of each garment [kg/m^2].
             stiffness: k_t [1/s^2].
             predicted: Positions [m].

@@ -63,7 +63,6 @@ def creases_of(level: Level, frame: FrameInput, last: State | None) -> Creases |
 
     Args:
         level: The finest level.
-        frame: The frame.
         last: State left by the start frame, or None for a cold start.
     """
     if last is None or last.fine is None or not keeps_creases(frame):

@@ -34,15 +34,11 @@ class Group:
     """Garments solved together, made by `Group.of`.
 
     Attributes:
-        garments: The garments.
         gravity: [m/s^2], shape (3,).
-        settings: Settings of the solve.
         levels: The levels, cage first.
         guide_maps: The guide's averaging operator of each level.
         moving_frames: Frames of the cage, to carry the last frame's detail.
         followers: Vertices not moved by the solve.
-        cloth: The cloth's contact with itself.
-        seams: The seam of each level, or None.
     """
 
     garments: tuple[Garment, ...]
@@ -75,7 +71,6 @@ class Group:
             garments: Garments solved together.
             refinements: Refinements of each garment.
             gravity: [m/s^2], shape (3,).
-            settings: Settings of the solve.
             dtype: Scalar type of the solve.
             device: "cpu" or a CUDA device.
             threads: Most threads per kernel on the CPU.
@@ -147,8 +142,6 @@ class Group:
         """Contact of a frame's cloth, or None without possible contact.
 
         Args:
-            frame: The frame.
-            cage: Positions of the cages.
             settings: Contact settings; the group's own when None.
             given_up: As for `FrameContact`.
         """

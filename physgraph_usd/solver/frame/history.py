@@ -26,13 +26,10 @@ class SolvedFrame:
     """One garment's solved frame.
 
     Attributes:
-        time: Time code.
-        frame: The garment's input.
         colliders: Poses of all of the scene's bodies.
         near: Numbers of the bodies within reach.
         part: Numbers of the garments solved together.
         points: Fine positions [m].
-        state: State for the next frame.
         crossing: Whether each fine vertex belongs to cloth that crosses cloth.
         first: Whether no frame was solved before.
         whole: As `SolveSettings.whole`, at the end of the solve.
@@ -111,7 +108,6 @@ class Origin:
         """Time from each garment's start frame to a time code [s]; 0 without either.
 
         Args:
-            time: The time code.
             seconds: Length of one time code [s].
         """
         starts = [None if each is None else each.time for each in self.frames]
@@ -136,8 +132,6 @@ def origin_of(
 
     Args:
         part: Numbers of the garments.
-        frame: The frame to be solved.
-        memories: Memory of each garment.
         near: Numbers of the bodies within reach.
         edge: Mean edge of the cages [m].
         gap: Whether the time between samples is too long.
@@ -241,7 +235,6 @@ def came_back(
     Args:
         last: The last frame.
         before: The start frame of ``last``.
-        now: The garment in this frame.
         colliders: Poses of all bodies in this frame.
         near: Numbers of the bodies within the garment's reach.
         edge: Mean edge of the cage [m]; a smaller move is no break: the cloth follows the move.
@@ -264,7 +257,6 @@ def jumped_in(
 
     Args:
         first: The first frame.
-        second: The second frame.
         now: The garment in this frame, the third.
         colliders: Poses of all bodies in this frame.
         near: Numbers of the bodies within the garment's reach.

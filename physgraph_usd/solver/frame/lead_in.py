@@ -27,11 +27,8 @@ def cages_walked(
     """Advance a scene's cages to the first frame of a run, if frames are continued and self contact is on.
 
     Args:
-        scene: The scene.
-        settings: Settings of the run.
         frame_at: Reads a time code.
         times: The shot's time codes up to the run's first, in order.
-        device: Device of the run.
         threads: Most threads per kernel on the CPU.
 
     Returns:

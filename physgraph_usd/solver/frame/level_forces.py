@@ -33,7 +33,6 @@ class Part:
     Attributes:
         fabrics: The fabrics, with values of no effect on the terms set to constants.
         level: The level, with the rest lengths of these fabrics.
-        terms: The terms.
     """
 
     fabrics: tuple[Fabric, ...]
@@ -69,7 +68,6 @@ class LevelForces:
     Attributes:
         plain: The level, with the rest lengths of its rest shape.
         guide_map: Averaging operator of the level.
-        garments: The garments.
         frames: Values of the garments at one time code.
         gravity: [m/s^2], shape (3,).
         lent: Metric of previous materials for `rough_metric`, and terms to reuse for equal fabrics; or None.
@@ -201,7 +199,6 @@ class LevelForces:
         """The system of a frame without contact.
 
         Args:
-            module: The terms.
             tie: Stiffness [1/s^2] and predicted positions [m] of a tether, or None.
             rough: Whether to use `rough_metric`.
         """

@@ -56,7 +56,6 @@ def state_left(problem: Problem, x: Placed) -> State:
     """State for the start of the next frame.
 
     Args:
-        problem: The frame.
         x: The result [m].
     """
     view, cage = problem.view(problem.finest), problem.cage
@@ -83,10 +82,8 @@ def telemetry_of(problem: Problem, x: Tensor, module: ForceModule, *, reports: S
     """Telemetry of a frame's solve and result, as plain values.
 
     Args:
-        problem: The frame.
         x: The result [m].
         module: The terms at the finest level.
-        reports: Reports of the levels' rounds.
     """
     finest = problem.forces[-1].level
     base = finest.base.apply(problem.cage.points)
@@ -104,7 +101,6 @@ def measured(problem: Problem, x: Tensor) -> tuple[dict[str, object], np.ndarray
     """Measures of contact: near parts and crossings, including contact switched off but measured.
 
     Args:
-        problem: The frame.
         x: The result [m].
 
     Returns:

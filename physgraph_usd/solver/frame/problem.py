@@ -33,7 +33,6 @@ class LevelProblem:
         lasting: Terms that last as long as the materials.
         module: All terms without contact.
         alone: The system without contact, tied to the start in a warm frame.
-        view: Contact of the level's cloth, or None.
         integrator: Makes the steps.
         untangler: Makes the steps to pull crossings apart.
         budget: Stopping criteria.
@@ -88,13 +87,8 @@ class Problem:
 
     Attributes:
         began: Start of the frame's computation [s].
-        group: The garments.
-        frame: The frame.
-        cage: Positions of the cages.
         aim: The cage followed by the fine cloth [m].
         forces: The lasting terms of each level, coarsest first.
-        contact: Contact of the cloth, or None.
-        start: Start of the cloth.
         walked: Cages advanced from an earlier frame [m], for a cold start; or None.
         before: Fine positions in the last frame [m], float64; None without a last frame.
         inside: Mask of the vertices inside a body in the last frame; None if none was.
@@ -213,8 +207,6 @@ def begin(group: Group, frame: FrameInput, last: State | None) -> Problem:
     """Prepare a frame for solving.
 
     Args:
-        group: The garments.
-        frame: The frame.
         last: State left by the last frame, or None for a cold start.
     """
     began = time.perf_counter()

@@ -31,9 +31,6 @@ class Refiner:
     """Refines the frames of one scene in order.
 
     Garments unable to touch in a frame are solved separately, the others together.
-
-    Attributes:
-        scene: The scene.
     """
 
     def __init__(
@@ -50,8 +47,6 @@ class Refiner:
         """Subdivide the garments.
 
         Args:
-            scene: The scene.
-            settings: Settings of the solve.
             levels: Subdivisions of each garment; the garments' own when None.
             dtype: Scalar type of the solve.
             device: "cpu" or a CUDA device.
@@ -139,7 +134,6 @@ class Refiner:
         Unsolvable garments follow their cages, if at least one garment was solved.
 
         Args:
-            frame: The frame.
             wanted: For each garment, whether a result is wanted; all when None.
 
         Raises:
@@ -194,7 +188,6 @@ class Refiner:
         """Move cloth towards wanted positions as far as possible without new crossings, and out of bodies; no solve.
 
         Args:
-            frame: The frame.
             start: Positions of each garment, world space [m], shape (V_fine, 3).
             wanted: Target positions, of the same form; a part with a garment of None is used unchanged.
 

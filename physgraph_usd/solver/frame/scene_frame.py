@@ -29,16 +29,13 @@ class SceneCloth:
     """Levels, groups and bodies for the frames of a scene; bodies are posed for one frame at a time.
 
     Attributes:
-        scene: The scene.
         refinements: The subdivisions of each garment, coarsest first.
-        bodies: All bodies.
     """
 
     def __init__(self, scene: Scene, levels: Sequence[int], *, dtype: torch.dtype, device: str, threads: int) -> None:
         """Subdivide the garments.
 
         Args:
-            scene: The scene.
             levels: Subdivisions of each garment.
             dtype: Scalar type of the solve.
             device: "cpu" or a CUDA device.
@@ -124,7 +121,6 @@ class SceneCloth:
             index: Number of the garment.
             points: World positions [m], shape (V, 3).
             crossing: Whether each vertex belongs to cloth that crosses cloth, shape (V,); None for no vertex.
-            settings: Settings of the solve.
         """
         near = self.bodies.near(self.scene.garments[index], bounds_of(points), 0.0)
         surfaces = [each.surface for each in self.bodies.touching(near, [[0.0] * len(near)])]
@@ -155,8 +151,6 @@ class SceneFrame:
 
     Attributes:
         cloth: Levels, groups and bodies of the scene; the bodies are posed.
-        settings: Settings of the solve.
-        frame: The frame.
         memories: Memory of each garment's last frames.
         gap: Whether the time since the last frame is too long for a warm start.
         walked: World positions of each cage [m] advanced here by another refiner, and the start time code; or None.
@@ -282,7 +276,6 @@ class SceneFrame:
         return (np.concatenate(found), self.walked[1]) if len(found) == len(part) else None
 
     def _refuse_strayed(self, part: tuple[int, ...], points: Sequence[np.ndarray]) -> None:
-        """Refuse cloth strayed from its cage."""
         for index, fine in zip(part, points, strict=True):
             last = self.memories[index].last
             before = None if last is None else last.frame.points

@@ -41,7 +41,6 @@ class SolveSettings:
         temporal: "tether", "warm" or "off".
         tether: Tether stiffness over that of inertia in an implicit step of the time between samples, m / dt^2.
         reset: Thresholds for a cold start.
-        contact: Contact settings.
         cancelled: Asked before each step whether the result is no longer needed; or None.
         rough: Whether a new material uses the last material's Cholesky factor as preconditioner.
         shown: Called with the positions of each garment [m], by path, after each round of the finest level; or None.

@@ -46,7 +46,6 @@ def solve_frame(group: Group, frame: FrameInput, last: State | None) -> Solved:
 
     Args:
         group: Garments solved together.
-        frame: The frame.
         last: State left by the last frame, or None for a cold start.
 
     Raises:
@@ -97,7 +96,6 @@ def solve_one_level(
     """Solve a level, in rounds if contact is possible.
 
     Args:
-        problem: The level.
         x: Start positions [m], shape (V, 3).
         smoothing: The move to remove a coarser mesh's facets in a cold start [m]; None in a warm frame.
 
@@ -150,7 +148,6 @@ def _with_cage_untangled(problem: Problem, *, since: float) -> tuple[Problem, li
     Pieces of cloth that are mostly tangled afterwards are given up.
 
     Args:
-        problem: The frame.
         since: Time at which the frame was ready to be solved [s].
     """
     contact = problem.contact
@@ -171,8 +168,6 @@ def _untangle(
     Rounds end early if whole pieces of cloth are tangled, and would be still at the pace of the last `STALLED` rounds.
 
     Args:
-        problem: The level.
-        view: Contact of the level's cloth.
         x: Positions [m].
         move: Moves the cloth to wanted positions [m] as far as is safe.
         most: Most rounds.
@@ -221,7 +216,6 @@ def solve_soundly(group: Group, frame: FrameInput, last: State | None) -> Solved
 
     Args:
         group: Garments solved together.
-        frame: The frame.
         last: State left by the last frame, or None for a cold start.
 
     Raises:

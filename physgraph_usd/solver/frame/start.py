@@ -62,8 +62,6 @@ def start_of(
 
     Args:
         state: State left by the last frame, or None for a cold start.
-        cage: Positions of the cages.
-        frames: Frames of the cage.
         finest: The finest level.
         reset: Thresholds for a cold start.
         moved: Largest motion of nearby bodies since [m]; infinite if more than poses changed.

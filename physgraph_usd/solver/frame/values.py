@@ -155,7 +155,6 @@ def split(state: State, coarse: Sequence[slice], fine: Sequence[slice]) -> list[
     """The state of each garment of a group.
 
     Args:
-        state: State of the group.
         coarse: Cage vertices of each garment.
         fine: Fine vertices of each garment.
     """

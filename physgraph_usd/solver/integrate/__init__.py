@@ -34,7 +34,6 @@ class Method:
 
 
 def _shipped() -> Integrator:
-    """The integrator of the shipped network."""
     return _guarded(shipped_network(LEARNED))
 
 

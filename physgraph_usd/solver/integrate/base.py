@@ -65,7 +65,6 @@ class System:
         free: False at fixed vertices, shape (V, 1).
         spacing: Mean rest edge length at each vertex [m], shape (V,).
         level: The level's mesh, or None.
-        field: The forces.
         metric: H0.
         evaluations: Number of force evaluations so far.
         metric_solves: Number of metric solves so far.

@@ -96,7 +96,6 @@ class EightPhysgraph:
         """Lay out the weights.
 
         Args:
-            network: The network.
             vertices: Number of vertices.
             longest: Longest displacement in local edge lengths.
             threads: Most threads that the kernel uses.

@@ -61,7 +61,6 @@ class Factors:
 
 
 def _of_cholespy(module: Any, values: Tensor, rows: Tensor, columns: Tensor, dtype: torch.dtype) -> Solver:
-    """The solve by a Cholesky factor."""
     kind = module.CholeskySolverD if dtype == torch.float64 else module.CholeskySolverF
     solver = kind(int(rows.max()) + 1, rows, columns, values, module.MatrixType.COO)
 

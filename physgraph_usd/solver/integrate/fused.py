@@ -53,7 +53,6 @@ class FusedPhysgraph:
         """Lay out the weights.
 
         Args:
-            network: The network.
             vertices: Number of vertices.
             longest: Longest displacement in local edge lengths.
             device: "cpu" or a CUDA device.

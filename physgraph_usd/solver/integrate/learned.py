@@ -47,7 +47,6 @@ class LearnedMetric:
         """Keep the network.
 
         Args:
-            network: The network.
             fuse: Use the kernels of `fused` if no gradient is needed.
         """
         self._network = network

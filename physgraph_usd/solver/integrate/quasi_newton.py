@@ -56,7 +56,6 @@ def truncated(
     all triangles are examined again.
 
     Args:
-        system: The level.
         x: Start of the move [m].
         move: Displacement [m].
     """
@@ -203,7 +202,6 @@ def backtrack(
     approximate Wolfe rule).
 
     Args:
-        system: The system.
         carry: Start of the step.
         direction: Displacement of the full step [m].
         slope: force . direction [J].

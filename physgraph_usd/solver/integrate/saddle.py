@@ -40,7 +40,6 @@ def facets(
     """The move across the surface to remove a coarser mesh's facets [m]; 0 at fixed vertices.
 
     Args:
-        level: The level.
         x: Vertices placed by a linear map [m].
         coarse: Vertices of the coarser mesh [m].
         smooth: The smooth map from the coarser mesh.

@@ -19,11 +19,7 @@ class LevelReport:
     """Record of one level's solve.
 
     Attributes:
-        level: Level index.
         vertices: Number of fine vertices.
-        steps: Steps made.
-        evaluations: Force evaluations.
-        metric_solves: Metric solves.
         energy_before: Energy at the start [J].
         energy_after: Energy at the end [J].
         remaining_move: RMS of H0^-1 F at the end, in local edge lengths.

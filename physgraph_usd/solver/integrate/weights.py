@@ -84,7 +84,6 @@ def save_network(network: nn.Module, file: Path) -> str:
     """Write weights with their self-description.
 
     Args:
-        network: The network.
         file: The .safetensors to write.
 
     Returns:

@@ -167,7 +167,6 @@ class Binding:
         weights: Barycentric coordinates, shape (N, 3).
         within: Half the way from each corner to its closest point, in the corner's frame, shape (N, 3, 3).
         offsets: The point relative to its closest point, in each corner's frame, shape (N, 3, 3).
-        frames: Frames of the surface.
         turned: Frames in the bind pose, shape (V, 3, 3).
         rigid: Number of the rigid part of each point, or -1, shape (N,).
         distance: Distance from the surface in the bind pose, shape (N,).
@@ -241,7 +240,6 @@ class Follower:
     """A binding with its surface at a time: points and turns follow.
 
     Attributes:
-        binding: The binding.
         surface: Positions of the surface, shape (V, 3).
         frames: Frames of the surface, shape (V, 3, 3).
     """

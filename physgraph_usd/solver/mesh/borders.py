@@ -64,7 +64,6 @@ def nearest_edges(
 
     Args:
         points: Positions [m].
-        vertices: Vertices to find an edge for.
         edges: Open edges of all borders.
         within: Search radius of each vertex [m].
     """
@@ -129,7 +128,6 @@ def _neighbours(edges: np.ndarray, vertex: np.ndarray, edge: np.ndarray) -> np.n
 
 
 def _on_edges(points: np.ndarray, vertex: np.ndarray, edge: np.ndarray) -> OnEdge:
-    """The nearest point of a given edge to each vertex."""
     start, way = points[edge[:, 0]], points[edge[:, 1]] - points[edge[:, 0]]
     squared = np.maximum((way**2).sum(axis=1), np.finfo(float).tiny)
     part = np.clip(((points[vertex] - start) * way).sum(axis=1) / squared, 0.0, 1.0)

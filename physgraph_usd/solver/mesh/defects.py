@@ -112,12 +112,10 @@ def _edge_defects(mesh: PolygonMesh) -> list[Defect]:
 
 
 def _pair(edge: np.ndarray) -> str:
-    """An edge in words."""
     return f"{edge[0]}-{edge[1]}"
 
 
 def _vertex_defects(mesh: PolygonMesh) -> list[Defect]:
-    """Check vertices."""
     bow_ties, isolated = np.flatnonzero(mesh.fan_counts > 1), np.flatnonzero(mesh.fan_counts == 0)
     found = _named("bow-tie-vertex", bow_ties, "vertex {} joins several fans of faces in a point")
     return found + _named("isolated-point", isolated, "no face uses vertex {}")

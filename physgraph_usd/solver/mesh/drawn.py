@@ -147,7 +147,6 @@ def _to_limit(cage: ControlMesh) -> sparse.csr_matrix:
 
 
 def _some_faces(mesh: PolygonMesh, kept: np.ndarray) -> PolygonMesh:
-    """The mesh with a selection of its faces."""
     if kept.all():
         return mesh
     return PolygonMesh(mesh.counts[kept], mesh.indices[kept[mesh.corner_face]], mesh.vertex_count)

@@ -49,7 +49,6 @@ def elastic_elements(mesh: PolygonMesh, split: TriangleSplit, rest: np.ndarray) 
     of their split.
 
     Args:
-        mesh: The mesh.
         split: Sound triangles of the mesh.
         rest: Rest positions [m], shape (V, 3), float64.
     """

@@ -128,7 +128,6 @@ def eight_elements(name: str, formula: str, *, corners: int) -> wp.Kernel:
     Args:
         name: The kernel's name.
         formula: Energy and forces of eight elements, see this module.
-        corners: Corners of an element.
 
     Returns:
         The kernel; an item is a block of `EIGHT` elements.

@@ -49,7 +49,6 @@ def overloads(kernel: Any, *kinds: Any) -> dict[torch.dtype, wp.Kernel]:
     """A generic kernel of (first, *arrays) for float32 and float64.
 
     Args:
-        kernel: The kernel.
         kinds: Element type of each array: a type, or `SCALAR` or `VECTOR`.
     """
 

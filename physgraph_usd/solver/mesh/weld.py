@@ -107,7 +107,6 @@ def weld(mesh: PolygonMesh, poses: Sequence[Float[np.ndarray, "vertices 3"]], wi
     """Join the vertices of faces coincident in every pose, and of coincident open edges in pairs.
 
     Args:
-        mesh: The mesh.
         poses: Positions [m], at least one.
         within: Distance below which two vertices coincide [m].
     """

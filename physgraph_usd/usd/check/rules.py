@@ -216,7 +216,6 @@ def heat_maps(fine: Fine) -> Iterator[Problem]:
 
 
 def _primvar_fault(primvar: UsdGeom.Primvar, time: float | None, expected: int) -> str:
-    """The fault in a primvar at one time, or ""."""
     value = primvar.Get(timecode(time))
     if value is None:
         return ""
@@ -330,7 +329,6 @@ BOUND_MESH_RULES = (topology, *BOUND_RULES, extent)
 
 
 def _error(message: str, path: str = "/", time: float | None = None) -> Problem:
-    """An error."""
     return Problem("error", path, time, message)
 
 
@@ -483,7 +481,6 @@ def _coarse(shot: StageView, mask: Usd.StagePopulationMask, selections: Sequence
 
 
 def _selected(stage: Usd.Stage, path: Sdf.Path) -> Sdf.Path:
-    """A selection's path, with the stage's current selection."""
     name, _ = path.GetVariantSelection()
     prim = stage.GetPrimAtPath(path.GetPrimPath())
     selection = prim.GetVariantSet(name).GetVariantSelection() if prim else ""

@@ -128,7 +128,6 @@ def _check_garment(prim: Usd.Prim, layer: Sdf.Layer, samples: int | None, *, coa
 
 
 def _named(rule: str, problems: Iterable[Problem]) -> Iterator[Problem]:
-    """Set the rule's name in problems."""
     return (replace(problem, rule=rule) for problem in problems)
 
 

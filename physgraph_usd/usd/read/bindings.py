@@ -23,7 +23,6 @@ class PlacedTarget:
     """A target at a time code.
 
     Attributes:
-        target: The target.
         points: Points [m], world space, shape (N, 3).
         follower: The binding at the refined surface, to turn normals.
     """

@@ -59,7 +59,6 @@ class ColliderReader:
     """A collider with everything needed for posing.
 
     Attributes:
-        prim: The collider's prim.
         collider: Constant data.
         metres: Length of one stage unit [m].
         within: Allowed distance of the mesh from the drawn surface [m].

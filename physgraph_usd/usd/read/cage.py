@@ -179,7 +179,6 @@ class PointReader:
     """Reads and repairs local points of one mesh.
 
     Attributes:
-        path: Prim path.
         count: Number of points, the same at every time.
     """
 

@@ -31,7 +31,6 @@ def find_garments(stage: Usd.Stage, wanted: Sequence[str] = ()) -> list[Usd.Prim
     """Find the meshes to refine, in stage order, including meshes inside instances.
 
     Args:
-        stage: The stage.
         wanted: Prim paths (a transform stands for the meshes drawn below), prim names, globs over paths, or collections
             (``/Prim.collection:name``); empty: every mesh with PhysGraphGarmentAPI.
 
@@ -68,7 +67,6 @@ def find_colliders(
     Invisible prims are included because they may be visible at different times; inactive and disabled prims are not.
 
     Args:
-        stage: The stage.
         garments: The garments; never colliders.
         wanted: As for ``find_garments``; empty: the targets of the garments' ``physgraph:colliders``, and for garments
             without targets every prim with PhysGraphColliderAPI or UsdPhysics' CollisionAPI.
@@ -186,7 +184,6 @@ def with_gravity(units: Units, garments: Sequence[Usd.Prim], asked: str | None) 
 
     Args:
         units: The stage's units.
-        garments: Mesh prims of the garments.
         asked: One of `AXES`, or None.
 
     Raises:
@@ -213,8 +210,6 @@ def find_paths(stage: Usd.Stage, item: str, kind: type, *, drawn: bool = True) -
     """Paths of the prims of a UsdGeom class named by an item, as in `find_garments`.
 
     Args:
-        stage: The stage.
-        item: The item.
         kind: The class.
         drawn: Whether proxies and guides are skipped unless named by path or name, or unless nothing else is named.
 

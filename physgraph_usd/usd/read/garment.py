@@ -70,7 +70,6 @@ class GarmentReader:
         garment: Constant data.
         source: Place on the stage.
         values: Sources of the animated values.
-        points: The points.
         edges: Edges as authored, shape (E, 2).
         weld: The mesh as authored and as solved.
         notices: Warnings about the garment.
@@ -90,7 +89,6 @@ class GarmentReader:
         All points of an absent garment are at one place, without contact: other garments may still have a frame.
 
         Args:
-            prim: The garment's mesh prim.
             metres: Length of one stage unit [m].
             time: Time code, or None for the default.
         """
@@ -341,7 +339,6 @@ def read_painted(prim: Usd.Prim, short: str, count: int) -> tuple[np.ndarray, tu
     Constant primvars are inherited from ancestors, as in USD.
 
     Args:
-        prim: Mesh prim.
         short: Short name of the schema's row, such as ``bendScale``.
         count: Number of points.
 

@@ -37,7 +37,6 @@ def read_grain(
     """The grain of a garment, and its source, in words.
 
     Args:
-        prim: Mesh prim.
         weld: The kept faces, as authored and welded.
         rest: Rest positions as authored [m], shape (V, 3).
         kept: Numbers of the kept faces among the authored faces, shape (F,).

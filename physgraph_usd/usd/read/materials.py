@@ -217,7 +217,6 @@ def _from_youngs(material: Usd.Prim, row: Property, thickness: Found, *, units: 
 
 
 def _on_mesh(prim: Usd.Prim, attribute: Usd.Attribute, row: Property, *, units: Units) -> Thickness:
-    """Thickness from the array on a mesh."""
     code, where = Usd.TimeCode.EarliestTime(), source_name(attribute)
     values = np.asarray(attribute.Get(code))
     if values.ndim != 1 or not np.issubdtype(values.dtype, np.number):

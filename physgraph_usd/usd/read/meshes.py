@@ -32,7 +32,6 @@ class DrawnMesh:
     Polygons are drawn as renderers draw them, and as the solver solves refined cloth: as fans from the first corner.
 
     Attributes:
-        path: Prim path.
         points: World positions [m], Y up, shape (V, 3).
         mesh: The polygons, counter-clockwise seen from outside, starting at the authored first corner.
         face_colors: Linear RGB per polygon, shape (F, 3).

@@ -103,7 +103,6 @@ def read_rest(
     """Find or fit the rest shape.
 
     Args:
-        prim: Mesh prim.
         weld: Faces of the cage, as authored and welded.
         asked: Time code of the rest shape's points, `AUTO`, or None.
         animation: Points over the shot.

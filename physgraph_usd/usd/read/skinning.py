@@ -24,12 +24,8 @@ class Skinned:
     """A mesh deformed by UsdSkel.
 
     Attributes:
-        path: Prim path.
-        root: The skel root.
         times: Authored time codes of the skeleton's animation and placement, ascending.
         query: UsdSkel's query of the binding.
-        skeleton: The skeleton's prim path.
-        animation: The animation's prim path, or None.
     """
 
     path: Sdf.Path

@@ -22,7 +22,6 @@ class MeshReport:
     """One mesh of a stage.
 
     Attributes:
-        path: Prim path.
         garment: Whether the mesh has PhysGraphGarmentAPI.
         points: Number of points; 0 if unreadable.
         faces: Number of faces to be refined.
@@ -49,7 +48,6 @@ class Survey:
     Attributes:
         path: The shot file, or the name of an in-memory stage.
         metres_per_unit: Length of one stage unit [m].
-        meshes: All meshes.
         notices: Warnings about the stage itself.
     """
 

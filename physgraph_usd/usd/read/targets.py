@@ -38,7 +38,6 @@ class Target:
     """A mesh, curves or points that follow a garment.
 
     Attributes:
-        path: Prim path.
         garment: Number of the garment.
         on: Parent target, a mesh; None for the cloth.
         time: Time code of the bind pose; None for the default.
@@ -74,7 +73,6 @@ class Bound:
     """A prim to be bound.
 
     Attributes:
-        path: Prim path.
         on: Garment or parent target; None for the nearest garment.
     """
 
@@ -86,8 +84,6 @@ def find_bound(stage: Usd.Stage, garments: Sequence[Usd.Prim], wanted: Sequence[
     """Prims bound to garments, each after its parent.
 
     Args:
-        stage: The stage.
-        garments: The garments' prims.
         wanted: Prim paths, names, globs or collections bound to the nearest garment.
 
     Raises:
@@ -203,7 +199,6 @@ def _poses(
 
 
 def _placed(prim: Usd.Prim, pose: _Pose, on: Sdf.Path | None, *, skinned: bool) -> Target:
-    """A target in its bind pose."""
     path, size = prim.GetPath(), pose.size
     distance = float(closest(pose.points, pose.surface, pose.triangles).distance.max(initial=0.0))
     if distance > FAR * size:

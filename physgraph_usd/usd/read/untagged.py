@@ -103,7 +103,6 @@ def _meeting(poses: Iterable[Pose | None], boxes: Sequence[Box]) -> Iterator[tup
 
 
 def _meets(bounds: Box, box: Box) -> bool:
-    """Whether bounds overlap a box."""
     return bool((bounds[0] <= box[1]).all() and (box[0] <= bounds[1]).all())
 
 

@@ -19,9 +19,6 @@ class VertexNormals:
         n_v = sum_f a_f / |sum_f a_f|,   a_f = 1/2 sum_i (p_i - p_0) x (p_{i+1} - p_0),
 
     exact for planar polygons and independent of the triangulation of a non-planar polygon (Newell's normal).
-
-    Attributes:
-        vertex_count: V.
     """
 
     def __init__(
@@ -30,7 +27,6 @@ class VertexNormals:
         """Prepare the stencils.
 
         Args:
-            mesh: The mesh.
             left_handed: Whether faces run clockwise seen from outside.
             welded: A number for each vertex; vertices with equal numbers share a normal. None if no vertices are
                 welded.

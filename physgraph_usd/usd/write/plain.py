@@ -118,7 +118,6 @@ class PlainStage:
     Attributes:
         name: Name of the default prim.
         doc: Purpose of the shot, one sentence.
-        meshes: The meshes.
         times: Time codes of every sample, ascending.
         skeleton: Skeleton of the skinned meshes, or None.
         rate: Time codes per second.

@@ -36,7 +36,6 @@ def carry_primvars(
     A primvar not matching its own mesh is hidden, because the values would match the fine mesh even less.
 
     Args:
-        stream: The layer.
         target: Prim to author on.
         prim: Coarse mesh as composed.
         fine: Map to the fine mesh.

@@ -140,7 +140,6 @@ class LayerStream:
         return self.target
 
     def _as_text(self, target: Path) -> Path:
-        """Convert the temporary layer to text."""
         path = temporary_path(target, suffix=".usda")
         try:
             self.layer.Export(str(path))

@@ -108,7 +108,6 @@ def _targets(shot: str, garments: Sequence[str], bind: Sequence[str]) -> dict[Sd
 
 
 def _check_word(what: str, word: str | None, words: Sequence[str]) -> None:
-    """Refuse an unknown word."""
     if word is not None and word not in words:
         raise UsageError(f"unknown {what} {word!r}; known {what}s: {', '.join(words)}")
 
@@ -156,7 +155,6 @@ def _author_over(spec: Sdf.PrimSpec, prim: Usd.Prim, row: Property, value: float
 
 
 def _author(spec: Sdf.PrimSpec, row: Property, value: float | str) -> None:
-    """Author one attribute's default."""
     variability = Sdf.VariabilityUniform if row.uniform else Sdf.VariabilityVarying
     kind = Sdf.ValueTypeNames.Find(row.type)  # pyright: ignore[reportCallIssue]  the stubs know no argument
     Sdf.AttributeSpec(spec, row.name, kind, variability).default = value

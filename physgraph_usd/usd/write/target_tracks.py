@@ -42,8 +42,6 @@ class TargetTracks:
         """Bind the targets and author constant properties.
 
         Args:
-            stream: The layer.
-            shot: The shot.
             index: Number of the garment.
             steps: The garment's refinements, coarse to fine.
             absent: Time codes at which the garment is absent.

@@ -88,7 +88,6 @@ class PointTrack:
         """Author the attributes, without values.
 
         Args:
-            stream: The layer.
             target: Prim to author on.
             normals: Computes normals of local points; None without.
             rest: Local points for the default time, shape (V, 3); if None, the first sample's points.
@@ -297,7 +296,6 @@ class HeatTrack:
         """Author nothing yet.
 
         Args:
-            stream: The layer.
             target: Prim to author on.
             count: Number of fine vertices.
             still: Whether the garment's input has no samples: a default is written instead of the first sample.
