@@ -18,7 +18,7 @@ LONGEST_SHORT = 15.0
 CLOCKS = ("wall", "cpu")
 SLOW = (PAPER,)
 """Integrators of which one step takes longer on the CPU than a frame of any other: 4 s at 26,000 vertices."""
-FOR_REFERENCE, FOR_CURVES, FOR_WARM, FOR_TERMS = 0.25, 0.5, 0.1, 0.15
+FOR_REFERENCE, FOR_CURVES = 0.25, 0.5
 """Fractions of the time."""
 PARTS = {"reference": (0.0, 0.25), "curves": (0.25, 0.75), "warm": (0.75, 0.85), "terms": (0.85, 1.0)}
 """Parts of a chart, in their order, and between which fractions of the time each lies."""

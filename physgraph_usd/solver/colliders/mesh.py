@@ -26,8 +26,6 @@ from .pose import MeshPose, Pose, moved_rigidly
 
 wp.set_module_options(KERNELS)
 
-Rim = tuple[np.ndarray, np.ndarray]
-"""Rim edges and rim corners of open triangles, as `Pieces` has them."""
 LIFT = 1e-4
 """Height above a vertex at which the surface is tested for being buried, relative to the surface's size."""
 ON_EDGE = 1e-4
