@@ -9,9 +9,9 @@ import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, Vt
 from stages import new_stage, sheet_faces, vec3
 
-from physgraph_usd.solver.mesh.attributes import vertex_values
 from physgraph_usd.solver.mesh.subdivide import Refinement, subdivide_times
 from physgraph_usd.usd.check.validate import validate_layer
+from physgraph_usd.usd.mesh.attributes import vertex_values
 from physgraph_usd.usd.read.reader import Shot, open_shot
 from physgraph_usd.usd.view import root_over
 from physgraph_usd.usd.write.writer import LayerWriter

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from physgraph_usd.solver.mesh.bind import Binding, closest
 from physgraph_usd.solver.rigid import best_motion
+from physgraph_usd.usd.mesh.bind import Binding, closest
 
 TURN = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]
 TURN = TURN * np.sign(np.linalg.det(TURN))

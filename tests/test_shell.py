@@ -10,8 +10,8 @@ from layers import COAT, dress_up, errors, make_shot, open_over
 from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 from shots import CLOTH, EDGE, cloth_shot, refine
 
-from physgraph_usd.solver.mesh.shell import Shell
 from physgraph_usd.solver.mesh.topology import PolygonMesh
+from physgraph_usd.usd.mesh.shell import Shell
 
 THICKNESS = 2e-3
 LATE = 4.0

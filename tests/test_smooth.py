@@ -16,9 +16,9 @@ from meshes import any_mesh, cube, faces_of, grid, mesh_of, prism, tetrahedron
 from scipy import sparse
 from scipy.spatial import KDTree
 
-from physgraph_usd.solver.mesh.attributes import edge_subset
 from physgraph_usd.solver.mesh.subdivide import Refinement, compose, smooth, subdivide, subdivide_times
 from physgraph_usd.solver.mesh.topology import PolygonMesh, find_edges
+from physgraph_usd.usd.mesh.attributes import edge_subset
 
 BLENDER = """
 import sys, numpy as np, bpy

@@ -19,11 +19,11 @@ from physgraph_usd.lab.samples import trims, tshirt
 from physgraph_usd.lab.samples.shapes import ellipsoid
 from physgraph_usd.shot.refine import inspect_shot
 from physgraph_usd.shot.stitch import stitch
-from physgraph_usd.solver.mesh.bind import closest
 from physgraph_usd.solver.mesh.subdivide import smooth, subdivide
 from physgraph_usd.solver.mesh.topology import PolygonMesh
 from physgraph_usd.solver.rigid import best_motion
 from physgraph_usd.studio.session import TuneSession
+from physgraph_usd.usd.mesh.bind import closest
 from physgraph_usd.usd.read.reader import open_shot
 from physgraph_usd.usd.read.targets import TARGETS
 from physgraph_usd.usd.write.sample_stage import write_stage

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from ...solver.mesh.bind import closest
 from ...solver.mesh.subdivide import smooth, subdivide
 from ...solver.mesh.topology import PolygonMesh, edges_of
+from ...usd.mesh.bind import closest
 from ...usd.write.plain import Look, PlainMesh, PlainStage
 from . import tshirt
 from .shapes import Solid, join, lathe, mesh, quad_grid, rings

@@ -1,1 +1,1 @@
-"""Polygon meshes: topology, subdivision and attributes."""
+"""Polygon meshes: topology and subdivision."""

@@ -11,9 +11,9 @@ from pxr import Sdf
 from scipy import sparse
 
 from ...errors import GarmentError
-from ...solver.mesh.bind import Binding, Follower
 from ...solver.mesh.subdivide import Refinement, smooth
 from ...solver.mesh.topology import PolygonMesh
+from ..mesh.bind import Binding, Follower
 from .reader import Shot
 from .targets import Target, points_at
 

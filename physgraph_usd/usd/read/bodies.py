@@ -14,10 +14,10 @@ from pxr import Usd, UsdGeom
 
 from ...solver.colliders.orient import FIXED
 from ...solver.colliders.pose import Collider, MeshPose, Pose, ShapePose
-from ...solver.mesh.drawn import MOST_VERTICES, ControlMesh, DrawnSurface, drawn_surface
 from ...solver.mesh.topology import PolygonMesh
 from ...solver.scene import FARTHEST, out_of_bounds
 from ..lookup import Override, find_token, find_value
+from ..mesh.drawn import MOST_VERTICES, ControlMesh, DrawnSurface, drawn_surface
 from ..schema import COLLIDER, GARMENT
 from ..stage import Notice, timecode, value_at
 from .absence import missing_value

@@ -12,11 +12,11 @@ import numpy as np
 from pxr import Sdf, Usd, UsdGeom
 
 from ...errors import GarmentError, SchemaError, counted
-from ...solver.mesh.pieces import sort_pieces
 from ...solver.mesh.topology import PolygonMesh
 from ...solver.mesh.weld import Weld, seam_reach, weld
 from ...solver.scene import Garment, GarmentFrame
 from ..lookup import Found, Override, bound_materials, check_limits, find_value
+from ..mesh.pieces import sort_pieces
 from ..schema import GARMENT
 from ..stage import GarmentSource, Notice, Units
 from ..times import garment_times, merge, transform_times, within

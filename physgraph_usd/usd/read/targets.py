@@ -9,8 +9,8 @@ import numpy as np
 from pxr import Sdf, Usd, UsdGeom
 
 from ...errors import GarmentError, SchemaError
-from ...solver.mesh.bind import closest
 from ...solver.mesh.topology import PolygonMesh, edges_of, joined_by
+from ..mesh.bind import closest
 from ..stage import timecode
 from ..times import garment_times
 from .find import find_paths, targets_of

@@ -10,7 +10,9 @@ import numpy as np
 from pxr import Sdf, Usd, UsdGeom, Vt
 from scipy import sparse
 
-from ...solver.mesh.attributes import (
+from ...solver.mesh.subdivide import Refinement, compose
+from ...solver.mesh.topology import PolygonMesh
+from ..mesh.attributes import (
     corner_values,
     edge_subset,
     face_subset,
@@ -18,9 +20,7 @@ from ...solver.mesh.attributes import (
     vertex_subset,
     vertex_values,
 )
-from ...solver.mesh.shell import Shell
-from ...solver.mesh.subdivide import Refinement, compose
-from ...solver.mesh.topology import PolygonMesh
+from ..mesh.shell import Shell
 from ..stage import Notice, timecode
 from .stream import LayerStream
 

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom
 
-from ...solver.mesh.bind import Follower
 from ...solver.mesh.subdivide import Refinement
+from ..mesh.bind import Follower
 from ..read.bindings import GarmentBindings, PlacedTarget
 from ..read.find import instance_roots
 from ..read.placement import to_metres

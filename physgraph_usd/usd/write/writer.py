@@ -17,11 +17,11 @@ import numpy as np
 from pxr import Sdf, Usd, UsdGeom
 
 from ...errors import LayerError, UsageError
-from ...solver.mesh.shell import Shell
 from ...solver.mesh.subdivide import Refinement
 from .. import provenance
 from ..check.validate import check_layer
 from ..files import check_targets, files_of
+from ..mesh.shell import Shell
 from ..read.absence import named_times
 from ..read.reader import Shot
 from ..stage import Notice, at_time, first_value, pxr_errors, value_at

@@ -14,8 +14,8 @@ from functools import reduce
 import numpy as np
 from scipy import sparse
 
-from .subdivide import Refinement, fine_count, smooth, subdivide
-from .topology import PolygonMesh, find_edges
+from ...solver.mesh.subdivide import Refinement, fine_count, smooth, subdivide
+from ...solver.mesh.topology import PolygonMesh, find_edges
 
 MOST_VERTICES = 25_000
 """Most vertices after subdivision, about as many as the cloth on top. Frames of a shirt of 22,000 vertices over a body

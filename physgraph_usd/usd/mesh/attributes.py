@@ -12,8 +12,8 @@ from collections.abc import Sequence
 import numpy as np
 from scipy import sparse
 
-from .subdivide import Refinement, compose, subdivide_times
-from .topology import PolygonMesh, find_edges
+from ...solver.mesh.subdivide import Refinement, compose, subdivide_times
+from ...solver.mesh.topology import PolygonMesh, find_edges
 
 
 def vertex_values(refinements: Sequence[Refinement], values: np.ndarray) -> np.ndarray:

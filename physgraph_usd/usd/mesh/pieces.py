@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from .topology import PolygonMesh, area_vectors, joined_by
+from ...solver.mesh.topology import PolygonMesh, area_vectors, joined_by
 
 SMALL = 0.25
 """Size, relative to the largest piece, below which a closed piece may be a rigid part."""

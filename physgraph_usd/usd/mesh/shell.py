@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from .topology import PolygonMesh
+from ...solver.mesh.topology import PolygonMesh
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,8 +23,8 @@ from jaxtyping import Float, Int
 from scipy import sparse
 from scipy.spatial import cKDTree
 
-from ..rigid import Rigid, best_motion
-from .topology import edges_of
+from ...solver.mesh.topology import edges_of
+from ...solver.rigid import Rigid, best_motion
 
 NEAREST = 8
 """Triangles that are tested for the closest point, nearest by their centroids."""
