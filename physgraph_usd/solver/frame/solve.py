@@ -36,6 +36,8 @@ from .values import FrameInput, Solved, State
 
 ROUNDING = 1e-3
 """Fraction of the energies' size below which two energies count as equal: sums are in single precision."""
+MORE = 2
+"""Crossings with a body allowed for each one of the cage: cloth pinched by bodies crosses them about as often."""
 MOST_WAIT = 64
 """Most frames between two starts from the cage. The wait doubles with each unsuccessful start, so such starts cost
 little in a shot with cloth impossible to pull apart."""
@@ -208,11 +210,11 @@ class RunawayError(SolveError):
 def solve_soundly(group: Group, frame: FrameInput, last: State | None) -> Solved:
     """Solve a frame, and once more from the cage if the result is unsound.
 
-    A result is unsound if cloth crosses cloth, or a body that the upsampled cage does not cross, or if its energy is
-    above the upsampled cage's energy without self contact (the self contact energy is as large as the cage's own
-    crossings are deep). The second result is used if it has fewer crossings of cloth with cloth. If it has as many: if
-    the first alone crosses such a body; or if neither does, the first energy is above the cage's, and the second is
-    lower. Bodies that the cage crosses are left out, since a start from the cage crosses them too.
+    A result is unsound if cloth crosses cloth, or a body over `MORE` times as often as the upsampled cage does, or if
+    its energy is above the upsampled cage's energy without self contact (the self contact energy is as large as the
+    cage's own crossings are deep). The second result is used if it has fewer crossings of cloth with cloth. If it has
+    as many: if the first alone crosses bodies too often (a few crossings less are no reason to change the folds); or
+    if neither does, the first energy is above the cage's, and the second is lower.
 
     Args:
         group: Garments solved together.
@@ -271,9 +273,9 @@ def _crossings(telemetry: Mapping[str, Any], *, given_up: bool = False) -> int:
 
 
 def _through_bodies(telemetry: Mapping[str, Any]) -> int:
-    """Crossings of a result with bodies that the upsampled cage does not cross."""
+    """Sum over bodies of the result's crossings beyond `MORE` times those of the upsampled cage."""
     bodies = telemetry.get("contact", {}).get("bodies", {}).values()
-    return sum(each["after"]["crossings"] for each in bodies if not each["before"]["crossings"])
+    return sum(max(each["after"]["crossings"] - MORE * each["before"]["crossings"], 0) for each in bodies)
 
 
 def _excess(telemetry: Mapping[str, Any], *, whole: bool = False) -> float:
