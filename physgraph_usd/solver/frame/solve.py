@@ -136,8 +136,7 @@ def solve_one_level(
             problem.show(x)
         if budget.ends(report, made=made, touched=touched, blocked=blocked):
             break
-        replaceable = smoothing is None and integrator.name != problem.untangler.name
-        if carry.setbacks >= PATIENCE or (replaceable and _went_up(reports)):
+        if carry.setbacks >= PATIENCE:
             integrator, carry = problem.untangler, None
         elif blocked:  # The guard's corrections do not apply to the blocked positions.
             carry = None if carry.setbacks else replace(carry, x=x)
@@ -190,11 +189,6 @@ def _untangle(
         if counts[-1] * STALLED > gone * left and view.tangled_pieces(x) is not None:
             break
     return x, reports
-
-
-def _went_up(reports: list[LevelReport]) -> bool:
-    """Whether the last round began at a higher energy than the round before, whose steps met undetected contact."""
-    return len(reports) > 1 and reports[-1].energy_before > reports[-2].energy_before
 
 
 def _smooth_move(system: System, carry: Carry, report: LevelReport) -> float:
