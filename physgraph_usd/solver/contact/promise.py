@@ -28,8 +28,6 @@ from .along import ApproachLimits, along
 from .cloth import ClothView
 from .tangles import TANGLED
 
-TRIES = 4
-"""Most tries that hold only the worsened tangles to the promise, before all hopeful tangles are held."""
 ROUNDS = 4
 """Most passes that shorten blocked displacements. Vertices still blocked afterwards stay at the start, so the passes
 end."""
@@ -92,11 +90,8 @@ class Promise:
             return x
         free = tangles.label.clone()
         x, _ = self._go(start, wanted, free, since)
-        for attempt in range(TRIES):
-            worse = tangles.worse(view.crossings(x))
-            if not bool(worse.any()):
-                break
-            free[worse if attempt < TRIES - 1 else ~tangles.given_up] = -1
+        if bool(tangles.worse(view.crossings(x)).any()):
+            free[~tangles.given_up] = -1
             x, _ = self._go(start, wanted, free, since)
         return x
 
