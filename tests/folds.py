@@ -128,7 +128,7 @@ def view_of(
     """The finest level's cloth in a frame."""
     lasting = ClothContact(levels, garments)
     each = torch.full((len(garments),), thickness, dtype=levels[-1].dtype)
-    settings = ContactSettings(cloth=form, cloth_stiffness=stiffness)
+    settings = ContactSettings(cloth=form, stiffness=stiffness)
     base = levels[-1].base.apply(levels[0].rest)
     base = base + 1e3 * levels[-1].vertex_garment.unsqueeze(1)  # The input has no two garments near one another.
     return ClothView(lasting, levels[-1], base=base, thickness=each, settings=settings, seam=seam)

@@ -8,7 +8,7 @@ import torch
 from cloth import finest_system, group_of, sheet, wave
 from numpy.linalg import inv
 
-from physgraph_usd.solver.contact.metric import COARSE, MIDDLE, ROUGH, HeldMetric
+from physgraph_usd.solver.contact.metric import COARSE, ROUGH, HeldMetric
 from physgraph_usd.solver.forces.base import ForceModule
 from physgraph_usd.solver.integrate.metric import Metric, on_edges
 
@@ -44,7 +44,7 @@ def test_the_solve_is_the_sum_over_levels(level: int):
         basis = basis @ up
         if number < len(ups) - 1:
             diagonal = np.diag(basis.T @ a @ basis)
-            expected += MIDDLE * (basis * np.where(diagonal > 0, 1.0 / np.maximum(diagonal, 1e-300), 0.0)) @ basis.T
+            expected += (basis * np.where(diagonal > 0, 1.0 / np.maximum(diagonal, 1e-300), 0.0)) @ basis.T
     cage = basis[:, np.abs(basis).sum(axis=0) > 0]
     expected += COARSE * cage @ inv(cage.T @ a @ cage) @ cage.T
     force = free[:, None] * np.random.default_rng(2).normal(size=(len(free), 3))

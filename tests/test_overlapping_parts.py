@@ -24,7 +24,7 @@ from physgraph_usd.solver.level import Level
 from physgraph_usd.usd.read.reader import open_shot
 
 SHEET = named(square(12))
-SETTINGS = ContactSettings(stiffness=1.0, cloth_stiffness=1e5)
+SETTINGS = ContactSettings(stiffness=1e5)
 OVER, UNDER = (ball(0.15, at=(0.0, side * 0.13, 0.0), level=4) for side in (1.0, -1.0))
 """Balls that overlap by 4 cm, in a lens of 7.5 cm about the middle of the sheet's plane."""
 

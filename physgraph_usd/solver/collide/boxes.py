@@ -12,6 +12,7 @@ each part.
 from __future__ import annotations
 
 import functools
+from enum import IntEnum
 from typing import Any
 
 import numpy as np
@@ -28,12 +29,19 @@ wp.set_module_options(KERNELS)
 ROWS = 12
 """Rows of a block of boxes."""
 FAR = wp.constant(wp.float64(1.0e30))
-"""Corner of an empty box."""
+"""Corner of an empty box, and distance of what is not there [m]."""
 WIDER = wp.constant(wp.float64(1.000001))
 """Factor on search distances, for their rounding to single precision."""
-MOVE, NEAR, CROSSING, MOVE_NEAR = (wp.constant(each) for each in range(4))
-"""Queries: parts that come too near on straight paths, near parts, edges that pass through faces, and parts that come
-too near on straight paths or are near at the end."""
+
+
+class Ask(IntEnum):
+    """Parts that come too near on straight paths, near parts, edges through faces, and both first kinds at once."""
+
+    MOVE = 0
+    NEAR = 1
+    CROSSING = 2
+    MOVE_NEAR = 3
+
 
 _OVERLAPPING = """
     const float* a = (const float*)boxes.data + (part / 8) * 96 + part % 8;
@@ -87,7 +95,7 @@ class Query:
     """What is searched: the kind of query, positions at both ends, queried vertices, and distances.
 
     Attributes:
-        kind: `MOVE`, `NEAR`, `CROSSING` or `MOVE_NEAR`.
+        kind: As in `Ask`.
         clusters: Number of clusters searched: those of the cloth, or all.
         start: Positions [m].
         end: Positions at the end; those at the start without a move [m].
@@ -258,7 +266,7 @@ def query_of(
     start: Tensor,
     end: Tensor | None = None,
     *,
-    kind: int = MOVE,
+    kind: Ask = Ask.MOVE,
     floor: float = 0.0,
     asked: Tensor | None = None,
     tangle: Tensor | None = None,

@@ -8,9 +8,9 @@ import warp as wp
 
 from ..mesh.kernels import KERNELS
 from ..mesh.piercing import passes_through
-from .boxes import CROSSING, MOVE, NEAR, Boxes, Query, boxes_near, lowest_bit, without_lowest
+from .boxes import Ask, Boxes, Query, boxes_near, lowest_bit, without_lowest
 from .separation import distance_of, gap_along, safe_fraction
-from .topology import EDGE, FACE, LANES, VERTEX, Topology
+from .topology import LANES, Part, Topology
 
 wp.set_module_options(KERNELS)
 
@@ -84,9 +84,9 @@ def value_of(face: wp.bool, c: wp.vec4i, parts: Topology, query: Query):
     least = room * wp.length(middles)
     if gap_along(middles, face, zero, b, d, f) >= least and gap_along(middles, face, zero, v, p, q) >= least:
         return one
-    if query.kind != NEAR:
+    if query.kind != Ask.NEAR:
         fraction = safe_fraction(face, b, d, f, v - b, p - d, q - f, query.floor)
-        if query.kind == MOVE:
+        if query.kind == Ask.MOVE:
             return fraction
         if fraction < one:
             return fraction - one
@@ -133,11 +133,11 @@ def write(
     """Write two parts if they are a result, and there is room; returns the number of pairs so far."""
     p, q = parts.parts[k], parts.parts[m]
     c = wp.vec4i(p[0], q[0], q[1], q[2])
-    if first == EDGE:
+    if first == Part.EDGE:
         c = wp.vec4i(p[0], p[1], q[0], q[1])
     value = wp.float64(0.0)
-    if query.kind != CROSSING:
-        value = value_of(first == VERTEX, c, parts, query)
+    if query.kind != Ask.CROSSING:
+        value = value_of(first == Part.VERTEX, c, parts, query)
     elif is_pierced(query, p, q):
         c = wp.vec4i(parts.number[k], parts.number[m], 0, 0)
     else:
@@ -148,7 +148,7 @@ def write(
     if place < found.begin[owner + 1]:
         found.corners[place] = c
         found.value[place] = value
-        found.face[place] = first == VERTEX
+        found.face[place] = first == Part.VERTEX
     return count + 1
 
 
@@ -211,13 +211,13 @@ def find_pairs(
     i, j = clusters[n][0], clusters[n][1]
     share, bits = own // KINDS, wp.max(tasks // KINDS, 1) - 1
     kind = wp.where(tasks == 1, -1, own % KINDS)
-    one, other, count = wp.where(query.kind == CROSSING, EDGE, VERTEX), FACE, wp.int32(0)
+    one, other, count = wp.where(query.kind == Ask.CROSSING, Part.EDGE, Part.VERTEX), Part.FACE, wp.int32(0)
     if kind <= 0:
         count = search_kind(parts, query, boxes, found, task, one, other, i, j, count, share, bits)
     if i != j and (kind < 0 or kind == 1):
         count = search_kind(parts, query, boxes, found, task, one, other, j, i, count, share, bits)
-    if query.kind != CROSSING and (kind < 0 or kind == 2):
-        count = search_kind(parts, query, boxes, found, task, EDGE, EDGE, i, j, count, share, bits)
+    if query.kind != Ask.CROSSING and (kind < 0 or kind == 2):
+        count = search_kind(parts, query, boxes, found, task, Part.EDGE, Part.EDGE, i, j, count, share, bits)
     found.count[task] = count
 
 

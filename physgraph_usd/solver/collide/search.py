@@ -18,7 +18,7 @@ from torch import Tensor
 
 from ..mesh.kernels import KERNELS
 from ..mesh.threads import argument, run
-from .boxes import CROSSING, MOVE, MOVE_NEAR, NEAR, Boxes, Query, bound_clusters, bound_parts, boxes_near, query_of
+from .boxes import Ask, Boxes, Query, bound_clusters, bound_parts, boxes_near, query_of
 from .narrow_phase import KINDS, Found, check_pairs, find_pairs
 from .pairs import NearAt, Pairs, Reach
 from .parts import Parts
@@ -28,8 +28,8 @@ wp.set_module_options(KERNELS)
 
 CLUSTERS = 32
 """Room for pairs of clusters per cluster before these are counted."""
-PAIRS, LEAST, MOST = 2**19, 16, 64
-"""Room for pairs of parts: of all tasks, and least and most of a task. Without enough room a search runs twice."""
+PAIRS, LEAST = 2**19, 16
+"""Room for pairs of parts, of all tasks, and at least of a task. Without enough room a search runs twice."""
 TASKS, THREADS = 4 * KINDS, 2**18
 """Tasks of a pair of clusters on CUDA, each with one kind of pairs and every fourth part; and threads running at once.
 With more tasks than threads, a single task per pair is faster: tasks repeat box tests."""
@@ -128,7 +128,7 @@ def near_parts(
     """
     asked = _of_cloth(parts, x) if asked is None else asked
     given = {"radius": reach.radius.double(), "play": reach.play.double(), "half": reach.half}
-    return NearAt(_search(parts, query_of(x.double(), kind=NEAR, asked=asked, inside=inside, **given)), reach)
+    return NearAt(_search(parts, query_of(x.double(), kind=Ask.NEAR, asked=asked, inside=inside, **given)), reach)
 
 
 def blocking_pairs(
@@ -155,7 +155,7 @@ def blocking_pairs(
         inside: Cloth vertices inside a body, without pairs with bodies; or None.
         near: All near pairs with cloth at the start; None if unknown.
     """
-    given = {"kind": MOVE, "floor": floor, "asked": asked, "tangle": tangle, "inside": inside}
+    given = {"kind": Ask.MOVE, "floor": floor, "asked": asked, "tangle": tangle, "inside": inside}
     start, end = start.double(), end.double()
     if near is None:
         return _search(parts, query_of(start, end, **given)) if bool(asked.any()) else Pairs.empty(0, asked.device)
@@ -181,7 +181,7 @@ def blocking_and_near(
     """
     asked = _of_cloth(parts, start) if asked is None else asked
     given = {"radius": reach.radius.double(), "play": reach.play.double(), "half": reach.half, "floor": floor}
-    found = _search(parts, query_of(start.double(), end.double(), kind=MOVE_NEAR, asked=asked, **given))
+    found = _search(parts, query_of(start.double(), end.double(), kind=Ask.MOVE_NEAR, asked=asked, **given))
     blocking, near = (found.where(mask) for mask in (found.value < 0.0, found.value >= 0.0))
     return replace(blocking, value=blocking.value + 1.0), NearAt(near, reach)
 
@@ -191,7 +191,7 @@ def piercing_edges(
 ) -> Int[Tensor, "crossings 2"]:
     """Indices of each crossing edge and face at x [m], sorted; clusters without a queried vertex may be left out."""
     asked = _of_cloth(parts, x) if asked is None else asked
-    found = _search(parts, query_of(x.double(), kind=CROSSING, asked=asked)).corners[:, :2].long()
+    found = _search(parts, query_of(x.double(), kind=Ask.CROSSING, asked=asked)).corners[:, :2].long()
     return found[torch.argsort(found[:, 0] * max(parts.faces, 1) + found[:, 1])]
 
 
@@ -243,7 +243,7 @@ def _pairs_of(parts: Parts, clusters: Int[Tensor, "clusters 2"], query: Any) -> 
     """The pairs of parts in pairs of clusters; pairs of clusters without enough room are searched again."""
     size = len(clusters)
     tasks = _tasks(size, cuda=clusters.is_cuda)
-    room = min(max(PAIRS // (size * tasks), LEAST), MOST)
+    room = max(PAIRS // (size * tasks), LEAST)
     begin = torch.arange(0, (size * tasks + 1) * room, room, dtype=torch.int32, device=clusters.device)
     found, count = _write(parts, clusters, query, begin, size * tasks * room, tasks=tasks)
     count = count.reshape(size, tasks)

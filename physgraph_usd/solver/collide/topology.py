@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from enum import IntEnum
 from typing import Any
 
 import numpy as np
@@ -16,8 +17,14 @@ from ..mesh.topology import owned_sides
 
 LANES = 8
 """Parts in a block, compared at a time; native code in `boxes` is written for eight."""
-VERTEX, EDGE, FACE = (wp.constant(each) for each in range(3))
-"""Kinds of parts."""
+
+
+class Part(IntEnum):
+    """Kinds of parts."""
+
+    VERTEX = 0
+    EDGE = 1
+    FACE = 2
 
 
 @wp.struct

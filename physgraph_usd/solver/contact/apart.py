@@ -19,6 +19,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.sparse import csr_matrix
 from torch import Tensor
 
+from ..collide.boxes import FAR
 from ..collide.crossings import Crossings, crossings
 from ..collide.distance import weights_on_triangle
 from ..deadline import is_over
@@ -26,18 +27,14 @@ from ..level import Level
 from ..mesh.kernels import KERNELS
 from ..mesh.threads import run
 from ..mesh.topology import joined_by
-from .cloth_mesh import ClothMesh
+from .cloth_mesh import RINGS, ClothMesh
 
 wp.set_module_options(KERNELS)
 
 PASSES = 6
 """Most passes that move pieces back: a pass may uncover another contour."""
-WIDER = (0.0, 0.25, 0.5)
-"""Minimum gaps tried, in mean edges: faces of curved cloth intersect if the gap is smaller than their sag."""
-BESIDE = 2
-"""Rings around a piece that count as part of the piece, not as cloth it went through."""
-FAR = wp.constant(wp.float64(1.0e30))
-"""Distance for an empty subset."""
+WIDER = 0.25
+"""Minimum gap of a second try, in mean edges: faces of curved cloth intersect if the gap is smaller than their sag."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +77,7 @@ def drawn_apart(
         Positions [m], x itself if nothing improves, and the number of crossings there.
     """
     best, first = (x, start), None
-    for least in WIDER:
+    for least in (0.0, WIDER):
         if not best[1].count or is_over():
             break
         first = _gone_through(mesh, start, x) if first is None else first
@@ -109,8 +106,8 @@ def _gone_through(mesh: ClothMesh, found: Crossings, x: Tensor) -> _Through:
     own = sp.csr_matrix(
         (np.ones(int((piece >= 0).sum()), np.float32), (piece[piece >= 0], np.flatnonzero(piece >= 0))), shape=met.shape
     )
-    rings = np.ceil(np.sqrt(np.bincount(piece[piece >= 0], minlength=count))).astype(int) + BESIDE
-    barrier = _grown(mesh, met, rings) - _grown(mesh, own, np.full(count, BESIDE))
+    rings = np.ceil(np.sqrt(np.bincount(piece[piece >= 0], minlength=count))).astype(int) + RINGS
+    barrier = _grown(mesh, met, rings) - _grown(mesh, own, np.full(count, RINGS))
     barrier = sp.csr_matrix(barrier > 0)
     depth = displacements_to(mesh.level, x, vertices, which, _faces_of(mesh, barrier))
     kept = torch.nonzero((depth != 0).any(dim=1)).squeeze(1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -24,8 +25,6 @@ REACH = 2.0
 AT_ONE_PLACE, COPY = 1e-4, 0.5
 """Distance of coinciding points, in mean edges, and the fraction of coinciding points from which a cage is a copy of
 another cage. Copies do not touch."""
-NEVER = -float("inf")
-"""Offset of a garment from a surface that the garment ignores."""
 
 
 class TouchingGroups:
@@ -172,7 +171,7 @@ class Bodies:
         for place, index in enumerate(indices):
             collider = self.colliders[index]
             own = (each[place] for each in offsets)
-            offset = tuple(NEVER if each is None else each + collider.offset for each in own)
+            offset = tuple(-math.inf if each is None else each + collider.offset for each in own)
             known = before[index] if before else None
             for surface in self._posed(index):
                 placed = None if known is None else surface.placed(known)

@@ -252,7 +252,7 @@ class ClothView:
         found, tangles = looked.crossings, looked.tangles
         found = found if tangles is None else tangles.hopeful(found)
         if found.count:
-            step, stiffness = OUT * float(self._level.spacing.mean()), self._settings.cloth_stiffness
+            step, stiffness = OUT * float(self._level.spacing.mean()), self._settings.stiffness
             gaps = gaps.with_more(gaps_out(self.mesh, found, x, step=step, stiffness=stiffness))
         self.came_near = bool(self.came_near) or len(gaps.corners) > 0
         named = (("contact", pushes), ("self_contact", gaps))
@@ -265,4 +265,4 @@ class ClothView:
             corners = near.near.corners.long()
             kept = ~self.mesh.crossed(self.crossings(x))[corners].any(dim=1)
             near = near.where(kept & ~tangles.given_up[corners].all(dim=1))
-        return self.springs.constraints(near, at, self._settings.cloth_stiffness)
+        return self.springs.constraints(near, at, self._settings.stiffness)

@@ -17,6 +17,9 @@ from ..forces.self_contact import PairConstraints
 from ..level import Level
 from ..mesh.topology import adjacency, find_edges, joined_by
 
+RINGS = 2
+"""Rings of vertices around a crossing, or around a piece of cloth, that belong to it."""
+
 
 class ClothMesh:
     """The faces and edges of a level, sewn at pairs of vertices.

@@ -8,11 +8,8 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from ..collide.crossings import Crossings, Pierced
-from .cloth_mesh import ClothMesh
+from .cloth_mesh import RINGS, ClothMesh
 from .tangles import Tangles
-
-BESIDE = 1
-"""Rings around crossings with a body within which cloth may pass through it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,5 +47,5 @@ class Look:
         """Mask of the cloth inside or through a body; None if none is."""
         if self.pierced is None or not any(self.in_bodies):
             return None
-        some = mesh.grown(mesh.crossed(self.pierced.crossings), BESIDE)
+        some = mesh.grown(mesh.crossed(self.pierced.crossings), RINGS)
         return some if self.inside is None else some | self.inside.any(dim=0)

@@ -1,13 +1,13 @@
 """The preconditioner of cloth that something touches: the cage exactly, each finer level by its diagonal (BPX).
 
-    P = c Z_0 A_0^-1 Z_0^T + m sum_l Z_l diag(A_l)^-1 Z_l^T + r diag(A)^-1,   A_l = Z_l^T A Z_l,   A = H + K
+    P = c Z_0 A_0^-1 Z_0^T + sum_l Z_l diag(A_l)^-1 Z_l^T + r diag(A)^-1,   A_l = Z_l^T A Z_l,   A = H + K
 
 | symbol | meaning |
 |---|---|
 | H | metric of the level that is solved, D its diagonal |
 | Z_l | linear map from level l; l = 0 is the cage, the sum has the levels between |
 | K | stiffness of what touches, a diagonal: three times its mean over directions, since a plane holds in one of them |
-| c, m, r | `COARSE`, `MIDDLE`, `ROUGH`: about so much that a first step needs no shortening |
+| c, r | `COARSE`, `ROUGH`: about so much that a first step needs no shortening |
 
 What touches is far stiffer than cloth, so the metric of free cloth misjudges both a patch that is held and the rough
 errors beside planes that turn from vertex to vertex. Here each level sees the contact at its own size (after Bramble,
@@ -26,7 +26,7 @@ from ..integrate.base import Solver
 from ..integrate.metric import Metric
 from ..mesh.stencil import three_columns
 
-COARSE, MIDDLE, ROUGH = 0.7, 1.0, 2.0
+COARSE, ROUGH = 0.7, 2.0
 """Weights of the parts of P."""
 SHORT = 0.5
 """Fraction of P used by steps without a line search."""
@@ -53,7 +53,7 @@ class HeldMetric:
         tiny = torch.finfo(stiff.dtype).tiny  # Where there is no cloth, there is no force.
         self._rough = ROUGH / plain.gathered(three_columns(own + stiff)).clamp_min(tiny)
         between, self._cage = plain.coarse.held(plain.gathered(three_columns(stiff))[:, 0])
-        self._middle = [three_columns(MIDDLE / each.clamp_min(tiny)) for each in between]
+        self._middle = [three_columns(1.0 / each.clamp_min(tiny)) for each in between]
 
     def serves(self, stiff: Float[Tensor, " vertices"]) -> bool:
         """True if K contains enough of the given stiffness [N/m]."""

@@ -26,7 +26,7 @@ from ..deadline import is_over
 from ..level import Placed
 from .along import ApproachLimits, along
 from .cloth import ClothView
-from .tangles import TANGLED
+from .cloth_mesh import RINGS
 
 ROUNDS = 4
 """Most passes that shorten blocked displacements. Vertices still blocked afterwards stay at the start, so the passes
@@ -157,7 +157,7 @@ class Promise:
             planes = planes.joined(ApproachLimits.of(begin, ends, met, self.floor))
         if halved:  # Pairs of other vertices stay apart on both halves of their straight paths.
             late, proved = _corners(met, torch.zeros_like(moves)), True
-            late[:count] = view.mesh.grown(late[:count], TANGLED)
+            late[:count] = view.mesh.grown(late[:count], RINGS)
             late &= moves
             last = torch.where(late.unsqueeze(1), end, ends)
             for aim in (0.5 * (begin + last), last):

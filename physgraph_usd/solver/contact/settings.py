@@ -14,8 +14,7 @@ class ContactSettings:
     Attributes:
         form: Contact with bodies: "quadratic" or "off".
         cloth: Contact of cloth with cloth: "pairs" of points, faces and edges, or "off".
-        stiffness: k_c of bodies, in stretch stiffnesses over the square of the cage's mean edge.
-        cloth_stiffness: k_c of cloth pairs, in the same unit.
+        stiffness: k_c of bodies and of cloth pairs, in stretch stiffnesses over the square of the cage's mean edge.
         clearance: Fraction of the offset to which cloth inside bodies is moved out after the solve.
         way_out: Longest push of vertices that get between overlapping parts of a body, in the cage's mean edges.
             Vertices between such parts in the input stay.
@@ -25,7 +24,6 @@ class ContactSettings:
     form: str = "quadratic"
     cloth: str = "pairs"
     stiffness: float = 15.0
-    cloth_stiffness: float = 15.0
     clearance: float = 0.25
     way_out: float = 0.5
     measured: bool = False
@@ -48,6 +46,4 @@ class ContactSettings:
         Args:
             stretch: Stretch stiffness of the cloth [N/m].
         """
-        per_area = stretch / float(cage.spacing.mean()) ** 2
-        stiffness, cloth = self.stiffness * per_area, self.cloth_stiffness * per_area
-        return replace(self, stiffness=stiffness, cloth_stiffness=cloth)
+        return replace(self, stiffness=self.stiffness * stretch / float(cage.spacing.mean()) ** 2)

@@ -31,10 +31,8 @@ from ..collide.crossings import Crossings, Pierced
 from ..forces.self_contact import PairConstraints
 from ..mesh.topology import joined_by
 from .bodies import Chords
-from .cloth_mesh import ClothMesh
+from .cloth_mesh import RINGS, ClothMesh
 
-TANGLED = 2
-"""Rings around crossings that belong to a tangle."""
 OUT = 0.5
 """Relative move of a crossing edge and face in a round [mean edges]."""
 GRAZING = 0.2
@@ -58,7 +56,7 @@ class Tangles:
 
     @staticmethod
     def find(mesh: ClothMesh, crossings: Crossings, given_up: Bool[Tensor, " vertices"]) -> Tangles:
-        """Tangles: connected components of the crossings and the cloth within `TANGLED` rings.
+        """Tangles: connected components of the crossings and the cloth within `RINGS` rings.
 
         Args:
             given_up: Mask of the vertices that are given up; these and all tangles they reach are one tangle.
@@ -66,7 +64,7 @@ class Tangles:
         corners = mesh.corners_of(crossings)
         region = torch.zeros_like(given_up)
         region[corners.reshape(-1)] = True
-        region, edges = mesh.grown(region, TANGLED) | given_up, mesh.level.edges.long()
+        region, edges = mesh.grown(region, RINGS) | given_up, mesh.level.edges.long()
         inside = edges[region[edges].all(dim=1)]
         across = torch.cat([corners[:, [0, place]] for place in range(1, 5)])
         lost = torch.nonzero(given_up).squeeze(1)
