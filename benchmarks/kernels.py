@@ -16,7 +16,7 @@ import warp as wp
 from torch import Tensor
 
 from benchmarks.rows import say
-from physgraph_usd.solver.forces import bending
+from physgraph_usd.solver.forces import bending, membrane, stretch
 from physgraph_usd.solver.integrate.base import System
 from physgraph_usd.solver.integrate.eight_vertices import EightPhysgraph
 from physgraph_usd.solver.integrate.fused import FusedPhysgraph
@@ -37,6 +37,8 @@ def compare(system: System, x: Tensor, config: PhysgraphConfig) -> None:
     assert level is not None
     six, four = level.hinges, level.hinges[:, [0, 1, 2, 4]]
     say("| kernel | items | plain | eight at once | difference |\n|---|---|---|---|---|")
+    row("springs", len(level.springs), *elements(stretch._KERNELS, stretch._EIGHT, x, corners=level.springs))
+    row("membrane", len(level.membrane), *elements(membrane._KERNELS, membrane._EIGHT, x, corners=level.membrane))
     row("hinges", len(four), *elements(bending._KERNELS, bending._EIGHT, x, corners=four))
     row("quads", len(six), *elements(bending._KERNELS_OF_QUADS, bending._EIGHT_OF_QUADS, x, corners=six))
     network, around = random_network(config, seed=1, scale=0.1), VertexFrame(level, x)
@@ -53,8 +55,8 @@ def elements(kernels: dict[torch.dtype, wp.Kernel], eight: wp.Kernel, x: Tensor,
     """A call of each of two element kernels, returning forces."""
     count, width = corners.shape
     packed = wp.from_torch(corners.contiguous(), dtype=wp.types.vector(length=width, dtype=wp.int32))
-    numbers = torch.rand((2, count), generator=torch.Generator().manual_seed(1)) + 0.5
-    parameters = [wp.from_torch(each) for each in numbers]
+    numbers = torch.rand((2, count, 4) if width == 3 else (2, count), generator=torch.Generator().manual_seed(1)) + 0.5
+    parameters = [vectors(each) if width == 3 else wp.from_torch(each) for each in numbers]
     calls = []
     for kernel, at_once in ((kernels[torch.float32], 1), (eight, EIGHT)):
         energy, force = torch.zeros(count), torch.zeros((count * width, 3))

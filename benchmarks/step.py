@@ -5,9 +5,10 @@
     python -m benchmarks.step --kernels      the CPU's kernels for eight elements at once, beside the plain ones
 
 A waved square sheet of triangles. Untrained networks of the sizes that ship: time does not depend on the weights.
-Medians: on CUDA of wall time, the device waited for after each step; on the CPU of the time of all threads together.
-The paper's times are of its own network on an RTX A6000. The page of the paper's results reads the figures of a GPU
-from the file that the second form writes.
+Medians: on CUDA of wall time, the device waited for after each step, the forces alone, quasi-Newton's and `physgraph`'s
+steps replayed as graphs of kernels; on the CPU of the time of all threads together. The paper's times are of its own
+network on an RTX A6000. The page of the paper's results reads the figures of a GPU from the file that the second form
+writes.
 """
 
 from __future__ import annotations

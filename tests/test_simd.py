@@ -5,25 +5,27 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
+import scipy.sparse as sp
 import torch
 import warp as wp
 from cloth import finest_system, group_of, sheet, wave
 from torch import Tensor
 
-from physgraph_usd.solver.forces import bending
+from physgraph_usd.solver.forces import base, bending, membrane, stretch
 from physgraph_usd.solver.integrate.eight_vertices import EightPhysgraph
 from physgraph_usd.solver.integrate.fused import FusedPhysgraph
 from physgraph_usd.solver.integrate.network import VECTORS, PhysgraphConfig
 from physgraph_usd.solver.integrate.vertex_frame import VertexFrame
 from physgraph_usd.solver.integrate.weights import random_network
+from physgraph_usd.solver.mesh import stencil
 from physgraph_usd.solver.mesh import threads as threads_module
 from physgraph_usd.solver.mesh.kernels import KERNELS
 from physgraph_usd.solver.mesh.simd import EIGHT, eight_elements
-from physgraph_usd.solver.mesh.stencil import vectors
+from physgraph_usd.solver.mesh.stencil import Stencil, incidence, vectors
 from physgraph_usd.solver.mesh.threads import Launch
 
 VERTICES = 500
@@ -37,18 +39,22 @@ class Term:
         plain: The plain kernels.
         eight: The kernel of eight elements.
         corners: Corners of an element.
+        numbers: Numbers in a parameter.
+        most: Largest difference of energies and of forces, relative to the largest.
     """
 
     plain: dict[torch.dtype, wp.Kernel]
     eight: wp.Kernel
     corners: int
+    numbers: int = 1
+    most: float = 0.0
 
 
-MOST = 5e-7
-"""Largest difference of energies and of forces, relative to the largest."""
 TERMS = {
-    "bending": Term(bending._KERNELS, bending._EIGHT, 4),
-    "bending of quads": Term(bending._KERNELS_OF_QUADS, bending._EIGHT_OF_QUADS, 6),
+    "stretch": Term(stretch._KERNELS, stretch._EIGHT, 2),
+    "membrane": Term(membrane._KERNELS, membrane._EIGHT, 3, numbers=4),
+    "bending": Term(bending._KERNELS, bending._EIGHT, 4, most=5e-7),
+    "bending of quads": Term(bending._KERNELS_OF_QUADS, bending._EIGHT_OF_QUADS, 6, most=5e-7),
 }
 
 
@@ -70,7 +76,7 @@ class Case:
         inputs = [
             vectors(self.x.to(dtype)),
             wp.from_torch(self.corners, dtype=wp.types.vector(length=width, dtype=wp.int32)),
-            *(wp.from_torch(each) for each in self._in(dtype)),
+            *(vectors(each) if each.ndim == 2 else wp.from_torch(each) for each in self._in(dtype)),
             wp.from_torch(energy),
             vectors(force),
         ]
@@ -97,7 +103,8 @@ def case_of(name: str, count: int, seed: int = 0) -> Case:
     corners[::7] = rng.integers(0, 2, size=corners[::7].shape)
     corners[::11] = rng.integers(2, 5, size=corners[::11].shape)
     corners[::13] = [5, 6, 7, 8, 7, 8][: term.corners]
-    parameters = [rng.uniform(0.1, 1.5, size=count).astype(np.float32) for _ in range(2)]
+    size = (count,) if term.numbers == 1 else (count, term.numbers)
+    parameters = [rng.uniform(0.1, 1.5, size=size).astype(np.float32) for _ in range(2)]
     own = [torch.as_tensor(each) for each in parameters]
     return Case(torch.as_tensor(x), torch.as_tensor(corners.astype(np.int32)), own)
 
@@ -108,8 +115,8 @@ def test_kernels_agree(name: str, count: int) -> None:
     term, case = TERMS[name], case_of(name, count)
     (e0, f0), (e1, f1) = (case.evaluate(kernel) for kernel in (term.plain[torch.float32], term.eight))
     assert bool(f1.isfinite().all())
-    assert float((e1 - e0).abs().max()) <= MOST * float(e0.abs().max())
-    assert float((f1 - f0).abs().max()) <= MOST * float(f0.abs().max())
+    assert float((e1 - e0).abs().max()) <= term.most * float(e0.abs().max())
+    assert float((f1 - f0).abs().max()) <= term.most * float(f0.abs().max())
 
 
 @pytest.mark.parametrize("name", TERMS)
@@ -144,6 +151,19 @@ def test_elements_do_not_depend_on_their_neighbours(name: str, monkeypatch: pyte
     assert torch.equal(f.reshape(count, -1), force.reshape(count, -1)[order])
 
 
+def test_gathers_agree() -> None:
+    rng = np.random.default_rng(4)
+    corners = torch.as_tensor(rng.integers(0, VERTICES, size=(2000, 4)).astype(np.int32))
+    starts, slots = incidence(corners, VERTICES)
+    corner_force = torch.as_tensor(rng.normal(size=(8001, 3)).astype(np.float32))[:-1]
+    totals = torch.ones(2, VERTICES, 3)
+    kernels = base._GATHER[torch.float32], cast(wp.Kernel, base._gather_corners_at_once)
+    for kernel, total in zip(kernels, totals, strict=True):
+        inputs = [wp.from_torch(starts), wp.from_torch(slots), vectors(corner_force), vectors(total)]
+        Launch(kernel, VERTICES, inputs, device="cpu")({})
+    assert torch.equal(*totals)
+
+
 @pytest.mark.parametrize("count", [3, 8, 21])
 @pytest.mark.parametrize(
     "config",
@@ -168,6 +188,18 @@ def test_networks_agree(config: PhysgraphConfig, count: int) -> None:
     plain, eight, shared = (each(bases, system.spacing, system.reach, 4, frame=lambda: around) for each in (two, *ones))
     assert torch.equal(eight, shared)
     assert float((eight - plain).abs().max()) <= 1e-5 * float(plain.abs().max())
+
+
+def test_stencils_agree() -> None:
+    rng = np.random.default_rng(5)
+    matrix = sp.csr_matrix(sp.random(300, VERTICES, density=0.02, random_state=rng))
+    x = torch.as_tensor(rng.normal(size=(VERTICES, 3)).astype(np.float32))
+    out = torch.full((300, 3), math.nan)
+    columns, starts = (torch.as_tensor(each.astype(np.int32)) for each in (matrix.indices, matrix.indptr))
+    values = torch.as_tensor(matrix.data.astype(np.float32))
+    arrays = [wp.from_torch(each) for each in (starts, columns, values)]
+    Launch(stencil._GATHER[torch.float32], 300, [*arrays, vectors(x), vectors(out)], device="cpu")({})
+    assert torch.equal(out, Stencil(matrix, dtype=torch.float32, device="cpu").apply(x))
 
 
 def test_formulas_are_for_the_cpu_alone() -> None:

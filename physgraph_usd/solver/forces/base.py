@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, cast, runtime_checkable
 
 import scipy.sparse as sp
 import torch
@@ -12,8 +12,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..level import Level
-from ..mesh.kernels import KERNELS
-from ..mesh.simd import EIGHT
+from ..mesh.kernels import ALONE, KERNELS
+from ..mesh.simd import EIGHT, FOUR, on_cpu
 from ..mesh.stencil import QUAD, SCALAR, VECTOR, incidence, overloads, vectors
 from ..mesh.threads import Launch
 
@@ -145,6 +145,38 @@ def _gather_corners(
     force[vertex] = total
 
 
+@wp.func_native(
+    on_cpu(
+        FOUR
+        + """
+    float* f = (float*)(force.data + vertex);
+    Four total = {f[0], f[1], f[2], 0.0f};
+    for (int k = starts.data[vertex]; k < starts.data[vertex + 1]; ++k)
+        total += *(const Four*)(corner_force.data + slots.data[k]);
+    for (int i = 0; i < 3; ++i) f[i] = total[i];
+    """
+    )
+)
+def _sum_corners(
+    vertex: wp.int32,
+    starts: wp.array(dtype=wp.int32),
+    slots: wp.array(dtype=wp.int32),
+    corner_force: wp.array(dtype=wp.vec3f),
+    force: wp.array(dtype=wp.vec3f),
+): ...
+
+
+@wp.kernel(**ALONE)
+def _gather_corners_at_once(
+    first: wp.int32,
+    starts: wp.array(dtype=wp.int32),
+    slots: wp.array(dtype=wp.int32),
+    corner_force: wp.array(dtype=wp.vec3f),
+    force: wp.array(dtype=wp.vec3f),
+):
+    _sum_corners(first + wp.tid(), starts, slots, corner_force, force)
+
+
 _GATHER = overloads(_gather_corners, wp.int32, wp.int32, VECTOR, VECTOR)
 
 
@@ -183,7 +215,8 @@ class Elements:
         corners = corners.clone(memory_format=torch.contiguous_format)
         packed = wp.from_torch(corners, dtype=wp.types.vector(length=width, dtype=wp.int32))
         self.energy = torch.zeros(self.count, dtype=dtype, device=device)
-        self.corner_force = torch.zeros((self.count * width, 3), dtype=dtype, device=device)
+        # One more row: the gather reads four numbers at once.
+        self.corner_force = torch.zeros((self.count * width + 1, 3), dtype=dtype, device=device)[:-1]
         x = vectors(torch.zeros_like(level.rest))
         arrays = [vectors(each) if each.ndim == 2 else wp.from_torch(each) for each in parameters]
         buffers = [wp.from_torch(self.energy), vectors(self.corner_force)]
@@ -194,7 +227,8 @@ class Elements:
             kernel, self.count, [x, packed, *arrays, *buffers], device=device, threads=threads, at_once=at_once
         )
         inputs = [wp.from_torch(starts), wp.from_torch(slots), buffers[1], x]
-        self._gather = Launch(_GATHER[dtype], level.vertex_count, inputs, device=device, threads=threads)
+        gather = cast(wp.Kernel, _gather_corners_at_once) if single else _GATHER[dtype]
+        self._gather = Launch(gather, level.vertex_count, inputs, device=device, threads=threads)
 
     def evaluate(
         self, x: Float[Tensor, "vertices 3"], force: Float[Tensor, "vertices 3"], given: Mapping[int, Any] | None = None

@@ -40,6 +40,7 @@ from torch import Tensor
 from ..fabric import Fabric
 from ..level import Level
 from ..mesh.kernels import KERNELS
+from ..mesh.simd import eight_elements
 from ..mesh.stencil import add_at
 from .base import Elements, Force, element_overloads
 from .stretch import Stretch
@@ -118,6 +119,34 @@ def _membrane(
 
 
 _KERNELS = element_overloads(_membrane, width=3, parameters=0, quad_parameters=2)
+_EIGHT = eight_elements(
+    "eight_membrane",
+    f"constexpr float POISSON = {POISSON}f, STIFFER = {STIFFER}f, ROUNDING = {ROUNDING}f;"
+    """
+    Vec x0 = corner(0), side1 = corner(1) - x0, side2 = corner(2) - x0;
+    Quad g = load4(parameter0), c = load4(parameter1);
+    Vec f1 = side1 * g[0] + side2 * g[2], f2 = side1 * g[1] + side2 * g[3];
+    Eight q1 = dot(f1, f1), q2 = dot(f2, f2), l1 = root(q1), l2 = root(q2);
+    Eight e1 = l1 - 1.0f, e2 = l2 - 1.0f, none = {};
+
+    Eight limit = c[3], coupling = POISSON * root(c[0] * c[1]);
+    Eight s1 = c[0] * e1 + coupling * e2, s2 = c[1] * e2 + coupling * e1;
+    Eight more1 = e1 > limit ? STIFFER * c[0] * (e1 - limit) : none;
+    Eight more2 = e2 > limit ? STIFFER * c[1] * (e2 - limit) : none;
+    Eight stored = s1 * e1 + s2 * e2 + more1 * (e1 - limit) + more2 * (e2 - limit);
+
+    constexpr float rounding = ROUNDING * ROUNDING;
+    Eight n1 = q1 + rounding, n2 = q2 + rounding, r = 1.0f / root(n1 * n2);
+    Eight sine = dot(f1, f2) * r, turn = c[2] * (1.0f + rounding) * (1.0f + rounding) * sine * r;
+    Eight back = sine * turn * r, tiny = 1.0e-6f + none;
+    Vec p1 = f1 * ((s1 + more1) / larger(l1, tiny) - back * n2) + f2 * turn;
+    Vec p2 = f2 * ((s2 + more2) / larger(l2, tiny) - back * n1) + f1 * turn;
+    Vec at1 = -(p1 * g[0] + p2 * g[1]), at2 = -(p1 * g[2] + p2 * g[3]);
+    store(0.5f * (stored + turn * dot(f1, f2)), {-(at1 + at2), at1, at2});
+    """,
+    corners=3,
+    parameter=wp.vec4f,
+)
 
 
 class Membrane:
@@ -160,7 +189,7 @@ class Membrane:
         self._level = level
         stiffness = [self.warp_stiffness, self.weft_stiffness, self.shear_stiffness, limits.to(level.rest)[owner]]
         parameters = [level.membrane_inverse.contiguous(), torch.stack(stiffness, dim=1)]
-        self._elements = Elements(_KERNELS, level.membrane, parameters, level=level)
+        self._elements = Elements(_KERNELS, level.membrane, parameters, level=level, eight=_EIGHT)
 
     def add_force(self, x: Float[Tensor, "vertices 3"], force: Float[Tensor, "vertices 3"]) -> Float[Tensor, ""]:
         """Add the force [N] in place and return the energy [J]."""

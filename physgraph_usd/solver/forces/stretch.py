@@ -24,6 +24,7 @@ from torch import Tensor
 
 from ..level import Level
 from ..mesh.kernels import KERNELS
+from ..mesh.simd import eight_elements
 from ..mesh.stencil import add_at
 from .base import Elements, element_overloads
 
@@ -53,6 +54,17 @@ def _stretch(
 
 
 _KERNELS = element_overloads(_stretch, width=2, parameters=2)
+_EIGHT = eight_elements(
+    "eight_stretch",
+    """
+    Vec span = corner(1) - corner(0);
+    Eight stiffness = load(parameter0), l0 = load(parameter1);
+    Eight length = root(dot(span, span)), extension = length - l0;
+    Vec pull = span * (stiffness * extension / larger(length, l0 * 1.0e-6f));
+    store(0.5f * stiffness * extension * extension, {pull, -pull});
+    """,
+    corners=2,
+)
 
 
 class Stretch:
@@ -73,7 +85,9 @@ class Stretch:
         modulus = youngs.to(level.rest)[level.spring_garment.long()] * level.spring_scale
         self.stiffness = 3.0 * modulus * level.spring_area / level.spring_length**2
         self._level = level
-        self._elements = Elements(_KERNELS, level.springs, [self.stiffness, level.spring_length], level=level)
+        self._elements = Elements(
+            _KERNELS, level.springs, [self.stiffness, level.spring_length], level=level, eight=_EIGHT
+        )
 
     def add_force(self, x: Float[Tensor, "vertices 3"], force: Float[Tensor, "vertices 3"]) -> Float[Tensor, ""]:
         """Add the force [N] in place and return the energy [J]."""

@@ -12,7 +12,7 @@ A formula is C++ with these names; the last two only in `eight_elements`:
 | ``Vec`` | a 3-vector of each element, with ``dot`` and ``cross`` |
 | ``root``, ``larger``, ``rint``, ``fabs`` | functions of an ``Eight`` |
 | ``element[i]`` | index of the i-th element; the last block repeats the last element |
-| ``load(array)`` | an ``Eight`` of an array with a number for each element |
+| ``load(array)``, ``load4(array)`` | an ``Eight`` of an array with a number for each element; four, indexed with [] |
 | ``vec([&](int i) { return address; })`` | the ``Vec`` with three floats of each element, from any address |
 | ``write(to, width, values, n)`` | writes n ``Eight`` values, n > 3, as rows of a table of a given width |
 | ``corner(k)`` | positions of the k-th corners [m], a ``Vec`` |
@@ -42,6 +42,10 @@ struct Vec {
     Vec operator-() const { return {-x, -y, -z}; }
     Vec operator*(Eight s) const { return {x * s, y * s, z * s}; }
 };
+struct Quad {
+    Eight column[4];
+    Eight operator[](int i) const { return column[i]; }
+};
 auto dot = [](Vec a, Vec b) { return a.x * b.x + a.y * b.y + a.z * b.z; };
 auto cross = [](Vec a, Vec b) -> Vec {
     return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
@@ -63,6 +67,13 @@ auto transpose = [](const Eight* in, Eight* out) {
     out[2] = __builtin_shufflevector(high[0], high[1], 0, 1, 8, 9, 4, 5, 12, 13);
     out[3] = __builtin_shufflevector(high[0], high[1], 2, 3, 10, 11, 6, 7, 14, 15);
 };
+auto columns = [&](const Four* row) -> Quad {
+    Eight half[4];
+    for (int i = 0; i < 4; ++i) half[i] = __builtin_shufflevector(row[i], row[i + 4], 0, 1, 2, 3, 4, 5, 6, 7);
+    Quad out;
+    transpose(half, out.column);
+    return out;
+};
 
 const int begin = 8 * block;
 const bool whole = begin + 8 <= count;
@@ -74,15 +85,18 @@ auto load = [&](const wp::array_t<float>& array) -> Eight {
     for (int i = 0; i < 8; ++i) out[i] = array.data[element[i]];
     return out;
 };
+auto load4 = [&](const auto& array) -> Quad {
+    Four row[8];
+    for (int i = 0; i < 8; ++i) row[i] = *(const Four*)(array.data + element[i]);
+    return columns(row);
+};
 auto vec = [&](auto address) -> Vec {
     Four row[8];
     for (int i = 0; i < 8; ++i) {
         const float* p = (const float*)address(i);
         row[i] = Four{p[0], p[1], p[2], 0.0f};
     }
-    Eight half[4], c[4];
-    for (int i = 0; i < 4; ++i) half[i] = __builtin_shufflevector(row[i], row[i + 4], 0, 1, 2, 3, 4, 5, 6, 7);
-    transpose(half, c);
+    Quad c = columns(row);
     return {c[0], c[1], c[2]};
 };
 auto write = [&](float* to, int width, const Eight* values, int n) {
@@ -108,12 +122,20 @@ auto store = [&](Eight energy, const Vec (&force)[K]) {
 """
 
 
-def eight_at_once(formula: str, count: str) -> str:
-    """Source of a native function for the elements 8 block to 8 block + 7 of a number of elements, named in C++.
+FOUR = """
+typedef float Four __attribute__((vector_size(16), aligned(4), may_alias));
+"""
+"""Source of the type of four floats, for sums of vectors."""
 
-    It is empty on CUDA, which has no such vectors.
-    """
-    return f"#ifndef __CUDACC__\nconst int count = {count};\n{_NAMES}\n{formula}\n#endif\n"
+
+def on_cpu(source: str) -> str:
+    """Source of a native function; empty on CUDA, which has no such vectors."""
+    return f"#ifndef __CUDACC__\n{source}\n#endif\n"
+
+
+def eight_at_once(formula: str, count: str) -> str:
+    """Source of a native function for the elements 8 block to 8 block + 7 of a number of elements, named in C++."""
+    return on_cpu(f"const int count = {count};\n{_NAMES}\n{formula}")
 
 
 def annotate(function: Any, *kinds: Any) -> None:
@@ -122,12 +144,14 @@ def annotate(function: Any, *kinds: Any) -> None:
     function.__annotations__ = dict(zip(code.co_varnames[: code.co_argcount], kinds, strict=True))
 
 
-def eight_elements(name: str, formula: str, *, corners: int) -> wp.Kernel:
+def eight_elements(name: str, formula: str, *, corners: int, parameter: Any = wp.float32) -> wp.Kernel:
     """A kernel of (first, x, corners, parameter0, parameter1, energy, corner_force), all in float32.
 
     Args:
         name: The kernel's name.
         formula: Energy and forces of eight elements, see this module.
+        corners: Corners of an element.
+        parameter: Type of both parameters.
 
     Returns:
         The kernel; an item is a block of `EIGHT` elements.
@@ -138,7 +162,7 @@ def eight_elements(name: str, formula: str, *, corners: int) -> wp.Kernel:
     def kernel(first, x, corners, parameter0, parameter1, energies, corner_force):
         native(first + wp.tid(), x, corners, parameter0, parameter1, energies, corner_force)
 
-    kinds = (wp.vec3f, wp.types.vector(corners, wp.int32), *[wp.float32] * 3, wp.vec3f)
+    kinds = (wp.vec3f, wp.types.vector(corners, wp.int32), parameter, parameter, wp.float32, wp.vec3f)
     for each in (eight, kernel):
         annotate(each, wp.int32, *(wp.array(dtype=kind) for kind in kinds))
     eight.__qualname__ = f"{name}_of_eight"

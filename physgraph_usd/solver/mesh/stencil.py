@@ -6,7 +6,7 @@ Gathering keeps the order of each sum fixed, so a run repeats bit for bit on eit
 from __future__ import annotations
 
 from functools import cached_property
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import scipy.sparse as sp
@@ -15,7 +15,8 @@ import warp as wp
 from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
-from .kernels import KERNELS
+from .kernels import ALONE, KERNELS
+from .simd import FOUR, on_cpu
 from .threads import Launch, argument
 
 wp.set_module_options(KERNELS)
@@ -35,6 +36,42 @@ def _gather_rows(
     for k in range(starts[row], starts[row + 1]):
         total += values[k] * x[columns[k]]
     out[row] = total
+
+
+@wp.func_native(
+    on_cpu(
+        FOUR
+        + """
+    Four total = {};
+    for (int k = starts.data[row]; k < starts.data[row + 1]; ++k) {
+        const wp::vec3f& at = x.data[columns.data[k]];
+        const Four part = Four{at[0], at[1], at[2], 0.0f} * values.data[k];
+        total += part;
+    }
+    out.data[row] = wp::vec3f(total[0], total[1], total[2]);
+    """
+    )
+)
+def _sum_row(
+    row: wp.int32,
+    starts: wp.array(dtype=wp.int32),
+    columns: wp.array(dtype=wp.int32),
+    values: wp.array(dtype=wp.float32),
+    x: wp.array(dtype=wp.vec3f),
+    out: wp.array(dtype=wp.vec3f),
+): ...
+
+
+@wp.kernel(**ALONE)
+def _gather_rows_at_once(
+    first: wp.int32,
+    starts: wp.array(dtype=wp.int32),
+    columns: wp.array(dtype=wp.int32),
+    values: wp.array(dtype=wp.float32),
+    x: wp.array(dtype=wp.vec3f),
+    out: wp.array(dtype=wp.vec3f),
+):
+    _sum_row(first + wp.tid(), starts, columns, values, x, out)
 
 
 VECTOR = {torch.float32: wp.vec3f, torch.float64: wp.vec3d}
@@ -111,7 +148,9 @@ class Stencil:
         values = wp.array(csr.data, dtype=SCALAR[dtype], device=device)
         x, out = (wp.zeros(count, dtype=VECTOR[dtype], device=device) for count in reversed(self.shape))
         inputs = [starts, columns, values, x, out]
-        self._launch = Launch(_GATHER[dtype], self.shape[0], inputs, device=device, threads=threads)
+        single = device == "cpu" and dtype == torch.float32
+        gather = cast(wp.Kernel, _gather_rows_at_once) if single else _GATHER[dtype]
+        self._launch = Launch(gather, self.shape[0], inputs, device=device, threads=threads)
 
     def alike(self, matrix: sp.csr_matrix) -> Stencil:
         """Another matrix, of equal type and on the same device."""
