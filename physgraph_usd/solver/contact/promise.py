@@ -90,8 +90,11 @@ class Promise:
             return x
         free = tangles.label.clone()
         x, _ = self._go(start, wanted, free, since)
-        if bool(tangles.worse(view.crossings(x)).any()):
-            free[~tangles.given_up] = -1
+        for whole in (False, True):  # First the worse tangles alone are held, then all.
+            worse = tangles.worse(view.crossings(x))
+            if not bool(worse.any()):
+                break
+            free[~tangles.given_up if whole else worse] = -1
             x, _ = self._go(start, wanted, free, since)
         return x
 
