@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 from brute import Soup, crossings
@@ -73,3 +75,24 @@ class TestAlong:
         assert torch.equal(out[0], way[0])
         weight = weights(x, pairs.corners, pairs.face)
         assert float(-(weight[0] * out[pairs.corners[0].long(), 1]).sum()) <= COMES * (0.1 - FLOOR) + 1e-6
+
+    def test_what_turns_on_its_way_is_held_where_it_meets_what_it_meets(self):
+        """An edge over another slides along until its end, which goes down, is over it: no plane of its middle sees
+        that."""
+        ends = [[-1.0, 0.1, 0.0], [1.0, 0.1, 0.0], [0.0, 0.0, -1.0], [0.0, 0.0, 1.0]]
+        x, way = torch.tensor(ends, dtype=torch.float64), torch.zeros(4, 3, dtype=torch.float64)
+        way[0], way[1] = torch.tensor([0.9, -0.4, 0.0]), torch.tensor([0.9, 0.3, 0.0])
+        corners, free = torch.arange(4, dtype=torch.int32).reshape(1, 4), torch.ones(4, 1, dtype=torch.bool)
+        met = Pairs(corners, torch.ones(1, dtype=torch.float64), torch.tensor([False]))
+
+        def gap(planes: ApproachLimits) -> float:
+            end = x + along(way, planes, free=free)
+            part = -end[0, 0] / (end[1, 0] - end[0, 0])
+            return float(end[0, 1] + part * (end[1, 1] - end[0, 1]) - end[2:, 1].mean())
+
+        planes = ApproachLimits.of(x, x, met, FLOOR)
+        assert gap(planes) < 0.0
+        for _ in range(2):
+            end = x + along(way, planes, free=free)
+            planes = planes.joined(ApproachLimits.of(x, end, replace(met, value=0.0 * met.value), FLOOR, corners=True))
+        assert gap(planes) > 0.0

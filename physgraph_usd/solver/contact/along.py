@@ -84,7 +84,7 @@ class ApproachLimits:
     may: Float[Tensor, " pairs"]
 
     @staticmethod
-    def of(x: Tensor, ends: Tensor, met: Pairs, floor: float) -> ApproachLimits:
+    def of(x: Tensor, ends: Tensor, met: Pairs, floor: float, *, corners: bool = False) -> ApproachLimits:
         """Limits along the shortest vectors between the parts of pairs, as far on the move as a plane keeps them apart.
 
         Args:
@@ -92,6 +92,7 @@ class ApproachLimits:
             ends: Positions after the move [m], float64, shape (V, 3).
             met: Pairs that come too near on the move.
             floor: Gap that pairs keep [m]; a pair that is already closer keeps most of its distance.
+            corners: True holds the two corners that are nearest at the ends, False the closest points.
         """
         met = met.where(_distinct(met, len(x)))
         places, face = met.corners.long(), met.face.bool()
@@ -99,6 +100,8 @@ class ApproachLimits:
         distance = _between(at, face)[1].norm(dim=1)
         weight, way = _between(at + met.value.reshape(-1, 1, 1) * (to - at), face)
         normal = way / way.norm(dim=1, keepdim=True).clamp_min(1e-300)
+        if corners:
+            weight = _nearest(to @ normal.unsqueeze(2), face)
         gap = (weight * (at @ normal.unsqueeze(2)).squeeze(2)).sum(dim=1)
         may = COMES * (distance - (TIGHT * distance).clamp_max(floor))
         return ApproachLimits(met.corners, weight, normal, gap - distance + may)
@@ -152,6 +155,15 @@ def _between(at: Float[Tensor, "pairs 4 3"], face: Tensor) -> tuple[Float[Tensor
     own = torch.arange(4 * len(at), dtype=torch.int32, device=at.device).reshape(-1, 4)
     weight = weights(at.reshape(-1, 3), own, face)
     return weight, (weight.unsqueeze(2) * at).sum(dim=1)
+
+
+def _nearest(height: Float[Tensor, "pairs 4 1"], face: Bool[Tensor, " pairs"]) -> Float[Tensor, "pairs 4"]:
+    """1 for the lowest corner of each pair's first part, -1 for the highest of its second, by heights [m]."""
+    own = height.squeeze(2)
+    is_first = torch.arange(4, device=own.device) < torch.where(face, 1, 2).unsqueeze(1)
+    low = torch.where(is_first, own, torch.inf).argmin(dim=1, keepdim=True)
+    high = torch.where(is_first, -torch.inf, own).argmax(dim=1, keepdim=True)
+    return torch.zeros_like(own).scatter(1, low, 1.0).scatter(1, high, -1.0)
 
 
 def _distinct(met: Pairs, count: int) -> Int[Tensor, " pairs"]:

@@ -157,7 +157,7 @@ class Promise:
             met = blocking_pairs(parts, begin, ends, **options, asked=_corners(met, (ends != last).any(dim=1)))
             if not len(met.value):
                 return ends, True
-            planes = planes.joined(ApproachLimits.of(begin, ends, met, self.floor))
+            planes = planes.joined(ApproachLimits.of(begin, ends, met, self.floor, corners=True))
         if halved:  # Pairs of other vertices stay apart on both halves of their straight paths.
             late, proved = _corners(met, torch.zeros_like(moves)), True
             late[:count] = view.mesh.grown(late[:count], RINGS)
