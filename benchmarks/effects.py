@@ -16,12 +16,8 @@ BASE_RIPPLES = 9
 """Ripples of the unchanged solver, more than of variants: every comparison uses their mean."""
 ERRORS, LEAST = 3.0, 0.01
 """Standard errors, and relative difference, beyond which a difference counts."""
-TIME_NOISE = 0.02
-"""Least relative standard deviation of times."""
 SHOWN = {
     "energy": "energy",
-    "warm": "warm frame",
-    "first": "first frame",
     "crossings": "crossings",
     "jumps": "jumps",
     "still": "still motion",
@@ -30,9 +26,10 @@ SHOWN = {
 COUNTS, TIMES = ("crossings", "jumps"), ("warm", "first")
 INTRODUCTION = """\
 Written by `python -m benchmarks.numbers`, whose head says how. Mean change over the scenes at half and at double a
-number: energy, times and still motion (of cloth whose cage stands) in percent; crossings and jumps in counts per run,
+number: energy and still motion (of cloth whose cage stands) in percent; crossings and jumps in counts per run,
 summed over the scenes. In brackets the scenes where the change is more than three standard errors of the ripples'
-noise, + for worse and - for better. Less is better everywhere."""
+noise, + for worse and - for better. Less is better everywhere. Times are not judged: a number that sizes a buffer has
+no effect here."""
 
 
 def key_of(scene: str, number: Number | None, kind: str) -> str:
@@ -70,12 +67,10 @@ def noise_of(runs: Sequence[Sequence[Values]], base: Sequence[Values]) -> dict[s
     noise = {}
     for name in SHOWN:
         own = _known(base, name)
-        groups = [own] if name in TIMES else [own, *(_known(each, name) for each in runs)]
+        groups = [own, *(_known(each, name) for each in runs)]
         variances = sorted(statistics.variance(each) for each in groups if len(each) > 1)
         kept = variances[: max(1, len(variances) - len(variances) // 10)]
         least = max(1.0, abs(statistics.fmean(own))) if name in COUNTS and own else 0.0
-        if name in TIMES and own:
-            least = (TIME_NOISE * statistics.fmean(own)) ** 2
         noise[name] = math.sqrt(max(least, statistics.fmean(kept) if kept else 0.0))
     return noise
 
@@ -91,10 +86,8 @@ def change_of(name: str, runs: Sequence[Values], base: Sequence[Values], noise: 
         return None
     if now == before[: len(now)]:
         return Change(0.0, EQUAL)
-    # Times have outliers, where another process took the cache.
-    centre = statistics.median if name in TIMES else statistics.fmean
-    mean = centre(before)
-    difference = centre(now) - mean
+    mean = statistics.fmean(before)
+    difference = statistics.fmean(now) - mean
     relative = difference if name in COUNTS else difference / abs(mean) if mean else 0.0
     error = noise * math.sqrt(1.0 / len(now) + 1.0 / len(before))
     if abs(difference) <= max(ERRORS * error, LEAST * abs(mean)):
@@ -162,13 +155,8 @@ class Effects:
         return BETTER in verdicts and WORSE not in verdicts and not self.failures(number, kind)
 
     def moves(self, number: Number, kind: str) -> bool:
-        """Whether a variant changes any figure of any scene but times."""
-        return any(
-            change.relative
-            for changes in self.changes(number, kind).values()
-            for name, change in changes.items()
-            if name not in TIMES
-        )
+        """Whether a variant changes any figure of any scene."""
+        return any(change.relative for changes in self.changes(number, kind).values() for change in changes.values())
 
 
 def _is_changed(key: str, scene: str, runs: Any) -> bool:

@@ -20,9 +20,6 @@ from ..mesh.topology import patches_with
 from .bodies import LevelBodies
 from .cloth_mesh import ClothMesh
 
-FAIRINGS, PASSES = 3, 2
-"""Rounds of smoothing and pushing out, and smoothing passes of a round."""
-
 
 def repaired_cage(
     cage: Level,
@@ -48,10 +45,7 @@ def repaired_cage(
     some, seeds = ((each & cage.free[:, 0]).cpu().numpy() for each in (inside.any(dim=0), held))
     hidden = torch.as_tensor(patches_with(np.stack(mesh.beside.nonzero(), axis=1), some, seeds), device=held.device)
     around = mesh.grown(hidden, 1) & cage.free[:, 0]
-    out = _membrane(x, hidden, mesh.beside)
-    for _ in range(FAIRINGS):
-        out = bodies.pushed_out(_smoothed(out, around, mesh.beside), inside)
-    return out
+    return bodies.pushed_out(_smoothed(_membrane(x, hidden, mesh.beside), around, mesh.beside), inside)
 
 
 def _membrane(x: Tensor, where: Bool[Tensor, " vertices"], beside: sp.csr_matrix) -> Tensor:
@@ -68,11 +62,10 @@ def _membrane(x: Tensor, where: Bool[Tensor, " vertices"], beside: sp.csr_matrix
 
 
 def _smoothed(x: Tensor, where: Bool[Tensor, " vertices"], beside: sp.csr_matrix) -> Tensor:
-    """Positions moved half way to the mean of the neighbours, `PASSES` times."""
+    """Positions moved half way to the mean of the neighbours."""
     which = np.flatnonzero(where.cpu().numpy())
     rows = beside[which]
     share = 1.0 / np.maximum(np.asarray(rows.sum(axis=1)), 1.0)
     points = x.double().cpu().numpy().copy()
-    for _ in range(PASSES):
-        points[which] = 0.5 * (points[which] + share * (rows @ points))
+    points[which] = 0.5 * (points[which] + share * (rows @ points))
     return torch.as_tensor(points).to(x)
