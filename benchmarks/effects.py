@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from benchmarks.constants import ROUND_CONTACT, Number, counts
-from benchmarks.rows import table
+from benchmarks.rows import commit, table
 from benchmarks.verdicts import BETTER, EQUAL, WORSE, Values
 
 BASE_RIPPLES = 9
@@ -25,11 +25,12 @@ SHOWN = {
 """Figures of the table; crossings are those of cloth with cloth and with bodies."""
 COUNTS, TIMES = ("crossings", "jumps"), ("warm", "first")
 INTRODUCTION = """\
-Written by `python -m benchmarks.numbers`, whose head says how. Mean change over the scenes at half and at double a
-number: energy and still motion (of cloth whose cage stands) in percent; crossings and jumps in counts per run,
-summed over the scenes. In brackets the scenes where the change is more than three standard errors of the ripples'
-noise, + for worse and - for better. Less is better everywhere. Times are not judged: a number that sizes a buffer has
-no effect here."""
+Written by `python -m benchmarks.numbers`, whose head says how, at commit {commit}.
+
+Mean change over the scenes at half and at double a number: energy and still motion (of cloth whose cage stands) in
+percent; crossings and jumps in counts per run, summed over the scenes. In brackets the scenes where the change is more
+than three standard errors of the ripples' noise, + for worse and - for better. Less is better everywhere. Times are
+not judged: a number that sizes a buffer has no effect here."""
 
 
 def key_of(scene: str, number: Number | None, kind: str) -> str:
@@ -178,7 +179,7 @@ def page(numbers: Sequence[Number], found: Mapping[str, Any], scenes: Sequence[s
         classes["better in something and worse in nothing"] = names
     lists = [f"**{kind}** ({len(each)}): {', '.join(each)}" for kind, each in sorted(classes.items())]
     title = "# What each number of the solver does"
-    return "\n\n".join([title, INTRODUCTION, table(head, rows), "## By class", *lists])
+    return "\n\n".join([title, INTRODUCTION.format(commit=commit()), table(head, rows), "## By class", *lists])
 
 
 def rows_of(number: Number, effects: Effects) -> Iterator[list[str]]:

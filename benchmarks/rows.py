@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import subprocess
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -52,6 +53,15 @@ def code_of(*folders: Path) -> str:
         for file in sorted(folder.rglob("*.py")):
             digest.update(file.read_bytes())
     return digest.hexdigest()[:12]
+
+
+def commit(*folders: str) -> str:
+    """The commit of this checkout, and whether the package or a folder was changed since; "no commit" without one."""
+    root = Path(__file__).resolve().parents[1]
+    asked = (["rev-parse", "--short=10", "HEAD"], ["status", "--porcelain", "--", "physgraph_usd", *folders])
+    ran = [subprocess.run(["git", *line], cwd=root, capture_output=True, text=True, check=False) for line in asked]
+    head, changed = (each.stdout.strip() for each in ran)
+    return f"{head or 'no commit'}{', with changes' if changed else ''}"
 
 
 def say(line: str) -> None:

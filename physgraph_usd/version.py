@@ -1,4 +1,4 @@
-"""The version of the package, which every file that it writes names, and the digest of its code."""
+"""The version of the package, as named in every written file, and a hash of its code."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ _RANGE = re.compile(r"(-?[\d.]+)-(-?[\d.]+)")
 
 
 class Text(click.ParamType):
-    """A text that a function turns into a value; its ValueError says what is wrong with it."""
+    """A parameter parsed by a function, whose ValueError is the message to the user."""
 
     def __init__(self, name: str, read: Callable[[str], Any]) -> None:
         """Take the type's name and the function."""

@@ -2,7 +2,7 @@
 
 A signal that asks the run to end is over time too; the caller then drops the frame.
 
-Cloth that walks is where a safe move ended, at any time, so what is written then is valid though it is not at rest.
+Cloth is always at the end of a safe move, so a frame that ends early is valid, though not at rest.
 """
 
 from __future__ import annotations

@@ -40,7 +40,7 @@ class Fabric:
 
     @property
     def has_membrane(self) -> bool:
-        """Whether edge springs cannot stand for it: they have one stiffness, its shear, and no limit."""
+        """Whether it needs a membrane: edge springs have a single stiffness and no stretch limit."""
         return any(each is not None for each in (self.shear, self.weft_stretch, self.stretch_limit))
 
     @property

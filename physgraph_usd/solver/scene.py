@@ -21,7 +21,7 @@ RESOLVED = 0.1
 """Part of an edge that single precision must tell apart where the farthest vertex is: about the garment's mean the
 solver's positions have 24 bits, and with less than that nothing of the cloth is left in them."""
 FALLS = 4.0
-"""Its sizes by which a garment may sink: a layer whose cloth is farther from its cage than one is invalid."""
+"""Largest distance by which a garment may sink, in its sizes. Cloth farther from its cage than one size is invalid."""
 SPECK = 0.1
 """Size under which a garment's units are in doubt before its guide is [m]."""
 OUTGROWN = 1e3

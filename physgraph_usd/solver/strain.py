@@ -21,7 +21,7 @@ SHRUNK = 0.25
 LEAST_FRACTION = 0.01
 """Of the garment's rest area; smaller parts, such as single faces in a fold, are passed over."""
 COVERED = 0.9
-"""Fraction of a part's faces inside a subset that gives it its name."""
+"""Fraction of a part's faces inside a subset from which the part is named after the subset."""
 THIRD = 1.0 / 6.0
 """How far from the middle of a box its middle third ends, in its sizes."""
 LARGEST = 4.0
@@ -128,7 +128,7 @@ def _face_areas(garment: Garment, points: np.ndarray) -> np.ndarray:
 
 
 def _connected(garment: Garment, faces: np.ndarray) -> list[np.ndarray]:
-    """Groups of faces that hang together by their vertices."""
+    """Connected components of faces, which share vertices."""
     mesh = garment.mesh
     corners = np.flatnonzero(np.isin(mesh.corner_face, faces))
     sides = np.stack([mesh.indices[corners], mesh.indices[mesh.next_corner[corners]]], axis=1)

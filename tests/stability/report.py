@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import json
 import platform
-import subprocess
 import sys
 import time
 import warnings
@@ -28,7 +27,7 @@ import warp as wp
 from report_solver import Result
 
 import physgraph_usd
-from benchmarks.rows import code_of
+from benchmarks.rows import code_of, commit
 from physgraph_usd.errors import PhysGraphError
 from physgraph_usd.lab.methods import METHODS
 
@@ -163,15 +162,6 @@ def row(case: Case, names: list[str], cells: Cells | None = None) -> tuple[list[
     return [held for held, _ in found + columns], f"{head} {once} | {' | '.join(shown)} |"
 
 
-def commit() -> str:
-    """The commit of this checkout, and whether its code was changed since; "no commit" outside of a repository."""
-    root = Path(__file__).resolve().parents[2]
-    asked = (["rev-parse", "--short=10", "HEAD"], ["status", "--porcelain", "--", "physgraph_usd", "tests/stability"])
-    ran = [subprocess.run(["git", *line], cwd=root, capture_output=True, text=True, check=False) for line in asked]
-    head, changed = (each.stdout.strip() for each in ran)
-    return f"{head or 'no commit'}{', with changes' if changed else ''}"
-
-
 def cells_of(page: str) -> dict[tuple[str, str], bool]:
     """Whether each measured cell of a page passed, by case and column."""
     rows = [[part.strip() for part in line.strip("|").split("|")] for line in page.splitlines() if line.startswith("|")]
@@ -236,7 +226,7 @@ def main(chosen: tuple[int, ...], short: bool, fresh: bool, out: Path) -> None:
     figures = {"passed": sum(every), "measured": len(every), "own": sum(own), "all_own": len(own)}
     form, long = (" --short", f"With `{SLOW}`, without --short, it takes about {LONG_MINUTES}.") if short else ("", "")
     words = {"form": form, "long": long, "minutes": cells.seconds / 60.0, "machine": f"{platform.machine()}, CPU"}
-    words["commit"] = commit()
+    words["commit"] = commit("tests/stability")
     out.write_text(TEXT.format(table=table, **words, **figures), encoding="utf-8")
     click.echo(out)
 

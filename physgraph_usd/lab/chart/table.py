@@ -311,7 +311,7 @@ def _warm(rows: Sequence[dict[str, Any]], references: dict[Any, Reference]) -> t
 
 
 def _point(rows: Sequence[dict[str, Any]], references: dict[Any, Reference]) -> Point | None:
-    """One budget of one method; None while a frame of it is missing."""
+    """The point of one method at one budget; None if a frame was not measured."""
     judged = {row["frame"]: row for row in rows if "energies" in row}
     if set(judged) != set(references):
         return None

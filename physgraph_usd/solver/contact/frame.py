@@ -33,7 +33,7 @@ from .tangles import Tangles
 FLOOR = 0.06
 """Gap below which gaps shrink by at most a tenth a move, as a fraction of the thickness."""
 STALLED = 4
-"""Most passes of moving cloth out of bodies that get no more out."""
+"""Most passes of moving cloth out of bodies without progress, and rounds over which untangling is judged."""
 Touch = SelfContact
 """A contact force term."""
 

@@ -1,7 +1,9 @@
 """When a level ends: the cloth rests, the steps are spent, or the time is over.
 
-Every number of this decision is in this file. `Budget` holds the criteria of a level, or of one round of a level:
-`descend` asks `reason` before each step, and the rounds of a frame ask `ends` after each round.
+`Budget` holds the criteria of a level, or of one round of a level: `descend` asks `reason` before each step, and the
+rounds of a frame ask `ends` after each round. Held poses (`frame/start.py`), corrections by the guard
+(`integrate/guard.py`), the tolerance with contact (`contact/metric.py`) and time limits (`frame/refiner.py`) have
+their numbers there.
 """
 
 from __future__ import annotations

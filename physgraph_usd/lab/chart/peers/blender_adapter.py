@@ -32,7 +32,7 @@ import numpy as np
 AIR = 5.0
 """Blender's air damping."""
 DRAG = 0.01 * AIR
-"""Mass that it makes of it [kg a frame]."""
+"""Drag coefficient of this damping [kg a frame]."""
 PROXIMITY = 0.01
 """The air's hold over the springs' constants: with less the forces of bending, which are explicit, swing."""
 INERTIA = 0.1
