@@ -28,10 +28,10 @@ from physgraph_usd.shot.solve import prepare_device
 from physgraph_usd.solver.frame.group import Group
 from physgraph_usd.solver.frame.settings import SolveSettings
 from physgraph_usd.solver.integrate.base import Integrator, System
+from physgraph_usd.solver.integrate.descend import solve_level
 from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton
-from physgraph_usd.solver.integrate.solve import solve_level
 from physgraph_usd.solver.integrate.stop import Budget
-from physgraph_usd.solver.integrate.weights import KINDS, integrator_of, load_network
+from physgraph_usd.solver.integrate.weights import NETWORKS, integrator_of, load_network
 from physgraph_usd.solver.level import refine_garments
 
 from .rows import Row, say
@@ -54,8 +54,8 @@ CONFIG = PatchConfig(count=3, levels=(2, 2), elastic=True, most_vertices=4000, r
 def main(arguments: Sequence[str] | None = None) -> None:
     """Print the table and draw the picture."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--weights", type=Path, default=KINDS["physgraph-paper"].file)
-    parser.add_argument("--physgraph", type=Path, default=KINDS["physgraph"].file)
+    parser.add_argument("--weights", type=Path, default=NETWORKS["physgraph-paper"].file)
+    parser.add_argument("--physgraph", type=Path, default=NETWORKS["physgraph"].file)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--out", type=Path, default=None)
     given = parser.parse_args(arguments)
@@ -94,7 +94,7 @@ def trained_like(device: str, config: PatchConfig = CONFIG) -> Iterator[Problem]
 def rows(short: bool) -> list[Row]:
     """On how many patches the paper's network lies below Adam and gradient descent."""
     config = CONFIG if short else replace(CONFIG, count=2 * CONFIG.count)
-    files = KINDS["physgraph-paper"].file, KINDS["physgraph"].file
+    files = NETWORKS["physgraph-paper"].file, NETWORKS["physgraph"].file
     below = [not overtaken(curves(patch, *files, device="cpu")) for patch in trained_like("cpu", config)]
     title = "the paper's network below Adam and gradient descent of every rate at every k <= 5"
     return [Row(title, f"{sum(below)} of {len(below)} patches", "every k", f"{len(below)} patches", all(below))]

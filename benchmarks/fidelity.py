@@ -42,9 +42,9 @@ from physgraph_usd.solver.frame.refiner import Refiner
 from physgraph_usd.solver.frame.settings import SolveSettings
 from physgraph_usd.solver.grain import axes
 from physgraph_usd.solver.integrate.base import System
+from physgraph_usd.solver.integrate.descend import solve_level
 from physgraph_usd.solver.integrate.metric import Metric
 from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton
-from physgraph_usd.solver.integrate.solve import solve_level
 from physgraph_usd.solver.integrate.stop import Budget
 from physgraph_usd.solver.level import Level, build_levels, hinge_geometry, refine_garments
 from physgraph_usd.solver.mesh.elements import hinges_of

@@ -40,7 +40,7 @@ from physgraph_usd.solver.integrate.base import Integrator
 from physgraph_usd.solver.integrate.guard import Guard
 from physgraph_usd.solver.integrate.network import PhysgraphConfig
 from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton
-from physgraph_usd.solver.integrate.weights import KINDS, integrator_of, load_network
+from physgraph_usd.solver.integrate.weights import NETWORKS, integrator_of, load_network
 
 from .unseen import FABRICS, SHOTS, Case, cases, descend
 
@@ -63,7 +63,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Print the tables."""
     given = parsed(arguments)
     prepare_device(given.device)
-    files = given.weights or [kind.file for kind in KINDS.values()]
+    files = given.weights or [kind.file for kind in NETWORKS.values()]
     candidates = {file: load(file, given.device) for file in files}
     if given.rounds:
         return on_rounds(candidates, given.device)

@@ -23,9 +23,9 @@ from physgraph_usd.solver.forces.base import Force, ForceModule
 from physgraph_usd.solver.forces.bending import Bending
 from physgraph_usd.solver.forces.gravity import Gravity
 from physgraph_usd.solver.integrate.base import System
+from physgraph_usd.solver.integrate.descend import solve_level
 from physgraph_usd.solver.integrate.metric import Metric
 from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton
-from physgraph_usd.solver.integrate.solve import solve_level
 from physgraph_usd.solver.integrate.stop import Budget
 from physgraph_usd.solver.level import Level
 

@@ -25,7 +25,7 @@ from physgraph_usd.solver.forces.bending import Bending
 from physgraph_usd.solver.frame.creases import SHARE, creases_of
 from physgraph_usd.solver.frame.refiner import Refiner
 from physgraph_usd.solver.frame.solve import solve_frame
-from physgraph_usd.solver.frame.values import FrameInput, State
+from physgraph_usd.solver.frame.values import FrameInput, FrameState
 from physgraph_usd.solver.level import Level, build_levels, hinge_geometry
 from physgraph_usd.solver.scene import Frame, GarmentFrame, Scene
 from physgraph_usd.usd.read.reader import open_shot
@@ -42,9 +42,9 @@ def bent_strip(turn: float) -> tuple[Level, torch.Tensor]:
     return level, placed(level, lambda rest: curved(rest, turn))
 
 
-def left_at(x: torch.Tensor, *bent: torch.Tensor | None) -> State:
+def left_at(x: torch.Tensor, *bent: torch.Tensor | None) -> FrameState:
     """What a frame left whose cloth was somewhere [m], of which its creases matter alone."""
-    return State(x, x, torch.eye(3).expand(len(x), 3, 3), fine=x, bent=bent)
+    return FrameState(x, x, torch.eye(3).expand(len(x), 3, 3), fine=x, bent=bent)
 
 
 def asked(elapsed: float, *times: float) -> FrameInput:

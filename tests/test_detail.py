@@ -10,7 +10,7 @@ from meshes import mesh_of
 from sheets import rotation
 
 from physgraph_usd.solver.frame.from_cage import MovingFrames
-from physgraph_usd.solver.frame.values import State
+from physgraph_usd.solver.frame.values import FrameState
 
 MESH, REST = sheet(6, 4)
 GROUP = group_of(MESH, REST, level=2)
@@ -28,7 +28,7 @@ def fine(coarse: torch.Tensor, *, seed: int = 0) -> torch.Tensor:
     return FINEST.smooth_base.apply(coarse) + 0.01 * noise
 
 
-def stored(coarse: torch.Tensor) -> tuple[torch.Tensor, State]:
+def stored(coarse: torch.Tensor) -> tuple[torch.Tensor, FrameState]:
     x = fine(coarse)
     return x, FRAMES.store(coarse, x)
 

@@ -18,7 +18,7 @@ from physgraph_usd.errors import LayerError
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.solver.colliders.mesh import MeshBody
 from physgraph_usd.solver.colliders.pose import MeshPose
-from physgraph_usd.solver.contact.heat import penetration_map
+from physgraph_usd.solver.contact.report import penetration_map
 from physgraph_usd.usd.check.validate import validate_layer
 from physgraph_usd.usd.read.reader import open_shot
 from physgraph_usd.usd.write.writer import LayerWriter

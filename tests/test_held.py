@@ -16,7 +16,7 @@ from shots import refine
 
 from physgraph_usd.solver.frame import start
 from physgraph_usd.solver.frame.start import STILL, slowing
-from physgraph_usd.solver.frame.values import State, join, split
+from physgraph_usd.solver.frame.values import FrameState, join, split
 from physgraph_usd.solver.scene import Frame
 
 MESH, REST = sheet(8, 8, 0.05)
@@ -38,7 +38,7 @@ class TestSlowing:
 
 class TestState:
     def test_garments_that_join_count_from_the_last_to_move(self):
-        one, other = (State(torch.zeros(2, 3), torch.zeros(4, 3), torch.zeros(2, 3, 3), held) for held in (7, 2))
+        one, other = (FrameState(torch.zeros(2, 3), torch.zeros(4, 3), torch.zeros(2, 3, 3), held) for held in (7, 2))
         both = join([one, other])
         assert both.held == 2
         assert [each.held for each in split(both, [slice(0, 2), slice(2, 4)], [slice(0, 4), slice(4, 8)])] == [2, 2]

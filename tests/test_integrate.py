@@ -16,9 +16,9 @@ from physgraph_usd.lab.methods import METHODS
 from physgraph_usd.lab.methods.lbfgs import Lbfgs
 from physgraph_usd.solver.integrate import method_named
 from physgraph_usd.solver.integrate.base import ForceField, Integrator, System
+from physgraph_usd.solver.integrate.descend import solve_level
 from physgraph_usd.solver.integrate.metric import Metric
 from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton
-from physgraph_usd.solver.integrate.solve import solve_level
 from physgraph_usd.solver.integrate.stop import Budget
 
 

@@ -22,12 +22,12 @@ from physgraph_usd.lab.methods.paper_network import PaperConfig
 from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.solver.fabric import Fabric
 from physgraph_usd.solver.integrate.base import Carry, Integrator, System
-from physgraph_usd.solver.integrate.learned import LONGEST, LearnedMetric
+from physgraph_usd.solver.integrate.descend import solve_level
+from physgraph_usd.solver.integrate.learned import LONGEST_STEP, LearnedMetric
 from physgraph_usd.solver.integrate.network import VECTORS, Physgraph, PhysgraphConfig
-from physgraph_usd.solver.integrate.solve import solve_level
 from physgraph_usd.solver.integrate.stop import Budget
 from physgraph_usd.solver.integrate.weights import (
-    KINDS,
+    NETWORKS,
     integrator_of,
     load_network,
     make_network,
@@ -116,7 +116,7 @@ def test_s12_no_force_no_step_and_no_step_beyond_the_cap(config: PhysgraphConfig
     move = integrator.propose(system, integrator.start(system, x))
     longest = float((move.norm(dim=1) / system.spacing).max())
     assert np.isfinite(longest)
-    assert longest <= LONGEST * (1 + 1e-6)
+    assert longest <= LONGEST_STEP * (1 + 1e-6)
     if factor == 0.0 and config is PLAIN:
         assert longest == 0.0
 
@@ -204,7 +204,7 @@ def test_s37_weights_of_the_other_kind_are_refused(tmp_path: Path):
 
 @pytest.mark.parametrize("kind", ["physgraph", "physgraph-paper"])
 def test_shipped_weights_solve_and_have_a_card(kind: str):
-    file = KINDS[kind].file
+    file = NETWORKS[kind].file
     card = json.loads(file.with_suffix(".json").read_text())
     with safe_open(str(file), framework="pt") as opened:
         assert opened.metadata()["sha256"] == card["sha256"]
@@ -233,7 +233,7 @@ def test_a_user_brings_weights_of_their_own(tmp_path: Path):
     assert points["own"] != points["shipped"]
     for options, word in (
         (["--integrator", "quasi-newton", "--weights", str(own)], "has no weights"),
-        (["--integrator", "physgraph", "--weights", str(KINDS["physgraph-paper"].file)], "not of 'physgraph'"),
+        (["--integrator", "physgraph", "--weights", str(NETWORKS["physgraph-paper"].file)], "not of 'physgraph'"),
         (["--integrator", "physgraph", "--weights", str(tmp_path / "none")], "no weights at"),
     ):
         result = CliRunner().invoke(main, ["refine", str(stage), "-o", str(tmp_path / "x.usda"), *options])

@@ -18,7 +18,7 @@ from physgraph_usd.shot.solve import prepare_device
 from physgraph_usd.solver.frame.refiner import Refiner
 from physgraph_usd.solver.frame.settings import SolveSettings
 from physgraph_usd.solver.integrate import METHODS
-from physgraph_usd.solver.integrate.solve import solve_level
+from physgraph_usd.solver.integrate.descend import solve_level
 from physgraph_usd.solver.integrate.stop import Budget
 from physgraph_usd.solver.scene import GarmentFrame
 from physgraph_usd.usd.read.reader import open_shot

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import importlib
 from pathlib import Path
 from typing import Any
@@ -88,6 +89,21 @@ def test_numbers_are_found_by_their_rule(tmp_path: Path):
     }
     assert counts(found) == {"contact": 14}
     assert named(found, "contact/other.py", "BORROWED").importers == ("physgraph_usd.solver.contact.one",)
+
+
+def test_a_name_means_one_thing():
+    """A constant or a class of the solver has a name of its own."""
+    places: dict[str, set[str]] = {}
+    for file in (ROOT / "physgraph_usd" / "solver").rglob("*.py"):
+        for node in ast.parse(file.read_text("utf-8")).body:
+            targets = [node.target] if isinstance(node, ast.AnnAssign) else getattr(node, "targets", [])
+            names = [each for target in targets for each in getattr(target, "elts", [target])]
+            found = [each.id for each in names if isinstance(each, ast.Name) and each.id.isupper()]
+            found += [node.name] if isinstance(node, ast.ClassDef) else []
+            for name in found:
+                if not name.startswith("_"):
+                    places.setdefault(name, set()).add(str(file))
+    assert {name: files for name, files in places.items() if len(files) > 1} == {}
 
 
 def test_half_and_double_keep_whole_numbers_whole_and_at_least_one():

@@ -215,7 +215,7 @@ def test_tasks_share_the_search_of_two_clusters(shape: Shape, monkeypatch: pytes
             on_card.setattr(search, "_tasks", lambda *_, **__: search.TASKS)
             assert cloth.found(x, end) == expected
             on_card.setattr(search, "PAIRS", 1)
-            on_card.setattr(search, "LEAST", 1)
+            on_card.setattr(search, "TASK_PAIRS", 1)
             assert cloth.found(x, end) == expected
         total += len(expected)
     assert total > 50

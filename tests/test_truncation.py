@@ -13,9 +13,9 @@ from physgraph_usd.shot.settled import unsettled
 from physgraph_usd.solver.fabric import Fabric
 from physgraph_usd.solver.frame.refiner import Refiner
 from physgraph_usd.solver.integrate.base import Carry, System
+from physgraph_usd.solver.integrate.descend import solve_level
 from physgraph_usd.solver.integrate.guard import Guard
 from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton, truncated
-from physgraph_usd.solver.integrate.solve import solve_level
 from physgraph_usd.solver.integrate.stop import Budget
 from physgraph_usd.usd.read.reader import open_shot
 

@@ -25,7 +25,7 @@ from physgraph_usd.solver.frame.lead_in import lead_in
 from physgraph_usd.solver.frame.refiner import Refiner
 from physgraph_usd.solver.frame.solve import RunawayError, solve_frame, solve_soundly
 from physgraph_usd.solver.frame.start import STILL, Start, start_of, torn
-from physgraph_usd.solver.frame.values import Cage, FrameInput, Solved, State
+from physgraph_usd.solver.frame.values import Cage, FrameInput, FrameState, Solved
 from physgraph_usd.solver.integrate.stop import EARLY, NEAR, ROUND, TOUCHING
 from physgraph_usd.solver.level import refine_garments
 from physgraph_usd.solver.resolution import edge_strain
@@ -35,7 +35,7 @@ from physgraph_usd.usd.read.reader import open_shot
 MESH, REST = sheet(8, 6)
 
 
-def begun(group: Group, state: State, cage: Cage) -> Start:
+def begun(group: Group, state: FrameState, cage: Cage) -> Start:
     """Where a frame starts, with no body that has moved."""
     given = {"frames": group.moving_frames, "finest": group.levels[-1], "reset": group.settings.reset}
     return start_of(state, cage, **given, moved=0.0)
@@ -179,7 +179,7 @@ def test_layers_that_are_shaken_end_about_as_low_as_by_quasi_newton(sample: Call
 
 
 @pytest.fixture(scope="module")
-def layers() -> tuple[Group, FrameInput, State]:
+def layers() -> tuple[Group, FrameInput, FrameState]:
     """Two level sheets 2 cm apart, and what their frame leaves to the next."""
     garments = [named(square(6), name) for name in ("Upper", "Lower")]
     cages = [garments[0].rest + np.array([0.0, 0.02, 0.0]), garments[1].rest]
@@ -196,7 +196,7 @@ def crossings(solved: Solved) -> int:
 
 @pytest.mark.parametrize(("twist", "why"), [(3.0, "it kept "), (0.0, "it ended with ")])
 def test_cloth_caught_on_the_wrong_side_is_started_anew(
-    layers: tuple[Group, FrameInput, State], twist: float, why: str
+    layers: tuple[Group, FrameInput, FrameState], twist: float, why: str
 ):
     """The last frame had the lower sheet above the upper one, or twisted through it."""
     group, frame, state = layers
@@ -217,20 +217,20 @@ def stand_in(monkeypatch: pytest.MonkeyPatch, warm: tuple[int, float], cold: tup
     """Frames that end with given crossings and energies [J], by their start; whether each was warm."""
     made: list[bool] = []
 
-    def solve(_group: Any, _frame: Any, last: State | None) -> Solved:
+    def solve(_group: Any, _frame: Any, last: FrameState | None) -> Solved:
         made.append(last is not None)
         count, energy = cold if last is None else warm
         told = {"energy_joules": {"input": {"stretch": 1.0, "self_contact": 1.0}, "output": {"stretch": energy}}}
         told |= {"contact": {"cloth": {"after": {"crossings": count}}}, "start": "cold" if last is None else "warm"}
         nothing = torch.zeros(0, 3)
-        return Solved([np.zeros((0, 3))], State(nothing, nothing, torch.zeros(0, 3, 3)), told, [])
+        return Solved([np.zeros((0, 3))], FrameState(nothing, nothing, torch.zeros(0, 3, 3)), told, [])
 
     monkeypatch.setattr(frame_solve, "solve_frame", solve)
     return made
 
 
 def test_cloth_that_runs_away_from_any_start_is_told(
-    layers: tuple[Group, FrameInput, State], monkeypatch: pytest.MonkeyPatch
+    layers: tuple[Group, FrameInput, FrameState], monkeypatch: pytest.MonkeyPatch
 ):
     stand_in(monkeypatch, (0, 4.0), (0, 4.0))
     with pytest.raises(RunawayError, match="3 J more than its upsampled cage has, and a start from the cage ends no"):

@@ -16,7 +16,7 @@ import click
 
 from benchmarks.rows import Row
 from physgraph_usd import __version__
-from physgraph_usd.solver.integrate.weights import KINDS
+from physgraph_usd.solver.integrate.weights import NETWORKS
 
 HEAD = ("| what | the paper | target | ours | |", "|---|---|---|---|---|")
 TEXT = """# The paper's results
@@ -120,7 +120,7 @@ def section(part: Part, known: dict[str, Any], *, short: bool) -> Iterator[str]:
 
 def hashes() -> Iterator[str]:
     """Names and the first digits of the hashes of the weights that ship."""
-    for file in sorted(kind.file for kind in KINDS.values()):
+    for file in sorted(kind.file for kind in NETWORKS.values()):
         yield f"`{file.stem}` {hashlib.sha256(file.read_bytes()).hexdigest()[:12]}"
 
 

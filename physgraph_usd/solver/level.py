@@ -16,7 +16,7 @@ from torch import Tensor
 
 from .fabric import Fabric
 from .grain import SHORTEST, LevelGrain, axes, edge_cosines
-from .mesh.defects import FLAT
+from .mesh.defects import NO_AREA
 from .mesh.elements import QUAD_SPRING, ElasticElements, elastic_elements
 from .mesh.lengths import ANGLES, LENGTHS, NORMALS, ElementValues
 from .mesh.stencil import Stencil
@@ -388,7 +388,7 @@ def _sound(split: TriangleSplit, rest: np.ndarray, *, rigid: np.ndarray) -> Tria
     area = 0.5 * np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
     valid = np.zeros(len(area), bool)
     valid[np.unique(np.sort(split.triangles, axis=1), axis=0, return_index=True)[1]] = True
-    valid &= (area > FLAT * (sides**2).sum(axis=2).max(axis=1)) & ~rigid[split.triangles[:, 0]]
+    valid &= (area > NO_AREA * (sides**2).sum(axis=2).max(axis=1)) & ~rigid[split.triangles[:, 0]]
     return split if valid.all() else TriangleSplit(split.triangles[valid], split.face[valid])
 
 

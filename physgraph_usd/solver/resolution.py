@@ -29,7 +29,7 @@ AUTO = -1
 MOST = 4
 SAMPLED_FRAMES = 5
 LEAST_STRAIN = 0.01
-LIMIT = 5
+HIGHEST_LEVEL = 5
 """The most that the schema allows."""
 SHARP_FOLD = math.radians(45.0)
 SHARP_FRACTION = 0.01

@@ -16,7 +16,7 @@ from .scene import Garment
 
 STRAINED = 1.1
 """Area over rest area, or its inverse, from which a face is strained."""
-SHRUNK = 0.25
+LEAST_GATHERED = 0.25
 """Area over rest area under which cloth is not gathered: the rest shape is another one's, or broken."""
 LEAST_FRACTION = 0.01
 """Of the garment's rest area; smaller parts, such as single faces in a fold, are passed over."""
@@ -50,7 +50,7 @@ class StrainedPart:
     @property
     def needs_rest(self) -> bool:
         """Whether refining spoils the part: cloth that is larger shrinks, and far smaller cloth has another's shape."""
-        return self.area_ratio > 1.0 or self.area_ratio < SHRUNK
+        return self.area_ratio > 1.0 or self.area_ratio < LEAST_GATHERED
 
 
 def strained_parts(

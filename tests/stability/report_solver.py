@@ -23,8 +23,8 @@ from physgraph_usd.solver.fabric import Fabric
 from physgraph_usd.solver.frame.solve import solve_frame
 from physgraph_usd.solver.frame.values import FrameInput
 from physgraph_usd.solver.integrate.base import Carry
+from physgraph_usd.solver.integrate.descend import solve_level
 from physgraph_usd.solver.integrate.guard import Guard
-from physgraph_usd.solver.integrate.solve import solve_level
 from physgraph_usd.solver.integrate.stop import Budget
 from physgraph_usd.solver.mesh.topology import PolygonMesh
 from physgraph_usd.solver.rigid import best_motion

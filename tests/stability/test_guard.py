@@ -11,9 +11,9 @@ import torch
 from cloth import Watched, finest_system, group_of, sheet, wave
 
 from physgraph_usd.solver.integrate.base import Carry, System
+from physgraph_usd.solver.integrate.descend import solve_level
 from physgraph_usd.solver.integrate.guard import PATIENCE, Guard
 from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton
-from physgraph_usd.solver.integrate.solve import solve_level
 from physgraph_usd.solver.integrate.stop import Budget
 
 Proposal = Callable[[Carry, torch.Generator], torch.Tensor]

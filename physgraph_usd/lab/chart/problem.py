@@ -20,7 +20,7 @@ from ...solver.frame.group import Group
 from ...solver.frame.refiner import Refiner
 from ...solver.frame.settings import SolveSettings
 from ...solver.frame.solve import solve_frame
-from ...solver.frame.values import FrameInput, State
+from ...solver.frame.values import FrameInput, FrameState
 from ...solver.level import Level
 from ...solver.resolution import edge_strain
 from ...solver.scene import Frame, Scene
@@ -143,8 +143,8 @@ class Problem:
         return Solved(points, busy * sum(spent), 1e3 * elapsed, steps, waited)
 
     def go_on(
-        self, frame: Frame, settings: SolveSettings, states: Sequence[State | None]
-    ) -> tuple[tuple[np.ndarray, ...], list[State]]:
+        self, frame: Frame, settings: SolveSettings, states: Sequence[FrameState | None]
+    ) -> tuple[tuple[np.ndarray, ...], list[FrameState]]:
         """Solve a frame on from the state of each part; cold where that is None.
 
         Returns:

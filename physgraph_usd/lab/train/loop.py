@@ -19,7 +19,7 @@ from torch import Tensor
 from ...errors import UsageError
 from ...shot.plain_json import to_json
 from ...solver.integrate.network import Physgraph, PhysgraphConfig
-from ...solver.integrate.weights import KINDS, integrator_of, load_network, make_network
+from ...solver.integrate.weights import NETWORKS, integrator_of, load_network, make_network
 from ..methods.paper_network import PaperConfig, PaperNetwork
 from .bundle import Bundle, RoundBundle, Twin, deal, deal_rounds, detached, unrolled
 from .held_out import HeldOut
@@ -293,7 +293,7 @@ def _begun(config: TrainConfig) -> Physgraph | PaperNetwork:
     network = make_network(config.network)
     if not config.start:
         return network
-    file = KINDS[config.kind].file if config.start == "shipped" else Path(config.start)
+    file = NETWORKS[config.kind].file if config.start == "shipped" else Path(config.start)
     known, own = load_network(file, kind=config.kind).state_dict(), network.state_dict()
     for name, value in known.items():
         if name.removesuffix(".weight").removesuffix(".bias").split(".")[0] in ("hidden", "decode", "messages"):

@@ -32,10 +32,10 @@ from ...solver.frame.group import Group
 from ...solver.frame.settings import SolveSettings
 from ...solver.integrate import METHODS
 from ...solver.integrate.base import System
+from ...solver.integrate.descend import solve_level
 from ...solver.integrate.metric import Metric
 from ...solver.integrate.quasi_newton import QuasiNewton
 from ...solver.integrate.saddle import leave_saddle
-from ...solver.integrate.solve import solve_level
 from ...solver.integrate.stop import Budget
 from ...solver.integrate.vertex_frame import VertexFrame
 from ...solver.level import Level, refine_garments

@@ -16,7 +16,7 @@ import torch
 from ...errors import UsageError
 from ...shot.plain_json import to_json
 from ...solver.integrate.network import VECTORS
-from ...solver.integrate.weights import KINDS, save_network
+from ...solver.integrate.weights import NETWORKS, save_network
 from ...version import __version__
 from .loop import TrainConfig, Trainer
 from .patches import PatchConfig, describe
@@ -91,9 +91,9 @@ def read_config(file: Path) -> TrainConfig:
     except (ValueError, RecursionError) as error:  # no TOML, no UTF-8, or nested without end
         raise UsageError(f"{file} is not TOML: {error}") from error
     kind = values.get("kind", "physgraph")
-    if kind not in KINDS:
-        raise UsageError(f"{file}: unknown kind '{kind}'; known: {', '.join(KINDS)}")
-    network = _filled(KINDS[kind].config, values.pop("network", {}), where=f"{file}, [network]")
+    if kind not in NETWORKS:
+        raise UsageError(f"{file}: unknown kind '{kind}'; known: {', '.join(NETWORKS)}")
+    network = _filled(NETWORKS[kind].config, values.pop("network", {}), where=f"{file}, [network]")
     patches = _filled(PatchConfig, values.pop("patches", {}), where=f"{file}, [patches]")
     rounds = _filled(RoundConfig, values.pop("rounds", {}), where=f"{file}, [rounds]")
     unknown = [name for name in getattr(network, "vectors", ()) if name not in VECTORS]

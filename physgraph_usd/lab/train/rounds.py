@@ -30,9 +30,9 @@ from ...solver.frame.refiner import Refiner
 from ...solver.frame.settings import SolveSettings
 from ...solver.integrate import METHODS, Method
 from ...solver.integrate.base import Carry, Integrator, System, resumed
+from ...solver.integrate.descend import solve_level
 from ...solver.integrate.metric import Metric
 from ...solver.integrate.quasi_newton import QuasiNewton
-from ...solver.integrate.solve import solve_level
 from ...solver.integrate.stop import Budget
 from ...solver.level import Level, refine_garments
 from ...solver.scene import Frame, Garment, GarmentFrame, Scene

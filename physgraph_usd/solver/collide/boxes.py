@@ -30,7 +30,7 @@ ROWS = 12
 """Rows of a block of boxes."""
 FAR = wp.constant(wp.float64(1.0e30))
 """Corner of an empty box, and distance of what is not there [m]."""
-WIDER = wp.constant(wp.float64(1.000001))
+ROUNDED_UP = wp.constant(wp.float64(1.000001))
 """Factor on search distances, for their rounding to single precision."""
 
 
@@ -213,7 +213,7 @@ def bound_clusters(first: wp.int32, parts: Topology, query: Query, boxes: Boxes)
         if query.asked[v]:
             asked = 1
     put(boxes.clusters, i, low, high, to_low, to_high)
-    radius = WIDER * (radius + wp.float64(0.5) * query.floor)
+    radius = ROUNDED_UP * (radius + wp.float64(0.5) * query.floor)
     boxes.radius[i] = wp.float32(radius)
     boxes.asked[i] = asked == 1
     boxes.met[i] = False

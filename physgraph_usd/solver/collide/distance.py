@@ -14,7 +14,7 @@ from ..mesh.threads import argument, run
 
 wp.set_module_options(KERNELS)
 
-FLAT = wp.constant(wp.float64(1.0e-20))
+PARALLEL = wp.constant(wp.float64(1.0e-20))
 """Squared sine below which a triangle counts as its sides, and two edges as parallel."""
 
 
@@ -35,7 +35,7 @@ def weights_on_triangle(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
     first, second, way = b - a, c - a, p - a
     normal = wp.cross(first, second)
     size = wp.dot(normal, normal)
-    if size > FLAT * wp.dot(first, first) * wp.dot(second, second):
+    if size > PARALLEL * wp.dot(first, first) * wp.dot(second, second):
         # Inside all three sides the foot of the perpendicular is the closest point.
         v, w = wp.dot(wp.cross(way, second), normal), wp.dot(wp.cross(first, way), normal)
         if v >= zero and w >= zero and v + w <= size:
@@ -60,7 +60,7 @@ def weights_of_edges(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
     size = aa * cc - ac * ac
     best = wp.vec4d(one, zero, zero, zero)
     least = wp.float64(1.0e300)
-    if size > FLAT * aa * cc:
+    if size > PARALLEL * aa * cc:
         s, t = (ac * wc - wa * cc) / size, (aa * wc - ac * wa) / size
         if s >= zero and s <= one and t >= zero and t <= one:
             # Of edges that are all but parallel rounding decides where: an end may be nearer.

@@ -18,7 +18,7 @@ WITHIN = wp.constant(wp.float64(20.0))
 """Largest distance of a body's edges and vertices from cloth that they push, in plays, of which an edge has twenty."""
 ALL = wp.constant(8)
 """Most blocks compared at a time."""
-KINDS = wp.constant(3)
+PAIR_KINDS = wp.constant(3)
 """Kinds of pairs of two clusters: parts of the first with faces of the second, the reverse, and edges with edges."""
 
 
@@ -204,13 +204,13 @@ def find_pairs(
 ):
     """Pairs of parts of each two clusters, counted even without room, in one task or in a task for each kind and share.
 
-    With several tasks for two clusters, their number is a power of two times `KINDS`.
+    With several tasks for two clusters, their number is a power of two times `PAIR_KINDS`.
     """
     task = start + wp.tid()
     n, own = task // tasks, task % tasks
     i, j = clusters[n][0], clusters[n][1]
-    share, bits = own // KINDS, wp.max(tasks // KINDS, 1) - 1
-    kind = wp.where(tasks == 1, -1, own % KINDS)
+    share, bits = own // PAIR_KINDS, wp.max(tasks // PAIR_KINDS, 1) - 1
+    kind = wp.where(tasks == 1, -1, own % PAIR_KINDS)
     one, other, count = wp.where(query.kind == Ask.CROSSING, Part.EDGE, Part.VERTEX), Part.FACE, wp.int32(0)
     if kind <= 0:
         count = search_kind(parts, query, boxes, found, task, one, other, i, j, count, share, bits)

@@ -19,7 +19,7 @@ from torch import Tensor
 from ..mesh.kernels import KERNELS
 from ..mesh.threads import argument, run
 from .boxes import Ask, Boxes, Query, bound_clusters, bound_parts, boxes_near, query_of
-from .narrow_phase import KINDS, Found, check_pairs, find_pairs
+from .narrow_phase import PAIR_KINDS, Found, check_pairs, find_pairs
 from .pairs import NearAt, Pairs, Reach
 from .parts import Parts
 from .topology import LANES, Topology
@@ -28,9 +28,9 @@ wp.set_module_options(KERNELS)
 
 CLUSTERS = 32
 """Room for pairs of clusters per cluster before these are counted."""
-PAIRS, LEAST = 2**19, 16
+PAIRS, TASK_PAIRS = 2**19, 16
 """Room for pairs of parts, of all tasks, and at least of a task. Without enough room a search runs twice."""
-TASKS, THREADS = 4 * KINDS, 2**18
+TASKS, THREADS = 4 * PAIR_KINDS, 2**18
 """Tasks of a pair of clusters on CUDA, each with one kind of pairs and every fourth part; and threads running at once.
 With more tasks than threads, a single task per pair is faster: tasks repeat box tests."""
 
@@ -243,7 +243,7 @@ def _pairs_of(parts: Parts, clusters: Int[Tensor, "clusters 2"], query: Any) -> 
     """The pairs of parts in pairs of clusters; pairs of clusters without enough room are searched again."""
     size = len(clusters)
     tasks = _tasks(size, cuda=clusters.is_cuda)
-    room = max(PAIRS // (size * tasks), LEAST)
+    room = max(PAIRS // (size * tasks), TASK_PAIRS)
     begin = torch.arange(0, (size * tasks + 1) * room, room, dtype=torch.int32, device=clusters.device)
     found, count = _write(parts, clusters, query, begin, size * tasks * room, tasks=tasks)
     count = count.reshape(size, tasks)

@@ -27,7 +27,7 @@ TIGHT = 0.9
 TOUCHES = 1e-12
 """Distance up to which parts touch [m]: nearer, double precision does not tell the side."""
 
-LEAST = wp.constant(wp.float64(1.0 / 16.0))
+LEAST_TIME = wp.constant(wp.float64(1.0 / 16.0))
 """Least fraction of the path for which a plane is tried."""
 
 
@@ -121,7 +121,7 @@ def safe_fraction(
         part = part_kept(face, zero, i, j, k, zero, b + end * v, c + end * p, d + end * q, keep)
         if part == one:
             time = end
-        elif step <= LEAST:
+        elif step <= LEAST_TIME:
             return time + part * step
         else:
             step *= wp.float64(0.5)

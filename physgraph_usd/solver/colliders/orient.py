@@ -25,7 +25,7 @@ OPENINGS = 0.5
 
 FIXED = {"front": 1.0, "back": -1.0}
 """Allowed side of an open piece along its normals, by name."""
-ASKED = 64
+WINDING_SAMPLES = 64
 """Number of cage vertices, spread over the cage, whose winding numbers stand for all: enough to tell a half from a
 quarter."""
 INSIDE = 0.5
@@ -180,7 +180,7 @@ def choose_side(points: np.ndarray, triangles: np.ndarray, cages: Sequence[np.nd
         triangles: Corners, counterclockwise on the front, shape (T, 3).
         cages: Positions of each cage [m], shape (U, 3).
     """
-    cages = [cage[:: max(1, len(cage) // ASKED)] for cage in cages if len(cage)]
+    cages = [cage[:: max(1, len(cage) // WINDING_SAMPLES)] for cage in cages if len(cage)]
     usual = pieces_of(points, triangles)
     if not len(usual.open) or not cages:
         return "auto"

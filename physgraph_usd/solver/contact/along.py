@@ -23,7 +23,7 @@ wp.set_module_options(KERNELS)
 
 COMES = 0.8
 """Fraction of the approach allowed by the promise that a pair may use; the rest absorbs the residual of the passes."""
-PASSES = 16
+JACOBI_PASSES = 16
 """Jacobi passes over the pairs. `safe_move` shortens displacements that still violate a plane afterwards."""
 
 
@@ -145,7 +145,7 @@ def along(
         Launch(_push_apart, len(places), push_apart, **launched),
         Launch(_add_pushes, len(way), add_pushes, **launched),
     ]
-    for launch in launches * PASSES:
+    for launch in launches * JACOBI_PASSES:
         launch({})
     return moved
 

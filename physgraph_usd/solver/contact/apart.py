@@ -31,9 +31,9 @@ from .cloth_mesh import RINGS, ClothMesh
 
 wp.set_module_options(KERNELS)
 
-PASSES = 6
+MIRROR_PASSES = 6
 """Most passes that move pieces back: a pass may uncover another contour."""
-WIDER = 0.25
+SECOND_GAP = 0.25
 """Minimum gap of a second try, in mean edges: faces of curved cloth intersect if the gap is smaller than their sag."""
 
 
@@ -77,13 +77,13 @@ def drawn_apart(
         Positions [m], x itself if nothing improves, and the number of crossings there.
     """
     best, first = (x, start), None
-    for least in (0.0, WIDER):
+    for least in (0.0, SECOND_GAP):
         if not best[1].count or is_over():
             break
         first = _gone_through(mesh, start, x) if first is None else first
         wide = max(gap, least * float(mesh.level.spacing.mean()))
         at, found, through = x, start, first
-        for _ in range(PASSES):
+        for _ in range(MIRROR_PASSES):
             moved = through.back(at, wide)
             after = crossings(mesh.parts, moved, asked)
             if after.count >= found.count:

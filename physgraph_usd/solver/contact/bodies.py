@@ -28,7 +28,7 @@ from .along import ApproachLimits, along
 from .measure import is_between, pinched
 from .settings import ContactSettings
 
-ASKED = 8
+SIDE_SAMPLES = 8
 """Most vertices of a piece of cloth whose sides are found; the majority decides."""
 ON_SURFACE = 1e-6
 """Distance below which the direction to the closest point is rounding, and the face's normal is taken [m]."""
@@ -324,12 +324,12 @@ class Chords:
 
 
 def _spread(piece: Int[np.ndarray, " vertices"]) -> tuple[np.ndarray, np.ndarray]:
-    """Up to `ASKED` vertices of each piece, evenly spaced in their order, and the piece of each."""
+    """Up to `SIDE_SAMPLES` vertices of each piece, evenly spaced in their order, and the piece of each."""
     order = np.argsort(piece, kind="stable")
     size = np.bincount(piece)
-    first, step = np.cumsum(size) - size, np.maximum(size // ASKED, 1)
+    first, step = np.cumsum(size) - size, np.maximum(size // SIDE_SAMPLES, 1)
     place = np.arange(len(piece)) - first[piece[order]]
-    taken = (place % step[piece[order]] == 0) & (place // step[piece[order]] < ASKED)
+    taken = (place % step[piece[order]] == 0) & (place // step[piece[order]] < SIDE_SAMPLES)
     return order[taken], piece[order[taken]]
 
 

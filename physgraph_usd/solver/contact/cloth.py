@@ -7,7 +7,7 @@ nearest: otherwise cloth that pushes at a place and is held at another would sta
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import cast
 
@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ..collide.crossings import Crossings, all_crossings, crossings
+from ..collide.crossings import Crossings, Pierced, all_crossings, crossings
 from ..collide.parts import Parts
 from ..colliders.base import Solid
 from ..forces.seam import Seam
@@ -25,11 +25,49 @@ from ..level import Level
 from ..scene import Garment
 from .bodies import Chords, FrameBodies, LevelBodies
 from .broad_phase import touch_one_another
-from .cloth_mesh import ClothMesh
-from .look import Look
+from .cloth_mesh import RINGS, ClothMesh
 from .settings import ContactSettings
 from .springs import ClothSprings, NearSprings
 from .tangles import OUT, Tangles, chords_of, gaps_out
+
+
+@dataclass(frozen=True, eq=False)
+class ContactState:
+    """Crossings at positions, with the tensor's version counter when they were found.
+
+    Attributes:
+        x: The positions [m].
+        version: The counter.
+        crossings: Crossings of cloth with cloth, without given-up cloth.
+        tangles: These with the cloth around them; None without crossings and given-up cloth.
+        pierced: Crossings of cloth and bodies; None without bodies.
+        inside: The vertices inside each body, shape (B, V); None if none is.
+    """
+
+    x: Tensor
+    version: int
+    crossings: Crossings
+    tangles: Tangles | None
+    pierced: Pierced | None = None
+    inside: Tensor | None = None
+
+    @staticmethod
+    def clean(x: Tensor) -> ContactState:
+        """Positions at which nothing crosses."""
+        return ContactState(x, x._version, Crossings.none(x.device), None)
+
+    @property
+    def in_bodies(self) -> tuple[int, int]:
+        """Number of vertices inside bodies, and of crossings with bodies."""
+        inside = 0 if self.inside is None else int(self.inside.sum())
+        return inside, 0 if self.pierced is None else self.pierced.count
+
+    def exempt(self, mesh: ClothMesh) -> Bool[Tensor, " vertices"] | None:
+        """Mask of the cloth inside or through a body; None if none is."""
+        if self.pierced is None or not any(self.in_bodies):
+            return None
+        some = mesh.grown(mesh.crossed(self.pierced.crossings), RINGS)
+        return some if self.inside is None else some | self.inside.any(dim=0)
 
 
 class ClothContact:
@@ -114,7 +152,7 @@ class ClothView:
         self.mesh = lasting.mesh(level, seam, bodies, itself=self.keeps_sides)
         self._level, self._settings, self._thickness = level, settings, thickness
         self._base, self._seam, self.frame = base, seam, bodies
-        self._doubtful, self._looked = doubtful, cast("Look | None", None)
+        self._doubtful, self._looked = doubtful, cast("ContactState | None", None)
         self.came_near: bool | None = None
 
     @cached_property
@@ -127,14 +165,14 @@ class ClothView:
         return bodies if inside is None else bodies.losing(self._base, inside)
 
     @cached_property
-    def at_base(self) -> Look:
+    def at_base(self) -> ContactState:
         """Crossings, tangles and vertices inside bodies of the upsampled cage that is followed."""
         return self.of_cage(self._base)
 
-    def of_cage(self, x: Float[Tensor, "vertices 3"]) -> Look:
+    def of_cage(self, x: Float[Tensor, "vertices 3"]) -> ContactState:
         """As `look` for an upsampled cage [m], searched only around what crosses in the cage itself."""
         known_clean = self._doubtful is not None and not bool(self._doubtful.any())
-        return Look.clean(x) if known_clean else self.found(x, self._doubtful)
+        return ContactState.clean(x) if known_clean else self.found(x, self._doubtful)
 
     @property
     def parts(self) -> Parts:
@@ -174,13 +212,13 @@ class ClothView:
         """Crossings at x [m], without given-up cloth; cached for the same tensor until its version changes."""
         return self.look(x).crossings
 
-    def look(self, x: Tensor) -> Look:
+    def look(self, x: Tensor) -> ContactState:
         """Cached crossings, tangles and vertices inside bodies at x."""
         if self._looked is None or self._looked.x is not x or self._looked.version != x._version:
             self._looked = self.found(x)
         return self._looked
 
-    def found(self, x: Tensor, some: Bool[Tensor, " vertices"] | None = None) -> Look:
+    def found(self, x: Tensor, some: Bool[Tensor, " vertices"] | None = None) -> ContactState:
         """Crossings, tangles and vertices inside bodies at x, of the given vertices; of all when None."""
         asked = self.asked if some is None else self.padded(some if self.given_up is None else some & ~self.given_up)
         bodies = None if self.frame is None else LevelBodies(self._level, self.frame, self.mesh.pieces)
@@ -196,7 +234,7 @@ class ClothView:
             kept = ~lost[self.mesh.corners_of(found)].all(dim=1)
             found = Crossings(found.edge[kept], found.face[kept])
         tangles = Tangles.find(self.mesh, found, lost) if found.count or self.given_up is not None else None
-        return Look(x, x._version, found, tangles, pierced, inside)
+        return ContactState(x, x._version, found, tangles, pierced, inside)
 
     def tangles(self, x: Float[Tensor, "vertices 3"]) -> Tangles | None:
         """Tangles at x [m]: crossings and the cloth around them; None without crossings and given-up cloth."""
@@ -235,7 +273,7 @@ class ClothView:
 
     def remember(self, x: Float[Tensor, "vertices 3"], given_up: Tangles | None = None) -> None:
         """Record that nothing crosses at x [m] but given-up cloth, as after a safe move from such positions."""
-        self._looked = replace(Look.clean(x), tangles=given_up)
+        self._looked = replace(ContactState.clean(x), tangles=given_up)
 
     def terms(self, x: Float[Tensor, "vertices 3"]) -> tuple[SelfContact, ...]:
         """Contact forces with bodies and between near cloth at x [m], with crossings drawn apart; () without any."""

@@ -30,7 +30,7 @@ from .report import measured, swallowed
 from .settings import ContactSettings
 from .tangles import Tangles
 
-FLOOR = 0.06
+KEPT_GAP = 0.06
 """Gap below which gaps shrink by at most a tenth a move, as a fraction of the thickness."""
 STALLED = 4
 """Most passes of moving cloth out of bodies without progress, and rounds over which untangling is judged."""
@@ -276,7 +276,7 @@ class FrameContact:
             own |= {"bodies": self._bodies, "given_up": self._given_up_at(level)}
             own |= {"doubtful": _share_of(level, self._doubtful) > 0.0}
             cloth = ClothView(self._cloth, level, **own)
-            promise = Promise(cloth, FLOOR * float(self._thickness.min()))
+            promise = Promise(cloth, KEPT_GAP * float(self._thickness.min()))
             self._views[level.index] = LevelContact(cloth, seam, promise)
         return self._views[level.index]
 

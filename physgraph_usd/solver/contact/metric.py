@@ -30,7 +30,7 @@ COARSE, ROUGH = 0.7, 2.0
 """Weights of the parts of P."""
 SHORT = 0.5
 """Fraction of P used by steps without a line search."""
-SHRUNK = 0.1
+HELD_TOLERANCE = 0.1
 """Tolerance of rounds with contact, relative to the level's: `HeldMetric.held` underestimates moves."""
 MISSING = 0.9
 """Fraction of the contact stiffness that a metric may lack before a new metric is made. Excess stiffness does no harm:

@@ -32,7 +32,7 @@ ROUNDS = 4
 """Most passes that shorten blocked displacements. Vertices still blocked afterwards stay at the start, so the passes
 end."""
 
-STRAINS, LEAST = 0.5, 0.01
+STRAINS, NEGLIGIBLE = 0.5, 0.01
 """Largest strain of an edge between vertices whose displacements are shortened, and the fraction of that change which
 is negligible. Without the limit shot 02 needs twice the rounds (53 for 24 in frame 18) and keeps crossings."""
 
@@ -241,7 +241,7 @@ def _spread(share: Tensor, way: Tensor, parts: Parts) -> Float[Tensor, " vertice
     late = length * (1.0 - share)
     first, second = parts.links.T
     within = STRAINS * parts.lengths
-    least = LEAST * within.mean()
+    least = NEGLIGIBLE * within.mean()
     while True:
         new = late.scatter_reduce(0, second, late[first] - within, "amax")
         new = new.scatter_reduce(0, first, new[second] - within, "amax")

@@ -1,7 +1,8 @@
-"""Penetrations and crossings of a frame before and after the solve, as plain values for reports."""
+"""Penetrations and crossings: of a frame before and after the solve for reports, and per vertex for heat maps."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict
 
 import numpy as np
@@ -9,11 +10,13 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ..collide.crossings import crossings
+from ..collide.crossings import all_crossings, crossings
+from ..colliders.base import Surface
+from ..level import Level
 from .bodies import LevelBodies
-from .cloth import ClothView
-from .look import Look
-from .measure import Penetration, penetration
+from .cloth import ClothView, ContactState
+from .cloth_mesh import ClothMesh
+from .measure import Penetration, depths, penetration
 
 
 def measured(
@@ -46,7 +49,9 @@ def measured(
     return said, view.mesh.crossed(found)
 
 
-def _of_bodies(bodies: LevelBodies, before: Tensor, first: Look, x: Tensor, last: Look) -> dict[str, object]:
+def _of_bodies(
+    bodies: LevelBodies, before: Tensor, first: ContactState, x: Tensor, last: ContactState
+) -> dict[str, object]:
     """Penetrations and crossings of each body before and after the solve."""
     found: dict[str, object] = {}
     for index, each in enumerate(bodies.frame.touching):
@@ -59,7 +64,7 @@ def _of_bodies(bodies: LevelBodies, before: Tensor, first: Look, x: Tensor, last
     return found
 
 
-def _penetration(bodies: LevelBodies, index: int, x: Tensor, look: Look, *, lost: Tensor | None) -> Penetration:
+def _penetration(bodies: LevelBodies, index: int, x: Tensor, look: ContactState, *, lost: Tensor | None) -> Penetration:
     inside = torch.zeros_like(bodies.level.free[:, 0]) if look.inside is None else look.inside[index]
     count = 0 if look.pierced is None else int((look.pierced.body == index).sum())
     known = {"longest": bodies.frame.longest, "lost": lost, "crossings": count}
@@ -80,3 +85,47 @@ def swallowed(
                 near = each.surface.closest(at, torch.full_like(at[:, 0], float("inf")))
                 found[place] = max(found[place], (float(near.distance.mean()), each.path))
     return found
+
+
+def penetration_map(surfaces: Sequence[Surface], points: np.ndarray, *, device: str = "cpu") -> np.ndarray:
+    """Depth of each vertex in the deepest of some bodies [mm].
+
+    In a closed body the depth is the length of the way out; behind an open surface with a fixed side, the distance.
+    Open surfaces whose side comes from the cage have no inside.
+
+    Args:
+        surfaces: The posed bodies.
+        points: World positions [m], shape (V, 3), float64.
+        device: "cpu" or a CUDA device.
+
+    Returns:
+        Shape (V,), float32, 0 outside.
+    """
+    deepest = torch.zeros(len(points), dtype=torch.float64, device=device)
+    for surface in surfaces:
+        x = torch.as_tensor(points - surface.origin, dtype=torch.float64, device=device)
+        if surface.closed:
+            depth = depths(surface, x, surface.inside(x), float("inf"))[0]
+        else:
+            found = surface.closest(x, torch.full_like(deepest, float("inf")))
+            depth = torch.where(found.is_behind(surface.fixed_side or 0.0), found.distance, 0.0)
+        deepest = torch.maximum(deepest, depth)
+    return (1e3 * deepest).to(torch.float32).cpu().numpy()
+
+
+def body_crossings(level: Level, surfaces: Sequence[Surface], points: np.ndarray) -> np.ndarray:
+    """Mask of the corners of cloth edges and faces that cross a body, shape (V,), bool.
+
+    Args:
+        surfaces: The posed bodies.
+        points: World positions [m], shape (V, 3), float64.
+    """
+    if not surfaces or not len(level.triangles):
+        return np.zeros(len(points), bool)
+    cloth, bodies = len(level.spans), len(surfaces)
+    meets = np.zeros((cloth + bodies, cloth + bodies), bool)
+    meets[:cloth, cloth:] = meets[cloth:, :cloth] = True
+    mesh = ClothMesh(level, meets, np.zeros((0, 2), np.int64), solids=tuple(each.solid for each in surfaces))
+    x = np.concatenate([points, *(each.world for each in surfaces)]) - points.mean(axis=0)
+    pierced = all_crossings(mesh.parts, torch.as_tensor(x, device=level.device))[1]
+    return mesh.crossed(pierced.crossings)[: len(points)].cpu().numpy()

@@ -2,7 +2,7 @@
 
 Each pair has an offset, the distance to keep, in metres:
 
-    offset = min(thickness, HALF distance at rest, max(distance in the upsampled cage, LEAST thickness))
+    offset = min(thickness, HALF distance at rest, max(distance in the upsampled cage, LEAST_OFFSET thickness))
 
 A pair has a spring if its distance is less than the offset plus `MARGIN` of an edge. Between garments the distance at
 rest is ignored. A body keeps its own offset. The stiffness is given by area, times the area of the pair: the vertex's
@@ -36,9 +36,9 @@ wp.set_module_options(KERNELS)
 HALF, MARGIN = 0.5, 0.1
 """Largest offset of a pair in a garment as a fraction of its distance at rest, so that a flat sheet exerts no force;
 and the search distance beyond the thickness, in edges."""
-LEAST = 0.25
+LEAST_OFFSET = 0.25
 """Minimum offset as a fraction of the thickness, however close the parts are in the input."""
-_HALF, _MARGIN, _LEAST = (wp.constant(wp.float64(each)) for each in (HALF, MARGIN, LEAST))
+_HALF, _MARGIN, _LEAST = (wp.constant(wp.float64(each)) for each in (HALF, MARGIN, LEAST_OFFSET))
 
 
 @wp.func

@@ -2,7 +2,7 @@
 
     E = sum_t A_t (1/2 C11 e1^2 + 1/2 C22 e2^2 + C12 e1 e2 + 1/2 G s^2 + limits),   e_i = |f_i| - 1
     C11 = Y1 / (1 - nu^2),   C22 = Y2 / (1 - nu^2),   C12 = nu sqrt(C11 C22),   nu = 1/3
-    s = (1 + d^2) f1 . f2 / (n1 n2),   n_i^2 = |f_i|^2 + d^2,   d = `ROUNDING`
+    s = (1 + d^2) f1 . f2 / (n1 n2),   n_i^2 = |f_i|^2 + d^2,   d = `COLLAPSED_SIDE`
     limits = 1/2 S (C11 max(0, e1 - e)^2 + C22 max(0, e2 - e)^2),   S = `STIFFER`
 
 | symbol | here | meaning |
@@ -55,7 +55,7 @@ STIFFER = 20.0
 """Stiffening factor beyond the limit: the tensile curves of the measured fabrics steepen ten- to thirtyfold."""
 STIFFEST = 1.0
 """Upper bound of A |g|^2 after `sliver_weight`: the value of a right-angled isosceles triangle."""
-ROUNDING = 0.2
+COLLAPSED_SIDE = 0.2
 """Length of warp or weft, relative to rest, below which the shear direction fades."""
 NO_LIMIT = 1e9
 """A strain never reached."""
@@ -101,7 +101,7 @@ def _membrane(
     more2 = _beyond(limit, e2, c[1])
     stored = s1 * e1 + s2 * e2 + more1 * (e1 - limit) + more2 * (e2 - limit)
     # Shear by the angle between f1 and f2; directions fade for a vanishing vector.
-    rounding = energy.dtype(ROUNDING) * energy.dtype(ROUNDING)
+    rounding = energy.dtype(COLLAPSED_SIDE) * energy.dtype(COLLAPSED_SIDE)
     n1 = q1 + rounding
     n2 = q2 + rounding
     r = one / wp.sqrt(n1 * n2)
@@ -121,7 +121,7 @@ def _membrane(
 _KERNELS = element_overloads(_membrane, width=3, parameters=0, quad_parameters=2)
 _EIGHT = eight_elements(
     "eight_membrane",
-    f"constexpr float POISSON = {POISSON}f, STIFFER = {STIFFER}f, ROUNDING = {ROUNDING}f;"
+    f"constexpr float POISSON = {POISSON}f, STIFFER = {STIFFER}f, COLLAPSED_SIDE = {COLLAPSED_SIDE}f;"
     """
     Vec x0 = corner(0), side1 = corner(1) - x0, side2 = corner(2) - x0;
     Quad g = load4(parameter0), c = load4(parameter1);
@@ -135,7 +135,7 @@ _EIGHT = eight_elements(
     Eight more2 = e2 > limit ? STIFFER * c[1] * (e2 - limit) : none;
     Eight stored = s1 * e1 + s2 * e2 + more1 * (e1 - limit) + more2 * (e2 - limit);
 
-    constexpr float rounding = ROUNDING * ROUNDING;
+    constexpr float rounding = COLLAPSED_SIDE * COLLAPSED_SIDE;
     Eight n1 = q1 + rounding, n2 = q2 + rounding, r = 1.0f / root(n1 * n2);
     Eight sine = dot(f1, f2) * r, turn = c[2] * (1.0f + rounding) * (1.0f + rounding) * sine * r;
     Eight back = sine * turn * r, tiny = 1.0e-6f + none;
@@ -210,10 +210,10 @@ class Membrane:
         sides = corners[:, 1:] - corners[:, :1]
         f = torch.einsum("tsc,tsm->tmc", sides, self._level.membrane_inverse.reshape(-1, 2, 2))
         length = f.norm(dim=2).clamp_min(1e-6)
-        reach = (length**2 + ROUNDING**2).sqrt().unsqueeze(2)
+        reach = (length**2 + COLLAPSED_SIDE**2).sqrt().unsqueeze(2)
         u = f / reach
         sine = (u[:, 0] * u[:, 1]).sum(dim=1)
-        turn = (1.0 + ROUNDING**2) * (u.flip(1) - u * sine[:, None, None]) / reach
+        turn = (1.0 + COLLAPSED_SIDE**2) * (u.flip(1) - u * sine[:, None, None]) / reach
         c11, c22, c12, c66 = (each[:, None] for each in self._stiffnesses)
         cosine = (f[:, 0] * f[:, 1]).sum(dim=1, keepdim=True) / length.prod(dim=1, keepdim=True)
         g = shape_gradients(self._level)

@@ -25,7 +25,7 @@ from ..level import Level
 from ..mesh.borders import OnEdge, finer_side, nearest_edges
 from ..mesh.stencil import Stencil
 from ..mesh.topology import find_edges, joined_by
-from ..mesh.weld import AT_ONE_PLACE, pairs_within
+from ..mesh.weld import WELDED, pairs_within
 from ..scene import Garment
 from .base import ForceModule
 
@@ -156,7 +156,7 @@ def _seam(level: Level, sewn_at: Float[np.ndarray, "coarse 3"]) -> Seam | None:
     share = np.asarray(level.from_coarse @ sewn.astype(np.float64)).ravel()
     on_seam = (share > 1.0 - 1e-9) & (level.vertex_area > 0).cpu().numpy()
     points = np.asarray(level.from_coarse @ np.where(sewn[:, None], sewn_at, 0.0))
-    within = AT_ONE_PLACE * float(level.spacing.mean())
+    within = WELDED * float(level.spacing.mean())
     pairs = pairs_within([points], np.flatnonzero(on_seam), within)
     alone = on_seam.copy()
     alone[pairs] = False

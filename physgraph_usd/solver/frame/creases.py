@@ -25,7 +25,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..level import Level
-from .values import FrameInput, State
+from .values import FrameInput, FrameState
 
 SHARE = 0.5
 """Fraction of a bend remaining, a round number: flat-folded plain cotton opens by about half in tests of crease
@@ -58,7 +58,7 @@ def keeps_creases(frame: FrameInput) -> bool:
     return any(each.fabric.crease_time > 0 for each in frame.garments)
 
 
-def creases_of(level: Level, frame: FrameInput, last: State | None) -> Creases | None:
+def creases_of(level: Level, frame: FrameInput, last: FrameState | None) -> Creases | None:
     """Creases of a frame, from the cloth's angles in the start frame; None if no fabric keeps creases.
 
     Args:

@@ -26,11 +26,11 @@ from ..mesh.stencil import Stencil, add_at
 from ..mesh.topology import PolygonMesh
 from ..rigid import best_motion
 from ..scene import Garment
-from .values import State
+from .values import FrameState
 
-NEAREST = 1e-6
+COINCIDES = 1e-6
 """Distance below which points count as coincident, in edge lengths."""
-LEAST = 12
+LEAST_FOLLOWED = 12
 """Fewest cloth vertices followed by a part."""
 
 
@@ -55,12 +55,12 @@ class MovingFrames:
         normal = add_at(torch.zeros_like(coarse), self._triangles.T.reshape(-1), area.repeat(3, 1))
         return orthonormal(normal, self._tangent.apply(coarse))
 
-    def store(self, coarse: Float[Tensor, "coarse 3"], fine: Float[Tensor, "vertices 3"]) -> State:
+    def store(self, coarse: Float[Tensor, "coarse 3"], fine: Float[Tensor, "vertices 3"]) -> FrameState:
         """Keep a solved frame's detail."""
-        return State(coarse, fine - self._level.smooth_base.apply(coarse), self.frames(coarse))
+        return FrameState(coarse, fine - self._level.smooth_base.apply(coarse), self.frames(coarse))
 
     def predict(
-        self, last: State, coarse: Float[Tensor, "coarse 3"]
+        self, last: FrameState, coarse: Float[Tensor, "coarse 3"]
     ) -> tuple[Float[Tensor, "vertices 3"], float, float]:
         """Carry detail to new cage positions.
 
@@ -109,7 +109,7 @@ class Followers:
         self._which, row = np.unique(ends[:, 0], return_inverse=True)
         rest = level.rest.double().cpu().numpy()
         length = np.linalg.norm(rest[ends[:, 0]] - rest[ends[:, 1]], axis=1)
-        near = 1.0 / np.maximum(length, NEAREST * float(level.spacing.mean()))
+        near = 1.0 / np.maximum(length, COINCIDES * float(level.spacing.mean()))
         beside = sp.csr_matrix((near, (row, ends[:, 1])), shape=(len(self._which), level.vertex_count))
         # Parts without any adjacent cloth stay: the margin makes the matrix invertible.
         degree = sp.diags(np.bincount(row, near, len(self._which)) * (1.0 + 1e-9))
@@ -218,7 +218,7 @@ class RigidParts:
                     continue  # Pinned parts stay on the cage.
                 middle = rest[members].mean(axis=0)
                 radius = float(np.linalg.norm(rest[members] - middle, axis=1).max())
-                near = tree.query(middle, k=min(LEAST, len(under)))[1].reshape(-1)
+                near = tree.query(middle, k=min(LEAST_FOLLOWED, len(under)))[1].reshape(-1)
                 around = np.asarray(tree.query_ball_point(middle, radius + spacing), np.int64)
                 self._parts.append((members, under[np.union1d(near, around).astype(np.int64)]))
 

@@ -14,7 +14,7 @@ import numpy as np
 from ..colliders.pose import Pose
 from ..rigid import AT_REST, Rigid, best_motion
 from ..scene import Frame, GarmentFrame
-from .values import State, join
+from .values import FrameState, join
 
 RETURNED = 0.25
 """Tolerance for the input's return after a broken frame, as a fraction of the move into the broken frame. Even motion
@@ -41,14 +41,14 @@ class SolvedFrame:
     near: tuple[int, ...]
     part: tuple[int, ...]
     points: np.ndarray
-    state: State
+    state: FrameState
     crossing: np.ndarray
     first: bool = False
     whole: bool = True
 
 
 @dataclass(frozen=True, eq=False)
-class Memory:
+class GarmentHistory:
     """Memory of one garment.
 
     Attributes:
@@ -76,7 +76,7 @@ class Origin:
     """
 
     frames: tuple[SolvedFrame | None, ...]
-    state: State | None
+    state: FrameState | None
     motion: Rigid
     broken: float | None
     jumped: float | None
@@ -126,7 +126,13 @@ class Origin:
 
 
 def origin_of(
-    part: tuple[int, ...], frame: Frame, memories: Sequence[Memory], *, near: Sequence[int], edge: float, gap: bool
+    part: tuple[int, ...],
+    frame: Frame,
+    memories: Sequence[GarmentHistory],
+    *,
+    near: Sequence[int],
+    edge: float,
+    gap: bool,
 ) -> Origin:
     """Choose the frame to start from.
 
@@ -157,7 +163,7 @@ def _motion(known: Sequence[SolvedFrame], now: Sequence[GarmentFrame]) -> Rigid:
 
 
 def _broken(
-    part: tuple[int, ...], frame: Frame, memories: Sequence[Memory], *, near: Sequence[int], edge: float
+    part: tuple[int, ...], frame: Frame, memories: Sequence[GarmentHistory], *, near: Sequence[int], edge: float
 ) -> float | None:
     """Time code of the last frame, if only the last frame's input left its place."""
     pairs = [(each.last, each.before) for each in memories if each.last is not None and each.before is not None]
@@ -169,7 +175,7 @@ def _broken(
 
 
 def jumped_from(
-    part: tuple[int, ...], frame: Frame, memories: Sequence[Memory], *, near: Sequence[int], edge: float
+    part: tuple[int, ...], frame: Frame, memories: Sequence[GarmentHistory], *, near: Sequence[int], edge: float
 ) -> float | None:
     """Time code of the first frame, if garments' input jumped from the first frame to the second and stays there."""
     for index, each in zip(part, memories, strict=True):
@@ -181,7 +187,7 @@ def jumped_from(
     return None
 
 
-def is_same(part: tuple[int, ...], frame: Frame, memories: Sequence[Memory], near: Sequence[int]) -> bool:
+def is_same(part: tuple[int, ...], frame: Frame, memories: Sequence[GarmentHistory], near: Sequence[int]) -> bool:
     """Whether garments and nearby bodies are unchanged, were solved together, and creases are at rest."""
     for index, each in zip(part, (each.last for each in memories), strict=True):
         if each is None or each.part != part or near != each.near or not each.whole:

@@ -27,7 +27,7 @@ from ..scene import Garment, GarmentFrame
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class ElasticTerms:
     """Elastic terms of fabrics.
 
     Attributes:
@@ -57,8 +57,8 @@ class Lent:
 
     metric: Metric
     stiffness: Float[Tensor, " vertices"]
-    in_plane: Part
-    bending: Part
+    in_plane: ElasticTerms
+    bending: ElasticTerms
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,20 +92,20 @@ class LevelForces:
         return (*self._in_plane.terms, *self._bending.terms, *body)
 
     @cached_property
-    def _in_plane(self) -> Part:
+    def _in_plane(self) -> ElasticTerms:
         fabrics = tuple(replace(each, bend=0.0, weft_bend=None) for each in self._elastic)
         if self.lent is not None and self.lent.in_plane.fabrics == fabrics:
             return self.lent.in_plane
         level = self.plain.eased(fabrics)
-        return Part(fabrics, level, in_plane_terms(level, fabrics))
+        return ElasticTerms(fabrics, level, in_plane_terms(level, fabrics))
 
     @cached_property
-    def _bending(self) -> Part:
+    def _bending(self) -> ElasticTerms:
         fabrics = self._elastic
         if self.lent is not None and self.lent.bending.fabrics == fabrics:
             return self.lent.bending
         raised = [each.raises_bending for each in self.garments]
-        return Part(fabrics, self.level, (bending_term(self.level, fabrics, raised=raised),))
+        return ElasticTerms(fabrics, self.level, (bending_term(self.level, fabrics, raised=raised),))
 
     @cached_property
     def guide(self) -> Guide:

@@ -12,14 +12,14 @@ from torch import Tensor
 
 from ...errors import SolveError
 from ..forces.base import ForceModule
-from ..integrate.solve import LevelReport
+from ..integrate.descend import LevelReport
 from ..level import Placed, unhindered
 from ..resolution import edge_strain, sharp_folds
 from ..scene import FARTHEST
 from .creases import keeps_creases
 from .level_forces import named
 from .problem import Problem
-from .values import State
+from .values import FrameState
 
 
 def refuse_swallowed(problem: Problem) -> None:
@@ -52,7 +52,7 @@ def scaled(problem: Problem, x: Placed) -> Placed:
     return x if result is x else unhindered(result) if view is None else view.moved(x, result)
 
 
-def state_left(problem: Problem, x: Placed) -> State:
+def state_left(problem: Problem, x: Placed) -> FrameState:
     """State for the start of the next frame.
 
     Args:

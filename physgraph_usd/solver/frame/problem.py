@@ -22,7 +22,7 @@ from .creases import Creases, creases_of
 from .group import Group
 from .level_forces import LevelForces
 from .start import Start, start_of, torn
-from .values import Cage, FrameInput, State
+from .values import Cage, FrameInput, FrameState
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,7 +203,7 @@ class Problem:
         return x, smoothing
 
 
-def begin(group: Group, frame: FrameInput, last: State | None) -> Problem:
+def begin(group: Group, frame: FrameInput, last: FrameState | None) -> Problem:
     """Prepare a frame for solving.
 
     Args:

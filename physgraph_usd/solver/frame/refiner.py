@@ -17,7 +17,7 @@ from ..deadline import ends_after
 from ..mesh.subdivide import Refinement
 from ..scene import Frame, Scene, State, refuse_far
 from .group import Group
-from .history import Memory
+from .history import GarmentHistory
 from .scene_frame import SceneCloth, SceneFrame
 from .settings import SolveSettings
 
@@ -59,7 +59,7 @@ class Refiner:
         chosen = levels if levels is not None else [garment.level for garment in scene.garments]
         self._cloth = SceneCloth(scene, chosen, dtype=dtype, device=device, threads=threads)
         self.scene, self._settings, self._heat_map = scene, settings, heat_map
-        self._memories = (Memory(),) * len(scene.garments)
+        self._memories = (GarmentHistory(),) * len(scene.garments)
         self._time: float | None = None
         self._walked: tuple[Sequence[np.ndarray | None], float] | None = None
         self._seconds: list[float] = []  # Durations of completed frames.
@@ -81,7 +81,7 @@ class Refiner:
     def forget(self) -> None:
         """Start the next frame cold, like the first."""
         self._cloth.bodies.forget()
-        self._memories, self._time, self._walked = (Memory(),) * len(self._memories), None, None
+        self._memories, self._time, self._walked = (GarmentHistory(),) * len(self._memories), None, None
 
     def begin_at(self, cages: Refiner, *, since: float) -> None:
         """Start the first frame, if cold, with the cage advanced by another refiner.

@@ -12,14 +12,14 @@ import torch
 from ...errors import At, GarmentError, SolveError
 from ..contact.bodies import Touching
 from ..contact.broad_phase import Bodies, TouchingGroups, bounds_of, reach_of
-from ..contact.heat import body_crossings, penetration_map
+from ..contact.report import body_crossings, penetration_map
 from ..deadline import is_over
 from ..level import refine_garments
 from ..rigid import AT_REST
 from ..scene import Frame, GarmentFrame, Scene, out_of_bounds
 from ..strain import has_collapsed, size_left, strayed
 from .group import Group
-from .history import Memory, Origin, SolvedFrame, is_same, jumped_from, origin_of
+from .history import GarmentHistory, Origin, SolvedFrame, is_same, jumped_from, origin_of
 from .settings import SolveSettings
 from .solve import RunawayError, solve_soundly
 from .values import FrameInput, split
@@ -137,12 +137,12 @@ class Answer:
     Attributes:
         points: Fine positions [m], world space.
         telemetry: Entries for the report.
-        memory: Memory for the next frame.
+        memory: GarmentHistory for the next frame.
     """
 
     points: np.ndarray
     telemetry: dict[str, object]
-    memory: Memory
+    memory: GarmentHistory
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,7 +151,7 @@ class SceneFrame:
 
     Attributes:
         cloth: Levels, groups and bodies of the scene; the bodies are posed.
-        memories: Memory of each garment's last frames.
+        memories: GarmentHistory of each garment's last frames.
         gap: Whether the time since the last frame is too long for a warm start.
         walked: World positions of each cage [m] advanced here by another refiner, and the start time code; or None.
         limit: Time limit of the frame [s].
@@ -160,7 +160,7 @@ class SceneFrame:
     cloth: SceneCloth
     settings: SolveSettings
     frame: Frame
-    memories: Sequence[Memory]
+    memories: Sequence[GarmentHistory]
     gap: bool
     walked: tuple[Sequence[np.ndarray | None], float] | None
     limit: float
@@ -247,7 +247,7 @@ class SceneFrame:
             ends = {"first": memory.last is None, "whole": self.settings.whole}
             now = SolvedFrame(*at, points, states[place], crossing, **ends)
             before = memory.last if origin.broken is None else origin.frames[place]
-            found.append(Answer(points, entry, Memory(now, before)))
+            found.append(Answer(points, entry, GarmentHistory(now, before)))
         return found
 
     def _jumped(self, part: tuple[int, ...], near: tuple[int, ...]) -> bool:

@@ -19,22 +19,22 @@ from torch import Tensor
 
 from ...errors import SolveError
 from ..contact.frame import STALLED, LevelContact
-from ..contact.metric import SHRUNK, HeldMetric
+from ..contact.metric import HELD_TOLERANCE, HeldMetric
 from ..deadline import is_over
 from ..forces.base import ForceModule
 from ..integrate.base import Carry, System
+from ..integrate.descend import LevelReport, descend, solve_level
 from ..integrate.guard import PATIENCE
 from ..integrate.saddle import leave_saddle
-from ..integrate.solve import LevelReport, descend, solve_level
 from ..integrate.stop import UNTANGLINGS, WARM_UNTANGLINGS
 from ..level import Placed, unhindered
 from .group import Group
 from .level_forces import blame
 from .outcome import measured, refuse_swallowed, scaled, state_left, telemetry_of
 from .problem import LevelProblem, Problem, begin
-from .values import FrameInput, Solved, State
+from .values import FrameInput, FrameState, Solved
 
-ROUNDING = 1e-3
+EQUAL_ENERGY = 1e-3
 """Fraction of the energies' size below which two energies count as equal: sums are in single precision."""
 MORE = 2
 """Crossings with a body allowed for each one of the cage: cloth pinched by bodies crosses them about as often."""
@@ -43,7 +43,7 @@ MOST_WAIT = 64
 little in a shot with cloth impossible to pull apart."""
 
 
-def solve_frame(group: Group, frame: FrameInput, last: State | None) -> Solved:
+def solve_frame(group: Group, frame: FrameInput, last: FrameState | None) -> Solved:
     """Solve one frame.
 
     Args:
@@ -123,7 +123,7 @@ def solve_one_level(
         touched = touched or bool(terms)
         system = problem.system(view, terms, x, last=last)
         resume = carry if last is not None and system.has_same_metric(last) else None
-        shrunk = SHRUNK if isinstance(system.metric, HeldMetric) else 1.0
+        shrunk = HELD_TOLERANCE if isinstance(system.metric, HeldMetric) else 1.0
         of_round = budget.for_round(first=not made, touching=bool(terms), shrunk=shrunk)
         carry, report = descend(system, integrator, x, level=level.index, budget=of_round, resume=resume)
         report.remaining_move = _smooth_move(system, carry, report)
@@ -201,7 +201,7 @@ class RunawayError(SolveError):
     """Cloth ending with more energy than its upsampled cage, from any start."""
 
 
-def solve_soundly(group: Group, frame: FrameInput, last: State | None) -> Solved:
+def solve_soundly(group: Group, frame: FrameInput, last: FrameState | None) -> Solved:
     """Solve a frame, and once more from the cage if the result is unsound.
 
     A result is unsound if cloth crosses cloth, or a body over `MORE` times as often as the upsampled cage does, or if
@@ -277,7 +277,7 @@ def _excess(telemetry: Mapping[str, Any], *, whole: bool = False) -> float:
     sides = telemetry["energy_joules"]
     before = {name: value for name, value in sides["input"].items() if whole or name != "self_contact"}
     size = sum(abs(each) for each in (*before.values(), *sides["output"].values()))
-    return max(_energy(telemetry) - sum(before.values()) - ROUNDING * size, 0.0)
+    return max(_energy(telemetry) - sum(before.values()) - EQUAL_ENERGY * size, 0.0)
 
 
 def _energy(telemetry: Mapping[str, Any]) -> float:

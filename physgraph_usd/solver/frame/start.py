@@ -13,9 +13,9 @@ from ..level import Level
 from ..resolution import edge_strain
 from .from_cage import MovingFrames
 from .settings import Reset
-from .values import Cage, State
+from .values import Cage, FrameState
 
-WORTH, LEAST_STRAIN = 2.0, 0.5
+TORN_FACTOR, TORN = 2.0, 0.5
 """Limits of the 99th percentile of edge strain with carried detail, relative to the upsampled cage's, and absolute. A
 frame starts cold above both: a crumpled cage tears carried detail."""
 STILL = 0.02
@@ -49,7 +49,7 @@ class Start:
 
 
 def start_of(
-    state: State | None,
+    state: FrameState | None,
     cage: Cage,
     *,
     frames: MovingFrames,
@@ -90,7 +90,7 @@ def torn(finest: Level, carried: Float[Tensor, "vertices 3"], cage: Float[Tensor
         cage: Cage positions [m].
     """
     strain, plain = (edge_strain(finest, x)["p99"] for x in (carried, finest.base.apply(cage)))
-    if strain <= max(WORTH * plain, LEAST_STRAIN):
+    if strain <= max(TORN_FACTOR * plain, TORN):
         return ""
     return f"cold: carried detail strains the cloth by {strain:.3g}, the upsampled cage by {plain:.3g}"
 

@@ -28,7 +28,7 @@ class FrameInput:
         moved: Largest motion of the surfaces since the last frame [m]; infinite if more than poses changed.
         walked: World positions of cages advanced from an earlier frame [m], shape (C, 3), for a cold start; or None.
         elapsed: Time since each garment's start frame [s]; () for a cold start.
-        given_up: As `State.given_up`, for a start from the cage.
+        given_up: As `FrameState.given_up`, for a start from the cage.
     """
 
     garments: Sequence[GarmentFrame]
@@ -61,7 +61,7 @@ class Cage:
 
 
 @dataclass(frozen=True, eq=False)
-class State:
+class FrameState:
     """State passed from frame to frame.
 
     Attributes:
@@ -93,7 +93,7 @@ class State:
     failures: int = 0
     wait: int = 0
 
-    def carried(self, motion: Rigid) -> State:
+    def carried(self, motion: Rigid) -> FrameState:
         """This state after a rigid motion."""
         if motion is AT_REST:
             return self
@@ -121,18 +121,18 @@ class Solved:
 
     Attributes:
         points: World positions of each garment [m].
-        state: State for the next frame.
+        state: FrameState for the next frame.
         telemetry: Plain values.
         crossing: For each garment, whether each vertex belongs to cloth that crosses cloth, shape (V,), bool.
     """
 
     points: list[np.ndarray]
-    state: State
+    state: FrameState
     telemetry: dict[str, Any]
     crossing: list[np.ndarray]
 
 
-def join(parts: Sequence[State]) -> State:
+def join(parts: Sequence[FrameState]) -> FrameState:
     """Join the states of several garments."""
     whole = (torch.cat([getattr(part, name) for part in parts]) for name in ("coarse", "detail", "frames"))
     fine = [part.fine for part in parts if part.fine is not None]
@@ -148,10 +148,10 @@ def join(parts: Sequence[State]) -> State:
     lost = [torch.zeros(len(p.coarse), dtype=torch.bool) if p.given_up is None else p.given_up.cpu() for p in parts]
     given_up = torch.cat(lost).to(parts[0].coarse.device) if any(p.given_up is not None for p in parts) else None
     kept = {"fine": walked, "clean": clean, "bent": bent, "creeps": creeps, "failures": failures, "wait": wait}
-    return State(*whole, held=min(part.held for part in parts), inside=inside, given_up=given_up, **kept)
+    return FrameState(*whole, held=min(part.held for part in parts), inside=inside, given_up=given_up, **kept)
 
 
-def split(state: State, coarse: Sequence[slice], fine: Sequence[slice]) -> list[State]:
+def split(state: FrameState, coarse: Sequence[slice], fine: Sequence[slice]) -> list[FrameState]:
     """The state of each garment of a group.
 
     Args:

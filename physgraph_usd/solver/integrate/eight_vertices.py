@@ -22,9 +22,9 @@ from ..mesh.simd import EIGHT, annotate, eight_at_once
 from ..mesh.stencil import vectors
 from ..mesh.threads import Launch, argument
 from .network import (
-    FLOOR,
     LOG_OFFSET,
     LOG_SCALE,
+    ZERO_LENGTH,
     Families,
     Pairs,
     Parts,
@@ -229,7 +229,7 @@ def _units(parts: Parts, families: Families) -> list[str]:
     ]
     for kind in range(kinds):
         terms = [_square(*part) for part, each in zip(parts, families, strict=True) if each == (kind, True)]
-        lines.append(f"size[{kind}] = {1.0 / len(terms)!r}f * ({' + '.join(terms)}) + {FLOOR**2!r}f;\n")
+        lines.append(f"size[{kind}] = {1.0 / len(terms)!r}f * ({' + '.join(terms)}) + {ZERO_LENGTH**2!r}f;\n")
         lines.append(f"inverse[{kind}] = 1.0f / root(size[{kind}]);\n")
     family_of = {row: family for (row, _), (family, _) in reversed(tuple(zip(parts, families, strict=True)))}
     lines += [f"unit[{row}] = near[{row}] * inverse[{family_of.get(row, 0)}];\n" for row in range(rows)]

@@ -25,9 +25,9 @@ from ..mesh.stencil import vectors
 from ..mesh.threads import Launch
 from .eight_vertices import EightPhysgraph
 from .network import (
-    FLOOR,
     LOG_OFFSET,
     LOG_SCALE,
+    ZERO_LENGTH,
     Families,
     Pairs,
     Parts,
@@ -228,7 +228,7 @@ def _comparing(parts: Parts, families: Families) -> Any:
                 w = wp.dot(w, across) * across
             size[wp.static(families[counts[k]][0])] += wp.dot(w, w)
         for k in range(wp.static(kinds)):
-            size[k] = wp.float32(wp.static(inverse_count[k])) * size[k] + wp.float32(wp.static(FLOOR**2))
+            size[k] = wp.float32(wp.static(inverse_count[k])) * size[k] + wp.float32(wp.static(ZERO_LENGTH**2))
             inverse[k] = wp.float32(1.0) / wp.sqrt(size[k])
         for u in range(wp.static(rows)):
             unit[u] = inverse[wp.static(of[u])] * near[u]

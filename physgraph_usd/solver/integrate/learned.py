@@ -5,7 +5,7 @@
 | H0^-1 F | ``preconditioned`` | displacement of a linear cloth of the rest shape under F [m] |
 | v_i | ``vectors`` | vectors for the network to combine, in local edge lengths |
 | c_i | ``coefficients`` | output of the network |
-| D | ``move`` | sum_i c_i v_i, no longer than `LONGEST` edges at any vertex |
+| D | ``move`` | sum_i c_i v_i, no longer than `LONGEST_STEP` edges at any vertex |
 
 The network sees a `System` only.
 """
@@ -27,14 +27,14 @@ from .base import Carry, System
 from .eight_vertices import EightPhysgraph
 from .fused import FusedPhysgraph, fused_physgraph
 from .network import Physgraph
-from .quasi_newton import Dot, Memory, dot, secant_direction
+from .quasi_newton import Dot, StepHistory, dot, secant_direction
 from .vertex_frame import VertexFrame
 
 NetworkT = TypeVar("NetworkT", bound=nn.Module)
 
 MOST_GARMENTS = 8
 """Most garments whose scalar products are summed one by one, in a fixed order."""
-LONGEST = 5.0
+LONGEST_STEP = 5.0
 """Longest move of a vertex in a step, in edge lengths."""
 
 
@@ -58,7 +58,7 @@ class LearnedMetric:
         self._network = placed(self._network, system, x.dtype)
         energy, force = system.energy_and_force(x)
         none = torch.zeros_like(x)
-        return Carry(x, energy, force, system.apply_short_inverse(force), self.name, Memory(none, (none, none)))
+        return Carry(x, energy, force, system.apply_short_inverse(force), self.name, StepHistory(none, (none, none)))
 
     def resume(self, system: System, carry: Carry) -> Carry:
         """Evaluate the carry's positions after a small change of the forces; the memory is kept."""
@@ -91,7 +91,7 @@ class LearnedMetric:
             return None
         threads = 1 if system.level is None else system.level.threads
         spacing = system.spacing
-        return fused_physgraph(self._network, len(spacing), LONGEST, device=str(spacing.device), threads=threads)
+        return fused_physgraph(self._network, len(spacing), LONGEST_STEP, device=str(spacing.device), threads=threads)
 
     def _combined(self, carry: Carry, *, system: System, fused: FusedPhysgraph | EightPhysgraph | None) -> Tensor:
         """The network's combination of vectors [m]."""
@@ -120,7 +120,7 @@ def _secant_direction(carry: Carry) -> Tensor:
 
 def _vector(name: str, *, system: System, carry: Carry) -> Tensor:
     """One of `network.WHOLE` [m]; zero if the history is too short."""
-    memory: Memory = carry.memory
+    memory: StepHistory = carry.memory
     if name == "secant":
         return _secant_direction(carry)
     if name.startswith("diagonal"):
@@ -141,9 +141,9 @@ def placed(network: NetworkT, system: System, dtype: torch.dtype) -> NetworkT:
 
 
 def limited(move: Float[Tensor, "vertices 3"], spacing: Float[Tensor, " vertices"]) -> Float[Tensor, "vertices 3"]:
-    """The displacement, limited to `LONGEST` local edge lengths at each vertex."""
+    """The displacement, limited to `LONGEST_STEP` local edge lengths at each vertex."""
     size = move.square().sum(dim=1, keepdim=True).clamp_min(torch.finfo(move.dtype).tiny).sqrt()
-    return move * (LONGEST * spacing.unsqueeze(1) / size).clamp_max(1.0)
+    return move * (LONGEST_STEP * spacing.unsqueeze(1) / size).clamp_max(1.0)
 
 
 def vectors_of(

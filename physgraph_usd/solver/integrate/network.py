@@ -23,7 +23,7 @@ and before, the L-BFGS direction."""
 VECTORS = (*WHOLE, *(f"{name}.{part}" for name in WHOLE for part in PARTS))
 """Vectors available for combination: `WHOLE` and the parts."""
 
-FLOOR = 1e-9
+ZERO_LENGTH = 1e-9
 """Lengths below this many edges count as zero."""
 LOG_SCALE, LOG_OFFSET = 0.25 / math.log(10.0), 1.5
 """Scale and offset of lengths: (log10 + 3) / 2 of a length, from the natural logarithm of the squared length."""
@@ -80,7 +80,7 @@ class Physgraph(nn.Module):
             step: Number of previous steps.
         """
         square = vectors.square().sum(dim=2)  # V N
-        size = (square @ self._mean + FLOOR**2).sqrt()  # V K
+        size = (square @ self._mean + ZERO_LENGTH**2).sqrt()  # V K
         unit = vectors / size[:, self._family].unsqueeze(2)  # V N 3
         product = (unit[:, self._first] * unit[:, self._second]).sum(dim=2)  # V P
         seen = torch.cat([unit.square().sum(dim=2), product, 0.5 * (size.log10() + 3.0)], dim=1)

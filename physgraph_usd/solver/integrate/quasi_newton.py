@@ -36,7 +36,7 @@ ARMIJO = 1e-4
 MAX_BACKTRACKS = 12
 SHORTENED = 0.01
 """Fraction of the full length below which a shortened step drops the secants and stiffens the metric."""
-TURN = math.cos(math.radians(45.0))
+TURN_COSINE = math.cos(math.radians(45.0))
 """Cosine of the largest turn of a triangle after a failed step: the angle between two neighbours then changes by at
 most a quarter turn, and no triangle is turned over."""
 CUTS = 8
@@ -50,7 +50,7 @@ Dot = Callable[[Tensor, Tensor], Any]
 def truncated(
     system: System, x: Float[Tensor, "vertices 3"], move: Float[Tensor, "vertices 3"]
 ) -> Float[Tensor, "vertices 3"] | None:
-    """A move [m] shortened at the corners of triangles turning by more than `TURN`; None if no triangle does.
+    """A move [m] shortened at the corners of triangles turning by more than `TURN_COSINE`; None if no triangle does.
 
     The moves of the corners are halved until no triangle turns too far. Shortening affects neighbouring triangles, so
     all triangles are examined again.
@@ -66,7 +66,7 @@ def truncated(
     part = torch.ones_like(x[:, :1])
     for _ in range(CUTS):
         after = level.normals(x + part * move)
-        turned = (before * after).sum(dim=1) < TURN * before.norm(dim=1) * after.norm(dim=1)
+        turned = (before * after).sum(dim=1) < TURN_COSINE * before.norm(dim=1) * after.norm(dim=1)
         if not bool(turned.any()):
             break
         part[torch.unique(corners[turned])] *= 0.5
@@ -256,7 +256,7 @@ class Secant:
 
 
 @dataclass(frozen=True, eq=False)
-class Memory:
+class StepHistory:
     """The past of a step.
 
     Attributes:
@@ -271,12 +271,12 @@ class Memory:
     secants: tuple[Secant, ...] = ()
     step: int = 0
 
-    def after(self, carry: Carry, move: Tensor, force: Tensor, image: Tensor, *, dot: Dot) -> Memory:
+    def after(self, carry: Carry, move: Tensor, force: Tensor, image: Tensor, *, dot: Dot) -> StepHistory:
         """The memory after a displacement [m] from a carry with this memory; force [N] and image [m] are at the end."""
         assert carry.preconditioned is not None
         newest = Secant(move, carry.force - force, carry.preconditioned - image, dot)
         images = (carry.preconditioned, self.images[0])
-        return Memory(carry.force, images, (*self.secants, newest)[-SECANTS:], self.step + 1)
+        return StepHistory(carry.force, images, (*self.secants, newest)[-SECANTS:], self.step + 1)
 
 
 def secant_direction(

@@ -16,7 +16,7 @@ from typing import Protocol
 
 from ..deadline import is_over
 
-ROUND, LONGEST = 4, 16
+ROUND, FREE_ROUND = 4, 16
 """Most steps of a round with contact, and without: near pairs are found again after a round."""
 HURRIED = 2
 """Most steps of a first round that somebody waits for."""
@@ -77,7 +77,7 @@ class Budget:
             shrunk: Factor of the tolerance: a metric with contact underestimates moves.
         """
         longest = max(ROUND, math.ceil(EARLY * self.steps)) if first and self.near else ROUND
-        steps = min(HURRIED if self.hurried and first else longest if touching else LONGEST, LONGEST, self.steps)
+        steps = min(HURRIED if self.hurried and first else longest if touching else FREE_ROUND, FREE_ROUND, self.steps)
         once = {} if first else {"rest": 1.0, "least": 0}
         return replace(self, steps=steps, tolerance=shrunk * self.tolerance, **once)
 

@@ -56,28 +56,28 @@ class Kind:
     file: Path
 
 
-KINDS = {"physgraph": Kind(PhysgraphConfig, Physgraph, LearnedMetric, FOLDER / "physgraph.safetensors")}
+NETWORKS = {"physgraph": Kind(PhysgraphConfig, Physgraph, LearnedMetric, FOLDER / "physgraph.safetensors")}
 """All kinds of networks by their name in weights files; `register_kind` adds a kind."""
 
 
 def register_kind(name: str, kind: Kind) -> None:
-    """Add a kind of network to `KINDS`."""
-    KINDS[name] = kind
+    """Add a kind of network to `NETWORKS`."""
+    NETWORKS[name] = kind
 
 
 def kind_of(network: nn.Module) -> str:
     """The name of a network's kind."""
-    return next(name for name, kind in KINDS.items() if isinstance(network, kind.network))
+    return next(name for name, kind in NETWORKS.items() if isinstance(network, kind.network))
 
 
 def integrator_of(network: nn.Module) -> Learned:
     """The unguarded integrator of a network."""
-    return KINDS[kind_of(network)].integrator(network)
+    return NETWORKS[kind_of(network)].integrator(network)
 
 
 def make_network(config: Any) -> Any:
     """An untrained network of the configuration's kind."""
-    return next(kind.network for kind in KINDS.values() if isinstance(config, kind.config))(config)
+    return next(kind.network for kind in NETWORKS.values() if isinstance(config, kind.config))(config)
 
 
 def save_network(network: nn.Module, file: Path) -> str:
@@ -105,7 +105,7 @@ def load_network(file: Path, *, kind: str, device: str = "cpu") -> nn.Module:
 
     Args:
         file: A file written by `save_network`.
-        kind: A name in `KINDS`.
+        kind: A name in `NETWORKS`.
         device: Device for the weights.
 
     Returns:
@@ -140,7 +140,7 @@ def shipped_network(kind: str) -> Any:
     Raises:
         WeightsError: The weights are missing.
     """
-    return load_network(KINDS[kind].file, kind=kind)
+    return load_network(NETWORKS[kind].file, kind=kind)
 
 
 def weights_hash(file: Path) -> str:
@@ -171,7 +171,7 @@ def _read(file: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
 
 def _config(kind: str, values: dict[str, Any]) -> Any:
     """A configuration from a file, with every field present; lists become tuples."""
-    config = KINDS[kind].config
+    config = NETWORKS[kind].config
     for each in fields(config):
         _ = values[each.name]
     made = config(**{name: tuple(value) if isinstance(value, list) else value for name, value in values.items()})

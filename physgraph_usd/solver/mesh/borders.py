@@ -14,7 +14,7 @@ SPACING = 0.25
 """Distance between the sample points of an edge, in median border edges."""
 MOST_SAMPLES = 64
 """Most sample points of one edge."""
-NEAREST = 16
+BORDER_SAMPLES = 16
 """Most sample points examined for each vertex, including the vertex's own two edges."""
 
 
@@ -78,7 +78,7 @@ def nearest_edges(
     start, end = points[edges[owner, 0]], points[edges[owner, 1]]
     reach = within.max() + 0.5 * float((length / count).max())
     tree = cKDTree(start + part[:, None] * (end - start))
-    found = tree.query(points[vertices], k=min(NEAREST, len(owner)), distance_upper_bound=reach)[1]
+    found = tree.query(points[vertices], k=min(BORDER_SAMPLES, len(owner)), distance_upper_bound=reach)[1]
     found = found.reshape(len(vertices), -1)
     row, column = np.nonzero(found < len(owner))
     vertex, edge = vertices[row], edges[owner[found[row, column]]]

@@ -10,7 +10,7 @@ import numpy as np
 
 from .topology import PolygonMesh
 
-FLAT = 1e-7
+NO_AREA = 1e-7
 """Area, as a fraction of the longest edge squared, below which a face counts as having no area in float32."""
 
 
@@ -89,7 +89,7 @@ def _areas_vanish(mesh: PolygonMesh, points: np.ndarray) -> np.ndarray:
     area = np.stack([np.bincount(mesh.corner_face, column, mesh.face_count) for column in twice.T], axis=1)
     longest = np.zeros(mesh.face_count)
     np.maximum.at(longest, mesh.corner_face, ((there - here) ** 2).sum(axis=1))
-    return ~(0.5 * np.linalg.norm(area, axis=1) > FLAT * longest)
+    return ~(0.5 * np.linalg.norm(area, axis=1) > NO_AREA * longest)
 
 
 def _edge_defects(mesh: PolygonMesh) -> list[Defect]:

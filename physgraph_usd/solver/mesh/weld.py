@@ -19,7 +19,7 @@ from .borders import open_edges
 from .subdivide import Refinement, face_points, subdivide_times
 from .topology import PolygonMesh, find_edges, joined_by
 
-AT_ONE_PLACE = 5e-3
+WELDED = 5e-3
 """Distance below which vertices coincide, in mean edges: 4% of an edge after three subdivisions. With a thousandth, a
 border with a gap of about a thousandth would be sewn at every second vertex, worse than fully sewn or fully open."""
 WIDEST = 0.25
@@ -207,13 +207,13 @@ def _edge_pairs(mesh: PolygonMesh, place: np.ndarray) -> np.ndarray:
 
 
 def seam_reach(mesh: PolygonMesh, points: Float[np.ndarray, "vertices 3"], tolerance: float) -> float:
-    """Distance below which vertices coincide [m]: the tolerance, at least `AT_ONE_PLACE`, at most `WIDEST`.
+    """Distance below which vertices coincide [m]: the tolerance, at least `WELDED`, at most `WIDEST`.
 
     A larger tolerance would join neighbours on the same border.
     """
     ends = mesh.half_edges.edges
     edge = float(np.linalg.norm(points[ends[:, 0]] - points[ends[:, 1]], axis=1).mean())
-    return float(np.clip(tolerance, AT_ONE_PLACE * edge, WIDEST * edge))
+    return float(np.clip(tolerance, WELDED * edge, WIDEST * edge))
 
 
 def pairs_within(poses: Sequence[np.ndarray], which: np.ndarray, within: float) -> np.ndarray:
