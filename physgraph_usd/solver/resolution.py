@@ -68,7 +68,7 @@ class LevelChoice:
 
     @property
     def is_tight(self) -> bool:
-        """Whether the cage has no slack: its edges are so little shorter than at rest that nothing of it folds."""
+        """Whether the cage has no slack: edge compression is at most `LEAST_STRAIN`, too little for folds."""
         return 0.0 < self.compression <= LEAST_STRAIN
 
 

@@ -25,10 +25,10 @@ COVERED = 0.9
 THIRD = 1.0 / 6.0
 """How far from the middle of a box its middle third ends, in its sizes."""
 LARGEST = 4.0
-"""Times its cage's size that refined cloth may have, or its cage may have of it: the validator refuses more."""
+"""Largest ratio of the sizes of refined cloth and cage, either way; the validator refuses larger ratios."""
 COLLAPSED = 0.01
-"""Size of a cage over its rest shape's below which there is nothing to solve: edges that are centimetres long at rest
-are shorter there than cloth is thick, so all of it touches all of it."""
+"""Ratio of cage size to rest size below which a frame is only upsampled: edges of a few centimetres at rest are then
+shorter than the cloth is thick, and every vertex touches its neighbours."""
 
 
 @dataclass(frozen=True)

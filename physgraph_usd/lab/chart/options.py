@@ -209,7 +209,7 @@ class Clock:
     """
 
     def __init__(self, minutes: float | None, progress: Callable[[float, float, str], None] | None) -> None:
-        """Start with the minutes that there are, or None; ``progress`` is that of `ChartOptions`."""
+        """Start the clock with a time limit [min] or None; ``progress`` as in `ChartOptions`."""
         self._began = self._entered = time.perf_counter()
         self._minutes, self._progress = minutes, progress
         self._part, self._done, self._shown = next(iter(PARTS)), 0.0, 0.0
@@ -231,7 +231,7 @@ class Clock:
         return self._minutes is not None and self.spent > 60.0 * LATEST * self._minutes
 
     def expect(self, seconds: float) -> None:
-        """Correct the time that all of it will take."""
+        """Set the expected total time [s]."""
         self.expected = seconds if self._minutes is None else min(seconds, 60.0 * self._minutes)
 
     def enter(self, part: str) -> None:

@@ -104,7 +104,7 @@ def _curves(axes: Axes, chart: Chart, style: dict[str, Style]) -> None:
 
 
 def _warm(axes: Axes, chart: Chart, style: dict[str, Style]) -> None:
-    """Gap against time in frames that begin where the last one ended."""
+    """Plot energy gap against time [s] for warm-started frames."""
     for name in dict.fromkeys(each.method for each in chart.warm):
         points = sorted((each for each in chart.warm if each.method == name), key=lambda each: each.steps)
         drawn = style.get(name, Style(BASELINE, dashed=False))
@@ -134,7 +134,7 @@ def _line(
     *,
     alone: str = "",
 ) -> None:
-    """One method, by the name that is written and, where it may be a sign alone, the curve's."""
+    """Plot the curve of a method, labelled by its name."""
     own = alone or name
     axes.plot(
         [max(p.ms, 1e-2) for p in points],

@@ -35,7 +35,7 @@ STARTS = (
 )
 """Integrators and steps: unlike one another, the most successful first, for a short search ends early."""
 SHORT, LEAST = 3, 2
-"""How many of them a short search takes, and one whose time is out: with one alone nobody knows how good it is."""
+"""Number of integrators in a short search, and after the time limit: a single result has no estimate of its error."""
 ON, ROUNDS, MORE = ("quasi-newton-flat", 100), 2, 10
 """How a start goes on, how often at most, and how often more where it is one of the finalists."""
 NEWTON, POLISHES = ("newton", 8), 6

@@ -144,7 +144,7 @@ class Chart:
 
     @property
     def busy(self) -> str:
-        """A warning where other programs had the cores, or ""."""
+        """Warning that other programs used the cores during measurement; "" if none did."""
         waited = self.about["waited"]
         if waited < BUSY or self.about.get("clock") == "cpu":
             return ""
@@ -158,7 +158,7 @@ class Chart:
 
     @property
     def likeness(self) -> dict[str, str]:
-        """Measures that compare with solvers outside, where there are any: fields of the points, and their titles."""
+        """Titles of measured similarities to external solvers, by field of `Point`; empty without such solvers."""
         return {name: title for name, title in LIKENESS.items() if self.notes and self._has(name)}
 
     @property

@@ -22,7 +22,7 @@ from .bodies import Touching
 
 REACH = 2.0
 """Expected distance of the cloth beyond the bounds of its cage, in mean cage edges."""
-COINCIDENT, COPY = 1e-4, 0.5
+COPIED_POINT, COPY = 1e-4, 0.5
 """Distance of coinciding points, in mean edges, and the fraction of coinciding points from which a cage is a copy of
 another cage. Copies do not touch."""
 
@@ -91,7 +91,7 @@ class TouchingGroups:
             points = frames[index].points
             trees[index] = trees.get(index) or cKDTree(points[np.isfinite(points).all(axis=1)])
         distance = np.asarray(trees[a].query(trees[b].data, distance_upper_bound=reach)[0])
-        copies = np.mean(distance < COINCIDENT * (self._edges[a] + self._edges[b]))
+        copies = np.mean(distance < COPIED_POINT * (self._edges[a] + self._edges[b]))
         return bool(np.isfinite(distance).any()) and float(copies) < COPY
 
 

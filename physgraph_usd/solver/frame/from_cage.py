@@ -28,7 +28,7 @@ from ..rigid import best_motion
 from ..scene import Garment
 from .values import FrameState
 
-COINCIDES = 1e-6
+SAME_POINT = 1e-6
 """Distance below which points count as coincident, in edge lengths."""
 LEAST_FOLLOWED = 12
 """Fewest cloth vertices followed by a part."""
@@ -109,7 +109,7 @@ class Followers:
         self._which, row = np.unique(ends[:, 0], return_inverse=True)
         rest = level.rest.double().cpu().numpy()
         length = np.linalg.norm(rest[ends[:, 0]] - rest[ends[:, 1]], axis=1)
-        near = 1.0 / np.maximum(length, COINCIDES * float(level.spacing.mean()))
+        near = 1.0 / np.maximum(length, SAME_POINT * float(level.spacing.mean()))
         beside = sp.csr_matrix((near, (row, ends[:, 1])), shape=(len(self._which), level.vertex_count))
         # Parts without any adjacent cloth stay: the margin makes the matrix invertible.
         degree = sp.diags(np.bincount(row, near, len(self._which)) * (1.0 + 1e-9))

@@ -33,7 +33,7 @@ from .vertex_frame import VertexFrame
 NetworkT = TypeVar("NetworkT", bound=nn.Module)
 
 MOST_GARMENTS = 8
-"""Most garments whose scalar products are summed one by one, in a fixed order."""
+"""Largest number of garments with scalar products summed per garment, in a fixed order."""
 LONGEST_STEP = 5.0
 """Longest move of a vertex in a step, in edge lengths."""
 

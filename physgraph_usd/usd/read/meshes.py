@@ -202,7 +202,7 @@ def _read(mesh: UsdGeom.Mesh, code: Usd.TimeCode, matrix: np.ndarray) -> DrawnMe
 
 
 def _colors(mesh: UsdGeom.Mesh, code: Usd.TimeCode, faces: int) -> np.ndarray:
-    """Linear colour per authored face: subset's material, else the mesh's, else displayColor, else neutral."""
+    """Linear colour of each authored face, shape (F, 3): its subset's or mesh's material, displayColor, or neutral."""
     colors = np.tile(np.array(NEUTRAL), (faces, 1))
     shown = mesh.GetDisplayColorPrimvar().ComputeFlattened(code)
     if shown:
