@@ -30,7 +30,6 @@ from benchmarks.rows import say
 from benchmarks.shots import opened
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.solve import prepare_device
-from physgraph_usd.solver.colliders.pose import MeshPose
 from physgraph_usd.solver.fabric import PRESETS
 from physgraph_usd.solver.frame.refiner import Refiner
 from physgraph_usd.solver.level import Level, build_levels, refine_garments
@@ -112,7 +111,7 @@ def shot_rows(name: str, given: argparse.Namespace) -> None:
     first, last = (float(each) for each in given.frames.split(":"))
     with closing(opened_with(name, 0.0, given)) as shot:
         times = [each for each in shot.scene.times if first <= each <= last]
-        poses = [pose for pose in shot.frame(times[-1]).colliders if isinstance(pose, MeshPose)]
+        poses = [pose for pose in shot.frame(times[-1]).colliders if pose]
         turn = upright if shot.scene.gravity[2] < -1.0 else np.asarray
         [garment, *_] = shot.scene.garments
     level, found = build_levels([garment], refine_garments([garment], [garment.level]))[-1], {}

@@ -32,7 +32,7 @@ from benchmarks.fidelity_stages import SCENES, Body, Stage
 from benchmarks.rows import say, table
 from benchmarks.waves import lowpass, vertex_area
 from physgraph_usd.shot.solve import prepare_device
-from physgraph_usd.solver.colliders.pose import Collider, ShapePose
+from physgraph_usd.solver.colliders.pose import Collider, Pose
 from physgraph_usd.solver.fabric import PRESETS, Fabric
 from physgraph_usd.solver.forces import body_terms, elastic_terms
 from physgraph_usd.solver.forces.base import ForceModule
@@ -195,12 +195,12 @@ def timed(
     stage: Stage, fabric: Fabric, cages: Sequence[np.ndarray], subdivisions: int, *, touches: bool, device: str = "cpu"
 ) -> Iterator[tuple[np.ndarray, float]]:
     """Positions of each frame [m], shape (V, 3), of the cages refined as a shot is, and milliseconds of each."""
-    kinds = [body.pose(0.0).kind for body in stage.bodies]
-    colliders = tuple(Collider(f"/Body{number}", kind) for number, kind in enumerate(kinds)) if touches else ()
+    bodies = enumerate(stage.bodies) if touches else ()
+    colliders = tuple(Collider(f"/Body{number}", body.kind) for number, body in bodies)
     garment = garment_of(stage, subdivisions, touches=touches)
     refiner = Refiner(Scene((garment,), GRAVITY, (), colliders), SolveSettings(), device=device)
     for n, cage in enumerate(cages):
-        poses: tuple[ShapePose, ...] = tuple(body.pose((n + 1) / RATE) for body in stage.bodies) if touches else ()
+        poses: tuple[Pose, ...] = tuple(body.pose((n + 1) / RATE) for body in stage.bodies) if touches else ()
         began = clock.perf_counter()
         (points,) = refiner.solve(Frame(float(n), (GarmentFrame(cage, fabric),), poses)).points
         assert points is not None  # The garment is in every frame.

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from physgraph_usd.solver.colliders.pose import ShapePose
+from physgraph_usd.solver.colliders.pose import Pose
+from physgraph_usd.solver.colliders.primitives import primitive
 
 Motion = Callable[[float], np.ndarray]
 
@@ -26,14 +27,18 @@ class Body:
     half: float
     ends: Callable[[float], tuple[np.ndarray, np.ndarray]]
 
-    def pose(self, time: float) -> ShapePose:
+    @property
+    def kind(self) -> str:
+        """The collider's kind."""
+        return "capsule" if self.half else "sphere"
+
+    def pose(self, time: float) -> Pose:
         """Where it is at a time [s]."""
         middle, axis = self.ends(time)
         side = np.cross([0.0, 1.0, 0.0], axis)
         side = side / np.linalg.norm(side)
         turn = np.stack([side, np.cross(axis, side), axis], axis=1)
-        kind = "capsule" if self.half else "sphere"
-        return ShapePose(kind, turn, middle, np.array([self.radius, self.radius, self.half or self.radius]))
+        return primitive(self.kind, np.array([self.radius, self.radius, self.half]), turn=turn, centre=middle)
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,9 +7,8 @@ import numpy as np
 import torch
 import trimesh
 
-from physgraph_usd.solver.colliders.base import Surface
 from physgraph_usd.solver.colliders.mesh import MeshBody, MeshSurface
-from physgraph_usd.solver.colliders.pose import MeshPose
+from physgraph_usd.solver.colliders.pose import Pose
 
 Soup = tuple[np.ndarray, np.ndarray]
 """Points, shape (V, 3), and triangles, shape (T, 3)."""
@@ -72,10 +71,10 @@ def split(soup: Soup) -> Soup:
 
 def surfaces(soup: Soup, side: str = "auto") -> tuple[MeshSurface, ...]:
     """The closed and the open part, posed."""
-    return MeshBody(side=side, device="cpu", threads=1).pose(MeshPose(*soup))
+    return MeshBody(side=side, device="cpu", threads=1).pose(Pose(*soup))
 
 
-def signed(surface: Surface, x: np.ndarray) -> np.ndarray:
+def signed(surface: MeshSurface, x: np.ndarray) -> np.ndarray:
     """Distances of world positions from a surface [m], negative inside or on the disallowed side."""
     at = torch.as_tensor(x - surface.origin)
     found = surface.closest(at, endless(len(x)))

@@ -16,7 +16,7 @@ from physgraph_usd.solver.collide.distance import weights
 from physgraph_usd.solver.collide.pairs import NearPairs, Reach
 from physgraph_usd.solver.collide.parts import Parts
 from physgraph_usd.solver.collide.search import near_parts
-from physgraph_usd.solver.colliders.pose import Collider, MeshPose, Pose
+from physgraph_usd.solver.colliders.pose import Collider, Pose
 from physgraph_usd.solver.contact.cloth import ClothContact, ClothView
 from physgraph_usd.solver.contact.promise import Promise
 from physgraph_usd.solver.contact.settings import ContactSettings
@@ -173,7 +173,7 @@ def frame_with(
     offset: float = 0.002,
 ) -> Frame:
     """Several garments and bodies, or soups of triangles, at one time code."""
-    bodies = tuple(MeshPose(*pose) if isinstance(pose, tuple) else pose for pose in poses)
+    bodies = tuple(Pose(*pose) if isinstance(pose, tuple) else pose for pose in poses)
     return Frame(time, tuple(GarmentFrame(cage, fabric, guide, offset=offset) for cage in cages), bodies)
 
 

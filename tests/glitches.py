@@ -11,7 +11,7 @@ import trimesh
 
 from physgraph_usd.errors import PhysGraphError
 from physgraph_usd.shot.options import RefineOptions
-from physgraph_usd.solver.colliders.pose import Collider, MeshPose
+from physgraph_usd.solver.colliders.pose import Collider, Pose
 from physgraph_usd.solver.fabric import PRESETS
 from physgraph_usd.solver.frame.refiner import Refiner
 from physgraph_usd.solver.mesh.topology import PolygonMesh
@@ -32,7 +32,7 @@ class SheetOverBall:
     edge: float
     radius: float
 
-    def scene(self, *, subdivisions: int) -> tuple[Scene, MeshPose]:
+    def scene(self, *, subdivisions: int) -> tuple[Scene, Pose]:
         """The sheet, which feels the ball, and the ball with so many subdivisions of an icosahedron."""
         ids = np.arange((self.side + 1) ** 2).reshape(self.side + 1, self.side + 1)
         quads = np.stack([ids[:-1, :-1], ids[:-1, 1:], ids[1:, 1:], ids[1:, :-1]], axis=-1).reshape(-1, 4)
@@ -42,7 +42,7 @@ class SheetOverBall:
         ball = trimesh.creation.icosphere(subdivisions=subdivisions, radius=self.radius)
         points = np.asarray(ball.vertices) - np.array([0.0, self.radius, 0.0])
         scene = Scene((garment,), np.array([0.0, -9.81, 0.0]), (), (Collider("/Ball", "mesh"),))
-        return scene, MeshPose(points, np.asarray(ball.faces, np.int32))
+        return scene, Pose(points, np.asarray(ball.faces, np.int32))
 
     def draped(self, height: float, phase: float = 0.0) -> np.ndarray:
         """The sheet bent over the ball and flared with folds outside it.
@@ -84,7 +84,7 @@ def _cage(change: Callable[[np.ndarray], np.ndarray]) -> Glitch:
 
 def _ball(change: Callable[[np.ndarray], np.ndarray]) -> Glitch:
     def broken(frame: Frame) -> Frame:
-        poses = [MeshPose(change(p.points), p.triangles) for p in frame.colliders if isinstance(p, MeshPose)]
+        poses = [Pose(change(p.points), p.triangles) for p in frame.colliders if p]
         return replace(frame, colliders=tuple(poses))
 
     return broken

@@ -29,7 +29,7 @@ body = {body}
 sheet = Garment.of("/Sheet", faces, rest, colliders=(0,) if body else ())
 scene = Scene((sheet,), np.array([0.0, 0.0, -9.81]), colliders=(Collider("/Ball", "sphere"),))
 frame = Frame(1.0, (GarmentFrame(rest * [0.9, 1.0, 1.0], PRESETS["jersey"]),),
-              (ShapePose("sphere", np.eye(3), np.zeros(3), np.full(3, 0.2)),))
+              (primitive("sphere", np.full(3, 0.2), turn=np.eye(3), centre=np.zeros(3)),))
 refiner, entered = Refiner(scene, SolveSettings()), set()
 sys.setprofile(lambda frame, event, arg: entered.add(frame.f_code.co_filename))
 refiner.solve(frame)

@@ -19,7 +19,7 @@ from cloth import DOWN, Answer, Solver, settings_of
 from folds import EDGE, Cloth, folded, frame_with, named, square, strip
 from meshes import mesh_of
 
-from physgraph_usd.solver.colliders.pose import Collider, MeshPose
+from physgraph_usd.solver.colliders.pose import Collider
 from physgraph_usd.solver.frame.refiner import Refiner
 from physgraph_usd.solver.level import refine_garments
 from physgraph_usd.solver.mesh.subdivide import Refinement
@@ -214,7 +214,7 @@ def inside(name: str, frame: int, points: Sequence[np.ndarray], *, deeper: float
     made, x = shot_of(name), np.concatenate(points)
     found = np.zeros(len(x), bool)
     for pose in made.frames[frame].colliders:
-        assert isinstance(pose, MeshPose)
+        assert pose is not None
         winding = igl.SIGNED_DISTANCE_TYPE_WINDING_NUMBER
         faces = pose.triangles.astype(np.int64)
         found |= np.asarray(igl.signed_distance(x, pose.points, faces, sign_type=winding)[0]) < -deeper

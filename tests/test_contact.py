@@ -11,7 +11,8 @@ from bodies import Soup, ball, box, distances, flipped, together
 from cloth import FABRIC, sheet
 from folds import frame_with, measured, named, refiner_with, square
 
-from physgraph_usd.solver.colliders.pose import Collider, ShapePose
+from physgraph_usd.solver.colliders.pose import Collider, Pose
+from physgraph_usd.solver.colliders.primitives import primitive
 from physgraph_usd.solver.contact.broad_phase import Bodies
 from physgraph_usd.solver.contact.settings import ContactSettings
 
@@ -26,10 +27,10 @@ def draped(height: float) -> np.ndarray:
     return FLAT + np.array([0.0, height, 0.0])
 
 
-def up(kind: str, size: tuple[float, float, float]) -> ShapePose:
+def up(kind: str, size: tuple[float, float, float]) -> Pose:
     """A primitive whose axis is up, at the origin."""
     turn = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
-    return ShapePose(kind, turn, np.zeros(3), np.array(size))
+    return primitive(kind, np.array(size), turn=turn, centre=np.zeros(3))
 
 
 SHAPES = {
@@ -101,7 +102,7 @@ class TestRest:
 def test_a_body_counts_within_its_own_offset(offset: float, counts: bool):
     """A ball that begins 5 cm over the bounds of the cloth."""
     bodies = Bodies([Collider("/World/Ball", "sphere", offset)], device="cpu", threads=1)
-    bodies.pose([ShapePose("sphere", np.eye(3), np.array([0.0, 0.55, 0.0]), np.full(3, 0.5))])
+    bodies.pose([primitive("sphere", np.full(3, 0.5), turn=np.eye(3), centre=np.array([0.0, 0.55, 0.0]))])
     garment = replace(named((MESH, FLAT)), colliders=(0,))
     assert (bodies.near(garment, np.stack([FLAT.min(axis=0), FLAT.max(axis=0)]), 0.0) == (0,)) == counts
 

@@ -17,7 +17,7 @@ from stages import COLLIDER_API
 from physgraph_usd.errors import LayerError
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.solver.colliders.mesh import MeshBody
-from physgraph_usd.solver.colliders.pose import MeshPose
+from physgraph_usd.solver.colliders.pose import Pose
 from physgraph_usd.solver.contact.report import penetration_map
 from physgraph_usd.usd.check.validate import validate_layer
 from physgraph_usd.usd.read.reader import open_shot
@@ -30,7 +30,7 @@ class TestPenetration:
     def test_in_a_mesh_it_is_libigls_distance(self):
         soup = ball(level=4)
         x = np.random.default_rng(1).uniform(-0.25, 0.25, (400, 3))
-        (surface,) = MeshBody(device="cpu", threads=1).pose(MeshPose(*soup))
+        (surface,) = MeshBody(device="cpu", threads=1).pose(Pose(*soup))
         inside = np.linalg.norm(x, axis=1) < 0.199
         clear = np.abs(np.linalg.norm(x, axis=1) - 0.2) > 2e-3
         found = penetration_map([surface], x)
@@ -38,7 +38,7 @@ class TestPenetration:
 
     @pytest.mark.parametrize(("side", "depth"), [("auto", 0.0), ("back", 0.0), ("front", 20.0)])
     def test_an_open_body_has_a_behind_only_where_its_side_is_fixed(self, side: str, depth: float):
-        (surface,) = MeshBody(side=side, device="cpu", threads=1).pose(MeshPose(*tube(around=256)))
+        (surface,) = MeshBody(side=side, device="cpu", threads=1).pose(Pose(*tube(around=256)))
         found = penetration_map([surface], np.array([[0.08, 0.0, 0.0]]))
         assert found[0] == pytest.approx(depth, abs=0.1)
 
@@ -147,7 +147,7 @@ class TestShots:
             assert found is not None
             points = 0.05 * np.asarray(UsdGeom.Mesh(stage.GetPrimAtPath(CLOTH)).GetPointsAttr().Get(time))
             away = np.linalg.norm(points - 0.05 * np.array([2.0, 2.0, time - 3.0]), axis=1)
-            np.testing.assert_allclose(found, 1e3 * np.maximum(0.075 - away, 0.0), atol=1e-3)
+            np.testing.assert_allclose(found, 1e3 * np.maximum(0.075 - away, 0.0), atol=0.1)  # A faceted ball.
             deepest = max(deepest, float(found.max()))
             crossing = values(stage, "crossing", time, path=CLOTH)
             assert crossing is not None

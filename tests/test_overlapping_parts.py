@@ -14,7 +14,7 @@ from folds import frame_with, levels_of, named, refiner_with, square
 from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.solver.colliders.mesh import MeshBody
-from physgraph_usd.solver.colliders.pose import MeshPose
+from physgraph_usd.solver.colliders.pose import Pose
 from physgraph_usd.solver.contact.bodies import FrameBodies, Touching
 from physgraph_usd.solver.contact.cloth import ClothContact, ClothView
 from physgraph_usd.solver.contact.measure import depths, pinched
@@ -31,7 +31,7 @@ OVER, UNDER = (ball(0.15, at=(0.0, side * 0.13, 0.0), level=4) for side in (1.0,
 
 def view_of(levels: tuple[Level, ...], cage: torch.Tensor, *soups: Any) -> ClothView:
     """The finest level of the sheet among bodies, meshes all."""
-    posed = [MeshBody(device="cpu", threads=1).pose(MeshPose(*soup))[0] for soup in soups]
+    posed = [MeshBody(device="cpu", threads=1).pose(Pose(*soup))[0] for soup in soups]
     touching = [Touching(f"/Body{index}", each, (0.002,)) for index, each in enumerate(posed)]
     bodies = FrameBodies.begin(levels[0], touching, cage, origin=np.zeros(3), settings=SETTINGS)
     base, thickness = levels[-1].base.apply(cage), torch.tensor([0.002])

@@ -13,7 +13,8 @@ import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from .colliders.pose import Collider, MeshPose, ShapePose
+    from .colliders.pose import Collider, Pose
+    from .colliders.primitives import primitive
     from .fabric import PRESETS, Fabric
     from .frame.refiner import Refiner
     from .frame.settings import SolveSettings
@@ -26,15 +27,16 @@ __all__ = [
     "Frame",
     "Garment",
     "GarmentFrame",
-    "MeshPose",
+    "Pose",
     "Refiner",
     "Scene",
-    "ShapePose",
     "SolveSettings",
     "State",
+    "primitive",
 ]
 _MODULES = {
-    "colliders.pose": ("Collider", "MeshPose", "ShapePose"),
+    "colliders.pose": ("Collider", "Pose"),
+    "colliders.primitives": ("primitive",),
     "fabric": ("PRESETS", "Fabric"),
     "frame.refiner": ("Refiner",),
     "frame.settings": ("SolveSettings",),

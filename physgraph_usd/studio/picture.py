@@ -11,11 +11,10 @@ import trimesh
 import viser
 from trimesh.exchange.gltf import export_glb
 
-from ..solver.colliders.pose import MeshPose, Pose
+from ..solver.colliders.pose import Pose
 from ..solver.mesh.topology import PolygonMesh
 from ..solver.scene import Frame
 from ..usd.read.bindings import GarmentBindings
-from ..usd.read.bodies import tessellated
 from .brush import Stroke
 from .maps import PLAIN, Map, find_map
 from .session import TuneSession
@@ -248,10 +247,9 @@ class Picture:
 
     def _draw_bodies(self, frame: Frame, column: str, *, at: np.ndarray) -> set[str]:
         """Draw the bodies in a column; returns the names of what is drawn."""
-        found = {f"body/{column}/{index}": mesh_of(pose) for index, pose in enumerate(frame.colliders) if pose}
-        drawn = {name: mesh for name, mesh in found.items() if mesh is not None}
-        for name, mesh in drawn.items():
-            self._place(name, Sheet(*mesh, np.empty((0, 2), int)), BODY, at=at)
+        drawn = {f"body/{column}/{index}": pose for index, pose in _drawn(frame).items()}
+        for name, pose in drawn.items():
+            self._place(name, Sheet(pose.points, pose.triangles, np.empty((0, 2), int)), BODY, at=at)
         return {*drawn}
 
     def _place(
@@ -310,20 +308,14 @@ def light(scene: viser.SceneApi, drawn: np.ndarray, *, right: np.ndarray, up: np
     scene.add_mesh_simple("floor", np.asarray(corners, np.float32), np.array([[0, 1, 2], [0, 2, 3]]), **look)
 
 
-def mesh_of(pose: Pose) -> tuple[np.ndarray, np.ndarray] | None:
-    """Points [m], world space, and triangles of a body; None of a plane, which has no end."""
-    if isinstance(pose, MeshPose):
-        return pose.points, pose.triangles
-    if pose.kind == "plane":
-        return None
-    points, triangles = tessellated(pose.kind, pose.size)
-    return points @ pose.turn.T + pose.centre, triangles
-
-
 def _everything(frame: Frame) -> np.ndarray:
     """Points of all cages and bodies [m], shape (N, 3)."""
-    bodies = [mesh[0] for mesh in map(mesh_of, filter(None, frame.colliders)) if mesh is not None]
-    return np.concatenate([*(each.points for each in frame.garments), *bodies])
+    return np.concatenate([each.points for each in (*frame.garments, *_drawn(frame).values())])
+
+
+def _drawn(frame: Frame) -> dict[int, Pose]:
+    """Poses of the bodies by number, without planes, which have no end."""
+    return {index: pose for index, pose in enumerate(frame.colliders) if pose and not pose.endless}
 
 
 def _edges(mesh: PolygonMesh) -> np.ndarray:

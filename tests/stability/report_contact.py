@@ -23,7 +23,7 @@ from test_contact import draped
 from test_contact_bodies import KINDS, STEP, STILL, bodies, jaws, needles
 from test_tangles import cornered, dented
 
-from physgraph_usd.solver.colliders.pose import MeshPose
+from physgraph_usd.solver.colliders.pose import Pose
 from physgraph_usd.solver.level import refine_garments
 from physgraph_usd.solver.mesh.topology import PolygonMesh
 
@@ -267,7 +267,7 @@ def s30_fast(method: str) -> Result:
     for time in range(4):
         lift = np.array([0.0, STEP * time, 0.0])
         cage = REST + lift + np.array([0.0, 0.149, 0.0])
-        answer = one.solve(frame_with([cage], MeshPose(points + lift, triangles), time=float(time)))
+        answer = one.solve(frame_with([cage], Pose(points + lift, triangles), time=float(time)))
         over = np.linalg.norm(answer.points[0][:, [0, 2]], axis=1) < 0.05
         wrong += inside(answer) + int((answer.points[0][over, 1] < lift[1] + 0.14).sum())
     return none_of(wrong, "inside or under")

@@ -12,7 +12,8 @@ from bodies import Soup, ball, box, together
 from cloth import Answer, base_of
 from folds import EDGE, frame_with, named, refiner_with, square
 
-from physgraph_usd.solver.colliders.pose import MeshPose, ShapePose
+from physgraph_usd.solver.colliders.pose import Pose
+from physgraph_usd.solver.colliders.primitives import primitive
 
 SHEET = square(8)
 REST = SHEET[1]
@@ -49,10 +50,11 @@ def jaws(gap: float, kind: str) -> tuple[Any, ...]:
     """Two bodies above and below the plane of x and z, a gap apart; "one" has both in one mesh."""
     shift = np.array([0.0, 0.05 + 0.5 * gap, 0.0])
     if kind == "capsules":
-        return tuple(ShapePose("capsule", np.eye(3), side * shift, np.array([0.05, 0.05, 0.1])) for side in (1.0, -1.0))
+        size = np.array([0.05, 0.05, 0.1])
+        return tuple(primitive("capsule", size, turn=np.eye(3), centre=side * shift) for side in (1.0, -1.0))
     made = [ball(0.05, level=3)] * 2 if kind == "one" else [box((0.18, 0.1, 0.18)), box((0.2, 0.1, 0.2))]
     both = [(points + side * shift, faces) for side, (points, faces) in zip((1.0, -1.0), made, strict=True)]
-    return (MeshPose(*together(*both)),) if kind == "one" else tuple(MeshPose(*each) for each in both)
+    return (Pose(*together(*both)),) if kind == "one" else tuple(Pose(*each) for each in both)
 
 
 KINDS = {"capsules": ["capsule"] * 2, "boxes": ["mesh"] * 2, "one": ["mesh"]}

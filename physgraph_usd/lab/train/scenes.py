@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ...solver.colliders.pose import Collider, MeshPose
+from ...solver.colliders.pose import Collider, Pose
 from ...solver.fabric import Fabric
 from ...solver.mesh.topology import PolygonMesh
 from ...solver.scene import Frame, Garment, GarmentFrame, Scene
@@ -68,7 +68,7 @@ def moving_scene(rng: np.random.Generator, *, kind: str, frames: int, most_verti
     colliders = (Collider("/Body", "mesh"),) if bodies else ()
     made = []
     for number, cage in enumerate(cages):
-        pose = (MeshPose(edge * bodies[number].points @ turn.T, _triangles(bodies[0])),) if bodies else ()
+        pose = (Pose(edge * bodies[number].points @ turn.T, _triangles(bodies[0])),) if bodies else ()
         points = GarmentFrame(edge * cage @ turn.T, fabric, guide, offset=min(0.002, 0.2 * edge))
         made.append(Frame(float(number), (points,), pose))
     times = tuple(float(number) for number in range(frames))

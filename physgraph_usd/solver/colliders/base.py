@@ -1,15 +1,12 @@
-"""Interface of a posed surface."""
+"""Triangles of a body, and closest points on its surface."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-
-from .pose import Pose
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,10 +39,10 @@ class Nearest:
         distance: Unsigned distances [m], infinite if nothing was in reach, shape (N,).
         point: Closest points [m], shape (N, 3).
         normal: Normals of the surface at the closest points, outward on closed surfaces, shape (N, 3).
-        side: 1 on the normals' side, -1 behind, shape (N,). Where parts of a closed mesh overlap, only `Surface.inside`
-            tells what is inside.
+        side: 1 on the normals' side, -1 behind, shape (N,). Where parts of a closed mesh overlap, only
+            `MeshSurface.inside` tells what is inside.
         rim: True if the closest point is on the rim of an open surface, shape (N,).
-        face: Triangle of the closest point, -1 on primitives, shape (N,), int32.
+        face: Triangle of the closest point, shape (N,), int32.
     """
 
     distance: Float[Tensor, " points"]
@@ -71,56 +68,3 @@ class Nearest:
         """A copy with some points replaced."""
         names = [each.name for each in fields(self)]
         return Nearest(**{name: getattr(self, name).index_put((which,), getattr(others, name)) for name in names})
-
-
-@runtime_checkable
-class Surface(Protocol):
-    """A posed surface.
-
-    Attributes:
-        closed: True if the surface has an inside.
-        fixed_side: Allowed side of an open surface, 1 along the normals or -1; None if the start decides.
-        origin: World position of the origin of the surface's coordinates [m], shape (3,), float64.
-        solid: The surface's triangles, in any pose; primitives are divided into triangles.
-        world: World positions of the triangles' corners [m], shape (B, 3), float64.
-    """
-
-    @property
-    def closed(self) -> bool: ...  # noqa: D102
-
-    @property
-    def fixed_side(self) -> float | None: ...  # noqa: D102
-
-    @property
-    def origin(self) -> np.ndarray: ...  # noqa: D102
-
-    @property
-    def solid(self) -> Solid: ...  # noqa: D102
-
-    @property
-    def world(self) -> np.ndarray: ...  # noqa: D102
-
-    def placed(self, pose: Pose) -> np.ndarray | None:
-        """World positions of the corners in another pose [m]; None if the pose is of another shape."""
-        ...
-
-    def closest(self, x: Float[Tensor, "points 3"], reach: Float[Tensor, " points"]) -> Nearest:
-        """The closest points within reach [m]."""
-        ...
-
-    def inside(self, x: Float[Tensor, "points 3"], *, parts: int = 1) -> Bool[Tensor, " points"]:
-        """Mask of the points inside; all False for open surfaces.
-
-        Args:
-            parts: Least number of overlapping parts of the surface that contain a point.
-        """
-        ...
-
-    def exit(self, x: Float[Tensor, "points 3"], found: Nearest) -> Nearest:
-        """The closest points through which inside points can leave, without faces buried in the surface.
-
-        Args:
-            x: Points inside.
-            found: Result of `closest` for the points.
-        """
-        ...

@@ -22,7 +22,7 @@ from ..mesh.piercing import passes_through, wide
 from ..mesh.threads import argument, run
 from .base import Nearest, Solid
 from .orient import FIXED, Pieces, pieces_of
-from .pose import MeshPose, Pose, moved_rigidly
+from .pose import Pose, moved_rigidly
 
 wp.set_module_options(KERNELS)
 
@@ -102,7 +102,7 @@ class MeshSurface:
 
     def __init__(
         self,
-        pose: MeshPose,
+        pose: Pose,
         triangles: np.ndarray,
         rim: tuple[np.ndarray, np.ndarray] | None,
         *,
@@ -138,7 +138,12 @@ class MeshSurface:
         self.mesh = _hierarchy(wp.array(self._place(pose), dtype=wp.vec3f, device=device), triangles, self.closed)
         self._faces = Faces(self)
 
-    def repose(self, pose: MeshPose) -> None:
+    @property
+    def has_inside(self) -> bool:
+        """True if places are disallowed wherever cloth starts: inside a closed surface, behind a fixed side."""
+        return self.closed or self.fixed_side is not None
+
+    def repose(self, pose: Pose) -> None:
         """Move the surface to another pose of equal topology; a rigid motion keeps the known self-intersections."""
         wp.copy(self.mesh.points, wp.array(self._place(pose), dtype=wp.vec3f, device=self.device))
         self.mesh.refit()
@@ -147,7 +152,7 @@ class MeshSurface:
         self._judged = self._judged if rigid else posed
         self._faces = self._faces.turned() if rigid else Faces(self)
 
-    def _place(self, pose: MeshPose) -> np.ndarray:
+    def _place(self, pose: Pose) -> np.ndarray:
         """Recentre a pose; vertices without a face are moved to the origin."""
         used = pose.points[self._used]
         used = self.world = np.where(np.isfinite(used), used, 0.0)
@@ -159,7 +164,7 @@ class MeshSurface:
 
     def placed(self, pose: Pose) -> np.ndarray | None:
         """World positions of the corners in another pose [m]; None if the pose is of another shape."""
-        if not isinstance(pose, MeshPose) or len(pose.points) != len(self.mesh.points):
+        if len(pose.points) != len(self.mesh.points):
             return None
         points = pose.points[self._used]
         return points if np.isfinite(points).all() else None
@@ -340,7 +345,7 @@ class MeshBody:
         self._points = np.zeros((0, 3))
         self._surfaces: tuple[MeshSurface, ...] = ()
 
-    def pose(self, pose: MeshPose) -> tuple[MeshSurface, ...]:
+    def pose(self, pose: Pose) -> tuple[MeshSurface, ...]:
         """The closed and the open surface at one time code, without empty surfaces."""
         same = self._triangles is not None and (
             pose.triangles is self._triangles or np.array_equal(pose.triangles, self._triangles)
@@ -357,7 +362,7 @@ class MeshBody:
         self._triangles, self._points = (pose.triangles if finite else None), pose.points.copy()
         return self._surfaces
 
-    def _build(self, pose: MeshPose, pieces: Pieces) -> list[MeshSurface]:
+    def _build(self, pose: Pose, pieces: Pieces) -> list[MeshSurface]:
         rims = (None, (pieces.rim, pieces.rim_vertex))
         return [
             MeshSurface(pose, triangles, rim, side=self._side, device=self._device, threads=self._threads)

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..rigid import AT_REST, Rigid, best_motion
 
-COLLIDER_KINDS = ("mesh", "sphere", "capsule", "cylinder", "cube", "plane")
+COLLIDER_KINDS = ("mesh", "sphere", "capsule", "cylinder", "cone", "cube", "plane")
 RIGID = 1e-6
 """Largest deviation of points from a rigid motion, relative to their extent: float32's rounding."""
 
@@ -31,80 +31,33 @@ class Collider:
 
 
 @dataclass(frozen=True, eq=False)
-class MeshPose:
-    """A mesh at one time code.
+class Pose:
+    """The triangles of a collider at one time code.
 
     Attributes:
         points: Positions [m], world space, shape (V, 3), float64.
         triangles: Corners, shape (T, 3), int32; the array object is kept while the topology is unchanged. Wound as
             authored; for the sides "front" and "back" counterclockwise in the world on the front.
+        endless: True if the mesh stands for a plane: only its first four points count for bounds and pictures.
     """
 
     points: np.ndarray
     triangles: np.ndarray
+    endless: bool = False
 
     def corners(self) -> np.ndarray:
-        """Points whose convex hull contains the mesh [m], shape (N, 3)."""
-        return self.points
+        """Points whose convex hull contains what is drawn of the mesh [m], shape (N, 3)."""
+        return self.points[:4] if self.endless else self.points
 
     def equals(self, other: Pose) -> bool:
         """True if both poses are bitwise equal."""
-        return (
-            isinstance(other, MeshPose)
-            and np.array_equal(self.triangles, other.triangles)
-            and np.array_equal(self.points, other.points)
-        )
+        return np.array_equal(self.triangles, other.triangles) and np.array_equal(self.points, other.points)
 
     def moved(self, since: Pose, along: Rigid = AT_REST) -> float:
-        """Largest distance of a point from its image of another pose under a motion [m]; infinite for unlike poses."""
-        if not isinstance(since, MeshPose) or not np.array_equal(self.triangles, since.triangles):
+        """Largest distance of a corner from its image of another pose under a motion [m]; infinite for unlike poses."""
+        if not np.array_equal(self.triangles, since.triangles):
             return np.inf
-        return _farthest(self.points, along(since.points))
-
-
-@dataclass(frozen=True, eq=False)
-class ShapePose:
-    """A primitive at one time code.
-
-    Attributes:
-        kind: "sphere", "capsule", "cylinder", "cube" or "plane".
-        turn: Rotation whose columns are the shape's axes in the world; the third column is the axis of a capsule or a
-            cylinder, and the outer normal of a plane, shape (3, 3), float64.
-        centre: Centre [m], world space, shape (3,), float64.
-        size: Half sizes along the axes [m]: (r, r, r) of a sphere, (r, r, half height without caps) of a capsule or a
-            cylinder, zero for a plane, shape (3,), float64.
-    """
-
-    kind: str
-    turn: np.ndarray
-    centre: np.ndarray
-    size: np.ndarray
-
-    def corners(self) -> np.ndarray:
-        """Points whose convex hull contains the shape [m], shape (N, 3); for an unbounded plane its centre."""
-        reach = self.size.sum()
-        return self.centre + np.array([[-reach], [reach]])
-
-    def equals(self, other: Pose) -> bool:
-        """True if both poses are bitwise equal."""
-        return (
-            isinstance(other, ShapePose)
-            and self.kind == other.kind
-            and all(np.array_equal(getattr(self, n), getattr(other, n)) for n in ("turn", "centre", "size"))
-        )
-
-    def moved(self, since: Pose, along: Rigid = AT_REST) -> float:
-        """Largest distance of an axis end from its image of another pose [m]; infinite for unlike kinds.
-
-        The ends of a plane's axes lie at a metre.
-        """
-        if not isinstance(since, ShapePose) or self.kind != since.kind:
-            return np.inf
-        ends = [each.centre + (each.turn * (each.size if each.size.any() else 1.0)).T for each in (self, since)]
-        return _farthest(ends[0], along(ends[1]))
-
-
-Pose = MeshPose | ShapePose
+        return _farthest(self.corners(), along(since.corners()))
 
 
 def _farthest(points: np.ndarray, others: np.ndarray) -> float:
@@ -123,3 +76,6 @@ def moved_rigidly(before: np.ndarray, after: np.ndarray) -> bool:
         after: Positions of the points after the motion [m].
     """
     return _farthest(after, best_motion(before, after)(before)) <= RIGID * np.ptp(before, axis=0).max()
+
+
+MeshPose = Pose

@@ -20,7 +20,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ..collide.crossings import Pierced
-from ..colliders.base import Nearest, Solid, Surface
+from ..colliders.base import Nearest, Solid
+from ..colliders.mesh import MeshSurface
 from ..forces.self_contact import PairConstraints
 from ..level import Level
 from ..mesh.topology import joined_by, patches_with
@@ -46,7 +47,7 @@ class Touching:
     """
 
     path: str
-    surface: Surface
+    surface: MeshSurface
     offset: tuple[float, ...]
     before: np.ndarray | None = None
 
@@ -136,9 +137,8 @@ class LevelBodies:
 
     def _inside(self, index: int, x: Tensor, cut: Tensor) -> Bool[Tensor, " vertices"]:
         surface, out = self.frame.touching[index].surface, torch.zeros_like(self.level.free[:, 0])
-        decided = surface.closed or surface.fixed_side is not None
         feels = self._feels(index)
-        if not bool(feels.any()) or not (decided or len(cut)):
+        if not bool(feels.any()) or not (surface.has_inside or len(cut)):
             return out
         piece = self.pieces
         if len(cut):
@@ -333,7 +333,7 @@ def _spread(piece: Int[np.ndarray, " vertices"]) -> tuple[np.ndarray, np.ndarray
     return order[taken], piece[order[taken]]
 
 
-def _start_sides(surface: Surface, cage: Float[Tensor, "coarse 3"]) -> Float[Tensor, " coarse"]:
+def _start_sides(surface: MeshSurface, cage: Float[Tensor, "coarse 3"]) -> Float[Tensor, " coarse"]:
     """Side of the surface on which each cage vertex lies, 1 or -1; 0 past the rim, and for closed surfaces."""
     if surface.closed or surface.fixed_side is not None:
         return torch.full_like(cage[:, 0], surface.fixed_side or 0.0)

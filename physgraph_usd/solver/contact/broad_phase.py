@@ -11,10 +11,9 @@ from scipy import sparse
 from scipy.sparse import csgraph
 from scipy.spatial import cKDTree
 
-from ..colliders.base import Surface
-from ..colliders.mesh import MeshBody
-from ..colliders.pose import Collider, MeshPose, Pose, ShapePose
-from ..colliders.primitives import ShapeSurface
+from ..colliders.mesh import MeshBody, MeshSurface
+from ..colliders.orient import FIXED
+from ..colliders.pose import Collider, Pose
 from ..rigid import AT_REST, Rigid
 from ..scene import Garment, GarmentFrame
 from ..strain import has_collapsed
@@ -113,12 +112,13 @@ class Bodies:
         self._device, self._threads = device, threads
         self.forget()
         self._poses: Sequence[Pose | None] = ()
-        self._surfaces: dict[int, tuple[Surface, ...]] = {}
+        self._surfaces: dict[int, tuple[MeshSurface, ...]] = {}
         self._bounds: dict[int, np.ndarray] = {}
 
     def forget(self) -> None:
         """Build every body anew: a refitted hierarchy breaks ties by the pose of its first build."""
-        self._meshes = [MeshBody(side=c.side, device=self._device, threads=self._threads) for c in self.colliders]
+        sides = ["front" if each.kind == "plane" and each.side not in FIXED else each.side for each in self.colliders]
+        self._meshes = [MeshBody(side=side, device=self._device, threads=self._threads) for side in sides]
 
     def pose(self, poses: Sequence[Pose | None]) -> None:
         """Set the pose of each collider for a frame."""
@@ -142,13 +142,9 @@ class Bodies:
         if pose is None:
             return False
         if index not in self._bounds:
-            self._bounds[index] = _bounds(pose)
+            self._bounds[index] = bounds_of(pose.points[np.isfinite(pose.points).all(axis=1)])
         grow = margin + self.colliders[index].offset
         low, high = self._bounds[index]
-        if isinstance(pose, ShapePose) and pose.kind == "plane":
-            normal = pose.turn[:, 2]
-            lowest = float(np.where(normal > 0, bounds[0], bounds[1]) @ normal)
-            return bool(lowest <= pose.centre @ normal + grow)
         return bool((bounds[0] - grow <= high).all() and (low <= bounds[1] + grow).all())
 
     def touching(
@@ -179,15 +175,10 @@ class Bodies:
                 found.append(Touching(collider.path, surface, offset, placed))
         return tuple(found)
 
-    def _posed(self, index: int) -> tuple[Surface, ...]:
+    def _posed(self, index: int) -> tuple[MeshSurface, ...]:
         if index not in self._surfaces:
-            pose, mesh = self._poses[index], self._meshes[index]
-            if isinstance(pose, ShapePose):
-                self._surfaces[index] = (ShapeSurface(pose, device=self._device),)
-            elif isinstance(pose, MeshPose):
-                self._surfaces[index] = mesh.pose(pose)
-            else:
-                self._surfaces[index] = ()
+            pose = self._poses[index]
+            self._surfaces[index] = () if pose is None else self._meshes[index].pose(pose)
         return self._surfaces[index]
 
 
@@ -209,11 +200,3 @@ def bounds_of(points: np.ndarray) -> np.ndarray:
         return np.stack([np.full(3, np.inf), np.full(3, -np.inf)])
     columns = np.ascontiguousarray(points.T)  # Over rows of three numpy is slow.
     return np.stack([columns.min(axis=1), columns.max(axis=1)])
-
-
-def _bounds(pose: Pose) -> np.ndarray:
-    """World bounds of a pose [m], shape (2, 3)."""
-    if isinstance(pose, ShapePose):
-        return ShapeSurface(pose).bounds + pose.centre
-    finite = pose.points[np.isfinite(pose.points).all(axis=1)]
-    return bounds_of(finite)

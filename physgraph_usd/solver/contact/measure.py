@@ -8,7 +8,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ..colliders.base import Nearest, Surface
+from ..colliders.base import Nearest
+from ..colliders.mesh import MeshSurface
 from ..level import Level
 
 DETOUR = 1.05
@@ -22,7 +23,8 @@ class Penetration:
     """Penetration of a garment into one surface.
 
     Attributes:
-        inside: Number of free vertices deeper than `DEEP` in a closed surface, without pinched vertices.
+        inside: Number of free vertices deeper than `DEEP` in a closed surface or behind a fixed side, without pinched
+            vertices.
         percent: Percentage of all free vertices.
         deepest_mm: Depth of the deepest free vertex [mm].
         pinned: Number of pinned vertices deeper than `DEEP`; pinned vertices stay.
@@ -41,7 +43,7 @@ class Penetration:
 
 
 def penetration(
-    surface: Surface,
+    surface: MeshSurface,
     level: Level,
     x: Float[Tensor, "vertices 3"],
     inside: Bool[Tensor, " vertices"],
@@ -75,14 +77,14 @@ def penetration(
 
 
 def depths(
-    surface: Surface,
+    surface: MeshSurface,
     x: Float[Tensor, "vertices 3"],
     inside: Bool[Tensor, " vertices"],
     longest: float,
     *,
     lost: Bool[Tensor, " vertices"] | None = None,
 ) -> tuple[Float[Tensor, " vertices"], Bool[Tensor, " vertices"]]:
-    """Length of the way out of a closed surface for each vertex [m], 0 outside, and a mask of the pinched vertices.
+    """Length of each vertex's way out of a surface with an inside [m], 0 outside, and a mask of pinched vertices.
 
     Args:
         x: Positions in the surface's coordinates [m].
@@ -91,7 +93,7 @@ def depths(
         lost: Vertices of cloth between overlapping parts, or None.
     """
     depth, stays = torch.zeros_like(x[:, 0]), torch.zeros_like(inside)
-    within = torch.nonzero(inside).squeeze(1) if surface.closed else depth.long()[:0]
+    within = torch.nonzero(inside).squeeze(1) if surface.has_inside else depth.long()[:0]
     if len(within):
         found = surface.closest(x[within], torch.full_like(depth[within], float("inf")))
         way = surface.exit(x[within], found)

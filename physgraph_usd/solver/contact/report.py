@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..collide.crossings import all_crossings, crossings
-from ..colliders.base import Surface
+from ..colliders.mesh import MeshSurface
 from ..level import Level
 from .bodies import LevelBodies
 from .cloth import ClothView, ContactState
@@ -55,7 +55,7 @@ def _of_bodies(
     """Penetrations and crossings of each body before and after the solve."""
     found: dict[str, object] = {}
     for index, each in enumerate(bodies.frame.touching):
-        name = each.path if each.surface.closed else f"{each.path} (open part)"
+        name = each.path if each.surface.has_inside else f"{each.path} (open part)"
         lost = None if bodies.lost is None else bodies.lost[index]
         found[name] = {
             "before": asdict(_penetration(bodies, index, before, first, lost=None)),
@@ -87,7 +87,7 @@ def swallowed(
     return found
 
 
-def penetration_map(surfaces: Sequence[Surface], points: np.ndarray, *, device: str = "cpu") -> np.ndarray:
+def penetration_map(surfaces: Sequence[MeshSurface], points: np.ndarray, *, device: str = "cpu") -> np.ndarray:
     """Depth of each vertex in the deepest of some bodies [mm].
 
     In a closed body the depth is the length of the way out; behind an open surface with a fixed side, the distance.
@@ -113,7 +113,7 @@ def penetration_map(surfaces: Sequence[Surface], points: np.ndarray, *, device: 
     return (1e3 * deepest).to(torch.float32).cpu().numpy()
 
 
-def body_crossings(level: Level, surfaces: Sequence[Surface], points: np.ndarray) -> np.ndarray:
+def body_crossings(level: Level, surfaces: Sequence[MeshSurface], points: np.ndarray) -> np.ndarray:
     """Mask of the corners of cloth edges and faces that cross a body, shape (V,), bool.
 
     Args:

@@ -13,7 +13,8 @@ import numpy as np
 from pxr import Usd, UsdGeom
 
 from ...solver.colliders.orient import FIXED
-from ...solver.colliders.pose import Collider, MeshPose, Pose, ShapePose
+from ...solver.colliders.pose import Collider, Pose
+from ...solver.colliders.primitives import primitive
 from ...solver.mesh.topology import PolygonMesh
 from ...solver.scene import FARTHEST, out_of_bounds
 from ..lookup import Override, find_token, find_value
@@ -25,14 +26,10 @@ from .placement import is_flipped, place
 
 DRAWN_NEAR = 0.1
 """Largest error of a body's surface relative to the contact offset: a smaller error is invisible behind the offset."""
-_EVEN = 1e-4
-"""Relative difference below which two scales count as equal."""
 _LEAST_OFFSET = 1e-3
 """Least offset for choosing a body's subdivision [m]: an offset of 0 would ask for unlimited subdivision."""
 _PLANE_START = ("plane", "start")
 _KINDS = ("Sphere", "Capsule", "Cylinder", "Cube", "Plane", "Cone")
-_TURNS, _RISES = 64, 24
-"""Segments about the axis and along a half circle."""
 
 UPRIGHT = {
     "X": np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
@@ -126,7 +123,7 @@ class ColliderReader:
         placed = place(np.where(np.isfinite(points), points, np.nan).astype(np.float64), matrix)
         if skinned is not None and skinned.shape == placed.shape:
             placed = skinned
-        return MeshPose(faces.drawn.place(placed), triangles), self._coarse(faces.drawn)
+        return Pose(faces.drawn.place(placed), triangles), self._coarse(faces.drawn)
 
     def _faces_of(self, points: np.ndarray, authored: tuple[np.ndarray, ...]) -> _Faces:
         """The drawn faces; cached while the topology stays the same.
@@ -168,27 +165,18 @@ class ColliderReader:
             normal = np.cross(linear[:, 0], linear[:, 1]) * np.sign(np.linalg.det(linear) or 1.0)
             if not np.linalg.norm(normal) > 0:
                 return None, (self._out(time, "its transform flattens it"),)
-            normal = -normal if self.collider.side == "back" else normal
-            return ShapePose(kind, _frame_about(normal), matrix[:3, 3], np.zeros(3)), ()
-        stretch = np.linalg.norm(linear, axis=0)
-        turn = linear / np.maximum(stretch, 1e-300)
-        square = np.allclose(turn.T @ turn, np.eye(3), atol=_EVEN)
-        even = {"sphere": (0, 1, 2), "capsule": (0, 1, 2), "cylinder": (0, 1), "cube": ()}.get(kind)
-        same = even is not None and np.allclose(stretch[list(even)], stretch[0] if even else 1.0, rtol=_EVEN)
-        if square and same and self.collider.side != "start":
-            return ShapePose(kind, turn, matrix[:3, 3], size * stretch), ()
-        points, triangles = tessellated(kind, size)
-        return MeshPose(points @ linear.T + matrix[:3, 3], triangles), ()
+            linear = _frame_about(normal)
+        return primitive(kind, size, turn=linear, centre=matrix[:3, 3]), ()
 
     def _bounded(self, pose: Pose, time: float | None) -> tuple[Pose | None, tuple[Notice, ...]]:
         """The pose without out-of-bounds parts: without the faces at such points, or None for a primitive."""
         if not (message := out_of_bounds(pose.corners())):
             return pose, ()
-        if not isinstance(pose, MeshPose):
+        if self.collider.kind != "mesh":
             return None, (self._out(time, message),)
         near = np.asarray((np.abs(pose.points) <= FARTHEST).all(axis=1))
         message = f"{message}; faces with it, and with {(~near).sum() - 1} more such, are left out"
-        whole = MeshPose(np.where(near[:, None], pose.points, np.nan), pose.triangles)
+        whole = Pose(np.where(near[:, None], pose.points, np.nan), pose.triangles)
         return whole, (Notice(self.collider.path, time, message),)
 
     def _out(self, time: float | None, why: str) -> Notice:
@@ -279,48 +267,3 @@ def _frame_about(normal: np.ndarray) -> np.ndarray:
     first = np.cross(np.eye(3)[np.abs(third).argmin()], third)
     first /= np.linalg.norm(first)
     return np.stack([first, np.cross(third, first), third], axis=1)
-
-
-def tessellated(kind: str, size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points, shape (V, 3), and outward triangles, shape (T, 3), int32, of a primitive about its third axis.
-
-    Args:
-        kind: "sphere", "capsule", "cylinder", "cone" or "cube".
-        size: Half sizes, the capsule's without its caps, shape (3,).
-    """
-    if kind == "cube":
-        return _box(size)
-    angle = np.linspace(-0.5 * np.pi, 0.5 * np.pi, _RISES + 1)
-    arc = size[0] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    height = size[2]
-    shift = np.array([0.0, height])
-    profiles = {
-        "sphere": arc,
-        "capsule": np.concatenate([arc[: _RISES // 2 + 1] - shift, arc[_RISES // 2 :] + shift]),
-        "cylinder": np.array([[0.0, -height], [size[0], -height], [size[0], height], [0.0, height]]),
-        "cone": np.array([[0.0, -height], [size[0], -height], [0.0, height]]),
-    }
-    return _revolved(profiles[kind][1:-1], profiles[kind][[0, -1], 1])
-
-
-def _revolved(profile: np.ndarray, poles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Turn a profile of (radius, height) rows, upwards, about the third axis and close it at two heights."""
-    rows = len(profile)
-    a = 2.0 * np.pi * np.arange(_TURNS) / _TURNS
-    ring = np.stack([profile[:, :1] * np.cos(a), profile[:, :1] * np.sin(a), profile[:, 1:] + 0.0 * a], axis=2)
-    ends = np.array([[0.0, 0.0, poles[0]], [0.0, 0.0, poles[1]]])
-    ids = np.arange(rows * _TURNS).reshape(rows, _TURNS)
-    here, there = ids, np.roll(ids, -1, axis=1)
-    quads = np.stack([here[:-1], there[:-1], there[1:], here[1:]], axis=-1).reshape(-1, 4)
-    south, north = rows * _TURNS, rows * _TURNS + 1
-    bottom = np.stack([np.full(_TURNS, south), there[0], here[0]], axis=1)
-    top = np.stack([np.full(_TURNS, north), here[-1], there[-1]], axis=1)
-    triangles = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]], bottom, top])
-    return np.concatenate([ring.reshape(-1, 3), ends]), triangles.astype(np.int32)
-
-
-def _box(size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The eight corners and twelve triangles of a box."""
-    signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=np.float64)
-    quads = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
-    return signs * size, np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]]).astype(np.int32)

@@ -24,7 +24,6 @@ from pxr import Sdf, Usd
 from ...errors import AbsentError, SchemaError, StageError, UsageError
 from ...interrupts import leave_if_asked
 from ...solver.colliders.orient import choose_side
-from ...solver.colliders.pose import MeshPose
 from ...solver.scene import Frame, Scene, refuse_falling, refuse_far
 from ..lookup import check_limits, check_overrides, is_on, parse_overrides
 from ..provenance import mute_refined, refuse_refined, selections, unsaved_layers
@@ -414,7 +413,7 @@ def _with_sides(
             front = body.on_side("front")  # On side "front", faces are wound as seen in world space.
             pose, _ = front.pose(time)
             felt = [cage for reader, cage in zip(readers, cages, strict=True) if number in reader.garment.colliders]
-            side = choose_side(pose.points, pose.triangles, felt) if isinstance(pose, MeshPose) else "auto"
+            side = choose_side(pose.points, pose.triangles, felt) if pose is not None else "auto"
             found[number] = front.on_side(side)
     return found
 
