@@ -272,16 +272,7 @@ def _modelled(opened: Shot, report: RefineReport, options: RefineOptions) -> dic
         modelled["self contact"] = f"pairs of points, {where}"
     if options.temporal == "tether" and len(opened.scene.times) > 1:
         modelled["tether"] = "ties each frame to the last one's detail"
-    if options.temporal != "off" and len(opened.scene.times) > 1:
-        modelled |= _creased(report)
     return modelled
-
-
-def _creased(report: RefineReport) -> dict[str, str]:
-    """Garments with crease memory, and the time constants."""
-    times = {garment["path"]: garment["fabric"]["crease_time"] for garment in report.garments}
-    worn = [f"{time:g} s for {path}" for path, time in times.items() if time]
-    return {"crease memory": f"folds set and fade in {', '.join(worn)}"} if worn else {}
 
 
 def _pull(gravity: np.ndarray) -> str:

@@ -23,7 +23,6 @@ class Fabric:
         stretch_limit: Strain from which the cloth stiffens; None is never.
         warp_ease: Length along the warp that the cloth has and its rest shape does not show, as a fraction.
         weft_ease: The same along the weft.
-        crease_time: Time in which hinges come to rest where they are bent [s]; 0 is never.
     """
 
     stretch: float = 30.0
@@ -36,7 +35,6 @@ class Fabric:
     stretch_limit: float | None = None
     warp_ease: float = 0.0
     weft_ease: float = 0.0
-    crease_time: float = 0.0
 
     @property
     def has_membrane(self) -> bool:
@@ -59,7 +57,7 @@ PRESETS: dict[str, Fabric] = {
     "jersey": Fabric(30.0, 4.7e-6, 0.187),
     "rib": Fabric(50.0, 9.3e-6, 0.276),
     "leather": Fabric(640.0, 50e-6, 0.65),
-    "worn-denim": Fabric(1054.0, 14e-6, 0.324, shear=69.0, weft_stretch=226.0, weft_ease=0.02, crease_time=1.5),
+    "worn-denim": Fabric(1054.0, 14e-6, 0.324, shear=69.0, weft_stretch=226.0, weft_ease=0.02),
     "crisp-cotton": Fabric(261.0, 23e-6, 0.150, weft_ease=0.01),
     "soft-jersey": Fabric(30.0, 3.6e-6, 0.187, weft_ease=0.03),
 }

@@ -18,7 +18,7 @@ from .fabric import Fabric
 from .grain import SHORTEST, LevelGrain, axes, edge_cosines
 from .mesh.defects import NO_AREA
 from .mesh.elements import QUAD_SPRING, ElasticElements, elastic_elements
-from .mesh.lengths import ANGLES, LENGTHS, NORMALS, ElementValues
+from .mesh.lengths import LENGTHS, NORMALS, ElementValues
 from .mesh.stencil import Stencil
 from .mesh.subdivide import Refinement, crease_mask, creases_of, halves_of, on_triangles, smooth, subdivide_times
 from .mesh.topology import PolygonMesh, TriangleSplit, edges_of, find_edges
@@ -174,11 +174,6 @@ class Level:
     def normals(self) -> ElementValues:
         """Gives the triangles' normals at positions [m], twice their areas long [m^2]."""
         return ElementValues(NORMALS, self.triangles, self.rest, shape=(3,), threads=self.threads)
-
-    @cached_property
-    def angles(self) -> ElementValues:
-        """Gives the hinges' signed angles at positions [m], in [-pi, pi]."""
-        return ElementValues(ANGLES, self.hinges, self.rest, shape=(), threads=self.threads)
 
     @cached_property
     def base(self) -> Stencil:

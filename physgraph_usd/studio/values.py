@@ -84,7 +84,6 @@ TUNABLES: dict[str, Tunable] = {
     for each in (
         Tunable("rest:weftEase", "%", 1.0, lambda f: _percent(f.fabric.weft_ease), decades=False),
         Tunable("rest:warpEase", "%", 1.0, lambda f: _percent(f.fabric.warp_ease), decades=False),
-        Tunable("rest:creaseTime", "s", 1.0, lambda f: f.fabric.crease_time, decades=False),
         Tunable("stretchStiffness", "N/m", 1.0, lambda f: f.fabric.stretch),
         Tunable("weftStretchStiffness", "N/m", 1.0, lambda f: f.fabric.weft_stretch),
         Tunable("shearStiffness", "N/m", 1.0, lambda f: f.fabric.shear),
@@ -103,7 +102,6 @@ TUNABLES: dict[str, Tunable] = {
 SAYS = {
     "rest:weftEase": "Higher: more folds, running along the warp.",
     "rest:warpEase": "Higher: more folds, running along the weft.",
-    "rest:creaseTime": "Folds stay in the cloth after half this time; 0: never.",
     "stretchStiffness": "Lower: cloth gives way and folds less; higher: it folds.",
     "weftStretchStiffness": "Along the weft. Lower: cloth gives way and folds less.",
     "shearStiffness": "Lower: cloth drapes round shapes; higher: it buckles in slanting folds.",

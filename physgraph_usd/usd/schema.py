@@ -41,7 +41,10 @@ for other pieces the side of the coarse cloth.
 """
 AXES = ("X", "Y", "Z", "-X", "-Y", "-Z")
 """Directions along the stage's axes."""
-RETIRED = {"physgraph:contact:layer": "the order of layers is found in the animation, not authored"}
+RETIRED = {
+    "physgraph:contact:layer": "the order of layers is found in the animation, not authored",
+    "physgraph:rest:creaseTime": "folds are not remembered",
+}
 """Attributes of earlier versions by full name, each with what replaced it."""
 _JERSEY = PRESETS["jersey"]
 
@@ -197,11 +200,6 @@ PROPERTIES: tuple[Property, ...] = (
     _ease("warp"),
     _ease("weft"),
     Property(
-        GARMENT_API, "physgraph:rest:creaseTime", "float", 0.0, "s", 0.0, 1e6,
-        "Time in which folds set, half of the way; 0 is never." + SI,
-        "Crease Time", REST, (0.0, 10.0),
-    ),
-    Property(
         GARMENT_API, "physgraph:contact:offset", "float", 0.002, "m", 0.0, 10.0,
         "Distance kept from colliders." + SI, "Contact Offset", CONTACT, (1e-4, 3e-2),
     ),
@@ -309,7 +307,6 @@ def every_fabric_value(fabric: Fabric) -> dict[str, float | None]:
         "stretchLimit": None if fabric.stretch_limit is None else 100.0 * fabric.stretch_limit,
         "rest:warpEase": 100.0 * fabric.warp_ease or None,
         "rest:weftEase": 100.0 * fabric.weft_ease or None,
-        "rest:creaseTime": fabric.crease_time or None,
     }
 
 

@@ -230,22 +230,19 @@ class Elements:
         gather = cast(wp.Kernel, _gather_corners_at_once) if single else _GATHER[dtype]
         self._gather = Launch(gather, level.vertex_count, inputs, device=device, threads=threads)
 
-    def evaluate(
-        self, x: Float[Tensor, "vertices 3"], force: Float[Tensor, "vertices 3"], given: Mapping[int, Any] | None = None
-    ) -> Float[Tensor, ""]:
+    def evaluate(self, x: Float[Tensor, "vertices 3"], force: Float[Tensor, "vertices 3"]) -> Float[Tensor, ""]:
         """Run the element kernel and gather: adds to ``force`` and returns the energy.
 
         Args:
             x: Positions [m].
             force: Force [N], added to in place.
-            given: The kernel's own arrays that change from call to call, by position; always the same positions.
 
         Returns:
             Energy [J], float64 scalar.
         """
         if not self.count:
             return torch.zeros((), dtype=torch.float64, device=x.device)
-        self._elements({0: vectors(x)} | {2 + place: array for place, array in (given or {}).items()})
+        self._elements({0: vectors(x)})
         self._gather({3: vectors(force)})
         return self.energy.sum(dtype=torch.float64)
 

@@ -17,7 +17,6 @@ from theta0. Gradient after Bridson, Marino, Fedkiw, "Simulation of Clothing wit
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -35,7 +34,6 @@ from ..level import Level
 from ..mesh.kernels import KERNELS
 from ..mesh.simd import eight_elements
 from ..mesh.stencil import add_at
-from ..mesh.threads import argument
 from .base import Elements, element_overloads
 
 wp.set_module_options(KERNELS)
@@ -224,7 +222,6 @@ class Bending:
 
     Attributes:
         weight: Angular stiffness [N m], shape (H,).
-        rest_angle: Angles at rest [rad], shape (H,).
     """
 
     name = "bending"
@@ -251,7 +248,7 @@ class Bending:
         if least is not None:
             scaled = torch.maximum(scaled, least)
         self.weight = scaled * level.hinge_shape
-        self._level, self.rest_angle = level, level.rest_angle
+        self._level = level
         narrow = (level.hinges[:, 2] == level.hinges[:, 3]) & (level.hinges[:, 4] == level.hinges[:, 5])
         self._kinds = [
             _Kind(
@@ -267,18 +264,11 @@ class Bending:
             if len(which)
         ]
 
-    def resting_at(self, rest_angle: Float[Tensor, " hinges"]) -> Bending:
-        """A copy with different rest angles [rad], read again at each evaluation."""
-        bending = copy.copy(self)
-        bending.rest_angle = rest_angle
-        return bending
-
     def add_force(self, x: Float[Tensor, "vertices 3"], force: Float[Tensor, "vertices 3"]) -> Float[Tensor, ""]:
         """Add the force [N] in place and return the energy [J]."""
         energy = torch.zeros((), dtype=torch.float64, device=x.device)
         for each in self._kinds:
-            angle = self.rest_angle if len(self._kinds) == 1 else self.rest_angle[each.which]
-            energy = energy + each.elements.evaluate(x, force, {1: argument(angle)})
+            energy = energy + each.elements.evaluate(x, force)
         return energy
 
     def split(self, x: Float[Tensor, "vertices 3"]) -> tuple[Float[Tensor, " parts"], Int[Tensor, " parts"]]:

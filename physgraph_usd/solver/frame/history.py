@@ -104,14 +104,14 @@ class Origin:
         one = self.state is not None and len(known) == len(self.frames) and len({each.time for each in known}) == 1
         return known[0].colliders if one else ()
 
-    def elapsed(self, time: float | None, seconds: float) -> list[float]:
-        """Time from each garment's start frame to a time code [s]; 0 without either.
+    def elapsed(self, time: float | None, seconds: float) -> float:
+        """Longest time from a garment's start frame to a time code [s]; 0 without either.
 
         Args:
             seconds: Length of one time code [s].
         """
-        starts = [None if each is None else each.time for each in self.frames]
-        return [0.0 if time is None or start is None else seconds * (time - start) for start in starts]
+        starts = [each.time for each in self.frames if each is not None and each.time is not None]
+        return 0.0 if time is None or not starts else seconds * (time - min(starts))
 
     def telemetry(self, walked_from: float | None) -> dict[str, object]:
         """Telemetry of the start, given the time code from which a cold frame's cage was advanced, or None."""
@@ -188,11 +188,9 @@ def jumped_from(
 
 
 def is_same(part: tuple[int, ...], frame: Frame, memories: Sequence[GarmentHistory], near: Sequence[int]) -> bool:
-    """Whether garments and nearby bodies are unchanged, were solved together, and creases are at rest."""
+    """Whether garments and nearby bodies are unchanged and were solved together."""
     for index, each in zip(part, (each.last for each in memories), strict=True):
         if each is None or each.part != part or near != each.near or not each.whole:
-            return False
-        if each.state.creeps and frame.time != each.time:
             return False
         now, then = frame.garments[index], each.frame
         if not (set_alike(now, then) and np.array_equal(now.points, then.points)):

@@ -14,7 +14,6 @@ from torch import Tensor
 from ..fabric import Fabric
 from ..forces import bending_term, body_terms
 from ..forces.base import Force, ForceModule
-from ..forces.bending import Bending
 from ..forces.guide import Guide, GuideMap
 from ..forces.membrane import in_plane_terms
 from ..forces.tether import Tether
@@ -145,7 +144,7 @@ class LevelForces:
     @property
     def _elastic(self) -> tuple[Fabric, ...]:
         """The fabrics without the values that no elastic term depends on."""
-        return tuple(replace(each, density=0.0, thickness=0.0, crease_time=0.0) for each in self._fabrics)
+        return tuple(replace(each, density=0.0, thickness=0.0) for each in self._fabrics)
 
     @cached_property
     def _stiffness(self) -> Float[Tensor, " vertices"]:
@@ -177,17 +176,9 @@ class LevelForces:
         """The move to remove a coarser mesh's facets from x, as in `facets` [m]; zero if nothing resists bending."""
         return facets(self.level, x, below, smooth.apply) if self.bends else torch.zeros_like(x)
 
-    def module(
-        self, coarse: Float[Tensor, "coarse 3"], rest_angle: Float[Tensor, " hinges"] | None = None
-    ) -> ForceModule:
-        """All terms of one frame, given the recentred coarse positions [m], and optional rest angles [rad]."""
-        return ForceModule((*self._resting_at(rest_angle), self.guide.retarget(coarse)))
-
-    def _resting_at(self, rest_angle: Float[Tensor, " hinges"] | None) -> tuple[Force, ...]:
-        """The lasting terms, with optional different rest angles [rad]."""
-        if rest_angle is None:
-            return self.terms
-        return tuple(each.resting_at(rest_angle) if isinstance(each, Bending) else each for each in self.terms)
+    def module(self, coarse: Float[Tensor, "coarse 3"]) -> ForceModule:
+        """All terms of one frame, given the recentred coarse positions [m]."""
+        return ForceModule((*self.terms, self.guide.retarget(coarse)))
 
     def system(
         self,

@@ -16,7 +16,6 @@ from ..integrate.descend import LevelReport
 from ..level import Placed, unhindered
 from ..resolution import edge_strain, sharp_folds
 from ..scene import FARTHEST
-from .creases import keeps_creases
 from .level_forces import named
 from .problem import Problem
 from .values import FrameState
@@ -61,7 +60,6 @@ def state_left(problem: Problem, x: Placed) -> FrameState:
     view, cage = problem.view(problem.finest), problem.cage
     stored = problem.group.moving_frames.store(cage.points, x)
     fine = x.double() + torch.as_tensor(cage.origin).to(x.device)
-    lasts = problem.group.settings.temporal != "off"
     lost = None if problem.contact is None else problem.contact.given_up
     clean = view is not None and lost is None and view.cloth.is_clean(x)
     exempt = None if view is None else view.cloth.exempt(x)
@@ -73,8 +71,6 @@ def state_left(problem: Problem, x: Placed) -> FrameState:
         clean=clean,
         inside=None if exempt is None else exempt[: len(x)],
         given_up=lost,
-        bent=() if problem.creases is None else problem.creases.split(problem.forces[-1].level),
-        creeps=lasts and keeps_creases(problem.frame) and not problem.start.rests,
     )
 
 

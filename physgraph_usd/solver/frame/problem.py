@@ -18,7 +18,6 @@ from ..integrate.base import Integrator, System
 from ..integrate.metric import Metric
 from ..integrate.stop import Budget
 from ..level import Level, Placed
-from .creases import Creases, creases_of
 from .group import Group
 from .level_forces import LevelForces
 from .start import Start, start_of, torn
@@ -93,7 +92,6 @@ class Problem:
         before: Fine positions in the last frame [m], float64; None without a last frame.
         inside: Mask of the vertices inside a body in the last frame; None if none was.
         tether: Stiffness of the tie to the start [1/s^2]; None without tie.
-        creases: Crease memory of the cloth; None for a cold start, or without creases.
     """
 
     began: float
@@ -108,7 +106,6 @@ class Problem:
     before: Placed | None
     inside: Bool[Tensor, " vertices"] | None
     tether: float | None
-    creases: Creases | None = None
 
     @property
     def warm(self) -> bool:
@@ -159,13 +156,10 @@ class Problem:
             since: Time at which the frame was ready to be solved [s].
         """
         lasting, settings = self.forces[index], self.group.settings
-        angles = self.creases.rest_angle if self.creases is not None and index == self.finest else None
-        module = lasting.module(self.aim, angles)
+        module = lasting.module(self.aim)
         tie = None if self.tether is None or self.start.detailed is None else (self.tether, self.start.detailed)
         alone = lasting.system(module, tie, rough=settings.rough)
         budget = settings.budget(self.finest - index, since, warm=self.warm)
-        if self.creases is not None:  # The stopping measure misses fading creases.
-            budget = replace(budget, near=0.0, rest=0.0 if self.start.held else budget.rest)
         budget = replace(budget, steps=0) if self.start.rests else budget
         who = (self.group.integrator, self.group.untangler)
         return LevelProblem(lasting, module, alone, self.view(index), *who, budget, self.group.outward)
@@ -213,10 +207,9 @@ def begin(group: Group, frame: FrameInput, last: FrameState | None) -> Problem:
     forces, cage, settings = group.forces_for(frame.garments), group.cage(frame.garments), group.settings
     known = None if settings.temporal == "off" else last
     before = None if last is None else last.about(cage.origin)
-    creases = creases_of(forces[-1].level, frame, known)
     moved = frame.moved if settings.temporal == "tether" else np.inf  # Only the tether slows the cloth down.
     reset = {"frames": group.moving_frames, "finest": forces[-1].level, "reset": settings.reset}
-    start = start_of(known, cage, **reset, moved=moved, pace=1.0 if creases is None else creases.pace)
+    start = start_of(known, cage, **reset, moved=moved)
     contact = group.contact(frame, cage, given_up=frame.given_up if known is None else known.given_up)
     if contact is not None and last is not None and last.clean and before is not None:
         contact.at(group.levels[-1]).remember(before)
@@ -233,7 +226,6 @@ def begin(group: Group, frame: FrameInput, last: FrameState | None) -> Problem:
         before=before,
         inside=None if last is None else last.inside,
         tether=start.slowed * settings.tether * frame.rate**2 if settings.temporal == "tether" else None,
-        creases=None if start.detailed is None else creases,
     )
     why = torn(forces[-1].level, problem.carried, cage.points) if problem.warm else ""
-    return replace(problem, start=Start(why), creases=None) if why else problem
+    return replace(problem, start=Start(why)) if why else problem

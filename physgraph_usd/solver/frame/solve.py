@@ -227,7 +227,7 @@ def solve_soundly(group: Group, frame: FrameInput, last: FrameState | None) -> S
     if last is not None and last.wait:
         return _waiting(solved, last.failures, last.wait - 1)
     given_up = None if last is None else last.given_up
-    fresh = solve_frame(group, replace(frame, moved=np.inf, walked=None, elapsed=(), given_up=given_up), None)
+    fresh = solve_frame(group, replace(frame, moved=np.inf, walked=None, elapsed=0.0, given_up=given_up), None)
     if _is_better(fresh.telemetry, solved.telemetry):
         return replace(fresh, telemetry=fresh.telemetry | {"start": f"cold: started anew, since {why}"})
     if all(_excess(each.telemetry, whole=True) > 0.0 for each in (solved, fresh)):

@@ -22,8 +22,7 @@ STILL = 0.02
 """Largest motion of cage and bodies between samples, in mean cage edges, for a held pose: slow settling is visible in a
 held pose, so the cloth is slowed down."""
 SLOWEST = 2.0**8
-"""Factor of the tether stiffness at which cloth rests: motion of cloth whose cage stands is visible. Cloth with creases
-rests once its creases have set (`creases`)."""
+"""Factor of the tether stiffness at which cloth rests: motion of cloth whose cage stands is visible."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +55,6 @@ def start_of(
     finest: Level,
     reset: Reset,
     moved: float = np.inf,
-    pace: float = 1.0,
 ) -> Start:
     """Carry the last frame's detail along, unless the cage jumped.
 
@@ -65,7 +63,6 @@ def start_of(
         finest: The finest level.
         reset: Thresholds for a cold start.
         moved: Largest motion of nearby bodies since [m]; infinite if more than poses changed.
-        pace: Fraction of its rest that cloth with creases comes to in a frame of a held pose; 1 without creases.
     """
     if state is None:
         return Start("cold")
@@ -76,7 +73,7 @@ def start_of(
     detailed = torch.where(finest.free, detailed, finest.base.apply(cage.points))
     moves = (cage.points - shifted.coarse).norm(dim=1)
     farthest = max(float(moves.max()) if len(moves) else 0.0, moved) / frames.edge
-    held, slowed = slowing(state.held, farthest, pace)
+    held, slowed = slowing(state.held, farthest)
     why = f"at rest: the pose has been held for {held} frames" if slowed >= SLOWEST else "warm"
     return Start(why, detailed, held, slowed)
 
@@ -95,7 +92,7 @@ def torn(finest: Level, carried: Float[Tensor, "vertices 3"], cage: Float[Tensor
     return f"cold: carried detail strains the cloth by {strain:.3g}, the upsampled cage by {plain:.3g}"
 
 
-def slowing(held: int, motion: float, pace: float = 1.0) -> tuple[int, float]:
+def slowing(held: int, motion: float) -> tuple[int, float]:
     """Number of frames of a held pose including now, and the resulting factor of the tether stiffness.
 
     The factor is bounded to keep the cloth faster than slow motion of the cage or of touching bodies.
@@ -103,9 +100,8 @@ def slowing(held: int, motion: float, pace: float = 1.0) -> tuple[int, float]:
     Args:
         held: Number of frames before.
         motion: Largest motion of a cage or body point since, in mean cage edges.
-        pace: As for `start_of`.
     """
     if motion >= STILL:
         return 0, 1.0
     held += 1
-    return held, min(SLOWEST ** min(pace * held, 1.0), (STILL / max(motion, 1e-9)) ** 2)
+    return held, min(SLOWEST, (STILL / max(motion, 1e-9)) ** 2)

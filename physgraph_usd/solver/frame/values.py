@@ -27,7 +27,7 @@ class FrameInput:
         touching: Surfaces within reach of the garments.
         moved: Largest motion of the surfaces since the last frame [m]; infinite if more than poses changed.
         walked: World positions of cages advanced from an earlier frame [m], shape (C, 3), for a cold start; or None.
-        elapsed: Time since each garment's start frame [s]; () for a cold start.
+        elapsed: Time since the start frame [s]; 0 for a cold start.
         given_up: As `FrameState.given_up`, for a start from the cage.
     """
 
@@ -36,13 +36,13 @@ class FrameInput:
     touching: Sequence[Touching] = ()
     moved: float = np.inf
     walked: np.ndarray | None = None
-    elapsed: Sequence[float] = ()
+    elapsed: float = 0.0
     given_up: Bool[Tensor, " coarse"] | None = None
 
     @property
     def rate(self) -> float:
-        """Samples per second since the start frame, the garments' least; 24 where no time is known."""
-        return 1.0 / (max(self.elapsed, default=0.0) or 1.0 / 24.0)
+        """Samples per second since the start frame; 24 where no time is known."""
+        return 1.0 / (self.elapsed or 1.0 / 24.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,9 +73,6 @@ class FrameState:
         clean: Whether nothing crosses and is given up, neither garments solved together nor bodies.
         inside: Mask of the vertices inside a body, shape (V,); None if none is.
         given_up: Mask of the pieces of the cage that are given up, shape (C,), bool; None for none.
-        bent: Remembered bends of the finest hinges of each garment [rad], shape (H,), None for a garment without
-            memory; () if no garment has creases.
-        creeps: Whether creases still change, so that equal input gives a different frame.
         failures: Consecutive starts from the cage that did not cure an unsound result.
         wait: Frames until the next start from the cage.
     """
@@ -88,8 +85,6 @@ class FrameState:
     clean: bool = False
     inside: Bool[Tensor, " vertices"] | None = None
     given_up: Bool[Tensor, " coarse"] | None = None
-    bent: tuple[Tensor | None, ...] = ()
-    creeps: bool = False
     failures: int = 0
     wait: int = 0
 
@@ -138,8 +133,6 @@ def join(parts: Sequence[FrameState]) -> FrameState:
     fine = [part.fine for part in parts if part.fine is not None]
     walked = torch.cat(fine) if len(fine) == len(parts) else None
     clean = all(part.clean for part in parts)
-    creeps = any(part.creeps for part in parts)
-    bent = tuple(each for part in parts for each in part.bent or (None,)) if any(part.bent for part in parts) else ()
     inside = None
     if any(part.inside is not None for part in parts):
         masks = [(part, torch.zeros(len(part.detail), dtype=torch.bool, device=part.detail.device)) for part in parts]
@@ -147,7 +140,7 @@ def join(parts: Sequence[FrameState]) -> FrameState:
     failures, wait = (max(getattr(part, name) for part in parts) for name in ("failures", "wait"))
     lost = [torch.zeros(len(p.coarse), dtype=torch.bool) if p.given_up is None else p.given_up.cpu() for p in parts]
     given_up = torch.cat(lost).to(parts[0].coarse.device) if any(p.given_up is not None for p in parts) else None
-    kept = {"fine": walked, "clean": clean, "bent": bent, "creeps": creeps, "failures": failures, "wait": wait}
+    kept = {"fine": walked, "clean": clean, "failures": failures, "wait": wait}
     return FrameState(*whole, held=min(part.held for part in parts), inside=inside, given_up=given_up, **kept)
 
 
@@ -167,7 +160,6 @@ def split(state: FrameState, coarse: Sequence[slice], fine: Sequence[slice]) -> 
             frames=state.frames[c],
             fine=None if state.fine is None else state.fine[f],
             inside=None if state.inside is None else state.inside[f],
-            bent=state.bent[place : place + 1],
         )
-        for place, (c, f) in enumerate(zip(coarse, fine, strict=True))
+        for c, f in zip(coarse, fine, strict=True)
     ]

@@ -1,4 +1,4 @@
-"""Lengths of edges, normals of triangles and angles of hinges, one kernel each: torch would need many passes."""
+"""Lengths of edges and normals of triangles, one kernel each: torch would need many passes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from .stencil import SCALAR, VECTOR, overloads, vectors
 from .threads import Launch
 
 wp.set_module_options(KERNELS)
-_SIX = wp.types.vector(length=6, dtype=wp.int32)
 
 
 @wp.kernel
@@ -41,25 +40,8 @@ def _normals(
     normal[t] = wp.cross(x[triangles[t][1]] - a, x[triangles[t][2]] - a)
 
 
-@wp.kernel
-def _angles(
-    first: wp.int32,
-    hinges: wp.array(dtype=_SIX),
-    x: wp.array(dtype=Any),
-    angle: wp.array(dtype=Any),
-):
-    h = first + wp.tid()
-    xi = x[hinges[h][0]]
-    axis = x[hinges[h][1]] - xi
-    half = angle.dtype(0.5)
-    il = (x[hinges[h][4]] + x[hinges[h][5]]) * half - xi
-    n1 = wp.cross(axis, (x[hinges[h][2]] + x[hinges[h][3]]) * half - xi)
-    angle[h] = wp.atan2(-wp.length(axis) * wp.dot(n1, il), wp.dot(n1, wp.cross(il, axis)))
-
-
 LENGTHS, NORMALS = overloads(_lengths, wp.vec2i, VECTOR, SCALAR), overloads(_normals, wp.vec3i, VECTOR, VECTOR)
-ANGLES = overloads(_angles, _SIX, VECTOR, SCALAR)
-"""Kernels for `ElementValues`: edge lengths [m], normals of twice the triangle's area [m^2], hinge angles [rad]."""
+"""Kernels for `ElementValues`: edge lengths [m], and normals of twice the triangle's area [m^2]."""
 
 
 class ElementValues:

@@ -51,7 +51,7 @@ STIFFNESSES = {
 _WOVEN = ("weftStretchStiffness", "weftBendStiffness", "stretchLimit")
 _EASE = ("rest:warpEase", "rest:weftEase")
 _FRAME_VALUES = (
-    *(*STIFFNESSES, *_WOVEN, "density", "thickness", *_EASE, "rest:creaseTime"),
+    *(*STIFFNESSES, *_WOVEN, "density", "thickness", *_EASE),
     *("guide:stiffness", "refine:detail", "contact:offset"),
 )
 DENSITY = "physics:density"
@@ -108,7 +108,6 @@ class Values:
             stretch_limit=limit,
             warp_ease=warp_ease,
             weft_ease=weft_ease,
-            crease_time=self.number("rest:creaseTime", time),
         )
 
     def thickness_scale(self, name: str) -> np.ndarray | float:
