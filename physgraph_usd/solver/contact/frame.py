@@ -218,7 +218,7 @@ class FrameContact:
 
         What the last frame solved is never given up because the cage crosses there.
         """
-        if self._last_given_up is None or not self.crossed:
+        if self._last_given_up is None or not (self._last_given_up.any() and self.crossed):
             return None
         mesh, found, *_ = self._cage
         tangled = Tangles.find(mesh, found, torch.zeros_like(self._last_given_up)).label >= 0

@@ -26,7 +26,6 @@ from ..mesh.stencil import Stencil, add_at
 from ..mesh.topology import PolygonMesh
 from ..rigid import best_motion
 from ..scene import Garment
-from .values import FrameState
 
 SAME_POINT = 1e-6
 """Distance below which points count as coincident, in edge lengths."""
@@ -55,22 +54,23 @@ class MovingFrames:
         normal = add_at(torch.zeros_like(coarse), self._triangles.T.reshape(-1), area.repeat(3, 1))
         return orthonormal(normal, self._tangent.apply(coarse))
 
-    def store(self, coarse: Float[Tensor, "coarse 3"], fine: Float[Tensor, "vertices 3"]) -> FrameState:
-        """Keep a solved frame's detail."""
-        return FrameState(coarse, fine - self._level.smooth_base.apply(coarse), self.frames(coarse))
-
     def predict(
-        self, last: FrameState, coarse: Float[Tensor, "coarse 3"]
+        self, before: Float[Tensor, "coarse 3"], fine: Float[Tensor, "vertices 3"], coarse: Float[Tensor, "coarse 3"]
     ) -> tuple[Float[Tensor, "vertices 3"], float, float]:
         """Carry detail to new cage positions.
+
+        Args:
+            before: Cage positions in the last frame [m].
+            fine: Fine positions in the last frame [m].
+            coarse: Cage positions now [m].
 
         Returns:
             Predicted fine positions [m], the RMS motion of the cage in mean cage edges, and its RMS turn [rad].
         """
-        frames = self.frames(coarse)
-        moved = torch.einsum("vij,vj->vi", self._turned(last.frames, frames), last.detail)
-        motion = float((coarse - last.coarse).square().sum(dim=1).mean().sqrt()) / self.edge
-        cosine = (torch.einsum("cij,cij->c", frames, last.frames) - 1.0) / 2.0
+        detail, last, frames = fine - self._level.smooth_base.apply(before), self.frames(before), self.frames(coarse)
+        moved = torch.einsum("vij,vj->vi", self._turned(last, frames), detail)
+        motion = float((coarse - before).square().sum(dim=1).mean().sqrt()) / self.edge
+        cosine = (torch.einsum("cij,cij->c", frames, last) - 1.0) / 2.0
         turn = float(torch.arccos(cosine.clamp(-1.0, 1.0)).square().mean().sqrt())
         return self._level.smooth_base.apply(coarse) + moved, motion, turn
 

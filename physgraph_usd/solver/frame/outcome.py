@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -58,19 +58,17 @@ def state_left(problem: Problem, x: Placed) -> FrameState:
         x: The result [m].
     """
     view, cage = problem.view(problem.finest), problem.cage
-    stored = problem.group.moving_frames.store(cage.points, x)
     fine = x.double() + torch.as_tensor(cage.origin).to(x.device)
     lost = None if problem.contact is None else problem.contact.given_up
     clean = view is not None and lost is None and view.cloth.is_clean(x)
     exempt = None if view is None else view.cloth.exempt(x)
-    return replace(
-        stored,
+    return FrameState(
         coarse=torch.as_tensor(cage.world),
-        held=problem.start.held,
         fine=fine,
+        inside=torch.zeros_like(x[:, 0], dtype=torch.bool) if exempt is None else exempt[: len(x)],
+        given_up=torch.zeros_like(cage.points[:, 0], dtype=torch.bool) if lost is None else lost,
+        held=problem.start.held,
         clean=clean,
-        inside=None if exempt is None else exempt[: len(x)],
-        given_up=lost,
     )
 
 

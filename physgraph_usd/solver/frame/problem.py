@@ -206,7 +206,7 @@ def begin(group: Group, frame: FrameInput, last: FrameState | None) -> Problem:
     began = time.perf_counter()
     forces, cage, settings = group.forces_for(frame.garments), group.cage(frame.garments), group.settings
     known = None if settings.temporal == "off" else last
-    before = None if last is None else last.about(cage.origin)
+    before = None if last is None else last.about(cage.origin)[1]
     moved = frame.moved if settings.temporal == "tether" else np.inf  # Only the tether slows the cloth down.
     reset = {"frames": group.moving_frames, "finest": forces[-1].level, "reset": settings.reset}
     start = start_of(known, cage, **reset, moved=moved)
@@ -224,7 +224,7 @@ def begin(group: Group, frame: FrameInput, last: FrameState | None) -> Problem:
         start=start,
         walked=None if frame.walked is None else group.tensor(frame.walked - cage.origin),
         before=before,
-        inside=None if last is None else last.inside,
+        inside=last.inside if last is not None and bool(last.inside.any()) else None,
         tether=start.slowed * settings.tether * frame.rate**2 if settings.temporal == "tether" else None,
     )
     why = torn(forces[-1].level, problem.carried, cage.points) if problem.warm else ""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -66,12 +66,12 @@ def start_of(
     """
     if state is None:
         return Start("cold")
-    shifted = replace(state, coarse=(state.coarse - torch.as_tensor(cage.world).mean(dim=0)).to(cage.points))
-    detailed, motion, turn = frames.predict(shifted, cage.points)
+    before, fine = (x.to(cage.points) for x in state.about(cage.origin))
+    detailed, motion, turn = frames.predict(before, fine, cage.points)
     if motion > reset.move or turn > reset.turn:
         return Start(f"cold: the cage moved {motion:.3g} edges and turned {np.degrees(turn):.3g} degrees")
     detailed = torch.where(finest.free, detailed, finest.base.apply(cage.points))
-    moves = (cage.points - shifted.coarse).norm(dim=1)
+    moves = (cage.points - before).norm(dim=1)
     farthest = max(float(moves.max()) if len(moves) else 0.0, moved) / frames.edge
     held, slowed = slowing(state.held, farthest)
     why = f"at rest: the pose has been held for {held} frames" if slowed >= SLOWEST else "warm"

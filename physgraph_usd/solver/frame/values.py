@@ -65,26 +65,22 @@ class FrameState:
     """State passed from frame to frame.
 
     Attributes:
-        coarse: Cage positions [m], world space.
-        detail: Fine positions minus the smooth base [m], shape (V, 3).
-        frames: Cage frames, columns are tangent, bitangent, normal, shape (C, 3, 3).
+        coarse: Cage positions [m], world space, float64, shape (C, 3).
+        fine: Fine positions [m], world space, float64, shape (V, 3).
+        inside: Mask of the vertices inside a body, shape (V,), bool.
+        given_up: Mask of the pieces of the cage that are given up, shape (C,), bool.
         held: Number of frames of a held pose.
-        fine: Fine positions [m], world space, float64, to continue from; None before the first solve.
         clean: Whether nothing crosses and is given up, neither garments solved together nor bodies.
-        inside: Mask of the vertices inside a body, shape (V,); None if none is.
-        given_up: Mask of the pieces of the cage that are given up, shape (C,), bool; None for none.
         failures: Consecutive starts from the cage that did not cure an unsound result.
         wait: Frames until the next start from the cage.
     """
 
     coarse: Float[Tensor, "coarse 3"]
-    detail: Float[Tensor, "vertices 3"]
-    frames: Float[Tensor, "coarse 3 3"]
+    fine: Float[Tensor, "vertices 3"]
+    inside: Bool[Tensor, " vertices"]
+    given_up: Bool[Tensor, " coarse"]
     held: int = 0
-    fine: Float[Tensor, "vertices 3"] | None = None
     clean: bool = False
-    inside: Bool[Tensor, " vertices"] | None = None
-    given_up: Bool[Tensor, " coarse"] | None = None
     failures: int = 0
     wait: int = 0
 
@@ -92,22 +88,13 @@ class FrameState:
         """This state after a rigid motion."""
         if motion is AT_REST:
             return self
-        turn = torch.as_tensor(motion.turn)
+        coarse, fine = (torch.as_tensor(motion(x.cpu().numpy())).to(x) for x in (self.coarse, self.fine))
+        return replace(self, coarse=coarse, fine=fine)
 
-        def placed(x: Tensor) -> Tensor:
-            return torch.as_tensor(motion(x.double().cpu().numpy())).to(x)
-
-        return replace(
-            self,
-            coarse=placed(self.coarse),
-            fine=None if self.fine is None else placed(self.fine),
-            detail=self.detail @ turn.T.to(self.detail),
-            frames=turn.to(self.frames) @ self.frames,
-        )
-
-    def about(self, origin: np.ndarray) -> Placed | None:
-        """Fine positions relative to an origin [m], float64, or None before the first solve."""
-        return None if self.fine is None else Placed(self.fine - torch.as_tensor(origin).to(self.fine))
+    def about(self, origin: np.ndarray) -> tuple[Float[Tensor, "coarse 3"], Placed]:
+        """Cage and fine positions relative to an origin [m], float64."""
+        coarse, fine = (x - torch.as_tensor(origin).to(x) for x in (self.coarse, self.fine))
+        return coarse, Placed(fine)
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,21 +114,19 @@ class Solved:
     crossing: list[np.ndarray]
 
 
+_COARSE, _FINE = ("coarse", "given_up"), ("fine", "inside")
+"""Fields of `FrameState` with a row for each vertex of the cage, and of the finest level."""
+
+
 def join(parts: Sequence[FrameState]) -> FrameState:
     """Join the states of several garments."""
-    whole = (torch.cat([getattr(part, name) for part in parts]) for name in ("coarse", "detail", "frames"))
-    fine = [part.fine for part in parts if part.fine is not None]
-    walked = torch.cat(fine) if len(fine) == len(parts) else None
-    clean = all(part.clean for part in parts)
-    inside = None
-    if any(part.inside is not None for part in parts):
-        masks = [(part, torch.zeros(len(part.detail), dtype=torch.bool, device=part.detail.device)) for part in parts]
-        inside = torch.cat([none if part.inside is None else part.inside for part, none in masks])
-    failures, wait = (max(getattr(part, name) for part in parts) for name in ("failures", "wait"))
-    lost = [torch.zeros(len(p.coarse), dtype=torch.bool) if p.given_up is None else p.given_up.cpu() for p in parts]
-    given_up = torch.cat(lost).to(parts[0].coarse.device) if any(p.given_up is not None for p in parts) else None
-    kept = {"fine": walked, "clean": clean, "failures": failures, "wait": wait}
-    return FrameState(*whole, held=min(part.held for part in parts), inside=inside, given_up=given_up, **kept)
+    return FrameState(
+        **{name: torch.cat([getattr(part, name) for part in parts]) for name in (*_COARSE, *_FINE)},
+        held=min(part.held for part in parts),
+        clean=all(part.clean for part in parts),
+        failures=max(part.failures for part in parts),
+        wait=max(part.wait for part in parts),
+    )
 
 
 def split(state: FrameState, coarse: Sequence[slice], fine: Sequence[slice]) -> list[FrameState]:
@@ -154,12 +139,8 @@ def split(state: FrameState, coarse: Sequence[slice], fine: Sequence[slice]) -> 
     return [
         replace(
             state,
-            coarse=state.coarse[c],
-            given_up=None if state.given_up is None else state.given_up[c],
-            detail=state.detail[f],
-            frames=state.frames[c],
-            fine=None if state.fine is None else state.fine[f],
-            inside=None if state.inside is None else state.inside[f],
+            **{name: getattr(state, name)[c] for name in _COARSE},
+            **{name: getattr(state, name)[f] for name in _FINE},
         )
         for c, f in zip(coarse, fine, strict=True)
     ]
