@@ -8,7 +8,6 @@ import numpy as np
 
 from ..rigid import AT_REST, Rigid, best_motion
 
-COLLIDER_KINDS = ("mesh", "sphere", "capsule", "cylinder", "cone", "cube", "plane")
 RIGID = 1e-6
 """Largest deviation of points from a rigid motion, relative to their extent: float32's rounding."""
 
@@ -19,7 +18,7 @@ class Collider:
 
     Attributes:
         path: Prim path, used as the name in reports.
-        kind: One of `COLLIDER_KINDS`.
+        kind: "mesh", or one of `primitives.KINDS`.
         offset: Distance kept from the collider [m], added to the garment's offset.
         side: One of `SIDES`.
     """

@@ -8,6 +8,7 @@ import numpy as np
 
 from .pose import Pose
 
+KINDS = ("sphere", "capsule", "cylinder", "cone", "cube", "plane")
 AROUND, RISES = 96, 48
 """Segments about the axis and along a half circle: faces lie up to a thousandth of the radius inside the shape."""
 SQUARES = (1.0, 10.0, 100.0, 1000.0)
@@ -19,7 +20,7 @@ def primitive(kind: str, size: np.ndarray, *, turn: np.ndarray, centre: np.ndarr
     """A primitive at one time code.
 
     Args:
-        kind: "sphere", "capsule", "cylinder", "cone", "cube" or "plane".
+        kind: One of `KINDS`.
         size: Half sizes along the axes [m]: (r, r, r) of a sphere, (r, r, half height) of a cone, a cylinder, or a
             capsule without its caps; ignored for a plane, shape (3,).
         turn: Matrix whose columns are the shape's axes in the world; the third is the axis of a cone, a cylinder or a
@@ -35,7 +36,7 @@ def tessellated(kind: str, x: float, y: float, z: float) -> tuple[np.ndarray, np
     """Points [m], shape (V, 3), and outward triangles, shape (T, 3), int32, of a primitive about its third axis.
 
     Args:
-        kind: "sphere", "capsule", "cylinder", "cone" or "cube".
+        kind: One of `KINDS` but "plane".
         x: Half size along the first axis [m], or the radius.
         y: Half size along the second axis [m].
         z: Half size along the third axis [m], of a capsule without its caps.

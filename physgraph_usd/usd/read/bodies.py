@@ -14,7 +14,7 @@ from pxr import Usd, UsdGeom
 
 from ...solver.colliders.orient import FIXED
 from ...solver.colliders.pose import Collider, Pose
-from ...solver.colliders.primitives import primitive
+from ...solver.colliders.primitives import KINDS, primitive
 from ...solver.mesh.topology import PolygonMesh
 from ...solver.scene import FARTHEST, out_of_bounds
 from ..lookup import Override, find_token, find_value
@@ -29,7 +29,6 @@ DRAWN_NEAR = 0.1
 _LEAST_OFFSET = 1e-3
 """Least offset for choosing a body's subdivision [m]: an offset of 0 would ask for unlimited subdivision."""
 _PLANE_START = ("plane", "start")
-_KINDS = ("Sphere", "Capsule", "Cylinder", "Cube", "Plane", "Cone")
 
 UPRIGHT = {
     "X": np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
@@ -198,7 +197,7 @@ def read_collider(
         SchemaError: When the collider's offset or side is invalid.
     """
     path, kind = str(prim.GetPath()), str(prim.GetTypeName()).removesuffix("_1")
-    if not UsdGeom.Mesh(prim) and kind not in _KINDS:
+    if not UsdGeom.Mesh(prim) and kind.lower() not in KINDS:
         return None, (Notice(path, None, f"a {kind} is no collider that cloth can rest on; left out"),)
     kind = "mesh" if UsdGeom.Mesh(prim) else kind.lower()
     own = find_value(prim, COLLIDER["collider:offset"], overrides).at(None) or 0.0
