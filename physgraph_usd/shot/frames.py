@@ -39,28 +39,13 @@ CHUNK = "chunk"
 """Entry in a chunk's record: number of the first frame, and of the frame after the last."""
 _DONE, _FAILED = ".npz", ".failed.npz"
 _FRAMES = ".frames"
-_BEFORE, _JOINED = ".before", ".joined"
+_BEFORE = ".before"
 _DAMAGED = (OSError, ValueError, KeyError, TypeError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error)
 """Errors of numpy and zipfile when reading a file not written by `FrameFolder.write`."""
-_OURS = re.compile(r"(\d+(\.(before|joined)\d+)?(\.failed)?\.npz|run\.json)(\.[\w-]+\.\d+\.tmp)?")
+_OF_SEAM = re.compile(r"(\d+)\.before(\d+)(?:\.failed)?\.npz")
+"""File names of pre-roll frames."""
+_OURS = re.compile(r"(\d+(\.before\d+)?(\.failed)?\.npz|run\.json)(\.[\w-]+\.\d+\.tmp)?")
 """File names of finished frames and of the record, including temporary names while writing."""
-
-
-@dataclass(frozen=True, eq=False)
-class Lead:
-    """A time code as solved by the process after a seam.
-
-    Attributes:
-        outcome: Result of the process after the seam.
-        seam: Number of the first frame solved by the process after the seam alone.
-        weight: Weight of ``outcome`` in the joined frame: k / (L + 1) in the k-th of the L frames solved twice.
-        joined: The joined frame, if the process before the seam has joined it.
-    """
-
-    outcome: Outcome
-    seam: int
-    weight: float
-    joined: Outcome | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +58,6 @@ class Outcome:
         reused: For each garment, True if the previous frame's points were kept.
         record: Telemetry, or {"error": message}, ready for JSON.
         heat: Heat maps of each garment by name, None for a garment without a sample; () if not requested.
-        lead: The same frame as solved behind the next seam, or None.
     """
 
     time: float | None
@@ -81,7 +65,6 @@ class Outcome:
     reused: tuple[bool, ...]
     record: dict[str, object]
     heat: tuple[dict[str, np.ndarray] | None, ...] = ()
-    lead: Lead | None = None
 
 
 def frames_folder(layer: Path) -> Path:
@@ -164,8 +147,8 @@ class Finished:
         self.folder, self._counts = folder, tuple(counts)
         self.kept = frozenset(whole_frames(folder))
 
-    def _file(self, index: int, suffix: str = _DONE, *, seam: int | None = None, joined: bool = False) -> Path:
-        return self.folder / (f"{index}" + ("" if seam is None else f"{_JOINED if joined else _BEFORE}{seam}") + suffix)
+    def _file(self, index: int, suffix: str, seam: int | None) -> Path:
+        return self.folder / (f"{index}" + ("" if seam is None else f"{_BEFORE}{seam}") + suffix)
 
     @property
     def failed(self) -> set[int]:
@@ -173,19 +156,22 @@ class Finished:
         stems = [file.name.removesuffix(_FAILED) for file in self.folder.glob(f"*{_FAILED}")]
         return {int(stem) for stem in stems if stem.isdecimal()}
 
-    def seams(self) -> set[int]:
-        """Numbers of the frames before which finished frames of two processes meet."""
-        names = [file.name.removesuffix(_DONE) for file in self.folder.glob(f"*{_BEFORE}*{_DONE}")]
-        found = {int(seam) for name in names if (seam := name.partition(_BEFORE)[2]).isdecimal()}
-        return found & self.kept
+    def seams(self) -> dict[int, int]:
+        """By number of the first frame after a seam of two processes, number of the first frame of its pre-roll."""
+        matches = (_OF_SEAM.fullmatch(file.name) for file in self.folder.glob("*"))
+        both, found = [(int(match[2]), int(match[1])) for match in matches if match], dict[int, int]()
+        for seam, index in sorted(both, reverse=True):
+            if index + 1 == found.get(seam, seam):
+                found[seam] = index
+        return {seam: first for seam, first in found.items() if seam in self.kept}
 
-    def read(self, index: int, time: float | None, *, seam: int | None = None, joined: bool = False) -> Outcome | None:
-        """A frame's result, or None if not finished; ``seam`` and ``joined`` as in `write`.
+    def read(self, index: int, time: float | None, *, seam: int | None = None) -> Outcome | None:
+        """A frame's result, or None if not finished; ``seam`` as in `write`.
 
         Raises:
             LayerError: The file is damaged.
         """
-        files = (self._file(index, suffix, seam=seam, joined=joined) for suffix in (_DONE, _FAILED))
+        files = (self._file(index, suffix, seam) for suffix in (_DONE, _FAILED))
         file = next((each for each in files if each.exists()), None)
         if file is None:
             return None
@@ -298,7 +284,7 @@ class FrameFolder(Finished):
         self.kept = frozenset(found if resume else ())
         self.dropped = 0 if resume or different else len(found)
         for file in self.folder.glob(f"*{_DONE}"):
-            if file.name.endswith(_FAILED) or _JOINED in file.name or not zipfile.is_zipfile(file):
+            if file.name.endswith(_FAILED) or not zipfile.is_zipfile(file):
                 file.unlink()
         if not self.kept:
             self._clear()
@@ -321,13 +307,12 @@ class FrameFolder(Finished):
         """Store the absolute path, for processes with a different working directory."""
         return self.__dict__ | {"folder": self.folder.absolute(), "_lock": None}
 
-    def write(self, index: int, outcome: Outcome, *, seam: int | None = None, joined: bool = False) -> None:
+    def write(self, index: int, outcome: Outcome, *, seam: int | None = None) -> None:
         """Write a frame's result.
 
         Args:
             index: Number of the frame.
             seam: Number of the frame whose pre-roll the result belongs to, or None.
-            joined: Whether the result is the frame as joined with that pre-roll.
 
         Raises:
             LayerError: The disk is full, or the folder is gone or taken by a new run: a task on a remote machine may
@@ -337,7 +322,7 @@ class FrameFolder(Finished):
         maps = [(k, name, values) for k, heat in enumerate(outcome.heat) for name, values in (heat or {}).items()]
         arrays |= {f"heat{k}.{name}": values for k, name, values in maps} | {"heated": np.array(len(outcome.heat))}
         arrays |= {"record": json.dumps(outcome.record), "reused": np.array(outcome.reused, dtype=bool)}
-        file = self._file(index, _DONE if outcome.points else _FAILED, seam=seam, joined=joined)
+        file = self._file(index, _DONE if outcome.points else _FAILED, seam)
         temporary = temporary_path(file, suffix="")
         try:
             if (self.folder / RUN).read_text(encoding="utf-8") != self._run:
@@ -383,23 +368,3 @@ def differences(there: Any, wanted: Any, name: str = "") -> list[str]:
     if isinstance(there, dict) and isinstance(wanted, dict):
         return [each for key in {*there, *wanted} for each in differences(there.get(key), wanted.get(key), key)]
     return [] if there == wanted else [name]
-
-
-class Folders:
-    """Frames of several chunks, presented as one folder.
-
-    Attributes:
-        kept: Numbers of the stored frames, including failed frames.
-    """
-
-    def __init__(self, owners: Mapping[int, Finished]) -> None:
-        """Take the folder of each frame, by number."""
-        self._owners, self.kept = owners, frozenset(owners)
-
-    def seams(self) -> set[int]:
-        """Numbers of the frames before which chunks, or two processes of one chunk, meet."""
-        return set().union(*(folder.seams() for folder in {*self._owners.values()})) & self.kept
-
-    def read(self, index: int, time: float | None, *, seam: int | None = None, joined: bool = False) -> Outcome | None:
-        """Read a frame like `Finished.read`; a seam's pre-roll is in the folder of the first frame after the seam."""
-        return self._owners[index if seam is None else seam].read(index, time, seam=seam, joined=joined)

@@ -29,7 +29,7 @@ from .options import RefineOptions, json_of
 from .page.report import write_folder
 from .processes import call_each, memory_is_named
 from .report import RefineReport, is_of_failure
-from .run import Joins, Run
+from .run import Run
 from .solve import open_for, time_frames
 from .warnings import WARNINGS
 
@@ -67,32 +67,28 @@ def refine_shot(shot: str | Path, out: str | Path, options: RefineOptions = DEFA
         if may_be_done(out, options) and is_result_of(out, made_from(opened, out, options), settled=options.strict):
             return taken_as_done(report, out)
         _check_new(out, options)
-        write_all(opened, out, options, report)
+        write_all(Run(opened, out, options, report), out)
     return report
 
 
-def write_all(
-    opened: Shot, out: Path, options: RefineOptions, report: RefineReport, *, joins: Joins | None = None
-) -> None:
+def write_all(run: Run, out: Path) -> None:
     """Write a run's layer or chunk, and the root and report if requested.
 
     Args:
-        opened: The shot.
+        run: The run.
         out: The layer, or the chunk's folder.
-        options: Options of the run.
-        report: The report.
-        joins: Chunks to join instead of solving; None to solve.
 
     Raises:
         SolveError: No frame could be solved.
         LayerError: A file cannot be written, or seams are refused.
     """
-    Run(opened, out, options, report, joins).refine()
+    run.refine()
+    options = run.options
     if options.root is not None:
-        files = {"layer": out, "shot": Path(opened.path), "absolute": options.asset_paths == "absolute"}
+        files = {"layer": out, "shot": Path(run.shot.path), "absolute": options.asset_paths == "absolute"}
         write_root(Path(options.root), **files, overwrite=options.overwrite)
     if options.report is not None:
-        _write_report(report, Path(options.report), opened)
+        _write_report(run.report, Path(options.report), run.shot)
 
 
 def refine_stage(
