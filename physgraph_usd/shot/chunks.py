@@ -110,10 +110,10 @@ def solve_in_chunks(
     """
     wanted = range(len(times)) if only is None else only
     chunks = chunks_of([k for k in wanted if k not in frames.kept], workers)
-    kept, parts = frames.seams(), [part for chunk in chunks for part in chunk]
+    parts = [part for chunk in chunks for part in chunk]
     # If an earlier run solved the frame after a range, the motion continues from the earlier run, not from the range.
-    new = [part.start for part in parts if part.stop not in frames.kept or part.stop in kept]
-    seams = kept | {first: max(0, first - preroll) for first in new}
+    new = [part.start for part in parts if part.stop not in frames.kept or part.stop in frames.seams]
+    seams = frames.seams | {first: max(0, first - preroll) for first in new}
     solved: Iterator[int] = iter(())
     calls: dict[int, Future[None]] = {}
     if start is None:

@@ -39,12 +39,11 @@ CHUNK = "chunk"
 """Entry in a chunk's record: number of the first frame, and of the frame after the last."""
 _DONE, _FAILED = ".npz", ".failed.npz"
 _FRAMES = ".frames"
-_BEFORE = ".before"
 _DAMAGED = (OSError, ValueError, KeyError, TypeError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error)
 """Errors of numpy and zipfile when reading a file not written by `FrameFolder.write`."""
-_OF_SEAM = re.compile(r"(\d+)\.before(\d+)(?:\.failed)?\.npz")
-"""File names of pre-roll frames."""
-_OURS = re.compile(r"(\d+(\.before\d+)?(\.failed)?\.npz|run\.json)(\.[\w-]+\.\d+\.tmp)?")
+_NAME = re.compile(r"(\d+)(?:\.before(\d+))?(\.failed)?\.npz")
+"""Name of a frame's file: number, number of the first frame after the pre-roll if in one, and whether it failed."""
+_OURS = re.compile(rf"({_NAME.pattern}|run\.json)(\.[\w-]+\.\d+\.tmp)?")
 """File names of finished frames and of the record, including temporary names while writing."""
 
 
@@ -97,7 +96,7 @@ def kept_for(out: Path) -> Kept | None:
     folder = out if out.is_dir() else frames_folder(out)
     run = record_in(folder)
     first, stop = run.get(CHUNK) or (0, len(run.get("times", ())))
-    count = len(whole_frames(folder))
+    count = len(Finished(folder).kept)
     if not count or (CHUNK in run and count == stop - first) or _is_locked(folder):
         return None
     return Kept(folder, count, stop - first)
@@ -128,42 +127,33 @@ def record_in(folder: Path) -> dict[str, Any]:
     return found if isinstance(found, dict) else {}
 
 
-def whole_frames(folder: Path) -> list[int]:
-    """Numbers of the complete, successful frames in a folder."""
-    names = [file.name for file in folder.glob("*")]
-    numbers = [int(stem) for name in names if (stem := name.removesuffix(_DONE)).isdecimal()]
-    return [number for number in numbers if zipfile.is_zipfile(folder / f"{number}{_DONE}")]
-
-
 class Finished:
     """Finished frames in a folder, read-only.
 
     Attributes:
-        kept: Numbers of the complete frames.
+        kept: Numbers of the complete, successful frames.
+        failed: Numbers of the frames that failed.
+        seams: By number of the first frame after a seam of two processes, number of the first frame of its pre-roll.
     """
 
     def __init__(self, folder: Path, *, counts: Sequence[int] = ()) -> None:
         """List the finished frames; ``counts`` as in `FrameFolder`."""
-        self.folder, self._counts = folder, tuple(counts)
-        self.kept = frozenset(whole_frames(folder))
+        self.folder, self.counts = folder, tuple(counts)
+        self._list()
 
-    def _file(self, index: int, suffix: str, seam: int | None) -> Path:
-        return self.folder / (f"{index}" + ("" if seam is None else f"{_BEFORE}{seam}") + suffix)
-
-    @property
-    def failed(self) -> set[int]:
-        """Numbers of the frames that failed."""
-        stems = [file.name.removesuffix(_FAILED) for file in self.folder.glob(f"*{_FAILED}")]
-        return {int(stem) for stem in stems if stem.isdecimal()}
-
-    def seams(self) -> dict[int, int]:
-        """By number of the first frame after a seam of two processes, number of the first frame of its pre-roll."""
-        matches = (_OF_SEAM.fullmatch(file.name) for file in self.folder.glob("*"))
-        both, found = [(int(match[2]), int(match[1])) for match in matches if match], dict[int, int]()
-        for seam, index in sorted(both, reverse=True):
+    def _list(self) -> None:
+        names = [match for file in self.folder.glob("*") if (match := _NAME.fullmatch(file.name))]
+        whole = [match for match in names if zipfile.is_zipfile(self.folder / match[0])]
+        self.kept = frozenset(int(match[1]) for match in whole if not match[2] and not match[3])
+        self.failed = frozenset(int(match[1]) for match in whole if not match[2] and match[3])
+        found: dict[int, int] = {}
+        for seam, index in sorted(((int(match[2]), int(match[1])) for match in whole if match[2]), reverse=True):
             if index + 1 == found.get(seam, seam):
                 found[seam] = index
-        return {seam: first for seam, first in found.items() if seam in self.kept}
+        self.seams = {seam: first for seam, first in found.items() if seam in self.kept}
+
+    def _file(self, index: int, seam: int | None, suffix: str) -> Path:
+        return self.folder / (f"{index}" + ("" if seam is None else f".before{seam}") + suffix)
 
     def read(self, index: int, time: float | None, *, seam: int | None = None) -> Outcome | None:
         """A frame's result, or None if not finished; ``seam`` as in `write`.
@@ -171,7 +161,7 @@ class Finished:
         Raises:
             LayerError: The file is damaged.
         """
-        files = (self._file(index, suffix, seam) for suffix in (_DONE, _FAILED))
+        files = (self._file(index, seam, suffix) for suffix in (_DONE, _FAILED))
         file = next((each for each in files if each.exists()), None)
         if file is None:
             return None
@@ -189,9 +179,9 @@ class Finished:
 
     def _check_points(self, points: Sequence[np.ndarray | None]) -> None:
         """Refuse (ValueError) points of the wrong shape: kernels index points by face corners, without checks."""
-        if points and self._counts and len(points) != len(self._counts):
-            raise ValueError(f"points of {len(points)} garments, not of {len(self._counts)}")
-        for each, count in zip(points, self._counts, strict=False):
+        if points and self.counts and len(points) != len(self.counts):
+            raise ValueError(f"points of {len(points)} garments, not of {len(self.counts)}")
+        for each, count in zip(points, self.counts, strict=False):
             if each is not None and (each.shape != (count, 3) or each.dtype.kind != "f" or not np.isfinite(each).all()):
                 raise ValueError(f"points of shape {each.shape}, not {count} finite positions")
 
@@ -272,22 +262,21 @@ class FrameFolder(Finished):
 
     def _take(self, wanted: dict[str, Any], *, resume: bool, drop: bool) -> None:
         """Use or drop existing frames; frames that failed, or whose files a crash cut short, are solved again."""
-        found = whole_frames(self.folder)
-        different = self._differences(wanted) if found else []
+        self._list()
+        found, holds = len(self.kept), f"{self.folder} holds {counted(len(self.kept), 'finished frame')}"
+        different = sorted(differences(record_in(self.folder), wanted)) if found else []
         if different and (resume or not drop):
-            holds = f"{self.folder} holds {counted(len(found), 'finished frame')} of a run"
             remedy = "refine as then, or drop them by --overwrite without --resume"
-            raise UsageError(f"{holds} with other {', '.join(different[:3])}; {remedy}")
+            raise UsageError(f"{holds} of a run with other {', '.join(different[:3])}; {remedy}")
         if found and self._stays and not (resume or drop):
-            there = f"{self.folder} holds {counted(len(found), 'finished frame')}"
-            raise UsageError(f"{there}; go on by --resume, or drop them by --overwrite")
-        self.kept = frozenset(found if resume else ())
-        self.dropped = 0 if resume or different else len(found)
+            raise UsageError(f"{holds}; go on by --resume, or drop them by --overwrite")
+        self.dropped = 0 if resume or different else found
+        if not (found and resume):
+            self._clear()
         for file in self.folder.glob(f"*{_DONE}"):
             if file.name.endswith(_FAILED) or not zipfile.is_zipfile(file):
                 file.unlink()
-        if not self.kept:
-            self._clear()
+        self._list()
         self._run = json.dumps(wanted, indent=2) + "\n"
         write_text(self.folder / RUN, self._run)
 
@@ -298,10 +287,6 @@ class FrameFolder(Finished):
         if others or (names and not names & {RUN, LOCK}):
             other = f"; {others[0]} is not a file of ours" if others else ""
             raise UsageError(f"{self.folder} is no folder of finished frames{other}; choose another name for the layer")
-
-    def _differences(self, wanted: dict[str, Any]) -> list[str]:
-        """Names of the entries that differ from the folder's record."""
-        return sorted(differences(record_in(self.folder), wanted))
 
     def __getstate__(self) -> dict[str, Any]:
         """Store the absolute path, for processes with a different working directory."""
@@ -322,7 +307,7 @@ class FrameFolder(Finished):
         maps = [(k, name, values) for k, heat in enumerate(outcome.heat) for name, values in (heat or {}).items()]
         arrays |= {f"heat{k}.{name}": values for k, name, values in maps} | {"heated": np.array(len(outcome.heat))}
         arrays |= {"record": json.dumps(outcome.record), "reused": np.array(outcome.reused, dtype=bool)}
-        file = self._file(index, _DONE if outcome.points else _FAILED, seam)
+        file = self._file(index, seam, _DONE if outcome.points else _FAILED)
         temporary = temporary_path(file, suffix="")
         try:
             if (self.folder / RUN).read_text(encoding="utf-8") != self._run:
@@ -351,7 +336,7 @@ class FrameFolder(Finished):
         """Keep the frames of a failed run unless ``keep`` is False; release the folder."""
         try:
             done = kind is None and not self._stays
-            if done or (kind and not (self._keep or self.kept)) or not whole_frames(self.folder):
+            if done or (kind and not (self._keep or self.kept)) or not Finished(self.folder).kept:
                 self._clear()
         finally:
             self._release()

@@ -10,7 +10,6 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
-from functools import cached_property
 from itertools import pairwise
 from math import ceil
 from pathlib import Path
@@ -63,26 +62,18 @@ class Seam:
         return f"{move}, {how}" + (f" ({self.why})" if self.why else "")
 
 
-@dataclass(frozen=True, eq=False)
-class _Chunk:
+class _Chunk(Finished):
     """A chunk's folder.
 
     Attributes:
         run: The record of the run.
+        numbers: Numbers of the stored frames, including failed frames, in order.
     """
 
-    folder: Path
-    run: Mapping[str, Any]
-
-    @cached_property
-    def finished(self) -> Finished:
-        """The stored frames."""
-        return Finished(self.folder)
-
-    @cached_property
-    def numbers(self) -> list[int]:
-        """Numbers of the stored frames, including failed frames, in order."""
-        return sorted(self.finished.kept | self.finished.failed)
+    def __init__(self, folder: Path, run: Mapping[str, Any]) -> None:
+        """List the stored frames."""
+        super().__init__(folder)
+        self.run, self.numbers = run, sorted(self.kept | self.failed)
 
     @property
     def is_whole(self) -> bool:
@@ -128,17 +119,11 @@ class _Joins:
         """List the stored frames; points not matching a mesh count as damaged."""
         garments, self.run = self.shot.scene.garments, self.parts[0].run
         self.meshes = fine_meshes(garments, refine_garments(garments, self.run["levels"]))
-        counts = [mesh.vertex_count for mesh in self.meshes]
-        folders = {
-            k: found for part in self.parts for found in [Finished(part.folder, counts=counts)] for k in part.numbers
-        }
-        self.folders = folders
-
-    @property
-    def starts(self) -> dict[int, int]:
-        """By number of the first frame of a chunk behind another, number of the first frame of its pre-roll."""
-        found = {start: first for folder in {*self.folders.values()} for start, first in folder.seams().items()}
-        return {start: first for start, first in found.items() if {start - 1, start} <= self.folders.keys()}
+        for part in self.parts:
+            part.counts = tuple(mesh.vertex_count for mesh in self.meshes)
+        self.chunks = {k: part for part in self.parts for k in part.numbers}
+        starts = {start: first for part in self.parts for start, first in part.seams.items()}
+        self.starts = {start: first for start, first in starts.items() if {start - 1, start} <= self.chunks.keys()}
 
     def outcomes(self, numbers: Iterable[int]) -> Generator[Outcome, None, None]:
         """Frames by number, joined, then a check of the seams (LayerError)."""
@@ -154,7 +139,7 @@ class _Joins:
 
     def _read(self, index: int, seam: int | None) -> Outcome:
         time = self.run["times"][index]
-        if outcome := self.folders[index if seam is None else seam].read(index, time, seam=seam):
+        if outcome := self.chunks[index if seam is None else seam].read(index, time, seam=seam):
             return outcome
         raise LayerError(f"the result of time code {time} is gone; refine it anew by --resume")
 
@@ -179,7 +164,7 @@ class _Joins:
         known = {seam.after for seam in self.seams}
         alone = self.run["options"].get("temporal") == "off" or not np.isfinite(self.bound)
         for part in () if alone else self.parts:
-            if part.numbers[0] - 1 in self.folders and part.times[0] not in known:
+            if part.numbers[0] - 1 in self.chunks and part.times[0] not in known:
                 unknown = f"nothing tells how far the seam at {part.times[0]:g} moves"
                 remedy = "refine it with --preroll 1 or more, or give --seam-bound inf"
                 raise LayerError(
@@ -276,7 +261,7 @@ def check_seams(
         _check_same_shot(parts[0], made_from(opened, parts[0].folder, parts[0].options()))
         joins = _Joins(parts, opened, seam_bound, lambda _: None)
         before = [k for start, first in joins.starts.items() for k in range(first, start)]
-        deque(joins.outcomes(sorted(joins.folders.keys() & {*before})), maxlen=0)
+        deque(joins.outcomes(sorted(joins.chunks.keys() & {*before})), maxlen=0)
     return joins.seams
 
 
