@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from shots import cloth_shot
 
-from physgraph_usd.shot.chunks import in_order
+from physgraph_usd.shot.chunks import frames_in_order
 from physgraph_usd.shot.frames import Outcome
 from physgraph_usd.shot.joined import join
 from physgraph_usd.shot.options import RefineOptions
@@ -47,7 +47,7 @@ def heights(found: list[Outcome]) -> list[float]:
 def test_cloth_that_would_cross_jumps_and_is_told_of():
     told: list[str] = []
     why = Passing("</a> would have 3 edges through cloth")
-    found = list(in_order(read, range(5), {3: 0}, join=lambda both: join(both, why, told.append).frames))
+    found = list(frames_in_order(read, range(5), {3: 0}, join=lambda both: join(both, why, told.append).frames))
     assert [each.reused for each in found] == [(True,), (True,), (True,), (False,), (True,)]
     assert heights(found) == [0.0, 0.0, 0.0, 1.0, 1.0]
     (said,) = told

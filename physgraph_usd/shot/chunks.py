@@ -55,7 +55,7 @@ def _ranges(numbers: Sequence[int]) -> list[range]:
     return [range(numbers[a], numbers[b - 1] + 1) for a, b in pairwise([*starts, len(numbers)])]
 
 
-def in_order(
+def frames_in_order(
     read: Read, numbers: Iterable[int], seams: Mapping[int, int], *, join: Join | None
 ) -> Generator[Outcome, None, None]:
     """Yield frames in order, those before each seam joined.
@@ -102,7 +102,7 @@ def solve_in_chunks(
         only: Numbers of the time codes to solve; None for all.
         preroll: Frames solved before each chunk except the shot's first.
         start: Starts a chunk in another process; None solves in this process.
-        join: As for `in_order`.
+        join: As for `frames_in_order`.
 
     Raises:
         SolveError: A process died.
@@ -126,7 +126,7 @@ def solve_in_chunks(
         stored = partial(frames.read, index, times[index], seam=seam)
         return _await(stored, times[index], call=calls.get(index if seam is None else seam), solved=solved)
 
-    yield from in_order(read, wanted, seams, join=join)
+    yield from frames_in_order(read, wanted, seams, join=join)
 
 
 def _solve(

@@ -20,7 +20,7 @@ import numpy as np
 from ..errors import LayerError, UsageError, counted
 from ..solver.level import refine_garments
 from ..usd.read.reader import Shot
-from .chunks import in_order
+from .chunks import frames_in_order
 from .finished import check_jobs, made_from
 from .frames import CHUNK, Finished, Outcome, record_in
 from .joined import Both, Joint, between, join
@@ -134,7 +134,7 @@ class _Joins:
             self._measure(both, joint)
             return joint.frames
 
-        yield from in_order(self._read, numbers, self.starts, join=joined)
+        yield from frames_in_order(self._read, numbers, self.starts, join=joined)
         self._check()
 
     def _read(self, index: int, seam: int | None) -> Outcome:
