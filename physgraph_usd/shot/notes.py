@@ -12,9 +12,9 @@ from ..solver.fabric import NAMED
 from ..solver.resolution import SHARP_FRACTION, LevelChoice
 from ..usd.read.reader import Shot
 from ..usd.schema import GARMENT
+from .options import options_of
 from .report import is_first
 from .settled import COLLAPSED, LIMITED, UNSOLVED, in_words
-from .untagged import options_of
 
 EASE = 4
 """Weft ease proposed by the note on slack [percent]: of the values in docs/fabrics.md, the one to fold every cage."""

@@ -13,9 +13,10 @@ from typing import Any
 from ..errors import counted
 from ..solver.strain import StrainedPart
 from ..usd.read.rest import FITTED
+from .options import options_of
 from .report import RefineReport, is_first
 from .settled import COLLAPSED, LIMITED, UNSOLVED, in_words
-from .untagged import AUTO, NEAR, Candidate, options_of
+from .untagged import AUTO, NEAR, Candidate
 
 MOST_NAMED = 3
 """Most prims, parts or time codes named in one warning."""
