@@ -14,7 +14,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Se
 from concurrent.futures import Future
 from dataclasses import replace
 from functools import partial
-from itertools import pairwise
+from itertools import chain, pairwise
 from math import inf
 from typing import Any
 
@@ -23,7 +23,7 @@ import numpy as np
 from ..errors import SolveError
 from ..interrupts import leave_if_asked
 from .frames import FrameFolder, Outcome
-from .joined import Both
+from .joined import Both, Joint, Mover, join
 from .processes import POLL_SECONDS, Start, memory_is_named, result_of
 
 PREROLL = 6
@@ -35,8 +35,8 @@ Solver = Callable[[Sequence[float | None]], Iterator[Outcome]]
 """Solves time codes in order; must be picklable to run in several processes."""
 Read = Callable[[int, int | None], Outcome]
 """Reads a frame by number, solved as usual (None) or in the pre-roll of the chunk that starts at a number."""
-Join = Callable[[Both], Iterable[Outcome]]
-"""Joins the frames before a seam."""
+Join = Callable[[int, Both], Iterable[Outcome]]
+"""Joins the frames before the seam at a number."""
 
 
 def chunks_of(missing: Sequence[int], workers: int) -> list[list[range]]:
@@ -66,7 +66,7 @@ def frames_in_order(
         seams: By number of the first frame after a seam, number of the first frame of its pre-roll.
         join: Joins the frames before a seam; None leaves them as solved before the seam.
     """
-    ends = {index: start for start in sorted(seams, reverse=True) for index in range(seams[start], start)}
+    ends = {index: seam for seam, before in _joined_at(seams).items() for index in before}
     both: list[tuple[Outcome, Outcome]] = []
     for index in numbers:
         leave_if_asked()
@@ -78,8 +78,14 @@ def frames_in_order(
             continue
         both.append((outcome, read(index, ends[index])))
         if index + 1 == ends[index]:
-            yield from join(both)
+            yield from join(ends[index], both)
             both = []
+
+
+def _joined_at(seams: Mapping[int, int]) -> dict[int, range]:
+    """Numbers of the frames joined at each seam: its pre-roll, as far as no earlier seam is in it."""
+    starts = [0, *sorted(seams)]
+    return {start: range(max(seams[start], before), start) for before, start in pairwise(starts)}
 
 
 def solve_in_chunks(
@@ -88,10 +94,11 @@ def solve_in_chunks(
     frames: FrameFolder,
     *,
     workers: int,
+    mover: Mover | None,
+    warn: Callable[..., object],
     only: range | None = None,
     preroll: int = PREROLL,
     start: Start | None = None,
-    join: Join | None = None,
 ) -> Generator[Outcome, None, None]:
     """Solve all time codes except the kept ones, in this process or in several, and yield all in order.
 
@@ -99,10 +106,11 @@ def solve_in_chunks(
         solver: Solves time codes in order.
         frames: Folder of the results; frames in ``frames.kept`` are read from the folder.
         workers: Number of chunks.
+        mover: Moves cloth safely, to join the frames before each seam; picklable. None leaves them unjoined.
+        warn: Called with the warnings of a seam.
         only: Numbers of the time codes to solve; None for all.
         preroll: Frames solved before each chunk except the shot's first.
         start: Starts a chunk in another process; None solves in this process.
-        join: As for `frames_in_order`.
 
     Raises:
         SolveError: A process died.
@@ -115,18 +123,24 @@ def solve_in_chunks(
     new = [part.start for part in parts if part.stop not in frames.kept or part.stop in frames.seams]
     seams = frames.seams | {first: max(0, first - preroll) for first in new}
     solved: Iterator[int] = iter(())
-    calls: dict[int, Future[None]] = {}
+    calls: dict[int, Future[dict[int, Joint]]] = {}
     if start is None:
         solved = _solve(solver, list(times), parts, frames, preroll)
     else:
-        called = [start(_work, solver, list(times), chunk, frames, preroll) for chunk in chunks]
+        called = [start(_work, (solver, list(times), chunk, frames, preroll), seams, mover) for chunk in chunks]
         calls = {k: call for chunk, call in zip(chunks, called, strict=True) for part in chunk for k in part}
 
     def read(index: int, seam: int | None) -> Outcome:
         stored = partial(frames.read, index, times[index], seam=seam)
         return _await(stored, times[index], call=calls.get(index if seam is None else seam), solved=solved)
 
-    yield from frames_in_order(read, wanted, seams, join=join)
+    def joined(move: Mover, seam: int, both: Both) -> Sequence[Outcome]:
+        known = result_of(calls[seam - 1]).get(seam) if seam - 1 in calls else None
+        joint = known or join(both, move)
+        warn(*joint.warnings)
+        return joint.frames
+
+    yield from frames_in_order(read, wanted, seams, join=partial(joined, mover) if mover else None)
 
 
 def _solve(
@@ -141,13 +155,29 @@ def _solve(
                 yield index
 
 
-def _work(*job: Any) -> None:
-    """Solve a chunk in a worker process."""
+def _work(job: tuple[Any, ...], seams: Mapping[int, int], mover: Mover | None) -> dict[int, Joint]:
+    """Solve a chunk in a worker process, and join its frames before each seam if the next chunk's are there."""
     deque(_solve(*job), maxlen=0)
+    _, times, chunk, frames, _ = job
+    own, joints = {index for part in chunk for index in part}, dict[int, Joint]()
+
+    def read(index: int, seam: int | None) -> Outcome:
+        return frames.read(index, times[index], seam=seam)
+
+    def joined(move: Mover, seam: int, both: Both) -> Sequence[Outcome]:
+        joints[seam] = join(both, move)
+        return joints[seam].frames
+
+    ready = [
+        each for seam, each in _joined_at(seams).items() if own.issuperset(each) and all(read(k, seam) for k in each)
+    ]
+    if mover:
+        deque(frames_in_order(read, chain(*ready), seams, join=partial(joined, mover)), maxlen=0)
+    return joints
 
 
 def _await(
-    stored: Callable[[], Outcome | None], time: float | None, *, call: Future[None] | None, solved: Iterator[int]
+    stored: Callable[[], Outcome | None], time: float | None, *, call: Future[Any] | None, solved: Iterator[int]
 ) -> Outcome:
     """A result once ``call``, or ``solved`` in this process, has stored it."""
     latest = inf

@@ -43,14 +43,19 @@ class Joint:
     frames: Sequence[Outcome]
     why: str
 
+    @property
+    def warnings(self) -> list[str]:
+        """A warning if the cloth jumps."""
+        jump = f"the cloth jumps after time code {self.frames[-1].time:g}, where the work of two processes meets"
+        return [f"{jump}: {self.why}"] if self.why else []
 
-def join(both: Both, move: Mover, warn: Callable[[str], object]) -> Joint:
+
+def join(both: Both, move: Mover) -> Joint:
     """Join the frames of one seam.
 
     Args:
         both: The frames before the seam, each with the solution of the process behind the seam.
         move: Moves cloth safely.
-        warn: Called with a warning if the cloth jumps.
     """
     frames = list[Outcome]()
     for k, (own, after) in enumerate(both, start=1):
@@ -63,8 +68,6 @@ def join(both: Both, move: Mover, warn: Callable[[str], object]) -> Joint:
         points, why = move(own.time, *((near, far) if weight < 0.5 else (far, near)), wanted)
         leave_if_asked()  # A signal may have cut the move short.
         if why:
-            seam = f"after time code {both[-1][0].time:g}"
-            warn(f"the cloth jumps {seam}, where the work of two processes meets: {why}")
             return Joint([own for own, _ in both], why)
         frames.append(replace(own, points=tuple(points), reused=(False,) * len(points)))
     return Joint(frames, "")

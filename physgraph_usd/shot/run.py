@@ -29,7 +29,6 @@ from .describe import say_what_was
 from .farm import connected
 from .finished import made_from
 from .frames import CHUNK, FrameFolder, Outcome, frames_folder
-from .joined import Both, join
 from .notes import of_energy, of_folds, of_rest
 from .options import RefineOptions
 from .processes import Start, separate_processes
@@ -180,13 +179,10 @@ class Run:
         self._warn_of_finished(frames, len(self._numbers))
         with self._processes() as start:
             how = {"workers": self.options.workers, "only": self._numbers, "preroll": self._preroll, "start": start}
-            how["join"] = None if self._is_chunk else self._joined
+            mover = None if self._is_chunk else self.solver.move_safely
+            how |= {"mover": mover, "warn": self.report.warn}
             with closing(solve_in_chunks(self.solver, self._times, frames, **how)) as solved:
                 yield from solved
-
-    def _joined(self, both: Both) -> Sequence[Outcome]:
-        """The frames before a seam, joined."""
-        return join(both, self.solver.move_safely, self.report.warn).frames
 
     def _processes(self) -> AbstractContextManager[Start | None]:
         """Starter of chunks: on a farm, in processes of this machine, or None to solve in this process."""

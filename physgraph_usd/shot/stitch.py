@@ -112,7 +112,7 @@ class _Joins:
     parts: Sequence[_Chunk]
     shot: Shot
     bound: float
-    warn: Callable[[str], object]
+    warn: Callable[..., object]
     seams: list[Seam] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -129,9 +129,10 @@ class _Joins:
         """Frames by number, joined, then a check of the seams (LayerError)."""
         solver = ShotSolver(self.shot.path, self.run["levels"], self.parts[0].options(), opened=self.shot)
 
-        def joined(both: Both) -> Sequence[Outcome]:
-            joint = join(both, solver.move_safely, self.warn)
-            self._measure(both, joint)
+        def joined(seam: int, both: Both) -> Sequence[Outcome]:
+            joint = join(both, solver.move_safely)
+            self.warn(*joint.warnings)
+            self._measure(seam, both, joint)
             return joint.frames
 
         yield from frames_in_order(self._read, numbers, self.starts, join=joined)
@@ -143,10 +144,9 @@ class _Joins:
             return outcome
         raise LayerError(f"the result of time code {time} is gone; refine it anew by --resume")
 
-    def _measure(self, both: Both, joint: Joint) -> None:
+    def _measure(self, seam: int, both: Both, joint: Joint) -> None:
         """Measure a seam; unknown if the last frame failed in either chunk."""
-        times = self.run["times"]
-        after = times[times.index(both[-1][0].time) + 1]
+        after = self.run["times"][seam]
         for index, (source, mesh) in enumerate(zip(self.shot.sources, self.meshes, strict=True)):
             moves = _moves(both, joint, index, mesh.half_edges.edges)
             if moves is not None:
@@ -259,7 +259,7 @@ def check_seams(
     _check_alike(parts, one_shot=shot is None)
     with closing(open_for(str(shot or parts[0].shot), parts[0].options())) as opened:
         _check_same_shot(parts[0], made_from(opened, parts[0].folder, parts[0].options()))
-        joins = _Joins(parts, opened, seam_bound, lambda _: None)
+        joins = _Joins(parts, opened, seam_bound, lambda *_: None)
         before = [k for start, first in joins.starts.items() for k in range(first, start)]
         deque(joins.outcomes(sorted(joins.chunks.keys() & {*before})), maxlen=0)
     return joins.seams
