@@ -158,21 +158,23 @@ def _solve(
 def _work(job: tuple[Any, ...], seams: Mapping[int, int], mover: Mover | None) -> dict[int, Joint]:
     """Solve a chunk in a worker process, and join its frames before each seam if the next chunk's are there."""
     deque(_solve(*job), maxlen=0)
+    joints: dict[int, Joint] = {}
+    if mover is None:
+        return joints
     _, times, chunk, frames, _ = job
-    own, joints = {index for part in chunk for index in part}, dict[int, Joint]()
+    own, move = {index for part in chunk for index in part}, mover
 
-    def read(index: int, seam: int | None) -> Outcome:
+    def read(index: int, seam: int | None) -> Any:
         return frames.read(index, times[index], seam=seam)
 
-    def joined(move: Mover, seam: int, both: Both) -> Sequence[Outcome]:
+    def joined(seam: int, both: Both) -> Sequence[Outcome]:
         joints[seam] = join(both, move)
         return joints[seam].frames
 
-    ready = [
+    before = [
         each for seam, each in _joined_at(seams).items() if own.issuperset(each) and all(read(k, seam) for k in each)
     ]
-    if mover:
-        deque(frames_in_order(read, chain(*ready), seams, join=partial(joined, mover)), maxlen=0)
+    deque(frames_in_order(read, chain(*before), seams, join=joined), maxlen=0)
     return joints
 
 
