@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from contextlib import closing
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +10,9 @@ import numpy as np
 import pytest
 from shots import cloth_shot
 
-from physgraph_usd.shot.frames import Lead, Outcome
-from physgraph_usd.shot.joined import SafeMover, joined
+from physgraph_usd.shot.chunks import frames_in_order
+from physgraph_usd.shot.frames import Outcome
+from physgraph_usd.shot.joined import join
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.solve import ShotSolver
 from physgraph_usd.usd.read.reader import open_shot
@@ -24,13 +24,9 @@ def outcome(time: float, height: float, *, kept: bool = False) -> Outcome:
     return Outcome(time, (points,), (kept,), {"time": time})
 
 
-def seam(count: int, height: float) -> list[Outcome]:
-    """A cloth at rest at zero, which another process has at a height in its last frames, and goes on there."""
-    both = [
-        replace(outcome(float(k), 0.0, kept=True), lead=Lead(outcome(float(k), height), count, (k + 1) / (count + 1)))
-        for k in range(count)
-    ]
-    return [*both, outcome(float(count), height, kept=True), outcome(count + 1.0, height, kept=True)]
+def read(index: int, seam: int | None) -> Outcome:
+    """A cloth at rest at zero, which another process has at a height in the first three frames, and goes on there."""
+    return outcome(float(index), 0.0 if seam is None and index < 3 else 1.0, kept=True)
 
 
 class Passing:
@@ -49,27 +45,27 @@ def heights(found: list[Outcome]) -> list[float]:
 
 
 def test_cloth_that_would_cross_jumps_and_is_told_of():
-    told: list[str] = []
-    found = list(joined(seam(3, 1.0), Passing("</a> would have 3 edges through cloth"), told.append))
+    joints = [join([(read(k, None), read(k, 3)) for k in range(3)], Passing("</a> would have 3 edges through cloth"))]
+    found = list(frames_in_order(read, range(5), {3: 0}, join=lambda *_: joints[0].frames))
+    assert [each.reused for each in found] == [(True,), (True,), (True,), (False,), (True,)]
     assert heights(found) == [0.0, 0.0, 0.0, 1.0, 1.0]
-    (said,) = told
+    (said,) = joints[0].warnings
     assert "after time code 2" in said
     assert "3 edges through cloth" in said
 
 
 def test_a_frame_that_failed_on_one_side_is_taken_as_it_is():
-    frames = seam(2, 1.0)
-    lead = frames[0].lead
-    assert lead is not None
-    frames[0] = replace(frames[0], lead=replace(lead, outcome=Outcome(0.0, (), (), {"error": "no"})))
-    found = list(joined(frames, Passing(), print))
-    assert heights(found) == pytest.approx([0.0, 2 / 3, 1.0, 1.0])
+    both = [(read(k, None), read(k, 3)) for k in range(3)]
+    both[0] = (both[0][0], Outcome(0.0, (), (), {"error": "no"}))
+    found = list(join(both, Passing()).frames)
+    assert heights(found) == pytest.approx([0.0, 0.5, 0.75])
+    assert [each.reused for each in found] == [(True,), (False,), (False,)]
 
 
 def test_folds_that_change_sides_stop_before_they_cross(tmp_path: Path):
     """Half way between a half that lies over the other one, and under it, they would pass through each other."""
     with closing(open_shot(str(cloth_shot(tmp_path / "shot.usdc", times=(1.0,), size=(4, 3))))) as opened:
-        move = SafeMover(ShotSolver(opened.path, [0], RefineOptions(), opened=opened), ["/Cloth"])
+        move = ShotSolver(opened.path, [0], RefineOptions(), opened=opened).move_safely
         flat = opened.frame(1.0).garments[0].points * [1.0, 1.0, 0.0]
         middle = flat.mean(axis=0)
         turned = np.flatnonzero(flat[:, 0] > middle[0] + 0.01)

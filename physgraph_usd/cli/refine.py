@@ -22,6 +22,7 @@ from .show_file import values_for
 from .structure import DONE, FAILED, GroupedCommand, errors_named, imports_uncollected, show_trace
 
 if TYPE_CHECKING:
+    from ..shot.finished import Job
     from ..shot.options import RefineOptions
     from ..shot.report import RefineReport
     from ..shot.summary import Row
@@ -29,8 +30,6 @@ if TYPE_CHECKING:
 USD_SUFFIXES = (".usd", ".usda", ".usdc")
 RENAMED = {"run-up": "preroll"}
 """Names that options had before, without dashes; they still work and are in no help."""
-
-Job = tuple[str, Path, "RefineOptions"]
 
 
 @click.command(cls=GroupedCommand, context_settings={"token_normalize_func": lambda name: RENAMED.get(name, name)})
@@ -102,6 +101,7 @@ def _each_or_none(shots: tuple[str, ...], to: Path | None, option: str, **known:
 
 def _refine_each(jobs: Sequence[Job], output: Output, *, summary: Path | None) -> int:
     """Refine the jobs and say of each what became of it; returns the exit code."""
+    from ..shot.finished import results
     from ..shot.summary import check_summary, exit_code_of, row_of
 
     if summary is not None:
@@ -115,7 +115,7 @@ def _refine_each(jobs: Sequence[Job], output: Output, *, summary: Path | None) -
 
     try:
         with at_end(interrupted):
-            for (shot, layer, _), done in zip(jobs, _results(jobs, output), strict=True):
+            for (shot, layer, _), done in zip(jobs, results(jobs, partial(_solved, output=output)), strict=True):
                 rows.append(row_of(shot, layer, done))
                 if isinstance(done, PhysGraphError):
                     failed.append(done)
@@ -152,20 +152,8 @@ def _print_failed(rows: Sequence[Row]) -> None:
         say(f"{len(failed)} of {counted(len(rows), 'shot')} failed", err=True)
 
 
-def _results(jobs: Sequence[Job], output: Output) -> Iterator[RefineReport | PhysGraphError]:
-    """Result of each job: one in this process, several in processes of their own.
-
-    What was finished before is passed over without the solver, whose import takes seconds.
-    """
-    from ..shot.finished import check_jobs, finished, in_order
-
-    check_jobs(jobs)
-    found = [finished(*job) for job in jobs]
-    yield from in_order(found, _solved([job for job, there in zip(jobs, found, strict=True) if there is None], output))
-
-
 def _solved(jobs: Sequence[Job], output: Output) -> Generator[RefineReport | PhysGraphError, None, None]:
-    """Fate of the jobs that are not finished."""
+    """Result of each job: one in this process, several in processes of their own."""
     if not jobs:
         return
     from ..shot.processes import import_ahead
@@ -188,14 +176,14 @@ def _solved(jobs: Sequence[Job], output: Output) -> Generator[RefineReport | Phy
     yield from refine_shots(jobs, workers=workers, refine=refine)
 
 
-def _refine_logged(shot: str, layer: Path, options: RefineOptions, *, output: Output, alone: bool) -> RefineReport:
+def _refine_logged(*job: Any, output: Output, alone: bool) -> RefineReport:
     """Refine a shot in a process of its own, which logs for itself."""
     with output.logged():
-        return _refine_shown(shot, layer, options, output=output, alone=alone)
+        return _refine_shown(*job, output=output, alone=alone)
 
 
 def _refine_shown(
-    shot: str, layer: Path, options: RefineOptions, *, output: Output, alone: bool = True
+    shot: str | Path, layer: Path, options: RefineOptions, *, output: Output, alone: bool = True
 ) -> RefineReport:
     """Refine a shot and show how far it is where it is alone at work."""
     with imports_uncollected():

@@ -1,27 +1,30 @@
-"""Solves a shot's time codes, in this process or in several, and returns the results in frame order.
+"""Solves a shot's time codes, in this process or in several, and reads the stored results in frame order.
 
 Each process opens the shot itself and starts a few frames before its chunk (the pre-roll), to settle its warm starts by
 the first frame of the chunk. Two processes solve the frames of a pre-roll; `joined` blends the two solutions. Results
 are stored in files: memory does not grow with the frame count, finished frames survive an interruption, and a later run
-does not solve finished frames again.
+does not solve finished frames again. `stitch` reads the folders of other runs in the same way.
 """
 
 from __future__ import annotations
 
 import time as clock
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import replace
-from itertools import pairwise
-from typing import Any, NoReturn
+from functools import partial
+from itertools import chain, pairwise
+from math import inf
+from typing import Any
 
 import numpy as np
 
-from ..errors import LayerError, SolveError
+from ..errors import SolveError
 from ..interrupts import leave_if_asked
-from .frames import Finished, Folders, FrameFolder, Lead, Outcome
-from .joined import Mover, join
-from .processes import POLL_SECONDS, Start, memory_is_named, result_of, wait_for
+from .frames import FrameFolder, Outcome
+from .joined import Both, Joint, Mover, join
+from .processes import POLL_SECONDS, Start, memory_is_named, result_of
 
 PREROLL = 6
 """Frames solved before a chunk if frames depend on their predecessors."""
@@ -30,8 +33,10 @@ LATE_SECONDS = 60.0
 """Longest time for a file to appear after its process has ended [s]: network file systems cache missing files."""
 Solver = Callable[[Sequence[float | None]], Iterator[Outcome]]
 """Solves time codes in order; must be picklable to run in several processes."""
-Seams = Mapping[int, tuple[int, float]]
-"""By number of a frame solved on both sides of a seam: number of the first frame after the seam, and `Lead.weight`."""
+Read = Callable[[int, int | None], Outcome]
+"""Reads a frame by number, solved as usual (None) or in the pre-roll of the chunk that starts at a number."""
+Join = Callable[[int, Both], Iterable[Outcome]]
+"""Joins the frames before the seam at a number."""
 
 
 def chunks_of(missing: Sequence[int], workers: int) -> list[list[range]]:
@@ -50,25 +55,37 @@ def _ranges(numbers: Sequence[int]) -> list[range]:
     return [range(numbers[a], numbers[b - 1] + 1) for a, b in pairwise([*starts, len(numbers)])]
 
 
-def seams_of(chunks: Sequence[Sequence[range]], frames: Finished | Folders, *, preroll: int) -> Seams:
-    """Find the frames solved on both sides of a seam.
+def frames_in_order(
+    read: Read, numbers: Iterable[int], seams: Mapping[int, int], *, join: Join | None
+) -> Generator[Outcome, None, None]:
+    """Yield frames in order, those before each seam joined.
 
     Args:
-        chunks: The frames of each worker.
-        frames: Stored results; frames of an earlier run have their own seams.
-        preroll: Frames solved before each range.
+        read: Reads a frame.
+        numbers: Numbers of the frames.
+        seams: By number of the first frame after a seam, number of the first frame of its pre-roll.
+        join: Joins the frames before a seam; None leaves them as solved before the seam.
     """
-    starts = frames.seams()
-    parts = [part for chunk in chunks for part in chunk if part.start]
-    # If an earlier run solved the frame after a range, the motion continues from the earlier run, not from the range.
-    starts |= {part.start for part in parts if part.stop not in frames.kept or part.stop in starts}
-    found: dict[int, tuple[int, float]] = {}
-    before = 0
-    for start in sorted(starts):
-        both = range(max(start - preroll, before), start)
-        found |= {index: (start, (k + 1) / (len(both) + 1)) for k, index in enumerate(both)}
-        before = start
-    return found
+    ends = {index: seam for seam, before in _joined_at(seams).items() for index in before}
+    both: list[tuple[Outcome, Outcome]] = []
+    for index in numbers:
+        leave_if_asked()
+        outcome = read(index, None)
+        if index in seams:  # "Reused" refers to the last pre-roll frame, not to the previous frame here.
+            outcome = replace(outcome, reused=(False,) * len(outcome.reused))
+        if join is None or index not in ends:
+            yield outcome
+            continue
+        both.append((outcome, read(index, ends[index])))
+        if index + 1 == ends[index]:
+            yield from join(ends[index], both)
+            both = []
+
+
+def _joined_at(seams: Mapping[int, int]) -> dict[int, range]:
+    """Numbers of the frames joined at each seam: its pre-roll, as far as no earlier seam is in it."""
+    starts = [0, *sorted(seams)]
+    return {start: range(max(seams[start], before), start) for before, start in pairwise(starts)}
 
 
 def solve_in_chunks(
@@ -77,10 +94,11 @@ def solve_in_chunks(
     frames: FrameFolder,
     *,
     workers: int,
+    mover: Mover | None,
+    warn: Callable[..., object],
     only: range | None = None,
     preroll: int = PREROLL,
     start: Start | None = None,
-    mover: Mover | None = None,
 ) -> Generator[Outcome, None, None]:
     """Solve all time codes except the kept ones, in this process or in several, and yield all in order.
 
@@ -88,12 +106,11 @@ def solve_in_chunks(
         solver: Solves time codes in order.
         frames: Folder of the results; frames in ``frames.kept`` are read from the folder.
         workers: Number of chunks.
+        mover: Moves cloth safely, to join the frames before each seam; picklable. None leaves them unjoined.
+        warn: Called with the warnings of a seam.
         only: Numbers of the time codes to solve; None for all.
-        preroll: Frames solved before each chunk except the shot's first; yielded as the ``lead`` of the same frames of
-            the previous chunk.
+        preroll: Frames solved before each chunk except the shot's first.
         start: Starts a chunk in another process; None solves in this process.
-        mover: Moves cloth safely; other processes then join the frames before a seam once both sides are solved, and
-            a ``lead`` holds the joined frame. Picklable.
 
     Raises:
         SolveError: A process died.
@@ -101,51 +118,29 @@ def solve_in_chunks(
     """
     wanted = range(len(times)) if only is None else only
     chunks = chunks_of([k for k in wanted if k not in frames.kept], workers)
-    seams = seams_of(chunks, frames, preroll=preroll)
+    parts = [part for chunk in chunks for part in chunk]
+    # If an earlier run solved the frame after a range, the motion continues from the earlier run, not from the range.
+    new = [part.start for part in parts if part.stop not in frames.kept or part.stop in frames.seams]
+    seams = frames.seams | {first: max(0, first - preroll) for first in new}
     solved: Iterator[int] = iter(())
-    owners: dict[int, Future[None]] = {}
+    calls: dict[int, Future[dict[int, Joint]]] = {}
     if start is None:
-        solved = _solve(solver, list(times), [part for chunk in chunks for part in chunk], frames, preroll)
+        solved = _solve(solver, list(times), parts, frames, preroll)
     else:
-        calls = [start(_work, (solver, list(times), chunk, frames, preroll), seams, mover) for chunk in chunks]
-        owners = {k: call for chunk, call in zip(chunks, calls, strict=True) for part in chunk for k in part}
-    for index in wanted:
-        time = times[index]
-        outcome = _collect(frames, index, time, owner=owners.get(index), solved=solved)
-        if index in seams:
-            seam, weight = seams[index]
-            lead = frames.read(index, time, seam=seam)
-            if lead is None and seam not in frames.kept:
-                lead = _collect(frames, index, time, owner=owners.get(seam), solved=solved, seam=seam)
-            if index in owners:
-                wait_for(owners[index])  # It may join its last frames with the next chunk.
-            made = frames.read(index, time, seam=seam, joined=True)
-            outcome = outcome if lead is None else replace(outcome, lead=Lead(lead, seam, weight, made))
-        yield outcome
+        called = [start(_work, (solver, list(times), chunk, frames, preroll), seams, mover) for chunk in chunks]
+        calls = {k: call for chunk, call in zip(chunks, called, strict=True) for part in chunk for k in part}
 
+    def read(index: int, seam: int | None) -> Outcome:
+        stored = partial(frames.read, index, times[index], seam=seam)
+        return _await(stored, times[index], call=calls.get(index if seam is None else seam), solved=solved)
 
-def finished_frames(
-    frames: Folders, times: Sequence[float | None], numbers: Sequence[int], *, preroll: int
-) -> Generator[Outcome, None, None]:
-    """Yield the frames of chunks in order; if two chunks hold a frame, the later chunk's result is the ``lead``.
+    def joined(move: Mover, seam: int, both: Both) -> Sequence[Outcome]:
+        known = result_of(calls[seam - 1]).get(seam) if seam - 1 in calls else None
+        joint = known or join(both, move)
+        warn(*joint.warnings)
+        return joint.frames
 
-    Args:
-        times: Time codes of the shot.
-        numbers: Numbers of the frames to yield.
-        preroll: Frames solved before each chunk.
-    """
-    starts, seams = frames.seams(), seams_of([], frames, preroll=preroll)
-    for index in numbers:
-        leave_if_asked()
-        outcome = frames.read(index, times[index])
-        if outcome is None:
-            raise LayerError(f"the result of time code {times[index]} is gone; refine it anew by --resume")
-        if index in starts:  # "Reused" refers to the last pre-roll frame, not to the previous frame here.
-            outcome = replace(outcome, reused=(False,) * len(outcome.reused))
-        seam, weight = seams.get(index, (None, 0.0))
-        lead = None if seam is None else frames.read(index, times[index], seam=seam)
-        made = None if seam is None else frames.read(index, times[index], seam=seam, joined=True)
-        yield outcome if lead is None or seam is None else replace(outcome, lead=Lead(lead, seam, weight, made))
+    yield from frames_in_order(read, wanted, seams, join=partial(joined, mover) if mover else None)
 
 
 def _solve(
@@ -160,60 +155,41 @@ def _solve(
                 yield index
 
 
-def _work(job: tuple[Any, ...], seams: Seams, mover: Mover | None) -> None:
-    """Solve a chunk in a worker process, and join its frames before a seam if the next chunk's are there."""
-    for _ in _solve(*job):
-        pass
+def _work(job: tuple[Any, ...], seams: Mapping[int, int], mover: Mover | None) -> dict[int, Joint]:
+    """Solve a chunk in a worker process, and join its frames before each seam if the next chunk's are there."""
+    deque(_solve(*job), maxlen=0)
+    joints: dict[int, Joint] = {}
+    if mover is None:
+        return joints
     _, times, chunk, frames, _ = job
-    own = {index for part in chunk for index in part}
-    for start in sorted({start for start, _ in seams.values()}) if mover else ():
-        numbers = [index for index, (seam, _) in seams.items() if seam == start]
-        if mover and own.issuperset(numbers):
-            _join(frames, {index: times[index] for index in numbers}, seams, mover)
+    own, move = {index for part in chunk for index in part}, mover
+
+    def read(index: int, seam: int | None) -> Any:
+        return frames.read(index, times[index], seam=seam)
+
+    def joined(seam: int, both: Both) -> Sequence[Outcome]:
+        joints[seam] = join(both, move)
+        return joints[seam].frames
+
+    before = [
+        each for seam, each in _joined_at(seams).items() if own.issuperset(each) and all(read(k, seam) for k in each)
+    ]
+    deque(frames_in_order(read, chain(*before), seams, join=joined), maxlen=0)
+    return joints
 
 
-def _join(frames: FrameFolder, times: Mapping[int, float | None], seams: Seams, mover: Mover) -> None:
-    """Join and store the frames before a seam, by number, unless the next chunk's are missing or the cloth jumps."""
-    both = list[tuple[Outcome, Lead]]()
-    for index, time in times.items():
-        seam, weight = seams[index]
-        own, lead = frames.read(index, time), frames.read(index, time, seam=seam)
-        if own is None or lead is None:
-            return
-        both.append((own, Lead(lead, seam, weight)))
-    joint = join(both, mover)
-    for index, outcome in zip(times, joint.frames, strict=True) if not joint.why else ():
-        frames.write(index, outcome, seam=seams[index][0], joined=True)
-
-
-def _collect(
-    frames: FrameFolder,
-    index: int,
-    time: float | None,
-    *,
-    owner: Future[None] | None,
-    solved: Iterator[int],
-    seam: int | None = None,
+def _await(
+    stored: Callable[[], Outcome | None], time: float | None, *, call: Future[Any] | None, solved: Iterator[int]
 ) -> Outcome:
-    """Read a frame once its owner, or ``solved`` without an owner, has stored it; ``seam`` as in `FrameFolder.read`."""
-    latest: float | None = None
-    while True:
+    """A result once ``call``, or ``solved`` in this process, has stored it."""
+    latest = inf
+    while (outcome := stored()) is None:
         leave_if_asked()
-        over = owner is not None and owner.done()
-        outcome = frames.read(index, time, seam=seam)
-        if outcome is not None:
-            return outcome
-        if owner is None:
-            if next(solved, None) is None:
-                _lost(time)
-            continue
-        if over:
-            result_of(owner, time=time)
-            latest = latest or clock.monotonic() + LATE_SECONDS
-            if clock.monotonic() > latest:
-                _lost(time)
-        clock.sleep(POLL_SECONDS)
-
-
-def _lost(time: float | None) -> NoReturn:
-    raise SolveError(f"a worker ended without the result of time code {time}")
+        if clock.monotonic() > latest or (call is None and next(solved, None) is None):
+            raise SolveError(f"a worker ended without the result of time code {time}")
+        if call is not None and call.done():
+            result_of(call, time=time)
+            latest = min(latest, clock.monotonic() + LATE_SECONDS)
+        if call is not None:
+            clock.sleep(POLL_SECONDS)
+    return outcome

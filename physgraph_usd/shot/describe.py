@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import closing
+from pathlib import Path
+from shlex import join
 from typing import Any
 
 import numpy as np
@@ -17,7 +20,8 @@ from ..solver.resolution import LevelChoice, choose_levels, sample_frames
 from ..solver.scene import Frame, Garment, GarmentFrame
 from ..solver.strain import StrainedPart, strained_parts
 from ..usd.read.find import GRAVITY_OPTION
-from ..usd.read.reader import Shot
+from ..usd.read.reader import Shot, open_shot
+from ..usd.read.rest import FITTED
 from ..usd.read.survey import survey
 from ..usd.read.targets import DETAIL, FOLLOW, Target
 from ..usd.schema import GARMENT
@@ -26,11 +30,14 @@ from ..usd.times import within
 from ..usd.view import Stage
 from .estimate import cannot_fit, estimate
 from .notes import of_fabrics, of_slack, of_trims
-from .options import RefineOptions
+from .options import RefineOptions, options_of
 from .report import RefineReport, of_a_kind
-from .untagged import FAR, Candidate, command_of, find_candidates, proposal, rest_options
+from .untagged import FAR, Candidate, find_candidates
 from .up_axis import across_gravity
 from .warnings import of_gravity, of_strain, of_unfelt
+
+MOST_ASKED = 32
+"""Most open meshes tried as garments."""
 
 
 def begin_report(report: RefineReport, opened: Shot, options: RefineOptions) -> list[str]:
@@ -138,12 +145,50 @@ def describe(opened: Shot, options: RefineOptions) -> dict[str, Any]:
 def _command(opened: Shot, report: RefineReport, options: RefineOptions) -> dict[str, str]:
     """The command with touched but unnamed colliders added, and the rest shape option if the garments need one."""
     unfelt = dict.fromkeys(path for garment in report.garments for path in garment.get("unfelt", ()))
-    strained = [(g["sources"]["rest"], [StrainedPart(**part) for part in g["strained"]]) for g in report.garments]
-    rest = rest_options(strained)
+    rest = _rest_options(
+        opened, [[StrainedPart(**part) for part in garment["strained"]] for garment in report.garments]
+    )
     if not (unfelt or rest):
         return {}
-    colliders = [*opened.colliders, *unfelt] if unfelt else options.colliders
-    return {"command": command_of(opened.path, options.garments, colliders, bind=options.bind, rest=rest)}
+    named = {
+        "--garment": options.garments,
+        "--collider": [*opened.colliders, *unfelt] if unfelt else options.colliders,
+        "--bind": options.bind,
+    }
+    return {"command": _command_of(opened.path, rest, named)}
+
+
+def _command_of(shot: str, rest: Sequence[str], named: Mapping[str, Iterable[str]]) -> str:
+    """The command to refine a shot, with the result of `_rest_options` and the paths given by each option."""
+    out = str(Path(shot).with_suffix(".refined.usdc"))
+    options = [word for name, values in named.items() for word in options_of(name, values)]
+    return join(["physgraph-usd", "refine", shot, "-o", out, *rest, *options])
+
+
+def _rest_options(opened: Shot, strained: Iterable[Sequence[StrainedPart]]) -> list[str]:
+    """``--rest auto`` as words of a command, if a garment with the given strained parts needs the option."""
+    fitted = [source.sources["rest"].startswith(FITTED) for source in opened.sources]
+    wrong = any(part.needs_rest for fits, parts in zip(fitted, strained, strict=True) if not fits for part in parts)
+    return ["--rest", "auto"] if wrong else []
+
+
+def _proposal(shot: str | Stage, meshes: Sequence[str], frames: tuple[float, float] | None) -> str:
+    """The command for a shot without tags: open meshes, the largest first, lying on closed meshes are the garments.
+
+    "" if no garment is found or the meshes cannot be read together.
+    """
+    try:
+        with closing(open_shot(shot, garments=meshes[:MOST_ASKED], frames=frames)) as opened:
+            sampled = sample_frames(opened.every_time, opened.frame)
+            found = [each for each in find_candidates(opened) if each.is_taken]
+            lying = {path for each in found for path in each.shares}
+            garments = [garment.path for garment in opened.scene.garments if garment.path in lying]
+            strained = _strained_parts(opened, sampled)
+            rest = _rest_options(opened, [parts if path in lying else [] for path, parts in strained.items()])
+            named = {"--garment": garments, "--collider": [each.path for each in found]}
+            return _command_of(opened.path, rest, named) if found else ""
+    except StageError:
+        return ""
 
 
 def describe_meshes(shot: str | Stage, problem: str, options: RefineOptions) -> dict[str, Any]:
@@ -156,7 +201,7 @@ def describe_meshes(shot: str | Stage, problem: str, options: RefineOptions) -> 
     if not options.garments and not any(mesh.garment for mesh in found.meshes):
         cloth = [mesh for mesh in found.meshes if mesh.is_open and not mesh.problem]
         cloth.sort(key=lambda mesh: -mesh.faces)
-        command = proposal(shot, [mesh.path for mesh in cloth], options.frames)
+        command = _proposal(shot, [mesh.path for mesh in cloth], options.frames)
     return {
         "shot": found.path,
         "metres_per_unit": found.metres_per_unit,
@@ -248,12 +293,20 @@ def _across(opened: Shot, frames: Sequence[Frame], beside: Sequence[Candidate]) 
 
 def _strained(opened: Shot, report: RefineReport, frames: Sequence[Frame]) -> list[str]:
     """Add to the report the garment parts not sized like their rest shape; returns a warning."""
-    found, up = {}, -opened.scene.gravity
-    for index, (garment, source) in enumerate(zip(opened.scene.garments, opened.sources, strict=True)):
-        parts = strained_parts(garment, [frame.garments[index].points for frame in frames], source.subsets, up=up)
-        report.garments[index]["strained"] = [dataclasses.asdict(part) for part in parts]
-        found[garment.path] = parts
+    found = _strained_parts(opened, frames)
+    for garment, parts in zip(report.garments, found.values(), strict=True):
+        garment["strained"] = [dataclasses.asdict(part) for part in parts]
     return of_strain(found, opened.sources[0].sources["rest"])
+
+
+def _strained_parts(opened: Shot, frames: Sequence[Frame]) -> dict[str, list[StrainedPart]]:
+    """By path of each garment, the parts not sized like the rest shape."""
+    return {
+        garment.path: strained_parts(
+            garment, [frame.garments[k].points for frame in frames], source.subsets, up=-opened.scene.gravity
+        )
+        for k, (garment, source) in enumerate(zip(opened.scene.garments, opened.sources, strict=True))
+    }
 
 
 def _modelled(opened: Shot, report: RefineReport, options: RefineOptions) -> dict[str, str]:

@@ -5,7 +5,7 @@ The check works without the solver, whose libraries take seconds to import.
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -43,37 +43,22 @@ def finished(shot: str | Path, out: Path, options: RefineOptions) -> RefineRepor
     Args:
         shot: Input file.
         options: With ``skip_existing``, an existing layer is kept. With ``resume``, the layer is kept if all outputs
-            exist and the layer's record names the same inputs.
+            exist, no unfinished frames do, and the layer's record names the same inputs.
     """
-    if there := skipped(shot, out, options):
-        return there
-    if options.dry_run or not may_be_done(out, options):
+    report = RefineReport(str(shot), None, options.plain(), options.value_sources())
+    if options.skip_existing and out.is_file():
+        LOG.info("skipped: %s is there", out, extra={"shot": report.shot})
+        report.out, report.skipped = out, True
+        return report
+    made = options.resume and all(path.is_file() for _, path in options.targets(out))
+    if options.dry_run or not made or frames_folder(out).exists():
         return None
     try:
-        wanted = made_from(_Opened(str(shot)), out, options)
+        wanted = made_from(_Opened(report.shot), out, options)
     except PhysGraphError:  # The run itself will raise the error.
         return None
     if not is_result_of(out, wanted, settled=options.strict):
         return None
-    return taken_as_done(RefineReport(str(shot), None, options.plain(), options.value_sources()), out)
-
-
-def skipped(shot: str | Path, out: Path, options: RefineOptions) -> RefineReport | None:
-    """The report of a shot whose existing layer is kept, or None."""
-    if not options.skip_existing or not out.is_file():
-        return None
-    LOG.info("skipped: %s is there", out, extra={"shot": str(shot)})
-    return RefineReport(str(shot), out, options.plain(), options.value_sources(), skipped=True)
-
-
-def may_be_done(out: Path, options: RefineOptions) -> bool:
-    """Whether a resumed run left all outputs and no unfinished frames."""
-    made = options.resume and all(path.is_file() for _, path in options.targets(out))
-    return made and not frames_folder(out).exists()
-
-
-def taken_as_done(report: RefineReport, out: Path) -> RefineReport:
-    """The report of a run whose layer exists."""
     report.warn(f"{out} is taken as done: the same files, options and version made it")
     report.out = out
     return report
@@ -117,10 +102,25 @@ def check_jobs(jobs: Sequence[Job], *, also: Sequence[Target] = ()) -> None:
     check_targets(targets, inputs)
 
 
-def in_order(
-    found: Sequence[RefineReport | None], done: Generator[RefineReport | PhysGraphError, None, None]
-) -> Iterator[RefineReport | PhysGraphError]:
-    """Results of jobs in order: the report of a job finished before, else the next result of ``done``."""
-    with closing(done):
-        for there in found:
-            yield next(done) if there is None else there
+def results(
+    jobs: Sequence[Job], solve: Callable[[list[Job]], Generator[RefineReport | PhysGraphError, None, None]]
+) -> Generator[RefineReport | PhysGraphError, None, None]:
+    """Results of jobs in order, without solving the finished ones.
+
+    Args:
+        jobs: Shot, layer to write and options of each.
+        solve: Yields the results of the unfinished jobs.
+
+    Raises:
+        UsageError: As in `check_jobs`; no job was begun.
+    """
+    check_jobs(jobs)
+    found = [finished(*job) for job in jobs]
+    solved = solve([job for job, there in zip(jobs, found, strict=True) if there is None])
+
+    def each() -> Generator[RefineReport | PhysGraphError, None, None]:
+        with closing(solved):
+            for there in found:
+                yield next(solved) if there is None else there
+
+    return each()

@@ -39,28 +39,12 @@ CHUNK = "chunk"
 """Entry in a chunk's record: number of the first frame, and of the frame after the last."""
 _DONE, _FAILED = ".npz", ".failed.npz"
 _FRAMES = ".frames"
-_BEFORE, _JOINED = ".before", ".joined"
 _DAMAGED = (OSError, ValueError, KeyError, TypeError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error)
 """Errors of numpy and zipfile when reading a file not written by `FrameFolder.write`."""
-_OURS = re.compile(r"(\d+(\.(before|joined)\d+)?(\.failed)?\.npz|run\.json)(\.[\w-]+\.\d+\.tmp)?")
+_NAME = re.compile(r"(\d+)(?:\.before(\d+))?(\.failed)?\.npz")
+"""Name of a frame's file: number, number of the first frame after the pre-roll if in one, and whether it failed."""
+_OURS = re.compile(rf"({_NAME.pattern}|run\.json)(\.[\w-]+\.\d+\.tmp)?")
 """File names of finished frames and of the record, including temporary names while writing."""
-
-
-@dataclass(frozen=True, eq=False)
-class Lead:
-    """A time code as solved by the process after a seam.
-
-    Attributes:
-        outcome: Result of the process after the seam.
-        seam: Number of the first frame solved by the process after the seam alone.
-        weight: Weight of ``outcome`` in the joined frame: k / (L + 1) in the k-th of the L frames solved twice.
-        joined: The joined frame, if the process before the seam has joined it.
-    """
-
-    outcome: Outcome
-    seam: int
-    weight: float
-    joined: Outcome | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +57,6 @@ class Outcome:
         reused: For each garment, True if the previous frame's points were kept.
         record: Telemetry, or {"error": message}, ready for JSON.
         heat: Heat maps of each garment by name, None for a garment without a sample; () if not requested.
-        lead: The same frame as solved behind the next seam, or None.
     """
 
     time: float | None
@@ -81,7 +64,6 @@ class Outcome:
     reused: tuple[bool, ...]
     record: dict[str, object]
     heat: tuple[dict[str, np.ndarray] | None, ...] = ()
-    lead: Lead | None = None
 
 
 def frames_folder(layer: Path) -> Path:
@@ -114,7 +96,7 @@ def kept_for(out: Path) -> Kept | None:
     folder = out if out.is_dir() else frames_folder(out)
     run = record_in(folder)
     first, stop = run.get(CHUNK) or (0, len(run.get("times", ())))
-    count = len(whole_frames(folder))
+    count = len(Finished(folder).kept)
     if not count or (CHUNK in run and count == stop - first) or _is_locked(folder):
         return None
     return Kept(folder, count, stop - first)
@@ -145,47 +127,41 @@ def record_in(folder: Path) -> dict[str, Any]:
     return found if isinstance(found, dict) else {}
 
 
-def whole_frames(folder: Path) -> list[int]:
-    """Numbers of the complete, successful frames in a folder."""
-    names = [file.name for file in folder.glob("*")]
-    numbers = [int(stem) for name in names if (stem := name.removesuffix(_DONE)).isdecimal()]
-    return [number for number in numbers if zipfile.is_zipfile(folder / f"{number}{_DONE}")]
-
-
 class Finished:
     """Finished frames in a folder, read-only.
 
     Attributes:
-        kept: Numbers of the complete frames.
+        kept: Numbers of the complete, successful frames.
+        failed: Numbers of the frames that failed.
+        seams: By number of the first frame after a seam of two processes, number of the first frame of its pre-roll.
     """
 
     def __init__(self, folder: Path, *, counts: Sequence[int] = ()) -> None:
         """List the finished frames; ``counts`` as in `FrameFolder`."""
-        self.folder, self._counts = folder, tuple(counts)
-        self.kept = frozenset(whole_frames(folder))
+        self.folder, self.counts = folder, tuple(counts)
+        self._list()
 
-    def _file(self, index: int, suffix: str = _DONE, *, seam: int | None = None, joined: bool = False) -> Path:
-        return self.folder / (f"{index}" + ("" if seam is None else f"{_JOINED if joined else _BEFORE}{seam}") + suffix)
+    def _list(self) -> None:
+        names = [match for file in self.folder.glob("*") if (match := _NAME.fullmatch(file.name))]
+        whole = [match for match in names if zipfile.is_zipfile(self.folder / match[0])]
+        self.kept = frozenset(int(match[1]) for match in whole if not match[2] and not match[3])
+        self.failed = frozenset(int(match[1]) for match in whole if not match[2] and match[3])
+        found: dict[int, int] = {}
+        for seam, index in sorted(((int(match[2]), int(match[1])) for match in whole if match[2]), reverse=True):
+            if index + 1 == found.get(seam, seam):
+                found[seam] = index
+        self.seams = {seam: first for seam, first in found.items() if seam in self.kept}
 
-    @property
-    def failed(self) -> set[int]:
-        """Numbers of the frames that failed."""
-        stems = [file.name.removesuffix(_FAILED) for file in self.folder.glob(f"*{_FAILED}")]
-        return {int(stem) for stem in stems if stem.isdecimal()}
+    def _file(self, index: int, seam: int | None, suffix: str) -> Path:
+        return self.folder / (f"{index}" + ("" if seam is None else f".before{seam}") + suffix)
 
-    def seams(self) -> set[int]:
-        """Numbers of the frames before which finished frames of two processes meet."""
-        names = [file.name.removesuffix(_DONE) for file in self.folder.glob(f"*{_BEFORE}*{_DONE}")]
-        found = {int(seam) for name in names if (seam := name.partition(_BEFORE)[2]).isdecimal()}
-        return found & self.kept
-
-    def read(self, index: int, time: float | None, *, seam: int | None = None, joined: bool = False) -> Outcome | None:
-        """A frame's result, or None if not finished; ``seam`` and ``joined`` as in `write`.
+    def read(self, index: int, time: float | None, *, seam: int | None = None) -> Outcome | None:
+        """A frame's result, or None if not finished; ``seam`` as in `write`.
 
         Raises:
             LayerError: The file is damaged.
         """
-        files = (self._file(index, suffix, seam=seam, joined=joined) for suffix in (_DONE, _FAILED))
+        files = (self._file(index, seam, suffix) for suffix in (_DONE, _FAILED))
         file = next((each for each in files if each.exists()), None)
         if file is None:
             return None
@@ -203,9 +179,9 @@ class Finished:
 
     def _check_points(self, points: Sequence[np.ndarray | None]) -> None:
         """Refuse (ValueError) points of the wrong shape: kernels index points by face corners, without checks."""
-        if points and self._counts and len(points) != len(self._counts):
-            raise ValueError(f"points of {len(points)} garments, not of {len(self._counts)}")
-        for each, count in zip(points, self._counts, strict=False):
+        if points and self.counts and len(points) != len(self.counts):
+            raise ValueError(f"points of {len(points)} garments, not of {len(self.counts)}")
+        for each, count in zip(points, self.counts, strict=False):
             if each is not None and (each.shape != (count, 3) or each.dtype.kind != "f" or not np.isfinite(each).all()):
                 raise ValueError(f"points of shape {each.shape}, not {count} finite positions")
 
@@ -286,22 +262,21 @@ class FrameFolder(Finished):
 
     def _take(self, wanted: dict[str, Any], *, resume: bool, drop: bool) -> None:
         """Use or drop existing frames; frames that failed, or whose files a crash cut short, are solved again."""
-        found = whole_frames(self.folder)
-        different = self._differences(wanted) if found else []
+        self._list()
+        found, holds = len(self.kept), f"{self.folder} holds {counted(len(self.kept), 'finished frame')}"
+        different = sorted(differences(record_in(self.folder), wanted)) if found else []
         if different and (resume or not drop):
-            holds = f"{self.folder} holds {counted(len(found), 'finished frame')} of a run"
             remedy = "refine as then, or drop them by --overwrite without --resume"
-            raise UsageError(f"{holds} with other {', '.join(different[:3])}; {remedy}")
+            raise UsageError(f"{holds} of a run with other {', '.join(different[:3])}; {remedy}")
         if found and self._stays and not (resume or drop):
-            there = f"{self.folder} holds {counted(len(found), 'finished frame')}"
-            raise UsageError(f"{there}; go on by --resume, or drop them by --overwrite")
-        self.kept = frozenset(found if resume else ())
-        self.dropped = 0 if resume or different else len(found)
-        for file in self.folder.glob(f"*{_DONE}"):
-            if file.name.endswith(_FAILED) or _JOINED in file.name or not zipfile.is_zipfile(file):
-                file.unlink()
-        if not self.kept:
+            raise UsageError(f"{holds}; go on by --resume, or drop them by --overwrite")
+        self.dropped = 0 if resume or different else found
+        if not (found and resume):
             self._clear()
+        for file in self.folder.glob(f"*{_DONE}"):
+            if file.name.endswith(_FAILED) or not zipfile.is_zipfile(file):
+                file.unlink()
+        self._list()
         self._run = json.dumps(wanted, indent=2) + "\n"
         write_text(self.folder / RUN, self._run)
 
@@ -313,21 +288,16 @@ class FrameFolder(Finished):
             other = f"; {others[0]} is not a file of ours" if others else ""
             raise UsageError(f"{self.folder} is no folder of finished frames{other}; choose another name for the layer")
 
-    def _differences(self, wanted: dict[str, Any]) -> list[str]:
-        """Names of the entries that differ from the folder's record."""
-        return sorted(differences(record_in(self.folder), wanted))
-
     def __getstate__(self) -> dict[str, Any]:
         """Store the absolute path, for processes with a different working directory."""
         return self.__dict__ | {"folder": self.folder.absolute(), "_lock": None}
 
-    def write(self, index: int, outcome: Outcome, *, seam: int | None = None, joined: bool = False) -> None:
+    def write(self, index: int, outcome: Outcome, *, seam: int | None = None) -> None:
         """Write a frame's result.
 
         Args:
             index: Number of the frame.
             seam: Number of the frame whose pre-roll the result belongs to, or None.
-            joined: Whether the result is the frame as joined with that pre-roll.
 
         Raises:
             LayerError: The disk is full, or the folder is gone or taken by a new run: a task on a remote machine may
@@ -337,7 +307,7 @@ class FrameFolder(Finished):
         maps = [(k, name, values) for k, heat in enumerate(outcome.heat) for name, values in (heat or {}).items()]
         arrays |= {f"heat{k}.{name}": values for k, name, values in maps} | {"heated": np.array(len(outcome.heat))}
         arrays |= {"record": json.dumps(outcome.record), "reused": np.array(outcome.reused, dtype=bool)}
-        file = self._file(index, _DONE if outcome.points else _FAILED, seam=seam, joined=joined)
+        file = self._file(index, seam, _DONE if outcome.points else _FAILED)
         temporary = temporary_path(file, suffix="")
         try:
             if (self.folder / RUN).read_text(encoding="utf-8") != self._run:
@@ -366,7 +336,7 @@ class FrameFolder(Finished):
         """Keep the frames of a failed run unless ``keep`` is False; release the folder."""
         try:
             done = kind is None and not self._stays
-            if done or (kind and not (self._keep or self.kept)) or not whole_frames(self.folder):
+            if done or (kind and not (self._keep or self.kept)) or not Finished(self.folder).kept:
                 self._clear()
         finally:
             self._release()
@@ -383,23 +353,3 @@ def differences(there: Any, wanted: Any, name: str = "") -> list[str]:
     if isinstance(there, dict) and isinstance(wanted, dict):
         return [each for key in {*there, *wanted} for each in differences(there.get(key), wanted.get(key), key)]
     return [] if there == wanted else [name]
-
-
-class Folders:
-    """Frames of several chunks, presented as one folder.
-
-    Attributes:
-        kept: Numbers of the stored frames, including failed frames.
-    """
-
-    def __init__(self, owners: Mapping[int, Finished]) -> None:
-        """Take the folder of each frame, by number."""
-        self._owners, self.kept = owners, frozenset(owners)
-
-    def seams(self) -> set[int]:
-        """Numbers of the frames before which chunks, or two processes of one chunk, meet."""
-        return set().union(*(folder.seams() for folder in {*self._owners.values()})) & self.kept
-
-    def read(self, index: int, time: float | None, *, seam: int | None = None, joined: bool = False) -> Outcome | None:
-        """Read a frame like `Finished.read`; a seam's pre-roll is in the folder of the first frame after the seam."""
-        return self._owners[index if seam is None else seam].read(index, time, seam=seam, joined=joined)

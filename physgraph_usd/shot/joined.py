@@ -13,16 +13,16 @@ solutions, nothing is joined and the cloth jumps.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from ..interrupts import leave_if_asked
-from .frames import Lead, Outcome
+from .frames import Outcome
 
-Both = Sequence[tuple[Outcome, Lead]]
+Both = Sequence[tuple[Outcome, Outcome]]
 """The frames before a seam, each with the solution of the process behind the seam."""
 Positions = Sequence[np.ndarray | None]
 """Points of each garment, shape (V, 3), None for a garment without a sample."""
@@ -40,8 +40,14 @@ class Joint:
         why: Reason for a jump, or "".
     """
 
-    frames: tuple[Outcome, ...]
+    frames: Sequence[Outcome]
     why: str
+
+    @property
+    def warnings(self) -> list[str]:
+        """A warning if the cloth jumps."""
+        jump = f"the cloth jumps after time code {self.frames[-1].time:g}, where the work of two processes meets"
+        return [f"{jump}: {self.why}"] if self.why else []
 
 
 def join(both: Both, move: Mover) -> Joint:
@@ -51,120 +57,45 @@ def join(both: Both, move: Mover) -> Joint:
         both: The frames before the seam, each with the solution of the process behind the seam.
         move: Moves cloth safely.
     """
-    frames, why = [], ""
-    for outcome, lead in both:
-        pairs = list(zip(outcome.points, lead.outcome.points, strict=False))
-        if why or all(a is None or b is None or np.array_equal(a, b) for a, b in pairs):
-            frames.append(outcome)
+    frames = list[Outcome]()
+    for k, (own, after) in enumerate(both, start=1):
+        pairs, weight = list(zip(own.points, after.points, strict=False)), k / (len(both) + 1)
+        if all(a is None or b is None or np.array_equal(a, b) for a, b in pairs):
+            frames.append(own)
             continue
-        wanted = [a if a is None or b is None else _between(a, b, lead.weight) for a, b in pairs]
+        wanted = [a if a is None or b is None else between(a, b, weight) for a, b in pairs]
         near, far = [a for a, _ in pairs], [b for _, b in pairs]
-        points, why = move(outcome.time, *((near, far) if lead.weight < 0.5 else (far, near)), wanted)
+        points, why = move(own.time, *((near, far) if weight < 0.5 else (far, near)), wanted)
         leave_if_asked()  # A signal may have cut the move short.
-        frames.append(replace(outcome, points=tuple(points), reused=(False,) * len(points)))
-    return Joint(tuple(replace(each, lead=None) for each in ([own for own, _ in both] if why else frames)), why)
+        if why:
+            return Joint([own for own, _ in both], why)
+        frames.append(replace(own, points=tuple(points), reused=(False,) * len(points)))
+    return Joint(frames, "")
 
 
-def _between(before: np.ndarray, after: np.ndarray, weight: float) -> np.ndarray:
+def between(before: np.ndarray, after: np.ndarray, weight: float) -> np.ndarray:
     """Points between two solutions, float64; equal points are unchanged to the bit."""
     start = before.astype(np.float64)
     return start + weight * (after.astype(np.float64) - start)
 
 
-def joined(
-    outcomes: Iterable[Outcome],
-    move: Mover,
-    warn: Callable[[str], object],
-    *,
-    seen: Callable[[Both, Joint], object] | None = None,
-) -> Iterator[Outcome]:
-    """Frames in order, joined if two processes solved them.
+def worse(paths: Sequence[str], found: Sequence[Mapping[str, Any]], *sides: Sequence[Mapping[str, Any]]) -> str:
+    """The first garment with more crossings than in all compared solutions, in words, or "".
 
     Args:
-        outcomes: The frames; a frame solved twice has the second solution as ``lead``.
-        move: Moves cloth safely.
-        warn: Called with a warning for each seam left as a jump.
-        seen: Called with the frames of each seam, before and after joining.
+        paths: Paths of the garments.
+        found: Contact telemetry of each garment.
+        sides: The same of each compared solution.
     """
-    both: list[tuple[Outcome, Lead]] = []
-    for outcome in outcomes:
-        ends = bool(both) and (outcome.lead is None or outcome.lead.seam != both[0][1].seam)
-        if ends:
-            yield from _and_warn(both, _known(both) or join(both, move), warn, seen)
-            both = []
-        # "Reused" refers to the last pre-roll frame, which was not written.
-        first = replace(outcome, reused=(False,) * len(outcome.reused)) if ends else outcome
-        if outcome.lead is None:
-            yield first
-        else:
-            both.append((first, outcome.lead))
-    yield from _and_warn(both, _known(both) or join(both, move), warn, seen)
-
-
-def _known(both: Both) -> Joint | None:
-    """The frames of a seam as the process before it has joined them, or None."""
-    found = [
-        replace(lead.joined, reused=tuple(a and b for a, b in zip(own.reused, lead.joined.reused, strict=True)))
-        for own, lead in both
-        if lead.joined is not None
-    ]
-    return Joint(tuple(found), "") if len(found) == len(both) else None
-
-
-def _and_warn(
-    both: Both, joint: Joint, warn: Callable[[str], object], seen: Callable[[Both, Joint], object] | None
-) -> tuple[Outcome, ...]:
-    if both and seen is not None:
-        seen(both, joint)
-    if joint.why:
-        after = f"after time code {both[-1][0].time:g}"
-        warn(f"the cloth jumps {after}, where the work of two processes meets: {joint.why}")
-    return joint.frames
-
-
-class Movable(Protocol):
-    """A shot's cloth, moved without a solve."""
-
-    def moved_safely(
-        self, time: float | None, start: Positions, wanted: Positions
-    ) -> list[tuple[np.ndarray | None, dict[str, Any]]]:
-        """Like `Refiner.moved_safely`, at a time code."""
-        ...
-
-
-@dataclass(frozen=True, eq=False)
-class SafeMover:
-    """Moves the cloth of a shot without new intersections or vertices in bodies, as `Mover` requires."""
-
-    cloth: Movable
-    paths: Sequence[str]
-
-    def __call__(
-        self, time: float | None, near: Positions, far: Positions, wanted: Positions
-    ) -> tuple[list[np.ndarray | None], str]:
-        """Move cloth; the two solutions are measured only if the result crosses something."""
-        found = self.cloth.moved_safely(time, near, wanted)
-        sides: list[list[dict[str, Any]]] = []
-        if any(count for _, contact in found for count in _counts(contact).values()):
-            sides = [[contact for _, contact in self.cloth.moved_safely(time, side, side)] for side in (near, far)]
-        worse = (
-            f"joined, <{path}> would have {more}"
-            for path, (_, contact), *others in zip(self.paths, found, *sides, strict=True)
-            if (more := _worse(contact, others))
-        )
-        return [points for points, _ in found], next(worse, "")
-
-
-def _worse(contact: Mapping[str, Any], others: Sequence[Mapping[str, Any]]) -> str:
-    """The first contact count larger than in all compared solutions, in words."""
-    before = [_counts(each) for each in others]
-    for name, count in _counts(contact).items():
-        if count > max((each.get(name, 0) for each in before), default=0):
-            return f"{count:,} {name}"
+    for path, contact, *others in zip(paths, found, *sides, strict=True):
+        before = [counts(each) for each in others]
+        for name, count in counts(contact).items():
+            if count > max((each.get(name, 0) for each in before), default=0):
+                return f"joined, <{path}> would have {count:,} {name}"
     return ""
 
 
-def _counts(contact: Mapping[str, Any]) -> dict[str, int]:
+def counts(contact: Mapping[str, Any]) -> dict[str, int]:
     """Numbers of crossing edges and of vertices in bodies, from contact telemetry."""
     bodies = {f"vertices inside <{path}>": each["after"]["inside"] for path, each in contact.get("bodies", {}).items()}
     return {"edges through cloth": contact.get("cloth", {}).get("after", {}).get("crossings", 0)} | bodies

@@ -12,9 +12,10 @@ from ..solver.fabric import NAMED
 from ..solver.resolution import SHARP_FRACTION, LevelChoice
 from ..usd.read.reader import Shot
 from ..usd.schema import GARMENT
+from ..usd.stage import at_time
+from .options import options_of
 from .report import is_first
 from .settled import COLLAPSED, LIMITED, UNSOLVED, in_words
-from .untagged import options_of
 
 EASE = 4
 """Weft ease proposed by the note on slack [percent]: of the values in docs/fabrics.md, the one to fold every cage."""
@@ -84,9 +85,8 @@ def of_rest(unsettled: Sequence[Mapping[str, Any]], frames: int) -> list[str]:
     if not moving:
         return []
     worst = max(moving, key=lambda entry: entry["remaining_move"])
-    at = "" if worst["time"] is None else f" at time code {worst['time']:g}"
-    count = len({entry["time"] for entry in moving})
-    return [f"{count} of {counted(frames, 'frame')} did not settle, <{worst['path']}>{at} the least: {in_words(worst)}"]
+    count, place = len({entry["time"] for entry in moving}), f"<{worst['path']}>{at_time(worst['time'])}"
+    return [f"{count} of {counted(frames, 'frame')} did not settle, {place} the least: {in_words(worst)}"]
 
 
 def of_energy(garments: Sequence[Mapping[str, Any]], frames: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -109,9 +109,9 @@ def of_energy(garments: Sequence[Mapping[str, Any]], frames: Sequence[Mapping[st
     if not above:
         return []
     _, path, time, before, after = max(above, key=lambda each: each[0])
-    count, at = len({each[2] for each in above}), "" if time is None else f" at time code {time:g}"
-    energies = f"{after:.3g} J, the cage's {before:.3g} J"
-    return [f"{counted(count, 'frame')} ended with more energy than the upsampled cage, <{path}>{at}: {energies}"]
+    count, energies = len({each[2] for each in above}), f"{after:.3g} J, the cage's {before:.3g} J"
+    more = f"{counted(count, 'frame')} ended with more energy than the upsampled cage"
+    return [f"{more}, <{path}>{at_time(time)}: {energies}"]
 
 
 def of_folds(garments: Sequence[Mapping[str, Any]], frames: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -130,8 +130,8 @@ def of_folds(garments: Sequence[Mapping[str, Any]], frames: Sequence[Mapping[str
     if share <= SHARP_FRACTION:
         return []
     others = len({id(garment) for each, _, garment in found if each > SHARP_FRACTION}) - 1
-    level, at = worst["level"], "" if time is None else f" at time code {time:g}"
-    text = f"level: {share:.0%} of the edges of <{worst['path']}>{at} fold by more than 45 degrees, so the mesh shows"
+    level, place = worst["level"], f"<{worst['path']}>{at_time(time)}"
+    text = f"level: {share:.0%} of the edges of {place} fold by more than 45 degrees, so the mesh shows"
     text += f", and in {counted(others, 'other garment')}" if others else ""
     finer = f"--level {level + 1} halves the edges of {worst['fine_edge_mm']:.1f} mm, for up to 4 times the time"
     return [text + (f"; {finer}" if level < (GARMENT["refine:level"].maximum or 0) else "")]

@@ -6,7 +6,7 @@ The solver is imported on demand, so a batch skips finished shots without loadin
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -257,3 +257,8 @@ def _check(name: str, value: Any, option: Option) -> None:
 def json_of(report: Path) -> Path:
     """The JSON file of a report: the path itself if named ``.json``, else `REPORT_NAME` in a folder at the path."""
     return report if report.suffix == ".json" and not report.is_dir() else report / REPORT_NAME
+
+
+def options_of(name: str, values: Iterable[str]) -> list[str]:
+    """An option for each of some values, as words of a command."""
+    return [word for value in values for word in (name, value)]

@@ -114,13 +114,6 @@ def call_each(
                 yield error
 
 
-def wait_for(future: Future[Any]) -> None:
-    """Wait for a call's end."""
-    while not future.done():
-        leave_if_asked()
-        wait([future], POLL_SECONDS)
-
-
 def result_of(future: Future[Any], *, time: float | None = None) -> Any:
     """Wait for a call's result.
 
@@ -132,7 +125,9 @@ def result_of(future: Future[Any], *, time: float | None = None) -> Any:
         PhysGraphError: Raised or returned by the function; other exceptions are converted by `named`.
         SolveError: The process died, or a farm dropped the call.
     """
-    wait_for(future)
+    while not future.done():
+        leave_if_asked()
+        wait([future], POLL_SECONDS)
     at = "" if time is None else f" at time code {time:g}"
     if future.cancelled():
         raise SolveError(f"a call was cancelled{at}: the farm's scheduler is gone, or dropped the call")

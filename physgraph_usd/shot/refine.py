@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time as clock
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
 from functools import partial
 from pathlib import Path
@@ -16,20 +16,20 @@ from ..interrupts import SIGNALLED, exit_code_of, signals_noted
 from ..solver.integrate.factors import FACTOR
 from ..solver.mesh.kernels import cards_for
 from ..usd.files import check_targets, files_of
-from ..usd.provenance import is_result_of, write_root
+from ..usd.provenance import write_root
 from ..usd.read.reader import Shot
 from ..usd.stage import shot_name
 from ..usd.view import Layer, Stage
 from ..usd.write.atomic import check_place
 from .describe import begin_report, describe, describe_meshes, too_large
 from .farm import shots_at_once
-from .finished import Job, check_jobs, finished, in_order, made_from, may_be_done, skipped, taken_as_done
+from .finished import Job, check_jobs, finished, results
 from .frames import kept_for
 from .options import RefineOptions, json_of
 from .page.report import write_folder
 from .processes import call_each, memory_is_named
 from .report import RefineReport, is_of_failure
-from .run import Joins, Run
+from .run import Run
 from .solve import open_for, time_frames
 from .warnings import WARNINGS
 
@@ -55,7 +55,7 @@ def refine_shot(shot: str | Path, out: str | Path, options: RefineOptions = DEFA
     """
     out = Path(out)
     check_jobs([(shot, out, options)])
-    if there := skipped(shot, out, options):
+    if there := finished(shot, out, options):
         return there
     if not options.dry_run:
         if not out.resolve().parent.is_dir():
@@ -64,35 +64,29 @@ def refine_shot(shot: str | Path, out: str | Path, options: RefineOptions = DEFA
     with running(str(shot), options, out=out) as (opened, report):
         if options.dry_run:
             return report
-        if may_be_done(out, options) and is_result_of(out, made_from(opened, out, options), settled=options.strict):
-            return taken_as_done(report, out)
         _check_new(out, options)
-        write_all(opened, out, options, report)
+        write_all(Run(opened, out, options, report), out)
     return report
 
 
-def write_all(
-    opened: Shot, out: Path, options: RefineOptions, report: RefineReport, *, joins: Joins | None = None
-) -> None:
+def write_all(run: Run, out: Path) -> None:
     """Write a run's layer or chunk, and the root and report if requested.
 
     Args:
-        opened: The shot.
+        run: The run.
         out: The layer, or the chunk's folder.
-        options: Options of the run.
-        report: The report.
-        joins: Chunks to join instead of solving; None to solve.
 
     Raises:
         SolveError: No frame could be solved.
         LayerError: A file cannot be written, or seams are refused.
     """
-    Run(opened, out, options, report, joins).refine()
+    run.refine()
+    options = run.options
     if options.root is not None:
-        files = {"layer": out, "shot": Path(opened.path), "absolute": options.asset_paths == "absolute"}
+        files = {"layer": out, "shot": Path(run.shot.path), "absolute": options.asset_paths == "absolute"}
         write_root(Path(options.root), **files, overwrite=options.overwrite)
     if options.report is not None:
-        _write_report(report, Path(options.report), opened)
+        _write_report(run.report, Path(options.report), run.shot)
 
 
 def refine_stage(
@@ -191,17 +185,16 @@ def refine_shots(
     Raises:
         UsageError: No job was begun: an option is wrong, or an output of a job is read or written by another job.
     """
-    check_jobs(jobs)
-    scheduler = jobs[0][2].scheduler if jobs else None
-    chunks, at_once = (workers, shots_at_once(scheduler, workers)) if scheduler else (1, workers)
-    found = [finished(*job) for job in jobs]
-    alone = [
-        (shot, out, dataclasses.replace(options, workers=chunks, progress=None))
-        for (shot, out, options), there in zip(jobs, found, strict=True)
-        if there is None
-    ]
-    cards = cards_for(jobs[0][2].device) if jobs else []
-    return in_order(found, call_each(refine, alone, workers=at_once, cards=cards))
+
+    def solve(left: Sequence[Job]) -> Generator[RefineReport | PhysGraphError, None, None]:
+        options = left[0][2] if left else DEFAULTS
+        chunks, at_once = 1, workers
+        if options.scheduler:
+            chunks, at_once = workers, shots_at_once(options.scheduler, workers)
+        alone = [(shot, out, dataclasses.replace(own, workers=chunks, progress=None)) for shot, out, own in left]
+        return call_each(refine, alone, workers=at_once, cards=cards_for(options.device))
+
+    return results(jobs, solve)
 
 
 def check_places(out: Path, options: RefineOptions) -> None:

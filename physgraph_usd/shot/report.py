@@ -25,7 +25,7 @@ LEFT = 0.1
 LOG = logging.getLogger("physgraph_usd")
 """Logger of the whole package, for warnings and progress."""
 MOST_NAMED = 3
-"""Most prims named by a warning about several prims."""
+"""Most prims, parts or time codes named in one warning."""
 _OF_PRIM = re.compile(r"<([^>]+)>(?=[: ])")
 _ALSO, _DIFFERS = re.compile(r"; also (?:at|in) .*$"), re.compile(r"<[^>]*>|[-+]?\d[\d,]*(?:\.\d+)?(?:e[-+]?\d+)?")
 _FRAME: dict[str, Any] = {"time": None, "read_ms": None, "garments": [], "error": ""}

@@ -10,7 +10,7 @@ from contextlib import AbstractContextManager, ExitStack, closing, nullcontext
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from ..errors import NOTICE, AbsentError, SolveError, counted
 from ..solver.level import refine_garments
@@ -23,13 +23,12 @@ from ..usd.read.reader import Shot
 from ..usd.times import within
 from ..usd.view import Layer
 from ..usd.write.writer import LayerWriter
-from .chunks import PREROLL, finished_frames, solve_in_chunks
+from .chunks import PREROLL, solve_in_chunks
 from .cuts import Cuts
 from .describe import say_what_was
 from .farm import connected
 from .finished import made_from
-from .frames import CHUNK, Folders, FrameFolder, Outcome, frames_folder
-from .joined import Both, Joint, SafeMover, joined
+from .frames import CHUNK, FrameFolder, Outcome, frames_folder
 from .notes import of_energy, of_folds, of_rest
 from .options import RefineOptions
 from .processes import Start, separate_processes
@@ -47,34 +46,19 @@ TIMED_FRAMES, LONG_RUN = 3, 60.0
 """Frames after which a run announces its end, and least remaining time for an announcement [s]."""
 
 
-class Joins(Protocol):
-    """Chunks to join.
+@dataclass(frozen=True, eq=False)
+class Stored:
+    """Frames stored by other runs, written instead of solving.
 
     Attributes:
-        numbers: Numbers of the frames to write, in order.
+        numbers: Numbers of the frames, in order.
         record: Entries of the layer's record.
+        outcomes: The frames.
     """
 
     numbers: range
     record: Mapping[str, Any]
-
-    @property
-    def frames(self) -> Folders:
-        """The stored frames."""
-        ...
-
-    @property
-    def preroll(self) -> int:
-        """Most frames solved before each chunk."""
-        ...
-
-    def seen(self, both: Both, joint: Joint) -> None:
-        """Record a seam."""
-        ...
-
-    def check(self) -> None:
-        """Refuse bad seams (LayerError), after the last frame and before the layer gets its final name."""
-        ...
+    outcomes: Outcomes
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,14 +69,14 @@ class Run:
         shot: The shot, open.
         out: The layer to write, or None for a layer in memory.
         report: The report, with the garments filled in.
-        joins: Chunks to join into the layer instead of solving; None to solve.
+        stored: Frames to write instead of solving; None to solve.
     """
 
     shot: Shot
     out: Path | None
     options: RefineOptions
     report: RefineReport
-    joins: Joins | None = None
+    stored: Stored | None = None
 
     def refine(self) -> Layer | None:
         """Solve and write all frames; returns the layer if in memory.
@@ -113,7 +97,7 @@ class Run:
     def _write_layer(self) -> Layer | None:
         """Solve all frames and write the layer or the chunk; returns the layer if in memory."""
         began, options = clock.perf_counter(), self.options
-        provenance = made_from(self.shot, self.out, options) | dict(self.joins.record if self.joins else {})
+        provenance = made_from(self.shot, self.out, options) | dict(self.stored.record if self.stored else {})
         known = len(self.shot.warnings)  # Warnings about the shot itself are already reported.
         part = [time for time in (self._times[k] for k in self._numbers) if time is not None]
         made = {"mode": options.mode, "velocities": options.velocities, "overwrite": options.overwrite}
@@ -121,7 +105,7 @@ class Run:
         refinements = refine_garments(self.shot.scene.garments, self.solver.levels)
         with ExitStack() as stack:
             frames = writer = None
-            if self.out is not None and self.joins is None:
+            if self.out is not None and self.stored is None:
                 frames = stack.enter_context(self._folder(self.out, provenance, refinements))
             if not self._is_chunk:
                 how = {"provenance": provenance, **made}
@@ -160,8 +144,8 @@ class Run:
     @cached_property
     def _numbers(self) -> range:
         """Numbers of the time codes to solve: all open time codes, or for a chunk those of the shot in ``frames``."""
-        if self.joins is not None:
-            return self.joins.numbers
+        if self.stored is not None:
+            return self.stored.numbers
         return numbers_in(self.shot.scene.times, self.options.frames if self._is_chunk else None)
 
     @cached_property
@@ -186,21 +170,19 @@ class Run:
 
     def _solved(self, frames: FrameFolder | None) -> Outcomes:
         """Frames in order, including reused frames of an interrupted run, joined if solved by several processes."""
-        times, numbers, options, joins = self._times, self._numbers, self.options, self.joins
-        mover = SafeMover(self.solver, [str(source.path) for source in self.shot.sources])
-        if joins is not None:
-            solved = finished_frames(joins.frames, times, numbers, preroll=joins.preroll)
-            yield from joined(solved, mover, self.report.warn, seen=joins.seen)
-            joins.check()
+        if self.stored is not None:
+            yield from self.stored.outcomes
             return
         if frames is None:
-            yield from self.solver(times)
+            yield from self.solver(self._times)
             return
-        self._warn_of_finished(frames, len(numbers))
+        self._warn_of_finished(frames, len(self._numbers))
         with self._processes() as start:
-            chunks = {"workers": options.workers, "only": numbers, "preroll": self._preroll, "start": start}
-            with closing(solve_in_chunks(self.solver, times, frames, mover=mover, **chunks)) as solved:
-                yield from solved if self._is_chunk else joined(solved, mover, self.report.warn)
+            how = {"workers": self.options.workers, "only": self._numbers, "preroll": self._preroll, "start": start}
+            mover = None if self._is_chunk else self.solver.move_safely
+            how |= {"mover": mover, "warn": self.report.warn}
+            with closing(solve_in_chunks(self.solver, self._times, frames, **how)) as solved:
+                yield from solved
 
     def _processes(self) -> AbstractContextManager[Start | None]:
         """Starter of chunks: on a farm, in processes of this machine, or None to solve in this process."""

@@ -9,7 +9,6 @@ from collections.abc import Generator, Sequence
 from statistics import mean
 from typing import Any
 
-import numpy as np
 import torch
 
 from ..errors import At, SolveError, StageError
@@ -20,6 +19,7 @@ from ..solver.mesh.kernels import device_of, start_warp
 from ..usd.read.reader import Shot
 from ..usd.view import Stage
 from .frames import Outcome
+from .joined import Positions, counts, worse
 from .options import RefineOptions
 from .processes import cores
 from .untagged import open_with_colliders
@@ -93,15 +93,28 @@ class ShotSolver:
             yield outcome
         self._refiner = refiner
 
-    def moved_safely(
-        self, time: float | None, start: Sequence[np.ndarray | None], wanted: Sequence[np.ndarray | None]
-    ) -> list[tuple[np.ndarray | None, dict[str, Any]]]:
-        """Like `Refiner.moved_safely`, at a time code; the levels are those of the last solved range, if any."""
-        shot = self._opened
-        if self._refiner is None or shot is None:
-            shot, self._refiner = self._built()
-        self._refiner.forget()
-        return self._refiner.moved_safely(shot.frame(time), start, wanted)
+    def move_safely(
+        self, time: float | None, near: Positions, far: Positions, wanted: Positions
+    ) -> tuple[Positions, str]:
+        """Move cloth without new intersections or vertices in bodies, as `Mover` requires.
+
+        The two solutions are measured only if the result crosses something. The levels are those of the last solved
+        range, if any.
+        """
+        if self._refiner is None or self._opened is None:
+            self._opened, self._refiner = self._built()
+        shot, refiner = self._opened, self._refiner
+        frame = shot.frame(time)
+
+        def moved(start: Positions, end: Positions) -> tuple[Positions, list[dict[str, Any]]]:
+            refiner.forget()
+            found = refiner.moved_safely(frame, start, end)
+            return [points for points, _ in found], [contact for _, contact in found]
+
+        points, contacts = moved(near, wanted)
+        crosses = any(any(counts(contact).values()) for contact in contacts)
+        sides = [moved(side, side)[1] for side in (near, far)] if crosses else []
+        return points, worse([str(source.path) for source in shot.sources], contacts, *sides)
 
     def _built(self) -> tuple[Shot, Refiner]:
         """The shot, opened if necessary, and a new refiner."""

@@ -6,10 +6,10 @@ solutions over the pre-roll.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field
-from functools import cached_property
 from itertools import pairwise
 from math import ceil
 from pathlib import Path
@@ -19,16 +19,15 @@ import numpy as np
 
 from ..errors import LayerError, UsageError, counted
 from ..solver.level import refine_garments
-from ..solver.mesh.topology import PolygonMesh
 from ..usd.read.reader import Shot
-from .chunks import finished_frames
+from .chunks import frames_in_order
 from .finished import check_jobs, made_from
-from .frames import CHUNK, Finished, Folders, record_in
-from .joined import Both, Joint, SafeMover, joined
+from .frames import CHUNK, Finished, Outcome, record_in
+from .joined import Both, Joint, between, join
 from .options import RefineOptions
 from .refine import check_places, running, write_all
 from .report import RefineReport
-from .run import fine_meshes, numbers_in
+from .run import Run, Stored, fine_meshes, numbers_in
 from .solve import ShotSolver, open_for
 
 SEAM_BOUND = 0.05
@@ -63,26 +62,18 @@ class Seam:
         return f"{move}, {how}" + (f" ({self.why})" if self.why else "")
 
 
-@dataclass(frozen=True, eq=False)
-class _Chunk:
+class _Chunk(Finished):
     """A chunk's folder.
 
     Attributes:
         run: The record of the run.
+        numbers: Numbers of the stored frames, including failed frames, in order.
     """
 
-    folder: Path
-    run: Mapping[str, Any]
-
-    @cached_property
-    def finished(self) -> Finished:
-        """The stored frames."""
-        return Finished(self.folder)
-
-    @cached_property
-    def numbers(self) -> list[int]:
-        """Numbers of the stored frames, including failed frames, in order."""
-        return sorted(self.finished.kept | self.finished.failed)
+    def __init__(self, folder: Path, run: Mapping[str, Any]) -> None:
+        """List the stored frames."""
+        super().__init__(folder)
+        self.run, self.numbers = run, sorted(self.kept | self.failed)
 
     @property
     def is_whole(self) -> bool:
@@ -98,11 +89,6 @@ class _Chunk:
     def shot(self) -> Path:
         """Path of the shot, from the record."""
         return (self.folder.resolve().parent / self.run["shot"]).resolve()
-
-    @property
-    def preroll(self) -> int:
-        """Most frames solved before the first frame."""
-        return 0 if self.run["options"].get("temporal") == "off" else int(self.run["options"]["preroll"])
 
     def decisive(self) -> dict[str, Any]:
         """Everything required to be equal in all chunks, as a flat record."""
@@ -121,39 +107,53 @@ class _Chunk:
 
 @dataclass(eq=False)
 class _Joins:
-    """Chunks to join and the measured seams; implements `run.Joins`."""
+    """Chunks of an open shot to join, and the measured seams."""
 
     parts: Sequence[_Chunk]
-    meshes: Sequence[PolygonMesh]
-    paths: Sequence[str]
+    shot: Shot
     bound: float
-    numbers: range = range(0)
-    record: Mapping[str, Any] = field(default_factory=dict)
+    warn: Callable[..., object]
     seams: list[Seam] = field(default_factory=list)
 
-    @property
-    def frames(self) -> Folders:
-        """The frames of all chunks; points not matching a mesh count as damaged."""
-        counts = [mesh.vertex_count for mesh in self.meshes]
-        return Folders(
-            {k: found for part in self.parts for found in [Finished(part.folder, counts=counts)] for k in part.numbers}
-        )
+    def __post_init__(self) -> None:
+        """List the stored frames; points not matching a mesh count as damaged."""
+        garments, self.run = self.shot.scene.garments, self.parts[0].run
+        self.meshes = fine_meshes(garments, refine_garments(garments, self.run["levels"]))
+        for part in self.parts:
+            part.counts = tuple(mesh.vertex_count for mesh in self.meshes)
+        self.chunks = {k: part for part in self.parts for k in part.numbers}
+        starts = {start: first for part in self.parts for start, first in part.seams.items()}
+        self.starts = {start: first for start, first in starts.items() if {start - 1, start} <= self.chunks.keys()}
 
-    @property
-    def preroll(self) -> int:
-        """Most frames solved before each chunk."""
-        return self.parts[0].preroll
+    def outcomes(self, numbers: Iterable[int]) -> Generator[Outcome, None, None]:
+        """Frames by number, joined, then a check of the seams (LayerError)."""
+        solver = ShotSolver(self.shot.path, self.run["levels"], self.parts[0].options(), opened=self.shot)
 
-    def seen(self, both: Both, joint: Joint) -> None:
+        def joined(seam: int, both: Both) -> Sequence[Outcome]:
+            joint = join(both, solver.move_safely)
+            self.warn(*joint.warnings)
+            self._measure(seam, both, joint)
+            return joint.frames
+
+        yield from frames_in_order(self._read, numbers, self.starts, join=joined)
+        self._check()
+
+    def _read(self, index: int, seam: int | None) -> Outcome:
+        time = self.run["times"][index]
+        if outcome := self.chunks[index if seam is None else seam].read(index, time, seam=seam):
+            return outcome
+        raise LayerError(f"the result of time code {time} is gone; refine it anew by --resume")
+
+    def _measure(self, seam: int, both: Both, joint: Joint) -> None:
         """Measure a seam; unknown if the last frame failed in either chunk."""
-        after = self.parts[0].run["times"][both[-1][1].seam]
-        for index, (path, mesh) in enumerate(zip(self.paths, self.meshes, strict=True)):
+        after = self.run["times"][seam]
+        for index, (source, mesh) in enumerate(zip(self.shot.sources, self.meshes, strict=True)):
             moves = _moves(both, joint, index, mesh.half_edges.edges)
             if moves is not None:
                 rms, largest = map(float, np.max(moves, axis=0))
-                self.seams.append(Seam(after, path, rms, largest, 0 if joint.why else len(both), joint.why))
+                self.seams.append(Seam(after, str(source.path), rms, largest, 0 if joint.why else len(both), joint.why))
 
-    def check(self) -> None:
+    def _check(self) -> None:
         """Refuse a seam with too large a move, or an unmeasured seam although frames depend on their predecessors."""
         worst = max(self.seams, key=lambda seam: seam.rms, default=None)
         if worst is not None and worst.rms > self.bound:
@@ -162,9 +162,9 @@ class _Joins:
             remedy = f"refine with {longer} or with --temporal off, or allow more by --seam-bound"
             raise LayerError(f"{worst}; at most {self.bound:g} RMS is allowed: {remedy}")
         known = {seam.after for seam in self.seams}
-        alone = self.parts[0].run["options"].get("temporal") == "off" or not np.isfinite(self.bound)
-        for part in () if alone else self.parts[1:]:
-            if part.times[0] not in known:
+        alone = self.run["options"].get("temporal") == "off" or not np.isfinite(self.bound)
+        for part in () if alone else self.parts:
+            if part.numbers[0] - 1 in self.chunks and part.times[0] not in known:
                 unknown = f"nothing tells how far the seam at {part.times[0]:g} moves"
                 remedy = "refine it with --preroll 1 or more, or give --seam-bound inf"
                 raise LayerError(
@@ -217,10 +217,10 @@ def stitch(
         recorded = {name: value for name, value in parts[0].run["options"].items() if name not in _OF_ONE_CHUNK}
         recorded |= {"frames": list(frames)} if frames else {}
         report.options = dict(recorded)
-        spans = [_span(part.times) for part in parts]
-        joins = _joins(parts, opened, seam_bound, numbers=numbers, record={"options": recorded, "chunks": spans})
+        joins = _Joins(parts, opened, seam_bound, report.warn)
+        record = {"options": recorded, "chunks": [_span(part.times) for part in parts]}
         _make_folder(out.resolve().parent)
-        write_all(opened, out, options, report, joins=joins)
+        write_all(Run(opened, out, options, report, Stored(numbers, record, joins.outcomes(numbers))), out)
     return report, joins.seams
 
 
@@ -250,27 +250,19 @@ def check_seams(
     if of is not None:
         (own,) = _opened([of])
         parts = [part for part in parts if part.shot == own.shot and part.is_whole]
-    pairs = [
-        (before, after)
-        for before, after in pairwise(parts)
-        if before.run[CHUNK][1] == after.run[CHUNK][0]
-        and (of is None or of.resolve() in [part.folder.resolve() for part in (before, after)])
-    ]
-    found: list[Seam] = []
-    for pair in pairs:
-        _check_alike(pair, one_shot=shot is None)
-        with _opened_shot(pair[0], shot) as opened:
-            start = pair[1].run[CHUNK][0]
-            numbers = [k for k in pair[0].numbers if k >= start - pair[0].preroll]
-            joins = _joins(pair, opened, seam_bound)
-            solver = ShotSolver(str(shot or pair[0].shot), pair[0].run["levels"], pair[0].options(), opened=opened)
-            mover = SafeMover(solver, [str(source.path) for source in opened.sources])
-            leading = finished_frames(joins.frames, pair[0].run["times"], numbers, preroll=joins.preroll)
-            for _ in joined(leading, mover, lambda _: None, seen=joins.seen):
-                pass
-            joins.check()
-            found += joins.seams
-    return found
+    pairs = [pair for pair in pairwise(parts) if pair[0].numbers[-1] + 1 == pair[1].numbers[0]]
+    if of is not None:
+        pairs = [pair for pair in pairs if of.resolve() in [part.folder.resolve() for part in pair]]
+    parts = list(dict.fromkeys(part for pair in pairs for part in pair))
+    if not parts:
+        return []
+    _check_alike(parts, one_shot=shot is None)
+    with closing(open_for(str(shot or parts[0].shot), parts[0].options())) as opened:
+        _check_same_shot(parts[0], made_from(opened, parts[0].folder, parts[0].options()))
+        joins = _Joins(parts, opened, seam_bound, lambda *_: None)
+        before = [k for start, first in joins.starts.items() for k in range(first, start)]
+        deque(joins.outcomes(sorted(joins.chunks.keys() & {*before})), maxlen=0)
+    return joins.seams
 
 
 def _make_folder(folder: Path) -> None:
@@ -279,23 +271,6 @@ def _make_folder(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise LayerError(f"cannot make the folder {folder}: {error.strerror}") from error
-
-
-@contextmanager
-def _opened_shot(part: _Chunk, shot: str | Path | None) -> Iterator[Shot]:
-    """A chunk's shot, opened and checked against the record of the chunk."""
-    opened = open_for(str(shot or part.shot), part.options())
-    try:
-        _check_same_shot(part, made_from(opened, part.folder, part.options()))
-        yield opened
-    finally:
-        opened.close()
-
-
-def _joins(parts: Sequence[_Chunk], opened: Shot, bound: float, **more: Any) -> _Joins:
-    garments = opened.scene.garments
-    meshes = fine_meshes(garments, refine_garments(garments, parts[0].run["levels"]))
-    return _Joins(parts, meshes, [str(source.path) for source in opened.sources], bound, **more)
 
 
 def _opened(chunks: Sequence[str | Path]) -> list[_Chunk]:
@@ -399,14 +374,14 @@ def _moves(both: Both, joint: Joint, index: int, edges: np.ndarray) -> list[tupl
     """
     moves, lag = [], np.zeros(1)
     jump: tuple[float, float] | None = None
-    for (own, lead), frame in zip(both, joint.frames, strict=True):
-        points = [each.points[index] if each.points else None for each in (own, lead.outcome, frame)]
+    for k, ((own, after), frame) in enumerate(zip(both, joint.frames, strict=True), start=1):
+        points = [each.points[index] if each.points else None for each in (own, after, frame)]
         jump, (a, b, x) = None, points
         if a is None or b is None or x is None:
             continue
         a, b = a.astype(np.float64), b.astype(np.float64)
         edge = float(np.linalg.norm(a[edges[:, 0]] - a[edges[:, 1]], axis=1).mean())
-        before, lag = lag, x - (a + lead.weight * (b - a))
+        before, lag = lag, x - between(a, b, k / (len(both) + 1))
         part, jump = (b - a) / (len(both) + 1), _size(b - a, edge)
         moves.append(_size(part + lag - before, edge))
         if own is both[-1][0]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -54,7 +54,9 @@ def row_of(shot: str | Path, layer: Path, done: RefineReport | PhysGraphError | 
         done: The report, the error, or None if the batch was interrupted.
     """
     if done is None:
-        return _interrupted(str(shot), layer)
+        kept = kept_for(layer)
+        left = Row(str(shot), str(layer))
+        return replace(left, state="interrupted", frames=kept.frames, error=f"interrupted, {kept}") if kept else left
     if isinstance(done, PhysGraphError):
         return Row(str(shot), str(layer), "failed", done.exit_code, error=str(done))
     frames = len(done.frames)
@@ -69,14 +71,6 @@ def row_of(shot: str | Path, layer: Path, done: RefineReport | PhysGraphError | 
         done.crossings,
         tuple(done.warnings),
     )
-
-
-def _interrupted(shot: str, layer: Path) -> Row:
-    """The row of a shot unfinished or not begun when the batch was interrupted."""
-    kept = kept_for(layer)
-    if kept is None:
-        return Row(shot, str(layer))
-    return Row(shot, str(layer), "interrupted", frames=kept.frames, error=f"interrupted, {kept}")
 
 
 def exit_code_of(rows: Sequence[Row]) -> int:

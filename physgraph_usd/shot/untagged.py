@@ -3,34 +3,28 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
-from pathlib import Path
-from shlex import join
 from typing import Any
 
 import numpy as np
 import torch
 
-from ..errors import StageError, counted
+from ..errors import counted
 from ..solver.colliders.mesh import MeshBody
 from ..solver.colliders.pose import MeshPose, Pose
 from ..solver.contact.broad_phase import bounds_of
 from ..solver.mesh.kernels import start_warp
 from ..solver.resolution import sample_frames
 from ..solver.scene import Frame, Garment, GarmentFrame
-from ..solver.strain import StrainedPart, strained_parts
+from ..usd.read.other_meshes import other_meshes
 from ..usd.read.reader import Shot, open_shot
-from ..usd.read.rest import FITTED
-from ..usd.read.untagged import unnamed_meshes
 from ..usd.stage import at_time
 from ..usd.view import Stage
 
 AUTO = "auto"
 """Pseudo-collider: all colliders named by the shot, and the meshes touched by garments."""
-MOST_ASKED = 32
-"""Most open meshes tried as garments."""
 NEAR = 0.025
 """Distance within which cloth lies on a body [m]: solvers keep up to 2 cm, plus rounding."""
 FAR = f"no cloth comes within {1e3 * NEAR:.0f} mm of it"
@@ -93,7 +87,7 @@ def find_candidates(shot: Shot) -> list[Candidate]:
     boxes = [bounds_of(np.concatenate([garment.points for garment in frame.garments])) for frame in frames]
     boxes = [box + np.array([[-NEAR], [NEAR]]) for box in boxes]
     found = []
-    for path, why, poses in unnamed_meshes(shot, [frame.time for frame in frames], boxes):
+    for path, why, poses in other_meshes(shot, [frame.time for frame in frames], boxes):
         found.append(Candidate(path, why) if why else _judged(path, poses, shot.scene.garments, frames=frames))
     return sorted(found, key=lambda each: -max(each.shares.values(), default=0.0))
 
@@ -170,68 +164,6 @@ def open_with_colliders(shot: str | os.PathLike[str] | Stage, *, colliders: Sequ
     with closing(open_shot(shot, colliders=[each for each in colliders if each != AUTO], **options)) as first:
         named = [*first.colliders, *(each.path for each in find_candidates(first) if each.is_taken)]
     return open_shot(shot, colliders=named, **options)
-
-
-def proposal(shot: str | Stage, meshes: Sequence[str], frames: tuple[float, float] | None) -> str:
-    """The command for a shot without tags: open meshes lying on closed meshes are the garments.
-
-    Args:
-        meshes: Open meshes of the shot, the largest first.
-        frames: First and last time code, or None.
-
-    Returns:
-        The command, or "" if no garment is found or the meshes cannot be read together.
-    """
-    try:
-        with closing(open_shot(shot, garments=meshes[:MOST_ASKED], frames=frames)) as opened:
-            sampled = sample_frames(opened.every_time, opened.frame)
-            found = [each for each in find_candidates(opened) if each.is_taken]
-            lying = {path for each in found for path in each.shares}
-            garments = [garment.path for garment in opened.scene.garments if garment.path in lying]
-            bodies, rest = [each.path for each in found], rest_options(_strained(opened, sampled, garments))
-            return command_of(opened.path, garments, bodies, rest=rest) if found else ""
-    except StageError:
-        return ""
-
-
-def command_of(
-    shot: str, garments: Iterable[str], colliders: Iterable[str], *, bind: Iterable[str] = (), rest: Sequence[str]
-) -> str:
-    """The command to refine a shot's garments with colliders and targets.
-
-    Args:
-        bind: Paths of targets.
-        rest: The result of `rest_options`.
-    """
-    out = str(Path(shot).with_suffix(".refined.usdc"))
-    named = {"--garment": garments, "--collider": colliders, "--bind": bind}
-    options = [word for name, values in named.items() for word in options_of(name, values)]
-    return join(["physgraph-usd", "refine", shot, "-o", out, *rest, *options])
-
-
-def rest_options(strained: Iterable[tuple[str, Sequence[StrainedPart]]]) -> list[str]:
-    """``--rest auto`` as words of a command, if a garment needs the option.
-
-    Args:
-        strained: For each garment the source of the rest shape, and the parts not sized like the rest shape.
-    """
-    wrong = any(part.needs_rest for source, parts in strained if not source.startswith(FITTED) for part in parts)
-    return ["--rest", "auto"] if wrong else []
-
-
-def options_of(name: str, values: Iterable[str]) -> list[str]:
-    """An option for each of some values, as words of a command."""
-    return [word for value in values for word in (name, value)]
-
-
-def _strained(
-    shot: Shot, frames: Sequence[Frame], paths: Sequence[str]
-) -> Iterator[tuple[str, Sequence[StrainedPart]]]:
-    """For some garments, the source of the rest shape and the parts not sized like the rest shape."""
-    for index, (garment, source) in enumerate(zip(shot.scene.garments, shot.sources, strict=True)):
-        if garment.path in paths:
-            cages = [frame.garments[index].points for frame in frames]
-            yield source.sources["rest"], strained_parts(garment, cages, source.subsets, up=-shot.scene.gravity)
 
 
 def _fraction_at(body: MeshBody, pose: Pose, cage: np.ndarray) -> float:

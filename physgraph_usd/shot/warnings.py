@@ -13,12 +13,12 @@ from typing import Any
 from ..errors import counted
 from ..solver.strain import StrainedPart
 from ..usd.read.rest import FITTED
-from .report import RefineReport, is_first
+from ..usd.stage import at_time
+from .options import options_of
+from .report import MOST_NAMED, RefineReport, is_first
 from .settled import COLLAPSED, LIMITED, UNSOLVED, in_words
-from .untagged import AUTO, NEAR, Candidate, options_of
+from .untagged import AUTO, NEAR, Candidate
 
-MOST_NAMED = 3
-"""Most prims, parts or time codes named in one warning."""
 Entries = Mapping[float | None, Mapping[str, Any]]
 """A garment's telemetry by time code."""
 
@@ -58,8 +58,7 @@ class Kind:
             figures: Values for the sentence and the remedy.
         """
         first, *others = times or (None,)
-        place = f"<{path}>" if path else ""
-        place += "" if first is None else f" at time code {first:g}"
+        place = (f"<{path}>" if path else "") + at_time(first)
         parts = [self.sentence.format(**figures), self.remedy.format(**figures), _also(others)]
         warning = Warned((f"{place}: " if place else "") + "; ".join(filter(None, parts)))
         warning.kind = self.title
@@ -235,7 +234,7 @@ def _of_unsolved(found: Sequence[Mapping[str, Any]]) -> Iterator[str]:
     for path, kind in dict.fromkeys((path, kind) for path, kind, _ in known):
         entries = [entry for *of, entry in known if of == [path, kind]]
         how = in_words(entries[0])
-        place = f"<{path}>" + ("" if entries[0]["time"] is None else f" at time code {entries[0]['time']:g}") + ": "
+        place = f"<{path}>{at_time(entries[0]['time'])}: "
         yield WARNINGS[kind](path, [entry["time"] for entry in entries], how=how.removeprefix(place))
 
 

@@ -66,10 +66,10 @@ def page(report: RefineReport, series: Sequence[Series], pictures: str = "") -> 
     """
     parts = [_head(report), pictures, _warnings(report), _model(report), _garments(report), _times(report)]
     times = [frame["time"] for frame in report.frames]
-    for index, garment in enumerate(series):
-        parts.append(f"<h2>&lt;{html.escape(garment.path)}&gt; over time</h2>")
+    for index, (garment, lines) in enumerate(zip(report.garments, series, strict=True)):
+        parts.append(f"<h2>&lt;{html.escape(garment['path'])}&gt; over time</h2>")
         drawn = [
-            plot(f"{name}-{index}", title, [0.0 if t is None else t for t in times], getattr(garment, name))
+            plot(f"{name}-{index}", title, [0.0 if t is None else t for t in times], lines.get(name, {}))
             for name, title in PLOTS
         ]
         parts.append("".join(drawn) or "<p>No frame says anything of it.</p>")

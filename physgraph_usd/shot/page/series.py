@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -16,44 +15,19 @@ from ...usd.read.reader import Shot
 from ..report import RefineReport
 
 Line = list[float | None]
-
-
-@dataclass(eq=False)
-class Series:
-    """One garment over time.
-
-    Attributes:
-        energy: Energy by term, and of the upsampled input [mJ].
-        strain: Size of the edges' extension [%].
-        remaining: RMS move that the end of the solve leaves [mm].
-        inside: Vertices inside bodies, before and after.
-        depth: Depth of the deepest vertex [mm], before and after.
-        crossings: Edges through faces, of bodies and of cloth, before and after.
-        time: Milliseconds of each stage.
-        jerk: RMS third difference of the detail [fine edges].
-    """
-
-    path: str
-    energy: dict[str, Line] = field(default_factory=dict)
-    strain: dict[str, Line] = field(default_factory=dict)
-    remaining: dict[str, Line] = field(default_factory=dict)
-    inside: dict[str, Line] = field(default_factory=dict)
-    depth: dict[str, Line] = field(default_factory=dict)
-    crossings: dict[str, Line] = field(default_factory=dict)
-    time: dict[str, Line] = field(default_factory=dict)
-    jerk: dict[str, Line] = field(default_factory=dict)
+"""A figure in each frame, None for a frame without the value."""
+Series = dict[str, dict[str, Line]]
+"""One garment's lines, by name of the plot, whose title has the unit, and by label."""
 
 
 def read_series(report: RefineReport, index: int) -> Series:
-    """One garment's lines from a report's frames; None for a frame without the value."""
-    found = Series(report.garments[index]["path"])
+    """One garment's lines from a report's frames."""
+    found: Series = {}
     for place, frame in enumerate(report.frames):
         entry = frame["garments"][index] if "garments" in frame else {}
         for name, values in _series_of(entry, frame).items():
-            lines: dict[str, Line] = getattr(found, name)
             for label, value in values.items():
-                line = lines.setdefault(label, [None] * len(report.frames))
-                line[place] = value
+                found.setdefault(name, {}).setdefault(label, [None] * len(report.frames))[place] = value
     return found
 
 
@@ -103,7 +77,7 @@ def add_jerk(series: Sequence[Series], report: RefineReport, shot: Shot, layer: 
             recent = [*recent[-3:], _detail(written, shot, frame["time"], index=index, steps=steps)]
             known = [each for each in recent if each is not None and len(each) >= len(garment.rest)]
             line.append(third_difference(known) / edge if len(known) == 4 and edge > 0 else None)
-        own.jerk = {"jerk": line}
+        own["jerk"] = {"jerk": line}
 
 
 def _detail(

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from ...errors import counted
 from ...solver.collide.crossings import crossings
 from ...solver.collide.parts import Parts
 from ...solver.frame.scene_frame import SceneCloth
@@ -18,6 +19,7 @@ from ...solver.mesh.elements import hinges_of
 from ...solver.scene import recentred
 from ...usd.read.meshes import RefinedLayer
 from ...usd.read.reader import Shot
+from ...usd.stage import at_time
 from ..report import RefineReport
 
 CLOSE = 0.12
@@ -45,16 +47,16 @@ def verdict(report: RefineReport) -> str:
     """One-sentence verdict of a run: faults first, then successes, and the time."""
     count, failed = len(report.frames), len(report.failed)
     wrong = [f"{failed} of {count} frames could not be solved"] if failed else []
-    right = [f"{_many(count - failed, 'frame')} refined"]
+    right = [f"{counted(count - failed, 'frame')} refined"]
     for name, nothing in ((CROSSINGS, "nothing crosses"), (INSIDE, "nothing is inside a body")):
         found = [(left[name], frame["time"]) for frame in report.frames if name in (left := _left(report, frame))]
         most, time = max(found, key=lambda each: each[0], default=(0, None))
         if most:
-            wrong.append(f"{most:,} {name}{_at(time)}, the worst frame")
+            wrong.append(f"{most:,} {name}{at_time(time)}, the worst frame")
         elif found:
             right.append(nothing)
     if report.unsettled:
-        wrong.append(f"{_many(len({each['time'] for each in report.unsettled}), 'frame')} did not settle")
+        wrong.append(f"{counted(len({each['time'] for each in report.unsettled}), 'frame')} did not settle")
     pace = [f"{report.seconds.get('frames', 0.0) / count:.2g} s a frame"] if count else []
     sentence = "; ".join([*wrong, ", ".join([*right, *pace])])
     return f"{sentence[:1].upper()}{sentence[1:]}."
@@ -85,7 +87,7 @@ def worst_place(report: RefineReport, shot: Shot) -> Worst | None:
     places = [_densest(each, weight) for each, weight in zip(cloth, marks, strict=True)]
     index = max(range(len(places)), key=lambda each: places[each][1])
     path = layer.target(shot, index)
-    return None if path is None else Worst(time, path, places[index][0], f"{reason}{_at(time)}")
+    return None if path is None else Worst(time, path, places[index][0], f"{reason}{at_time(time)}")
 
 
 def _left(report: RefineReport, frame: dict[str, Any]) -> dict[str, int]:
@@ -147,11 +149,3 @@ def _finest(report: RefineReport, shot: Shot) -> Level:
 
 def _levels(report: RefineReport) -> list[int]:
     return [garment["level"] for garment in report.garments]
-
-
-def _many(count: int, noun: str) -> str:
-    return f"{count:,} {noun}{'' if count == 1 else 's'}"
-
-
-def _at(time: float | None) -> str:
-    return "" if time is None else f" at time code {time:g}"

@@ -22,7 +22,7 @@ Box = np.ndarray
 """Least and greatest corner [m], world space, shape (2, 3)."""
 
 
-def unnamed_meshes(
+def other_meshes(
     shot: Shot, times: Sequence[float | None], boxes: Sequence[Box]
 ) -> Iterator[tuple[str, str, Iterator[tuple[int, Pose]]]]:
     """Meshes that are neither garments nor colliders of a shot, and their poses in some frames.
