@@ -20,13 +20,7 @@ from physgraph_usd.solver.scene import Frame, Garment, GarmentFrame, Scene
 
 @dataclass(frozen=True)
 class SheetOverBall:
-    """The sheet and the ball.
-
-    Attributes:
-        side: Quads along an edge of the cage.
-        edge: Length of a quad [m].
-        radius: Of the ball, whose top is at the origin [m].
-    """
+    """A sheet of quads with an edge [m], and a ball of a radius [m] whose top is at the origin."""
 
     side: int
     edge: float
@@ -45,15 +39,7 @@ class SheetOverBall:
         return scene, MeshPose(points, np.asarray(ball.faces, np.int32))
 
     def draped(self, height: float, phase: float = 0.0) -> np.ndarray:
-        """The sheet bent over the ball and flared with folds outside it.
-
-        Args:
-            height: Of its middle above the ball [m].
-            phase: Angle by which the folds are turned [rad].
-
-        Returns:
-            Positions [m], shape (V, 3).
-        """
+        """The sheet bent over the ball, at a height above it [m], and flared with folds turned by a phase [rad]."""
         flat = self._flat()
         radius, angle = np.hypot(flat[:, 0], flat[:, 2]), np.arctan2(flat[:, 2], flat[:, 0])
         bend, beyond = np.minimum(radius / self.radius, 1.2), np.maximum(radius - 1.2 * self.radius, 0.0)
@@ -110,19 +96,7 @@ GLITCHES: dict[str, Glitch] = {
 def run(
     level: int, after: int, *, travel: float, glitch: Glitch | None = None, at: int = BEFORE, first: int = 0
 ) -> list[tuple[np.ndarray, dict[str, Any]]]:
-    """Refine all frames in order.
-
-    Args:
-        level: Subdivisions.
-        after: Frames after the broken one.
-        travel: Angle by which folds travel in a frame [rad].
-        glitch: What breaks one frame, or None.
-        at: Which frame that is.
-        first: The first frame that is solved.
-
-    Returns:
-        Fine positions [m], shape (V, 3), and telemetry of each frame; where it failed those of the frame before.
-    """
+    """Fine positions [m] and telemetry of frames in order, one of them broken; where one failed those before it."""
     scene, ball = SHEET.scene(subdivisions=4)
     refiner = Refiner(scene, RefineOptions().solve_settings(), levels=[level], threads=2)
     told: list[tuple[np.ndarray, dict[str, Any]]] = []

@@ -40,7 +40,6 @@ sys.stdout.write(" ".join(names))
 
 
 def modules() -> dict[str, Path]:
-    """Every module by its dotted name."""
     found = {}
     for file in PACKAGE.rglob("*.py"):
         name = ".".join(file.relative_to(ROOT).with_suffix("").parts)
@@ -100,7 +99,6 @@ def circles(graph: dict[str, set[str]]) -> list[list[str]]:
 
 
 def lines(file: Path) -> int:
-    """Lines of a file."""
     return len(file.read_text(encoding="utf-8").splitlines())
 
 

@@ -74,7 +74,6 @@ def plain(answer: Any) -> Any:
 
 
 def solved(a: Asked) -> Any:
-    """A cold frame."""
     a.refiner.forget()
     return a.refiner.solve(a.frame)
 

@@ -33,7 +33,6 @@ def listed(found: Crossings) -> set[tuple[int, int]]:
 
 
 def found_at(level: Level, x: torch.Tensor, meets: np.ndarray = ALL) -> set[tuple[int, int]]:
-    """What crosses at positions [m]."""
     return listed(crossings(Parts(level, meets), x))
 
 
@@ -79,7 +78,6 @@ def coarse(seed: int) -> tuple[Level, torch.Tensor]:
 
 @cache
 def scene(name: str) -> tuple[Level, torch.Tensor]:
-    """A level and positions."""
     if name in (more := {"two sheets": two_sheets, "two fans": two_fans}):
         return more[name]()
     if name == "two sheets of quads":

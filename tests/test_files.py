@@ -61,12 +61,14 @@ def contents(folder: Path) -> dict[str, str]:
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes of POSIX")
+@pytest.mark.parametrize("pipe", ["shot.usda", "below.usda"])
 @pytest.mark.parametrize("command", ["refine", "inspect"])
-def test_a_pipe_among_them_is_named_in_place_of_a_wait(tmp_path: Path, command: str) -> None:
-    os.mkfifo(tmp_path / "pipe.usda")
-    (tmp_path / "shot.usda").write_text("#usda 1.0\n(\n    subLayers = [@./pipe.usda@]\n)\n")
+def test_a_pipe_among_them_is_named_in_place_of_a_wait(tmp_path: Path, command: str, pipe: str) -> None:
+    (tmp_path / "shot.usda").write_text("#usda 1.0\n(\n    subLayers = [@./below.usda@]\n)\n")
+    (tmp_path / pipe).unlink(missing_ok=True)
+    os.mkfifo(tmp_path / pipe)
     done = run(command, tmp_path / "shot.usda", *(("-o", tmp_path / "o.usdc") if command == "refine" else ()))
-    assert (done.exit_code, "pipe.usda is no file: it is a pipe" in done.stderr) == (1, True)
+    assert (done.exit_code, f"{pipe} is no file: it is a pipe" in done.stderr) == (1, True)
 
 
 def test_every_file_of_a_shot_is_found(shot: Path) -> None:

@@ -33,7 +33,6 @@ def dense(force: Force, x: Tensor) -> np.ndarray:
 
 
 def matrix_of(force: Force) -> np.ndarray:
-    """The rest matrix of a term that has one."""
     matrix = force.rest_matrix()
     assert matrix is not None
     return matrix.toarray()

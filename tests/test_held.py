@@ -11,8 +11,9 @@ import torch
 from bodies import ball
 from cloth import sheet
 from folds import frame_with, named, refiner_with
-from pxr import Usd, UsdGeom, Vt
+from pxr import Usd, UsdGeom
 from shots import refine
+from stages import add_mesh, new_stage, save
 
 from physgraph_usd.solver.frame import start
 from physgraph_usd.solver.frame.start import STILL, slowing
@@ -91,7 +92,6 @@ def moves(frames: list[Frame]) -> np.ndarray:
 
 
 def never(_held: int, _motion: float, _pace: float = 1.0, *, again: bool = False) -> tuple[int, float]:
-    """Cloth that is never slowed down."""
     del again
     return 0, 1.0
 
@@ -105,9 +105,7 @@ def tubes(file: Path, jitter: int) -> Path:
     Vertices are moved by up to 0.1 um: at exactly one place rounding decides which of two equal tubes is outside.
     """
     rng = np.random.default_rng(jitter)
-    stage = Usd.Stage.CreateNew(str(file))
-    UsdGeom.SetStageUpAxis(stage, "Y")
-    UsdGeom.SetStageMetersPerUnit(stage, 0.01)
+    stage = new_stage(file, metres=0.01)
     corners = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
     for name, half, rings in zip(NAMES, (0.5, 0.05, 0.05), (10, 3, 3), strict=True):
         points = [[half * a, height, half * b] for height in np.linspace(0.0, 2.0, rings) for a, b in corners]
@@ -117,14 +115,10 @@ def tubes(file: Path, jitter: int) -> Path:
             for k in range(4)
         ]
         faces = [*sides, [0, 1, 2, 3], [4 * rings - 1, 4 * rings - 2, 4 * rings - 3, 4 * rings - 4]]
-        mesh = UsdGeom.Mesh.Define(stage, f"/World/{name}")
-        mesh.CreateFaceVertexCountsAttr([4] * len(faces))
-        mesh.CreateFaceVertexIndicesAttr(np.ravel(faces).tolist())
-        mesh.CreateSubdivisionSchemeAttr("none")
         moved = np.array(points) + 1e-5 * (rng.random((len(points), 3)) - 0.5)
-        mesh.CreatePointsAttr().Set(Vt.Vec3fArray.FromNumpy(moved.astype(np.float32)), 1.0)
-    stage.Save()
-    return file
+        mesh = add_mesh(stage, f"/World/{name}", moved, faces, schema=None)
+        mesh.CreateSubdivisionSchemeAttr("none")
+    return Path(save(stage))
 
 
 @pytest.mark.parametrize("jitter", range(3))
@@ -135,5 +129,5 @@ def test_tubes_that_cross_keep_their_length_in_few_steps(tmp_path: Path, jitter:
     assert report.unsettled
     stage = Usd.Stage.Open(str(tmp_path / "fine.usdc"))
     for name in NAMES:
-        points = np.array(UsdGeom.Mesh(stage.GetPrimAtPath(f"/World/{name}")).GetPointsAttr().Get(1.0))
+        points = np.array(UsdGeom.Mesh(stage.GetPrimAtPath(f"/World/{name}")).GetPointsAttr().Get())
         assert 1.8 < np.ptp(points, axis=0).max() < 2.6, name

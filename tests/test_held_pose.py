@@ -24,13 +24,7 @@ LEAD, LAST = 3, 6
 
 @dataclass(frozen=True)
 class Moves:
-    """How cloth moves from frame to frame at the end.
-
-    Attributes:
-        vertices: Fine vertices.
-        farthest: Move of the vertex that moves farthest [m], mean over frames.
-        many: Vertices that move by more than a millimetre, mean over frames.
-    """
+    """Fine vertices; how far the farthest one moves in a frame [m], and how many by over 1 mm: means at the end."""
 
     vertices: int
     farthest: float
@@ -38,14 +32,7 @@ class Moves:
 
 
 def held(name: str, place: Path, *, level: int, frames: int = 15) -> Moves:
-    """Refine a few frames of a sample in a row, then hold the pose of the last one but for a drift of its cage.
-
-    Args:
-        name: The sample.
-        place: Where it is written.
-        level: Subdivisions.
-        frames: Held frames.
-    """
+    """Refine a few frames of a sample in a row, then hold the pose of the last one but for a drift of its cage."""
     shot, at = open_one(name, place, None)
     times = shot.scene.times[max(at - LEAD, 0) : at + 1]
     settings = RefineOptions().solve_settings()
@@ -60,7 +47,6 @@ def held(name: str, place: Path, *, level: int, frames: int = 15) -> Moves:
 
 
 def _held(frame: Frame, count: int) -> Frame:
-    """A frame again, some frames later."""
     garments = tuple(replace(each, points=each.points + count * DRIFT) for each in frame.garments)
     return replace(frame, time=None if frame.time is None else frame.time + count, garments=garments)
 

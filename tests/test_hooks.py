@@ -48,7 +48,6 @@ def count(stage: Usd.Stage, time: float = 2.0) -> int:
 
 
 def tear(stage: Usd.Stage) -> None:
-    """Break the topology of the sheet."""
     UsdGeom.Mesh(stage.GetPrimAtPath(CLOTH)).GetFaceVertexIndicesAttr().Set([0, 1, 99])
 
 

@@ -55,7 +55,6 @@ def system_of(matrix: np.ndarray, *, metric: np.ndarray | None = None, fixed: tu
 
 
 def minimum_of(system: System) -> torch.Tensor:
-    """Where a quadratic's energy is least."""
     assert isinstance(system.field, Quadratic)
     return system.field.minimum
 

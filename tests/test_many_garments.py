@@ -59,7 +59,6 @@ def linear(run: Callable[[int], Any]) -> bool:
 
 
 def scattered(count: int, spread: float) -> tuple[list[Garment], list[GarmentFrame]]:
-    """Small sheets at random places."""
     places = np.random.default_rng(3).uniform(0.0, spread, (count, 3))
     garments = [replace(garment_of(MESH, REST), path=f"/World/g{index}") for index in range(count)]
     return garments, [frame_of(REST + place).garments[0] for place in places]
@@ -103,14 +102,13 @@ def joined(count: int, pairs: Sequence[tuple[int, int]]) -> list[tuple[int, ...]
     return sorted({tuple(sorted(part)) for part in parts.values()})
 
 
-class TestWarnings:
-    def test_of_a_shot_name_all_prims_in_the_report(self, tmp_path: Path):
-        shot = tmp_path / "shot.usda"
-        stage = sheets(shot, 5)
-        stage.ClearMetadata("metersPerUnit")
-        stage.Save()
-        report = refine(shot, tmp_path / "fine.usdc")
-        (said,) = [each for each in report.warnings if "measures" in each]
-        assert said.startswith("</World/g0>, </World/g1>, </World/g2> and 2 more: measures ")
-        assert report.warned[said] == [f"/World/g{index}" for index in range(5)]
-        assert said in inspect_shot(shot, level=1)["warnings"]
+def test_a_warning_of_the_whole_shot_names_all_prims_in_the_report(tmp_path: Path):
+    shot = tmp_path / "shot.usda"
+    stage = sheets(shot, 5)
+    stage.ClearMetadata("metersPerUnit")
+    stage.Save()
+    report = refine(shot, tmp_path / "fine.usdc")
+    (said,) = [each for each in report.warnings if "measures" in each]
+    assert said.startswith("</World/g0>, </World/g1>, </World/g2> and 2 more: measures ")
+    assert report.warned[said] == [f"/World/g{index}" for index in range(5)]
+    assert said in inspect_shot(shot, level=1)["warnings"]

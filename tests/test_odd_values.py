@@ -20,7 +20,6 @@ CLOTH = "/World/cloth"
 
 
 def retype(stage: Usd.Stage, path: str, kind: str, value: object) -> None:
-    """Author an attribute with another type than its schema's."""
     replace(stage, Sdf.Path(path), kind, value)
 
 

@@ -20,6 +20,7 @@ from layers import (
     write_shot,
 )
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdSkel
+from stages import clip_shot
 
 from physgraph_usd.errors import LayerError
 from physgraph_usd.usd.read.reader import open_shot
@@ -88,27 +89,13 @@ def test_a_garment_in_an_instance(tmp_path: Path, mode: str) -> None:
 
 
 def test_samples_from_value_clips_are_replaced(tmp_path: Path) -> None:
-    make_shot(tmp_path / "clip.usda")
-    manifest = Usd.Stage.CreateNew(str(tmp_path / "manifest.usda"))
-    manifest.OverridePrim(COAT).CreateAttribute("points", Sdf.ValueTypeNames.Point3fArray, False)
-    manifest.Save()
-    path = tmp_path / "shot.usda"
-    stage = make_shot(path, times=())
-    clips = Usd.ClipsAPI(stage.GetPrimAtPath(COAT))
-    clips.SetClipPrimPath(COAT)
-    clips.SetClipAssetPaths([Sdf.AssetPath("./clip.usda")])
-    clips.SetClipManifestAssetPath(Sdf.AssetPath("./manifest.usda"))
-    clips.SetClipActive([(0, 0)])
-    clips.SetClipTimes([(0, 0), (10, 10)])
-    stage.Save()
-    shot = open_shot(str(path), level=1)
-    write_shot(shot, tmp_path / "out.usdc", times=TIMES)
-    composed = open_over(path, tmp_path / "out.usdc")
-    points = UsdGeom.Mesh(composed.GetPrimAtPath(COAT)).GetPointsAttr()
-    for time in (None, *TIMES):
-        assert len(points.Get(Usd.TimeCode.Default() if time is None else time)) == 63
-    expected = fine_points(shot, refine_all(shot), 4.0)[0]
-    np.testing.assert_allclose(world_metres(composed, COAT, 4.0), expected, atol=1e-6)
+    path = clip_shot(tmp_path)
+    shot = open_shot(path, level=1)
+    write_shot(shot, tmp_path / "out.usdc")
+    composed = open_over(Path(path), tmp_path / "out.usdc")
+    for time in (1.0, 2.0, 3.0):
+        expected = fine_points(shot, refine_all(shot), time)[0]
+        np.testing.assert_allclose(world_metres(composed, "/World/cloth", time), expected, atol=1e-6)
 
 
 def make_skinned(path: Path, *, inherited: bool) -> None:

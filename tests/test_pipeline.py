@@ -29,10 +29,6 @@ def pair(first: np.ndarray, second: np.ndarray, time: float | None = None) -> Fr
     return Frame(time, (GarmentFrame(first, FABRIC), GarmentFrame(second, FABRIC)))
 
 
-def starts(states: list) -> list[str]:
-    return [str(state.telemetry[0]["start"]).partition(":")[0] for state in states]
-
-
 def test_levels_report_what_they_did():
     telemetry = solved(MESH, REST, wave(REST), level=2).telemetry[0]
     levels = telemetry["levels"]
@@ -79,57 +75,37 @@ class TestReuse:
         assert two.solve(pair(wave(REST), wave(OTHER_REST, phase=1.0), 2.0)).reused == (False, False)
 
 
-class TestTime:
-    def test_warm_starts_take_fewer_steps(self):
-        one = refiner(temporal="warm", level=2)
-        states = [one.solve(frame_of(wave(REST, phase=0.01 * t), float(t))) for t in range(4)]
-        made = [sum(entry["steps"] for entry in state.telemetry[0]["levels"]) for state in states]
-        assert starts(states) == ["cold", "warm", "warm", "warm"]
-        assert max(made[1:]) < made[0]
-
-    def test_off_is_cold_each_time(self):
-        states = list(refiner(temporal="off").refine(frame_of(wave(REST, phase=0.1 * t), float(t)) for t in range(3)))
-        assert starts(states) == ["cold"] * 3
-
-    def test_forget(self):
-        one = refiner()
-        first = one.solve(frame_of(wave(REST), 1.0))
-        one.solve(frame_of(wave(REST, phase=0.1), 2.0))
-        one.forget()
-        again = one.solve(frame_of(wave(REST), 3.0))
-        assert starts([again]) == ["cold"]
-        assert again.points[0].tobytes() == first.points[0].tobytes()
+def test_warm_starts_take_fewer_steps():
+    one = refiner(temporal="warm", level=2)
+    told = [one.solve(frame_of(wave(REST, phase=0.01 * t), float(t))).telemetry[0] for t in range(4)]
+    made = [sum(entry["steps"] for entry in each["levels"]) for each in told]
+    assert [each["start"].partition(":")[0] for each in told] == ["cold", "warm", "warm", "warm"]
+    assert max(made[1:]) < made[0]
 
 
-class TestGain:
-    def test_none_is_the_smooth_surface_and_two_is_twice_the_detail(self):
-        points = wave(REST)
-        surface = smooth(MESH, refiner(level=1).refinements[0][0]) @ points
+def test_no_detail_is_the_smooth_surface_and_two_is_twice_the_detail():
+    points = wave(REST)
+    surface = smooth(MESH, refiner(level=1).refinements[0][0]) @ points
 
-        def solve(detail: float) -> np.ndarray:
-            frame = Frame(None, (GarmentFrame(points, FABRIC, 2000.0, detail),))
-            return refiner_of([garment_of(MESH, REST)], level=1).solve(frame).points[0]
+    def solve(detail: float) -> np.ndarray:
+        frame = Frame(None, (GarmentFrame(points, FABRIC, 2000.0, detail),))
+        return refiner_of([garment_of(MESH, REST)], level=1).solve(frame).points[0]
 
-        assert np.allclose(solve(0.0), surface, rtol=0, atol=1e-9)
-        assert np.allclose(solve(2.0) - surface, 2 * (solve(1.0) - surface), rtol=0, atol=1e-9)
+    assert np.allclose(solve(0.0), surface, rtol=0, atol=1e-9)
+    assert np.allclose(solve(2.0) - surface, 2 * (solve(1.0) - surface), rtol=0, atol=1e-9)
 
 
 TORN = Fabric(stretch=1e38)
 """Cloth whose energy, pulled far within bounds, is not finite in float32."""
 
 
-class TestNotFinite:
-    def test_the_error_names_prim_time_and_term(self):
-        with pytest.raises(SolveError, match=r"</World/Sheet> at time code 7: .*not finite.*stretch"):
-            refiner().solve(frame_of(9e2 * wave(REST), 7.0, fabric=TORN))
-
-    def test_the_next_frame_can_be_solved(self):
-        one = refiner()
-        with pytest.raises(SolveError):
-            one.solve(frame_of(9e2 * wave(REST), 1.0, fabric=TORN))
-        one.forget()
-        fresh = refiner().solve(frame_of(wave(REST), 2.0))
-        assert one.solve(frame_of(wave(REST), 2.0)).points[0].tobytes() == fresh.points[0].tobytes()
+def test_an_energy_that_is_not_finite_names_prim_time_and_term_and_the_next_frame_can_be_solved():
+    one = refiner()
+    with pytest.raises(SolveError, match=r"</World/Sheet> at time code 7: .*not finite.*stretch"):
+        one.solve(frame_of(9e2 * wave(REST), 7.0, fabric=TORN))
+    one.forget()
+    fresh = refiner().solve(frame_of(wave(REST), 2.0))
+    assert one.solve(frame_of(wave(REST), 2.0)).points[0].tobytes() == fresh.points[0].tobytes()
 
 
 def test_animated_stiffness_rebuilds_the_metric_and_returns_to_the_same_bytes():

@@ -26,13 +26,11 @@ def squeezed() -> tuple[Problem, Frame]:
 
 @pytest.fixture(scope="module")
 def found() -> Reference:
-    """Its reference."""
     return find_reference(*squeezed(), settings=ALONE)
 
 
 @pytest.fixture(scope="module")
 def bounded() -> Reference:
-    """What a short search finds."""
     return find_reference(*squeezed(), settings=ALONE, short=True)
 
 

@@ -37,7 +37,6 @@ SHORT = (1.0, 2.0, 3.0)
 
 @pytest.fixture
 def stage(tmp_path: Path) -> Usd.Stage:
-    """An open sheet of three frames."""
     return Usd.Stage.Open(str(cloth_shot(tmp_path / "shot.usda", times=SHORT)))
 
 

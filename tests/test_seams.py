@@ -81,7 +81,6 @@ def two_halves(pin: bool = False) -> tuple[Level, Seam, torch.Tensor]:
 
 
 def noise(like: torch.Tensor, seed: int = 0) -> torch.Tensor:
-    """Normal numbers."""
     return torch.randn(like.shape, generator=torch.Generator().manual_seed(seed), dtype=like.dtype)
 
 

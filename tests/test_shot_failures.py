@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bodies import ball
-from pxr import Sdf, UsdGeom
+from pxr import Sdf
 from shots import CLOTH, TIMES, cloth_shot, faults, fine, only, refine, sample_times
-from stages import COLLIDER_API, add_sheet, new_stage, save, sheet_points, vec3
+from stages import COLLIDER_API, add_mesh, add_sheet, new_stage, save, sheet_points, vec3
 
 from physgraph_usd.errors import GarmentError, UsageError
 
@@ -136,12 +136,8 @@ def test_one_garment_that_cannot_be_solved_follows_its_cage(tmp_path: Path, belo
         for time in (1.0, 2.0):
             mesh.GetPointsAttr().Set(vec3(points + np.array([aside, 0.001 * time, 0.0])), time)
     points, faces = ball(0.05)
-    body = UsdGeom.Mesh.Define(stage, "/World/body")
-    body.CreateFaceVertexCountsAttr([3] * len(faces))
-    body.CreateFaceVertexIndicesAttr(np.asarray(faces).ravel().tolist())
+    body = add_mesh(stage, "/World/body", points - [0.0, below, 0.0], faces, schema=COLLIDER_API)
     body.CreateSubdivisionSchemeAttr("none")
-    body.CreatePointsAttr().Set(vec3(points - [0.0, below, 0.0]))
-    body.GetPrim().AddAppliedSchema(COLLIDER_API)
     shot, out = Path(save(stage)), tmp_path / "fine.usdc"
     report = refine(shot, out)
     assert (report.exit_code, report.failed) == (3, {})

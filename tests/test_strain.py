@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
-from pxr import UsdGeom, Vt
 from shots import fine, refine, run, sample_times
-from stages import GARMENT_API, new_stage, save, vec3
+from stages import add_mesh, new_stage, save, vec3
 
 from physgraph_usd.shot.refine import inspect_shot
 from physgraph_usd.shot.warnings import of_strain
@@ -33,31 +31,18 @@ def tube(puff: float, *, bend: float = 0.0) -> np.ndarray:
 
 
 def puffed_shot(
-    path: Path,
-    *,
-    puff: float = PUFFED,
-    subset: bool = False,
-    odd: dict[float, float] | None = None,
-    default: bool = True,
-    times: Sequence[float] = TIMES,
+    path: Path, *, puff: float = PUFFED, odd: dict[float, float] | None = None, default: bool = True
 ) -> str:
     """A sleeve whose default points, if any, are a plain tube and whose animation is puffed; ``odd`` scales samples."""
     stage = new_stage(path)
-    mesh = UsdGeom.Mesh.Define(stage, SLEEVE)
     ids = np.arange(AROUND * ROWS).reshape(ROWS, AROUND)
     across = np.roll(ids, -1, axis=1)
     quads = np.stack([ids[:-1], ids[1:], across[1:], across[:-1]], axis=-1).reshape(-1, 4)
-    mesh.CreateFaceVertexCountsAttr([4] * len(quads))
-    mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(quads.ravel().astype(np.int32)))
-    mesh.CreatePointsAttr()
-    if default:
-        mesh.GetPointsAttr().Set(vec3(tube(1.0)))
-    for time in times:
+    mesh = add_mesh(stage, SLEEVE, tube(1.0), quads)
+    if not default:
+        mesh.GetPointsAttr().ClearDefault()
+    for time in TIMES:
         mesh.GetPointsAttr().Set(vec3((odd or {}).get(time, 1.0) * tube(puff, bend=0.03 * time)), time)
-    if subset:
-        upper = Vt.IntArray.FromNumpy(np.arange(len(quads) // 2, len(quads)).astype(np.int32))
-        UsdGeom.Subset.CreateGeomSubset(mesh, "puff", "face", upper)
-    mesh.GetPrim().AddAppliedSchema(GARMENT_API)
     return save(stage)
 
 

@@ -12,7 +12,7 @@ from layers import errors, open_over, world_metres
 from numpy.typing import ArrayLike
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
 from shots import CLOTH, EDGE, cloth_shot, only, refine, run
-from stages import sheet_faces, sheet_points, vec3
+from stages import add_mesh, sheet_faces, sheet_points, vec3
 
 from physgraph_usd.errors import AbsentError, GarmentError, SchemaError
 from physgraph_usd.lab.samples import trims, tshirt
@@ -38,14 +38,11 @@ def bind(stage: Usd.Stage, *paths: str, to: str = CLOTH) -> None:
     stage.GetPrimAtPath(to).CreateRelationship(TARGETS).SetTargets([Sdf.Path(path) for path in paths])
 
 
-def beside(stage: Usd.Stage, path: str, middle: ArrayLike, *, radius: float = 0.1, moves: bool = False) -> UsdGeom.Mesh:
-    """A closed ball beside the sheet, in its units; one that moves has samples of its own."""
+def beside(stage: Usd.Stage, path: str, middle: ArrayLike, *, radius: float = 0.1) -> UsdGeom.Mesh:
+    """A closed ball beside the sheet, in its units."""
     solid = ellipsoid(np.full(3, radius), np.asarray(middle, float), (8, 6))
-    mesh = UsdGeom.Mesh.Define(stage, path)
-    mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(solid.counts.astype(np.int32)))
-    mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(solid.indices.astype(np.int32)))
-    mesh.CreatePointsAttr(vec3(solid.points))
-    return mesh
+    faces = np.split(solid.indices, np.cumsum(solid.counts)[:-1])
+    return add_mesh(stage, path, solid.points, faces, schema=None)
 
 
 def on_sheet(x: float, y: float, above: float = 0.0) -> np.ndarray:

@@ -122,14 +122,6 @@ class TestFromPython:
         assert place_in(report_of(tmp_path / "report.json")) == ("ValueError", [CLOTH], 1.0)
         assert told[0].failure is not None
 
-    def test_the_report_of_a_run_that_ended_well_is_kept(self, tmp_path: Path):
-        file = tmp_path / "report.json"
-        file.write_text(RefineReport("shot.usda", None, {}).to_json())
-        before = file.read_bytes()
-        with pytest.raises(Exception, match="exists"):
-            refine(cloth_shot(tmp_path / "shot.usda"), tmp_path / "fine.usdc", report=file)
-        assert file.read_bytes() == before
-
 
 def test_a_prim_that_is_not_there_is_reported_too(tmp_path: Path):
     shot, file = cloth_shot(tmp_path / "shot.usda"), tmp_path / "report.json"

@@ -50,8 +50,6 @@ def default(name: str, edit: Callable[[np.ndarray], object]) -> Mutation:
 
 
 def sample(name: str, edit: Callable[[np.ndarray], object], *, time: float = 2.5) -> Mutation:
-    """Replace one time sample."""
-
     def mutate(layer: Sdf.Layer) -> None:
         layer.SetTimeSample(at(name), time, edit(np.array(layer.QueryTimeSample(at(name), time))))
 
@@ -59,8 +57,6 @@ def sample(name: str, edit: Callable[[np.ndarray], object], *, time: float = 2.5
 
 
 def drop(name: str) -> Mutation:
-    """Remove an attribute."""
-
     def mutate(layer: Sdf.Layer) -> None:
         prim = layer.GetPrimAtPath(COAT)
         prim.RemoveProperty(prim.properties[name])
@@ -69,8 +65,6 @@ def drop(name: str) -> Mutation:
 
 
 def author(name: str, type_name: Sdf.ValueTypeName, value: object) -> Mutation:
-    """Add an attribute."""
-
     def mutate(layer: Sdf.Layer) -> None:
         spec = layer.GetAttributeAtPath(at(name))
         if spec is None:

@@ -13,27 +13,28 @@ from stages import add_sheet, new_stage, said, save, sheet_points, vec3
 from physgraph_usd.usd.read.reader import open_shot
 
 
-def per_corner(mesh: UsdGeom.Mesh, *, apart: float = 0.0) -> None:
+def per_corner(mesh: UsdGeom.Mesh, *, apart: float) -> None:
     """A rest shape 1.1 times as large, a value per corner, the last one some way apart from its point's others."""
     values = 1.1 * sheet_points()[np.asarray(mesh.GetFaceVertexIndicesAttr().Get())]
     values[5] += np.float32(apart)
     UsdGeom.PrimvarsAPI(mesh).CreatePrimvar("rest", Sdf.ValueTypeNames.Point3fArray, "faceVarying").Set(vec3(values))
 
 
-class TestARestShapePerCorner:
-    def test_is_used_where_corners_of_a_point_agree(self, tmp_path: Path):
-        stage = new_stage(tmp_path / "s.usda")
-        per_corner(add_sheet(stage))
-        shot = open_shot(save(stage))
-        np.testing.assert_allclose(shot.scene.garments[0].rest, 1.1 * sheet_points(), rtol=1e-6)
-        assert "primvars:rest is per corner; corners of a point agree, so it is the rest shape" in said(shot)
-
-    def test_is_left_out_with_a_word_where_they_differ(self, tmp_path: Path):
-        stage = new_stage(tmp_path / "s.usda")
-        per_corner(add_sheet(stage), apart=0.1)
-        shot = open_shot(save(stage))
-        np.testing.assert_array_equal(shot.scene.garments[0].rest, sheet_points())
-        assert "primvars:rest is per corner and differs between corners of points[" in said(shot)
+@pytest.mark.parametrize(
+    ("apart", "scale", "word"),
+    [
+        (0.0, 1.1, "; corners of a point agree, so it is the rest shape"),
+        (0.1, 1.0, " and differs between corners of points["),
+    ],
+)
+def test_a_rest_shape_per_corner_is_used_where_corners_of_a_point_agree(
+    tmp_path: Path, apart: float, scale: float, word: str
+):
+    stage = new_stage(tmp_path / "s.usda")
+    per_corner(add_sheet(stage), apart=apart)
+    shot = open_shot(save(stage))
+    np.testing.assert_allclose(shot.scene.garments[0].rest, scale * sheet_points(), rtol=1e-6)
+    assert f"primvars:rest is per corner{word}" in said(shot)
 
 
 @pytest.fixture
