@@ -273,9 +273,9 @@ class TestCloth:
 def test_a_skinned_box_cut_at_its_edges(real_data: Path, tmp_path: Path):
     """The stage that showed it: new crossings and a crease in each frame, where seams were springs."""
     shot = real_data / "stages" / "usdskel" / "dqs.usda"
-    report = refine(shot, tmp_path / "fine.usdc", level=4, garments=["/Root/Mesh"])
+    report = refine(shot, tmp_path / "fine.usdc", level=4, garments=["/Root/Mesh"], frames=(1.0, 10.0))
     found = [garment for frame in report.frames for garment in frame["garments"]]
-    assert len(found) == 30
+    assert len(found) == 10
     for each in found:
         assert each["contact"]["cloth"]["after"]["crossings"] == 0
         assert each["strain"]["p99"] < 0.06
