@@ -18,7 +18,6 @@ from typing import Any
 
 import pytest
 import torch
-from click.testing import CliRunner, Result
 
 from physgraph_usd import cli, errors
 from physgraph_usd.cli.refine import refine
@@ -28,17 +27,10 @@ pytest.importorskip("pxr", reason="the commands read stages with usd-core")
 
 from frame_solvers import as_named
 from pxr import Usd
-from shots import CLOTH, cloth_shot
+from shots import CLOTH, cloth_shot, run
 
 Sample = Callable[[str], Path]
 SMALL = ("--frames", "1:2", "--level", "1")
-
-
-def run(*args: object) -> Result:
-    result = CliRunner().invoke(cli.main, [str(arg) for arg in args])
-    if result.exception and not isinstance(result.exception, SystemExit):
-        raise result.exception
-    return result
 
 
 @pytest.fixture

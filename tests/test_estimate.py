@@ -12,14 +12,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from cloth import sheet
 from pxr import UsdGeom, Vt
 from sheets import garment_of
 from shots import cloth_shot, command, fine, refine, run
 from stages import add_sheet, new_stage, save, sheet_faces, vec3
 
-from physgraph_usd.cli import main
 from physgraph_usd.errors import GarmentError
 from physgraph_usd.shot.estimate import cannot_fit, estimate
 from physgraph_usd.shot.refine import inspect_shot
@@ -60,7 +58,7 @@ def test_a_long_run_says_after_three_frames_when_it_will_end(tmp_path: Path, mon
     assert ending(0.3, 48, 1) == ""
     monkeypatch.setattr("physgraph_usd.shot.run.LONG_RUN", 0.0)
     shot = cloth_shot(tmp_path / "shot.usda", times=(1.0, 2.0, 3.0, 4.0, 5.0))
-    done = CliRunner().invoke(main, ["refine", str(shot), "-o", str(tmp_path / "out.usdc"), "--level", "0"])
+    done = run("refine", shot, "-o", tmp_path / "out.usdc", "--level", 0)
     assert done.exit_code == 0, done.output
     assert "3 of 5 frames in " in done.output
 

@@ -71,11 +71,10 @@ def seam_of(level: Level, base: torch.Tensor) -> Seam:
     return Seam(level, found)
 
 
-def two_halves(pin: bool = False) -> tuple[Level, Seam, torch.Tensor]:
+def two_halves() -> tuple[Level, Seam, torch.Tensor]:
     """A sheet cut in two at its finest level, its seam, and its positions."""
     cloth, _ = panels(square(4))
-    held = (cloth[1][:, 2] < -0.09) * 1.0 if pin else np.zeros(len(cloth[1]))
-    levels = levels_of(named(cloth, pin=held), dtype=torch.float64)
+    levels = levels_of(named(cloth), dtype=torch.float64)
     base = fine(levels, cloth[1])
     return levels[-1], seam_of(levels[-1], base), base
 

@@ -9,10 +9,7 @@ from brute import Soup, crossings
 from folds import EDGE, SHAPES, curved, folded, levels_of, named, placed, promise_of, square, strip, view_of
 from scenes import shot
 
-from physgraph_usd.solver.collide.crossings import Crossings
-from physgraph_usd.solver.collide.crossings import crossings as crossings_of
 from physgraph_usd.solver.contact.cloth import ClothView
-from physgraph_usd.solver.contact.cloth_mesh import ClothMesh
 from physgraph_usd.solver.contact.promise import Promise
 from physgraph_usd.solver.forces.self_contact import PairConstraints, SelfContact
 from physgraph_usd.solver.level import Level, Placed
@@ -55,13 +52,6 @@ def shifted(points: np.ndarray) -> np.ndarray:
 
 
 UPPER = {"dented": dented, "cornered": cornered, "tilted": tilted, "on edge": shifted}
-
-
-def found_in(level: Level, x: torch.Tensor) -> tuple[ClothMesh, Crossings]:
-    mesh = ClothMesh(level, BOTH, np.zeros((0, 2), np.int64))
-    found = crossings_of(mesh.parts, x)
-    assert found.count > 5
-    return mesh, found
 
 
 def crossed_strip(name: str) -> tuple[Level, Promise, torch.Tensor]:
