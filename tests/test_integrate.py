@@ -114,15 +114,14 @@ class OnAPlateau(Quadratic):
         return energy + 1e10 + 2e-6 * torch.sin(1e9 * x.sum()), force
 
 
-class TestRounding:
-    def test_steps_go_on_by_the_force_where_the_energy_tells_nothing(self):
-        plain = system_of(spd(12, 50.0), metric=np.eye(12))
-        assert isinstance(plain.field, Quadratic)
-        field = OnAPlateau(plain.field.matrix.numpy(), plain.field.minimum)
-        system = System(field, plain.metric, free=plain.free, spacing=plain.spacing)
-        _, report = solve_level(system, QuasiNewton(), start(12), level=0, budget=Budget(100, tolerance=1e-9))
-        assert report.stopped == "tolerance"
-        assert report.evaluations < 2 * report.steps
+def test_steps_go_on_by_the_force_where_the_energy_tells_nothing():
+    plain = system_of(spd(12, 50.0), metric=np.eye(12))
+    assert isinstance(plain.field, Quadratic)
+    field = OnAPlateau(plain.field.matrix.numpy(), plain.field.minimum)
+    system = System(field, plain.metric, free=plain.free, spacing=plain.spacing)
+    _, report = solve_level(system, QuasiNewton(), start(12), level=0, budget=Budget(100, tolerance=1e-9))
+    assert report.stopped == "tolerance"
+    assert report.evaluations < 2 * report.steps
 
 
 class TestWhyItStopped:

@@ -58,17 +58,16 @@ def exported(tmp_path: Path) -> Path:
     return tmp_path / "s.usda"
 
 
-class TestAnExportWithEverythingTwice:
-    def test_is_refined_without_what_no_longer_fits(self, exported: Path, tmp_path: Path):
-        writer = write_shot(open_shot(str(exported), level=1), tmp_path / "fine.usdc")
-        notices = "\n".join(map(str, writer.notices))
-        for name in ("primvars:id", "other:springs", "other:places"):
-            assert f"{name} " in notices
-        assert "primvars:side" not in notices
-        assert errors(tmp_path / "fine.usdc", exported) == []
-        stage = open_over(exported, tmp_path / "fine.usdc")
-        found = UsdGeom.PrimvarsAPI(stage.GetPrimAtPath(COAT))
-        assert [found.GetPrimvar(name).HasAuthoredValue() for name in ("normals", "id", "side")] == [False, False, True]
+def test_an_export_with_everything_twice_is_refined_without_what_no_longer_fits(exported: Path, tmp_path: Path):
+    writer = write_shot(open_shot(str(exported), level=1), tmp_path / "fine.usdc")
+    notices = "\n".join(map(str, writer.notices))
+    for name in ("primvars:id", "other:springs", "other:places"):
+        assert f"{name} " in notices
+    assert "primvars:side" not in notices
+    assert errors(tmp_path / "fine.usdc", exported) == []
+    stage = open_over(exported, tmp_path / "fine.usdc")
+    found = UsdGeom.PrimvarsAPI(stage.GetPrimAtPath(COAT))
+    assert [found.GetPrimvar(name).HasAuthoredValue() for name in ("normals", "id", "side")] == [False, False, True]
 
 
 def test_a_mesh_with_a_sample_of_every_array_in_every_frame_is_refined(tmp_path: Path):
