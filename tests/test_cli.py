@@ -18,16 +18,13 @@ from typing import Any
 
 import pytest
 import torch
+from frame_solvers import as_named
+from pxr import Usd
+from shots import CLOTH, cloth_shot, run
 
 from physgraph_usd import cli, errors
 from physgraph_usd.cli.refine import refine
 from physgraph_usd.shot.report import RefineReport
-
-pytest.importorskip("pxr", reason="the commands read stages with usd-core")
-
-from frame_solvers import as_named
-from pxr import Usd
-from shots import CLOTH, cloth_shot, run
 
 Sample = Callable[[str], Path]
 SMALL = ("--frames", "1:2", "--level", "1")

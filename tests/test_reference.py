@@ -9,8 +9,6 @@ import torch
 from cloth import DOWN, frame_of, sheet, wave
 from sheets import garment_of
 
-pytest.importorskip("pxr", reason="benchmarks read stages with usd-core")
-
 from physgraph_usd.lab.chart.problem import ALONE, Problem
 from physgraph_usd.lab.chart.reference import Reference, find_reference
 from physgraph_usd.lab.methods import METHODS

@@ -8,9 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-pytest.importorskip("pxr", reason="samples are written with usd-core")
-
 from pxr import Usd, UsdGeom
 
 from physgraph_usd.errors import UsageError

@@ -88,7 +88,7 @@ except PhysGraphError as error:
 @pytest.mark.parametrize("part", [pytest.param(0.0, marks=pytest.mark.slow), 0.6])
 def test_a_shot_that_is_cut_short_while_it_is_read_is_named(tmp_path: Path, part: float):
     """In a process of its own: where layers are mapped into memory, it dies of SIGBUS."""
-    shot = cloth_shot(tmp_path / "shot.usdc", size=(40, 40))
+    shot = cloth_shot(tmp_path / "shot.usdc", size=(24, 24))
     line = [sys.executable, "-c", CUT, str(shot), str(part)]
     done = subprocess.run(line, capture_output=True, text=True, check=False, timeout=300)
     assert done.returncode == 0, done.stderr

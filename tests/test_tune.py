@@ -15,9 +15,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-pytest.importorskip("pxr", reason="shots are read with usd-core")
-
 from cloth import frame_of, rms, sheet
 from meshes import grid
 from pxr import Usd, UsdGeom
