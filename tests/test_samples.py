@@ -13,7 +13,7 @@ from pxr import Usd, UsdGeom
 from physgraph_usd.errors import UsageError
 from physgraph_usd.lab.samples import SAMPLES, write_sample
 
-GARMENT, COLLIDER = "PhysGraphGarmentAPI", "PhysGraphColliderAPI"
+GARMENT = "PhysGraphGarmentAPI"
 
 
 def prims_with(stage: Usd.Stage, schema: str) -> list[Usd.Prim]:

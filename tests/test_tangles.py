@@ -19,7 +19,7 @@ from physgraph_usd.solver.contact.promise import Promise
 from physgraph_usd.solver.forces.self_contact import PairConstraints, SelfContact
 from physgraph_usd.solver.level import Level, Placed
 
-BOTH, SIZE = np.ones((2, 2), bool), 20
+SIZE = 20
 LIFT = 0.3 * EDGE
 
 

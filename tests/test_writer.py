@@ -31,8 +31,6 @@ from physgraph_usd.usd.write.normals import VertexNormals
 from physgraph_usd.usd.write.primvars import FineMap, to_numpy, to_vt
 from physgraph_usd.usd.write.writer import LayerWriter
 
-ROOT = Path(__file__).resolve().parents[1]
-
 
 @pytest.mark.parametrize(("mode", "suffix"), [("over", ".usdc"), ("sibling", ".usda")])
 def test_points_come_back_in_world_metres(dressed: Path, tmp_path: Path, mode: str, suffix: str) -> None:
