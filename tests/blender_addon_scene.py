@@ -117,7 +117,6 @@ def ball(coat, size):
 
 
 def choose(colliders=None, **settings):
-    """Set what the panel shows."""
     panel = bpy.context.scene.physgraph
     panel.colliders = bpy.data.collections[colliders] if colliders else None
     for name, value in settings.items():
@@ -125,7 +124,6 @@ def choose(colliders=None, **settings):
 
 
 def select(*names):
-    """Select objects by name."""
     bpy.ops.object.select_all(action="DESELECT")
     for name in names:
         bpy.data.objects[name].hide_set(False)
@@ -141,12 +139,10 @@ def refine(label):
 
 
 def rename(name, to):
-    """Give an object another name."""
     bpy.data.objects[name].name = to
 
 
 def add_modifier(name, kind):
-    """Add a modifier to an object."""
     bpy.data.objects[name].modifiers.new(kind.lower(), kind)
 
 
@@ -178,7 +174,6 @@ class Layout:
 
 
 def draw(label):
-    """Draw the panel and the preferences."""
     from bl_ext.user_default.physgraph_usd import panel  # pyright: ignore[reportMissingImports]
 
     SEEN[label] = []
@@ -263,7 +258,6 @@ def follow(label, state="settled", patience=100.0):
 
 
 def live_points():
-    """Positions of the live objects, by name."""
     found = {}
     for item in bpy.data.objects:
         if item.name.endswith("_live"):
@@ -273,7 +267,6 @@ def live_points():
 
 
 def go(frame):
-    """Go to a frame."""
     bpy.context.scene.frame_set(frame)
 
 
@@ -283,22 +276,18 @@ def push():
 
 
 def undo():
-    """Undo."""
     bpy.ops.ed.undo()
 
 
 def keep(label):
-    """Press "Keep"."""
     SEEN[label] = sorted(bpy.ops.physgraph.keep())
 
 
 def kill():
-    """Kill the process."""
     globals()["process"].kill()
 
 
 def press_escape():
-    """Press Esc."""
     button, event = Button(live_view().PHYSGRAPH_OT_live), SimpleNamespace(type="ESC", value="PRESS")
     assert button.modal(bpy.context, event) == {"CANCELLED"}
 
@@ -309,13 +298,11 @@ def ended(label):
 
 
 def unregister():
-    """Disable the add-on."""
     bpy.ops.preferences.addon_disable(module=ADDON)
     SEEN["unregistered"] = [hasattr(bpy.context.scene, "physgraph"), hasattr(bpy.types.Object, "physgraph_coarse")]
 
 
 def reopen(path):
-    """Save and open the file again."""
     bpy.ops.wm.save_as_mainfile(filepath=path)
     bpy.ops.wm.open_mainfile(filepath=path)
 

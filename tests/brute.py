@@ -13,14 +13,7 @@ from physgraph_usd.solver.level import Level
 
 @dataclass(frozen=True, eq=False)
 class Soup:
-    """A level's elements as arrays of numpy.
-
-    Attributes:
-        x: Positions, rounded as the package's hierarchy rounds them, shape (V, 3).
-        edges: Shape (E, 2).
-        faces: Shape (F, 3).
-        garment: Of each vertex, shape (V,).
-    """
+    """A level's elements as arrays of numpy; positions are rounded as the package's hierarchy rounds them."""
 
     x: np.ndarray
     edges: np.ndarray
@@ -29,17 +22,13 @@ class Soup:
 
     @staticmethod
     def of(level: Level, x: object) -> Soup:
-        """The elements of a level at positions."""
         rounded = np.asarray(x).astype(np.float32).astype(np.float64)
         arrays = (np.asarray(each).astype(np.int64) for each in (level.edges, level.triangles, level.vertex_garment))
         return Soup(rounded, *arrays)
 
 
 def crossing_points(x: np.ndarray, edges: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Edges that pass through faces with which they share no vertex: numbers of both, and where, shape (N, 3).
-
-    Those in one plane, as on a table, do not cross.
-    """
+    """Edges that pass through faces that share no vertex with them, none in one plane: numbers of both, and where."""
     edge, face = _near(x, edges, faces)
     apart = (edges[edge][:, :, None] != faces[face][:, None, :]).all(axis=(1, 2))
     edge, face = edge[apart], face[apart]

@@ -63,7 +63,6 @@ class Bend:
 
 
 def measure_plane(kind: str, shear: float | None) -> Plane:
-    """Stretch and shear a sheet of a mesh kind."""
     level = level_of_kind(kind, SHEET)
     terms = in_plane_terms(level, [Fabric(YOUNGS, shear=shear)])
     constants = plane_constants(plane_stiffness(level, terms))
@@ -72,7 +71,6 @@ def measure_plane(kind: str, shear: float | None) -> Plane:
 
 
 def measure_bend(kind: str) -> Bend:
-    """Bend a sheet of a mesh kind."""
     level = level_of_kind(kind, SHEET)
     constants = bending_constants(bending_stiffness(level, RIGIDITY))
     rolled = over_directions(lambda angle: cylinder_rigidity(level, 10 * SHEET[2], angle))
@@ -104,7 +102,6 @@ def cell(spread: Spread) -> str:
 
 
 def plane_table() -> list[str]:
-    """Rows of the in-plane table."""
     rows = ["| mesh | in-plane term | Y | nu | G | pulled: Y | nu |", "|---|---|---|---|---|---|---|"]
     for kind in KINDS:
         for term, shear in SHEAR.items():
@@ -115,7 +112,6 @@ def plane_table() -> list[str]:
 
 
 def bend_table() -> list[str]:
-    """Rows of the bending table."""
     rows = ["| mesh | D | nu of bending | D, rolled without relaxing | strip's angle | its D |"]
     rows.append("|---|---|---|---|---|---|")
     for kind in KINDS:
@@ -127,7 +123,6 @@ def bend_table() -> list[str]:
 
 
 def chain_table() -> list[str]:
-    """Rows of the catenary table."""
     expected = catenary_sag(CHAIN_LENGTH, CHAIN_SPAN)
     rows = ["| mesh | sag mm | catenary mm |", "|---|---|---|"]
     for kind in KINDS:
@@ -195,7 +190,6 @@ A strip of 30 edges, nearly inextensible and nearly without bending stiffness, p
 
 
 def page() -> str:
-    """The whole page."""
     narrow, wide = expected_cantilever(1 / 3), expected_cantilever(0.0)
     tables = {"plane": plane_table(), "bend": bend_table(), "chain": chain_table()}
     return PAGE.format(narrow=narrow, wide=wide, **{name: "\n".join(rows) for name, rows in tables.items()})

@@ -33,7 +33,6 @@ def sheet(columns: int, rows: int, edge: float = 0.05, *, kind: str = "triangles
 
 
 def settings_of(*, integrator: str = "quasi-newton", **options: Any) -> SolveSettings:
-    """Settings with a method by its name."""
     return SolveSettings(METHODS[integrator], **options)
 
 
@@ -78,7 +77,6 @@ def refiner_of(
 
 
 def frame_of(points: np.ndarray, time: float | None = None, *, fabric: Fabric = FABRIC, guide: float = GUIDE) -> Frame:
-    """A frame of one garment."""
     return Frame(time, (GarmentFrame(points, fabric, guide),))
 
 
@@ -112,7 +110,6 @@ def group_of(
     dtype: torch.dtype = torch.float64,
     **options: Any,
 ) -> Group:
-    """One garment's group."""
     garments = [garment_of(mesh, rest)]
     return Group.of(
         garments, refine_garments(garments, [level]), gravity, settings_of(**options), dtype=dtype, device="cpu"

@@ -11,7 +11,6 @@ from physgraph_usd.solver.forces.base import Force
 
 
 def evaluate(force: Force, x: Tensor) -> tuple[float, Tensor]:
-    """Energy and force of a term."""
     out = torch.zeros_like(x)
     energy = force.add_force(x, out)
     return float(energy), out

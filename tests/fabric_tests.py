@@ -118,7 +118,6 @@ def measured(fabric: Fabric) -> dict[str, tuple[float, float]]:
 
 
 def drape_row(name: str, *, edge: float) -> str:
-    """A fabric's row of the drape test."""
     fabric, (low, high) = PRESETS[name], BANDS[name]
     length = 100.0 * (fabric.bend / (fabric.density * G)) ** (1 / 3)
     every = drapes(fabric, edge=edge)
@@ -129,7 +128,6 @@ def drape_row(name: str, *, edge: float) -> str:
 
 
 def main() -> None:
-    """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--edge", type=float, default=EDGE, help="Edge of the disc's triangles [m].")
     edge = parser.parse_args().edge

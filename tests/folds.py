@@ -46,7 +46,6 @@ def strip(length: int = 16, width: int = 4, *, edge: float = EDGE) -> Cloth:
 
 
 def flat(points: np.ndarray) -> np.ndarray:
-    """As it is."""
     return points
 
 
@@ -95,12 +94,10 @@ SHAPES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 
 
 def named(cloth: Cloth, name: str = "Sheet", **fields: Any) -> Garment:
-    """A garment of a name."""
     return replace(garment_of(*cloth), path=f"/World/{name}", **fields)
 
 
 def levels_of(*garments: Garment, level: int = 1, dtype: torch.dtype = torch.float32) -> tuple[Level, ...]:
-    """The levels of garments solved together."""
     return build_levels(garments, refine_garments(garments, [level] * len(garments)), dtype=dtype)
 
 

@@ -22,38 +22,33 @@ MIRROR = Gf.Matrix4d().SetScale(Gf.Vec3d(-2, 1, 0.5)) * Gf.Matrix4d().SetTransla
 """A parent that mirrors, scales unevenly and lies far from the origin."""
 
 
-def grid(columns: int = 4, rows: int = 3, *, quads: bool = True) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def grid(columns: int = 4, rows: int = 3) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Points in the plane, counts and indices of a sheet that faces +Z."""
     x, y = np.meshgrid(np.arange(columns + 1.0), np.arange(rows + 1.0))
     points = np.stack([x, y, 0.1 * np.sin(x)], axis=-1).reshape(-1, 3)
-    return points, *sheet_faces("quads" if quads else "triangles", (columns, rows))
+    return points, *sheet_faces("quads", (columns, rows))
 
 
 def make_shot(
     path: Path,
     *,
     times: Sequence[float] = TIMES,
-    size: tuple[int, int] = (4, 3),
-    quads: bool = True,
     matrix: Gf.Matrix4d | None = None,
-    metres: float = 0.01,
     orientation: str = "rightHanded",
-    default: bool = True,
 ) -> Usd.Stage:
     """A coat under a moving rig, in memory of a new layer; saved, and returned for more edits."""
-    stage = new_stage(path, metres=metres, up="Z", rate=30.0)
+    stage = new_stage(path, metres=0.01, up="Z", rate=30.0)
     UsdGeom.Xform.Define(stage, "/World/rig").AddTransformOp().Set(matrix or Gf.Matrix4d(1.0))
-    points, counts, indices = grid(*size, quads=quads)
+    points, counts, indices = grid()
     if orientation == "leftHanded":
-        indices = indices.reshape(len(counts), -1)[:, ::-1].reshape(-1).copy()
+        indices = indices.reshape(-1, 4)[:, ::-1].reshape(-1).copy()
     mesh = UsdGeom.Mesh.Define(stage, COAT)
     mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(counts))
     mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(indices))
     mesh.CreateOrientationAttr(orientation)
     mesh.CreateDoubleSidedAttr(True)
-    if default:
-        mesh.CreatePointsAttr(vec3(points))
-        mesh.CreateExtentAttr(UsdGeom.PointBased.ComputeExtent(vec3(points)))
+    mesh.CreatePointsAttr(vec3(points))
+    mesh.CreateExtentAttr(UsdGeom.PointBased.ComputeExtent(vec3(points)))
     for index, time in enumerate(times):
         moved = points + np.array([0.0, 0.0, 0.25 * index])
         mesh.CreatePointsAttr().Set(vec3(moved), time)
@@ -106,7 +101,6 @@ def dress_up(stage: Usd.Stage) -> None:
 
 
 def refine_all(shot: Shot) -> list[tuple[Refinement, ...]]:
-    """Refinements of every garment at its level."""
     return [subdivide_times(garment.mesh, garment.level) for garment in shot.scene.garments]
 
 
@@ -138,12 +132,10 @@ def open_over(path: Path, out: Path) -> Usd.Stage:
 
 
 def errors(out: Path, shot: Path | None = None) -> list[str]:
-    """What the validator calls errors."""
     return [str(problem) for problem in validate_layer(out, shot) if problem.severity == "error"]
 
 
 def world_metres(stage: Usd.Stage, path: str, time: float | None) -> np.ndarray:
-    """Points of a mesh in world metres."""
     code = Usd.TimeCode.Default() if time is None else Usd.TimeCode(time)
     mesh = UsdGeom.Mesh(stage.GetPrimAtPath(path))
     matrix = np.array(UsdGeom.XformCache(code).GetLocalToWorldTransform(mesh.GetPrim()))

@@ -9,14 +9,12 @@ from physgraph_usd.solver.mesh.topology import PolygonMesh
 
 
 def mesh_of(faces: list[list[int]], vertex_count: int | None = None) -> PolygonMesh:
-    """A mesh from faces written as lists."""
     indices = [vertex for face in faces for vertex in face]
     count = max(indices, default=-1) + 1 if vertex_count is None else vertex_count
     return PolygonMesh(np.array([len(face) for face in faces], np.int32), np.array(indices, np.int32), count)
 
 
 def faces_of(mesh: PolygonMesh) -> list[list[int]]:
-    """The faces as lists."""
     return [mesh.indices[a:b].tolist() for a, b in zip(mesh.starts[:-1], mesh.starts[1:], strict=True)]
 
 

@@ -28,13 +28,7 @@ from physgraph_usd.solver.scene import Frame, Garment, Scene
 
 @dataclass(frozen=True)
 class Shot:
-    """A scene and its frames.
-
-    Attributes:
-        scene: Garments, and bodies that all of them feel.
-        frames: In order.
-        crossed: Whether the cages cross in some frames.
-    """
+    """A scene of garments and bodies that all of them feel, its frames, and whether its cages cross in some."""
 
     scene: Scene
     frames: tuple[Frame, ...]
@@ -43,7 +37,6 @@ class Shot:
     def refiner(
         self, *, level: int = 1, dtype: torch.dtype = torch.float32, threads: int = 1, **options: Any
     ) -> Solver:
-        """A fresh refiner."""
         levels = [level] * len(self.scene.garments)
         return Solver(Refiner(self.scene, settings_of(**options), levels=levels, dtype=dtype, threads=threads))
 
@@ -175,7 +168,6 @@ BODIES = ("layers", "ball", "tube", "armpit", "torus")
 
 @cache
 def shot_of(name: str) -> Shot:
-    """A scene by its name."""
     return SCENES[name]()
 
 
@@ -193,7 +185,6 @@ def upsampled(name: str, frame: int, level: int = 1) -> list[np.ndarray]:
 
 
 def triangles(name: str, level: int = 1) -> list[np.ndarray]:
-    """The triangles of each garment at a level."""
     return [steps[-1].mesh.triangulate().triangles.astype(np.int64) for steps in _steps(name, level)]
 
 
@@ -204,7 +195,6 @@ def _steps(name: str, level: int) -> list[tuple[Refinement, ...]]:
 
 
 def soup_of(points: Sequence[np.ndarray], faces: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Garments as one mesh."""
     starts = np.cumsum([0, *map(len, points)])
     return np.concatenate(points), np.concatenate([each + start for each, start in zip(faces, starts, strict=False)])
 

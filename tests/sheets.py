@@ -21,7 +21,6 @@ Sheet = tuple[np.ndarray, np.ndarray]
 
 
 def triangle_mesh(triangles: np.ndarray, vertex_count: int) -> PolygonMesh:
-    """A polygon mesh of triangles."""
     return PolygonMesh(np.full(len(triangles), 3), triangles.ravel(), vertex_count)
 
 
@@ -126,15 +125,7 @@ def level_of_kind(
     pinned: Callable[[np.ndarray], np.ndarray] | None = None,
     warp: np.ndarray | None = None,
 ) -> Level:
-    """A sheet of a mesh kind in float64; quads are refined, so that the level knows them for quads.
-
-    Args:
-        kind: One of `KINDS`.
-        size: Length, width and edge length.
-        start: Where x begins.
-        pinned: Tells from points which are pinned.
-        warp: Direction of the warp, for triangles.
-    """
+    """A sheet of a mesh kind, and a length, width and edge; quads are refined: the level knows them for quads."""
     shift = np.array([start, 0.0, 0.0])
     if kind != "quads":
         points, triangles = KINDS[kind](*size)

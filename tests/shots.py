@@ -72,7 +72,6 @@ def refine(shot: Path, out: Path, **options: Any) -> RefineReport:
 
 
 def sample_times(layer: Path, prim: str = CLOTH) -> tuple[float, ...]:
-    """Time codes of a layer's points."""
     return tuple(Sdf.Layer.FindOrOpen(str(layer)).ListTimeSamplesForPath(f"{prim}.points"))
 
 
@@ -81,9 +80,7 @@ def fine(shot: Path, layer: Path, time: float | None, *, prim: str = CLOTH) -> n
     return world_metres(open_over(shot, layer), prim, time)
 
 
-def faults(layer: Path, shot: Path) -> list[str]:
-    """Errors that the validator finds."""
-    return errors(layer, shot)
+faults = errors
 
 
 def run(*args: object) -> Result:

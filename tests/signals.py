@@ -61,7 +61,6 @@ def ends(line: list[str], number: signal.Signals, delay: float) -> tuple[int, fl
 
 
 def main() -> None:
-    """Send the signals."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--short", action="store_true")
     count = 8 if parser.parse_args().short else 40

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -66,7 +66,6 @@ def sheet_faces(kind: str = "quads", size: tuple[int, int] = SIZE) -> tuple[np.n
 
 
 def vec3(points: np.ndarray) -> Vt.Vec3fArray:
-    """Points for USD."""
     return Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(points, np.float32))
 
 
@@ -91,6 +90,19 @@ def add_sheet(
         mesh.CreatePointsAttr().Set(vec3(sheet_points(time, size)), time)
     if tagged:
         mesh.GetPrim().AddAppliedSchema(GARMENT_API)
+    return mesh
+
+
+def add_mesh(
+    stage: Usd.Stage, path: str, points: ArrayLike, faces: Iterable[Iterable[int]], *, schema: str | None = GARMENT_API
+) -> UsdGeom.Mesh:
+    """A mesh of faces, by their corners, with default points; a garment unless it gets another schema, or none."""
+    mesh, corners = UsdGeom.Mesh.Define(stage, path), [list(map(int, face)) for face in faces]
+    mesh.CreateFaceVertexCountsAttr([len(face) for face in corners])
+    mesh.CreateFaceVertexIndicesAttr([corner for face in corners for corner in face])
+    mesh.CreatePointsAttr(vec3(np.asarray(points)))
+    if schema is not None:
+        mesh.GetPrim().AddAppliedSchema(schema)
     return mesh
 
 

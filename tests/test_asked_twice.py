@@ -34,7 +34,7 @@ def beside(points: np.ndarray) -> np.ndarray:
     return points + np.array([np.ptp(points[:, 0]), 0.0, 0.0])
 
 
-SHEET = square(4)
+SHEET = square(3)
 SCENES: dict[str, tuple[Sequence[Cloth], Sequence[np.ndarray]]] = {
     "one through the other": ([SHEET] * 2, [SHEET[1], tilted(SHEET[1])]),
     "sewn on a ball": ([SHEET] * 2, [SHEET[1] + OVER, beside(SHEET[1]) + OVER]),
@@ -74,7 +74,6 @@ def plain(answer: Any) -> Any:
 
 
 def solved(a: Asked) -> Any:
-    """A cold frame."""
     a.refiner.forget()
     return a.refiner.solve(a.frame)
 

@@ -99,7 +99,6 @@ class Seen(NamedTuple):
 
 
 def in_blender(folder: Path, script: str, *arguments: str) -> None:
-    """Run a script in Blender's Python."""
     python = os.environ["PHYSGRAPH_BPY_PYTHON"]
     (folder / "script.py").write_text(script)
     ran = subprocess.run(

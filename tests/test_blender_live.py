@@ -15,9 +15,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-
-pytest.importorskip("pxr", reason="shots are read with usd-core")
-
 from blender import addon_module
 from shots import CLOTH, cloth_shot
 

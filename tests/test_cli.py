@@ -18,27 +18,16 @@ from typing import Any
 
 import pytest
 import torch
-from click.testing import CliRunner, Result
+from frame_solvers import as_named
+from pxr import Usd
+from shots import CLOTH, cloth_shot, run
 
 from physgraph_usd import cli, errors
 from physgraph_usd.cli.refine import refine
 from physgraph_usd.shot.report import RefineReport
 
-pytest.importorskip("pxr", reason="the commands read stages with usd-core")
-
-from frame_solvers import as_named
-from pxr import Usd
-from shots import CLOTH, cloth_shot
-
 Sample = Callable[[str], Path]
 SMALL = ("--frames", "1:2", "--level", "1")
-
-
-def run(*args: object) -> Result:
-    result = CliRunner().invoke(cli.main, [str(arg) for arg in args])
-    if result.exception and not isinstance(result.exception, SystemExit):
-        raise result.exception
-    return result
 
 
 @pytest.fixture

@@ -33,7 +33,6 @@ def listed(found: Crossings) -> set[tuple[int, int]]:
 
 
 def found_at(level: Level, x: torch.Tensor, meets: np.ndarray = ALL) -> set[tuple[int, int]]:
-    """What crosses at positions [m]."""
     return listed(crossings(Parts(level, meets), x))
 
 
@@ -79,7 +78,6 @@ def coarse(seed: int) -> tuple[Level, torch.Tensor]:
 
 @cache
 def scene(name: str) -> tuple[Level, torch.Tensor]:
-    """A level and positions."""
     if name in (more := {"two sheets": two_sheets, "two fans": two_fans}):
         return more[name]()
     if name == "two sheets of quads":
@@ -229,25 +227,22 @@ class TestWhatCounts:
         assert listed(crossings(Parts(level, ALL, label), x)) == kept
 
 
-class TestUpsampledOnTriangles:
-    """A level's vertices on the triangles of the level below: what does not cross there does not cross here."""
-
-    @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-    @pytest.mark.parametrize("kind", ["quads", "mixed", "triangles"])
-    def test_a_cage_that_does_not_cross_crosses_at_no_level(self, kind: str, dtype: torch.dtype):
-        """Crumpled sheets, as far as their cages do not cross; by the means of quads some of them would."""
-        levels = levels_of(named(square(4, kind=kind)), level=2, dtype=dtype)
-        tried = bent = 0
-        for seed in range(60):
-            x = torch.as_tensor(crumpled(levels[0].rest.double().numpy(), seed, size=0.9), dtype=dtype)
-            if found_at(levels[0], x):
-                continue
-            tried, mean = tried + 1, x
-            for level in levels[1:]:
-                assert level.flat_from_below is not None
-                assert level.from_below is not None
-                x, mean = level.flat_from_below.apply(x), level.from_below.apply(mean)
-                assert not found_at(level, x), (seed, level.index)
-            bent += bool(found_at(levels[-1], mean))
-        assert tried > 5
-        assert kind == "triangles" or bent > 0
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("kind", ["quads", "mixed", "triangles"])
+def test_a_cage_that_does_not_cross_crosses_at_no_level(kind: str, dtype: torch.dtype):
+    """Crumpled sheets, as far as their cages do not cross; by the means of quads some of them would."""
+    levels = levels_of(named(square(4, kind=kind)), level=2, dtype=dtype)
+    tried = bent = 0
+    for seed in range(60):
+        x = torch.as_tensor(crumpled(levels[0].rest.double().numpy(), seed, size=0.9), dtype=dtype)
+        if found_at(levels[0], x):
+            continue
+        tried, mean = tried + 1, x
+        for level in levels[1:]:
+            assert level.flat_from_below is not None
+            assert level.from_below is not None
+            x, mean = level.flat_from_below.apply(x), level.from_below.apply(mean)
+            assert not found_at(level, x), (seed, level.index)
+        bent += bool(found_at(levels[-1], mean))
+    assert tried > 5
+    assert kind == "triangles" or bent > 0

@@ -12,9 +12,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
-from pxr import UsdGeom, Vt
 from shots import run
-from stages import GARMENT_API, add_sheet, new_stage, save
+from stages import add_mesh, add_sheet, new_stage, save
 
 from docs import warnings_table
 from physgraph_usd.cli import main
@@ -54,11 +53,8 @@ def folder(tmp_path: Path, page: Path) -> Path:
     count = 48 if page.stem == "farm" else 4
     stage = new_stage(tmp_path / "shot.usda", metres=0.05)
     add_sheet(stage, "/World/Coat", times=tuple(map(float, range(1, count + 1))), size=(3, 2))
-    stage.GetPrimAtPath("/World/Coat").AddAppliedSchema(GARMENT_API)
-    body = UsdGeom.Mesh.Define(stage, "/World/Body")
-    body.CreateFaceVertexCountsAttr(Vt.IntArray([3] * 4))
-    body.CreateFaceVertexIndicesAttr(Vt.IntArray([0, 2, 1, 0, 1, 3, 1, 2, 3, 0, 3, 2]))
-    body.CreatePointsAttr(Vt.Vec3fArray([(0, 0, -4), (3, 0, -4), (0, 2, -4), (0, 0, -1)]))
+    corners = [(0, 0, -4), (3, 0, -4), (0, 2, -4), (0, 0, -1)]
+    add_mesh(stage, "/World/Body", corners, [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]], schema=None)
     shot = save(stage)
     for name in ("seq", "c", "publish", "build"):
         (tmp_path / name).mkdir()

@@ -3,28 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 import torch
-from energies import (
-    evaluate,
-)
+from energies import apart, difference_force, evaluate
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from meshes import planar_mesh
-from sheets import level_of, quality, rotation
+from meshes import grid, mesh_of, planar_mesh
+from sheets import KINDS, Sheet, garment_of, irregular, level_of, quality, rotation
 from torch import Tensor
 
 from physgraph_usd.solver.forces.base import Force, ForceModule
-from physgraph_usd.solver.forces.bending import Bending
+from physgraph_usd.solver.forces.bending import Bending, hinge_jacobian
 from physgraph_usd.solver.forces.gravity import Gravity
 from physgraph_usd.solver.forces.guide import Guide, GuideMap
 from physgraph_usd.solver.forces.membrane import Membrane
+from physgraph_usd.solver.forces.self_contact import PairConstraints, SelfContact
 from physgraph_usd.solver.forces.stretch import Stretch
 from physgraph_usd.solver.forces.tether import Tether
-from physgraph_usd.solver.level import Level
+from physgraph_usd.solver.level import Level, build_levels, refine_garments, triangle_areas
+from physgraph_usd.solver.mesh.topology import PolygonMesh
 
 DOWN = np.array([0.0, 0.0, -9.81])
 INTERNAL = ("stretch", "membrane", "bending")
@@ -158,3 +158,237 @@ def test_a_module_that_remembers_evaluates_its_own_terms_once_at_the_same_positi
     assert torch.equal(joined.energy_and_force(x)[1], 2.0 * x)
     assert torch.equal(module.energy_and_force(x.clone())[1], x)
     assert own.asked == 3
+
+
+CORNERS = [0, 1, 2, 4]
+"""Columns of hinges between triangles, without the corners that stand twice."""
+
+
+def sheet(kind: str = "irregular") -> Sheet:
+    points, triangles = KINDS[kind](0.5, 0.4, 0.1)
+    return points @ rotation(5).T + 0.3, triangles
+
+
+def dense(force: Force, x: Tensor) -> np.ndarray:
+    """Hessian by finite differences, shape (V, 3, V, 3)."""
+    flat = plain_hessian(force, x)
+    return flat.reshape(len(x), 3, len(x), 3)
+
+
+def matrix_of(force: Force) -> np.ndarray:
+    matrix = force.rest_matrix()
+    assert matrix is not None
+    return matrix.toarray()
+
+
+def plain_hessian(force: Force, x: Tensor, step: float = 1e-6) -> np.ndarray:
+    columns = []
+    for v in range(len(x)):
+        for axis in range(3):
+            moved = x.clone()
+            moved[v, axis] += step
+            ahead = evaluate(force, moved)[1]
+            moved[v, axis] -= 2 * step
+            columns.append(((evaluate(force, moved)[1] - ahead) / (2 * step)).reshape(-1).numpy())
+    return np.array(columns)
+
+
+@pytest.mark.parametrize("name", ["membrane", "bending"])
+def test_diagonal_away_from_rest(name: str):
+    """The stretched membrane's block without the curvature of its sine; bending's without that of its angle."""
+    points, triangles = sheet()
+    level = level_of(points, triangles)
+    force = force_of(name, level)
+    if name == "membrane":
+        x = 1.2 * level.rest + 0.01 * crumple(points, 0.2, 4)
+        expected = np.einsum("vava->v", dense(force, x)) / 3
+    else:
+        assert isinstance(force, Bending)
+        x = crumple(points, 0.02, 4)
+        hinges = level.hinges[:, CORNERS]
+        jacobian = hinge_jacobian(x, hinges)
+        expected = np.zeros(len(x))
+        for hinge, rows, weight in zip(hinges.tolist(), jacobian.numpy(), force.weight.tolist(), strict=True):
+            for vertex, row in zip(hinge, rows, strict=True):
+                expected[vertex] += weight * row @ row / 3
+    assert np.allclose(force.diagonal(x).numpy(), expected, rtol=5e-3 if name == "membrane" else 1e-5)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("name", INTERNAL)
+def test_rest_matrix_is_the_trace_of_the_flat_hessian(name: str, kind: str):
+    level = level_of(*sheet(kind))
+    force = force_of(name, level)
+    trace = np.einsum("vawa->vw", dense(force, level.rest))
+    assert np.allclose(matrix_of(force), trace, atol=1e-6 * np.abs(trace).max())
+
+
+def refined() -> Level:
+    mesh, points = grid(3, 2, "mixed")
+    pin = np.where(np.arange(len(points)) == 4, 0.5, 0.0)
+    garment = garment_of(mesh, points, pin=pin)
+    return build_levels([garment], refine_garments([garment], [2]), dtype=torch.float64)[-1]
+
+
+def test_guide_is_at_rest_on_the_cage_and_blind_to_wrinkles():
+    level = refined()
+    guide_map = GuideMap(level)
+    count = level.from_coarse.shape[1]
+    coarse = torch.randn((count, 3), dtype=torch.float64)
+    guide = Guide(level, guide_map, torch.full((count,), 100.0)).retarget(coarse)
+    x = level.base.apply(coarse)
+    energy, f = evaluate(guide, x)
+    assert float(energy) == 0.0
+    assert not f.any()
+    matrix = guide_map.spread_matrix.T.toarray()
+    wrinkle = torch.as_tensor(null_vector(matrix, (level.pin > 0).numpy()))[:, None] * torch.ones(3)
+    assert float(evaluate(guide, x + wrinkle)[0]) == pytest.approx(0.0, abs=1e-12)
+    off = torch.randn_like(x)
+    lag = guide_map.average.apply(off)
+    area = torch.as_tensor(guide_map.coarse_area)[:, None]
+    expected = 0.5 * 100.0 * (area * lag**2).sum() + 0.5 * 10 * (soft(level, 100.0)[:, None] * off**2).sum()
+    assert float(evaluate(guide, x + off)[0]) == pytest.approx(float(expected), rel=1e-9)
+
+
+def soft(level: Level, stiffness: float) -> Tensor:
+    return stiffness * level.vertex_area * level.pin / (1 - level.pin)
+
+
+def null_vector(matrix: np.ndarray, fixed: np.ndarray) -> np.ndarray:
+    """A unit vector that the averaging does not see and that leaves fixed vertices alone."""
+    constraints = np.concatenate([matrix, np.eye(len(fixed))[fixed]])
+    return np.linalg.svd(constraints)[2][-1]
+
+
+def levels_of(mesh: PolygonMesh, rest: np.ndarray, depth: int = 0) -> tuple[Level, ...]:
+    garment = garment_of(mesh, rest, bent=True)
+    return build_levels([garment], refine_garments([garment], [depth]), dtype=torch.float64)
+
+
+def test_no_corner_of_a_quad_is_the_first():
+    """Small twists are the same round either diagonal; stretch is the mean of both splits."""
+    mesh, flat = grid(4, 3)
+    rest = flat * [1.0, 0.7, 0.0]
+    x = torch.as_tensor(rest + 1e-4 * np.random.default_rng(0).normal(size=rest.shape))
+    energies = []
+    for turn in range(4):
+        rolled = PolygonMesh(mesh.counts, np.roll(mesh.indices.reshape(-1, 4), turn, axis=1).ravel(), len(rest))
+        level = levels_of(rolled, rest)[0]
+        energies.append([evaluate(force_of(name, level), x)[0] for name in INTERNAL])
+    np.testing.assert_allclose(energies, np.broadcast_to(energies[0], (4, 3)), rtol=1e-3)
+
+
+@pytest.mark.parametrize("name", INTERNAL)
+def test_forces_of_triangles_beside_quads_are_minus_the_gradient(name: str):
+    mesh, flat = grid(4, 2, "mixed")
+    level = levels_of(mesh, flat + np.random.default_rng(0).normal(scale=0.05, size=flat.shape))[0]
+    force, x = force_of(name, level), crumple(flat, 0.1, 2)
+    assert apart(evaluate(force, x)[1], difference_force(force, x, 1e-3)) < 1e-6
+
+
+@pytest.mark.parametrize(
+    "corners", [[[0, 0], [1, -3], [0, 9], [-1, -3]], [[0, 0], [1, 0], [1, 0], [0, 1]], [[0, 0], [1, 0], [2, 0], [0, 1]]]
+)
+def test_quads_that_are_not_convex_count_as_triangles(corners: list[list[float]]):
+    """A dart, a quad with a side without length, and a quad with a straight corner."""
+    rest = np.column_stack([np.array(corners, float), np.zeros(4)])
+    level = levels_of(mesh_of([[0, 1, 2, 3]]), rest)[0]
+    assert torch.equal(level.membrane, level.triangles)
+    assert torch.equal(level.springs, level.edges)
+    split = mesh_of([[0, 1, 2, 3]]).triangulate(rest).triangles
+    assert float(level.membrane_area.sum()) == pytest.approx(triangle_areas(rest, split).sum())
+
+
+def test_a_flat_cage_of_triangles_rests_unstrained():
+    """Smooth subdivision rounds its outline, and the cloth keeps its own."""
+    mesh, points = grid(4, 3, "triangles")
+    for level in levels_of(mesh, points, 2):
+        for name in INTERNAL:
+            assert evaluate(force_of(name, level), level.base.apply(torch.as_tensor(points)))[0] < 1e-12
+
+
+POINTS, TRIANGLES = irregular(0.4, 0.3, 0.1)
+LEVEL = level_of(POINTS, TRIANGLES)
+X = crumple(POINTS, 0.05, 8)
+
+
+def gaps_of(x: torch.Tensor, count: int = 40, *, lack: float | None = None, seed: int = 0) -> PairConstraints:
+    """Random pairs, vertex-face ones first; all short of their offset by the same, or by anything between +-2 cm."""
+    rng = np.random.default_rng(seed)
+    corners = torch.as_tensor(np.array([rng.choice(len(x), 4, replace=False) for _ in range(count)]), dtype=torch.int32)
+    b, st = rng.dirichlet(np.ones(3), count), rng.uniform(0, 1, (count, 2))
+    face = np.arange(count)[:, None] < count // 2
+    weight = np.where(
+        face,
+        np.column_stack([np.ones(count), -b]),
+        np.column_stack([1 - st[:, 0], st[:, 0], st[:, 1] - 1, -st[:, 1]]),
+    )
+    normal = rng.normal(size=(count, 3))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    none = torch.zeros(count, dtype=x.dtype)
+    made = PairConstraints(corners, torch.as_tensor(weight), torch.as_tensor(normal), none, none)
+    offset = (made.vectors(x) * made.normal).sum(dim=1)
+    short = torch.as_tensor(rng.uniform(-0.02, 0.02, count)) if lack is None else torch.full_like(none, lack)
+    return replace(made, offset=offset + short, stiffness=torch.as_tensor(rng.uniform(10, 1000, count)))
+
+
+TERMS = {
+    "gaps": lambda: SelfContact(LEVEL, gaps_of(X)),
+    "gaps, just open": lambda: SelfContact(LEVEL, gaps_of(X, lack=-1e-5)),
+    "gaps, just short": lambda: SelfContact(LEVEL, gaps_of(X, lack=1e-3)),
+}
+OPEN = ("gaps, just open",)
+
+
+@pytest.mark.parametrize("name", TERMS)
+def test_the_force_is_minus_the_gradient(name: str):
+    term = TERMS[name]()
+    energy, force = evaluate(term, X)
+    assert (energy == 0.0) == (name in OPEN)
+    assert bool(force.any()) == (name not in OPEN)
+    difference = difference_force(term, X, 2e-7)
+    assert float((force - difference).abs().max()) < 1e-6 * max(float(difference.abs().max()), 1e-3)
+
+
+def test_they_turn_with_the_cloth():
+    turn, shift = torch.as_tensor(rotation(4)), torch.tensor([0.3, -0.2, 5.0], dtype=X.dtype)
+    moved = X @ turn.T + shift
+    gaps = gaps_of(X)
+    energy, force = evaluate(SelfContact(LEVEL, gaps), X)
+    turned = SelfContact(LEVEL, replace(gaps, normal=gaps.normal @ turn.T))
+    energy_there, force_there = evaluate(turned, moved)
+    assert energy_there == pytest.approx(energy, rel=1e-9)
+    assert apart(force_there, force @ turn.T) < 1e-9
+
+
+class TestRoom:
+    """Constraints on one vertex 1 mm above a floor that wants 3 mm."""
+
+    X = torch.tensor([[0.0, 1e-3, 0.0], [1.0, 0.0, 0.0]], dtype=torch.float64)
+
+    def depths(self, normal: list[float], offset: float, *, side: float = 1.0) -> list[float]:
+        """Depths of the floor's constraint and of another once both share the room [m]."""
+        normals = torch.tensor([[0.0, 1.0, 0.0], normal], dtype=torch.float64)
+        offsets, one = torch.tensor([3e-3, offset], dtype=torch.float64), torch.ones(2, dtype=torch.float64)
+        corners, weight = torch.zeros((2, 4), dtype=torch.int32), torch.zeros((2, 4), dtype=torch.float64)
+        weight[:, 0] = torch.tensor([1.0, side])
+        both = PairConstraints(corners, weight, normals, offsets, one).sharing_room(self.X)
+        return (both.offset - (both.normal * both.vectors(self.X)).sum(dim=1)).tolist()
+
+    def test_a_ceiling_too_low_leaves_the_vertex_the_middle(self):
+        """The ceiling at 2 mm wants 3 mm, too: the vertex is in the middle and nothing pushes."""
+        assert self.depths([0.0, -1.0, 0.0], 1e-3) == pytest.approx([0.0, 0.0], abs=1e-12)
+
+    def test_the_vertex_may_be_the_second_point(self):
+        """A vertex of the ceiling over the cloth: the vector between them points up."""
+        assert self.depths([0.0, 1.0, 0.0], 1e-3, side=-1.0) == pytest.approx([0.0, 0.0], abs=1e-12)
+        assert self.depths([0.0, -1.0, 0.0], 5e-3, side=-1.0)[0] == pytest.approx(2e-3, abs=1e-12)
+
+    def test_whichever_side_the_vertex_is_on(self):
+        """The ceiling at 1 mm below the floor: the middle is 1.5 mm lower, and only the ceiling pushes."""
+        assert self.depths([0.0, -1.0, 0.0], 4e-3) == pytest.approx([-1.5e-3, 1.5e-3], abs=1e-12)
+
+    @pytest.mark.parametrize(("normal", "offset"), [([0.0, -1.0, 0.0], -4e-3), ([0.6, 0.8, 0.0], 5e-3)])
+    def test_what_does_not_contradict_stays(self, normal: list[float], offset: float):
+        """A high ceiling, and a wall that leans the same way."""
+        assert self.depths(normal, offset)[0] == pytest.approx(2e-3, abs=1e-12)

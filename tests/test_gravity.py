@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from bodies import Soup, box, tube
+from bodies import box, tube
 from pxr import Sdf, Usd, UsdGeom
 from shots import refine
-from stages import COLLIDER_API, GARMENT_API, author, new_stage, save, vec3
+from stages import COLLIDER_API, GARMENT_API, add_mesh, author, new_stage, save
 
 from physgraph_usd.errors import SchemaError
 from physgraph_usd.shot.refine import inspect_shot
@@ -28,15 +28,11 @@ def along(axis: str, points: np.ndarray) -> np.ndarray:
     return points if axis == "Z" else points @ upright(np.array([0.0, 0.0, 1.0])).T
 
 
-def worn(path: Path, *, up: str, axis: str, cloth: Soup = SKIRT, body: tuple[float, float, float] = PERSON) -> str:
+def worn(path: Path, *, up: str, axis: str) -> str:
     """A stage of an up axis, with cloth round a body that stand along another, or the same."""
     stage = new_stage(path, up=up)
-    for name, (points, faces), api in (("cloth", cloth, GARMENT_API), ("body", box(body), COLLIDER_API)):
-        mesh = UsdGeom.Mesh.Define(stage, f"/World/{name}")
-        mesh.CreatePointsAttr(vec3(along(axis, points)))
-        mesh.CreateFaceVertexCountsAttr(np.full(len(faces), 3).tolist())
-        mesh.CreateFaceVertexIndicesAttr(faces.ravel().tolist())
-        mesh.GetPrim().AddAppliedSchema(api)
+    for name, (points, faces), api in (("cloth", SKIRT, GARMENT_API), ("body", box(PERSON), COLLIDER_API)):
+        add_mesh(stage, f"/World/{name}", along(axis, points), faces, schema=api)
     return save(stage)
 
 
@@ -99,11 +95,7 @@ def test_garments_author_one_gravity_and_options_go_before(tmp_path: Path):
 def test_gravity_that_is_none_or_two_is_refused(tmp_path: Path, values: tuple[str, ...], message: str):
     stage = new_stage(tmp_path / "s.usda")
     for index, value in enumerate(values):
-        mesh = UsdGeom.Mesh.Define(stage, f"/World/cloth{index}")
-        mesh.CreatePointsAttr(vec3(np.eye(3)))
-        mesh.CreateFaceVertexCountsAttr([3])
-        mesh.CreateFaceVertexIndicesAttr([0, 1, 2])
-        mesh.GetPrim().AddAppliedSchema(GARMENT_API)
+        mesh = add_mesh(stage, f"/World/cloth{index}", np.eye(3), [[0, 1, 2]])
         author(mesh.GetPrim(), "physgraph:gravity", value, kind="token")
     with pytest.raises(SchemaError, match=message):
         open_shot(save(stage))

@@ -48,7 +48,6 @@ def count(stage: Usd.Stage, time: float = 2.0) -> int:
 
 
 def tear(stage: Usd.Stage) -> None:
-    """Break the topology of the sheet."""
     UsdGeom.Mesh(stage.GetPrimAtPath(CLOTH)).GetFaceVertexIndicesAttr().Set([0, 1, 99])
 
 
@@ -72,14 +71,20 @@ class TestPublishHook:
         assert not (tmp_path / "cloth.usdc").exists()
 
 
+@pytest.fixture
+def pyblish(monkeypatch: pytest.MonkeyPatch) -> tuple[Any, Any]:
+    """Its modules ``api`` and ``util``."""
+    monkeypatch.setattr(sys, "path", [*sys.path, str(PYBLISH)])
+    monkeypatch.setattr(sys, "meta_path", [*sys.meta_path])  # It leaves an importer there that warns of others.
+    api = pytest.importorskip("pyblish.api", reason="needs pyblish-base, which make test installs")
+    return api, importlib.import_module("pyblish.util")
+
+
 class TestPyblish:
     @pytest.fixture
-    def run(self, monkeypatch: pytest.MonkeyPatch) -> Any:
+    def run(self, pyblish: tuple[Any, Any]) -> Any:
         """Publish with our plug-ins alone; the context, whose ``results`` say what became of each."""
-        monkeypatch.setattr(sys, "path", [*sys.path, str(PYBLISH)])
-        monkeypatch.setattr(sys, "meta_path", [*sys.meta_path])  # It leaves an importer there that warns of others.
-        api = pytest.importorskip("pyblish.api", reason="needs pyblish-base, which make test installs")
-        util = importlib.import_module("pyblish.util")
+        api, util = pyblish
         api.deregister_all_plugins()
         api.deregister_all_paths()
         api.register_plugin_path(str(PLUGINS / "pyblish"))
@@ -115,12 +120,9 @@ class TestAyon:
     """The plug-ins under pyblish, which AYON runs; ayon-core's extractor is a stand-in."""
 
     @pytest.fixture
-    def run(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Any:
+    def run(self, pyblish: tuple[Any, Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Any:
         """Publish with our plug-ins alone, as settings make them."""
-        monkeypatch.setattr(sys, "path", [*sys.path, str(PYBLISH)])
-        monkeypatch.setattr(sys, "meta_path", [*sys.meta_path])
-        api = pytest.importorskip("pyblish.api", reason="needs pyblish-base, which make test installs")
-        util = importlib.import_module("pyblish.util")
+        api, util = pyblish
         own = {"order": api.ExtractorOrder, "staging_dir": lambda *_: str(tmp_path)}
         core = SimpleNamespace(Extractor=type("Extractor", (api.InstancePlugin,), own))
         monkeypatch.setitem(sys.modules, "ayon_core", ModuleType("ayon_core"))

@@ -9,12 +9,7 @@ from meshes import grid, mesh_of
 from sheets import equilateral, garment_of, level_of
 from test_forces import force_of
 
-from physgraph_usd.solver.level import (
-    Level,
-    build_levels,
-    hinge_geometry,
-    refine_garments,
-)
+from physgraph_usd.solver.level import Level, build_levels, hinge_geometry, refine_garments
 
 
 def two_garments(depths: tuple[int, ...]) -> tuple[Level, ...]:

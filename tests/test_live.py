@@ -14,9 +14,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-
-pytest.importorskip("pxr", reason="shots are read with usd-core")
-
 from pxr import Usd
 from shots import CLOTH, cloth_shot
 

@@ -20,39 +20,36 @@ CLOTH = "/World/cloth"
 
 
 def retype(stage: Usd.Stage, path: str, kind: str, value: object) -> None:
-    """Author an attribute with another type than its schema's."""
     replace(stage, Sdf.Path(path), kind, value)
 
 
-class TestGravity:
-    @pytest.mark.parametrize(
-        ("name", "kind", "value"),
-        [
-            ("gravityMagnitude", "float3", Gf.Vec3f(1, 2, 3)),
-            ("gravityMagnitude", "float", float("nan")),
-            ("gravityDirection", "timecode", Sdf.TimeCode(1.0)),
-            ("gravityDirection", "vector3f", Gf.Vec3f(float("nan"), 0, 0)),
-        ],
-    )
-    def test_what_is_none_is_told_and_the_earth_s_taken(self, tmp_path: Path, name: str, kind: str, value: object):
-        stage = new_stage(tmp_path / "s.usda")
-        UsdPhysics.Scene.Define(stage, "/World/physics")
-        retype(stage, f"/World/physics.physics:{name}", kind, value)
-        units, notices = read_units(stage)
-        np.testing.assert_allclose(units.gravity, [0.0, -9.81, 0.0])
-        assert [notice.path for notice in notices if name in notice.message] == ["/World/physics"]
+@pytest.mark.parametrize(
+    ("name", "kind", "value"),
+    [
+        ("gravityMagnitude", "float3", Gf.Vec3f(1, 2, 3)),
+        ("gravityMagnitude", "float", float("nan")),
+        ("gravityDirection", "timecode", Sdf.TimeCode(1.0)),
+        ("gravityDirection", "vector3f", Gf.Vec3f(float("nan"), 0, 0)),
+    ],
+)
+def test_gravity_that_is_none_is_told_and_the_earth_s_taken(tmp_path: Path, name: str, kind: str, value: object):
+    stage = new_stage(tmp_path / "s.usda")
+    UsdPhysics.Scene.Define(stage, "/World/physics")
+    retype(stage, f"/World/physics.physics:{name}", kind, value)
+    units, notices = read_units(stage)
+    np.testing.assert_allclose(units.gravity, [0.0, -9.81, 0.0])
+    assert [notice.path for notice in notices if name in notice.message] == ["/World/physics"]
 
 
-class TestMessages:
-    def test_a_mistake_in_a_text_file_is_told_in_short_and_without_names_of_code(self, tmp_path: Path):
-        shot = Path(sheet_shot(tmp_path / "s.usda", size=(40, 30)))
-        for old, new in (("[(", "[("[:1]), ("point3f[]", "string"), ('"World"', '"World')):
-            broken = tmp_path / "broken.usda"
-            broken.write_text(shot.read_text().replace(old, new, 1))
-            with pytest.raises(StageError, match=r"broken\.usda") as caught:
-                open_shot(str(broken))
-            assert "pxrInternal" not in str(caught.value)
-            assert len(str(caught.value)) < 6 * LONGEST_REASON
+def test_a_mistake_in_a_text_file_is_told_in_short_and_without_names_of_code(tmp_path: Path):
+    shot = Path(sheet_shot(tmp_path / "s.usda", size=(40, 30)))
+    for old, new in (("[(", "[("[:1]), ("point3f[]", "string"), ('"World"', '"World')):
+        broken = tmp_path / "broken.usda"
+        broken.write_text(shot.read_text().replace(old, new, 1))
+        with pytest.raises(StageError, match=r"broken\.usda") as caught:
+            open_shot(str(broken))
+        assert "pxrInternal" not in str(caught.value)
+        assert len(str(caught.value)) < 6 * LONGEST_REASON
 
 
 @pytest.mark.parametrize("name", ["physics:restShapePoints", "primvars:rest"])
@@ -65,38 +62,34 @@ def test_a_rest_shape_that_is_no_array_is_refused_by_name(tmp_path: Path, name: 
         open_shot(save(stage))
 
 
-class TestPlacement:
-    @pytest.mark.parametrize("scale", [1e150, 1e-150])
-    def test_a_scale_that_is_no_length_is_refused(self, tmp_path: Path, scale: float):
-        stage = new_stage(tmp_path / "s.usda")
-        matrix = Gf.Matrix4d(1.0).SetScale(scale)
-        add_sheet(stage, CLOTH, times=(1.0,), size=(3, 2)).AddTransformOp().Set(matrix)
-        with pytest.raises(GarmentError, match=f"scales by {scale:.3g}".replace("+", r"\+")):
-            open_shot(save(stage))
+@pytest.mark.parametrize("scale", [1e150, 1e-150])
+def test_a_scale_that_is_no_length_is_refused(tmp_path: Path, scale: float):
+    stage = new_stage(tmp_path / "s.usda")
+    matrix = Gf.Matrix4d(1.0).SetScale(scale)
+    add_sheet(stage, CLOTH, times=(1.0,), size=(3, 2)).AddTransformOp().Set(matrix)
+    with pytest.raises(GarmentError, match=f"scales by {scale:.3g}".replace("+", r"\+")):
+        open_shot(save(stage))
 
 
-class TestBodies:
-    @pytest.mark.parametrize(
-        ("name", "kind", "value"),
-        [
-            ("radius", "float2[]", Vt.Vec2fArray([Gf.Vec2f(0, 1)])),
-            ("radius", "string", "big"),
-            ("radius", "double", float("nan")),
-            ("radius", "double", -1.0),
-            ("height", "double", float("inf")),
-            ("axis", "token", "W"),
-        ],
-    )
-    def test_a_shape_without_a_size_or_an_axis_is_left_out_with_a_word(
-        self, tmp_path: Path, name: str, kind: str, value: object
-    ):
-        stage = new_stage(tmp_path / "s.usda")
-        add_sheet(stage, CLOTH)
-        stage.DefinePrim("/World/post", "Capsule").AddAppliedSchema(COLLIDER_API)
-        retype(stage, f"/World/post.{name}", kind, value)
-        shot = open_shot(save(stage))
-        assert shot.frame(1.0).colliders == (None,)
-        assert any("left out here: its sizes or its axis" in notice.message for notice in shot.warnings)
+@pytest.mark.parametrize(
+    ("name", "kind", "value"),
+    [
+        ("radius", "float2[]", Vt.Vec2fArray([Gf.Vec2f(0, 1)])),
+        ("radius", "string", "big"),
+        ("radius", "double", float("nan")),
+        ("radius", "double", -1.0),
+        ("height", "double", float("inf")),
+        ("axis", "token", "W"),
+    ],
+)
+def test_a_body_without_a_size_or_an_axis_is_left_out_with_a_word(tmp_path: Path, name: str, kind: str, value: object):
+    stage = new_stage(tmp_path / "s.usda")
+    add_sheet(stage, CLOTH)
+    stage.DefinePrim("/World/post", "Capsule").AddAppliedSchema(COLLIDER_API)
+    retype(stage, f"/World/post.{name}", kind, value)
+    shot = open_shot(save(stage))
+    assert shot.frame(1.0).colliders == (None,)
+    assert any("left out here: its sizes or its axis" in notice.message for notice in shot.warnings)
 
 
 @pytest.fixture

@@ -12,6 +12,7 @@ from layers import (
     dress_up,
     errors,
     fine_points,
+    grid,
     make_shot,
     open_over,
     refine_all,
@@ -20,6 +21,7 @@ from layers import (
     write_shot,
 )
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdSkel
+from stages import add_skeleton, clip_shot, skinned_points
 
 from physgraph_usd.errors import LayerError
 from physgraph_usd.usd.read.reader import open_shot
@@ -88,49 +90,24 @@ def test_a_garment_in_an_instance(tmp_path: Path, mode: str) -> None:
 
 
 def test_samples_from_value_clips_are_replaced(tmp_path: Path) -> None:
-    make_shot(tmp_path / "clip.usda")
-    manifest = Usd.Stage.CreateNew(str(tmp_path / "manifest.usda"))
-    manifest.OverridePrim(COAT).CreateAttribute("points", Sdf.ValueTypeNames.Point3fArray, False)
-    manifest.Save()
-    path = tmp_path / "shot.usda"
-    stage = make_shot(path, times=())
-    clips = Usd.ClipsAPI(stage.GetPrimAtPath(COAT))
-    clips.SetClipPrimPath(COAT)
-    clips.SetClipAssetPaths([Sdf.AssetPath("./clip.usda")])
-    clips.SetClipManifestAssetPath(Sdf.AssetPath("./manifest.usda"))
-    clips.SetClipActive([(0, 0)])
-    clips.SetClipTimes([(0, 0), (10, 10)])
-    stage.Save()
-    shot = open_shot(str(path), level=1)
-    write_shot(shot, tmp_path / "out.usdc", times=TIMES)
-    composed = open_over(path, tmp_path / "out.usdc")
-    points = UsdGeom.Mesh(composed.GetPrimAtPath(COAT)).GetPointsAttr()
-    for time in (None, *TIMES):
-        assert len(points.Get(Usd.TimeCode.Default() if time is None else time)) == 63
-    expected = fine_points(shot, refine_all(shot), 4.0)[0]
-    np.testing.assert_allclose(world_metres(composed, COAT, 4.0), expected, atol=1e-6)
+    path = clip_shot(tmp_path)
+    shot = open_shot(path, level=1)
+    write_shot(shot, tmp_path / "out.usdc")
+    composed = open_over(Path(path), tmp_path / "out.usdc")
+    for time in (1.0, 2.0, 3.0):
+        expected = fine_points(shot, refine_all(shot), time)[0]
+        np.testing.assert_allclose(world_metres(composed, "/World/cloth", time), expected, atol=1e-6)
 
 
 def make_skinned(path: Path, *, inherited: bool) -> None:
-    """The coat on a skeleton of one joint that moves along X, bound on the mesh or on its parent."""
+    """The coat on a joint that turns, bound on the mesh or on its parent."""
     stage = make_shot(path, times=())
-    UsdSkel.Root.Define(stage, "/World")
-    skeleton = UsdSkel.Skeleton.Define(stage, "/World/skeleton")
-    skeleton.CreateJointsAttr(["joint"])
-    skeleton.CreateBindTransformsAttr([Gf.Matrix4d(1)])
-    skeleton.CreateRestTransformsAttr([Gf.Matrix4d(1)])
-    animation = UsdSkel.Animation.Define(stage, "/World/animation")
-    animation.CreateJointsAttr(["joint"])
-    animation.CreateRotationsAttr([Gf.Quatf(1)])
-    animation.CreateScalesAttr([Gf.Vec3h(1, 1, 1)])
-    for time in TIMES:
-        animation.CreateTranslationsAttr().Set([Gf.Vec3f(time, 0, 0)], time)
-    UsdSkel.BindingAPI.Apply(skeleton.GetPrim()).CreateAnimationSourceRel().SetTargets([animation.GetPath()])
+    add_skeleton(stage, "/World", TIMES)
     mesh = stage.GetPrimAtPath(COAT)
     UsdSkel.BindingAPI.Apply(mesh)
     binding = UsdSkel.BindingAPI.Apply(mesh.GetParent() if inherited else mesh)
-    binding.CreateSkeletonRel().SetTargets([skeleton.GetPath()])
-    binding.CreateJointIndicesPrimvar(inherited, 1).Set([0] if inherited else [0] * 20)
+    binding.CreateSkeletonRel().SetTargets(["/World/skel"])
+    binding.CreateJointIndicesPrimvar(inherited, 1).Set([1] if inherited else [1] * 20)
     binding.CreateJointWeightsPrimvar(inherited, 1).Set([1.0] if inherited else [1.0] * 20)
     stage.SetStartTimeCode(TIMES[0])
     stage.SetEndTimeCode(TIMES[-1])
@@ -158,7 +135,7 @@ def test_a_skinned_garment_is_not_skinned_twice(tmp_path: Path, mode: str, inher
     for time in TIMES:
         found = world_metres(stage, str(writer.targets[0]), time)
         np.testing.assert_allclose(found, fine_points(shot, refine_all(shot), time)[0], atol=1e-6)
-        assert found[0, 0] == pytest.approx(0.01 * time)
+        np.testing.assert_allclose(found[:20], 0.01 * skinned_points(grid()[0], [1] * 20, time), atol=1e-6)
     assert errors(out) == []
 
 

@@ -28,16 +28,11 @@ def modules_after(code: str) -> set[str]:
     return set(done.stdout.split())
 
 
-def test_importing_is_light() -> None:
-    assert not HEAVY & modules_after("import physgraph_usd")
-
-
-def test_importing_reads_no_stage() -> None:
-    assert "pxr.Usd" not in modules_after("import physgraph_usd")
+def test_importing_is_light_and_reads_no_stage() -> None:
+    assert not {*HEAVY, "pxr.Usd"} & modules_after("import physgraph_usd")
 
 
 def test_importing_registers_the_schemas() -> None:
-    pytest.importorskip("pxr")
     code = (
         "import physgraph_usd\nfrom pxr import Usd\n"
         "assert Usd.SchemaRegistry().FindAppliedAPIPrimDefinition('PhysGraphGarmentAPI')"
@@ -45,26 +40,18 @@ def test_importing_registers_the_schemas() -> None:
     assert "pxr.Usd" in modules_after(code)
 
 
-def test_importing_works_without_usd() -> None:
-    assert "physgraph_usd" in modules_after("import sys; sys.modules['pxr'] = None\nimport physgraph_usd")
-
-
 def test_the_solver_solves_its_pages_example_without_usd() -> None:
     page = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
-    code = page.partition("```python\n")[2].partition("```")[0].replace("range(1, 25)", "range(1, 3)")
-    assert "range(1, 3)" in code
+    code = page.partition("```python\n")[2].partition("```")[0].replace("range(1, 25)", "range(1, 2)")
+    assert "range(1, 2)" in code
     check = "assert fine.shape == (2401, 3) and 0.2 < np.linalg.norm(fine, axis=1).min() < 0.21"
     assert "warp" in modules_after(f"import sys; sys.modules['pxr'] = None\n{code}\n{check}")
 
 
-@pytest.mark.parametrize("name", physgraph_usd.__all__)
-def test_public_name_is_there(name: str) -> None:
-    pytest.importorskip("pxr")
-    assert getattr(physgraph_usd, name) is not None
-    assert name in dir(physgraph_usd)
-
-
-def test_unknown_name_lists_the_public_ones() -> None:
+def test_public_names_are_there_and_an_unknown_one_lists_them() -> None:
+    for name in physgraph_usd.__all__:
+        assert getattr(physgraph_usd, name) is not None
+        assert name in dir(physgraph_usd)
     with pytest.raises(AttributeError, match=r"'refine'.*refine_shot"):
         _ = physgraph_usd.refine
 

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("pxr", reason="charts read stages with usd-core")
 pytest.importorskip("matplotlib", reason="charts are drawn with matplotlib")
 pytest.importorskip("plotly", reason="charts are drawn with plotly")
 

@@ -15,10 +15,10 @@ from cloth import frame_of, refiner_of
 from hypothesis import HealthCheck, Phase, assume, given, settings
 from hypothesis import strategies as st
 from layers import errors, open_over, world_metres
-from meshes import any_mesh, planar_mesh
-from pxr import Sdf, UsdGeom, Vt
+from meshes import any_mesh, faces_of, planar_mesh
+from pxr import Sdf, UsdGeom
 from sheets import garment_of, rotation
-from stages import GARMENT_API, affine, author, new_stage, save, set_matrix, vec3
+from stages import add_mesh, affine, author, new_stage, save, set_matrix, vec3
 
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.refine import refine_shot
@@ -92,24 +92,20 @@ def sheets(draw: st.DrawFn, *, planar: bool | None = None, times: tuple[float, .
 
 
 def write(sheet: Sheet, path: Path, how: Convention) -> Path:
-    """Write a sheet as a shot in a convention."""
     stage = new_stage(path, metres=how.metres, up=how.up, rate=how.rate)
     turn = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]) if how.up == "Z" else np.eye(3)
-    mesh = UsdGeom.Mesh.Define(stage, CLOTH)
+    faces = faces_of(sheet.mesh)
+    if how.left_handed:
+        faces = [[face[0], *face[:0:-1]] for face in faces]
+    mesh = add_mesh(stage, CLOTH, sheet.rest @ turn.T / (how.metres * how.parent_scale), faces)
     set_matrix(mesh.GetPrim().GetParent(), affine(np.eye(3) * how.parent_scale))
-    faces = [sheet.mesh.indices[a:b] for a, b in zip(sheet.mesh.starts[:-1], sheet.mesh.starts[1:], strict=True)]
     if how.left_handed:
         mesh.CreateOrientationAttr(UsdGeom.Tokens.leftHanded)
-        faces = [np.concatenate([face[:1], face[:0:-1]]) for face in faces]
-    mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(sheet.mesh.counts.astype(np.int32)))
-    mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(np.concatenate(faces).astype(np.int32)))
-    mesh.CreatePointsAttr(vec3(sheet.rest @ turn.T / (how.metres * how.parent_scale)))
     for time, points in sheet.moving.items():
         mesh.GetPointsAttr().Set(vec3(points @ turn.T / (how.metres * how.parent_scale)), time)
     for name, value in sheet.fabric.items():
         author(mesh.GetPrim(), f"physgraph:material:{name}", value, kind="double")
     author(mesh.GetPrim(), "physgraph:contact:selfCollision", False, kind="bool")
-    mesh.GetPrim().AddAppliedSchema(GARMENT_API)
     return Path(save(stage))
 
 
@@ -131,7 +127,6 @@ def refined(sheet: Sheet, folder: Path, how: Convention, **options) -> tuple[dic
 
 
 def folder() -> tempfile.TemporaryDirectory[str]:
-    """A new folder for each example."""
     return tempfile.TemporaryDirectory(prefix="physgraph-property-")
 
 

@@ -9,8 +9,6 @@ import torch
 from cloth import DOWN, frame_of, sheet, wave
 from sheets import garment_of
 
-pytest.importorskip("pxr", reason="benchmarks read stages with usd-core")
-
 from physgraph_usd.lab.chart.problem import ALONE, Problem
 from physgraph_usd.lab.chart.reference import Reference, find_reference
 from physgraph_usd.lab.methods import METHODS
@@ -26,13 +24,11 @@ def squeezed() -> tuple[Problem, Frame]:
 
 @pytest.fixture(scope="module")
 def found() -> Reference:
-    """Its reference."""
     return find_reference(*squeezed(), settings=ALONE)
 
 
 @pytest.fixture(scope="module")
 def bounded() -> Reference:
-    """What a short search finds."""
     return find_reference(*squeezed(), settings=ALONE, short=True)
 
 

@@ -12,17 +12,7 @@ import torch
 from layers import world_metres
 from pxr import Sdf, Usd, UsdGeom
 from shots import CLOTH, FAST, TIMES, cloth_shot, fine, refine
-from stages import (
-    GARMENT_API,
-    add_sheet,
-    add_skeleton,
-    author,
-    bind_skin,
-    new_stage,
-    sheet_faces,
-    sheet_points,
-    vec3,
-)
+from stages import GARMENT_API, add_sheet, add_skeleton, author, bind_skin, new_stage, sheet_faces, sheet_points, vec3
 
 import physgraph_usd as pg
 from physgraph_usd.shot.options import RefineOptions
@@ -37,7 +27,6 @@ SHORT = (1.0, 2.0, 3.0)
 
 @pytest.fixture
 def stage(tmp_path: Path) -> Usd.Stage:
-    """An open sheet of three frames."""
     return Usd.Stage.Open(str(cloth_shot(tmp_path / "shot.usda", times=SHORT)))
 
 

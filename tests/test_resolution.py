@@ -25,14 +25,7 @@ from physgraph_usd.solver.forces.bending import Bending
 from physgraph_usd.solver.level import Level, build_levels, hinge_geometry, refine_garments
 from physgraph_usd.solver.mesh.elements import hinges_of
 from physgraph_usd.solver.mesh.subdivide import subdivide_times
-from physgraph_usd.solver.resolution import (
-    AUTO,
-    MOST,
-    LevelChoice,
-    choose_levels,
-    sample_frames,
-    sharp_folds,
-)
+from physgraph_usd.solver.resolution import AUTO, MOST, LevelChoice, choose_levels, sample_frames, sharp_folds
 from physgraph_usd.solver.scene import Frame, Scene
 from physgraph_usd.usd.read.reader import open_shot
 

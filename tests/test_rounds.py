@@ -15,7 +15,7 @@ from physgraph_usd.solver.contact.metric import HeldMetric
 from physgraph_usd.solver.integrate.network import PhysgraphConfig
 from physgraph_usd.solver.integrate.weights import integrator_of, random_network, shipped_network
 
-FEW = RoundConfig(scenes=3, reference_steps=15, most_vertices=1)
+FEW = RoundConfig(scenes=2, reference_steps=15, most_vertices=1)
 
 
 @pytest.fixture(scope="module")

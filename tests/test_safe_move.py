@@ -194,13 +194,12 @@ class TestWhatIsFreeToGoGoes:
         assert (moved.numpy() != wanted)[none].any()
 
 
-class TestTheSame:
-    def test_each_time_and_in_any_number_of_threads(self):
-        results = []
-        for threads in (1, 1, 2):
-            scenes = Scenes(40, gap=1e-2, far=0.0, dtype=torch.float32)
-            scenes.parts.level = replace(scenes.level, threads=threads)
-            scenes.go(wanted_of(scenes, np.random.default_rng(5)))
-            results.append(scenes.x)
-        assert torch.equal(results[0], results[1])
-        assert torch.equal(results[0], results[2])
+def test_moves_are_the_same_each_time_and_in_any_number_of_threads():
+    results = []
+    for threads in (1, 1, 2):
+        scenes = Scenes(40, gap=1e-2, far=0.0, dtype=torch.float32)
+        scenes.parts.level = replace(scenes.level, threads=threads)
+        scenes.go(wanted_of(scenes, np.random.default_rng(5)))
+        results.append(scenes.x)
+    assert torch.equal(results[0], results[1])
+    assert torch.equal(results[0], results[2])

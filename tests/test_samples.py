@@ -8,15 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-pytest.importorskip("pxr", reason="samples are written with usd-core")
-
 from pxr import Usd, UsdGeom
 
 from physgraph_usd.errors import UsageError
 from physgraph_usd.lab.samples import SAMPLES, write_sample
 
-GARMENT, COLLIDER = "PhysGraphGarmentAPI", "PhysGraphColliderAPI"
+GARMENT = "PhysGraphGarmentAPI"
 
 
 def prims_with(stage: Usd.Stage, schema: str) -> list[Usd.Prim]:

@@ -17,10 +17,6 @@ from physgraph_usd.shot.warnings import WARNINGS, Entries, of_contact
 from physgraph_usd.solver import deadline
 
 
-def told(level: int, remaining: float, stopped: str = "steps") -> dict[str, Any]:
-    return {"level": level, "remaining_move": remaining, "stopped": stopped}
-
-
 @pytest.fixture
 def gentle(tmp_path: Path) -> Path:
     """One frame shrinks the sheet to half its size: far to go, but steps get there."""
@@ -36,12 +32,6 @@ def test_a_note_names_prim_time_code_and_figure(gentle: Path, tmp_path: Path):
     assert f"{worst['remaining_move']:.2g} edges" in said
     assert not [each for each in report.warnings if "settle" in each]
     assert report.exit_code == 0
-
-
-def test_a_frame_that_settles_is_not_told_of(gentle: Path, tmp_path: Path):
-    report = refine(gentle, tmp_path / "fine.usdc", steps=96)
-    assert report.unsettled == []
-    assert not [each for each in report.notes if "settle" in each]
 
 
 @pytest.mark.parametrize(("steps", "code"), [(0, 3), (96, 0)])

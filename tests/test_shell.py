@@ -25,10 +25,6 @@ def shelled(path: Path, thickness: float = THICKNESS) -> Path:
     return path
 
 
-def mesh_of(layer: Path, shot: Path) -> UsdGeom.Mesh:
-    return UsdGeom.Mesh(open_over(shot, layer).GetPrimAtPath(CLOTH))
-
-
 def polygons(stage: Usd.Stage) -> tuple[PolygonMesh, np.ndarray]:
     """Faces and late positions of the refined cloth."""
     mesh = UsdGeom.Mesh(stage.GetPrimAtPath(CLOTH))

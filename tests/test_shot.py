@@ -122,14 +122,13 @@ class TestDone:
             assert np.array_equal(written, np.asarray(mesh.GetPointsAttr().Get(time)))
 
 
-class TestOverrides:
-    def test_set_changes_the_cloth_and_is_recorded(self, shot: Path, tmp_path: Path):
-        plain, stiff = tmp_path / "plain.usdc", tmp_path / "stiff.usdc"
-        refine(shot, plain)
-        report = refine(shot, stiff, overrides=[f"{BEND}=1e-3"])
-        assert report.garments[0]["fabric"]["bend"] == pytest.approx(1e-3)
-        assert np.abs(fine(shot, plain, 3.0) - fine(shot, stiff, 3.0)).max() > 1e-4
-        assert any("--set" in str(source) for source in report.garments[0]["sources"].values())
+def test_set_changes_the_cloth_and_is_recorded(shot: Path, tmp_path: Path):
+    plain, stiff = tmp_path / "plain.usdc", tmp_path / "stiff.usdc"
+    refine(shot, plain)
+    report = refine(shot, stiff, overrides=[f"{BEND}=1e-3"])
+    assert report.garments[0]["fabric"]["bend"] == pytest.approx(1e-3)
+    assert np.abs(fine(shot, plain, 3.0) - fine(shot, stiff, 3.0)).max() > 1e-4
+    assert any("--set" in str(source) for source in report.garments[0]["sources"].values())
 
 
 class TestOptions:

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bodies import ball
-from pxr import Sdf, UsdGeom
+from pxr import Sdf
 from shots import CLOTH, TIMES, cloth_shot, faults, fine, only, refine, sample_times
-from stages import COLLIDER_API, add_sheet, new_stage, save, sheet_points, vec3
+from stages import COLLIDER_API, add_mesh, add_sheet, new_stage, save, sheet_points, vec3
 
 from physgraph_usd.errors import GarmentError, UsageError
 
@@ -88,7 +88,7 @@ except PhysGraphError as error:
 @pytest.mark.parametrize("part", [pytest.param(0.0, marks=pytest.mark.slow), 0.6])
 def test_a_shot_that_is_cut_short_while_it_is_read_is_named(tmp_path: Path, part: float):
     """In a process of its own: where layers are mapped into memory, it dies of SIGBUS."""
-    shot = cloth_shot(tmp_path / "shot.usdc", size=(40, 40))
+    shot = cloth_shot(tmp_path / "shot.usdc", size=(24, 24))
     line = [sys.executable, "-c", CUT, str(shot), str(part)]
     done = subprocess.run(line, capture_output=True, text=True, check=False, timeout=300)
     assert done.returncode == 0, done.stderr
@@ -136,12 +136,8 @@ def test_one_garment_that_cannot_be_solved_follows_its_cage(tmp_path: Path, belo
         for time in (1.0, 2.0):
             mesh.GetPointsAttr().Set(vec3(points + np.array([aside, 0.001 * time, 0.0])), time)
     points, faces = ball(0.05)
-    body = UsdGeom.Mesh.Define(stage, "/World/body")
-    body.CreateFaceVertexCountsAttr([3] * len(faces))
-    body.CreateFaceVertexIndicesAttr(np.asarray(faces).ravel().tolist())
+    body = add_mesh(stage, "/World/body", points - [0.0, below, 0.0], faces, schema=COLLIDER_API)
     body.CreateSubdivisionSchemeAttr("none")
-    body.CreatePointsAttr().Set(vec3(points - [0.0, below, 0.0]))
-    body.GetPrim().AddAppliedSchema(COLLIDER_API)
     shot, out = Path(save(stage)), tmp_path / "fine.usdc"
     report = refine(shot, out)
     assert (report.exit_code, report.failed) == (3, {})

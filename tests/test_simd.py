@@ -33,15 +33,7 @@ VERTICES = 500
 
 @dataclass(frozen=True)
 class Term:
-    """A kernel pair.
-
-    Attributes:
-        plain: The plain kernels.
-        eight: The kernel of eight elements.
-        corners: Corners of an element.
-        numbers: Numbers in a parameter.
-        most: Largest difference of energies and of forces, relative to the largest.
-    """
+    """A kernel pair; energies and forces differ by `most` of the largest, at most."""
 
     plain: dict[torch.dtype, wp.Kernel]
     eight: wp.Kernel

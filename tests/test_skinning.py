@@ -8,17 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pxr import Usd, UsdGeom, UsdSkel
-from stages import (
-    add_sheet,
-    add_skeleton,
-    affine,
-    bind_skin,
-    new_stage,
-    save,
-    set_matrix,
-    sheet_points,
-    skinned_points,
-)
+from stages import add_sheet, add_skeleton, affine, bind_skin, new_stage, save, set_matrix, sheet_points, skinned_points
 
 from physgraph_usd.usd.read.reader import Shot, open_shot
 

@@ -79,6 +79,8 @@ def test_wrong_requests_name_the_choices(untagged: Path, tmp_path: Path) -> None
         tag(untagged, tmp_path / "a.usda", garments=[COAT], preset="tweed")
     with pytest.raises(StageError, match=COAT):
         tag(untagged, tmp_path / "a.usda", garments=["/World/nothing"])
+    with pytest.raises(UsageError, match="density is -1"):
+        tag(untagged, tmp_path / "a.usda", garments=[COAT], values={COAT: {"density": -1.0}})
     with pytest.raises(UsageError, match="never edited"):
         tag(untagged, untagged, garments=[COAT], overwrite=True)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["shot.usda"]

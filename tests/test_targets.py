@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from contextlib import closing
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,10 +11,10 @@ from layers import errors, open_over, world_metres
 from numpy.typing import ArrayLike
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
 from shots import CLOTH, EDGE, cloth_shot, only, refine, run
-from stages import sheet_faces, sheet_points, vec3
+from stages import add_mesh, add_sheet, add_skeleton, bind_skin, new_stage, sheet_faces, sheet_points, vec3
 
 from physgraph_usd.errors import AbsentError, GarmentError, SchemaError
-from physgraph_usd.lab.samples import trims, tshirt
+from physgraph_usd.lab.samples import trims
 from physgraph_usd.lab.samples.shapes import ellipsoid
 from physgraph_usd.shot.refine import inspect_shot
 from physgraph_usd.shot.stitch import stitch
@@ -23,7 +22,7 @@ from physgraph_usd.solver.mesh.subdivide import smooth, subdivide
 from physgraph_usd.solver.mesh.topology import PolygonMesh
 from physgraph_usd.solver.rigid import best_motion
 from physgraph_usd.studio.session import TuneSession
-from physgraph_usd.usd.mesh.bind import closest
+from physgraph_usd.usd.mesh.bind import Binding, closest
 from physgraph_usd.usd.read.reader import open_shot
 from physgraph_usd.usd.read.targets import TARGETS
 from physgraph_usd.usd.write.sample_stage import write_stage
@@ -38,14 +37,11 @@ def bind(stage: Usd.Stage, *paths: str, to: str = CLOTH) -> None:
     stage.GetPrimAtPath(to).CreateRelationship(TARGETS).SetTargets([Sdf.Path(path) for path in paths])
 
 
-def beside(stage: Usd.Stage, path: str, middle: ArrayLike, *, radius: float = 0.1, moves: bool = False) -> UsdGeom.Mesh:
-    """A closed ball beside the sheet, in its units; one that moves has samples of its own."""
+def beside(stage: Usd.Stage, path: str, middle: ArrayLike, *, radius: float = 0.1) -> UsdGeom.Mesh:
+    """A closed ball beside the sheet, in its units."""
     solid = ellipsoid(np.full(3, radius), np.asarray(middle, float), (8, 6))
-    mesh = UsdGeom.Mesh.Define(stage, path)
-    mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(solid.counts.astype(np.int32)))
-    mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(solid.indices.astype(np.int32)))
-    mesh.CreatePointsAttr(vec3(solid.points))
-    return mesh
+    faces = np.split(solid.indices, np.cumsum(solid.counts)[:-1])
+    return add_mesh(stage, path, solid.points, faces, schema=None)
 
 
 def on_sheet(x: float, y: float, above: float = 0.0) -> np.ndarray:
@@ -240,18 +236,21 @@ def test_a_trim_inside_an_instance_follows_the_cloth_of_that_instance(shot: Path
 
 
 def test_a_skinned_trim_is_not_skinned_twice(tmp_path: Path):
-    plain = tshirt.build()
-    shirt = plain.meshes[0]
-    own = {"name": "Patch", "role": "trim", "fabric": None, "subsets": (), "points": shirt.points * 1.001}
-    shot = write_stage(replace(plain, meshes=(*plain.meshes, replace(shirt, **own))), tmp_path / "shot.usdc")
-    refine(shot, tmp_path / "out.usdc", frames=(12.0, 13.0))
-    stage = open_over(shot, tmp_path / "out.usdc")
-    patch = stage.GetPrimAtPath("/TshirtShot/Patch")
-    before = np.asarray(UsdGeom.Mesh(patch).GetPointsAttr().Get(13.0))
-    UsdSkel.BakeSkinning(UsdSkel.Root(stage.GetPrimAtPath("/TshirtShot")), Gf.Interval(12, 13))
-    np.testing.assert_array_equal(np.asarray(UsdGeom.Mesh(patch).GetPointsAttr().Get(13.0)), before)
-    points, triangles = cloth_at(stage, 13.0, "/TshirtShot/Shirt")
-    assert np.quantile(closest(before.astype(float), points, triangles).distance, 0.99) < 6e-3
+    rig, shot = "/World/rig", tmp_path / "shot.usda"
+    stage = new_stage(shot, metres=EDGE)
+    add_skeleton(stage, rig, (1.0, LATE))
+    for name in ("cloth", "patch"):
+        mesh = add_sheet(stage, f"{rig}/{name}", times=(), tagged=name == "cloth")
+        bind_skin(mesh, rig, joints=[int(x > 2) for x in sheet_points()[:, 0]])
+    bind(stage, f"{rig}/patch", to=f"{rig}/cloth")
+    stage.Save()
+    refine(shot, tmp_path / "out.usdc")
+    over = open_over(shot, tmp_path / "out.usdc")
+    before = world_metres(over, f"{rig}/patch", LATE)
+    assert np.abs(before - EDGE * sheet_points()).max() > EDGE
+    UsdSkel.BakeSkinning(UsdSkel.Root(over.GetPrimAtPath(rig)), Gf.Interval(1.0, LATE))
+    np.testing.assert_array_equal(world_metres(over, f"{rig}/patch", LATE), before)
+    assert closest(before, *cloth_at(over, LATE, f"{rig}/cloth")).distance.max() < 0.1 * EDGE
 
 
 def test_the_option_binds_to_the_nearest_garment_as_the_relationship_does(shot: Path, tmp_path: Path):
@@ -424,7 +423,8 @@ def test_the_sample_keeps_thickness_area_and_buttons(tmp_path: Path, monkeypatch
     """The T-shirt's render mesh stands still in the shot; the middle of its faces lies on the refined cloth."""
     monkeypatch.setattr(trims, "FINE", 2)
     shot = write_stage(trims.build(), tmp_path / "trims.usdc")
-    report = refine(shot, tmp_path / "out.usdc", level=2, frames=(12.0, 13.0))
+    alone = {"contact": "off", "self_contact": "off"}
+    report = refine(shot, tmp_path / "out.usdc", level=2, frames=(12.0, 13.0), **alone)
     assert 0.5 < report.estimate["layer_mb"] / ((tmp_path / "out.usdc").stat().st_size / 1e6) < 2.0
     assert [(each["path"], each["rigid_parts"]) for each in report.garments[0]["bound"]] == [
         ("/TrimsShot/Render", 0),
@@ -450,3 +450,77 @@ def test_the_sample_keeps_thickness_area_and_buttons(tmp_path: Path, monkeypatch
     before, after = (np.split(np.asarray(buttons.Get(code), float), trims.BUTTONS) for code in codes)
     for first, then in zip(before, after, strict=True):
         assert np.linalg.norm(best_motion(first, then)(first) - then, axis=1).max() < 1e-5
+
+
+TURN = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]
+TURN = TURN * np.sign(np.linalg.det(TURN))
+
+
+def sheet(cells: int) -> tuple[np.ndarray, np.ndarray]:
+    """A unit square in triangles: positions [m] and corners."""
+    line = np.linspace(0.0, 1.0, cells + 1)
+    y, x = (each.ravel() for each in np.meshgrid(line, line, indexing="ij"))
+    number = np.arange((cells + 1) ** 2).reshape(cells + 1, -1)
+    a, b, c, d = (each.ravel() for each in (number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]))
+    triangles = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+    return np.stack([x, y, 0.0 * x], axis=1), triangles
+
+
+def rolled(points: np.ndarray, curvature: float = 2.0) -> np.ndarray:
+    """A flat sheet and what lies beside it, rolled without stretch."""
+    angle, radius = curvature * points[:, 0], 1.0 / curvature - points[:, 2]
+    return np.stack([radius * np.sin(angle), points[:, 1], 1.0 / curvature - radius * np.cos(angle)], axis=1)
+
+
+def cloud(count: int, depth: float) -> np.ndarray:
+    """Points beside the sheet, away from its border."""
+    return np.random.default_rng(1).uniform([0.1, 0.1, -depth], [0.9, 0.9, depth], (count, 3))
+
+
+def test_what_is_closest_is_found_inside_on_edges_and_beyond_the_border():
+    points, triangles = sheet(4)
+    asked = np.array([[0.3, 0.4, 0.2], [-0.3, 0.5, 0.4], [1.3, 1.4, 0.0], [0.25, 0.25, -0.1]])
+    found = closest(asked, points, triangles)
+    assert found.distance == pytest.approx([0.2, 0.5, 0.5, 0.1])
+    places = np.einsum("nk,nkx->nx", found.weights, points[triangles[found.triangle]])
+    np.testing.assert_allclose(np.linalg.norm(places - asked, axis=1), found.distance, atol=1e-12)
+    assert (found.weights >= 0.0).all()
+
+
+def test_points_stay_in_the_bind_pose_and_move_as_one_body_with_the_surface():
+    points, triangles = sheet(8)
+    bound = Binding.of(cloud(200, 0.1), points, triangles)
+    np.testing.assert_allclose(bound.at(points).points, bound.bind, atol=1e-12)
+    moved = bound.at(points @ TURN.T + 3.0)
+    np.testing.assert_allclose(moved.points, bound.bind @ TURN.T + 3.0, atol=1e-9)
+    every = np.arange(200)
+    np.testing.assert_allclose(moved.turned(np.tile([0.0, 0.0, 1.0], (200, 1)), every), np.tile(TURN[:, 2], (200, 1)))
+
+
+def test_a_stretched_surface_stretches_what_lies_along_it_and_keeps_its_distance():
+    points, triangles = sheet(8)
+    bound = Binding.of(cloud(200, 0.02), points, triangles)
+    np.testing.assert_allclose(bound.at(points * [1.3, 1.0, 1.0]).points, bound.bind * [1.3, 1.0, 1.0], atol=1e-9)
+
+
+def test_facets_do_not_print_through_and_thickness_is_kept():
+    """A sheet rolled in chords: their middles lie 2.5 mm within the arc; what is bound to them lies on the arc."""
+    points, triangles = sheet(10)
+    chord = 0.5 * (1.0 - np.cos(0.1))
+    flat = cloud(2000, 0.0)
+    up = np.array([0.0, 0.0, 1e-3])
+    thick = Binding.of(np.concatenate([flat + up, flat - up]), points, triangles)
+    outer, inner = np.split(thick.at(rolled(points)).points, 2)
+    radius = np.hypot(outer[:, 0], 0.5 - outer[:, 2])
+    assert chord > 2.4e-3
+    assert np.abs(radius - 0.499).max() < 0.05 * chord
+    np.testing.assert_allclose(np.linalg.norm(outer - inner, axis=1), 2e-3, rtol=1e-6)
+
+
+def test_normals_turn_with_the_surface():
+    points, triangles = sheet(20)
+    bound = Binding.of(cloud(500, 0.01), points, triangles)
+    turned = bound.at(rolled(points)).turned(np.tile([0.0, 0.0, 1.0], (500, 1)), np.arange(500))
+    angle = 2.0 * bound.bind[:, 0]
+    expected = np.stack([-np.sin(angle), 0.0 * angle, np.cos(angle)], axis=1)
+    assert np.degrees(np.arccos(np.einsum("nx,nx->n", turned, expected).clip(-1, 1))).max() < 1.0

@@ -10,7 +10,6 @@ from stages import COLLIDER_API, add_sheet, new_stage, save
 
 from physgraph_usd.cli.printing import outline
 from physgraph_usd.shot.refine import inspect_shot
-from physgraph_usd.solver.scene import Garment
 from physgraph_usd.usd.read.reader import Shot, open_shot
 
 CLOTH = "/World/rig/cloth"
@@ -23,16 +22,10 @@ def stage(tmp_path: Path) -> Usd.Stage:
     return made
 
 
-def garment(stage: Usd.Stage, *overrides: str) -> tuple[Garment, dict[str, str]]:
-    shot = open_shot(save(stage), overrides=overrides)
-    return shot.scene.garments[0], shot.sources[0].sources
-
-
-class TestSelfContact:
-    def test_a_garment_feels_itself_unless_it_says_otherwise(self, stage: Usd.Stage):
-        read, sources = garment(stage)
-        assert read.self_contact
-        assert sources["contact:selfCollision"] == "fallback"
+def test_a_garment_feels_itself_unless_it_says_otherwise(stage: Usd.Stage):
+    shot = open_shot(save(stage))
+    assert shot.scene.garments[0].self_contact
+    assert shot.sources[0].sources["contact:selfCollision"] == "fallback"
 
 
 class TestExclusion:

@@ -15,16 +15,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-pytest.importorskip("pxr", reason="shots are read with usd-core")
-
-from click.testing import CliRunner
 from cloth import frame_of, rms, sheet
 from meshes import grid
 from pxr import Usd, UsdGeom
-from shots import CLOTH, EDGE, cloth_shot
+from shots import CLOTH, EDGE, cloth_shot, run
 
-from physgraph_usd.cli import main
 from physgraph_usd.errors import PhysGraphError, SchemaError, UsageError
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.solver.frame.refiner import Refiner
@@ -143,7 +138,7 @@ def test_the_command_refines_the_whole_shot(session: TuneSession, tmp_path: Path
     session.set_value(CLOTH, "bendStiffness", STIFF)
     session.save()
     words = shlex.split(session.command)
-    done = CliRunner().invoke(main, words[1:])
+    done = run(*words[1:])
     assert done.exit_code == 0, done.output
     stage = Usd.Stage.Open(words[words.index("-o") + 1])
     assert UsdGeom.Mesh(stage.GetPrimAtPath(CLOTH)).GetPointsAttr().GetNumTimeSamples() == len(session.times)

@@ -11,7 +11,6 @@ from urllib.parse import urlsplit
 
 import pytest
 
-pytest.importorskip("pxr", reason="shots are read with usd-core")
 pytest.importorskip("viser", reason="the page is served with viser")
 
 import viser

@@ -11,11 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
-
-pytest.importorskip("pxr", reason="shots are read with usd-core")
-
 import psutil
+import pytest
 import torch
 from shots import CLOTH, cloth_shot
 

@@ -61,8 +61,11 @@ def place_in(report: dict[str, Any]) -> tuple[str, list[str], float]:
 
 @pytest.mark.parametrize("workers", [1, 2])
 def test_one_ends_with_a_line_and_a_report_and_keeps_what_is_finished(tmp_path: Path, workers: int):
-    """Two workers have three frames each, so that the fault is in the first frame of the second one."""
-    cloth_shot(tmp_path / "shot.usda")
+    """Two workers have three frames each, so that the fault is in the first frame of the second one.
+
+    Resumed with the mended solver, frames are the same bytes as at once.
+    """
+    shot = cloth_shot(tmp_path / "shot.usda")
     also = ("--report", "report.json", "--summary", "summary.json", "--log-file", "log.txt")
     done = broken(tmp_path, "shot.usda", "-o", "fine.usdc", "--workers", workers, *also)
     *before, last = done.stderr.splitlines()
@@ -78,6 +81,11 @@ def test_one_ends_with_a_line_and_a_report_and_keeps_what_is_finished(tmp_path: 
     assert (row["state"], row["error"]) == ("failed", report["error"])
     assert report["error"] in (tmp_path / "log.txt").read_text()
     assert not (tmp_path / "fine.usdc").exists()
+    line = ("--level", 0, "--steps", 2, "--report", tmp_path / "report.json", "--overwrite")
+    for out, more in (("fine.usdc", ["--resume"]), ("whole.usdc", [])):  # By the mended solver.
+        assert run("refine", shot, "-o", tmp_path / out, *line, *more).exit_code == 0
+    for time in (3.0, 4.0):
+        assert (fine(shot, tmp_path / "fine.usdc", time) == fine(shot, tmp_path / "whole.usdc", time)).all()
 
 
 def test_one_of_several_shots_leaves_the_others(tmp_path: Path):
@@ -121,14 +129,6 @@ class TestFromPython:
             refine_stage(stage, options, on_report=told.append)
         assert place_in(report_of(tmp_path / "report.json")) == ("ValueError", [CLOTH], 1.0)
         assert told[0].failure is not None
-
-    def test_the_report_of_a_run_that_ended_well_is_kept(self, tmp_path: Path):
-        file = tmp_path / "report.json"
-        file.write_text(RefineReport("shot.usda", None, {}).to_json())
-        before = file.read_bytes()
-        with pytest.raises(Exception, match="exists"):
-            refine(cloth_shot(tmp_path / "shot.usda"), tmp_path / "fine.usdc", report=file)
-        assert file.read_bytes() == before
 
 
 def test_a_prim_that_is_not_there_is_reported_too(tmp_path: Path):
@@ -206,15 +206,3 @@ class TestPlace:
     def test_the_disk_is_no_fault_of_the_program(self):
         with pytest.raises(Exception, match=r"^there: No space left on device$"), exceptions_named():
             raise OSError(28, "No space left on device", "there")
-
-
-def test_frames_before_it_are_as_without_it(tmp_path: Path):
-    """Refined up to the fault, then on with the mended solver: the same bytes as at once."""
-    shot = cloth_shot(tmp_path / "shot.usda")
-    line = ("--level", 0, "--steps", 2)
-    assert broken(tmp_path, "shot.usda", "-o", "fine.usdc").returncode == 1
-    assert (tmp_path / "fine.usdc.frames").is_dir()
-    assert run("refine", shot, "-o", tmp_path / "fine.usdc", *line, "--resume").exit_code == 0
-    assert run("refine", shot, "-o", tmp_path / "whole.usdc", *line).exit_code == 0
-    for time in (3.0, 4.0):
-        assert (fine(shot, tmp_path / "fine.usdc", time) == fine(shot, tmp_path / "whole.usdc", time)).all()

@@ -16,6 +16,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
 from shots import CLOTH, cloth_shot, refine
 
 from physgraph_usd.errors import LayerError
+from physgraph_usd.shot.refine import inspect_shot
 from physgraph_usd.usd.check.rules import LAYER_RULES, RULES
 from physgraph_usd.usd.check.validate import Problem, validate_layer
 from physgraph_usd.usd.check.validators import PLUGIN
@@ -50,8 +51,6 @@ def default(name: str, edit: Callable[[np.ndarray], object]) -> Mutation:
 
 
 def sample(name: str, edit: Callable[[np.ndarray], object], *, time: float = 2.5) -> Mutation:
-    """Replace one time sample."""
-
     def mutate(layer: Sdf.Layer) -> None:
         layer.SetTimeSample(at(name), time, edit(np.array(layer.QueryTimeSample(at(name), time))))
 
@@ -59,8 +58,6 @@ def sample(name: str, edit: Callable[[np.ndarray], object], *, time: float = 2.5
 
 
 def drop(name: str) -> Mutation:
-    """Remove an attribute."""
-
     def mutate(layer: Sdf.Layer) -> None:
         prim = layer.GetPrimAtPath(COAT)
         prim.RemoveProperty(prim.properties[name])
@@ -69,8 +66,6 @@ def drop(name: str) -> Mutation:
 
 
 def author(name: str, type_name: Sdf.ValueTypeName, value: object) -> Mutation:
-    """Add an attribute."""
-
     def mutate(layer: Sdf.Layer) -> None:
         spec = layer.GetAttributeAtPath(at(name))
         if spec is None:
@@ -266,6 +261,27 @@ def test_a_file_that_is_no_layer_is_a_clear_error(tmp_path: Path) -> None:
     (tmp_path / "cut.usdc").write_bytes(b"PXR-USDC cut")
     with pytest.raises(LayerError, match="cannot read"):
         validate_layer(tmp_path / "cut.usdc")
+
+
+def test_a_value_beyond_its_limits_is_named_with_them_by_inspect_too(tmp_path: Path) -> None:
+    shot, out, name = cloth_shot(tmp_path / "sheet.usda"), tmp_path / "out.usda", "physgraph:material:density"
+    refine(shot, out, level=0, frames=(1.0, 1.0))
+    stage, refined = Usd.Stage.Open(str(shot)), Sdf.Layer.FindOrOpen(str(out))
+    authored = stage.GetPrimAtPath(CLOTH).CreateAttribute(name, Sdf.ValueTypeNames.Float)
+    over = refined.GetPrimAtPath(CLOTH)
+
+    def found(value: float) -> str:
+        authored.Set(value)
+        stage.Save()
+        kept = over.attributes.get(name) or Sdf.AttributeSpec(over, name, Sdf.ValueTypeNames.Float)
+        kept.default = value
+        return "\n".join(str(each) for each in validate_layer(out, shot) if each.rule == "limits")
+
+    assert found(0.2) == ""
+    assert f"<{CLOTH}.{name}>: is 50 kg/m^2, beyond its soft limits 0.01 .. 2" in found(50.0)
+    assert f"{name} is 50 kg/m^2" in str(inspect_shot(shot)["warnings"])
+    assert "is -1 kg/m^2, beyond its hard limits 0.0001 .." in found(-1.0)
+    assert f"{name} is -1" in inspect_shot(shot)["problem"]
 
 
 def test_cloth_is_compared_with_its_cage_in_the_world(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ import pytest
 import torch
 from cloth import DOWN, FABRIC, GUIDE, frame_of, group_of, settings_of, sheet, wave
 from folds import frame_with, named, refiner_with, square
+from scenes import shot_of
 from shots import refine
 
 from physgraph_usd.errors import StageError
@@ -119,7 +120,7 @@ def skirt(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_nothing_crosses_in_frames_whose_cages_cross(skirt: Path, tmp_path: Path):
     """Without the earlier frames a contour stays that the cage by itself does not get rid of."""
-    options = RefineOptions(frames=(36.0, 40.0), level=1)
+    options = RefineOptions(frames=(36.0, 37.0), level=1)
     entries: list[Any] = [each["garments"][0] for each in refine_shot(skirt, tmp_path / "a.usdc", options).frames]
     crossings = [entry["contact"]["cloth"] for entry in entries]
     assert all(each["before"]["crossings"] > 100 and each["after"]["crossings"] == 0 for each in crossings)
@@ -155,12 +156,12 @@ def test_a_frame_that_cannot_be_read_is_passed_over(skirt: Path, broken: float |
     assert found[1] == begun
 
 
-def test_a_warm_frame_is_done_early_only_near_rest(sample: Callable[[str], Path], tmp_path: Path):
+def test_a_warm_frame_is_done_early_only_near_rest():
     steps = []
-    for name, frames in (("torus", (17.0, 20.0)), ("dancer", (20.0, 22.0))):
-        report = refine(sample(name), tmp_path / f"{name}.usdc", level=1, steps=12, frames=frames)
-        for frame in report.frames[1:]:
-            rounds = frame["garments"][0]["levels"]
+    for shot in (shot_of("ball"), shot_of("torus")):
+        refiner = Refiner(shot.scene, RefineOptions(steps=12).solve_settings(), levels=[1])
+        for state in list(refiner.refine(shot.frames))[1:]:
+            rounds: Any = state.telemetry[0]["levels"]
             steps.append(sum(each["steps"] for each in rounds))
             near = rounds[-1]["remaining_move"] < NEAR * RefineOptions().tolerance
             assert near or rounds[-1]["stopped"] == "stalled" or steps[-1] >= TOUCHING * 12

@@ -12,10 +12,7 @@ from pxr import Plug, Tf
 
 
 class Registry:
-    """Takes commands."""
-
     def registerCommandPlugin(self, name: str, title: str, call: Callable[[Any], None]) -> tuple[str, str, Any]:
-        """The command, as a menu takes it."""
         return name, title, call
 
 
@@ -26,7 +23,6 @@ class Builder:
         self.menus: dict[str, list[Any]] = {}
 
     def findOrCreateMenu(self, name: str) -> Any:
-        """A menu."""
         menu, items = ModuleType(name), self.menus.setdefault(name, [])
         vars(menu)["addItem"] = items.append
         return menu

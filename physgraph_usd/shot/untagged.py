@@ -13,7 +13,7 @@ import torch
 
 from ..errors import counted
 from ..solver.colliders.mesh import MeshBody
-from ..solver.colliders.pose import MeshPose, Pose
+from ..solver.colliders.pose import Pose
 from ..solver.contact.broad_phase import bounds_of
 from ..solver.mesh.kernels import start_warp
 from ..solver.resolution import sample_frames
@@ -118,8 +118,8 @@ def _moves_with(garment: Garment, frames: Sequence[tuple[GarmentFrame, Pose]]) -
     """Whether a mesh lies along a cage in the first frame, and stays near the same places of the cage in all frames."""
     (cloth, pose), *later = frames
     triangles = garment.mesh.triangulate(garment.rest).triangles
-    surfaces = MeshBody(side="start", device="cpu", threads=1).pose(MeshPose(cloth.points, triangles))
-    if not isinstance(pose, MeshPose) or not surfaces:
+    surfaces = MeshBody(side="start", device="cpu", threads=1).pose(Pose(cloth.points, triangles))
+    if not surfaces:
         return False
     used = np.unique(pose.triangles)
     points = torch.as_tensor(pose.points[used] - surfaces[0].origin)
@@ -131,7 +131,7 @@ def _moves_with(garment: Garment, frames: Sequence[tuple[GarmentFrame, Pose]]) -
     corners = surfaces[0].triangles[found.face.numpy()[near]]
     weights = _weights(cloth.points[corners], found.point.numpy()[near] + surfaces[0].origin)
     for other, moved in later:
-        if not isinstance(moved, MeshPose) or moved.points.shape != pose.points.shape:
+        if moved.points.shape != pose.points.shape:
             return False
         places = np.einsum("nk,nkd->nd", weights, other.points[corners])
         away = np.linalg.norm(moved.points[used][near] - places, axis=1)
@@ -177,7 +177,7 @@ def _fraction_at(body: MeshBody, pose: Pose, cage: np.ndarray) -> float:
         contact.
     """
     fraction = 0.0
-    for surface in body.pose(pose) if isinstance(pose, MeshPose) else ():
+    for surface in body.pose(pose):
         x = torch.as_tensor(cage - surface.origin)
         near = surface.closest(x, torch.full_like(x[:, 0], NEAR)).distance.isfinite()
         inside = surface.inside(x)

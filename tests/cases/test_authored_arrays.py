@@ -13,27 +13,28 @@ from stages import add_sheet, new_stage, said, save, sheet_points, vec3
 from physgraph_usd.usd.read.reader import open_shot
 
 
-def per_corner(mesh: UsdGeom.Mesh, *, apart: float = 0.0) -> None:
+def per_corner(mesh: UsdGeom.Mesh, *, apart: float) -> None:
     """A rest shape 1.1 times as large, a value per corner, the last one some way apart from its point's others."""
     values = 1.1 * sheet_points()[np.asarray(mesh.GetFaceVertexIndicesAttr().Get())]
     values[5] += np.float32(apart)
     UsdGeom.PrimvarsAPI(mesh).CreatePrimvar("rest", Sdf.ValueTypeNames.Point3fArray, "faceVarying").Set(vec3(values))
 
 
-class TestARestShapePerCorner:
-    def test_is_used_where_corners_of_a_point_agree(self, tmp_path: Path):
-        stage = new_stage(tmp_path / "s.usda")
-        per_corner(add_sheet(stage))
-        shot = open_shot(save(stage))
-        np.testing.assert_allclose(shot.scene.garments[0].rest, 1.1 * sheet_points(), rtol=1e-6)
-        assert "primvars:rest is per corner; corners of a point agree, so it is the rest shape" in said(shot)
-
-    def test_is_left_out_with_a_word_where_they_differ(self, tmp_path: Path):
-        stage = new_stage(tmp_path / "s.usda")
-        per_corner(add_sheet(stage), apart=0.1)
-        shot = open_shot(save(stage))
-        np.testing.assert_array_equal(shot.scene.garments[0].rest, sheet_points())
-        assert "primvars:rest is per corner and differs between corners of points[" in said(shot)
+@pytest.mark.parametrize(
+    ("apart", "scale", "word"),
+    [
+        (0.0, 1.1, "; corners of a point agree, so it is the rest shape"),
+        (0.1, 1.0, " and differs between corners of points["),
+    ],
+)
+def test_a_rest_shape_per_corner_is_used_where_corners_of_a_point_agree(
+    tmp_path: Path, apart: float, scale: float, word: str
+):
+    stage = new_stage(tmp_path / "s.usda")
+    per_corner(add_sheet(stage), apart=apart)
+    shot = open_shot(save(stage))
+    np.testing.assert_allclose(shot.scene.garments[0].rest, scale * sheet_points(), rtol=1e-6)
+    assert f"primvars:rest is per corner{word}" in said(shot)
 
 
 @pytest.fixture
@@ -57,17 +58,16 @@ def exported(tmp_path: Path) -> Path:
     return tmp_path / "s.usda"
 
 
-class TestAnExportWithEverythingTwice:
-    def test_is_refined_without_what_no_longer_fits(self, exported: Path, tmp_path: Path):
-        writer = write_shot(open_shot(str(exported), level=1), tmp_path / "fine.usdc")
-        notices = "\n".join(map(str, writer.notices))
-        for name in ("primvars:id", "other:springs", "other:places"):
-            assert f"{name} " in notices
-        assert "primvars:side" not in notices
-        assert errors(tmp_path / "fine.usdc", exported) == []
-        stage = open_over(exported, tmp_path / "fine.usdc")
-        found = UsdGeom.PrimvarsAPI(stage.GetPrimAtPath(COAT))
-        assert [found.GetPrimvar(name).HasAuthoredValue() for name in ("normals", "id", "side")] == [False, False, True]
+def test_an_export_with_everything_twice_is_refined_without_what_no_longer_fits(exported: Path, tmp_path: Path):
+    writer = write_shot(open_shot(str(exported), level=1), tmp_path / "fine.usdc")
+    notices = "\n".join(map(str, writer.notices))
+    for name in ("primvars:id", "other:springs", "other:places"):
+        assert f"{name} " in notices
+    assert "primvars:side" not in notices
+    assert errors(tmp_path / "fine.usdc", exported) == []
+    stage = open_over(exported, tmp_path / "fine.usdc")
+    found = UsdGeom.PrimvarsAPI(stage.GetPrimAtPath(COAT))
+    assert [found.GetPrimvar(name).HasAuthoredValue() for name in ("normals", "id", "side")] == [False, False, True]
 
 
 def test_a_mesh_with_a_sample_of_every_array_in_every_frame_is_refined(tmp_path: Path):

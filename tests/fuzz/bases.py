@@ -157,7 +157,6 @@ BASES: dict[str, Callable[[Path], None]] = {
 
 
 def write_bases(folder: Path) -> None:
-    """Write every sound shot into a folder of its own name."""
     for name, write in BASES.items():
         (folder / name).mkdir(parents=True)
         write(folder / name)

@@ -70,7 +70,6 @@ class Tally:
     """Counts outcomes, keeps the failed mutants and shows how far it is."""
 
     def __init__(self, work: Path, failures: Path, total: int) -> None:
-        """Start counting."""
         self._work, self._failures, self._total = work, failures, total
         self._counts: Counter[tuple[str, str]] = Counter()
         self._noise: Counter[str] = Counter()
@@ -78,7 +77,6 @@ class Tally:
         self.failed: list[Outcome] = []
 
     def add(self, outcome: Outcome) -> None:
-        """Count one outcome."""
         folder = self._work / str(outcome.number)
         if outcome.result in {"hang", "died"}:
             describe_dead(outcome, folder)

@@ -48,15 +48,7 @@ VALUES: dict[str, Any] = {
 
 
 def replace(stage: Usd.Stage, path: Sdf.Path, kind: str, value: Any, *, times: Sequence[float] = ()) -> None:
-    """Author an attribute with another type and value in the root layer, whatever its schema says.
-
-    Args:
-        stage: The stage.
-        path: The attribute.
-        kind: Name of the Sdf type.
-        value: Its value.
-        times: Time codes to author it at; none authors the default.
-    """
+    """Author an attribute with another type and value in the root layer, whatever its schema says."""
     layer = stage.GetRootLayer()
     prim = Sdf.CreatePrimInLayer(layer, path.GetPrimPath())
     known = layer.GetAttributeAtPath(path)

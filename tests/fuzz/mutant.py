@@ -18,15 +18,7 @@ SHOT = "shot.usda"
 
 @dataclass
 class Draft:
-    """A shot being broken.
-
-    Attributes:
-        folder: Its folder; the shot is ``folder / name``.
-        rng: The mutant's own generator.
-        name: The shot's file.
-        said: What was done, one entry per change.
-        options: Options for `refine_shot` that belong to the mutation.
-    """
+    """A shot being broken: its folder, the mutant's own generator, the shot's file, what was done, and its options."""
 
     folder: Path
     rng: np.random.Generator
@@ -36,11 +28,9 @@ class Draft:
 
     @property
     def shot(self) -> Path:
-        """The shot's file."""
         return self.folder / self.name
 
     def pick(self, choices: Sequence[T]) -> T:
-        """One of several."""
         return choices[int(self.rng.integers(len(choices)))]
 
     def chance(self, part: float) -> bool:
@@ -52,7 +42,6 @@ class Draft:
         return Usd.Stage.Open(str(self.shot))
 
     def save(self, stage: Usd.Stage, said: str) -> None:
-        """Save the root layer and note what was done."""
         stage.GetRootLayer().Save()
         self.said.append(said)
 
@@ -62,7 +51,6 @@ class Draft:
         return [self.shot, *others]
 
     def as_crate(self) -> None:
-        """Turn the root layer into a binary one."""
         layer = Sdf.Layer.FindOrOpen(str(self.shot))
         layer.Export(str(self.folder / "shot.usdc"))
         self.shot.unlink()
@@ -74,14 +62,7 @@ Mutation = Callable[[Draft], None]
 
 @dataclass(frozen=True)
 class Kind:
-    """One way to break shots.
-
-    Attributes:
-        name: Its name in the table.
-        mutate: Breaks a draft and notes what it did.
-        bases: The sound shots that it applies to.
-        in_process: False where USD itself may crash, so that only a process of its own is safe.
-    """
+    """One way to break shots; not `in_process` where USD itself may crash."""
 
     name: str
     mutate: Mutation
@@ -90,17 +71,7 @@ class Kind:
 
 
 def make(number: int, kinds: Sequence[Kind], bases: Path, folder: Path) -> tuple[Kind, Draft]:
-    """Make one mutant.
-
-    Args:
-        number: Decides everything: the kind in turn, the shot and the damage by a generator of its own.
-        kinds: All kinds.
-        bases: Folder with the sound shots.
-        folder: Folder to make it in; must not exist.
-
-    Returns:
-        Its kind and the draft.
-    """
+    """Make one mutant in a new folder: its number decides the kind in turn, the shot and the damage."""
     kind = kinds[number % len(kinds)]
     rng = np.random.default_rng([SEED, number])
     base = kind.bases[int(rng.integers(len(kind.bases)))]

@@ -48,8 +48,6 @@ def serve(bases: Path, work: Path) -> None:
 
 
 class Child:
-    """One child process."""
-
     def __init__(self, bases: Path, work: Path) -> None:
         """Start it; it is ready at the first answer."""
         self._log = work / f"child-{threading.get_ident()}-{time.monotonic_ns()}.log"
@@ -108,16 +106,7 @@ def run_all(
     seconds: float,
     done: Callable[[Outcome], None],
 ) -> None:
-    """Try mutants in child processes.
-
-    Args:
-        numbers: The mutants.
-        bases: Folder with the sound shots.
-        work: Folder to make the mutants in; each has its number as its name.
-        jobs: Number of children.
-        seconds: Time limit of one mutant.
-        done: Called with each outcome, by one thread at a time.
-    """
+    """Try mutants in child processes; `done` is called with each outcome, by one thread at a time."""
     waiting, lock = list(reversed(numbers)), threading.Lock()
 
     def attend() -> None:
@@ -155,5 +144,4 @@ def describe_dead(outcome: Outcome, folder: Path) -> None:
 
 
 def clear(folder: Path) -> None:
-    """Remove a mutant's folder."""
     shutil.rmtree(folder, ignore_errors=True)

@@ -13,7 +13,6 @@ from .mutant import Draft, Kind
 
 
 def _faces(mesh: UsdGeom.Mesh) -> list[np.ndarray]:
-    """Corners of each face."""
     counts, indices = (
         numbers(each.Get()) for each in (mesh.GetFaceVertexCountsAttr(), mesh.GetFaceVertexIndicesAttr())
     )

@@ -31,16 +31,7 @@ LONGEST_MESSAGE = 2000
 
 @dataclass
 class Outcome:
-    """What came of a mutant.
-
-    Attributes:
-        number: The mutant.
-        kind: Its kind of mutation.
-        result: One of `GOOD` or `BAD`.
-        detail: The error, or what is wrong.
-        said: What was done to the shot.
-        noise: Python warnings that got out, as text.
-    """
+    """What came of a mutant: one of `GOOD` or `BAD`, what is wrong, what was done, and Python warnings that got out."""
 
     number: int
     kind: str
@@ -50,19 +41,11 @@ class Outcome:
     noise: list[str] = field(default_factory=list)
 
     def to_json(self) -> str:
-        """One line."""
         return json.dumps(asdict(self))
 
 
 def attempt(number: int, kinds: Sequence[Kind], bases: Path, folder: Path) -> Outcome:
-    """Make a mutant in a new folder and try it.
-
-    Args:
-        number: The mutant.
-        kinds: All kinds.
-        bases: Folder with the sound shots.
-        folder: Folder to make it in; it stays.
-    """
+    """Make a mutant in a new folder, which stays, and try it."""
     kind, draft = make(number, kinds, bases, folder)
     outcome = Outcome(number, kind.name, "done", said=draft.said)
     note = {"number": number, "kind": kind.name, "said": draft.said, "options": draft.options}
@@ -92,16 +75,11 @@ def _tried(draft: Draft) -> tuple[str, str]:
 
 
 class Escape:
-    """A context that ends whatever error leaves it: which one is what the fuzzer looks for.
-
-    Attributes:
-        error: The error; None when none came.
-    """
+    """A context that keeps whatever error leaves it: which one is what the fuzzer looks for."""
 
     error: BaseException | None = None
 
     def __enter__(self) -> Escape:
-        """Begin."""
         return self
 
     def __exit__(
@@ -124,7 +102,6 @@ def _refined(draft: Draft, out: Path) -> tuple[str, str]:
 
 
 def _checked(report: RefineReport, out: Path, shot: Path) -> tuple[str, str]:
-    """Validate what was written."""
     try:
         errors = [str(problem) for problem in validate_layer(out, shot) if problem.severity == "error"]
     except Tf.ErrorException as error:

@@ -46,7 +46,6 @@ def main(*, only: str, seconds: float, sound: bool) -> None:
 
 
 def _copy(root: Path) -> None:
-    """Copy what the tests need."""
     for name in COPIED:
         source = ROOT / name
         if source.is_dir():

@@ -12,16 +12,7 @@ LIST = Path(__file__).with_name("list.toml")
 
 @dataclass(frozen=True)
 class Mutation:
-    """One defect.
-
-    Attributes:
-        name: What it does, in a few words.
-        file: File of the package where the old text was last seen.
-        old: Text that occurs once.
-        new: What takes its place.
-        breaks: What is wrong then.
-        tests: Test files, or tests in them, that must fail.
-    """
+    """A defect: text that occurs once, what takes its place, what is wrong then, and the tests that must fail."""
 
     name: str
     file: str
@@ -32,20 +23,11 @@ class Mutation:
 
 
 def read_list() -> list[Mutation]:
-    """Every defect, in the list's order."""
     return [Mutation(**entry) for entry in tomllib.loads(LIST.read_text(encoding="utf-8"))["mutation"]]
 
 
 def place_of(mutation: Mutation, root: Path) -> Path:
-    """The file that has the old text: the one named, or where it was moved to.
-
-    Args:
-        mutation: The defect.
-        root: Folder that holds the package.
-
-    Raises:
-        LookupError: The text is in no file, in several, or several times in one.
-    """
+    """The file that has the old text: the one named, or where it was moved to."""
     named = root / PACKAGE / mutation.file
     files = [named] if named.is_file() and mutation.old in named.read_text(encoding="utf-8") else []
     files = files or [

@@ -75,6 +75,3 @@ def moved_rigidly(before: np.ndarray, after: np.ndarray) -> bool:
         after: Positions of the points after the motion [m].
     """
     return _farthest(after, best_motion(before, after)(before)) <= RIGID * np.ptp(before, axis=0).max()
-
-
-MeshPose = Pose

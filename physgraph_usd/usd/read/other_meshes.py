@@ -9,7 +9,7 @@ import numpy as np
 from pxr import Sdf, Usd, UsdGeom, UsdSkel
 
 from ...errors import GarmentError
-from ...solver.colliders.pose import Collider, MeshPose, Pose
+from ...solver.colliders.pose import Collider, Pose
 from ..lookup import with_ancestors
 from ..stage import TRAVERSAL, pxr_errors, quiet, timecode
 from .bodies import ColliderReader
@@ -108,7 +108,7 @@ def _meets(bounds: Box, box: Box) -> bool:
 
 def _same_place(a: Pose | None, b: Pose | None) -> bool:
     """Whether two poses have the same points, up to float32 rounding."""
-    if not isinstance(a, MeshPose) or not isinstance(b, MeshPose) or a.points.shape != b.points.shape:
+    if a is None or b is None or a.points.shape != b.points.shape:
         return False
     return bool(np.allclose(a.points, b.points, rtol=1e-5, atol=1e-6, equal_nan=True))
 
