@@ -9,7 +9,7 @@ import numpy as np
 from ...solver.fabric import PRESETS
 from ...usd.write.plain import Look, PlainStage
 from .drape import Drape, DrapeOptions
-from .shapes import box, mesh, off_box, square
+from .shapes import box, mesh, off_box, spin, square
 
 SIDE, CELLS = 0.72, 32
 """Side of the sheet [m] and its quads along a side."""
@@ -25,9 +25,7 @@ FRAMES, STEPS = 24, 2
 def build() -> PlainStage:
     """One garment over a static block of six faces."""
     level, quads, uv = square(SIDE, CELLS, 2.0 * HALF[1] + ABOVE)
-    x, y, z = level.T
-    c, s = np.cos(TURNED), np.sin(TURNED)
-    rest = np.stack([c * x + s * z, y, c * z - s * x], axis=1)
+    rest = spin(level, TURNED)
     look = Look("Cotton", (0.62, 0.34, 0.22))
     sheet = mesh("Sheet", quads, rest, look, samples=_drop(rest, quads), uv=uv, fabric=PRESETS["cotton"])
     solid = box(HALF)
@@ -45,9 +43,4 @@ def _drop(rest: np.ndarray, quads: np.ndarray) -> np.ndarray:
         return off_box(points - middle, HALF - ROUND, ROUND + GAP) + middle
 
     sheet = Drape(rest, quads, np.zeros(0, int), options=options, project=project)
-    frames = []
-    for _ in range(FRAMES):
-        frames.append(sheet.points)
-        for _ in range(STEPS):
-            sheet.step(np.zeros((0, 3)))
-    return np.stack(frames)
+    return sheet.film(FRAMES, STEPS, lambda _: np.zeros((0, 3)))

@@ -57,7 +57,7 @@ class Drape:
         faces: np.ndarray,
         pinned: np.ndarray,
         *,
-        options: DrapeOptions | None = None,
+        options: DrapeOptions,
         project: Callable[[np.ndarray, float], np.ndarray] | None = None,
         start: np.ndarray | None = None,
     ) -> None:
@@ -67,12 +67,11 @@ class Drape:
             rest: Rest positions [m], shape (V, 3).
             faces: Triangles or quads, shape (F, 3) or (F, 4).
             pinned: Vertices that follow targets, shape (K,).
-            options: How the cloth behaves.
+            options: Values of the cloth and of its solve.
             project: Moves positions out of colliders at a time, in place of contact forces; or None.
             start: Positions at the beginning when they differ from ``rest``.
         """
-        self.options = options or DrapeOptions()
-        self.pinned, self._project = pinned, project
+        self.options, self.pinned, self._project = options, pinned, project
         self.points = np.array(rest if start is None else start, dtype=float)
         self.velocity = np.zeros_like(self.points)
         self.time = 0.0
@@ -126,6 +125,18 @@ class Drape:
         self.velocity = (points - self.points) / step
         self.points = points
         return points
+
+    def film(self, frames: int, steps: int, targets: Callable[[float], np.ndarray]) -> np.ndarray:
+        """Positions of frames that lie a number of steps apart [m], shape (frames, V, 3), the present ones first.
+
+        ``targets`` gives the positions of the pinned vertices at a time [s].
+        """
+        samples = []
+        for _ in range(frames):
+            samples.append(self.points)
+            for _ in range(steps):
+                self.step(targets(self.time + self.options.step))
+        return np.stack(samples)
 
     def _touch(self, moved: np.ndarray, *, afresh: bool) -> None:
         """Let the points that were moved count as touching, besides or in place of those that did."""

@@ -9,6 +9,9 @@ import numpy as np
 
 from ...usd.write.plain import FaceVarying, Look, PlainMesh
 
+CANVAS = Look("Canvas", (0.60, 0.56, 0.50))
+"""Material of the bodies."""
+
 
 def mesh(name: str, faces: np.ndarray, points: np.ndarray, look: Look, **values: Any) -> PlainMesh:
     """A mesh of triangles or quads, shape (F, 3) or (F, 4), with any further fields of `PlainMesh`."""
@@ -32,6 +35,18 @@ def grid_uv(rows: int, columns: int, *, closed: bool = False) -> FaceVarying:
     width = columns + 1 if closed else columns
     v, u = np.meshgrid(np.linspace(0, 1, rows), np.linspace(0, 1, width), indexing="ij")
     return FaceVarying(np.stack([u.ravel(), v.ravel()], axis=1), quad_grid(rows, width).ravel())
+
+
+def spin(points: np.ndarray, angle: np.ndarray | float) -> np.ndarray:
+    """Positions [m], shape (V, 3), turned about the Y axis by an angle [rad], one for all or one each."""
+    x, y, z = points.T
+    c, s = np.cos(angle), np.sin(angle)
+    return np.stack([c * x + s * z, y, c * z - s * x], axis=1)
+
+
+def at_height(table: np.ndarray, height: np.ndarray) -> list[np.ndarray]:
+    """The columns of a table at heights, between its rows; its first column is the height, which falls."""
+    return [np.interp(-height, -table[:, 0], column) for column in table[:, 1:].T]
 
 
 def flipped(uv: FaceVarying) -> FaceVarying:

@@ -7,7 +7,7 @@ import numpy as np
 from ...solver.fabric import PRESETS
 from ...usd.write.plain import FaceVarying, Look, PlainMesh, PlainStage
 from .drape import Drape, DrapeOptions
-from .shapes import Solid, ease, grid_uv, lathe, mesh, quad_grid, rings
+from .shapes import Solid, at_height, ease, grid_uv, lathe, mesh, quad_grid, rings
 
 ROWS, AROUND, FOLDS = 23, 76, 8
 """Rows from waist to hem, columns around, and folds at the hem."""
@@ -97,35 +97,28 @@ def _swing(rest: np.ndarray, quads: np.ndarray) -> np.ndarray:
     skirt = Drape(rest, quads, band, options=options, project=project, start=start)
     for _ in range(WARM_UP):
         skirt.step(start[band])
-    frames = []
-    for _ in range(FRAMES):
-        frames.append(skirt.points)
-        for _ in range(STEPS):
-            pose = _hips(skirt.time + options.step - WARM_UP * options.step)
-            skirt.step(rest[band] @ pose[:3, :3].T + pose[:3, 3])
-    return np.stack(frames)
+
+    def held(time: float) -> np.ndarray:
+        pose = _hips(time - WARM_UP * options.step)
+        return rest[band] @ pose[:3, :3].T + pose[:3, 3]
+
+    return skirt.film(FRAMES, STEPS, held)
 
 
 def _push_out(points: np.ndarray, pose: np.ndarray) -> np.ndarray:
     """Move points that are inside the hips to 15 mm outside, horizontally."""
     local = (points - pose[:3, 3]) @ pose[:3, :3]
-    across, deep = (axis + 0.015 for axis in _half_axes(local[:, 1]))
+    across, deep = (axis + 0.015 for axis in at_height(PROFILE, local[:, 1]))
     reach = np.hypot(local[:, 0] / across, local[:, 2] / deep)
     grow = np.where((reach < 1.0) & (local[:, 1] > PROFILE[-1, 0]), 1.0 / np.maximum(reach, 1e-3), 1.0)
     return (local * np.stack([grow, np.ones_like(grow), grow], axis=1)) @ pose[:3, :3].T + pose[:3, 3]
-
-
-def _half_axes(height: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Half axes of the hips across and deep at heights [m]."""
-    across, deep = (np.interp(-height, -PROFILE[:, 0], PROFILE[:, i]) for i in (1, 2))
-    return across, deep
 
 
 def _hip_mesh(poses: np.ndarray) -> PlainMesh:
     """The hips as a closed mesh of quads with triangle fans at both ends; its quads face inwards."""
     around, rows = 40, 30
     height = np.concatenate([[0.1225, 0.118, 0.11], np.linspace(0.10, PROFILE[-1, 0], rows - 3)])
-    across, deep = _half_axes(height)
+    across, deep = at_height(PROFILE, height)
     ends = np.array([[0.0, PROFILE[0, 0] + 0.001, 0.0], [0.0, PROFILE[-1, 0] - 0.02, 0.0]])
     solid = lathe(rings(across, height, deep, around), ends)
     quads, fans = np.split(solid.indices, [4 * (rows - 1) * around])

@@ -44,10 +44,5 @@ def _pull(rest: np.ndarray, quads: np.ndarray, grip: np.ndarray) -> np.ndarray:
         return off_torus(points, MAJOR, MINOR + GAP)
 
     sheet = Drape(rest, quads, grip, options=options, project=project)
-    frames = []
-    for frame in range(FRAMES):
-        frames.append(sheet.points)
-        for step in range(STEPS):
-            t = (frame + (step + 1) / STEPS) / (FRAMES - 1)
-            sheet.step(rest[grip] - PULL * ease(t) * np.array([0.0, 1.0, 0.0]))
-    return np.stack(frames)
+    down = PULL * np.array([0.0, 1.0, 0.0])
+    return sheet.film(FRAMES, STEPS, lambda time: rest[grip] - ease(24.0 * time / (FRAMES - 1)) * down)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from ...solver.mesh.subdivide import smooth, subdivide
-from ...solver.mesh.topology import PolygonMesh, edges_of
+from ...solver.mesh.topology import PolygonMesh
 from ...usd.mesh.bind import closest
 from ...usd.write.plain import Look, PlainMesh, PlainStage
 from . import tshirt
@@ -54,10 +54,8 @@ def _normals(faces: np.ndarray, points: np.ndarray) -> np.ndarray:
 def _rims(faces: np.ndarray) -> list[np.ndarray]:
     """Vertices of each open border in order, along the border's faces."""
     sides = np.concatenate([faces[:, [k, (k + 1) % 4]] for k in range(4)])
-    triangles = np.concatenate([faces[:, :3], faces[:, [0, 2, 3]]])
-    edges = edges_of(triangles, int(faces.max()) + 1)
-    open_edges = {tuple(edge) for edge in edges.vertices[edges.face_count == 1].tolist()}
-    after = {a: b for a, b in sides.tolist() if (min(a, b), max(a, b)) in open_edges}
+    whole = {tuple(side) for side in sides.tolist()}
+    after = {a: b for a, b in sides.tolist() if (b, a) not in whole}
     loops = []
     while after:
         start, loop = next(iter(after)), []
