@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from physgraph_usd.lab.train.bundle import RoundBundle, deal_rounds
+from physgraph_usd.lab.train.bundle import RoundBundle, deal
 from physgraph_usd.lab.train.loop import TrainConfig, Trainer
 from physgraph_usd.lab.train.patches import PatchConfig
 from physgraph_usd.lab.train.rounds import Round, RoundConfig, make_rounds, system_of
@@ -24,7 +24,7 @@ def rounds() -> list[Round]:
 
 
 def touching(rounds: list[Round]) -> list[Round]:
-    return max(deal_rounds([each for each in rounds if each.touches], 8), key=len)
+    return max(deal([each for each in rounds if each.touches], 8), key=len)
 
 
 def test_rounds_side_by_side_move_as_they_do_alone(rounds: list[Round]):

@@ -9,11 +9,11 @@ cloth, some of them pushing, as the solver's rounds show them to an integrator. 
 from __future__ import annotations
 
 import multiprocessing
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -43,7 +43,7 @@ from ...solver.mesh.topology import PolygonMesh, edges_of
 from ...solver.scene import Garment, GarmentFrame
 from ..samples.shapes import quad_grid
 
-SHAPES = ("sheet", "tube", "dome")
+T = TypeVar("T")
 BORDERS = ("fixed", "one side", "free")
 HEIGHT = (-2.0, -0.9)
 """Least and largest power of ten of the height of a body's waves, in cage edges: how far the body pierces the cloth."""
@@ -53,10 +53,9 @@ WAVES = (0.5, 3.0)
 
 @dataclass(frozen=True)
 class PatchConfig:
-    """How patches are made.
+    """Values of generated patches.
 
     Attributes:
-        count: Number of patches.
         levels: Least and most subdivisions.
         edges: Least and most cage edges along a side.
         decades: Range of the stiffnesses in powers of ten; two thirds of them lie in the middle half.
@@ -143,12 +142,11 @@ class Patch:
     """One patch in one pose, on the CPU.
 
     Attributes:
-        garment: Its cage.
         frame: Its pose, about the origin, and fabric.
         gravity: [m/s^2], shape (3,).
         words: Its shape, mesh, border and levels.
         body: The body that it rests on, or None.
-        raw: Upsampled cage at each level [m], float32, off the saddle where it is flat.
+        raw: Upsampled cage at each level [m], float32; a flat one, a saddle of the energy, is bent a little.
         start: Its energy without leaving the saddle [J].
         least: Least energy known at each level [J].
         solved: Positions after some steps of nested quasi-Newton at each level [m], float32.
@@ -164,20 +162,21 @@ class Patch:
     least: list[float] = field(default_factory=list)
     solved: list[np.ndarray] = field(default_factory=list)
 
+    @property
+    def level(self) -> int:
+        """Subdivisions of its cage."""
+        return self.garment.level
+
     @cached_property
     def group(self) -> Group:
         """The solver's levels."""
-        return _group(self.garment, self.gravity, self.garment.level)
+        return group_of([self.garment], self.gravity, self.level)
 
     @cached_property
     def systems(self) -> list[System]:
         """One system a level, cage first."""
         systems, coarse = self.group.systems([self.frame])
         return with_bodies(systems, self.group.levels, coarse, [self.body])
-
-    def begin(self, index: int) -> Tensor:
-        """The upsampled cage at a level [m]; flat cloth is bent a little: a flat sheet is a saddle of the energy."""
-        return torch.as_tensor(self.raw[index])
 
     def __getstate__(self) -> dict[str, Any]:
         """The fields without `group` and `systems`: they hold kernels, and are made on demand."""
@@ -186,20 +185,24 @@ class Patch:
 
 def make_patches(config: PatchConfig, *, seed: int, workers: int = 1) -> list[Patch]:
     """Make patches, the same for a seed with any number of processes; those whose pose is near rest are made again."""
-    jobs = [(config, seed, number) for number in range(config.count)]
+    return made_of_numbers(_numbered, config, seed, config.count, workers=workers)
+
+
+def made_of_numbers(make: Callable[[Any, int, int], T], config: Any, seed: int, count: int, *, workers: int) -> list[T]:
+    """Results of a function for a configuration, a seed and each number below a count, made in some processes."""
+    jobs = [(config, seed, number) for number in range(count)]
     if workers <= 1 or len(jobs) < 2 * workers:
-        return [_numbered(*job) for job in jobs]
+        return [make(*job) for job in jobs]
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(workers, mp_context=context, initializer=prepare_device, initargs=("cpu",)) as pool:
-        return list(pool.map(_numbered, *zip(*jobs, strict=True), chunksize=4))
+        return list(pool.map(make, *zip(*jobs, strict=True)))
 
 
-def measure(patch: Patch, steps: int, *, presolve: int) -> None:
+def _measure(patch: Patch, steps: int, *, presolve: int) -> None:
     """Find the energies between which a patch's levels move, by nested quasi-Newton of so many steps a level.
 
     The positions of a second, shorter solve of ``presolve`` steps a level are starts for training.
     """
-    patch.raw, patch.start, patch.least, patch.solved = [], [], [], []
     coarse = patch.group.systems([patch.frame])[1]
     x = short = coarse
     for index, (level, system) in enumerate(zip(patch.group.levels, patch.systems, strict=True)):
@@ -215,26 +218,26 @@ def measure(patch: Patch, steps: int, *, presolve: int) -> None:
 
 
 def _numbered(config: PatchConfig, seed: int, number: int) -> Patch:
-    """The patch of a number, the same in every process."""
     rng = np.random.default_rng([seed, number])
     while True:
         patch = patch_of(config, rng)
-        measure(patch, config.reference_steps, presolve=int(rng.choice([5, 10, 20, 40])))
+        _measure(patch, config.reference_steps, presolve=int(rng.choice([5, 10, 20, 40])))
         drop = [a - b for a, b in zip(patch.start, patch.least, strict=True)]
         if all(np.isfinite(drop)) and min(drop) > 1e-3 * abs(patch.start[-1]) + 1e-12:
             patch.__dict__ = patch.__getstate__()
             return patch
 
 
-def _group(garment: Garment, gravity: np.ndarray, level: int) -> Group:
-    chains, settings = refine_garments([garment], [level]), SolveSettings(METHODS["quasi-newton"])
-    return Group.of([garment], chains, gravity, settings, dtype=torch.float32, device="cpu")
+def group_of(garments: Sequence[Garment], gravity: np.ndarray, level: int, *, device: str = "cpu") -> Group:
+    """The levels of garments that are all subdivided so many times, under a gravity [m/s^2]."""
+    chains, settings = refine_garments(garments, [level] * len(garments)), SolveSettings(METHODS["quasi-newton"])
+    return Group.of(garments, chains, gravity, settings, dtype=torch.float32, device=device)
 
 
 def patch_of(config: PatchConfig, rng: np.random.Generator) -> Patch:
     """A patch in a random pose, its energies not yet measured."""
     mesh, flat, closed = _mesh(config, rng)
-    shape = "tube" if closed else str(rng.choice([s for s in SHAPES if s != "tube"]))
+    shape = "tube" if closed else str(rng.choice(["sheet", "dome"]))
     edge = 10 ** rng.uniform(-2.3, -1.3)
     rest = edge * _rolled(flat, shape, rng)
     border = "fixed" if config.elastic else str(rng.choice(BORDERS, p=(0.25, 0.25, 0.5)))
@@ -247,7 +250,7 @@ def patch_of(config: PatchConfig, rng: np.random.Generator) -> Patch:
     garment = Garment("/Patch", mesh, rest, levels, bool(rng.random() < 0.3), one, one, one, one, pin)
     points = posed(rest, rng, config)
     if rng.random() < 0.5 and pin.any():
-        points = _draped(_group(garment, gravity, 0), points, fabric, guide=guide, rng=rng)
+        points = _draped(group_of([garment], gravity, 0), points, fabric, guide=guide, rng=rng)
     frame = GarmentFrame(points - points.mean(axis=0), fabric, guide)
     words = f"{shape}, {'quads' if not mesh.is_triangles else 'triangles'}, border {border}, levels {levels}"
     body = None
