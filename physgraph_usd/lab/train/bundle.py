@@ -17,7 +17,7 @@ from torch import Tensor
 
 from ...solver.forces.base import ForceModule
 from ...solver.integrate.base import Carry, Integrator, Shortened, Solver, System
-from .patches import Patch, group_of, with_bodies
+from .patches import Patch, group_of
 from .rounds import Round, system_of
 
 NOISE = 1e-3
@@ -182,8 +182,7 @@ class Bundle:
         """Build the group of patches that have the same number of levels and the same gravity."""
         garments = [patch.garment for patch in patches]
         group = group_of(garments, patches[0].gravity, patches[0].level, device=device)
-        plain, coarse = group.systems([patch.frame for patch in patches])
-        systems = with_bodies(plain, group.levels, coarse, [patch.body for patch in patches])
+        systems, _ = group.systems([patch.frame for patch in patches])
         self.systems = [JointSystem(system, through_forces=through_forces) for system in systems]
         self._from_below = [level.from_below for level in group.levels]
         self._solved = _joined([patch.solved for patch in patches], device)

@@ -20,7 +20,7 @@ from torch import Tensor
 from ...errors import UsageError
 from ...shot.plain_json import to_json
 from ...solver.integrate.network import Physgraph, PhysgraphConfig
-from ...solver.integrate.weights import NETWORKS, integrator_of, load_network, make_network
+from ...solver.integrate.weights import integrator_of, load_network, make_network
 from ..methods.paper_network import PaperConfig, PaperNetwork
 from .bundle import Bundle, RoundBundle, Twin, deal, detached, unrolled
 from .held_out import HeldOut
@@ -29,6 +29,8 @@ from .rounds import Round, RoundConfig, make_rounds
 
 HARMLESS = 0.02
 """Fraction of the energy at the start below which the logarithm of the gap stops to reward."""
+MOST_GRADIENT = 1.0
+"""Largest norm of the gradient."""
 TWINS = 1 / 3
 """Fraction of the iterations in which a second descent shows how differences grow; the weight makes up for the rest."""
 EVERY = 120.0
@@ -59,12 +61,10 @@ class TrainConfig:
         own: Fraction of those that the network itself has solved; quasi-Newton the others.
         turn: Turn each start at random; only where neither gravity nor guide has a direction.
         rate: Adam's first rate; it falls to a hundredth along a cosine.
-        clip: Largest norm of the gradient.
         average: Decay of the weights' running mean, which is the result.
         held_out: Patches to measure on.
         rounds: Rounds of moving scenes with contact to train on beside the patches.
-        start: Weights to begin with: "" none, "shipped" those that ship, or a file; in TOML
-            relative to it; a larger network begins as they do.
+        start: File of weights to begin with, in TOML relative to it; "" for none.
     """
 
     kind: str = "physgraph"
@@ -85,7 +85,6 @@ class TrainConfig:
     own: float = 0.5
     turn: bool = False
     rate: float = 3e-3
-    clip: float = 1.0
     average: float = 0.99
     held_out: int = 8
     rounds: RoundConfig = field(default_factory=RoundConfig)
@@ -102,10 +101,20 @@ class Trainer:
     """
 
     def __init__(self, config: TrainConfig, *, device: str = "cpu", data: Data | None = None) -> None:
-        """Make patches, rounds and a network on "cpu" or a CUDA device; data that `data_of` gave are not made anew."""
+        """Make patches, rounds and a network on "cpu" or a CUDA device; data that `data_of` gave are not made anew.
+
+        Raises:
+            UsageError: The weights to begin with are of another size.
+            WeightsError: They cannot be read.
+        """
         self.config, self.device = config, device
         torch.manual_seed(config.seed)
-        self.network = _begun(config).to(device)
+        self.network = make_network(config.network).to(device)
+        if config.start:
+            begun = load_network(Path(config.start), kind=config.kind)
+            if begun.config != config.network:
+                raise UsageError(f"{config.start} holds a network of another size than this configuration's")
+            self.network.load_state_dict(begun.state_dict())
         self._mean = torch.optim.swa_utils.AveragedModel(
             self.network, multi_avg_fn=torch.optim.swa_utils.get_ema_multi_avg_fn(config.average), use_buffers=True
         )
@@ -158,7 +167,7 @@ class Trainer:
         self._optimiser.zero_grad()
         self.network.train()
         loss = self._descend(steps)
-        torch.nn.utils.clip_grad_norm_(self.network.parameters(), config.clip)
+        torch.nn.utils.clip_grad_norm_(self.network.parameters(), MOST_GRADIENT)
         if all(bool(p.grad.isfinite().all()) for p in self.network.parameters() if p.grad is not None):
             self._optimiser.step()
             self._mean.update_parameters(self.network)
@@ -273,21 +282,6 @@ def data_of(config: TrainConfig) -> Data:
     own = make_rounds(config.rounds, seed=config.seed, workers=workers)
     few = replace(config.rounds, scenes=config.rounds.held_out)
     return patches, own, rest, make_rounds(few, seed=HELD_OUT, workers=workers)
-
-
-def _begun(config: TrainConfig) -> Physgraph | PaperNetwork:
-    """The network that training begins with."""
-    network = make_network(config.network)
-    if not config.start:
-        return network
-    file = NETWORKS[config.kind].file if config.start == "shipped" else Path(config.start)
-    known, own = load_network(file, kind=config.kind).state_dict(), network.state_dict()
-    for name, value in known.items():
-        if name.removesuffix(".weight").removesuffix(".bias").split(".")[0] in ("hidden", "decode", "messages"):
-            own[name].zero_() if name.startswith("decode") else own[name][: len(value)].zero_()
-        own[name][tuple(slice(0, size) for size in value.shape)] = value
-    network.load_state_dict(own)
-    return network
 
 
 def loss_of(

@@ -2,8 +2,7 @@
 
 A patch is a sheet, a tube or a dome of 6 to 12 cage edges, irregular or in quads whose diagonals alternate. It is posed
 by a smooth random deformation, and some patches are draped first: our own solver lets the cage hang from what is fixed.
-Some rest on a wavy body close to the cloth, seen as a plane at each vertex: planes that stay, about parallel to the
-cloth, some of them pushing, as the solver's rounds show them to an integrator. No asset is read.
+No asset is read.
 """
 
 from __future__ import annotations
@@ -17,38 +16,28 @@ from typing import Any, TypeVar
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from scipy.spatial import Delaunay
 from scipy.spatial.transform import Rotation
-from torch import Tensor
 
 from ...shot.solve import prepare_device
-from ...solver.contact.metric import HeldMetric
-from ...solver.contact.settings import ContactSettings
 from ...solver.fabric import Fabric
-from ...solver.forces.base import ForceModule
-from ...solver.forces.self_contact import PairConstraints, SelfContact
 from ...solver.frame.group import Group
 from ...solver.frame.settings import SolveSettings
 from ...solver.integrate import METHODS
 from ...solver.integrate.base import System
 from ...solver.integrate.descend import solve_level
-from ...solver.integrate.metric import Metric
 from ...solver.integrate.quasi_newton import QuasiNewton
 from ...solver.integrate.saddle import leave_saddle
 from ...solver.integrate.stop import Budget
-from ...solver.integrate.vertex_frame import VertexFrame
-from ...solver.level import Level, refine_garments
+from ...solver.level import refine_garments
 from ...solver.mesh.topology import PolygonMesh, edges_of
 from ...solver.scene import Garment, GarmentFrame
 from ..samples.shapes import quad_grid
 
 T = TypeVar("T")
 BORDERS = ("fixed", "one side", "free")
-HEIGHT = (-2.0, -0.9)
-"""Least and largest power of ten of the height of a body's waves, in cage edges: how far the body pierces the cloth."""
-WAVES = (0.5, 3.0)
-"""A body's waves along a patch."""
+DECADES = 3.0
+"""Range of the stiffnesses in powers of ten; two thirds of them lie in the middle half."""
 
 
 @dataclass(frozen=True)
@@ -58,11 +47,9 @@ class PatchConfig:
     Attributes:
         levels: Least and most subdivisions.
         edges: Least and most cage edges along a side.
-        decades: Range of the stiffnesses in powers of ten; two thirds of them lie in the middle half.
         elastic: Stretch and bending only, the border fixed, as in the paper; else gravity and guide too.
         most_vertices: Finest vertices beyond which a patch has one level less.
         reference_steps: Quasi-Newton steps a level behind the least energy known.
-        touched: Fraction of the patches that rest on a body.
         skinned: Fraction of the poses that are bent as linear blend skinning bends, sharply and losing length.
         pulled: Fraction of the poses that are stretched along one direction.
     """
@@ -70,71 +57,11 @@ class PatchConfig:
     count: int = 64
     levels: tuple[int, int] = (1, 3)
     edges: tuple[int, int] = (6, 12)
-    decades: float = 3.0
     elastic: bool = False
     most_vertices: int = 4000
     reference_steps: int = 150
-    touched: float = 0.0
     skinned: float = 0.0
     pulled: float = 0.0
-
-
-@dataclass(frozen=True, eq=False)
-class Body:
-    """A body beside one patch.
-
-    Attributes:
-        side: 1 where it lies behind the cloth's normals, -1 before them.
-        wave: Wave vector [1/m], shape (3,).
-        phase: [rad].
-        height: How far it comes through the upsampled cage at most [m]; at least it stays as far away.
-        stiffness: k_c [N/m^3].
-    """
-
-    side: float
-    wave: np.ndarray
-    phase: float
-    height: float
-    stiffness: float
-
-    @staticmethod
-    def random(rng: np.random.Generator, *, size: float, edge: float, stretch: float) -> Body:
-        """A body for a patch of so large a size [m], with cage edges [m] and a stretch stiffness [N/m]."""
-        direction = rng.normal(size=3)
-        wave = 2.0 * np.pi * rng.uniform(*WAVES) / size * direction / np.linalg.norm(direction)
-        stiffness = ContactSettings().stiffness * stretch / edge**2
-        height = edge * 10.0 ** rng.uniform(*HEIGHT)
-        return Body(float(rng.choice([-1.0, 1.0])), wave, float(rng.uniform(0.0, 2.0 * np.pi)), height, stiffness)
-
-    def contact(self, level: Level, base: Float[Tensor, "vertices 3"], *, span: slice) -> SelfContact:
-        """The force on a patch at a level, from the upsampled cages [m] and the span of the patch's vertices."""
-        normal = self.side * VertexFrame(level, base).normal[span]
-        cage = base[span]
-        lift = self.height * torch.sin(cage @ torch.as_tensor(self.wave).to(cage) + self.phase)
-        vertex = torch.arange(span.start, span.stop, dtype=torch.int32, device=base.device)
-        weight = torch.zeros((len(vertex), 4), dtype=base.dtype, device=base.device)
-        weight[:, 0] = 1.0
-        height, stiffness = (normal * cage).sum(dim=1) + lift, self.stiffness * level.vertex_area[span]
-        corners = vertex.unsqueeze(1).repeat(1, 4)
-        return SelfContact(level, PairConstraints(corners, weight, normal.contiguous(), height, stiffness), "contact")
-
-
-def with_bodies(
-    systems: Sequence[System], levels: Sequence[Level], coarse: Float[Tensor, "coarse 3"], bodies: Sequence[Body | None]
-) -> list[System]:
-    """Systems without contact, one a level, made to feel the body of each patch, in their forces and their metrics."""
-    if not any(bodies):
-        return list(systems)
-    out = []
-    for system, level in zip(systems, levels, strict=True):
-        base = level.base.apply(coarse)
-        terms = [body.contact(level, base, span=span) for body, span in zip(bodies, level.spans, strict=True) if body]
-        assert isinstance(system.field, ForceModule)
-        assert isinstance(system.metric, Metric)
-        stiff = 3.0 * torch.stack([term.diagonal(base) for term in terms]).sum(dim=0)
-        field = ForceModule((*system.field.forces, *terms))
-        out.append(System(field, HeldMetric(system.metric, stiff), free=level.free, spacing=level.spacing, level=level))
-    return out
 
 
 @dataclass(eq=False)
@@ -145,7 +72,6 @@ class Patch:
         frame: Its pose, about the origin, and fabric.
         gravity: [m/s^2], shape (3,).
         words: Its shape, mesh, border and levels.
-        body: The body that it rests on, or None.
         raw: Upsampled cage at each level [m], float32; a flat one, a saddle of the energy, is bent a little.
         start: Its energy without leaving the saddle [J].
         least: Least energy known at each level [J].
@@ -156,7 +82,6 @@ class Patch:
     frame: GarmentFrame
     gravity: np.ndarray
     words: str
-    body: Body | None = None
     raw: list[np.ndarray] = field(default_factory=list)
     start: list[float] = field(default_factory=list)
     least: list[float] = field(default_factory=list)
@@ -175,8 +100,7 @@ class Patch:
     @cached_property
     def systems(self) -> list[System]:
         """One system a level, cage first."""
-        systems, coarse = self.group.systems([self.frame])
-        return with_bodies(systems, self.group.levels, coarse, [self.body])
+        return self.group.systems([self.frame])[0]
 
     def __getstate__(self) -> dict[str, Any]:
         """The fields without `group` and `systems`: they hold kernels, and are made on demand."""
@@ -253,11 +177,7 @@ def patch_of(config: PatchConfig, rng: np.random.Generator) -> Patch:
         points = _draped(group_of([garment], gravity, 0), points, fabric, guide=guide, rng=rng)
     frame = GarmentFrame(points - points.mean(axis=0), fabric, guide)
     words = f"{shape}, {'quads' if not mesh.is_triangles else 'triangles'}, border {border}, levels {levels}"
-    body = None
-    if config.touched and rng.random() < config.touched:
-        size = float(np.ptp(points, axis=0).max())
-        body, words = Body.random(rng, size=size, edge=edge, stretch=fabric.stretch), f"{words}, on a body"
-    return Patch(garment, frame, gravity, words, body)
+    return Patch(garment, frame, gravity, words)
 
 
 def _mesh(config: PatchConfig, rng: np.random.Generator) -> tuple[PolygonMesh, np.ndarray, bool]:
@@ -357,10 +277,8 @@ def _pinned(mesh: PolygonMesh, flat: np.ndarray, border: str) -> np.ndarray:
 
 def _material(config: PatchConfig, rng: np.random.Generator, *, free: bool) -> tuple[Fabric, float, np.ndarray]:
     """Fabric, guide stiffness [N/m^3] and gravity [m/s^2]."""
-    half = 0.5 * config.decades
-    stretch, bend = (
-        middle * 10 ** float(np.clip(rng.normal(0.0, 0.5 * half), -half, half)) for middle in (100.0, 5e-6)
-    )
+    half = 0.5 * DECADES
+    stretch, bend = (m * 10 ** float(np.clip(rng.normal(0.0, 0.5 * half), -half, half)) for m in (100.0, 5e-6))
     # Poses are turned anywhere, so one direction of gravity is enough.
     down = np.array([0.0, 0.0, -9.81]) * (0.0 if config.elastic else float(rng.random() < 0.7))
     guide = 2000.0 * 10 ** rng.uniform(-0.7, 0.7) if free or rng.random() < 0.8 else 0.0

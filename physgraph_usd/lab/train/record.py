@@ -98,7 +98,7 @@ def read_config(file: Path) -> TrainConfig:
     unknown = [name for name in getattr(network, "vectors", ()) if name not in VECTORS]
     if unknown:
         raise UsageError(f"{file}: unknown vectors {', '.join(unknown)}; known: {', '.join(VECTORS)}")
-    if (start := values.get("start")) and start != "shipped":
+    if start := values.get("start"):
         values["start"] = str(file.parent / str(start))
     return _filled(TrainConfig, values | {"network": network, "patches": patches, "rounds": rounds}, where=str(file))
 
