@@ -51,5 +51,7 @@ def measure_warm(journal: Journal, problems: tuple[Problem, Problem], row: Seque
             except SolveError:
                 continue
             values: dict[str, Any] = {} if repeat else asdict(judge.judge(row[-1], solved[-1].points))
+            values |= {} if name == AUTO else {"integrator": name, "nested": settings.method.nested}
             spent = [each.milliseconds for each in solved[1:]]
-            journal.add("warm", repeat=repeat, ms=round(typical(spent), 3), **key, **values)
+            made = {"made": solved[-1].steps, "tolerance": settings.tolerance}
+            journal.add("warm", repeat=repeat, ms=round(typical(spent), 3), **key, **made, **values)

@@ -122,8 +122,11 @@ def warm_advice(chart: Chart) -> str:
 
 def settings(point: Point) -> str:
     """Settings that a point was solved with."""
-    if point.method == DEFAULT:
-        return f"at most {counted(point.steps, 'step')} at the finest level, tolerance {point.tolerance:g} edge lengths"
+    if point.tolerance:
+        words = (
+            f"at most {counted(point.steps, 'step')} at the finest level, tolerance {point.tolerance:g} edge lengths"
+        )
+        return f"{point.integrator}, {words}" if point.integrator else words
     if not point.integrator:
         return "no physics"
     where = "nested" if point.nested else "finest level only"
