@@ -180,7 +180,6 @@ def _legend(chart: Chart) -> str:
 
 
 def _looks(chart: Chart, folder: Path) -> str:
-    """The pictures of gaps."""
     parts = []
     for file, caption in looks_of(chart, folder):
         data, words = base64.b64encode(file.read_bytes()).decode("ascii"), html.escape(caption)
@@ -191,7 +190,6 @@ def _looks(chart: Chart, folder: Path) -> str:
 
 
 def _lead(chart: Chart) -> str:
-    """The sentences that a reader should know first."""
     sentences = [each for each in (advice(chart), warm_advice(chart)) if each]
     times = chart.times_to(JUDGED)
     if times:
@@ -203,7 +201,6 @@ def _lead(chart: Chart) -> str:
 
 
 def _terms(chart: Chart) -> str:
-    """Cost and gain of each part of the model, as a table."""
     found = changes(chart)
     if not found:
         return ""
@@ -226,7 +223,6 @@ def _terms(chart: Chart) -> str:
 
 
 def _notes(chart: Chart) -> str:
-    """How it was measured."""
     plan, longer = chart.about["plan"] or {}, chart.about.get("long_minutes")
     rows = [
         (

@@ -103,7 +103,7 @@ def _curves(axes: Axes, chart: Chart, style: dict[str, Style]) -> None:
 
 
 def _warm(axes: Axes, chart: Chart, style: dict[str, Style]) -> None:
-    """Plot energy gap against time [s] for warm-started frames."""
+    """Gap against time for frames that begin where the last one ended."""
     for name in dict.fromkeys(each.method for each in chart.warm):
         points = [each for each in chart.warm if each.method == name]
         _gaps(axes, name, points, style.get(name, Style(BASELINE, dashed=False)))
@@ -124,7 +124,6 @@ def _gaps(axes: Axes, name: str, points: Sequence[Point], style: Style) -> None:
 
 
 def _line(axes: Axes, name: str, points: Sequence[Point], style: Style, heights: list[float]) -> None:
-    """Plot the curve of a method, labelled by its name."""
     axes.plot(
         [max(p.ms, 1e-2) for p in points],
         heights,
@@ -158,7 +157,6 @@ def _measure(axes: Axes, name: str, words: str, *, chart: Chart, style: dict[str
 
 
 def _terms(panels: Any, steps: list[Change]) -> None:
-    """Cost and gain of each part of the model."""
     places = list(range(len(steps)))[::-1]
     cost, buys, words = panels
     for axes, values, colour, digits in (

@@ -43,8 +43,8 @@ def measure_warm(journal: Journal, problems: tuple[Problem, Problem], row: Seque
                 continue
             if clock.late:
                 return
-            clock.part((repeat * len(runs) + number) / (REPEATS * len(runs)))
-            clock.say(f"warm frames, {name}, {counted(steps, 'step')}, turn {repeat + 1} of {REPEATS}")
+            words = f"warm frames, {name}, {counted(steps, 'step')}, turn {repeat + 1} of {REPEATS}"
+            clock.say(words, (repeat * len(runs) + number) / (REPEATS * len(runs)))
             timed.refiner.use(settings)
             try:
                 solved = [timed.next(frame) for frame in row]

@@ -77,7 +77,6 @@ def build() -> PlainStage:
 
 
 def _dress(body: Rig) -> PlainMesh:
-    """The dress, simulated on the body."""
     cut = sew(DRESS)
     rest = move_out(_shape(cut.points), body.cones, body.radii, gap=GAP)
     held = _held(cut.points)
@@ -134,7 +133,6 @@ def _skirt(points: np.ndarray, shaped: np.ndarray) -> np.ndarray:
 
 
 def _simulate(body: Rig, rest: np.ndarray, quads: np.ndarray, held: np.ndarray) -> np.ndarray:
-    """Positions of the coarse dress, shape (T, V, 3)."""
     options = DrapeOptions(step=1.0 / (RATE * STEPS), iterations=8, give=0.84, bend=0.3, drag=3.0, density=0.15)
     legs = np.flatnonzero([body.names[first].startswith(("thigh", "shin")) for first in body.ends[:, 0]])
     radii = np.concatenate([body.radii, body.radii[legs[::2]]])

@@ -89,7 +89,6 @@ def _even(fraction: np.ndarray, wide: np.ndarray, high: np.ndarray) -> np.ndarra
 
 
 def _lengths(curve: np.ndarray) -> np.ndarray:
-    """Length of a curve up to each of its points."""
     return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))])
 
 
@@ -114,7 +113,6 @@ def _angles(time: float) -> tuple[float, float]:
 
 
 def _pose(time: float) -> np.ndarray:
-    """The head's matrix at a time [s]."""
     matrix = np.eye(4)
     matrix[:3, :3] = _rotate(np.eye(3), *_angles(time)).T
     return matrix

@@ -38,7 +38,6 @@ def build() -> PlainStage:
     quads = quad_grid(ROWS, AROUND, closed=True)[:, ::-1]
     uv = grid_uv(ROWS, AROUND, closed=True)
     triangles, corners = (_split(each) for each in (quads, uv.indices.reshape(-1, 4)[:, ::-1]))
-    poses = np.stack([_hips(frame / 24.0) for frame in range(FRAMES)])
     garment = mesh(
         "Skirt",
         triangles,
@@ -50,7 +49,7 @@ def build() -> PlainStage:
         fabric=PRESETS["wool"],
     )
     doc = "A flared skirt on turning hips"
-    return PlainStage("SkirtShot", doc, (garment, _hip_mesh(poses)), np.arange(1.0, FRAMES + 1))
+    return PlainStage("SkirtShot", doc, (garment, _body()), np.arange(1.0, FRAMES + 1))
 
 
 def _rest() -> np.ndarray:
@@ -86,7 +85,6 @@ def _hips(time: float) -> np.ndarray:
 
 
 def _swing(rest: np.ndarray, quads: np.ndarray) -> np.ndarray:
-    """Simulate the coarse skirt, shape (T, V, 3)."""
     options = DrapeOptions(spring=40.0, iterations=5, give=0.84, bend=0.12, drag=1.2, density=0.235)
     band = np.arange(2 * AROUND)
 
@@ -114,7 +112,7 @@ def _push_out(points: np.ndarray, pose: np.ndarray) -> np.ndarray:
     return (local * np.stack([grow, np.ones_like(grow), grow], axis=1)) @ pose[:3, :3].T + pose[:3, 3]
 
 
-def _hip_mesh(poses: np.ndarray) -> PlainMesh:
+def _body() -> PlainMesh:
     """The hips as a closed mesh of quads with triangle fans at both ends; its quads face inwards."""
     around, rows = 40, 30
     height = np.concatenate([[0.1225, 0.118, 0.11], np.linspace(0.10, PROFILE[-1, 0], rows - 3)])
@@ -123,4 +121,5 @@ def _hip_mesh(poses: np.ndarray) -> PlainMesh:
     solid = lathe(rings(across, height, deep, around), ends)
     quads, fans = np.split(solid.indices, [4 * (rows - 1) * around])
     hips = Solid(solid.points, solid.counts, np.concatenate([quads.reshape(-1, 4)[:, ::-1].ravel(), fans]))
+    poses = np.stack([_hips(frame / 24.0) for frame in range(FRAMES)])
     return hips.collider("Hips", Look("Form", (0.60, 0.56, 0.50)), transforms=poses)

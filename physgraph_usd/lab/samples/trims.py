@@ -43,7 +43,6 @@ def _smoothed(shirt: PlainMesh) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _normals(faces: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Unit normals of vertices, shape (V, 3)."""
     a, b, c, d = points[faces].swapaxes(0, 1)
     areas, total = np.cross(c - a, d - b), np.zeros_like(points)
     for corner in faces.T:
@@ -67,7 +66,6 @@ def _rims(faces: np.ndarray) -> list[np.ndarray]:
 
 
 def _shell(faces: np.ndarray, points: np.ndarray) -> PlainMesh:
-    """The shirt with thickness: outer face, inner face and rims."""
     normals, count = _normals(faces, points), len(points)
     both = np.concatenate([points + 0.5 * THICKNESS * normals, points - 0.5 * THICKNESS * normals])
     rims = [
@@ -85,7 +83,10 @@ def _buttons(faces: np.ndarray, points: np.ndarray) -> PlainMesh:
     corners = triangles[found.triangle]
     places = np.einsum("nk,nkx->nx", found.weights, points[corners])
     directions = np.einsum("nk,nkx->nx", found.weights, _normals(faces, points)[corners])
-    return _trim("Buttons", join(*map(_button, places, directions)), Look("Horn", (0.30, 0.20, 0.12), 0.4))
+    discs = join(*map(_button, places, directions))
+    return PlainMesh(
+        "Buttons", discs.counts, discs.indices, discs.points, Look("Horn", (0.30, 0.20, 0.12), 0.4), "trim"
+    )
 
 
 def _button(place: np.ndarray, normal: np.ndarray) -> Solid:
@@ -113,8 +114,3 @@ def _piping(faces: np.ndarray, points: np.ndarray) -> PlainMesh:
     )
     rows = quad_grid(len(hem) + 1, 8, closed=True) % (8 * len(hem))
     return mesh("Piping", rows, tube.reshape(-1, 3), Look("Cord", (0.78, 0.66, 0.40)), role="trim")
-
-
-def _trim(name: str, solid: Solid, look: Look) -> PlainMesh:
-    """A solid that follows the garment."""
-    return PlainMesh(name, solid.counts, solid.indices, solid.points, look, role="trim")

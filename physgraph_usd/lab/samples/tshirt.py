@@ -43,7 +43,6 @@ def build() -> PlainStage:
 
 
 def _form() -> PlainMesh:
-    """The body: a sewn form with rounded ends and a neck."""
     body = sew(BODY)
     points = body.points.copy()
     reach = ((np.abs(points[:, 0]) - BODY.half_width) / BODY.sleeve).clip(0.0)

@@ -153,7 +153,6 @@ def _leg(cells: Cells, side: int, gap: Gap) -> np.ndarray:
 
 
 def _squared(angle: np.ndarray, square: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points on superellipses."""
     c, s = np.cos(angle), np.sin(angle)
     reach = (np.abs(c) ** square + np.abs(s) ** square) ** (-1.0 / square)
     return reach * c, reach * s

@@ -259,7 +259,6 @@ class Trainer:
             raise UsageError(f"{file} does not fit this configuration: {error}") from error
 
     def _take(self, state: dict[str, Any]) -> None:
-        """Take over what `save` wrote."""
         self.network.load_state_dict(state["network"])
         self._mean.load_state_dict(state["mean"])
         self._optimiser.load_state_dict(state["optimiser"])

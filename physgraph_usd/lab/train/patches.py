@@ -10,7 +10,7 @@ from __future__ import annotations
 import multiprocessing
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, TypeVar
 
@@ -173,8 +173,11 @@ def patch_of(config: PatchConfig, rng: np.random.Generator) -> Patch:
         levels -= 1
     garment = Garment("/Patch", mesh, rest, levels, bool(rng.random() < 0.3), one, one, one, one, pin)
     points = posed(rest, rng, config)
-    if rng.random() < 0.5 and pin.any():
-        points = _draped(group_of([garment], gravity, 0), points, fabric, guide=guide, rng=rng)
+    if rng.random() < 0.5 and pin.any():  # some steps of our own solver, softer than the cloth: it folds as a cage does
+        soft = GarmentFrame(points, replace(fabric, bend=100.0 * fabric.bend), 0.1 * guide)
+        systems, x = group_of([garment], gravity, 0).systems([soft])
+        x, _ = solve_level(systems[0], QuasiNewton(), x, level=0, budget=Budget(int(rng.integers(2, 20))))
+        points = x.double().numpy()
     frame = GarmentFrame(points - points.mean(axis=0), fabric, guide)
     words = f"{shape}, {'quads' if not mesh.is_triangles else 'triangles'}, border {border}, levels {levels}"
     return Patch(garment, frame, gravity, words)
@@ -216,7 +219,6 @@ def _quads(columns: int, rows: int, rng: np.random.Generator, *, closed: bool) -
 
 
 def _rolled(flat: np.ndarray, shape: str, rng: np.random.Generator) -> np.ndarray:
-    """The rest shape in cage edges."""
     u, v = flat.T
     if shape == "tube":
         columns = u.max() + 1.0
@@ -264,7 +266,6 @@ def _skinned(x: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def _pinned(mesh: PolygonMesh, flat: np.ndarray, border: str) -> np.ndarray:
-    """1 on the fixed part of the border."""
     pin = np.zeros(mesh.vertex_count)
     edges = edges_of(mesh.triangulate().triangles, mesh.vertex_count)
     rim = np.unique(edges.vertices[edges.face_count == 1])
@@ -276,21 +277,12 @@ def _pinned(mesh: PolygonMesh, flat: np.ndarray, border: str) -> np.ndarray:
 
 
 def _material(config: PatchConfig, rng: np.random.Generator, *, free: bool) -> tuple[Fabric, float, np.ndarray]:
-    """Fabric, guide stiffness [N/m^3] and gravity [m/s^2]."""
     half = 0.5 * DECADES
     stretch, bend = (m * 10 ** float(np.clip(rng.normal(0.0, 0.5 * half), -half, half)) for m in (100.0, 5e-6))
     # Poses are turned anywhere, so one direction of gravity is enough.
     down = np.array([0.0, 0.0, -9.81]) * (0.0 if config.elastic else float(rng.random() < 0.7))
     guide = 2000.0 * 10 ** rng.uniform(-0.7, 0.7) if free or rng.random() < 0.8 else 0.0
     return Fabric(stretch, bend, rng.uniform(0.08, 0.6)), 0.0 if config.elastic else guide, down
-
-
-def _draped(group: Group, points: np.ndarray, fabric: Fabric, *, guide: float, rng: np.random.Generator) -> np.ndarray:
-    """The cage after some steps of our own solver, softer than the cloth so that it folds as a cage does."""
-    soft = Fabric(fabric.stretch, 100.0 * fabric.bend, fabric.density)
-    systems, x = group.systems([GarmentFrame(points, soft, 0.1 * guide)])
-    x, _ = solve_level(systems[0], QuasiNewton(), x, level=0, budget=Budget(int(rng.integers(2, 20))))
-    return x.double().numpy()
 
 
 def describe(patches: Sequence[Patch]) -> list[str]:

@@ -104,7 +104,6 @@ def read_config(file: Path) -> TrainConfig:
 
 
 def _card(trainer: Trainer, digest: str, *, config_file: Path, out: Path) -> dict[str, Any]:
-    """The card of weights: network, patches, time, and the command that trains them again."""
     config = trainer.config
     cuda = trainer.device.startswith("cuda")
     command = ["physgraph-usd", "train", "--config", str(config_file), "--device", trainer.device, "-o", str(out)]

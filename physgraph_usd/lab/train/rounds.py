@@ -142,7 +142,6 @@ def _rounds_of(moving: Moving, method: str) -> list[Round]:
 
 
 def _noted(words: str, group: Group, frames: Sequence[GarmentFrame], system: System, x: Tensor) -> Round:
-    """The round of a system and a start."""
     field = system.field
     assert isinstance(field, ForceModule)
     gaps, tie, predicted, aim = list[PairConstraints](), 0.0, x, None

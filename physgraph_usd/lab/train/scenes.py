@@ -75,7 +75,6 @@ Motion = tuple[np.ndarray, np.ndarray, list[np.ndarray], list[Solid]]
 
 
 def _ball(rng: np.random.Generator, frames: int) -> Motion:
-    """Sheets over an ellipsoid."""
     cells = int(rng.integers(7, 12))
     line = np.arange(cells + 1.0) - 0.5 * cells
     x, y = (each.ravel() for each in np.meshgrid(line, line))
@@ -102,7 +101,6 @@ def _ball(rng: np.random.Generator, frames: int) -> Motion:
 
 
 def _tube(rng: np.random.Generator, frames: int) -> Motion:
-    """A sleeve about an arm that bends."""
     around, rows = int(rng.integers(10, 16)), int(rng.integers(8, 14))
     radius = around / (2.0 * np.pi)
     angle = 2.0 * np.pi * np.arange(around) / around
@@ -135,7 +133,6 @@ def _bent(points: np.ndarray, turn: float, radius: float) -> np.ndarray:
 
 
 def _fold(rng: np.random.Generator, frames: int) -> Motion:
-    """A strip laid back over itself."""
     length, width = int(rng.integers(12, 18)), int(rng.integers(5, 9))
     x, y = (each.ravel() for each in np.meshgrid(np.arange(length + 1.0), np.arange(width + 1.0)))
     faces, rest = quad_grid(width + 1, length + 1), np.stack([x, y, 0.0 * x], axis=1)
