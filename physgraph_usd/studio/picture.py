@@ -216,7 +216,6 @@ class Picture:
         return replace(sheet, triangles=chosen(sheet.triangles), edges=chosen(sheet.edges))
 
     def _draw_wires(self, name: str, sheet: Sheet, *, at: np.ndarray) -> set[str]:
-        """Draw a mesh's edges; returns the node's name."""
         name, segments = f"{name}/wires", self._placed(sheet.points, at)[sheet.edges]
         known, handle = self._handles.pop(name, (None, None))
         if handle is not None and known == len(segments):
@@ -247,7 +246,6 @@ class Picture:
         return named
 
     def _draw_bodies(self, frame: Frame, column: str, *, at: np.ndarray) -> set[str]:
-        """Draw the bodies in a column; returns the names of what is drawn."""
         found = {f"body/{column}/{index}": mesh_of(pose) for index, pose in enumerate(frame.colliders) if pose}
         drawn = {name: mesh for name, mesh in found.items() if mesh is not None}
         for name, mesh in drawn.items():

@@ -173,7 +173,6 @@ class Tuning:
         return self.garments.index(garment)
 
     def _values(self, garment: str) -> dict[str, float]:
-        """The values tried on a garment."""
         self._index(garment)
         return dict(self.setting.values.get(garment, {}))
 

@@ -102,14 +102,13 @@ def _figure(chart: Chart) -> go.Figure:
     for name in dict.fromkeys(each.method for each in chart.warm):
         own, points = style.get(name, Style(BASELINE, dashed=False)), [p for p in chart.warm if p.method == name]
         figure.add_trace(_trace(chart, name, own, points, field="gap"), row=2, col=1)
-        figure.update_yaxes(title_text=panels["gap"], row=2, col=1)
     figure.update_xaxes(type="log", dtick=1, minor={"dtick": "D1", "showgrid": True})
     figure.update_xaxes(title_text="milliseconds a frame", row=1, col=1)
     figure.update_xaxes(title_text="milliseconds a frame", row=len(panels) + warm, col=1)
     figure.update_yaxes(type="log", tickvals=TICKS, tickformat="~p", row=1, col=1)
     if warm:  # it often spans less than a decade
         figure.update_xaxes(dtick="D2", minor=None, row=2, col=1)
-        figure.update_yaxes(type="log", dtick="D2", tickformat="~p", row=2, col=1)
+        figure.update_yaxes(type="log", dtick="D2", tickformat="~p", title_text=panels["gap"], row=2, col=1)
     figure.update_layout(
         height=520 + 330 * warm + 220 * (len(panels) - 1),
         template="plotly_white",

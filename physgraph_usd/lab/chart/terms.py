@@ -52,7 +52,7 @@ TERMS = (
 
 @dataclass(frozen=True, eq=False)
 class TermBench:
-    """What the terms are measured on.
+    """Problems, frames and levels that the terms are measured on.
 
     Attributes:
         timed: The problem in float32.

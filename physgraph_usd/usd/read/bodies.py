@@ -50,9 +50,6 @@ class _Faces:
     drawn: DrawnSurface
     wound: tuple[np.ndarray, np.ndarray]
 
-    def are_of(self, authored: tuple[np.ndarray, ...]) -> bool:
-        return all(map(np.array_equal, self.authored, authored))
-
 
 @dataclass(eq=False)
 class ColliderReader:
@@ -83,7 +80,8 @@ class ColliderReader:
             time: The time code, or None for the default.
             skinned: World positions of a mesh's points [m], to replace the authored points; or None.
         """
-        if not self.always and _is_invisible(self.prim, time):
+        visibility = UsdGeom.Imageable(self.prim).ComputeVisibility(timecode(time))
+        if not self.always and visibility == UsdGeom.Tokens.invisible:
             message = f"no collider where it is invisible, unless {COLLIDER['collider:enabled'].name} is set to true"
             return None, (Notice(self.collider.path, None, message),)
         matrix = self._matrix(timecode(time))
@@ -133,7 +131,7 @@ class ColliderReader:
 
         Subdivision and splitting of quads use the collider's first sample, whichever frame is read first.
         """
-        if self._faces is None or not self._faces.are_of(authored):
+        if self._faces is None or not all(map(np.array_equal, self._faces.authored, authored)):
             counts, indices, holes = authored
             mesh = UsdGeom.Mesh(self.prim)
             first = np.asarray(mesh.GetPointsAttr().Get(Usd.TimeCode.EarliestTime()), dtype=np.float64)
@@ -201,7 +199,6 @@ def read_collider(
     """Reader of a gprim as a collider, or None for an unsupported kind of prim, and notices.
 
     Args:
-        prim: A gprim.
         metres: Length of one stage unit [m].
         overrides: Values of ``--set``.
         offset: Least distance kept from colliders by a garment [m].
@@ -219,10 +216,6 @@ def read_collider(
     within = DRAWN_NEAR * max(offset + own, _LEAST_OFFSET)
     always = find_value(prim, COLLIDER["collider:enabled"], overrides).source != "fallback"
     return ColliderReader(prim, Collider(path, kind, own, side), metres, within, always), odd
-
-
-def _is_invisible(prim: Usd.Prim, time: float | None) -> bool:
-    return UsdGeom.Imageable(prim).ComputeVisibility(timecode(time)) == UsdGeom.Tokens.invisible
 
 
 def _control_mesh(mesh: UsdGeom.Mesh, polygons: PolygonMesh) -> ControlMesh:
@@ -320,7 +313,6 @@ def _revolved(profile: np.ndarray, poles: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def _box(size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The eight corners and twelve triangles of a box."""
     signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=np.float64)
     quads = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
     return signs * size, np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]]).astype(np.int32)

@@ -16,6 +16,7 @@ from ..mesh.attributes import (
     corner_values,
     edge_subset,
     face_subset,
+    interpolated,
     uniform_values,
     vertex_subset,
     vertex_values,
@@ -38,7 +39,6 @@ def carry_primvars(
     Args:
         target: Prim to author on.
         prim: Coarse mesh as composed.
-        fine: Map to the fine mesh.
         span: First and last relevant time code, or None for all.
 
     Returns:
@@ -79,7 +79,6 @@ def _numbers_points(primvar: UsdGeom.Primvar) -> bool:
 
 
 def _hide(stream: LayerStream, target: Sdf.Path, primvar: UsdGeom.Primvar) -> None:
-    """Block a primvar's values and indices."""
     stream.block(target.AppendProperty(primvar.GetAttr().GetName()), primvar.GetTypeName())
     indices = primvar.GetIndicesAttr()
     if primvar.IsIndexed() and indices.GetTypeName():
@@ -177,7 +176,6 @@ class FineMap:
         """Prepare the map.
 
         Args:
-            cage: The coarse mesh before refinement.
             refinements: Coarse to fine; empty if the fine mesh is the cage.
             counts: Authored corners per face, shape (F,), including dropped faces.
             kept: Numbers of the authored faces in the cage, shape (F_cage,).
@@ -270,10 +268,14 @@ class FineMap:
 
     def interpolate(self, values: np.ndarray) -> np.ndarray:
         """Refine floating-point values on vertices linearly, shape (V, ...) to (V_fine, ...), type kept."""
-        if self.stencil is None:
-            return values
-        flat = values.reshape(len(values), int(np.prod(values.shape[1:])))
-        return (self.stencil @ flat.astype(np.float64)).reshape(-1, *values.shape[1:]).astype(values.dtype)
+        return values if self.stencil is None else interpolated(self.stencil, values)
+
+    def vectors(self, value: Any) -> np.ndarray | None:
+        """Refine vectors authored on vertices, shape (V_fine, 3), float32; None unless there is a finite one each."""
+        if value is None or len(value) != self.cage.vertex_count:
+            return None
+        fine = self.interpolate(np.asarray(value, np.float32))
+        return fine if np.isfinite(fine).all() else None
 
     def _picked(
         self, interpolation: str, values: np.ndarray, indices: np.ndarray | None

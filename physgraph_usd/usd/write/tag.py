@@ -113,7 +113,6 @@ def _check_word(what: str, word: str | None, words: Sequence[str]) -> None:
 
 
 def _check_values(values: Mapping[str, Mapping[str, float]]) -> None:
-    """Refuse values invalid for refining."""
     try:
         for path, items in values.items():
             for name, value in items.items():
