@@ -11,6 +11,7 @@ from PIL import Image
 
 from ...shot.page.drawing import Surface, draw, fit_view
 from ...solver.scene import Frame
+from ...usd.read.meshes import upright
 from ..methods import METHODS
 from .measure import find_curves
 from .problem import COLD, Problem
@@ -39,7 +40,7 @@ def draw_looks(chart: Chart, problem: Problem, frame: Frame, best: Sequence[np.n
     if best is not None:
         shapes["0"] = best
     up = -problem.scene.gravity if problem.scene.gravity.any() else np.array([0.0, 1.0, 0.0])
-    turn = _upright(up)
+    turn = upright(up / np.linalg.norm(up))
     cloud = np.concatenate([np.concatenate(list(each)) for each in shapes.values()]) @ turn.T
     view, floor = fit_view(cloud, SIZE[0] / SIZE[1]), float(cloud[:, 1].min() - 0.03 * np.ptp(cloud, axis=0).max())
     meshes = [chain[-1].mesh for chain in problem.refiner.refinements if chain]
@@ -73,14 +74,3 @@ def _nearest(chart: Chart, gap: float) -> Point | None:
 def _solved(problem: Problem, frame: Frame, point: Point) -> tuple[np.ndarray, ...]:
     [curve] = [each for each in find_curves() if each.name == point.method] or find_curves([point.integrator])[:1]
     return problem.solve(frame, replace(COLD, method=curve.method, steps=point.steps, tolerance=0.0)).points
-
-
-def _upright(up: np.ndarray) -> np.ndarray:
-    """The rotation that takes a direction to Y, shape (3, 3), as the shortest turn of the axes does."""
-    axis = int(np.abs(up).argmax())
-    y = up / np.linalg.norm(up)
-    x = np.zeros(3)
-    x[(axis + 2) % 3 if axis == 1 else 0] = 1.0
-    x -= (x @ y) * y
-    x /= np.linalg.norm(x)
-    return np.stack([x, y, np.cross(x, y)])

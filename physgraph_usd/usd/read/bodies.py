@@ -57,7 +57,6 @@ class ColliderReader:
 
     Attributes:
         collider: Constant data.
-        metres: Length of one stage unit [m].
         within: Allowed distance of the mesh from the drawn surface [m].
         always: Whether the collider counts even while invisible.
     """
@@ -77,7 +76,6 @@ class ColliderReader:
         """Pose at a time code, interpolated like USD; None, with a notice, without a usable pose.
 
         Args:
-            time: The time code, or None for the default.
             skinned: World positions of a mesh's points [m], to replace the authored points; or None.
         """
         visibility = UsdGeom.Imageable(self.prim).ComputeVisibility(timecode(time))
@@ -199,8 +197,6 @@ def read_collider(
     """Reader of a gprim as a collider, or None for an unsupported kind of prim, and notices.
 
     Args:
-        metres: Length of one stage unit [m].
-        overrides: Values of ``--set``.
         offset: Least distance kept from colliders by a garment [m].
 
     Raises:

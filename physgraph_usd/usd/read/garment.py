@@ -48,7 +48,6 @@ class Request:
         bake: Baked skinning.
         frames: First and last time code, or None.
         level: Number of subdivisions for all, -1 for auto, or None.
-        overrides: Values of ``--set``.
         rest_frame: Time code of the rest shape's points, "auto" for a shape fitted to the shot, or None.
         assumed_units: Whether metersPerUnit is not authored.
     """
@@ -87,10 +86,6 @@ class GarmentReader:
         """The garment at a time code, and notices of repairs.
 
         All points of an absent garment are at one place, without contact: other garments may still have a frame.
-
-        Args:
-            metres: Length of one stage unit [m].
-            time: Time code, or None for the default.
         """
         notices: tuple[Notice, ...] = ()
         if time is not None and absence(prim, time):

@@ -113,11 +113,7 @@ class Shot:
         self._readers, self._bodies, self._request = tuple(readers), tuple(bodies), request
 
     def to_metres(self, index: int, time: float | None) -> np.ndarray:
-        """Matrix from a garment's local space to world metres, shape (4, 4), float64: ``world = M @ [local; 1]``.
-
-        Args:
-            index: Number of the garment.
-            time: Time code, or None for the default.
+        """Matrix from a garment's local space to world metres, by number, (4, 4), float64: ``world = M @ [local; 1]``.
 
         Raises:
             GarmentError: When the matrix is not invertible.

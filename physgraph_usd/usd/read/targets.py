@@ -131,7 +131,6 @@ def read_targets(
         bound: From `find_bound`; prims bound to garments that are not refined are left out.
         garments: Path, mesh and first time code of each garment.
         cage: Places the garments.
-        metres: Length of one stage unit [m].
         skinned: Prims with baked points.
 
     Raises:

@@ -37,8 +37,6 @@ def carry_primvars(
     A primvar not matching its own mesh is hidden, because the values would match the fine mesh even less.
 
     Args:
-        target: Prim to author on.
-        prim: Coarse mesh as composed.
         span: First and last relevant time code, or None for all.
 
     Returns:

@@ -124,9 +124,8 @@ def _material(stage: Usd.Stage, look: Look) -> UsdShade.Material:
 
 def _write_garment(prim: Usd.Prim, mesh: PlainMesh) -> None:
     prim.AddAppliedSchema("PhysGraphGarmentAPI")
-    if mesh.level is not None:
-        name, whole = "physgraph:refine:level", Sdf.ValueTypeNames.Int
-        prim.CreateAttribute(name, whole, False, Sdf.VariabilityUniform).Set(mesh.level)
+    level = "physgraph:refine:level", Sdf.ValueTypeNames.Int, False, Sdf.VariabilityUniform
+    prim.CreateAttribute(*level).Set(mesh.level)
     for name, value in ({} if mesh.fabric is None else fabric_values(mesh.fabric)).items():
         prim.CreateAttribute(f"physgraph:material:{name}", Sdf.ValueTypeNames.Float, False).Set(value)
 
