@@ -64,6 +64,13 @@ def corner_values(
     return chain[-1].mesh.indices, vertex_values(chain, values)
 
 
+def kept_corners(counts: np.ndarray, kept: np.ndarray) -> np.ndarray:
+    """Numbers of the kept faces' corners, in order, among those of all faces, which have so many each, shape (F,)."""
+    counts = np.asarray(counts, np.int64)
+    before = (np.cumsum(counts) - counts)[kept] - (np.cumsum(counts[kept]) - counts[kept])
+    return np.repeat(before, counts[kept]) + np.arange(counts[kept].sum())
+
+
 def face_subset(refinements: Sequence[Refinement], faces: np.ndarray) -> np.ndarray:
     """The fine faces inside a subset of coarse faces, ascending, int32; a partition stays a partition."""
     if not refinements:

@@ -17,6 +17,7 @@ from ..mesh.attributes import (
     edge_subset,
     face_subset,
     interpolated,
+    kept_corners,
     uniform_values,
     vertex_subset,
     vertex_values,
@@ -184,8 +185,7 @@ class FineMap:
         self.fine = self.sheet if shell is None else shell.mesh
         self._refinements = tuple(refinements)
         self._kept = np.asarray(kept, np.int64)
-        self._face_count = len(counts)
-        self._starts = np.concatenate([[0], np.cumsum(np.asarray(counts, np.int64))])
+        self._counts = counts
 
     @cached_property
     def stencil(self) -> sparse.csr_matrix | None:
@@ -215,9 +215,7 @@ class FineMap:
     @cached_property
     def kept_corners(self) -> np.ndarray:
         """Authored corner of each corner of the cage, shape (C,)."""
-        counts = np.asarray(self.cage.counts, np.int64)
-        first = np.repeat(self._starts[self._kept] - np.concatenate([[0], np.cumsum(counts)[:-1]]), counts)
-        return first + np.arange(len(first))
+        return kept_corners(self._counts, self._kept)
 
     @cached_property
     def nearest_corner(self) -> np.ndarray:
@@ -230,7 +228,7 @@ class FineMap:
     def count(self, interpolation: str) -> int:
         """Number of authored elements of an interpolation; ValueError for an interpolation independent of topology."""
         counts = dict.fromkeys(("vertex", "varying"), self.cage.vertex_count)
-        counts |= {"uniform": self._face_count, "faceVarying": int(self._starts[-1])}
+        counts |= {"uniform": len(self._counts), "faceVarying": int(np.sum(self._counts))}
         if interpolation not in counts:
             raise ValueError(f"has interpolation {interpolation!r}; known: constant, {', '.join(counts)}")
         return counts[interpolation]
@@ -309,7 +307,7 @@ class FineMap:
         indices = indices.astype(np.int64).reshape(-1)
         if element == "edge" and len(indices) % 2:
             raise ValueError(f"has {len(indices)} indices for edges, which need pairs")
-        limit = self._face_count if element == "face" else self.cage.vertex_count
+        limit = len(self._counts) if element == "face" else self.cage.vertex_count
         if len(indices) and not 0 <= indices.min() <= indices.max() < limit:
             raise ValueError(f"has {element} indices from {indices.min()} to {indices.max()}; the mesh has {limit}")
         if element == "face":

@@ -16,11 +16,12 @@ from typing import Any
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom
 
-from ...errors import LayerError, UsageError
+from ...errors import LayerError
 from ...solver.mesh.subdivide import Refinement
 from .. import provenance
 from ..check.validate import check_layer
 from ..files import check_targets, files_of
+from ..lookup import check_known
 from ..mesh.shell import Shell
 from ..read.absence import named_times
 from ..read.reader import Shot
@@ -73,8 +74,7 @@ class LayerWriter:
             UsageError: The mode is unknown, or the file exists or belongs to the shot.
             LayerError: The layer cannot be written.
         """
-        if mode not in MODES:
-            raise UsageError(f"unknown mode {mode!r}; known modes: {', '.join(MODES)}")
+        check_known("mode", mode, MODES)
         if len(refinements) != len(shot.scene.garments):
             raise LayerError(f"{len(refinements)} refinements for {len(shot.scene.garments)} garments")
         if out is not None:
