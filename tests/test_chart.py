@@ -253,7 +253,6 @@ def test_a_damaged_row_is_named(tmp_path: Path, line: bytes):
 
 
 @pytest.mark.slow
-@pytest.mark.slow
 def test_a_solver_outside_is_measured_by_the_same_ruler(
     made: tuple[Path, Path, Chart], tmp_path: Path, monkeypatch: Any
 ):

@@ -7,13 +7,14 @@ from dataclasses import replace
 import pytest
 import torch
 
-from physgraph_usd.lab.train.bundle import RoundBundle, deal_rounds
+from physgraph_usd.errors import UsageError
+from physgraph_usd.lab.train.bundle import RoundBundle, deal
 from physgraph_usd.lab.train.loop import TrainConfig, Trainer
 from physgraph_usd.lab.train.patches import PatchConfig
 from physgraph_usd.lab.train.rounds import Round, RoundConfig, make_rounds, system_of
 from physgraph_usd.solver.contact.metric import HeldMetric
 from physgraph_usd.solver.integrate.network import PhysgraphConfig
-from physgraph_usd.solver.integrate.weights import integrator_of, random_network, shipped_network
+from physgraph_usd.solver.integrate.weights import NETWORKS, integrator_of, random_network, shipped_network
 
 FEW = RoundConfig(scenes=2, reference_steps=15, most_vertices=1)
 
@@ -24,7 +25,7 @@ def rounds() -> list[Round]:
 
 
 def touching(rounds: list[Round]) -> list[Round]:
-    return max(deal_rounds([each for each in rounds if each.touches], 8), key=len)
+    return max(deal([each for each in rounds if each.touches], 8), key=len)
 
 
 def test_rounds_side_by_side_move_as_they_do_alone(rounds: list[Round]):
@@ -58,16 +59,16 @@ def test_the_energys_gradient_is_minus_the_force(rounds: list[Round]):
     assert torch.allclose(gradient * system.free, -force, rtol=1e-5, atol=1e-7 * float(force.abs().max()))
 
 
-def test_training_begins_with_the_weights_that_ship_and_a_wider_network_does_as_they_do(rounds: list[Round]):
-    shipped = shipped_network("physgraph")
+def test_training_begins_with_the_weights_of_a_file(rounds: list[Round]):
+    shipped, file = shipped_network("physgraph"), str(NETWORKS["physgraph"].file)
     config = shipped.config
     assert isinstance(config, PhysgraphConfig)
     vectors = torch.randn((50, len(config.vectors), 3), generator=torch.Generator().manual_seed(1))
-    none = PatchConfig(count=0)
-    for width in (config.width, 2 * config.width):
-        run = TrainConfig(network=replace(config, width=width), patches=none, held_out=0, start="shipped")
-        network = Trainer(run, data=([], rounds, [], [])).network
-        torch.testing.assert_close(network(vectors, 3), shipped(vectors, 3))
+    run = TrainConfig(network=config, patches=PatchConfig(count=0), held_out=0, start=file)
+    network = Trainer(run, data=([], rounds, [], [])).network
+    torch.testing.assert_close(network(vectors, 3), shipped(vectors, 3))
+    with pytest.raises(UsageError, match="another size"):
+        Trainer(replace(run, network=replace(config, width=2 * config.width)), data=([], rounds, [], []))
 
 
 def test_iterations_on_rounds_change_the_weights(rounds: list[Round]):

@@ -41,7 +41,7 @@ import numpy as np
 from ..errors import PhysGraphError, SolveError, UsageError
 from ..interrupts import leave_if_asked
 from ..solver.fabric import PRESETS
-from ..usd.lookup import parse_overrides
+from ..usd.lookup import check_known, parse_overrides
 from ..usd.schema import GARMENT
 from .loop import Change, SolveLoop
 from .session import TuneSession
@@ -181,8 +181,7 @@ def changes_in(request: Mapping[str, Any], session: TuneSession, *, save: Change
         "quit": lambda *_: [],
     }  # fmt: skip
     for key in request:
-        if key not in known:
-            raise UsageError(f"unknown request '{key}'; known requests: {', '.join(known)}")
+        check_known("request", key, known)
     return [change for key, read in known.items() if key in request for change in read(request[key], session)]
 
 
@@ -260,8 +259,7 @@ def _of_authored(given: Any, session: TuneSession) -> list[Change]:
 
 def _of_presets(given: Any, session: TuneSession) -> list[Change]:
     for preset in _table(given, "preset").values():
-        if not isinstance(preset, str) or preset not in PRESETS:
-            raise UsageError(f"unknown preset '{preset}'; known presets: {', '.join(sorted(PRESETS))}")
+        check_known("preset", preset, sorted(PRESETS))
     return [methodcaller("set_preset", _checked(garment, session), preset) for garment, preset in given.items()]
 
 
@@ -269,8 +267,7 @@ def _of_values(given: Any, session: TuneSession) -> list[Change]:
     found = list[Change]()
     for garment, values in _table(given, "values").items():
         for name, value in _table(values, f"values of <{_checked(garment, session)}>").items():
-            if name not in TUNABLES:
-                raise UsageError(f"unknown value '{name}'; known values: {', '.join(TUNABLES)}")
+            check_known("value", name, TUNABLES)
             number = _number(value, name)
             _check_limits(garment, name, number)
             found.append(methodcaller("set_value", garment, name, number))

@@ -146,7 +146,6 @@ class TunePage:
             self._command = gui.add_html("")
 
     def _build_history(self) -> None:
-        """Save, undo and redo."""
         gui, desk = self._server.gui, self._desk
         save = gui.add_button("Save layer", hint="Writes what is tried as a layer, as physgraph-usd tag does.")
         desk.press(save, self._save)

@@ -215,7 +215,6 @@ class Picture:
         return replace(sheet, triangles=chosen(sheet.triangles), edges=chosen(sheet.edges))
 
     def _draw_wires(self, name: str, sheet: Sheet, *, at: np.ndarray) -> set[str]:
-        """Draw a mesh's edges; returns the node's name."""
         name, segments = f"{name}/wires", self._placed(sheet.points, at)[sheet.edges]
         known, handle = self._handles.pop(name, (None, None))
         if handle is not None and known == len(segments):
@@ -246,7 +245,6 @@ class Picture:
         return named
 
     def _draw_bodies(self, frame: Frame, column: str, *, at: np.ndarray) -> set[str]:
-        """Draw the bodies in a column; returns the names of what is drawn."""
         drawn = {f"body/{column}/{index}": pose for index, pose in _drawn(frame).items()}
         for name, pose in drawn.items():
             self._place(name, Sheet(pose.points, pose.triangles, np.empty((0, 2), int)), BODY, at=at)

@@ -93,7 +93,6 @@ class TriedShot:
         }
 
     def _with_maps(self, painted: Mapping[str, Mapping[str, np.ndarray]]) -> Shot:
-        """The shot with painted maps, opened again after a change of the maps."""
         if not painted:
             return self.opened
         if self._painted[0] is not painted:

@@ -11,6 +11,7 @@ import numpy as np
 from ..errors import UsageError
 from ..solver.fabric import PRESETS
 from ..solver.resolution import choose_levels, sample_frames
+from ..usd.lookup import check_known
 from ..usd.read.reader import Shot
 from ..usd.schema import AUTO_LEVEL, FABRIC, GARMENT, fabric_values
 from .setting import History, Setting
@@ -82,8 +83,7 @@ class Tuning:
         Raises:
             UsageError: The garment or the name is unknown, or the value is outside its limits.
         """
-        if name not in TUNABLES:
-            raise UsageError(f"unknown value '{name}'; known values: {', '.join(TUNABLES)}")
+        check_known("value", name, TUNABLES)
         tried, given = self._values(garment), _rounded({name: value})
         if tried.get(name) != given[name]:  # Pages tell a number twice: when it is typed, and when it is left.
             self._try(garment, tried | given, TUNABLES[name].label, joins=True)
@@ -114,8 +114,7 @@ class Tuning:
         Raises:
             UsageError: The garment or the fabric is unknown.
         """
-        if preset not in PRESETS:
-            raise UsageError(f"unknown preset '{preset}'; known presets: {', '.join(sorted(PRESETS))}")
+        check_known("preset", preset, sorted(PRESETS))
         self.set_fabric(garment, fabric_values(PRESETS[preset]), preset)
 
     def set_fabric(self, garment: str, values: Mapping[str, float], name: str) -> None:
@@ -134,8 +133,7 @@ class Tuning:
             UsageError: The garment or the map is unknown.
             SchemaError: A value is outside the map's limits.
         """
-        if name not in MAPS:
-            raise UsageError(f"unknown map '{name}'; known maps: {', '.join(MAPS)}")
+        check_known("map", name, MAPS)
         maps = {**self.setting.painted.get(garment, {}), name: np.array(values, np.float32)}
         painted = {**self.setting.painted, garment: maps}
         self._try(garment, self._values(garment), GARMENT[name].label, painted=painted)
@@ -173,7 +171,6 @@ class Tuning:
         return self.garments.index(garment)
 
     def _values(self, garment: str) -> dict[str, float]:
-        """The values tried on a garment."""
         self._index(garment)
         return dict(self.setting.values.get(garment, {}))
 

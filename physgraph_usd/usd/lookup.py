@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -70,6 +70,12 @@ class Found:
         if self.attribute is None:
             return self.constant
         return check_limits(self.row, read_number(self.attribute, time) * self.scale, self.source)
+
+
+def check_known(what: str, word: object, known: Collection[object]) -> None:
+    """Refuse (UsageError) a word that is none of the known ones, in their order."""
+    if word not in known:
+        raise UsageError(f"unknown {what} '{word}'; known {what}s: {', '.join(map(str, known))}")
 
 
 def parse_overrides(texts: Sequence[str]) -> tuple[Override, ...]:

@@ -49,7 +49,6 @@ def _otherwise(row: Property) -> str:
 
 
 def _limits(row: Property) -> str:
-    """Allowed values and usual values, in usda."""
     if row.tokens:
         return f"        allowedTokens = [{', '.join(_number(row, token) for token in row.tokens)}]\n"
     hard = _range(row, "hard", row.minimum, row.maximum)

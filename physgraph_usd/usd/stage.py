@@ -216,7 +216,6 @@ class Units:
     """Units, up axis and gravity of a stage.
 
     Attributes:
-        metres: Length of one stage unit [m].
         kilograms: Mass of one stage unit [kg].
         up: Upward unit vector, against gravity if present, shape (3,).
         gravity: Gravity [m/s^2], shape (3,).
@@ -241,13 +240,13 @@ def read_units(stage: Usd.Stage) -> tuple[Units, list[Notice]]:
     metres, notices = metres_per_unit(stage)
     mass = root_metadata(stage, "kilogramsPerUnit")
     kilograms = float(mass) if isinstance(mass, int | float) and math.isfinite(mass) and mass > 0 else 1.0
-    up, odd = up_vector(stage)
+    up, odd = _up_vector(stage)
     pull, source, odd_pull = gravity(stage, up, metres)
     strength = float(np.linalg.norm(pull))
     return Units(metres, kilograms, -pull / strength if strength else up, pull, source), notices + odd + odd_pull
 
 
-def up_vector(stage: Usd.Stage) -> tuple[np.ndarray, list[Notice]]:
+def _up_vector(stage: Usd.Stage) -> tuple[np.ndarray, list[Notice]]:
     """Upward unit vector, shape (3,), and notices; never raises."""
     authored = root_metadata(stage, "upAxis") or UsdGeom.GetFallbackUpAxis()
     if authored in {"Y", "Z"}:

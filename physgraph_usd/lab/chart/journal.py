@@ -37,7 +37,7 @@ class Journal:
             )
 
     def add(self, kind: str, /, **values: Any) -> dict[str, Any]:
-        """Write one row."""
+        """Write one row and return it."""
         row = {"row": kind, **values}
         with self._file.open("a", encoding="utf-8") as file:
             file.write(json.dumps(row) + "\n")

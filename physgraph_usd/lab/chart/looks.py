@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +11,7 @@ from PIL import Image
 
 from ...shot.page.drawing import Surface, draw, fit_view
 from ...solver.scene import Frame
+from ...usd.read.meshes import upright
 from ..methods import METHODS
 from .measure import find_curves
 from .problem import COLD, Problem
@@ -24,40 +25,22 @@ NEAR = 1.5
 FILE = "chart.looks.{}.png"
 
 
-@dataclass(frozen=True)
-class Look:
-    """A picture of cloth refined by one method.
-
-    Attributes:
-        file: Name of the picture's file.
-        gap: Energy gap of the cloth, (Phi - Phi*) / (Phi0 - Phi*).
-        words: Caption.
-    """
-
-    file: Path
-    gap: float
-    words: str
-
-
 def draw_looks(chart: Chart, problem: Problem, frame: Frame, best: Sequence[np.ndarray] | None, folder: Path) -> None:
     """Draw a frame upsampled, at each of `GAPS` where a method came near it, and at its best.
 
     Args:
-        chart: What was measured.
         problem: The problem in float32.
-        frame: The frame, one of those measured.
+        frame: One of the measured frames.
         best: Fine world positions [m] of each garment at Phi*, or None where they are not known.
-        folder: Where the pictures go.
     """
     shapes: dict[str, Sequence[np.ndarray]] = {"100": problem.upsampled(frame, smooth=False)}
     for gap in GAPS:
-        point = nearest(chart, gap)
-        if point is not None:
+        if point := _nearest(chart, gap):
             shapes[f"{100 * gap:g}"] = _solved(problem, frame, point)
     if best is not None:
         shapes["0"] = best
     up = -problem.scene.gravity if problem.scene.gravity.any() else np.array([0.0, 1.0, 0.0])
-    turn = _upright(up)
+    turn = upright(up / np.linalg.norm(up))
     cloud = np.concatenate([np.concatenate(list(each)) for each in shapes.values()]) @ turn.T
     view, floor = fit_view(cloud, SIZE[0] / SIZE[1]), float(cloud[:, 1].min() - 0.03 * np.ptp(cloud, axis=0).max())
     meshes = [chain[-1].mesh for chain in problem.refiner.refinements if chain]
@@ -70,45 +53,24 @@ def draw_looks(chart: Chart, problem: Problem, frame: Frame, best: Sequence[np.n
         Image.fromarray(draw(surfaces, view, size=SIZE, floor=floor)).save(folder / FILE.format(name), optimize=True)
 
 
-def looks_of(chart: Chart, folder: Path) -> list[Look]:
-    """Existing pictures of a chart, by falling energy gap."""
-    found = []
-    for name, gap in (("100", 1.0), *((f"{100 * gap:g}", gap) for gap in GAPS), ("0", 0.0)):
-        file, point = folder / FILE.format(name), nearest(chart, gap)
-        if not file.exists():
-            continue
-        if name in ("0", "100"):
-            words = "the best known" if name == "0" else "plain upsampling, no physics"
-            found.append(Look(file, gap, words))
-        elif point is not None:
-            found.append(Look(file, point.gap, f"{point.method}, {point.ms:.0f} ms a frame"))
-    return found
+def looks_of(chart: Chart, folder: Path) -> list[tuple[Path, str]]:
+    """Existing pictures of a chart and their captions, by falling energy gap."""
+    captions = {"100": "100%: plain upsampling, no physics"}
+    for gap in GAPS:
+        if point := _nearest(chart, gap):
+            left = f"{percent(point.gap, digits=2)} above the best known"
+            captions[f"{100 * gap:g}"] = f"{left}: {point.method}, {point.ms:.0f} ms a frame"
+    captions["0"] = "0%: the best known"
+    files = ((folder / FILE.format(name), words) for name, words in captions.items())
+    return [(file, words) for file, words in files if file.exists()]
 
 
-def nearest(chart: Chart, gap: float) -> Point | None:
+def _nearest(chart: Chart, gap: float) -> Point | None:
     """The point of a method of ours that lies nearest to a gap, or None where none lies near."""
     there = [each for each in chart.points if each.integrator in METHODS and gap / NEAR <= each.gap <= gap * NEAR]
     return min(there, key=lambda each: abs(np.log(each.gap / gap)), default=None)
 
 
-def caption(look: Look) -> str:
-    """Caption of a picture: its energy gap and its method."""
-    left = "0%" if look.gap == 0.0 else percent(look.gap, digits=2)
-    return f"{left} above the best known: {look.words}" if 0.0 < look.gap < 1.0 else f"{left}: {look.words}"
-
-
 def _solved(problem: Problem, frame: Frame, point: Point) -> tuple[np.ndarray, ...]:
-    """The positions of a point [m]."""
     [curve] = [each for each in find_curves() if each.name == point.method] or find_curves([point.integrator])[:1]
     return problem.solve(frame, replace(COLD, method=curve.method, steps=point.steps, tolerance=0.0)).points
-
-
-def _upright(up: np.ndarray) -> np.ndarray:
-    """The rotation that takes a direction to Y, shape (3, 3), as the shortest turn of the axes does."""
-    axis = int(np.abs(up).argmax())
-    y = up / np.linalg.norm(up)
-    x = np.zeros(3)
-    x[(axis + 2) % 3 if axis == 1 else 0] = 1.0
-    x -= (x @ y) * y
-    x /= np.linalg.norm(x)
-    return np.stack([x, y, np.cross(x, y)])

@@ -7,6 +7,7 @@ is measured again. All methods take a budget before any takes the next, so that 
 from __future__ import annotations
 
 import math
+import statistics
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -36,13 +37,7 @@ UPSAMPLED, SMOOTH = "plain upsampling", "Loop subdivision"
 
 @dataclass(frozen=True)
 class Curve:
-    """One line of the chart.
-
-    Attributes:
-        name: Its name in legends and tables.
-        integrator: The name in `METHODS`.
-        method: The integrator and whether it is nested.
-    """
+    """One line of the chart: its name in legends and tables, the name in `METHODS`, and the method."""
 
     name: str
     integrator: str
@@ -83,15 +78,7 @@ def budgets_of(growth: float) -> Iterator[int]:
 
 
 class CurveBench:
-    """Runs methods by budgets on frames; rows that are in the journal are not measured again.
-
-    Attributes:
-        journal: Where rows go.
-        timed: The problem in float32.
-        frames: The frames.
-        plan: Repeats, budgets and the longest time.
-        clock: Says when to stop.
-    """
+    """Runs methods by budgets on frames; rows that are in the journal are not measured again."""
 
     def __init__(
         self,
@@ -133,7 +120,7 @@ class CurveBench:
         return asdict(self._judge.judge(frame, points)) | {"apart_mm": self._solutions.apart_mm(frame, points)}
 
     def _without_physics(self) -> None:
-        """The two rows that no solver makes."""
+        """Measure the two curves that no solver makes."""
         for name, smooth in ((UPSAMPLED, False), (SMOOTH, True)):
             for frame in self.frames:
                 if self.journal.one("point", method=name, frame=frame.time):
@@ -165,28 +152,25 @@ class CurveBench:
             self._add(name, frame, solved.milliseconds, steps=steps, repeat=repeat, **about, **values)
 
     def _is_done(self, name: str, steps: int) -> bool:
-        """Whether a method's next budget would take too long, or gets nowhere."""
-        rows = self.journal.rows("point", method=name, repeat=0)
+        """Whether a method's next budget would take too long, or its last three changed next to nothing.
+
+        Where it is nearly at the gap by which methods are put in order it may take longer: else one run of a chart
+        would know its time and the next, a little slower, would not.
+        """
+        rows = [row for row in self.journal.rows("point", method=name, repeat=0) if row["steps"] <= steps]
+        budgets = sorted({row["steps"] for row in rows})[-3:]
         last = [row for row in rows if row["steps"] == steps]
         if len(last) < len(self.frames):
             return True
-        if expected_ms(rows, steps, self.plan.growth) > self.plan.most_ms * allowance(self._gap(last)):
-            return True
-        return self._is_flat(rows, steps)
-
-    def _gap(self, rows: list[dict[str, Any]]) -> float:
-        """The gap that a row of each frame leaves over all frames."""
         start, least = (sum(row[name] for row in self.journal.rows("reference")) for name in ("start", "least"))
-        return (_energy(rows) - least) / max(start - least, 1e-30)
-
-    def _is_flat(self, rows: list[dict[str, Any]], steps: int) -> bool:
-        """Whether two budgets in a row changed next to nothing."""
-        budgets = sorted({row["steps"] for row in rows if row["steps"] <= steps})[-3:]
-        if len(budgets) < 3:
-            return False
+        gap = (_energy(last) - least) / max(start - least, 1e-30)
+        longest = self.plan.most_ms * (FURTHER if JUDGED < gap < NEARLY else 1.0)
+        if _expected_ms(rows, budgets[-2:], self.plan.growth) > longest:
+            return True
         totals = [_energy([row for row in rows if row["steps"] == each]) for each in budgets]
         fall = max(_energy(self.journal.rows("point", method=UPSAMPLED)) - totals[-1], 1e-30)
-        return all(math.isfinite(total) and abs(total - totals[-1]) < FLAT * fall for total in totals)
+        flat = all(math.isfinite(total) and abs(total - totals[-1]) < FLAT * fall for total in totals)
+        return len(budgets) == 3 and flat
 
     def _add(self, name: str, frame: Frame, spent: float, **values: Any) -> None:
         self.journal.add("point", method=name, frame=frame.time, ms=round(spent, 3), **values)
@@ -196,20 +180,10 @@ def _energy(rows: list[dict[str, Any]]) -> float:
     return sum(sum(row["energies"].values()) for row in rows)
 
 
-def allowance(gap: float) -> float:
-    """How many times the longest time a method may take that has come to a gap.
-
-    More where it is nearly there: else one run of a chart would know its time and the next, a little slower, would not.
-    """
-    return FURTHER if JUDGED < gap < NEARLY else 1.0
-
-
-def expected_ms(rows: list[dict[str, Any]], steps: int, growth: float) -> float:
+def _expected_ms(rows: list[dict[str, Any]], budgets: Sequence[int], growth: float) -> float:
     """Time of the next budget [ms], on the line through the last two: some of a frame's time grows with no steps."""
-    budgets = sorted({row["steps"] for row in rows if row["steps"] <= steps})[-2:]
-    spent = [[row["ms"] for row in rows if row["steps"] == each] for each in budgets]
-    means = [sum(each) / len(each) for each in spent]
+    means = [statistics.fmean(row["ms"] for row in rows if row["steps"] == each) for each in budgets]
     if len(means) < 2:
         return means[-1]
     slope = max(means[1] - means[0], 0.0) / (budgets[1] - budgets[0])
-    return means[1] + slope * (growth - 1.0) * steps
+    return means[1] + slope * (growth - 1.0) * budgets[1]

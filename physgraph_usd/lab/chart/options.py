@@ -38,7 +38,7 @@ SPARSE = 4.0
 
 @dataclass(frozen=True)
 class Size:
-    """How much is measured.
+    """Extent of a chart.
 
     Attributes:
         minutes: Time to plan with, or None for as long as it takes.
@@ -56,11 +56,6 @@ class Size:
     reach: float
     frames: int
 
-    @property
-    def is_short(self) -> bool:
-        """Whether it is the short form."""
-        return self.reach == SHORT.reach
-
 
 SHORT = Size(SHORT_MINUTES, repeats=3, more=6, growth=2.0, reach=6.25, frames=2)
 LONG = Size(None, repeats=5, more=5, growth=1.5, reach=8.0, frames=3)
@@ -72,20 +67,18 @@ class ChartOptions:
 
     Attributes:
         frames: First and last time code that frames are taken from, or None for all of the shot.
-        garments: Prim paths, globs or collections; empty finds applied schemas.
-        colliders: Prim paths, globs or collections; empty finds applied schemas.
+        garments, colliders: Prim paths, globs or collections; empty finds applied schemas.
         level: Subdivisions; -1 chooses, None takes the stage's.
         overrides: "</Prim>.attribute=value" or "attribute=value".
         rest_frame: Time code whose points are the rest shape, "auto" for one fitted to the shot, or None.
-        device: "cpu" or "cuda".
         clock: "wall", or "cpu" to count one core's own time, which other programs do not change.
         methods: Names of `METHODS` to measure; empty takes all, on the CPU's short form but `SLOW`.
         peers: "NAME=PYTHON" for each solver outside to measure; see `peers.run.PEERS`.
         count: Frames to measure, or None for the size's own number.
-        short: Take the short size.
+        short: Whether to take the short size.
         budget_minutes: Minutes to plan with, or None.
         repeats: Measurements of each time, or None for as many as there is time for.
-        overwrite: Begin anew where another chart is.
+        overwrite: Whether to begin anew where another chart is.
         progress: Called with (fraction done, seconds left, what is being measured), or None.
     """
 
@@ -121,10 +114,14 @@ class ChartOptions:
         if self.clock not in CLOCKS or (self.clock == "cpu" and self.device != "cpu"):
             raise UsageError(f"clock '{self.clock}' on {self.device}; known: wall, and on the cpu cpu")
 
+    @property
+    def is_short(self) -> bool:
+        """Whether the chart has the short form's size."""
+        return self.short or (self.budget_minutes is not None and self.budget_minutes <= LONGEST_SHORT)
+
     def size(self) -> Size:
-        """How much is to be measured."""
-        short = self.short or (self.budget_minutes is not None and self.budget_minutes <= LONGEST_SHORT)
-        chosen = SHORT if short else LONG
+        """Extent of the chart."""
+        chosen = SHORT if self.is_short else LONG
         return replace(
             chosen,
             minutes=self.budget_minutes or chosen.minutes,
@@ -135,7 +132,7 @@ class ChartOptions:
 
     def names(self) -> tuple[str, ...]:
         """Integrators to measure; empty for all."""
-        if self.methods or self.device != "cpu" or self.size().minutes is None or not self.size().is_short:
+        if self.methods or self.device != "cpu" or not self.is_short:
             return tuple(self.methods)
         return tuple(name for name, method in METHODS.items() if method.nested is not None and name not in SLOW)
 
@@ -147,12 +144,9 @@ class ChartOptions:
 
 @dataclass(frozen=True)
 class Plan:
-    """Settings of a measurement.
+    """Settings of a measurement, a `Size` fitted into its time.
 
     Attributes:
-        frames: Number of frames.
-        repeats: Measurements of each time.
-        growth: Steps of a budget over those of the one before.
         most_ms: Time of a frame beyond which a method takes no larger budget.
         reference_seconds: Time for the least energy of one frame.
         minutes: Time that all of it takes, about.
@@ -172,7 +166,6 @@ def make_plan(
     """Fit a size into its time: fewer frames first, then shorter curves, then fewer budgets.
 
     Args:
-        size: What is wanted.
         curves: Number of methods.
         default_ms: Time of a frame by refine's default, as the chart counts it [ms].
         elapsed_ms: Wall time of such a frame and of all that goes with it [ms].
@@ -206,12 +199,15 @@ class Clock:
 
     A chart is done in the parts of `PARTS`, one after another. Within a part that says how much of it is done the bar
     goes by that, else by the time it should take; a part that takes longer slows the bar down and never stops it.
+
+    Attributes:
+        expected: Time that the chart should take [s].
     """
 
     def __init__(self, minutes: float | None, progress: Callable[[float, float, str], None] | None) -> None:
         """Start the clock with a time limit [min] or None; ``progress`` as in `ChartOptions`."""
         self._began = self._entered = time.perf_counter()
-        self._minutes, self._progress = minutes, progress
+        self._most, self._progress = math.inf if minutes is None else 60.0 * minutes, progress
         self._part, self._done, self._shown = next(iter(PARTS)), 0.0, 0.0
         self.expected = 60.0 * (minutes or 0.0)
 
@@ -223,27 +219,24 @@ class Clock:
     @property
     def late(self) -> bool:
         """Whether the present part has to end."""
-        return self._minutes is not None and self.spent > 60.0 * PARTS[self._part][1] * self._minutes
+        return self.spent > PARTS[self._part][1] * self._most
 
     @property
     def over(self) -> bool:
         """Whether no further measurement may begin."""
-        return self._minutes is not None and self.spent > 60.0 * LATEST * self._minutes
+        return self.spent > LATEST * self._most
 
     def expect(self, seconds: float) -> None:
         """Set the expected total time [s]."""
-        self.expected = seconds if self._minutes is None else min(seconds, 60.0 * self._minutes)
+        self.expected = min(seconds, self._most)
 
     def enter(self, part: str) -> None:
         """Begin a part out of `PARTS`."""
         self._part, self._done, self._entered = part, 0.0, time.perf_counter()
 
-    def part(self, done: float) -> None:
-        """Say what fraction of the present part is done."""
-        self._done = done
-
-    def say(self, what: str) -> None:
-        """Report what is being measured."""
+    def say(self, what: str, done: float | None = None) -> None:
+        """Report what is being measured, and what fraction of the present part is done, where that is known."""
+        self._done = self._done if done is None else done
         if not self._progress:
             return
         low, high = PARTS[self._part]

@@ -11,11 +11,10 @@ import plotly.graph_objects as go
 from plotly.io import to_html
 from plotly.subplots import make_subplots
 
-from ...errors import counted
 from ...shot.page.document import document, table
-from .looks import caption, looks_of
+from .looks import looks_of
 from .measure import DEFAULT, JUDGED, SMOOTH, UPSAMPLED
-from .table import Chart, Point, WarmPoint
+from .table import Chart, Point
 from .words import (
     BASELINE,
     FAR,
@@ -98,18 +97,18 @@ def _figure(chart: Chart) -> go.Figure:
     for place, (field, words) in enumerate(panels.items(), start=1):
         row = place + (warm if place > 1 else 0)
         for name in chart.methods:
-            figure.add_trace(_trace(chart, name, style[name], field=field), row=row, col=1)
+            figure.add_trace(_trace(chart, name, style[name], chart.curve(name), field=field), row=row, col=1)
         figure.update_yaxes(title_text=words, row=row, col=1)
     for name in dict.fromkeys(each.method for each in chart.warm):
-        own = style.get(name, Style(BASELINE, dashed=False))
-        figure.add_trace(_warm(chart, name, own), row=2, col=1)
-        figure.update_yaxes(title_text=panels["gap"], row=2, col=1)
+        own, points = style.get(name, Style(BASELINE, dashed=False)), [p for p in chart.warm if p.method == name]
+        figure.add_trace(_trace(chart, name, own, points, field="gap"), row=2, col=1)
     figure.update_xaxes(type="log", dtick=1, minor={"dtick": "D1", "showgrid": True})
     figure.update_xaxes(title_text="milliseconds a frame", row=1, col=1)
     figure.update_xaxes(title_text="milliseconds a frame", row=len(panels) + warm, col=1)
     figure.update_yaxes(type="log", tickvals=TICKS, tickformat="~p", row=1, col=1)
-    if warm:
-        _label_warm(figure)
+    if warm:  # it often spans less than a decade
+        figure.update_xaxes(dtick="D2", minor=None, row=2, col=1)
+        figure.update_yaxes(type="log", dtick="D2", tickformat="~p", title_text=panels["gap"], row=2, col=1)
     figure.update_layout(
         height=520 + 330 * warm + 220 * (len(panels) - 1),
         template="plotly_white",
@@ -142,40 +141,7 @@ def _add_front(figure: go.Figure, chart: Chart) -> None:
     )
 
 
-def _label_warm(figure: go.Figure) -> None:
-    """Labels at 1, 2 and 5 in the panel of warm frames, which often spans less than a decade."""
-    figure.update_xaxes(dtick="D2", minor=None, row=2, col=1)
-    figure.update_yaxes(type="log", dtick="D2", tickformat="~p", row=2, col=1)
-
-
-def _trace(chart: Chart, name: str, style: Style, *, field: str) -> go.Scatter:
-    points = chart.curve(name)
-    labels = ["<br>".join([settings(p), *figures(p, touches=bool(chart.panels))]) for p in points]
-    values = [max(p.gap, FLOOR) if field == "gap" else getattr(p, field) for p in points]
-    return _scatter(name, points, values, style, labels=labels, sign=name, spread=field == "gap")
-
-
-def _warm(chart: Chart, name: str, style: Style) -> go.Scatter:
-    points = [each for each in chart.warm if each.method == name]
-    labels = [
-        f"at most {counted(p.steps, 'step')}<br>gap {percent(p.gap)}<br>{p.ms:.1f} ms a frame (least {p.ms_least:.1f}, "
-        f"most {p.ms_most:.1f})<br>{p.inside} vertices inside, {p.tangles} edges through cloth"
-        for p in points
-    ]
-    heights = [max(p.gap, FLOOR) for p in points]
-    return _scatter(name, points, heights, style, labels=labels, sign=name, spread=True)
-
-
-def _scatter(
-    name: str,
-    points: Sequence[Point | WarmPoint],
-    heights: Sequence[float],
-    style: Style,
-    *,
-    labels: Sequence[str],
-    sign: str,
-    spread: bool,
-) -> go.Scatter:
+def _trace(chart: Chart, name: str, style: Style, points: Sequence[Point], *, field: str) -> go.Scatter:
     """One line; what a click on the method's name hides has its name for a group."""
     ms = [max(p.ms, 1e-2) for p in points]
     most = [max(p.ms_most, own) - own for p, own in zip(points, ms, strict=True)]
@@ -183,18 +149,18 @@ def _scatter(
     bars = {"type": "data", "symmetric": False, "array": most, "arrayminus": least, "thickness": 1.5, "width": 3}
     return go.Scatter(
         x=ms,
-        y=list(heights),
+        y=[max(p.gap, FLOOR) if field == "gap" else getattr(p, field) for p in points],
         name=name,
         legendgroup=name,
-        mode="markers" if sign in SIGNS else "lines+markers",
+        mode="markers" if name in SIGNS else "lines+markers",
         line={"color": style.colour, "dash": "dash" if style.dashed else "solid", "width": 2},
         marker={
-            "symbol": SIGNS.get(sign, "triangle-up" if style.outside else "circle"),
-            "size": 16 if sign == DEFAULT else 8,
+            "symbol": SIGNS.get(name, "triangle-up" if style.outside else "circle"),
+            "size": 16 if name == DEFAULT else 8,
             "color": style.colour,
         },
-        error_x=bars if spread else None,
-        customdata=list(labels),
+        error_x=bars if field == "gap" else None,
+        customdata=["<br>".join([settings(p), *figures(p, touches=bool(chart.panels))]) for p in points],
         hovertemplate=f"<b>{html.escape(name)}</b><br>%{{customdata}}<extra></extra>",
     )
 
@@ -213,20 +179,16 @@ def _legend(chart: Chart) -> str:
 
 
 def _looks(chart: Chart, folder: Path) -> str:
-    """The pictures of gaps."""
-    found = looks_of(chart, folder)
-    if not found:
-        return ""
     parts = []
-    for each in found:
-        data, words = base64.b64encode(each.file.read_bytes()).decode("ascii"), html.escape(caption(each))
+    for file, caption in looks_of(chart, folder):
+        data, words = base64.b64encode(file.read_bytes()).decode("ascii"), html.escape(caption)
         picture = f"<img alt='{words}' src='data:image/png;base64,{data}'>"
         parts.append(f"<figure>{picture}<figcaption>{words}</figcaption></figure>")
-    return f"<h2>What these percentages look like</h2><div class='looks'>{''.join(parts)}</div>"
+    title = "<h2>What these percentages look like</h2>"
+    return f"{title}<div class='looks'>{''.join(parts)}</div>" if parts else ""
 
 
 def _lead(chart: Chart) -> str:
-    """The sentences that a reader should know first."""
     sentences = [each for each in (advice(chart), warm_advice(chart)) if each]
     times = chart.times_to(JUDGED)
     if times:
@@ -238,7 +200,6 @@ def _lead(chart: Chart) -> str:
 
 
 def _terms(chart: Chart) -> str:
-    """Cost and gain of each part of the model, as a table."""
     found = changes(chart)
     if not found:
         return ""
@@ -261,7 +222,6 @@ def _terms(chart: Chart) -> str:
 
 
 def _notes(chart: Chart) -> str:
-    """How it was measured."""
     plan, longer = chart.about["plan"] or {}, chart.about.get("long_minutes")
     rows = [
         (

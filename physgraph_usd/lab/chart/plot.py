@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter, SymmetricalLogLocator
 
 from .measure import DEFAULT, JUDGED, SMOOTH, UPSAMPLED
-from .table import Chart, Point, WarmPoint
+from .table import Chart, Point
 from .words import ABOVE, BASELINE, FAR, FRONT, Change, Style, advice, changes, percent, styles, title
 
 FLOOR = 1e-4
@@ -84,8 +84,7 @@ def _curves(axes: Axes, chart: Chart, style: dict[str, Style]) -> None:
     )
     for name in chart.methods:
         points = chart.curve(name)
-        _line(axes, name, points, style[name], [max(p.gap, FLOOR) for p in points], alone=name)
-        _spread(axes, points, style[name])
+        _gaps(axes, name, points, style[name])
     axes.set(xscale="log", yscale="log", xlabel="milliseconds a frame", title="Cold frames, contact on")
     axes.set_ylabel(ABOVE)
     axes.annotate(
@@ -104,12 +103,10 @@ def _curves(axes: Axes, chart: Chart, style: dict[str, Style]) -> None:
 
 
 def _warm(axes: Axes, chart: Chart, style: dict[str, Style]) -> None:
-    """Plot energy gap against time [s] for warm-started frames."""
+    """Gap against time for frames that begin where the last one ended."""
     for name in dict.fromkeys(each.method for each in chart.warm):
-        points = sorted((each for each in chart.warm if each.method == name), key=lambda each: each.steps)
-        drawn = style.get(name, Style(BASELINE, dashed=False))
-        _line(axes, name, points, drawn, [max(p.gap, FLOOR) for p in points], alone=name)
-        _spread(axes, points, drawn)
+        points = [each for each in chart.warm if each.method == name]
+        _gaps(axes, name, points, style.get(name, Style(BASELINE, dashed=False)))
     axes.set(xscale="log", yscale="log", xlabel="milliseconds a frame", title="Warm frames")
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     least, most = min(p.ms_least for p in chart.warm), max(p.ms_most for p in chart.warm)
@@ -118,33 +115,24 @@ def _warm(axes: Axes, chart: Chart, style: dict[str, Style]) -> None:
     axes.axhline(JUDGED, color="#b0b0b0", linewidth=0.8, linestyle=":")
 
 
-def _spread(axes: Axes, points: Sequence[Point | WarmPoint], style: Style) -> None:
-    """The fastest and the slowest turn of each point."""
+def _gaps(axes: Axes, name: str, points: Sequence[Point], style: Style) -> None:
+    """Gaps of a method against time, with the fastest and the slowest turn of each point."""
+    _line(axes, name, points, style, [max(p.gap, FLOOR) for p in points])
     for point in points:
         ends = [max(each, 1e-2) for each in (point.ms_least, max(point.ms_most, point.ms_least))]
         axes.plot(ends, [max(point.gap, FLOOR)] * 2, color=style.colour, linewidth=3.2, alpha=0.3, zorder=1.5)
 
 
-def _line(
-    axes: Axes,
-    name: str,
-    points: Sequence[Point | WarmPoint],
-    style: Style,
-    heights: list[float],
-    *,
-    alone: str = "",
-) -> None:
-    """Plot the curve of a method, labelled by its name."""
-    own = alone or name
+def _line(axes: Axes, name: str, points: Sequence[Point], style: Style, heights: list[float]) -> None:
     axes.plot(
         [max(p.ms, 1e-2) for p in points],
         heights,
         color=style.colour,
-        linestyle="" if own in ONE_POINT else "--" if style.dashed else "-",
-        marker=ONE_POINT.get(own, "^" if style.outside else "o"),
-        markersize=11 if own == DEFAULT else 5 if own in ONE_POINT or style.outside else 3,
+        linestyle="" if name in ONE_POINT else "--" if style.dashed else "-",
+        marker=ONE_POINT.get(name, "^" if style.outside else "o"),
+        markersize=11 if name == DEFAULT else 5 if name in ONE_POINT or style.outside else 3,
         linewidth=1.4,
-        zorder=5 if own == DEFAULT else 2,
+        zorder=5 if name == DEFAULT else 2,
         label=name,
         clip_on=False,
     )
@@ -169,7 +157,6 @@ def _measure(axes: Axes, name: str, words: str, *, chart: Chart, style: dict[str
 
 
 def _terms(panels: Any, steps: list[Change]) -> None:
-    """Cost and gain of each part of the model."""
     places = list(range(len(steps)))[::-1]
     cost, buys, words = panels
     for axes, values, colour, digits in (

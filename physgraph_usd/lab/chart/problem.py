@@ -16,7 +16,6 @@ import torch
 from ...shot.options import RefineOptions
 from ...solver.contact.settings import ContactSettings
 from ...solver.forces.base import ForceModule
-from ...solver.frame.group import Group
 from ...solver.frame.refiner import Refiner
 from ...solver.frame.settings import SolveSettings
 from ...solver.frame.solve import solve_frame
@@ -63,7 +62,7 @@ class Judgement:
 
 @dataclass(frozen=True, eq=False)
 class Solved:
-    """One frame, solved.
+    """A solved frame.
 
     Attributes:
         points: Fine world positions [m] of each garment.
@@ -81,13 +80,7 @@ class Solved:
 
 
 class Problem:
-    """The frames of a scene with the solver's levels built, in one precision.
-
-    Attributes:
-        scene: The scene.
-        refiner: The solver.
-        has_bodies: Whether a garment may touch something.
-    """
+    """The frames of a scene with the solver's levels built, in one precision."""
 
     def __init__(
         self,
@@ -106,7 +99,6 @@ class Problem:
             levels: Subdivisions of each garment.
             device: "cpu" or a CUDA device.
             threads: Most threads of a kernel.
-            dtype: Scalar type of the solve.
             clock: "wall", or "cpu" to count the processor's time alone.
         """
         self._clock = clock
@@ -114,7 +106,6 @@ class Problem:
         scene = replace(scene, garments=garments)
         self.scene = scene
         self.refiner = Refiner(scene, DEFAULT, levels=levels, dtype=dtype, device=device, threads=threads)
-        self.has_bodies = any(garment.colliders for garment in garments)
 
     @property
     def vertex_count(self) -> int:
@@ -193,13 +184,17 @@ def judge(refiner: Refiner, frame: Frame, points: Sequence[np.ndarray]) -> Judge
     for part in refiner.parts_of(frame):
         group = refiner.group_of(part)
         joined = np.concatenate([points[index] for index in part])
-        terms, strain, contact = _judge_part(group, refiner, frame, part=part, points=joined)
-        for name, value in terms.items():
+        module, touching, origin = group.potential([frame.garments[i] for i in part], refiner.touching(part, frame))
+        finest = group.levels[-1]
+        x = torch.as_tensor(joined - origin, dtype=finest.dtype, device=finest.device)
+        touched = () if touching is None else touching.at(finest).terms(x)
+        for name, value in ForceModule((*module.forces, *touched)).energies(x).items():
             energies[name] += value
-        strains.append(strain)
+        strains.append(edge_strain(finest, x)["p99"])
+        contact: dict[str, Any] = {} if touching is None else touching.measure(x)[0]
         bodies += [body["after"] for body in contact.get("bodies", {}).values()]
         tangles += contact.get("cloth", {}).get("after", {}).get("crossings", 0)
-        count += group.levels[-1].vertex_count
+        count += finest.vertex_count
     inside = sum(body["inside"] for body in bodies)
     return Judgement(
         energies=dict(energies),
@@ -210,19 +205,6 @@ def judge(refiner: Refiner, frame: Frame, points: Sequence[np.ndarray]) -> Judge
         crossings=sum(body["crossings"] for body in bodies),
         tangles=tangles,
     )
-
-
-def _judge_part(
-    group: Group, refiner: Refiner, frame: Frame, *, part: tuple[int, ...], points: np.ndarray
-) -> tuple[dict[str, float], float, dict[str, Any]]:
-    """Energies [J], strain and contact of garments that are solved together."""
-    frames = [frame.garments[index] for index in part]
-    module, contact, origin = group.potential(frames, refiner.touching(part, frame))
-    finest = group.levels[-1]
-    x = torch.as_tensor(points - origin, dtype=finest.dtype, device=finest.device)
-    touched = () if contact is None else contact.at(finest).terms(x)
-    energies = ForceModule((*module.forces, *touched)).energies(x)
-    return energies, edge_strain(finest, x)["p99"], {} if contact is None else contact.measure(x)[0]
 
 
 OVER_FRAMES: dict[str, Callable[..., Any]] = {

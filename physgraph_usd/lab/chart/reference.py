@@ -92,7 +92,7 @@ class Reference:
         return replace(self, least=energy, by=by, apart=apart, energies=energies, points=())
 
     def __str__(self) -> str:
-        """Phi*, the method that found Phi*, and the gap to the next best method."""
+        """Phi* [mJ], the method that found Phi*, and the gap to the next best method."""
         other = "nobody else looked" if self.apart is None else f"the next best ends {self.apart:.2%} of the fall above"
         return f"Phi* {1e3 * self.least:.5g} mJ by {self.by}; {other}"
 
@@ -161,12 +161,6 @@ class _Descent:
         return self
 
 
-def _finalists(runs: Sequence[_Descent]) -> list[_Descent]:
-    """The best of all and the best of each beginning: what a search that ends earlier goes on from is among them."""
-    led = (run for k, run in enumerate(runs) if sum(each.energy < run.energy for each in runs[:k]) < FINALISTS)
-    return sorted(led, key=lambda run: run.energy)
-
-
 def find_reference(
     problem: Problem, frame: Frame, *, settings: SolveSettings = COLD, seconds: float = math.inf, short: bool = False
 ) -> Reference:
@@ -188,7 +182,9 @@ def find_reference(
         descent = _Descent(problem, frame, settings, start=start)
         descent.go_on(f"{method[0]}, {counted(method[1], 'step')}", method, most=1)
         runs.append(descent.go_on(", and on", ON, most=ROUNDS, until=began + DESCENT * seconds))
-    for each in _finalists(runs):
+    # The best of all and the best of each beginning: what a search that ends earlier goes on from is among them.
+    led = (run for k, run in enumerate(runs) if sum(each.energy < run.energy for each in runs[:k]) < FINALISTS)
+    for each in sorted(led, key=lambda run: run.energy):
         each.go_on(", and on", ON, most=MORE, until=began + seconds)
         each.go_on(", and Newton", NEWTON, most=POLISHES, until=began + seconds)
     best, *others = sorted(runs, key=lambda run: run.energy)

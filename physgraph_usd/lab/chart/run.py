@@ -49,12 +49,7 @@ def chart_shot(shot: str | Path, folder: str | Path, options: ChartOptions = DEF
 
     Args:
         shot: The stage to read; never edited.
-        folder: Where the chart goes; one that was begun there goes on.
-        options: What to measure and how much.
-
-    Returns:
-        The chart. Written are ``chart.png``, ``chart.svg``, ``chart.html``, ``chart.csv`` and ``chart.json``, and
-        ``chart.rows.jsonl`` with every single measurement.
+        folder: Where `WRITTEN` and the rows of all measurements go; a chart that was begun there goes on.
 
     Raises:
         UsageError: An option is wrong, or the folder holds the chart of another shot.
@@ -126,13 +121,14 @@ def _measure(opened: Shot, folder: Path, options: ChartOptions) -> Chart:
     bench = CurveBench(journal, problems, frames, plan=plan, clock=clock, solutions=solutions)
     bench.measure(curves)
     measure_peers(bench, parse_peers(options.peers), clock_name=options.clock)
-    row = tuple(_frame(opened, time) for time in _row_up_to(opened, frames[-1].time))
+    times: list[float | None] = list(opened.scene.times)
+    end = times.index(frames[-1].time) + 1 if times else 0
+    row = tuple(_frame(opened, time) for time in times[max(0, end - RUN) : end])
     clock.enter("warm")
     measure_warm(journal, problems, row[-ROW:], clock)
     measure_terms(journal, TermBench(*problems, opened.scene, levels, frames=frames, row=row, build=build), clock)
     chart = collate(journal)
-    clock.part(1.0)
-    clock.say("pictures")
+    clock.say("pictures", 1.0)
     draw_looks(chart, problems[0], frames[-1], solutions.points(frames[-1].time), folder)
     return chart
 
@@ -195,9 +191,3 @@ def _times(opened: Shot, count: int) -> list[float | None]:
         return [None]
     picks = np.unique(np.linspace(0, len(times) - 1, min(count, len(times)) + 1).round().astype(int)[1:])
     return [times[i] for i in picks]
-
-
-def _row_up_to(opened: Shot, time: float | None) -> list[float | None]:
-    """Frames in a row that end at a time code."""
-    times: list[float | None] = list(opened.scene.times)
-    return times[max(0, times.index(time) + 1 - RUN) : times.index(time) + 1] if time in times else []

@@ -36,7 +36,7 @@ LIKENESS = {"strain": "edge strain, 99th percentile", "apart_mm": "distance from
 
 @dataclass(frozen=True)
 class Point:
-    """A method with one budget.
+    """A method with one budget, on frames that start cold or in a row of frames, each begun where the last one ended.
 
     Attributes:
         method: The curve's name.
@@ -52,13 +52,8 @@ class Point:
         gap: (Phi - Phi*) / (Phi0 - Phi*), both summed over the frames.
         energy: Phi, mean over the frames [J].
         energies: Phi by term [J].
-        strain: The edges' 99th percentile, the worst frame's.
-        inside: Vertices inside bodies, summed over the frames.
-        percent: Their fraction of all vertices [%].
-        deepest_mm: Depth of the deepest [mm].
-        crossings: Edges through faces, of cloth and bodies, summed over the frames.
-        tangles: Edges of cloth through faces of cloth, summed over the frames.
-        frames: Number of frames.
+        strain, inside, percent, deepest_mm, crossings, tangles: As for `Judgement`, over the frames by `OVER_FRAMES`.
+        frames: Number of frames that are judged: all of them, or the last of a row.
         repeats: Number of times that the time was taken.
         note: How much of the problem a solver outside was given, "" for ours.
         apart_mm: RMS distance from the reference's positions [mm], mean over the frames; None where they are not known.
@@ -84,36 +79,9 @@ class Point:
     tangles: int
     frames: int
     repeats: int
-    note: str = ""
-    apart_mm: float | None = None
-    ms_most: float = 0.0
-
-
-@dataclass(frozen=True)
-class WarmPoint:
-    """A method with one budget, in frames that begin where the last one ended.
-
-    Attributes:
-        method: Refine's default, or the integrator's name.
-        steps: Most steps a frame.
-        ms: Milliseconds a frame: `typical` over the repeats.
-        ms_least: Milliseconds of the fastest repeat.
-        ms_most: Milliseconds of the slowest repeat.
-        gap: As for `Point`, of the last frame in the row.
-        inside: Vertices inside bodies there.
-        tangles: Edges of cloth through faces of cloth there.
-        repeats: Number of times that the time was taken.
-    """
-
-    method: str
-    steps: int
-    ms: float
-    ms_least: float
+    note: str
+    apart_mm: float | None
     ms_most: float
-    gap: float
-    inside: int
-    tangles: int
-    repeats: int
 
 
 @dataclass(frozen=True)
@@ -126,7 +94,7 @@ class Chart:
         references: Per frame, Phi0, Phi*, who found it and how far the next best ended above it.
         terms: What each term, the last frame's detail and each level cost and buy.
         failed: Runs that ended in an error.
-        warm: Methods in frames that begin where the last one ended.
+        warm: Methods in rows of frames that begin where the last one ended.
     """
 
     about: dict[str, Any]
@@ -134,7 +102,7 @@ class Chart:
     references: tuple[dict[str, Any], ...]
     terms: tuple[dict[str, Any], ...]
     failed: tuple[dict[str, Any], ...]
-    warm: tuple[WarmPoint, ...] = ()
+    warm: tuple[Point, ...]
 
     @property
     def methods(self) -> tuple[str, ...]:
@@ -184,8 +152,18 @@ class Chart:
         return tuple(best)
 
     def time_to(self, method: str, gap: float) -> float | None:
-        """`quickest` of a method."""
-        return quickest([(point.ms, point.gap) for point in self.curve(method)], gap)
+        """Milliseconds that a method needs to a gap, between its budgets by powers; None where it never gets there."""
+        best: list[Point] = []
+        for point in self.curve(method):
+            if not best or point.gap < best[-1].gap:
+                best.append(point)
+        if best and best[0].gap <= gap:
+            return best[0].ms
+        for last, point in pairwise(best):
+            if point.gap <= gap:
+                part = math.log(last.gap / gap) / math.log(last.gap / max(point.gap, TINY))
+                return last.ms * (point.ms / last.ms) ** part
+        return None
 
     def times_to(self, gap: float) -> dict[str, float]:
         """Milliseconds to a gap of the methods that get there, the fastest first."""
@@ -205,15 +183,17 @@ class Chart:
     def to_dict(self) -> dict[str, Any]:
         """The chart as plain values."""
         times = {f"{gap:g}": self.times_to(gap) for gap in GAPS}
-        plain = asdict(self) | {"points": [asdict(point) for point in self.points]}
-        return {"default": self.default_place(), "milliseconds_to_gap": times, **plain}
+        return {"default": self.default_place(), "milliseconds_to_gap": times, **asdict(self)}
 
     def write(self, folder: Path) -> None:
         """Write ``chart.json`` and ``chart.csv``."""
         (folder / "chart.json").write_text(to_json(self.to_dict()) + "\n", encoding="utf-8")
         terms = sorted({name for point in self.points for name in point.energies})
         with (folder / "chart.csv").open("w", encoding="utf-8", newline="") as file:
-            rows = [_flat(point, terms) for name in self.methods for point in self.curve(name)]
+            rows = [asdict(point) for name in self.methods for point in self.curve(name)]
+            for row in rows:
+                energies = row.pop("energies")
+                row |= {f"{name}_joules": energies.get(name, "") for name in terms}
             writer = csv.DictWriter(file, list(rows[0]) if rows else ["method"])
             writer.writeheader()
             writer.writerows(rows)
@@ -245,24 +225,6 @@ class Chart:
             yield f"the long form would take about {longer:.0f} minutes here"
 
 
-def quickest(points: Sequence[tuple[float, float]], gap: float) -> float | None:
-    """Milliseconds that a method needs to a gap, between its budgets by powers; None where it never gets there.
-
-    Its points are milliseconds and gap of each budget, the smallest first.
-    """
-    best: list[tuple[float, float]] = []
-    for point in points:
-        if not best or point[1] < best[-1][1]:
-            best.append(point)
-    if best and best[0][1] <= gap:
-        return best[0][0]
-    for (ms, above), (more, below) in pairwise(best):
-        if below <= gap:
-            part = math.log(above / gap) / math.log(above / max(below, TINY))
-            return ms * (more / ms) ** part
-    return None
-
-
 def typical(times: Sequence[float]) -> float:
     """Median of the faster half: whatever else a machine does only ever adds to a time."""
     return statistics.median(sorted(times)[: -(-len(times) // 2)])
@@ -270,51 +232,35 @@ def typical(times: Sequence[float]) -> float:
 
 def collate(journal: Journal) -> Chart:
     """Put a journal's rows together."""
-    rows = journal.rows("point")
+    cold, warm = journal.rows("point"), journal.rows("warm")
     found = {row["frame"]: Reference.of(row) for row in journal.rows("reference")}
-    for row in rows:
+    for row in (*cold, *warm):
         if row["frame"] in found and "energies" in row:
-            by = f"{row['method']}, {counted(row['steps'], 'step')}"
+            by = f"{row['method']}, {counted(row['steps'], 'step')}" + (", warm" if row["row"] == "warm" else "")
             found[row["frame"]] = found[row["frame"]].lowered(row["energies"], by)
-    warm = journal.rows("warm")
-    for row in warm:
-        if row["frame"] in found and "energies" in row:
-            by = f"{row['method']}, {counted(row['steps'], 'step')}, warm"
-            found[row["frame"]] = found[row["frame"]].lowered(row["energies"], by)
-    keys = dict.fromkeys((row["method"], row["steps"]) for row in rows)
-    points = [_point([r for r in rows if (r["method"], r["steps"]) == key], found) for key in keys]
+    last = {row["frame"]: found[row["frame"]] for row in warm if row["frame"] in found}
     plan = journal.one("plan") or {}
     about = journal.rows("problem")[0]["problem"] | {name: plan.get(name) for name in ("plan", "long_minutes")}
-    about["waited"] = sum(r.get("waited") or 0.0 for r in rows) / max(sum(r.get("elapsed", 0.0) for r in rows), TINY)
+    about["waited"] = sum(r.get("waited") or 0.0 for r in cold) / max(sum(r.get("elapsed", 0.0) for r in cold), TINY)
     terms, failed = (
         tuple({name: value for name, value in row.items() if name != "row"} for row in journal.rows(kind))
         for kind in ("term", "failed")
     )
     references = tuple({"frame": frame, **each.plain()} for frame, each in found.items())
-    whole = tuple(point for point in points if point is not None)
-    return Chart(about, whole, references, terms, failed, _warm(warm, found))
+    in_rows = sorted(_points(warm, last), key=lambda point: (point.method, point.steps))
+    return Chart(about, tuple(_points(cold, found)), references, terms, failed, tuple(in_rows))
 
 
-def _warm(rows: Sequence[dict[str, Any]], references: dict[Any, Reference]) -> tuple[WarmPoint, ...]:
-    """The points of warm frames."""
-    found = []
-    for method, steps in dict.fromkeys((row["method"], row["steps"]) for row in rows):
-        own = [row for row in rows if (row["method"], row["steps"]) == (method, steps)]
-        judged = next((row for row in own if "energies" in row), None)
-        if judged is None or judged["frame"] not in references:
-            continue
-        times = [row["ms"] for row in own]
-        gap = references[judged["frame"]].gap(sum(judged["energies"].values()))
-        spread = (typical(times), min(times), max(times))
-        found.append(WarmPoint(method, steps, *spread, gap, judged["inside"], judged["tangles"], len(times)))
-    return tuple(sorted(found, key=lambda each: (each.method, each.steps)))
+def _points(rows: Sequence[dict[str, Any]], references: dict[Any, Reference]) -> Iterator[Point]:
+    """The point of each method at each budget for which all frames were measured."""
+    for key in dict.fromkeys((row["method"], row["steps"]) for row in rows):
+        own = [row for row in rows if (row["method"], row["steps"]) == key]
+        if {row["frame"] for row in own if "energies" in row} == set(references):
+            yield _point(own, references)
 
 
-def _point(rows: Sequence[dict[str, Any]], references: dict[Any, Reference]) -> Point | None:
-    """The point of one method at one budget; None if a frame was not measured."""
+def _point(rows: Sequence[dict[str, Any]], references: dict[Any, Reference]) -> Point:
     judged = {row["frame"]: row for row in rows if "energies" in row}
-    if set(judged) != set(references):
-        return None
     times = [[row["ms"] for row in rows if row["frame"] == frame] for frame in judged]
     first, values = rows[0], list(judged.values())
     energies = {name: statistics.fmean(v["energies"].get(name, 0.0) for v in values) for name in values[0]["energies"]}
@@ -326,7 +272,7 @@ def _point(rows: Sequence[dict[str, Any]], references: dict[Any, Reference]) -> 
         integrator=first.get("integrator", ""),
         nested=first.get("nested"),
         steps=first["steps"],
-        made=statistics.fmean(v["made"] for v in values),
+        made=statistics.fmean(v.get("made", v["steps"]) for v in values),
         tolerance=first.get("tolerance", 0.0),
         ms=statistics.fmean(typical(each) for each in times),
         ms_median=statistics.fmean(statistics.median(each) for each in times),
@@ -342,10 +288,3 @@ def _point(rows: Sequence[dict[str, Any]], references: dict[Any, Reference]) -> 
         note=first.get("note", ""),
         apart_mm=statistics.fmean(apart) if len(apart) == len(values) else None,
     )
-
-
-def _flat(point: Point, terms: Sequence[str]) -> dict[str, Any]:
-    """One line of the CSV."""
-    values = asdict(point)
-    energies = values.pop("energies")
-    return values | {f"{name}_joules": energies.get(name, "") for name in terms}

@@ -31,24 +31,12 @@ Points = tuple[np.ndarray, ...]
 
 @dataclass(frozen=True)
 class Without:
-    """One thing left out of the model.
-
-    Attributes:
-        term: Its name.
-        scene: Leaves it out of the scene.
-        garment: Leaves it out of a garment's values.
-        settings: Leaves it out of the solve.
-    """
+    """One thing left out of the model: of the scene, of each garment's values or of the solve."""
 
     term: str
     scene: Callable[[Scene], Scene] | None = None
     garment: Callable[[GarmentFrame], GarmentFrame] | None = None
     settings: Callable[[SolveSettings], SolveSettings] | None = None
-
-    @property
-    def same_problem(self) -> bool:
-        """Whether only the settings differ."""
-        return self.scene is None and self.garment is None
 
 
 TERMS = (
@@ -64,13 +52,11 @@ TERMS = (
 
 @dataclass(frozen=True, eq=False)
 class TermBench:
-    """Bench on which the terms are measured.
+    """Problems, frames and levels that the terms are measured on.
 
     Attributes:
         timed: The problem in float32.
         judge: The problem in float64.
-        scene: The scene.
-        levels: Subdivisions of each garment.
         frames: Frames that stand alone.
         row: Frames in a row, oldest first.
         build: Makes a problem in float32 from a scene and levels.
@@ -88,7 +74,7 @@ class TermBench:
     def terms(self) -> tuple[Without, ...]:
         """Those that the scene has."""
         sheared = any(garment.fabric.has_membrane for garment in self.frames[0].garments)
-        absent = {"membrane": not sheared, "contact": not self.timed.has_bodies}
+        absent = {"membrane": not sheared, "contact": not any(garment.colliders for garment in self.scene.garments)}
         absent["gravity"] = not self.scene.gravity.any()
         return tuple(each for each in TERMS if not absent.get(each.term))
 
@@ -116,12 +102,11 @@ def measure_terms(journal: Journal, bench: TermBench, clock: Clock) -> None:
         tasks += [(name, "time", partial(_one_row, bench, name)) for name in ("tether", "warm")]
     clock.enter("terms")
     for number, (name, kind, measured) in enumerate(tasks):
-        clock.part(number / len(tasks))
         if clock.over:
             return
         if journal.one("term", term=name):
             continue
-        clock.say(f"what {name} costs and buys")
+        clock.say(f"what {name} costs and buys", number / len(tasks))
         try:
             journal.add("term", term=name, kind=kind, **measured())
         except SolveError as error:
@@ -130,10 +115,13 @@ def measure_terms(journal: Journal, bench: TermBench, clock: Clock) -> None:
 
 def _one_term(bench: TermBench, without: Without) -> dict[str, Any]:
     """Solve with and without a term, turn by turn."""
-    scene = without.scene(bench.scene) if without.scene else bench.scene
-    other = bench.timed if without.same_problem else bench.build(scene, bench.levels)
-    settings = without.settings(COLD) if without.settings else COLD
-    frames = [with_garments(f, without.garment) if without.garment else f for f in bench.frames]
+    other, frames, settings = bench.timed, bench.frames, COLD
+    if without.settings:
+        settings = without.settings(COLD)
+    else:
+        other = bench.build(without.scene(bench.scene) if without.scene else bench.scene, bench.levels)
+    if without.garment:
+        frames = [with_garments(frame, without.garment) for frame in frames]
     sides = {"with": (bench.timed, bench.frames, COLD), "without": (other, frames, settings)}
     spent: dict[str, list[float]] = {name: [] for name in sides}
     points: dict[str, Sequence[Points]] = {}
@@ -145,26 +133,36 @@ def _one_term(bench: TermBench, without: Without) -> dict[str, Any]:
 
 
 def _one_level(bench: TermBench, level: int) -> dict[str, Any]:
-    """Solve no finer than a level, and carry the result to the finest one."""
+    """Solve no finer than a level, and carry the result to the finest one by the linear map."""
     levels = [min(level, each) for each in bench.levels]
     other = bench.timed if tuple(levels) == bench.levels else bench.build(bench.scene, levels)
     turns = [_solved(other, bench.frames, COLD) for _ in range(REPEATS + 1)]
-    fine = [_carried_up(bench, each, levels) for each in turns[-1][1]]
+    above = [chain[each:] for chain, each in zip(bench.timed.refiner.refinements, levels, strict=True)]
+    fine = [
+        tuple(reduce(lambda x, step: np.asarray(step.linear @ x), chain, x) for chain, x in zip(above, p, strict=True))
+        for p in turns[-1][1]
+    ]
     full = _solved(bench.timed, bench.frames, COLD)[1]
     values = {"ms": typical([ms for ms, _ in turns[1:]]), "vertices": other.vertex_count}
     return {"without": bench.judged(fine, bench.frames) | values, "moved_mm": _moved(full, fine)}
 
 
 def _one_row(bench: TermBench, temporal: str) -> dict[str, Any]:
-    """Solve frames in a row with what a frame takes over from the last one, and each alone."""
+    """Solve frames in a row with what a frame takes over from the last one, and each alone.
+
+    A row's jerk is the RMS third difference of its detail, in fine edge lengths.
+    """
     points: dict[str, Sequence[Points]] = {}
     values: dict[str, dict[str, float]] = {}
+    flat = np.stack([np.concatenate(bench.timed.upsampled(frame, smooth=False)) for frame in bench.row])
+    spacing = np.concatenate(bench.timed.spacing(bench.row[0]))[:, None]
     for name, settings in (("with", replace(COLD, temporal=temporal)), ("without", COLD)):
         bench.timed.refiner.use(settings)
         solved = [bench.timed.next(frame) for frame in bench.row]
         points[name] = [each.points for each in solved]
-        spent = typical([each.milliseconds for each in solved[1:]])
-        values[name] = {"ms": spent, "jerk": _jerk(bench, points[name])}
+        third = np.diff(np.stack([np.concatenate(each) for each in points[name]]) - flat, n=3, axis=0) / spacing
+        jerk = float(np.sqrt(np.square(third).sum(axis=2).mean()))
+        values[name] = {"ms": typical([each.milliseconds for each in solved[1:]]), "jerk": jerk}
     return bench.compared(points, bench.row, values)
 
 
@@ -174,23 +172,6 @@ def _solved(problem: Problem, frames: Sequence[Frame], settings: SolveSettings) 
     return sum(each.milliseconds for each in solved) / len(solved), [each.points for each in solved]
 
 
-def _carried_up(bench: TermBench, points: Points, levels: Sequence[int]) -> Points:
-    """Positions at a level taken to the finest one by the linear map [m]."""
-    chains = zip(bench.timed.refiner.refinements, points, levels, strict=True)
-    return tuple(reduce(lambda x, step: np.asarray(step.linear @ x), chain[level:], x) for chain, x, level in chains)
-
-
 def _moved(a: Sequence[Points], b: Sequence[Points]) -> float:
     """RMS distance between two results [mm]."""
     return rms_mm([points for each in a for points in each], [points for each in b for points in each])
-
-
-def _jerk(bench: TermBench, points: Sequence[Points]) -> float:
-    """RMS third difference of the detail over frames in a row, in fine edge lengths."""
-    detail = [
-        np.concatenate([p - q for p, q in zip(each, bench.timed.upsampled(frame, smooth=False), strict=True)])
-        for each, frame in zip(points, bench.row, strict=True)
-    ]
-    spacing = np.concatenate(bench.timed.spacing(bench.row[0]))
-    third = np.diff(np.stack(detail), n=3, axis=0) / spacing[:, None]
-    return float(np.sqrt(np.square(third).sum(axis=2).mean()))

@@ -43,13 +43,15 @@ def measure_warm(journal: Journal, problems: tuple[Problem, Problem], row: Seque
                 continue
             if clock.late:
                 return
-            clock.part((repeat * len(runs) + number) / (REPEATS * len(runs)))
-            clock.say(f"warm frames, {name}, {counted(steps, 'step')}, turn {repeat + 1} of {REPEATS}")
+            words = f"warm frames, {name}, {counted(steps, 'step')}, turn {repeat + 1} of {REPEATS}"
+            clock.say(words, (repeat * len(runs) + number) / (REPEATS * len(runs)))
             timed.refiner.use(settings)
             try:
                 solved = [timed.next(frame) for frame in row]
             except SolveError:
                 continue
             values: dict[str, Any] = {} if repeat else asdict(judge.judge(row[-1], solved[-1].points))
+            values |= {} if name == AUTO else {"integrator": name, "nested": settings.method.nested}
             spent = [each.milliseconds for each in solved[1:]]
-            journal.add("warm", repeat=repeat, ms=round(typical(spent), 3), **key, **values)
+            made = {"made": solved[-1].steps, "tolerance": settings.tolerance}
+            journal.add("warm", repeat=repeat, ms=round(typical(spent), 3), **key, **made, **values)

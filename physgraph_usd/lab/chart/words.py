@@ -25,7 +25,6 @@ class Change:
     """Cost and gain of a part of the model.
 
     Attributes:
-        name: The part.
         cost_ms: Time of a frame with it less that without [ms].
         fraction: That cost over the time with it.
         moved_mm: RMS distance between the results [mm].
@@ -41,13 +40,7 @@ class Change:
 
 @dataclass(frozen=True)
 class Style:
-    """How a curve is drawn.
-
-    Attributes:
-        colour: As "#rrggbb".
-        dashed: Whether the curve is broken: the method as it is not used by default.
-        outside: Whether a solver outside drew it.
-    """
+    """How a curve is drawn: broken where the method is as it is not used by default."""
 
     colour: str
     dashed: bool
@@ -122,8 +115,11 @@ def warm_advice(chart: Chart) -> str:
 
 def settings(point: Point) -> str:
     """Settings that a point was solved with."""
-    if point.method == DEFAULT:
-        return f"at most {counted(point.steps, 'step')} at the finest level, tolerance {point.tolerance:g} edge lengths"
+    if point.tolerance:
+        words = (
+            f"at most {counted(point.steps, 'step')} at the finest level, tolerance {point.tolerance:g} edge lengths"
+        )
+        return f"{point.integrator}, {words}" if point.integrator else words
     if not point.integrator:
         return "no physics"
     where = "nested" if point.nested else "finest level only"
@@ -152,21 +148,29 @@ def figures(point: Point, *, touches: bool) -> list[str]:
 
 def changes(chart: Chart) -> list[Change]:
     """Changes of the energy by each measured part of the model, and by each level."""
-    fall = sum(each["start"] - each["least"] for each in chart.references)
+    fall = max(sum(each["start"] - each["least"] for each in chart.references), 1e-12)
     least = sum(each["least"] for each in chart.references)
-    rows = [each for each in chart.terms if "failed" not in each]
-    terms = [_term(each, fall, least) for each in rows if each["kind"] != "level"]
-    return terms + _levels([each for each in rows if each["kind"] == "level"], fall, least)
+    found, levels, before, apart = list[Change](), list[Change](), 0.0, None
+    for row in (each for each in chart.terms if "failed" not in each):
+        without = row["without"]
+        gap = f"gap {percent((without['energy'] - least) / fall)}"
+        if row["kind"] != "level":
+            found.append(_term(row, gap))
+            continue
+        cost = without["ms"] - before
+        moved = 0.0 if apart is None else max(apart - row["moved_mm"], 0.0)
+        name = f"{row['term']} ({without['vertices']:,} vertices)"
+        levels.append(Change(name, cost, cost / max(without["ms"], 1e-9), moved, f"as the last one {gap}"))
+        before, apart = without["ms"], row["moved_mm"]
+    return found + levels
 
 
-def _term(row: dict[str, Any], fall: float, least: float) -> Change:
+def _term(row: dict[str, Any], gap: str) -> Change:
     full, other = row["with"], row["without"]
+    name, worse = row["term"], [gap]
     if row["kind"] == "time":
-        name = {"tether": "tether to the last frame", "warm": "start from the last frame"}[row["term"]]
+        name = {"tether": "tether to the last frame", "warm": "start from the last frame"}[name]
         worse = [f"jerk {other['jerk']:.3g} edges (with it {full['jerk']:.3g})"]
-    else:
-        name = row["term"]
-        worse = [f"gap {percent((other['energy'] - least) / max(fall, 1e-12))}"]
     worse += [
         f"{key} {other[key]} ({full[key]})" for key in ("inside", "crossings", "tangles") if full[key] != other[key]
     ]
@@ -174,16 +178,3 @@ def _term(row: dict[str, Any], fall: float, least: float) -> Change:
     if row["moved_mm"] > FAR:
         worse = ["the cloth falls away"]
     return Change(name, cost, cost / max(full["ms"], 1e-9), row["moved_mm"], "without it " + ", ".join(worse))
-
-
-def _levels(rows: list[dict[str, Any]], fall: float, least: float) -> list[Change]:
-    found, before, apart = [], 0.0, None
-    for row in rows:
-        last = row["without"]
-        gap = percent((last["energy"] - least) / max(fall, 1e-12))
-        cost = last["ms"] - before
-        moved = 0.0 if apart is None else max(apart - row["moved_mm"], 0.0)
-        name = f"{row['term']} ({last['vertices']:,} vertices)"
-        found.append(Change(name, cost, cost / max(last["ms"], 1e-9), moved, f"as the last one gap {gap}"))
-        before, apart = last["ms"], row["moved_mm"]
-    return found

@@ -21,7 +21,6 @@ PAPER = "physgraph-paper"
 
 
 def _paper() -> Guard:
-    """The paper's network with the weights that ship, guarded."""
     return Guard(LearnedPaper(shipped_network(PAPER)))
 
 

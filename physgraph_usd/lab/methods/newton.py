@@ -41,7 +41,6 @@ class Newton:
         return Carry(x, energy, force, system.apply_metric_inverse(force), self.name)
 
     def _direction(self, system: System, carry: Carry) -> Tensor:
-        """Approximate H^-1 F."""
         residual = carry.force
         image = system.apply_metric_inverse(residual)
         search = image

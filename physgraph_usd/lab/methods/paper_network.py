@@ -134,7 +134,6 @@ def _updated_edges(perceptron: nn.Sequential, v: Tensor, e: Tensor, *, edges: Di
 
 
 def _vertex_update(perceptron: nn.Sequential, v: Tensor, gathered: Tensor, *, kernels: bool) -> Tensor:
-    """The perceptron of (vertex, gathered edges)."""
     if not kernels:
         return perceptron(torch.cat([v, gathered], dim=1))
     from .messages import updated_vertices  # noqa: PLC0415

@@ -16,6 +16,9 @@ from ...solver.integrate.learned import level_of, limited, placed
 from ...solver.level import Level
 from .paper_network import DirectedEdges, PaperNetwork
 
+_EDGES: WeakKeyDictionary[Level, DirectedEdges] = WeakKeyDictionary()
+"""The edges of each level in both directions, found once."""
+
 
 @dataclass(frozen=True, eq=False)
 class _History:
@@ -57,7 +60,9 @@ class LearnedPaper:
         """The displacement of the next step [m]."""
         memory: _History = carry.memory
         config, level = self._network.config, level_of(system)
-        edges = directed_edges(level)
+        if level not in _EDGES:
+            _EDGES[level] = DirectedEdges.of(level.edges, len(level.rest))
+        edges = _EDGES[level]
         scaled = config.features == "scaled"
         length = system.spacing.unsqueeze(1)  # V 1
         unit, force_unit = (length, memory.stiffness * length) if scaled else (1.0, 1.0)
@@ -70,23 +75,13 @@ class LearnedPaper:
         spans = [(x[receiver] - x[sender]) / size for x in (carry.x, level.rest)]
         edge = torch.cat([part for s in spans for part in (s, s.norm(dim=1, keepdim=True))], dim=1)  # 2E 8
         fixed = (~system.free).to(torch.float32)
-        with fast_products(carry.x.is_cuda and not self._network.training):
+        with _fast_products(carry.x.is_cuda and not self._network.training):
             out = self._network(vertex.float(), edge.float(), fixed, edges=edges)
         return limited(out.to(carry.x) * length, system.spacing) * system.free
 
 
-_EDGES: WeakKeyDictionary[Level, DirectedEdges] = WeakKeyDictionary()
-
-
-def directed_edges(level: Level) -> DirectedEdges:
-    """The edges of a level in both directions, found once."""
-    if level not in _EDGES:
-        _EDGES[level] = DirectedEdges.of(level.edges, len(level.rest))
-    return _EDGES[level]
-
-
 @contextmanager
-def fast_products(wanted: bool) -> Iterator[None]:
+def _fast_products(wanted: bool) -> Iterator[None]:
     """Let float32 products of matrices on CUDA use tensor cores, whose factors have 10 bits: enough for a proposal."""
     before = torch.backends.cuda.matmul.allow_tf32
     torch.backends.cuda.matmul.allow_tf32 = wanted or before

@@ -13,7 +13,7 @@ from scipy.interpolate import PchipInterpolator
 from ...solver.fabric import PRESETS
 from ...usd.write.plain import Look, PlainStage
 from .panel import sew
-from .shapes import Solid, ease, ellipsoid, join, lathe, mesh, rings
+from .shapes import CANVAS, Solid, at_height, ease, ellipsoid, join, lathe, mesh, rings
 from .tshirt import SHIRT, dress, trim
 
 ARMPIT = (0.202, 0.403)
@@ -69,7 +69,7 @@ def build() -> PlainStage:
     places = [_lower(moving.points, *each, below=(-95.0, 2.5)) for each in pressed]
     solids = [join(Solid(place, moving.counts, moving.indices), neck) for place in places]
     samples = np.stack([solid.points for solid in solids])
-    body = solids[0].collider("Form", Look("Canvas", (0.60, 0.56, 0.50)), samples=samples)
+    body = solids[0].collider("Form", CANVAS, samples=samples)
     doc = "A T-shirt pinched between a hanging arm and the side"
     return PlainStage("ArmpitShot", doc, (garment, body), 1.0 + np.arange(FRAMES))
 
@@ -97,7 +97,7 @@ def _torso() -> Solid:
     """The torso as rings that are closer together at the shoulders."""
     around, rows = 56, 30
     height = TORSO[0, 0] - (TORSO[0, 0] - TORSO[-1, 0]) * np.linspace(0.0, 1.0, rows) ** 1.3
-    across, deep = (np.interp(-height, -TORSO[:, 0], TORSO[:, i]) for i in (1, 2))
+    across, deep = at_height(TORSO, height)
     return lathe(
         rings(across, height, deep, around),
         np.array([[0.0, TORSO[0, 0] + 0.005, 0.0], [0.0, TORSO[-1, 0] - 0.015, 0.0]]),

@@ -9,7 +9,7 @@ import numpy as np
 from ...solver.fabric import PRESETS
 from ...usd.write.plain import Look, PlainStage
 from .drape import Drape, DrapeOptions
-from .shapes import box, mesh, off_box, square
+from .shapes import box, mesh, off_box, spin, square
 
 SIDE, CELLS = 0.72, 32
 """Side of the sheet [m] and its quads along a side."""
@@ -25,29 +25,18 @@ FRAMES, STEPS = 24, 2
 def build() -> PlainStage:
     """One garment over a static block of six faces."""
     level, quads, uv = square(SIDE, CELLS, 2.0 * HALF[1] + ABOVE)
-    x, y, z = level.T
-    c, s = np.cos(TURNED), np.sin(TURNED)
-    rest = np.stack([c * x + s * z, y, c * z - s * x], axis=1)
+    rest = spin(level, TURNED)
     look = Look("Cotton", (0.62, 0.34, 0.22))
-    sheet = mesh("Sheet", quads, rest, look, samples=_drop(rest, quads), uv=uv, fabric=PRESETS["cotton"])
-    solid = box(HALF)
-    standing = replace(solid, points=solid.points + np.array([0.0, HALF[1], 0.0]))
-    block = standing.collider("Block", Look("Stone", (0.45, 0.45, 0.44)))
-    return PlainStage("BlockShot", "A sheet dropped over a block", (sheet, block), np.arange(1.0, FRAMES + 1))
-
-
-def _drop(rest: np.ndarray, quads: np.ndarray) -> np.ndarray:
-    """Simulate the coarse sheet, shape (T, V, 3)."""
-    options = DrapeOptions(spring=100.0, iterations=16, give=0.82, drag=3.0, contact=1.0)
     middle = np.array([0.0, HALF[1], 0.0])
 
     def project(points: np.ndarray, _: float) -> np.ndarray:
         return off_box(points - middle, HALF - ROUND, ROUND + GAP) + middle
 
-    sheet = Drape(rest, quads, np.zeros(0, int), options=options, project=project)
-    frames = []
-    for _ in range(FRAMES):
-        frames.append(sheet.points)
-        for _ in range(STEPS):
-            sheet.step(np.zeros((0, 3)))
-    return np.stack(frames)
+    options = DrapeOptions(spring=100.0, iterations=16, give=0.82, drag=3.0, contact=1.0)
+    cloth = Drape(rest, quads, np.zeros(0, int), options=options, project=project)
+    samples = cloth.film(FRAMES, STEPS, lambda _: np.zeros((0, 3)))
+    sheet = mesh("Sheet", quads, rest, look, samples=samples, uv=uv, fabric=PRESETS["cotton"])
+    solid = box(HALF)
+    standing = replace(solid, points=solid.points + middle)
+    block = standing.collider("Block", Look("Stone", (0.45, 0.45, 0.44)))
+    return PlainStage("BlockShot", "A sheet dropped over a block", (sheet, block), np.arange(1.0, FRAMES + 1))

@@ -10,12 +10,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ...solver.fabric import PRESETS
 from ...usd.write.plain import Look, PlainMesh, PlainStage
 from .drape import Drape, DrapeOptions
 from .panel import Cut, sew
-from .shapes import Solid, ease, mesh
+from .shapes import CANVAS, Solid, ease, mesh
 
 FRAMES, RATE = 60, 24.0
 """Samples in the shot, which is one turn, and their number a second."""
@@ -70,13 +71,12 @@ def build() -> PlainStage:
     for frame in range(FRAMES):
         matrices = pose(body, frame / RATE)
         samples.append(move_out(blend(solid.points, weights, matrices), posed_cones(body, matrices), body.radii))
-    form = solid.collider("Body", Look("Canvas", (0.60, 0.56, 0.50)), samples=np.stack(samples))
+    form = solid.collider("Body", CANVAS, samples=np.stack(samples))
     doc = "A dancer in a dress with a wide skirt, who turns once on one foot"
     return PlainStage("DancerShot", doc, (_dress(body), form), 1.0 + np.arange(FRAMES))
 
 
 def _dress(body: Rig) -> PlainMesh:
-    """The dress, simulated on the body."""
     cut = sew(DRESS)
     rest = move_out(_shape(cut.points), body.cones, body.radii, gap=GAP)
     held = _held(cut.points)
@@ -133,7 +133,6 @@ def _skirt(points: np.ndarray, shaped: np.ndarray) -> np.ndarray:
 
 
 def _simulate(body: Rig, rest: np.ndarray, quads: np.ndarray, held: np.ndarray) -> np.ndarray:
-    """Positions of the coarse dress, shape (T, V, 3)."""
     options = DrapeOptions(step=1.0 / (RATE * STEPS), iterations=8, give=0.84, bend=0.3, drag=3.0, density=0.15)
     legs = np.flatnonzero([body.names[first].startswith(("thigh", "shin")) for first in body.ends[:, 0]])
     radii = np.concatenate([body.radii, body.radii[legs[::2]]])
@@ -146,14 +145,12 @@ def _simulate(body: Rig, rest: np.ndarray, quads: np.ndarray, held: np.ndarray) 
 
     weights = skin(rest[held], body)
     dress = Drape(rest, quads, held, options=options, project=project)
-    samples = []
-    for _ in range(before + FRAMES):
-        samples.append(dress.points)
-        for _ in range(STEPS):
-            matrices = pose(body, dress.time + options.step - before / RATE)
-            targets = blend(rest[held], weights, matrices)
-            dress.step(move_out(targets, posed_cones(body, matrices), body.radii, gap=GAP))
-    return np.stack(samples[before:])
+
+    def targets(time: float) -> np.ndarray:
+        matrices = pose(body, time - before / RATE)
+        return move_out(blend(rest[held], weights, matrices), posed_cones(body, matrices), body.radii, gap=GAP)
+
+    return dress.film(before + FRAMES, STEPS, targets)[before:]
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,24 +197,12 @@ def rig() -> Rig:
     return Rig(names, np.array(parents), np.array(places), np.array(ends), np.array(cones), np.array(radii))
 
 
-def rotation(vector: np.ndarray) -> np.ndarray:
-    """The matrix of a rotation vector [rad], shape (3, 3)."""
-    angle = np.linalg.norm(vector)
-    x, y, z = vector / max(angle, 1e-12)
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * cross @ cross
-
-
 def pose(body: Rig, time: float) -> np.ndarray:
     """Matrices that take joints from rest to a time since a turn began [s], shape (J, 4, 4); the right foot stays."""
-    return turned(body, motion(time))
-
-
-def turned(body: Rig, angles: dict[str, np.ndarray]) -> np.ndarray:
-    """Matrices of joints turned by rotation vectors [degrees], shape (J, 4, 4); the right foot stays."""
+    angles = motion(time)
     matrices = np.tile(np.eye(4), (len(body.names), 1, 1))
     for i, (name, parent, place) in enumerate(zip(body.names, body.parents, body.places, strict=True)):
-        turn = rotation(np.radians(angles.get(name, np.zeros(3))))
+        turn = Rotation.from_rotvec(angles.get(name, np.zeros(3)), degrees=True).as_matrix()
         matrices[i, :3, :3], matrices[i, :3, 3] = turn, place - turn @ place
         if parent >= 0:
             matrices[i] = matrices[parent] @ matrices[i]

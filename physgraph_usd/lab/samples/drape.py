@@ -24,7 +24,7 @@ RENEWALS = 3
 
 @dataclass(frozen=True)
 class DrapeOptions:
-    """How the coarse cloth behaves.
+    """Values of a coarse cloth and of its solve.
 
     Attributes:
         step: Time step [s].
@@ -57,7 +57,7 @@ class Drape:
         faces: np.ndarray,
         pinned: np.ndarray,
         *,
-        options: DrapeOptions | None = None,
+        options: DrapeOptions,
         project: Callable[[np.ndarray, float], np.ndarray] | None = None,
         start: np.ndarray | None = None,
     ) -> None:
@@ -67,12 +67,10 @@ class Drape:
             rest: Rest positions [m], shape (V, 3).
             faces: Triangles or quads, shape (F, 3) or (F, 4).
             pinned: Vertices that follow targets, shape (K,).
-            options: How the cloth behaves.
             project: Moves positions out of colliders at a time, in place of contact forces; or None.
             start: Positions at the beginning when they differ from ``rest``.
         """
-        self.options = options or DrapeOptions()
-        self.pinned, self._project = pinned, project
+        self.options, self.pinned, self._project = options, pinned, project
         self.points = np.array(rest if start is None else start, dtype=float)
         self.velocity = np.zeros_like(self.points)
         self.time = 0.0
@@ -92,7 +90,6 @@ class Drape:
         self._solver = self._factorise()
 
     def _factorise(self) -> SuperLU:
-        """Factorise inertia + springs + bending + pins + contact."""
         fixed = self._inertia + self._hold + self._contact()
         system = sparse.csc_matrix(sparse.diags(fixed) + self._elastic[0] + self._elastic[1])
         if self.options.contact == 0.0:
@@ -121,18 +118,27 @@ class Drape:
             if self._project is not None:
                 moved = self._project(points, self.time)
                 if iteration < RENEWALS and self.options.contact > 0.0:
-                    self._touch(np.abs(moved - points).max(axis=1) > 1e-9, afresh=iteration == 0)
+                    touching = np.abs(moved - points).max(axis=1) > 1e-9
+                    touching = touching if iteration == 0 else touching | self._touching
+                    if not np.array_equal(touching, self._touching):
+                        self._touching = touching
+                        self._solver = self._factorise()
                 points = moved
         self.velocity = (points - self.points) / step
         self.points = points
         return points
 
-    def _touch(self, moved: np.ndarray, *, afresh: bool) -> None:
-        """Let the points that were moved count as touching, besides or in place of those that did."""
-        touching = moved if afresh else moved | self._touching
-        if not np.array_equal(touching, self._touching):
-            self._touching = touching
-            self._solver = self._factorise()
+    def film(self, frames: int, steps: int, targets: Callable[[float], np.ndarray]) -> np.ndarray:
+        """Positions of frames that lie a number of steps apart [m], shape (frames, V, 3), the present ones first.
+
+        ``targets`` gives the positions of the pinned vertices at a time [s].
+        """
+        samples = []
+        for _ in range(frames):
+            samples.append(self.points)
+            for _ in range(steps):
+                self.step(targets(self.time + self.options.step))
+        return np.stack(samples)
 
 
 def _smoothing(rest: np.ndarray, faces: np.ndarray) -> sparse.csr_matrix:
@@ -159,9 +165,7 @@ def _smoothing(rest: np.ndarray, faces: np.ndarray) -> sparse.csr_matrix:
 def _areas(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Each vertex's share of the area of its faces [m^2]."""
     corners = points[faces]
-    last = corners[:, 3] - corners[:, 1] if faces.shape[1] == 4 else corners[:, 2] - corners[:, 1]
-    first = corners[:, 2] - corners[:, 0] if faces.shape[1] == 4 else corners[:, 1] - corners[:, 0]
-    area = 0.5 * np.linalg.norm(np.cross(first, last), axis=1)
+    area = 0.5 * np.linalg.norm(np.cross(corners[:, 2] - corners[:, 0], corners[:, -1] - corners[:, 1]), axis=1)
     total = np.zeros(len(points))
     for i in range(faces.shape[1]):
         np.add.at(total, faces[:, i], area / faces.shape[1])

@@ -36,7 +36,6 @@ def build() -> PlainStage:
 
 
 def _settle(rest: np.ndarray, quads: np.ndarray) -> np.ndarray:
-    """Drop the cloth on the table and wait."""
     options = DrapeOptions(step=1 / 30, spring=40.0, iterations=8, give=0.85, bend=0.15, drag=4.0, density=0.15)
     turned = np.radians(20.0)
     start = rest.copy()

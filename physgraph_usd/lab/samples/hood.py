@@ -9,7 +9,7 @@ import numpy as np
 
 from ...solver.fabric import PRESETS
 from ...usd.write.plain import FaceVarying, Look, PlainStage
-from .shapes import ease, ellipsoid, grid_uv, join, mesh, quad_grid
+from .shapes import CANVAS, ease, ellipsoid, grid_uv, join, mesh, quad_grid, spin
 
 UP, DEEP, FOLD = 20, 15, (3, 5)
 """Quads from the neckline up one side to the top, from the face to the seam behind, and to the fold's two bends."""
@@ -38,11 +38,10 @@ def build() -> PlainStage:
         pin=(rest[:, 1] < 1e-9).astype(float),
         fabric=PRESETS["jersey"],
     )
-    skin = Look("Canvas", (0.60, 0.56, 0.50))
     poses = np.stack([_pose(time) for time in times])
-    head = ellipsoid(HEAD, HEAD_AT, (32, 22)).collider("Head", skin, transforms=poses)
+    head = ellipsoid(HEAD, HEAD_AT, (32, 22)).collider("Head", CANVAS, transforms=poses)
     neck = ellipsoid(np.array([0.052, 0.110, 0.054]), np.array([0.0, 0.03, -0.01]), (24, 14))
-    bust = join(ellipsoid(BUST, BUST_AT, (40, 18)), neck).collider("Bust", skin)
+    bust = join(ellipsoid(BUST, BUST_AT, (40, 18)), neck).collider("Bust", CANVAS)
     doc = "A wide hood over a turning head, with a fold that lies on itself"
     return PlainStage("HoodShot", doc, (hood, head, bust), 1.0 + np.arange(FRAMES))
 
@@ -90,7 +89,6 @@ def _even(fraction: np.ndarray, wide: np.ndarray, high: np.ndarray) -> np.ndarra
 
 
 def _lengths(curve: np.ndarray) -> np.ndarray:
-    """Length of a curve up to each of its points."""
     return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))])
 
 
@@ -115,7 +113,6 @@ def _angles(time: float) -> tuple[float, float]:
 
 
 def _pose(time: float) -> np.ndarray:
-    """The head's matrix at a time [s]."""
     matrix = np.eye(4)
     matrix[:3, :3] = _rotate(np.eye(3), *_angles(time)).T
     return matrix
@@ -130,8 +127,6 @@ def _turn(points: np.ndarray, time: float, *, fraction: float) -> np.ndarray:
 
 def _rotate(points: np.ndarray, turn: np.ndarray | float, lean: np.ndarray | float) -> np.ndarray:
     """Turn points about the vertical, then lean them about z."""
-    x, y, z = points.T
-    c, s = np.cos(turn), np.sin(turn)
-    x, z = c * x + s * z, c * z - s * x
+    x, y, z = spin(points, turn).T
     c, s = np.cos(lean), np.sin(lean)
     return np.stack([c * x - s * y, s * x + c * y, z], axis=1)

@@ -2,30 +2,25 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
-from ...solver.fabric import PRESETS, Fabric
 from ...usd.write.plain import Look, PlainMesh, PlainStage
-from .shapes import ease, mesh
-from .walker import Cage, Cells, body, trousers, tube, walk
+from .shapes import ease
+from .walker import WAIST, Cells, form, garment, trousers, tube, walk
 
 FRAMES, RATE = 30, 24.0
 GAPS = (0.005, 0.010, 0.0152)
 """Distance of trousers, shirt and belt from the body, where all three lie over one another [m]."""
-WAIST = 1.02
-"""Height of the belt's middle [m]."""
-LONGER, WIDER = 1.08, 1.04
-"""Size of the trousers and the shirt at rest over the size in which they are worn: they are pushed together."""
 
 
 def build() -> PlainStage:
     """Three garments in three layers and a body."""
     times = np.arange(FRAMES) / RATE
-    solid = body()
-    samples = np.stack([walk(solid.points, time) for time in times])
-    form = solid.collider("Form", Look("Canvas", (0.60, 0.56, 0.50)), samples=samples)
     doc = "Trousers, shirt and belt in three layers on a body that walks in place"
-    return PlainStage("LayersShot", doc, (_trousers(times), _shirt(times), _belt(times), form), 1.0 + np.arange(FRAMES))
+    meshes = (_trousers(times), _shirt(times), _belt(times), form(times))
+    return PlainStage("LayersShot", doc, meshes, 1.0 + np.arange(FRAMES))
 
 
 def _trousers(times: np.ndarray) -> PlainMesh:
@@ -34,7 +29,7 @@ def _trousers(times: np.ndarray) -> PlainMesh:
     cage = trousers(cells, lambda height: GAPS[0] + 0.015 * ease((0.62 - height) / 0.35))
     late = 0.006 * ease((0.5 - cage.points[:, 1]) / 0.4)
     samples = np.stack([walk(cage.points, time - late) for time in times])
-    return _garment("Trousers", cage, samples, Look("Denim", (0.12, 0.17, 0.30)), fabric=PRESETS["denim"])
+    return garment("Trousers", cage, samples, Look("Denim", (0.12, 0.17, 0.30)), larger=True)
 
 
 def _shirt(times: np.ndarray) -> PlainMesh:
@@ -46,30 +41,11 @@ def _shirt(times: np.ndarray) -> PlainMesh:
         phase = 2 * np.pi * (time - 0.06) / 0.625
         swing = 0.004 * ease(time / 0.35) * np.array([np.sin(0.5 * phase), 0.0, np.sin(phase)])
         samples.append(walk(cage.points, time) + free[:, None] * swing)
-    return _garment("Shirt", cage, np.stack(samples), Look("Cotton", (0.72, 0.70, 0.64)))
+    return garment("Shirt", cage, np.stack(samples), Look("Cotton", (0.72, 0.70, 0.64)), larger=True)
 
 
 def _belt(times: np.ndarray) -> PlainMesh:
-    """A belt of leather, as long as it is worn."""
+    """A belt of leather, as long as it is worn, that nothing holds."""
     cage = tube(WAIST + np.linspace(0.0225, -0.0225, 4), 44, lambda height: np.full_like(height, GAPS[2]))
     samples = np.stack([walk(cage.points, time) for time in times])
-    look = Look("Leather", (0.16, 0.09, 0.05), 0.5)
-    return _garment("Belt", cage, samples, look, fabric=PRESETS["leather"], loose=False)
-
-
-def _garment(
-    name: str, cage: Cage, samples: np.ndarray, look: Look, *, fabric: Fabric = PRESETS["cotton"], loose: bool = True
-) -> PlainMesh:
-    """A garment; all but the belt are larger at rest and held by their top row."""
-    points, top = cage.points, cage.points[:, 1] > cage.points[:, 1].max() - 1e-6
-    rest = (points - (0.0, WAIST, 0.0)) * (WIDER, LONGER, WIDER) + (0.0, WAIST, 0.0)
-    return mesh(
-        name,
-        cage.quads,
-        rest if loose else points,
-        look,
-        samples=samples,
-        uv=cage.uv,
-        pin=top.astype(float) if loose else None,
-        fabric=fabric,
-    )
+    return replace(garment("Belt", cage, samples, Look("Leather", (0.16, 0.09, 0.05), 0.5)), pin=None)

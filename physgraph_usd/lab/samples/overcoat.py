@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...solver.fabric import PRESETS
-from ...usd.write.plain import Look, PlainMesh, PlainStage
-from .shapes import ease, mesh
-from .walker import Cage, body, tube, walk
+from ...usd.write.plain import Look, PlainStage
+from .shapes import ease
+from .walker import Cage, form, garment, tube, walk
 
 FRAMES, RATE = 24, 24.0
 GAPS = (0.012, 0.013)
@@ -21,15 +20,14 @@ LATE = 0.05
 def build() -> PlainStage:
     """Two garments and a body."""
     times = np.arange(FRAMES) / RATE
-    solid = body()
-    samples = np.stack([walk(solid.points, time) for time in times])
-    form = solid.collider("Form", Look("Canvas", (0.60, 0.56, 0.50)), samples=samples)
-    shirt = _garment(
-        "Shirt", _folded((1.27, 0.86, 22), 48, 12, GAPS[0]), times, 0.0, Look("Cotton", (0.72, 0.70, 0.64))
-    )
-    coat = _garment("Coat", _folded((1.28, 0.80, 25), 52, 9, GAPS[1]), times, LATE, Look("Wool", (0.20, 0.16, 0.14)))
+    under, over = _folded((1.27, 0.86, 22), 48, 12, GAPS[0]), _folded((1.28, 0.80, 25), 52, 9, GAPS[1])
+    late = LATE * ease((1.1 - over.points[:, 1]) / 0.25)
+    walking = np.stack([walk(under.points, time) for time in times])
+    lagging = np.stack([walk(over.points, time - late) for time in times])
+    shirt = garment("Shirt", under, walking, Look("Cotton", (0.72, 0.70, 0.64)))
+    coat = garment("Coat", over, lagging, Look("Wool", (0.20, 0.16, 0.14)))
     doc = "A coat over a shirt, skinned apart: their cages cross in every frame"
-    return PlainStage("OvercoatShot", doc, (shirt, coat, form), 1.0 + np.arange(FRAMES))
+    return PlainStage("OvercoatShot", doc, (shirt, coat, form(times)), 1.0 + np.arange(FRAMES))
 
 
 def _folded(rows: tuple[float, float, int], around: int, folds: int, gap: float) -> Cage:
@@ -47,19 +45,3 @@ def _folded(rows: tuple[float, float, int], around: int, folds: int, gap: float)
     out = np.stack([np.cos(angle), np.zeros_like(angle), np.sin(angle)], axis=1)
     cage.points[:] += (FOLD * low * np.cos(folds * angle + 2.0 * cage.points[:, 1] / 0.3))[:, None] * out
     return cage
-
-
-def _garment(name: str, cage: Cage, times: np.ndarray, late: float, look: Look) -> PlainMesh:
-    """A garment whose lower end lags [s], held by its top row."""
-    points, top = cage.points, cage.points[:, 1] > cage.points[:, 1].max() - 1e-6
-    lag = late * ease((1.1 - points[:, 1]) / 0.25)
-    return mesh(
-        name,
-        cage.quads,
-        points,
-        look,
-        samples=np.stack([walk(points, time - lag) for time in times]),
-        uv=cage.uv,
-        pin=top.astype(float),
-        fabric=PRESETS[look.name.lower()],
-    )

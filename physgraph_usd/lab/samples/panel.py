@@ -49,14 +49,12 @@ class Pillow:
         points: Positions with level sleeves [m], shape (V, 3); Z is front.
         uv: The panels side by side.
         cell: Row and column of each face on its panel, shape (F, 2).
-        front: Whether each vertex belongs to the front panel or its seam, shape (V,).
     """
 
     quads: np.ndarray
     points: np.ndarray
     uv: FaceVarying
     cell: np.ndarray
-    front: np.ndarray
 
 
 def sew(cut: Cut) -> Pillow:
@@ -72,7 +70,9 @@ def sew(cut: Cut) -> Pillow:
     whole = (corners >= 0).all(axis=-1)
     cells, quads = np.argwhere(whole), corners[whole]
     flat = np.stack([x[columns[used]], y[rows[used]]], axis=1)
-    height = _inflate(flat, quads, seam[used]) * _depth(cut, flat)
+    t = np.clip((np.abs(flat[:, 0]) / cut.half_width - 0.75) / 0.5, 0.0, 1.0)
+    depth = cut.depth[0] + (cut.depth[1] - cut.depth[0]) * t * t * (3.0 - 2.0 * t)
+    height = _inflate(flat, quads, seam[used]) * depth
     count = len(flat)
     back = np.where(seam[used], np.arange(count), count + np.cumsum(~seam[used]) - 1)
     points = np.concatenate(
@@ -87,7 +87,6 @@ def sew(cut: Cut) -> Pillow:
         points,
         FaceVarying(np.concatenate([uv, mirrored]), np.concatenate([quads, (count + quads)[:, ::-1]]).ravel()),
         np.concatenate([cells, cells]),
-        np.arange(len(points)) < count,
     )
 
 
@@ -109,7 +108,6 @@ def _ends_closer(cells: int, cosine: float) -> np.ndarray:
 
 
 def _seams(cut: Cut, rows: np.ndarray, columns: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Where front and back are sewn together."""
     torso, sleeve, below, _ = cut.cells
     sides = ((columns == sleeve) | (columns == sleeve + torso)) & (rows <= below)
     under = (rows == below) & ((columns <= sleeve) | (columns >= sleeve + torso))
@@ -136,9 +134,3 @@ def _inflate(flat: np.ndarray, quads: np.ndarray, seam: np.ndarray) -> np.ndarra
     solution = np.zeros(count)
     solution[free] = splu(sparse.csc_matrix(sparse.csr_matrix(system)[free][:, free])).solve(right[free])
     return np.sqrt(solution.clip(0.0))
-
-
-def _depth(cut: Cut, flat: np.ndarray) -> np.ndarray:
-    """Half depth over half width, from the torso's value to the sleeves'."""
-    t = np.clip((np.abs(flat[:, 0]) / cut.half_width - 0.75) / 0.5, 0.0, 1.0)
-    return cut.depth[0] + (cut.depth[1] - cut.depth[0]) * t * t * (3.0 - 2.0 * t)

@@ -9,6 +9,9 @@ import numpy as np
 
 from ...usd.write.plain import FaceVarying, Look, PlainMesh
 
+CANVAS = Look("Canvas", (0.60, 0.56, 0.50))
+"""Material of the bodies."""
+
 
 def mesh(name: str, faces: np.ndarray, points: np.ndarray, look: Look, **values: Any) -> PlainMesh:
     """A mesh of triangles or quads, shape (F, 3) or (F, 4), with any further fields of `PlainMesh`."""
@@ -32,6 +35,18 @@ def grid_uv(rows: int, columns: int, *, closed: bool = False) -> FaceVarying:
     width = columns + 1 if closed else columns
     v, u = np.meshgrid(np.linspace(0, 1, rows), np.linspace(0, 1, width), indexing="ij")
     return FaceVarying(np.stack([u.ravel(), v.ravel()], axis=1), quad_grid(rows, width).ravel())
+
+
+def spin(points: np.ndarray, angle: np.ndarray | float) -> np.ndarray:
+    """Positions [m], shape (V, 3), turned about the Y axis by an angle [rad], one for all or one each."""
+    x, y, z = points.T
+    c, s = np.cos(angle), np.sin(angle)
+    return np.stack([c * x + s * z, y, c * z - s * x], axis=1)
+
+
+def at_height(table: np.ndarray, height: np.ndarray) -> list[np.ndarray]:
+    """The columns of a table at heights, between its rows; its first column is the height, which falls."""
+    return [np.interp(-height, -table[:, 0], column) for column in table[:, 1:].T]
 
 
 def flipped(uv: FaceVarying) -> FaceVarying:
@@ -89,11 +104,9 @@ def rings(across: np.ndarray, height: np.ndarray, deep: np.ndarray, around: int)
 
 
 def lathe(rings: np.ndarray, ends: np.ndarray) -> Solid:
-    """Rings closed by a fan at each end; the solid's points are the rings, then the two tips.
+    """Rings [m], shape (R, A, 3), closed by fans to a tip at each end [m], shape (2, 3).
 
-    Args:
-        rings: Rings [m], shape (R, A, 3); seen from the first ring's end they run clockwise.
-        ends: Tips of the fans beyond the first and the last ring [m], shape (2, 3).
+    Seen from the first ring's end the rings run clockwise. The solid's points are the rings, then the two tips.
     """
     count, around = rings.shape[:2]
     here = np.arange(around)
@@ -133,9 +146,7 @@ def torus(major: float, minor: float, cells: tuple[int, int]) -> Solid:
     a, b = np.meshgrid(*(2 * np.pi * np.arange(count) / count for count in cells), indexing="ij")
     radius = major + minor * np.cos(b)
     points = np.stack([radius * np.cos(a), minor * np.sin(b), radius * np.sin(a)], axis=-1).reshape(-1, 3)
-    i, j = np.divmod(np.arange(cells[0] * cells[1]), cells[1])
-    over, up = (i + 1) % cells[0] * cells[1], (j + 1) % cells[1]
-    quads = np.stack([i * cells[1] + j, i * cells[1] + up, over + up, over + j], axis=1)
+    quads = quad_grid(cells[0] + 1, cells[1], closed=True) % len(points)
     return Solid(points, np.full(len(quads), 4), quads.ravel())
 
 
@@ -150,12 +161,9 @@ def ellipsoid(axes: np.ndarray, middle: np.ndarray, cells: tuple[int, int]) -> S
 
 
 def off_box(points: np.ndarray, half: np.ndarray, gap: float) -> np.ndarray:
-    """Positions with those closer to a box about the origin than a gap moved straight out.
+    """Positions [m], shape (V, 3), with those closer to a box about the origin than a gap moved straight out.
 
-    Args:
-        points: Positions [m], shape (V, 3).
-        half: Half sizes of the box [m], shape (3,).
-        gap: Distance kept, and the radius of the edges of the surface on which points come to lie [m].
+    The box has half sizes [m], shape (3,); the surface on which points come to lie has edges of the gap's radius [m].
     """
     outside = np.abs(points) - half
     far = outside.clip(0.0)

@@ -7,7 +7,7 @@ import numpy as np
 from ...solver.fabric import PRESETS
 from ...usd.write.plain import FaceVarying, Look, PlainMesh, PlainStage
 from .drape import Drape, DrapeOptions
-from .shapes import Solid, ease, grid_uv, lathe, mesh, quad_grid, rings
+from .shapes import Solid, at_height, ease, grid_uv, lathe, mesh, quad_grid, rings
 
 ROWS, AROUND, FOLDS = 23, 76, 8
 """Rows from waist to hem, columns around, and folds at the hem."""
@@ -38,7 +38,6 @@ def build() -> PlainStage:
     quads = quad_grid(ROWS, AROUND, closed=True)[:, ::-1]
     uv = grid_uv(ROWS, AROUND, closed=True)
     triangles, corners = (_split(each) for each in (quads, uv.indices.reshape(-1, 4)[:, ::-1]))
-    poses = np.stack([_hips(frame / 24.0) for frame in range(FRAMES)])
     garment = mesh(
         "Skirt",
         triangles,
@@ -50,7 +49,7 @@ def build() -> PlainStage:
         fabric=PRESETS["wool"],
     )
     doc = "A flared skirt on turning hips"
-    return PlainStage("SkirtShot", doc, (garment, _hip_mesh(poses)), np.arange(1.0, FRAMES + 1))
+    return PlainStage("SkirtShot", doc, (garment, _body()), np.arange(1.0, FRAMES + 1))
 
 
 def _rest() -> np.ndarray:
@@ -86,7 +85,6 @@ def _hips(time: float) -> np.ndarray:
 
 
 def _swing(rest: np.ndarray, quads: np.ndarray) -> np.ndarray:
-    """Simulate the coarse skirt, shape (T, V, 3)."""
     options = DrapeOptions(spring=40.0, iterations=5, give=0.84, bend=0.12, drag=1.2, density=0.235)
     band = np.arange(2 * AROUND)
 
@@ -97,37 +95,31 @@ def _swing(rest: np.ndarray, quads: np.ndarray) -> np.ndarray:
     skirt = Drape(rest, quads, band, options=options, project=project, start=start)
     for _ in range(WARM_UP):
         skirt.step(start[band])
-    frames = []
-    for _ in range(FRAMES):
-        frames.append(skirt.points)
-        for _ in range(STEPS):
-            pose = _hips(skirt.time + options.step - WARM_UP * options.step)
-            skirt.step(rest[band] @ pose[:3, :3].T + pose[:3, 3])
-    return np.stack(frames)
+
+    def held(time: float) -> np.ndarray:
+        pose = _hips(time - WARM_UP * options.step)
+        return rest[band] @ pose[:3, :3].T + pose[:3, 3]
+
+    return skirt.film(FRAMES, STEPS, held)
 
 
 def _push_out(points: np.ndarray, pose: np.ndarray) -> np.ndarray:
     """Move points that are inside the hips to 15 mm outside, horizontally."""
     local = (points - pose[:3, 3]) @ pose[:3, :3]
-    across, deep = (axis + 0.015 for axis in _half_axes(local[:, 1]))
+    across, deep = (axis + 0.015 for axis in at_height(PROFILE, local[:, 1]))
     reach = np.hypot(local[:, 0] / across, local[:, 2] / deep)
     grow = np.where((reach < 1.0) & (local[:, 1] > PROFILE[-1, 0]), 1.0 / np.maximum(reach, 1e-3), 1.0)
     return (local * np.stack([grow, np.ones_like(grow), grow], axis=1)) @ pose[:3, :3].T + pose[:3, 3]
 
 
-def _half_axes(height: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Half axes of the hips across and deep at heights [m]."""
-    across, deep = (np.interp(-height, -PROFILE[:, 0], PROFILE[:, i]) for i in (1, 2))
-    return across, deep
-
-
-def _hip_mesh(poses: np.ndarray) -> PlainMesh:
+def _body() -> PlainMesh:
     """The hips as a closed mesh of quads with triangle fans at both ends; its quads face inwards."""
     around, rows = 40, 30
     height = np.concatenate([[0.1225, 0.118, 0.11], np.linspace(0.10, PROFILE[-1, 0], rows - 3)])
-    across, deep = _half_axes(height)
+    across, deep = at_height(PROFILE, height)
     ends = np.array([[0.0, PROFILE[0, 0] + 0.001, 0.0], [0.0, PROFILE[-1, 0] - 0.02, 0.0]])
     solid = lathe(rings(across, height, deep, around), ends)
     quads, fans = np.split(solid.indices, [4 * (rows - 1) * around])
     hips = Solid(solid.points, solid.counts, np.concatenate([quads.reshape(-1, 4)[:, ::-1].ravel(), fans]))
+    poses = np.stack([_hips(frame / 24.0) for frame in range(FRAMES)])
     return hips.collider("Hips", Look("Form", (0.60, 0.56, 0.50)), transforms=poses)

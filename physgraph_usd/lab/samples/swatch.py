@@ -6,7 +6,7 @@ import numpy as np
 
 from ...solver.fabric import PRESETS
 from ...usd.write.plain import Look, PlainStage
-from .shapes import ease, flipped, grid_uv, mesh, quad_grid
+from .shapes import ease, flipped, grid_uv, mesh, quad_grid, spin
 
 ROWS, COLUMNS, FRAMES = 20, 16, 24
 """Vertices down and across, and samples."""
@@ -52,7 +52,5 @@ def _pose(amount: float) -> np.ndarray:
     x = WIDTH * u * gather
     fold = 0.012 * amount * (1.0 - 0.7 * v) * np.cos(2 * np.pi * 1.5 * u + 0.4)
     bow = 0.10 * amount * (u * u - 0.08) * WIDTH * 4.0
-    turn = np.radians(25.0) * amount * (1.0 - v)
-    z = fold + bow
     y = LENGTH * v * (1.0 - 0.03 * amount) + 0.2 + 0.02 * amount * u * (1.0 - v)
-    return np.stack([np.cos(turn) * x + np.sin(turn) * z, y, np.cos(turn) * z - np.sin(turn) * x], axis=1)
+    return spin(np.stack([x, y, fold + bow], axis=1), np.radians(25.0) * amount * (1.0 - v))

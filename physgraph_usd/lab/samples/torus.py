@@ -22,32 +22,21 @@ def build() -> PlainStage:
     """One garment over a static torus; the middle of the sheet is pinned."""
     rest, quads, uv = square(SIDE, CELLS, MINOR + GAP)
     grip = np.flatnonzero(np.hypot(rest[:, 0], rest[:, 2]) < 1.5 * SIDE / CELLS)
+
+    def project(points: np.ndarray, _: float) -> np.ndarray:
+        return off_torus(points, MAJOR, MINOR + GAP)
+
+    options = DrapeOptions(step=1 / 24 / STEPS, spring=60.0, iterations=10, give=0.65, drag=4.0, contact=1.0)
+    cloth, down = Drape(rest, quads, grip, options=options, project=project), PULL * np.array([0.0, 1.0, 0.0])
     sheet = mesh(
         "Sheet",
         quads,
         rest,
         Look("Silk", (0.50, 0.20, 0.34), 0.5),
-        samples=_pull(rest, quads, grip),
+        samples=cloth.film(FRAMES, STEPS, lambda time: rest[grip] - ease(24.0 * time / (FRAMES - 1)) * down),
         uv=uv,
         pin=np.isin(np.arange(len(rest)), grip).astype(float),
         fabric=PRESETS["silk"],
     )
     ring = torus(MAJOR, MINOR, (64, 24)).collider("Ring", Look("Wood", (0.42, 0.29, 0.16), 0.5))
     return PlainStage("TorusShot", "A sheet pulled through a torus", (sheet, ring), 1.0 + np.arange(FRAMES))
-
-
-def _pull(rest: np.ndarray, quads: np.ndarray, grip: np.ndarray) -> np.ndarray:
-    """Simulate the coarse sheet, shape (T, V, 3)."""
-    options = DrapeOptions(step=1 / 24 / STEPS, spring=60.0, iterations=10, give=0.65, drag=4.0, contact=1.0)
-
-    def project(points: np.ndarray, _: float) -> np.ndarray:
-        return off_torus(points, MAJOR, MINOR + GAP)
-
-    sheet = Drape(rest, quads, grip, options=options, project=project)
-    frames = []
-    for frame in range(FRAMES):
-        frames.append(sheet.points)
-        for step in range(STEPS):
-            t = (frame + (step + 1) / STEPS) / (FRAMES - 1)
-            sheet.step(rest[grip] - PULL * ease(t) * np.array([0.0, 1.0, 0.0]))
-    return np.stack(frames)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from ...solver.mesh.subdivide import smooth, subdivide
-from ...solver.mesh.topology import PolygonMesh, edges_of
+from ...solver.mesh.topology import PolygonMesh
 from ...usd.mesh.bind import closest
 from ...usd.write.plain import Look, PlainMesh, PlainStage
 from . import tshirt
@@ -43,7 +43,6 @@ def _smoothed(shirt: PlainMesh) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _normals(faces: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Unit normals of vertices, shape (V, 3)."""
     a, b, c, d = points[faces].swapaxes(0, 1)
     areas, total = np.cross(c - a, d - b), np.zeros_like(points)
     for corner in faces.T:
@@ -54,10 +53,8 @@ def _normals(faces: np.ndarray, points: np.ndarray) -> np.ndarray:
 def _rims(faces: np.ndarray) -> list[np.ndarray]:
     """Vertices of each open border in order, along the border's faces."""
     sides = np.concatenate([faces[:, [k, (k + 1) % 4]] for k in range(4)])
-    triangles = np.concatenate([faces[:, :3], faces[:, [0, 2, 3]]])
-    edges = edges_of(triangles, int(faces.max()) + 1)
-    open_edges = {tuple(edge) for edge in edges.vertices[edges.face_count == 1].tolist()}
-    after = {a: b for a, b in sides.tolist() if (min(a, b), max(a, b)) in open_edges}
+    whole = {tuple(side) for side in sides.tolist()}
+    after = {a: b for a, b in sides.tolist() if (b, a) not in whole}
     loops = []
     while after:
         start, loop = next(iter(after)), []
@@ -69,7 +66,6 @@ def _rims(faces: np.ndarray) -> list[np.ndarray]:
 
 
 def _shell(faces: np.ndarray, points: np.ndarray) -> PlainMesh:
-    """The shirt with thickness: outer face, inner face and rims."""
     normals, count = _normals(faces, points), len(points)
     both = np.concatenate([points + 0.5 * THICKNESS * normals, points - 0.5 * THICKNESS * normals])
     rims = [
@@ -87,7 +83,10 @@ def _buttons(faces: np.ndarray, points: np.ndarray) -> PlainMesh:
     corners = triangles[found.triangle]
     places = np.einsum("nk,nkx->nx", found.weights, points[corners])
     directions = np.einsum("nk,nkx->nx", found.weights, _normals(faces, points)[corners])
-    return _trim("Buttons", join(*map(_button, places, directions)), Look("Horn", (0.30, 0.20, 0.12), 0.4))
+    discs = join(*map(_button, places, directions))
+    return PlainMesh(
+        "Buttons", discs.counts, discs.indices, discs.points, Look("Horn", (0.30, 0.20, 0.12), 0.4), "trim"
+    )
 
 
 def _button(place: np.ndarray, normal: np.ndarray) -> Solid:
@@ -115,8 +114,3 @@ def _piping(faces: np.ndarray, points: np.ndarray) -> PlainMesh:
     )
     rows = quad_grid(len(hem) + 1, 8, closed=True) % (8 * len(hem))
     return mesh("Piping", rows, tube.reshape(-1, 3), Look("Cord", (0.78, 0.66, 0.40)), role="trim")
-
-
-def _trim(name: str, solid: Solid, look: Look) -> PlainMesh:
-    """A solid that follows the garment."""
-    return PlainMesh(name, solid.counts, solid.indices, solid.points, look, role="trim")

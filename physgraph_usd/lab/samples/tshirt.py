@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ...solver.fabric import PRESETS
 from ...usd.write.plain import Look, PlainMesh, PlainStage, Skeleton, Skin
 from .panel import Cut, Pillow, sew
-from .shapes import Solid, ease, mesh, quad_grid, rings
+from .shapes import CANVAS, Solid, ease, mesh, quad_grid, rings
 
 SHIRT = Cut(0.200, 0.405, 0.575, 0.0, 0.16, 0.078, (18, 6, 18, 8))
 BODY = Cut(0.172, 0.440, 0.556, -0.10, 0.36, 0.0, (16, 12, 16, 8), closed=True)
@@ -42,7 +43,6 @@ def build() -> PlainStage:
 
 
 def _form() -> PlainMesh:
-    """The body: a sewn form with rounded ends and a neck."""
     body = sew(BODY)
     points = body.points.copy()
     reach = ((np.abs(points[:, 0]) - BODY.half_width) / BODY.sleeve).clip(0.0)
@@ -63,7 +63,7 @@ def _form() -> PlainMesh:
     counts = np.concatenate([np.full(len(body.quads) + len(neck), 4), [20]])
     indices = np.concatenate([body.quads.ravel(), neck.ravel(), cap])
     form = Solid(np.concatenate([_slope(points), level[len(points) :]]), counts, indices)
-    return form.collider("Form", Look("Canvas", (0.60, 0.56, 0.50)), skin=weights, scheme="catmullClark")
+    return form.collider("Form", CANVAS, skin=weights, scheme="catmullClark")
 
 
 def _round(t: np.ndarray) -> np.ndarray:
@@ -129,13 +129,9 @@ def _skeleton(times: np.ndarray) -> Skeleton:
     left = np.where(up > 0, 64.0, 44.0) * up
     right = np.where(up > 0, 44.0, 64.0) * up
     turns = [[zero, -6.0 * up, zero], [zero, -22.0 * up, 17.0 * up], [zero, zero, left], [zero, zero, right]]
-    rotations = _quaternions(np.radians(np.moveaxis(np.array(turns), 2, 0)))
+    vectors = np.moveaxis(np.array(turns), 2, 0)
+    rotations = Rotation.from_rotvec(vectors.reshape(-1, 3), degrees=True).as_quat().reshape(-1, 4, 4)
+    rotations = np.roll(rotations, 1, axis=2)  # the real part first
     local = bind[:, :3, 3] - bind[[0, 0, 1, 1], :3, 3]
     joints = ("hips", "hips/chest", "hips/chest/arm_left", "hips/chest/arm_right")
     return Skeleton(joints, bind, rotations, np.broadcast_to(local, (len(times), 4, 3)))
-
-
-def _quaternions(vectors: np.ndarray) -> np.ndarray:
-    """Quaternions (w, x, y, z) of rotation vectors [rad], shape (..., 4)."""
-    angle = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return np.concatenate([np.cos(0.5 * angle), vectors * 0.5 * np.sinc(0.5 * angle / np.pi)], axis=-1)

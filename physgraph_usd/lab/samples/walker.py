@@ -11,8 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...usd.write.plain import FaceVarying
-from .shapes import Solid, ease, grid_uv, quad_grid
+from ...solver.fabric import PRESETS
+from ...usd.write.plain import FaceVarying, Look, PlainMesh
+from .shapes import CANVAS, Solid, at_height, ease, grid_uv, mesh, quad_grid, spin
 
 TRUNK = np.array(
     [
@@ -39,6 +40,8 @@ LEG = np.array(
 """A leg: height, distance of its axis from the middle, half axes across and deep [m], and how square it is."""
 CROTCH, HIP, KNEE = 0.768, 0.86, 0.47
 """Heights of the crotch and of the joints [m]."""
+WAIST, LARGER = 1.02, (1.04, 1.08, 1.04)
+"""Height of the waist [m], and size of what is pushed together at rest over the size in which it is worn."""
 PERIOD = 1.25
 """Time of two steps [s]."""
 
@@ -129,7 +132,7 @@ def _sew(cells: Cells, upper: list[np.ndarray], start: int) -> tuple[np.ndarray,
 
 def _trunk(height: np.ndarray, angle: np.ndarray, gap: Gap) -> np.ndarray:
     """Points round the trunk, shape (..., 3)."""
-    across, deep = (np.interp(-height, -TRUNK[:, 0], TRUNK[:, i]) + gap(height) for i in (1, 2))
+    across, deep = (axis + gap(height) for axis in at_height(TRUNK, height))
     c, s = _squared(angle, 2.3 + 0.9 * ease((0.95 - height) / 0.14))
     return np.stack([across * c, height, deep * s], axis=-1)
 
@@ -142,7 +145,7 @@ def _leg(cells: Cells, side: int, gap: Gap) -> np.ndarray:
     inner = corner + (2 * np.pi - 2 * corner) * np.arange(1, cells.between) / cells.between
     angle = np.concatenate([outer, inner], axis=1)
     height = cells.leg[:, None] + 0.034 * (1.0 - t) * np.sin(angle) ** 2
-    axis, across, deep, square = (np.interp(-height, -LEG[:, 0], LEG[:, i]) for i in (1, 2, 3, 4))
+    axis, across, deep, square = at_height(LEG, height)
     square = 2.1 + (square - 2.1) * (0.5 - 0.5 * np.cos(angle)) ** 0.5  # flat where the legs face each other
     c, s = _squared(angle, square)
     points = np.stack([axis + (across + gap(height)) * c, height, (deep + gap(height)) * s], axis=-1)
@@ -150,14 +153,13 @@ def _leg(cells: Cells, side: int, gap: Gap) -> np.ndarray:
 
 
 def _squared(angle: np.ndarray, square: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points on superellipses."""
     c, s = np.cos(angle), np.sin(angle)
     reach = (np.abs(c) ** square + np.abs(s) ** square) ** (-1.0 / square)
     return reach * c, reach * s
 
 
-def body() -> Solid:
-    """Hips, trunk and legs at rest as one mesh [m], closed at the chest and at the ankles."""
+def form(times: np.ndarray) -> PlainMesh:
+    """Hips, trunk and legs that walk, as one body at times [s], closed at the chest and at the ankles."""
     cells = Cells(56, 14, np.linspace(1.32, 0.832, 26), np.linspace(0.745, 0.08, 34))
     cage = trousers(cells, np.zeros_like)
     ring, count = cells.around // 2 + cells.between, len(cage.points)
@@ -165,10 +167,27 @@ def body() -> Solid:
     tips = np.array([[0.0, 1.335, 0.0], [LEG[-1, 1], 0.07, 0.0], [-LEG[-1, 1], 0.07, 0.0]])
     rings = [np.arange(cells.around)[::-1], last - ring + np.arange(ring), count - ring + np.arange(ring)]
     fans = [np.stack([np.full(len(r), count + i), r, np.roll(r, -1)], axis=1) for i, r in enumerate(rings)]
-    return Solid(
+    solid = Solid(
         np.concatenate([cage.points, tips]),
         np.concatenate([np.full(len(cage.quads), 4), np.full(sum(len(fan) for fan in fans), 3)]),
         np.concatenate([cage.quads.ravel(), *(fan.ravel() for fan in fans)]),
+    )
+    return solid.collider("Form", CANVAS, samples=np.stack([walk(solid.points, time) for time in times]))
+
+
+def garment(name: str, cage: Cage, samples: np.ndarray, look: Look, *, larger: bool = False) -> PlainMesh:
+    """A garment of its look's fabric, held by its top row; ``larger`` at rest than it is worn, and pushed together."""
+    top = cage.points[:, 1] > cage.points[:, 1].max() - 1e-6
+    waist = np.array([0.0, WAIST, 0.0])
+    return mesh(
+        name,
+        cage.quads,
+        (cage.points - waist) * LARGER + waist if larger else cage.points,
+        look,
+        samples=samples,
+        uv=cage.uv,
+        pin=top.astype(float),
+        fabric=PRESETS[look.name.lower()],
     )
 
 
@@ -191,10 +210,9 @@ def walk(points: np.ndarray, time: np.ndarray | float) -> np.ndarray:
     y, z = _bend(y, z, swing * ease((0.92 - points[:, 1]) / 0.25), at=(HIP, 0.0))
     chest = ease((points[:, 1] - 0.96) / 0.30)
     turn = np.radians(7.0) * stride * np.sin(phase) * (1.6 * chest - 1.0)
-    c, s = np.cos(turn), np.sin(turn)
     sway = 0.016 * stride * np.sin(phase + 0.6)
     bob = 0.010 * stride * np.cos(2.0 * phase)
-    return np.stack([c * x + s * z + sway, y + bob, c * z - s * x], axis=1)
+    return spin(np.stack([x, y, z], axis=1), turn) + np.stack(np.broadcast_arrays(sway, bob, 0.0), axis=-1)
 
 
 def _bend(y: np.ndarray, z: np.ndarray, angle: np.ndarray, *, at: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import fields, is_dataclass, replace
-from typing import Any, cast
+from typing import Any, TypeVar, cast
 
 import numpy as np
 import torch
@@ -16,12 +16,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ...solver.forces.base import ForceModule
-from ...solver.frame.group import Group
-from ...solver.frame.settings import SolveSettings
-from ...solver.integrate import METHODS
 from ...solver.integrate.base import Carry, Integrator, Shortened, Solver, System
-from ...solver.level import refine_garments
-from .patches import Patch, with_bodies
+from .patches import Patch, group_of
 from .rounds import Round, system_of
 
 NOISE = 1e-3
@@ -35,7 +31,6 @@ class JointSystem(System):
 
     Attributes:
         owner: Garment of each vertex, shape (V,).
-        garments: Number of garments.
         through: Whether gradients flow through forces.
         energies: Energy of each garment [J] at each evaluation, in their order.
     """
@@ -44,7 +39,6 @@ class JointSystem(System):
         """Take over a system that has a level.
 
         Args:
-            system: The system.
             through_forces: Let gradients flow through forces into the positions they were evaluated at; else only
                 through displacements.
         """
@@ -54,10 +48,6 @@ class JointSystem(System):
         self.owner, self.garments = level.vertex_garment.long(), len(level.spans)
         self.through = through_forces
         self.energies: list[Tensor] = []
-
-    def each(self, x: Float[Tensor, "vertices 3"]) -> tuple[Float[Tensor, " garments"], Float[Tensor, "vertices 3"]]:
-        """Energy of each garment [J] and the force [N]."""
-        return cast(ForceModule, self.field).energy_and_force_each(x.contiguous(), self.garments)
 
     def energy_and_force(self, x: Float[Tensor, "vertices 3"]) -> tuple[float, Float[Tensor, "vertices 3"]]:
         """Energy [J] and force [N], with gradients."""
@@ -85,7 +75,7 @@ class _EnergyForce(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, system: JointSystem) -> tuple[Tensor, Tensor]:
-        energies, force = system.each(x)
+        energies, force = cast(ForceModule, system.field).energy_and_force_each(x.contiguous(), system.garments)
         ctx.save_for_backward(x, force)
         ctx.system = system
         return energies, force
@@ -175,43 +165,39 @@ class Twin:
         return (total / count + 1e-12).sqrt()
 
 
+def _joined(positions: Sequence[Sequence[np.ndarray]], device: str) -> list[Tensor]:
+    """Positions of each patch at each level [m] as one tensor a level."""
+    return [torch.as_tensor(np.concatenate(each), device=device) for each in zip(*positions, strict=True)]
+
+
 class Bundle:
     """Patches of equally many levels under the same gravity, on one device.
 
     Attributes:
-        patches: The patches.
-        levels: Number of levels, the cage's included.
+        systems: One system a level, cage first.
         least: Least energy known of each patch at each level [J], shape (levels, patches), float64.
     """
 
     def __init__(self, patches: Sequence[Patch], *, device: str, through_forces: bool) -> None:
         """Build the group of patches that have the same number of levels and the same gravity."""
-        self.patches: tuple[Patch | Round, ...] = tuple(patches)
-        garments, count = [patch.garment for patch in patches], patches[0].garment.level
-        settings = SolveSettings(METHODS["quasi-newton"])
-        chains = refine_garments(garments, [count] * len(garments))
-        group = Group.of(garments, chains, patches[0].gravity, settings, dtype=torch.float32, device=device)
-        plain, coarse = group.systems([patch.frame for patch in patches])
-        systems = with_bodies(plain, group.levels, coarse, [patch.body for patch in patches])
+        garments = [patch.garment for patch in patches]
+        group = group_of(garments, patches[0].gravity, patches[0].level, device=device)
+        systems, _ = group.systems([patch.frame for patch in patches])
         self.systems = [JointSystem(system, through_forces=through_forces) for system in systems]
-        self.levels = len(systems)
         self._from_below = [level.from_below for level in group.levels]
-        self._raw, self._solved = (
-            [
-                torch.as_tensor(np.concatenate([getattr(p, name)[k] for p in patches]), device=device)
-                for k in range(self.levels)
-            ]
-            for name in ("raw", "solved")
-        )
-        self.least = torch.tensor([p.least for p in patches], dtype=torch.float64, device=device).T.contiguous()
-        self._ends = [x.clone() for x in self._raw]
-        self._known = torch.zeros((self.levels, len(patches)), dtype=torch.bool, device=device)
+        self._solved = _joined([patch.solved for patch in patches], device)
+        self._begin(_joined([patch.raw for patch in patches], device), [patch.least for patch in patches])
+
+    def _begin(self, raw: list[Tensor], least: Sequence[Sequence[float]]) -> None:
+        """Take the first starts [m], a tensor a level, and the least energies [J] of each patch at each level."""
+        self._raw, self._ends = raw, [x.clone() for x in raw]
+        self.least = torch.tensor(least, dtype=torch.float64, device=raw[0].device).T.contiguous()
+        self._known = torch.zeros(self.least.shape, dtype=torch.bool, device=raw[0].device)
 
     def begin(self, index: int, dice: Callable[[], Float[Tensor, " patches"]], *, config: Any) -> Tensor:
         """A start of each patch at a level [m]: the upsampled cage, a solved level below, or an earlier end.
 
         Args:
-            index: The level.
             dice: Gives a number between 0 and 1 for each patch.
             config: A `TrainConfig`, for its ``raw``, ``middle`` and ``own``.
         """
@@ -251,27 +237,17 @@ class RoundBundle(Bundle):
 
     def __init__(self, rounds: Sequence[Round], *, device: str, through_forces: bool) -> None:
         """Build the system of all rounds."""
-        self.patches = tuple(rounds)
         self.systems = [JointSystem(system_of(rounds, device=device), through_forces=through_forces)]
-        self.levels, self._from_below = 1, [None]
-        self._raw = [torch.as_tensor(np.concatenate([each.x for each in rounds]), device=device)]
-        self._solved = self._raw
-        self.least = torch.tensor([[each.least for each in rounds]], dtype=torch.float64, device=device)
-        self._ends = [x.clone() for x in self._raw]
-        self._known = torch.zeros((1, len(rounds)), dtype=torch.bool, device=device)
+        self._from_below = [None]
+        self._begin(_joined([[each.x] for each in rounds], device), [[each.least] for each in rounds])
 
 
-def deal_rounds(rounds: Sequence[Round], size: int) -> list[list[Round]]:
-    """Group rounds of equal level and gravity, in order, into batches for `RoundBundle` of a largest size."""
-    piles: dict[tuple[int, bool], list[Round]] = {}
-    for each in rounds:
-        piles.setdefault((each.garments[0].level, bool(each.gravity.any())), []).append(each)
-    return [pile[k : k + size] for pile in piles.values() for k in range(0, len(pile), size)]
+Case = TypeVar("Case", Patch, Round)
 
 
-def deal(patches: Sequence[Patch], size: int) -> list[list[Patch]]:
-    """Group patches of equal level and gravity, in order, into batches for `Bundle` of a largest size."""
-    piles: dict[tuple[int, bool], list[Patch]] = {}
-    for patch in patches:
-        piles.setdefault((patch.garment.level, bool(patch.gravity.any())), []).append(patch)
+def deal(cases: Sequence[Case], size: int) -> list[list[Case]]:
+    """Group patches or rounds of equal level and gravity, in order, into batches of a largest size."""
+    piles: dict[tuple[int, bool], list[Case]] = {}
+    for case in cases:
+        piles.setdefault((case.level, bool(case.gravity.any())), []).append(case)
     return [pile[k : k + size] for pile in piles.values() for k in range(0, len(pile), size)]

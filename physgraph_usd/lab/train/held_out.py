@@ -23,10 +23,10 @@ EVALUATIONS = (4, 12)
 
 
 class HeldOut:
-    """Patches and rounds to measure on, and what quasi-Newton comes to there."""
+    """Patches and rounds to measure on, and the gaps of quasi-Newton there."""
 
     def __init__(self, patches: Sequence[Patch], rounds: Sequence[Round]) -> None:
-        """Take them; quasi-Newton is asked when it is first needed."""
+        """Build the systems of the rounds; quasi-Newton is measured when it is first needed."""
         self._patches, self._rounds = patches, [(each, system_of([each], device="cpu")) for each in rounds]
         self._known: dict[str, list[float]] = {}
 
@@ -44,22 +44,20 @@ class HeldOut:
 
     def _ratio(self, name: str, ours: Integrator, cases: Sequence[Any], steps: Any) -> float:
         if name not in self._known:
-            self._known[name] = [_gap(case, QuasiNewton(), steps) for case in cases]
-        pairs = [(_gap(case, ours, steps), theirs) for case, theirs in zip(cases, self._known[name], strict=True)]
+            self._known[name] = self._gaps(QuasiNewton(), cases, steps)
+        pairs = zip(self._gaps(ours, cases, steps), self._known[name], strict=True)
         logs = [math.log(max(mine, 1e-3) / max(theirs, 1e-3)) for mine, theirs in pairs]
         return round(math.exp(float(np.mean(logs))), 4)
 
-
-def _gap(case: Any, integrator: Integrator, steps: Any) -> float:
-    if isinstance(case, Patch):
-        return nested_gap(case, integrator, steps)
-    each, system = case
-    return round_gap(each, system, integrator, steps)
+    def _gaps(self, integrator: Integrator, cases: Sequence[Any], steps: Any) -> list[float]:
+        if cases is self._patches:
+            return [nested_gap(case, integrator, steps) for case in cases]
+        return [_round_gap(each, system, integrator, steps) for each, system in cases]
 
 
 def nested_gap(patch: Patch, integrator: Integrator, steps: Sequence[int]) -> float:
     """Gap at the finest level after so many steps a level, the last entries for the finest levels."""
-    x = patch.begin(0)
+    x = torch.as_tensor(patch.raw[0])
     energy = math.inf
     counts = steps[-len(patch.systems) :] if len(patch.systems) <= len(steps) else (steps[0], *steps)
     with torch.no_grad():
@@ -72,7 +70,7 @@ def nested_gap(patch: Patch, integrator: Integrator, steps: Sequence[int]) -> fl
     return gap if math.isfinite(gap) else 1e6
 
 
-def round_gap(each: Round, system: System, integrator: Integrator, evaluations: int) -> float:
+def _round_gap(each: Round, system: System, integrator: Integrator, evaluations: int) -> float:
     """Gap of a round after so many force evaluations, that at its start not counted."""
     before = system.evaluations
     carry = integrator.start(system, torch.as_tensor(each.x))

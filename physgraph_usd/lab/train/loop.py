@@ -7,6 +7,7 @@ import os
 import pickle
 import time
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -19,15 +20,17 @@ from torch import Tensor
 from ...errors import UsageError
 from ...shot.plain_json import to_json
 from ...solver.integrate.network import Physgraph, PhysgraphConfig
-from ...solver.integrate.weights import NETWORKS, integrator_of, load_network, make_network
+from ...solver.integrate.weights import integrator_of, load_network, make_network
 from ..methods.paper_network import PaperConfig, PaperNetwork
-from .bundle import Bundle, RoundBundle, Twin, deal, deal_rounds, detached, unrolled
+from .bundle import Bundle, RoundBundle, Twin, deal, detached, unrolled
 from .held_out import HeldOut
 from .patches import Patch, PatchConfig, make_patches
 from .rounds import Round, RoundConfig, make_rounds
 
 HARMLESS = 0.02
 """Fraction of the energy at the start below which the logarithm of the gap stops to reward."""
+MOST_GRADIENT = 1.0
+"""Largest norm of the gradient."""
 TWINS = 1 / 3
 """Fraction of the iterations in which a second descent shows how differences grow; the weight makes up for the rest."""
 EVERY = 120.0
@@ -42,8 +45,6 @@ class TrainConfig:
 
     Attributes:
         kind: "physgraph" or "physgraph-paper".
-        network: Size of the network.
-        patches: The patches that it is trained on.
         seed: Of patches, weights and order.
         minutes: How long to train, patches not counted.
         iterations: Most iterations, or None.
@@ -60,12 +61,10 @@ class TrainConfig:
         own: Fraction of those that the network itself has solved; quasi-Newton the others.
         turn: Turn each start at random; only where neither gravity nor guide has a direction.
         rate: Adam's first rate; it falls to a hundredth along a cosine.
-        clip: Largest norm of the gradient.
         average: Decay of the weights' running mean, which is the result.
         held_out: Patches to measure on.
-        rounds: Rounds of moving scenes with contact that it is trained on, beside the patches.
-        start: Weights to begin with: "" none, "shipped" those that ship, or a file; in TOML
-            relative to it; a larger network begins as they do.
+        rounds: Rounds of moving scenes with contact to train on beside the patches.
+        start: File of weights to begin with, in TOML relative to it; "" for none.
     """
 
     kind: str = "physgraph"
@@ -86,7 +85,6 @@ class TrainConfig:
     own: float = 0.5
     turn: bool = False
     rate: float = 3e-3
-    clip: float = 1.0
     average: float = 0.99
     held_out: int = 8
     rounds: RoundConfig = field(default_factory=RoundConfig)
@@ -97,40 +95,44 @@ class Trainer:
     """A network in training.
 
     Attributes:
-        config: The run.
-        network: The network.
         iteration: Iterations made.
-        seconds: Time they took.
-        curve: Measurements on the way.
+        seconds: Time they took [s].
+        curve: Measurements on held-out patches and rounds.
     """
 
     def __init__(self, config: TrainConfig, *, device: str = "cpu", data: Data | None = None) -> None:
-        """Make patches, rounds and a network on "cpu" or a CUDA device; data that `data_of` gave are not made anew."""
+        """Make patches, rounds and a network on "cpu" or a CUDA device; data that `data_of` gave are not made anew.
+
+        Raises:
+            UsageError: The weights to begin with are of another size.
+            WeightsError: They cannot be read.
+        """
         self.config, self.device = config, device
         torch.manual_seed(config.seed)
-        self.network = _begun(config).to(device)
+        self.network = make_network(config.network).to(device)
+        if config.start:
+            begun = load_network(Path(config.start), kind=config.kind)
+            if begun.config != config.network:
+                raise UsageError(f"{config.start} holds a network of another size than this configuration's")
+            self.network.load_state_dict(begun.state_dict())
         self._mean = torch.optim.swa_utils.AveragedModel(
             self.network, multi_avg_fn=torch.optim.swa_utils.get_ema_multi_avg_fn(config.average), use_buffers=True
         )
         self._optimiser = torch.optim.Adam(self.network.parameters(), lr=config.rate)
         self.patches, rounds, rest, few = data or data_of(config)
         self._held_out = HeldOut(rest, few)
-        through = config.through_forces
-        self._bundles: list[Bundle] = [
-            Bundle(batch, device=device, through_forces=through) for batch in deal(self.patches, config.batch)
-        ]
-        self._round_bundles = [
-            RoundBundle(batch, device=device, through_forces=through) for batch in deal_rounds(rounds, config.batch)
-        ]
+        made = {"device": device, "through_forces": config.through_forces}
+        self._bundles = [Bundle(batch, **made) for batch in deal(self.patches, config.batch)]
+        self._round_bundles = [RoundBundle(batch, **made) for batch in deal(rounds, config.batch)]
         self._rng = np.random.default_rng(config.seed + 1)
         self.iteration, self.seconds = 0, 0.0
         self.curve: list[dict[str, Any]] = []
 
-    def train(self, *, say: Any = None, keep: Path | None = None) -> None:
+    def train(self, *, say: Callable[[str], None] | None = None, keep: Path | None = None) -> None:
         """Train until the time or the iterations are spent.
 
         Args:
-            say: Called with a line at each measurement.
+            say: Called with a line of JSON at each measurement.
             keep: File for checkpoints, or None.
         """
         config = self.config
@@ -153,11 +155,8 @@ class Trainer:
     @property
     def progress(self) -> float:
         """Fraction of the run that is done."""
-        config = self.config
-        parts = [self.seconds / (60.0 * config.minutes)]
-        if config.iterations is not None:
-            parts.append(self.iteration / config.iterations)
-        return max(parts)
+        by_time, most = self.seconds / (60.0 * self.config.minutes), self.config.iterations
+        return by_time if most is None else max(by_time, self.iteration / most)
 
     def iterate(self) -> float:
         """One iteration; returns the mean loss."""
@@ -168,7 +167,7 @@ class Trainer:
         self._optimiser.zero_grad()
         self.network.train()
         loss = self._descend(steps)
-        torch.nn.utils.clip_grad_norm_(self.network.parameters(), config.clip)
+        torch.nn.utils.clip_grad_norm_(self.network.parameters(), MOST_GRADIENT)
         if all(bool(p.grad.isfinite().all()) for p in self.network.parameters() if p.grad is not None):
             self._optimiser.step()
             self._mean.update_parameters(self.network)
@@ -181,13 +180,19 @@ class Trainer:
         touching = bool(self._round_bundles) and self._rng.random() < config.rounds.share
         bundles = self._round_bundles if touching else self._bundles
         bundle = bundles[int(self._rng.integers(len(bundles)))]
-        index = int(self._rng.integers(bundle.levels))
+        index = int(self._rng.integers(len(bundle.systems)))
         system = bundle.systems[index]
         system.energies.clear()
-        x = bundle.begin(index, lambda: self._dice(len(bundle.patches)), config=config)
+
+        def dice() -> Tensor:
+            return torch.as_tensor(self._rng.random(system.garments), device=self.device)
+
+        x = bundle.begin(index, dice, config=config)
         integrator = integrator_of(self.network)
         segments = int(self._rng.integers(1, config.segments + 1))
-        x = self._turned(x) if config.turn else x
+        if config.turn:
+            turn = np.linalg.qr(self._rng.normal(size=(3, 3)))[0]
+            x = x @ torch.as_tensor(turn * np.linalg.det(turn), dtype=x.dtype, device=x.device)
         twin = Twin(integrator, system, x) if config.steady and self._rng.random() < TWINS else None
         carry, total = integrator.start(system, x), 0.0
         before = system.energies[-1].detach()
@@ -208,14 +213,6 @@ class Trainer:
             total += float(loss.detach()) / segments
         bundle.keep(index, carry.x.detach(), system.energies[-1].detach() <= before)
         return total
-
-    def _turned(self, x: Tensor) -> Tensor:
-        """The positions after a random rotation."""
-        turn = np.linalg.qr(self._rng.normal(size=(3, 3)))[0]
-        return x @ torch.as_tensor(turn * np.linalg.det(turn), dtype=x.dtype, device=x.device)
-
-    def _dice(self, count: int) -> Tensor:
-        return torch.as_tensor(self._rng.random(count), device=self.device)
 
     def averaged(self) -> Physgraph | PaperNetwork:
         """The running mean of the weights, ready for use."""
@@ -262,7 +259,6 @@ class Trainer:
             raise UsageError(f"{file} does not fit this configuration: {error}") from error
 
     def _take(self, state: dict[str, Any]) -> None:
-        """Take over what `save` wrote."""
         self.network.load_state_dict(state["network"])
         self._mean.load_state_dict(state["mean"])
         self._optimiser.load_state_dict(state["optimiser"])
@@ -277,30 +273,14 @@ Data = tuple[list[Patch], list[Round], list[Patch], list[Round]]
 """Patches and rounds to train on, and those to measure on."""
 
 
-def data_of(config: TrainConfig, *, workers: int | None = None) -> Data:
+def data_of(config: TrainConfig) -> Data:
     """Patches and rounds of a configuration, the same for a seed with any number of processes."""
-    workers = os.cpu_count() or 1 if workers is None else workers
-    held = config.held_out
+    workers, held = os.cpu_count() or 1, config.held_out
     patches = make_patches(config.patches, seed=config.seed, workers=min(workers, config.patches.count // 8))
     rest = make_patches(replace(config.patches, count=held), seed=HELD_OUT, workers=min(workers, held // 4))
-    own = make_rounds(config.rounds, seed=config.seed, workers=workers) if config.rounds.scenes else []
+    own = make_rounds(config.rounds, seed=config.seed, workers=workers)
     few = replace(config.rounds, scenes=config.rounds.held_out)
-    return patches, own, rest, make_rounds(few, seed=HELD_OUT, workers=workers) if few.scenes else []
-
-
-def _begun(config: TrainConfig) -> Physgraph | PaperNetwork:
-    """The network that training begins with."""
-    network = make_network(config.network)
-    if not config.start:
-        return network
-    file = NETWORKS[config.kind].file if config.start == "shipped" else Path(config.start)
-    known, own = load_network(file, kind=config.kind).state_dict(), network.state_dict()
-    for name, value in known.items():
-        if name.removesuffix(".weight").removesuffix(".bias").split(".")[0] in ("hidden", "decode", "messages"):
-            own[name].zero_() if name.startswith("decode") else own[name][: len(value)].zero_()
-        own[name][tuple(slice(0, size) for size in value.shape)] = value
-    network.load_state_dict(own)
-    return network
+    return patches, own, rest, make_rounds(few, seed=HELD_OUT, workers=workers)
 
 
 def loss_of(
@@ -311,14 +291,14 @@ def loss_of(
     kind: str,
     late: float = 0.0,
 ) -> Float[Tensor, ""]:
-    """Mean over patches, weighted over steps, of the gap or of its logarithm, relative to the start; energies [J].
+    """Mean over patches of the gap or of its logarithm, relative to the start, step k weighted by a power of k.
 
     Args:
-        energies: After each step.
-        before: At the start.
-        least: The least known.
+        energies: Energies after each step [J].
+        before: Energies at the start [J].
+        least: Least energies known [J].
         kind: "ratio" or "log".
-        late: Power of k that weighs step k.
+        late: The power.
     """
     scale = torch.maximum(before - least, 1e-6 * before.abs()).clamp_min(1e-30)
     gap = (energies - least) / scale

@@ -2,68 +2,54 @@
 
 A patch is a sheet, a tube or a dome of 6 to 12 cage edges, irregular or in quads whose diagonals alternate. It is posed
 by a smooth random deformation, and some patches are draped first: our own solver lets the cage hang from what is fixed.
-Some rest on a wavy body close to the cloth, seen as a plane at each vertex: planes that stay, about parallel to the
-cloth, some of them pushing, as the solver's rounds show them to an integrator. No asset is read.
+No asset is read.
 """
 
 from __future__ import annotations
 
 import multiprocessing
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from scipy.spatial import Delaunay
 from scipy.spatial.transform import Rotation
-from torch import Tensor
 
 from ...shot.solve import prepare_device
-from ...solver.contact.metric import HeldMetric
-from ...solver.contact.settings import ContactSettings
 from ...solver.fabric import Fabric
-from ...solver.forces.base import ForceModule
-from ...solver.forces.self_contact import PairConstraints, SelfContact
 from ...solver.frame.group import Group
 from ...solver.frame.settings import SolveSettings
 from ...solver.integrate import METHODS
 from ...solver.integrate.base import System
 from ...solver.integrate.descend import solve_level
-from ...solver.integrate.metric import Metric
 from ...solver.integrate.quasi_newton import QuasiNewton
 from ...solver.integrate.saddle import leave_saddle
 from ...solver.integrate.stop import Budget
-from ...solver.integrate.vertex_frame import VertexFrame
-from ...solver.level import Level, refine_garments
+from ...solver.level import refine_garments
 from ...solver.mesh.topology import PolygonMesh, edges_of
 from ...solver.scene import Garment, GarmentFrame
 from ..samples.shapes import quad_grid
 
-SHAPES = ("sheet", "tube", "dome")
+T = TypeVar("T")
 BORDERS = ("fixed", "one side", "free")
-HEIGHT = (-2.0, -0.9)
-"""Least and largest power of ten of the height of a body's waves, in cage edges: how far the body pierces the cloth."""
-WAVES = (0.5, 3.0)
-"""A body's waves along a patch."""
+DECADES = 3.0
+"""Range of the stiffnesses in powers of ten; two thirds of them lie in the middle half."""
 
 
 @dataclass(frozen=True)
 class PatchConfig:
-    """How patches are made.
+    """Values of generated patches.
 
     Attributes:
-        count: Number of patches.
         levels: Least and most subdivisions.
         edges: Least and most cage edges along a side.
-        decades: Range of the stiffnesses in powers of ten; two thirds of them lie in the middle half.
         elastic: Stretch and bending only, the border fixed, as in the paper; else gravity and guide too.
         most_vertices: Finest vertices beyond which a patch has one level less.
         reference_steps: Quasi-Newton steps a level behind the least energy known.
-        touched: Fraction of the patches that rest on a body.
         skinned: Fraction of the poses that are bent as linear blend skinning bends, sharply and losing length.
         pulled: Fraction of the poses that are stretched along one direction.
     """
@@ -71,71 +57,11 @@ class PatchConfig:
     count: int = 64
     levels: tuple[int, int] = (1, 3)
     edges: tuple[int, int] = (6, 12)
-    decades: float = 3.0
     elastic: bool = False
     most_vertices: int = 4000
     reference_steps: int = 150
-    touched: float = 0.0
     skinned: float = 0.0
     pulled: float = 0.0
-
-
-@dataclass(frozen=True, eq=False)
-class Body:
-    """A body beside one patch.
-
-    Attributes:
-        side: 1 where it lies behind the cloth's normals, -1 before them.
-        wave: Wave vector [1/m], shape (3,).
-        phase: [rad].
-        height: How far it comes through the upsampled cage at most [m]; at least it stays as far away.
-        stiffness: k_c [N/m^3].
-    """
-
-    side: float
-    wave: np.ndarray
-    phase: float
-    height: float
-    stiffness: float
-
-    @staticmethod
-    def random(rng: np.random.Generator, *, size: float, edge: float, stretch: float) -> Body:
-        """A body for a patch of so large a size [m], with cage edges [m] and a stretch stiffness [N/m]."""
-        direction = rng.normal(size=3)
-        wave = 2.0 * np.pi * rng.uniform(*WAVES) / size * direction / np.linalg.norm(direction)
-        stiffness = ContactSettings().stiffness * stretch / edge**2
-        height = edge * 10.0 ** rng.uniform(*HEIGHT)
-        return Body(float(rng.choice([-1.0, 1.0])), wave, float(rng.uniform(0.0, 2.0 * np.pi)), height, stiffness)
-
-    def contact(self, level: Level, base: Float[Tensor, "vertices 3"], *, span: slice) -> SelfContact:
-        """The force on a patch at a level, from the upsampled cages [m] and the span of the patch's vertices."""
-        normal = self.side * VertexFrame(level, base).normal[span]
-        cage = base[span]
-        lift = self.height * torch.sin(cage @ torch.as_tensor(self.wave).to(cage) + self.phase)
-        vertex = torch.arange(span.start, span.stop, dtype=torch.int32, device=base.device)
-        weight = torch.zeros((len(vertex), 4), dtype=base.dtype, device=base.device)
-        weight[:, 0] = 1.0
-        height, stiffness = (normal * cage).sum(dim=1) + lift, self.stiffness * level.vertex_area[span]
-        corners = vertex.unsqueeze(1).repeat(1, 4)
-        return SelfContact(level, PairConstraints(corners, weight, normal.contiguous(), height, stiffness), "contact")
-
-
-def with_bodies(
-    systems: Sequence[System], levels: Sequence[Level], coarse: Float[Tensor, "coarse 3"], bodies: Sequence[Body | None]
-) -> list[System]:
-    """Systems without contact, one a level, made to feel the body of each patch, in their forces and their metrics."""
-    if not any(bodies):
-        return list(systems)
-    out = []
-    for system, level in zip(systems, levels, strict=True):
-        base = level.base.apply(coarse)
-        terms = [body.contact(level, base, span=span) for body, span in zip(bodies, level.spans, strict=True) if body]
-        assert isinstance(system.field, ForceModule)
-        assert isinstance(system.metric, Metric)
-        stiff = 3.0 * torch.stack([term.diagonal(base) for term in terms]).sum(dim=0)
-        field = ForceModule((*system.field.forces, *terms))
-        out.append(System(field, HeldMetric(system.metric, stiff), free=level.free, spacing=level.spacing, level=level))
-    return out
 
 
 @dataclass(eq=False)
@@ -143,12 +69,10 @@ class Patch:
     """One patch in one pose, on the CPU.
 
     Attributes:
-        garment: Its cage.
         frame: Its pose, about the origin, and fabric.
         gravity: [m/s^2], shape (3,).
         words: Its shape, mesh, border and levels.
-        body: The body that it rests on, or None.
-        raw: Upsampled cage at each level [m], float32, off the saddle where it is flat.
+        raw: Upsampled cage at each level [m], float32; a flat one, a saddle of the energy, is bent a little.
         start: Its energy without leaving the saddle [J].
         least: Least energy known at each level [J].
         solved: Positions after some steps of nested quasi-Newton at each level [m], float32.
@@ -158,26 +82,25 @@ class Patch:
     frame: GarmentFrame
     gravity: np.ndarray
     words: str
-    body: Body | None = None
     raw: list[np.ndarray] = field(default_factory=list)
     start: list[float] = field(default_factory=list)
     least: list[float] = field(default_factory=list)
     solved: list[np.ndarray] = field(default_factory=list)
 
+    @property
+    def level(self) -> int:
+        """Subdivisions of its cage."""
+        return self.garment.level
+
     @cached_property
     def group(self) -> Group:
         """The solver's levels."""
-        return _group(self.garment, self.gravity, self.garment.level)
+        return group_of([self.garment], self.gravity, self.level)
 
     @cached_property
     def systems(self) -> list[System]:
         """One system a level, cage first."""
-        systems, coarse = self.group.systems([self.frame])
-        return with_bodies(systems, self.group.levels, coarse, [self.body])
-
-    def begin(self, index: int) -> Tensor:
-        """The upsampled cage at a level [m]; flat cloth is bent a little: a flat sheet is a saddle of the energy."""
-        return torch.as_tensor(self.raw[index])
+        return self.group.systems([self.frame])[0]
 
     def __getstate__(self) -> dict[str, Any]:
         """The fields without `group` and `systems`: they hold kernels, and are made on demand."""
@@ -186,20 +109,24 @@ class Patch:
 
 def make_patches(config: PatchConfig, *, seed: int, workers: int = 1) -> list[Patch]:
     """Make patches, the same for a seed with any number of processes; those whose pose is near rest are made again."""
-    jobs = [(config, seed, number) for number in range(config.count)]
+    return made_of_numbers(_numbered, config, seed, config.count, workers=workers)
+
+
+def made_of_numbers(make: Callable[[Any, int, int], T], config: Any, seed: int, count: int, *, workers: int) -> list[T]:
+    """Results of a function for a configuration, a seed and each number below a count, made in some processes."""
+    jobs = [(config, seed, number) for number in range(count)]
     if workers <= 1 or len(jobs) < 2 * workers:
-        return [_numbered(*job) for job in jobs]
+        return [make(*job) for job in jobs]
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(workers, mp_context=context, initializer=prepare_device, initargs=("cpu",)) as pool:
-        return list(pool.map(_numbered, *zip(*jobs, strict=True), chunksize=4))
+        return list(pool.map(make, *zip(*jobs, strict=True)))
 
 
-def measure(patch: Patch, steps: int, *, presolve: int) -> None:
+def _measure(patch: Patch, steps: int, *, presolve: int) -> None:
     """Find the energies between which a patch's levels move, by nested quasi-Newton of so many steps a level.
 
     The positions of a second, shorter solve of ``presolve`` steps a level are starts for training.
     """
-    patch.raw, patch.start, patch.least, patch.solved = [], [], [], []
     coarse = patch.group.systems([patch.frame])[1]
     x = short = coarse
     for index, (level, system) in enumerate(zip(patch.group.levels, patch.systems, strict=True)):
@@ -215,26 +142,26 @@ def measure(patch: Patch, steps: int, *, presolve: int) -> None:
 
 
 def _numbered(config: PatchConfig, seed: int, number: int) -> Patch:
-    """The patch of a number, the same in every process."""
     rng = np.random.default_rng([seed, number])
     while True:
         patch = patch_of(config, rng)
-        measure(patch, config.reference_steps, presolve=int(rng.choice([5, 10, 20, 40])))
+        _measure(patch, config.reference_steps, presolve=int(rng.choice([5, 10, 20, 40])))
         drop = [a - b for a, b in zip(patch.start, patch.least, strict=True)]
         if all(np.isfinite(drop)) and min(drop) > 1e-3 * abs(patch.start[-1]) + 1e-12:
             patch.__dict__ = patch.__getstate__()
             return patch
 
 
-def _group(garment: Garment, gravity: np.ndarray, level: int) -> Group:
-    chains, settings = refine_garments([garment], [level]), SolveSettings(METHODS["quasi-newton"])
-    return Group.of([garment], chains, gravity, settings, dtype=torch.float32, device="cpu")
+def group_of(garments: Sequence[Garment], gravity: np.ndarray, level: int, *, device: str = "cpu") -> Group:
+    """The levels of garments that are all subdivided so many times, under a gravity [m/s^2]."""
+    chains, settings = refine_garments(garments, [level] * len(garments)), SolveSettings(METHODS["quasi-newton"])
+    return Group.of(garments, chains, gravity, settings, dtype=torch.float32, device=device)
 
 
 def patch_of(config: PatchConfig, rng: np.random.Generator) -> Patch:
     """A patch in a random pose, its energies not yet measured."""
     mesh, flat, closed = _mesh(config, rng)
-    shape = "tube" if closed else str(rng.choice([s for s in SHAPES if s != "tube"]))
+    shape = "tube" if closed else str(rng.choice(["sheet", "dome"]))
     edge = 10 ** rng.uniform(-2.3, -1.3)
     rest = edge * _rolled(flat, shape, rng)
     border = "fixed" if config.elastic else str(rng.choice(BORDERS, p=(0.25, 0.25, 0.5)))
@@ -246,15 +173,14 @@ def patch_of(config: PatchConfig, rng: np.random.Generator) -> Patch:
         levels -= 1
     garment = Garment("/Patch", mesh, rest, levels, bool(rng.random() < 0.3), one, one, one, one, pin)
     points = posed(rest, rng, config)
-    if rng.random() < 0.5 and pin.any():
-        points = _draped(_group(garment, gravity, 0), points, fabric, guide=guide, rng=rng)
+    if rng.random() < 0.5 and pin.any():  # some steps of our own solver, softer than the cloth: it folds as a cage does
+        soft = GarmentFrame(points, replace(fabric, bend=100.0 * fabric.bend), 0.1 * guide)
+        systems, x = group_of([garment], gravity, 0).systems([soft])
+        x, _ = solve_level(systems[0], QuasiNewton(), x, level=0, budget=Budget(int(rng.integers(2, 20))))
+        points = x.double().numpy()
     frame = GarmentFrame(points - points.mean(axis=0), fabric, guide)
     words = f"{shape}, {'quads' if not mesh.is_triangles else 'triangles'}, border {border}, levels {levels}"
-    body = None
-    if config.touched and rng.random() < config.touched:
-        size = float(np.ptp(points, axis=0).max())
-        body, words = Body.random(rng, size=size, edge=edge, stretch=fabric.stretch), f"{words}, on a body"
-    return Patch(garment, frame, gravity, words, body)
+    return Patch(garment, frame, gravity, words)
 
 
 def _mesh(config: PatchConfig, rng: np.random.Generator) -> tuple[PolygonMesh, np.ndarray, bool]:
@@ -293,7 +219,6 @@ def _quads(columns: int, rows: int, rng: np.random.Generator, *, closed: bool) -
 
 
 def _rolled(flat: np.ndarray, shape: str, rng: np.random.Generator) -> np.ndarray:
-    """The rest shape in cage edges."""
     u, v = flat.T
     if shape == "tube":
         columns = u.max() + 1.0
@@ -341,7 +266,6 @@ def _skinned(x: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def _pinned(mesh: PolygonMesh, flat: np.ndarray, border: str) -> np.ndarray:
-    """1 on the fixed part of the border."""
     pin = np.zeros(mesh.vertex_count)
     edges = edges_of(mesh.triangulate().triangles, mesh.vertex_count)
     rim = np.unique(edges.vertices[edges.face_count == 1])
@@ -353,23 +277,12 @@ def _pinned(mesh: PolygonMesh, flat: np.ndarray, border: str) -> np.ndarray:
 
 
 def _material(config: PatchConfig, rng: np.random.Generator, *, free: bool) -> tuple[Fabric, float, np.ndarray]:
-    """Fabric, guide stiffness [N/m^3] and gravity [m/s^2]."""
-    half = 0.5 * config.decades
-    stretch, bend = (
-        middle * 10 ** float(np.clip(rng.normal(0.0, 0.5 * half), -half, half)) for middle in (100.0, 5e-6)
-    )
+    half = 0.5 * DECADES
+    stretch, bend = (m * 10 ** float(np.clip(rng.normal(0.0, 0.5 * half), -half, half)) for m in (100.0, 5e-6))
     # Poses are turned anywhere, so one direction of gravity is enough.
     down = np.array([0.0, 0.0, -9.81]) * (0.0 if config.elastic else float(rng.random() < 0.7))
     guide = 2000.0 * 10 ** rng.uniform(-0.7, 0.7) if free or rng.random() < 0.8 else 0.0
     return Fabric(stretch, bend, rng.uniform(0.08, 0.6)), 0.0 if config.elastic else guide, down
-
-
-def _draped(group: Group, points: np.ndarray, fabric: Fabric, *, guide: float, rng: np.random.Generator) -> np.ndarray:
-    """The cage after some steps of our own solver, softer than the cloth so that it folds as a cage does."""
-    soft = Fabric(fabric.stretch, 100.0 * fabric.bend, fabric.density)
-    systems, x = group.systems([GarmentFrame(points, soft, 0.1 * guide)])
-    x, _ = solve_level(systems[0], QuasiNewton(), x, level=0, budget=Budget(int(rng.integers(2, 20))))
-    return x.double().numpy()
 
 
 def describe(patches: Sequence[Patch]) -> list[str]:

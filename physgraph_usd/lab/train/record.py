@@ -40,7 +40,6 @@ def run_training(
     Args:
         config_file: TOML whose keys are those of `TrainConfig`, with tables ``network``, ``patches`` and ``rounds``.
         out: Folder for the log, the checkpoint, the weights and the card; created when missing.
-        device: "cpu" or a CUDA device.
         resume: Go on from the folder's checkpoint.
         minutes: In place of the configuration's.
         say: Called with a line of JSON at each measurement.
@@ -73,8 +72,8 @@ def run_training(
 
     trainer.train(say=note, keep=checkpoint)
     digest = save_network(trainer.averaged(), weights)
-    card = card_of(trainer, digest, config_file=config_file, out=out)
-    weights.with_suffix(".json").write_text(to_json(card) + "\n", encoding="utf-8")
+    card = to_json(_card(trainer, digest, config_file=config_file, out=out))
+    weights.with_suffix(".json").write_text(card + "\n", encoding="utf-8")
     return weights
 
 
@@ -99,13 +98,12 @@ def read_config(file: Path) -> TrainConfig:
     unknown = [name for name in getattr(network, "vectors", ()) if name not in VECTORS]
     if unknown:
         raise UsageError(f"{file}: unknown vectors {', '.join(unknown)}; known: {', '.join(VECTORS)}")
-    if (start := values.get("start")) and start != "shipped":
+    if start := values.get("start"):
         values["start"] = str(file.parent / str(start))
     return _filled(TrainConfig, values | {"network": network, "patches": patches, "rounds": rounds}, where=str(file))
 
 
-def card_of(trainer: Trainer, digest: str, *, config_file: Path, out: Path) -> dict[str, Any]:
-    """The card of weights: network, patches, time, and the command that trains them again."""
+def _card(trainer: Trainer, digest: str, *, config_file: Path, out: Path) -> dict[str, Any]:
     config = trainer.config
     cuda = trainer.device.startswith("cuda")
     command = ["physgraph-usd", "train", "--config", str(config_file), "--device", trainer.device, "-o", str(out)]

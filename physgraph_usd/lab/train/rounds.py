@@ -7,9 +7,7 @@ in many processes and built again, many as one system, where they are needed.
 
 from __future__ import annotations
 
-import multiprocessing
-from collections.abc import Iterable, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import reduce
 
@@ -19,7 +17,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ...errors import PhysGraphError
-from ...shot.solve import prepare_device
 from ...solver.contact.metric import HeldMetric
 from ...solver.forces.base import Force, ForceModule
 from ...solver.forces.guide import Guide
@@ -34,17 +31,20 @@ from ...solver.integrate.descend import solve_level
 from ...solver.integrate.metric import Metric
 from ...solver.integrate.quasi_newton import QuasiNewton
 from ...solver.integrate.stop import Budget
-from ...solver.level import Level, refine_garments
-from ...solver.scene import Frame, Garment, GarmentFrame, Scene
-from .scenes import KINDS, moving_scene
+from ...solver.scene import Garment, GarmentFrame
+from .patches import group_of, made_of_numbers
+from .scenes import KINDS, Moving, moving_scene
+
+STEPS = 12
+"""Most steps of a level while rounds are recorded."""
 
 
 @dataclass(frozen=True)
 class RoundConfig:
-    """How rounds are made.
+    """Values of recorded rounds.
 
     Attributes:
-        scenes: Number of scenes; none are made at 0.
+        scenes: Number of scenes.
         held_out: Number of scenes to measure on.
         share: Part of the iterations that descend rounds.
         reference_steps: Quasi-Newton steps behind the least energies known.
@@ -58,16 +58,13 @@ class RoundConfig:
     most_vertices: int = 4000
 
 
-Arrays = tuple[np.ndarray, ...]
-
-
 @dataclass(frozen=True, eq=False)
 class Round:
     """One round of the finest level of garments that are solved together, as its integrator sees it.
 
     Attributes:
-        words: Which.
-        garments: Their cages.
+        words: Name for logs.
+        garments: Their cages, all with as many subdivisions.
         frames: Their materials.
         gravity: [m/s^2], shape (3,).
         aim: The cage that the cloth follows, recentred [m], shape (C, 3).
@@ -85,7 +82,7 @@ class Round:
     frames: tuple[GarmentFrame, ...]
     gravity: np.ndarray
     aim: np.ndarray
-    pairs: Arrays
+    pairs: tuple[np.ndarray, ...]
     tie: float
     predicted: np.ndarray
     stiff: np.ndarray
@@ -94,60 +91,57 @@ class Round:
     least: float = 0.0
 
     @property
+    def level(self) -> int:
+        """Subdivisions of the cages."""
+        return self.garments[0].level
+
+    @property
     def touches(self) -> bool:
         """Whether something is near."""
         return bool(self.pairs)
 
 
 class Watch:
-    """Wraps an integrator and records system and start positions of each round at the finest level."""
+    """An integrator that records the system and the start of each round."""
 
     def __init__(self, inner: Integrator) -> None:
-        """Watch an integrator."""
+        """Wrap the integrator whose steps are made."""
         self.name, self._inner = inner.name, inner
         self.seen: list[tuple[System, Tensor]] = []
 
     def start(self, system: System, x: Float[Tensor, "vertices 3"]) -> Carry:
-        """Note, and start."""
+        """The inner integrator's start, recorded."""
         self.seen.append((system, x.clone()))
         return self._inner.start(system, x)
 
     def resume(self, system: System, carry: Carry) -> Carry:
-        """Note, and go on."""
+        """The inner integrator's resumed carry, recorded."""
         self.seen.append((system, carry.x.clone()))
         return resumed(self._inner, system, carry)
 
     def step(self, system: System, carry: Carry) -> Carry:
-        """One step of the integrator's."""
+        """The inner integrator's step."""
         return self._inner.step(system, carry)
 
 
-def rounds_of(
-    scene: Scene, frames: Iterable[Frame], *, levels: Sequence[int], method: str, words: str, steps: int = 12
-) -> list[Round]:
-    """The rounds of some frames in order, solved by a method; only of levels that are the garments' finest."""
+def _rounds_of(moving: Moving, method: str) -> list[Round]:
+    """The rounds of a scene's frames in order, solved by a method; only of the garments' finest levels."""
     watch = Watch(METHODS[method].build())
-    settings = SolveSettings(Method(lambda: watch, nested=True), steps=steps)
-    refiner = Refiner(scene, settings, levels=list(levels))
+    refiner = Refiner(moving.scene, SolveSettings(Method(lambda: watch, nested=True), steps=STEPS))
     rounds = []
-    for number, frame in enumerate(frames):
+    for number, frame in enumerate(moving.frames):
         watch.seen.clear()
         refiner.solve(frame)
         for part in refiner.parts_of(frame):
-            group = refiner.group_of(part)
-            own = [(system, x) for system, x in watch.seen if _is_of(system, group.levels[-1])]
+            group, frames = refiner.group_of(part), [frame.garments[index] for index in part]
+            finest = group.levels[-1].index, group.levels[-1].vertex_count
+            own = [(s, x) for s, x in watch.seen if s.level and (s.level.index, s.level.vertex_count) == finest]
             for place, (system, x) in enumerate(own):
-                label = f"{words}, frame {number}, round {place}"
-                rounds.append(_noted(label, group, [frame.garments[index] for index in part], system, x))
+                rounds.append(_noted(f"{moving.words}, frame {number}, round {place}", group, frames, system, x))
     return rounds
 
 
-def _is_of(system: System, level: Level) -> bool:
-    return system.level is not None and system.level.index == level.index and len(system.spacing) == level.vertex_count
-
-
 def _noted(words: str, group: Group, frames: Sequence[GarmentFrame], system: System, x: Tensor) -> Round:
-    """A system and a start as plain arrays."""
     field = system.field
     assert isinstance(field, ForceModule)
     gaps, tie, predicted, aim = list[PairConstraints](), 0.0, x, None
@@ -172,10 +166,7 @@ def system_of(rounds: Sequence[Round], *, device: str) -> System:
     """One system of rounds of equally many levels under the same gravity."""
     garments = [garment for each in rounds for garment in each.garments]
     frames = [frame for each in rounds for frame in each.frames]
-    count = rounds[0].garments[0].level
-    chains = refine_garments(garments, [count] * len(garments))
-    settings = SolveSettings(METHODS["quasi-newton"])
-    group = Group.of(garments, chains, rounds[0].gravity, settings, dtype=torch.float32, device=device)
+    group = group_of(garments, rounds[0].gravity, rounds[0].level, device=device)
     lasting, level = group.forces_for(frames)[-1], group.levels[-1]
 
     def joined(arrays: Sequence[np.ndarray]) -> Tensor:
@@ -196,7 +187,7 @@ def system_of(rounds: Sequence[Round], *, device: str) -> System:
     return System(ForceModule(forces), held, free=level.free, spacing=level.spacing, level=level)
 
 
-def measured(each: Round, steps: int) -> Round | None:
+def _measured(each: Round, steps: int) -> Round | None:
     """The round with its energies [J] at the start and after ``steps`` quasi-Newton steps; None at rest."""
     system, x = system_of([each], device="cpu"), torch.as_tensor(each.x)
     _, report = solve_level(system, QuasiNewton(), x, level=0, budget=Budget(steps))
@@ -208,13 +199,7 @@ def measured(each: Round, steps: int) -> Round | None:
 
 def make_rounds(config: RoundConfig, *, seed: int, workers: int = 1) -> list[Round]:
     """Rounds of scenes out of `scenes`, a few of each; the same for a seed with any number of processes."""
-    jobs = [(config, seed, number) for number in range(config.scenes)]
-    if workers <= 1 or len(jobs) < 2 * workers:
-        found = [_scene_rounds(*job) for job in jobs]
-    else:
-        context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(workers, mp_context=context, initializer=prepare_device, initargs=("cpu",)) as pool:
-            found = list(pool.map(_scene_rounds, *zip(*jobs, strict=True)))
+    found = made_of_numbers(_scene_rounds, config, seed, config.scenes, workers=workers)
     return [each for rounds in found for each in rounds]
 
 
@@ -224,10 +209,9 @@ def _scene_rounds(config: RoundConfig, seed: int, number: int) -> list[Round]:
     kind = KINDS[number % len(KINDS)]
     moving = moving_scene(rng, kind=kind, frames=3, most_vertices=config.most_vertices)
     method = "quasi-newton" if rng.random() < 0.5 else "physgraph"
-    levels = [garment.level for garment in moving.scene.garments]
     try:
-        rounds = rounds_of(moving.scene, moving.frames, levels=levels, method=method, words=moving.words)
+        rounds = _rounds_of(moving, method)
     except PhysGraphError:  # Cloth that starts wholly in a body.
         return []
     chosen = sorted(rng.permutation(len(rounds))[:4]) if len(rounds) > 4 else range(len(rounds))
-    return [each for place in chosen if (each := measured(rounds[place], config.reference_steps)) is not None]
+    return [each for place in chosen if (each := _measured(rounds[place], config.reference_steps)) is not None]

@@ -12,7 +12,6 @@ No asset is read.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -44,17 +43,12 @@ def moving_scene(rng: np.random.Generator, *, kind: str, frames: int, most_verti
     """A scene of a kind out of `KINDS`.
 
     Args:
-        rng: Where its numbers come from.
-        kind: Its kind.
-        frames: Number of frames.
         most_vertices: Fine vertices beyond which cloth has one subdivision, not two.
     """
     if kind == "free":
         return _free(rng, frames, most_vertices)
-    make: dict[str, Callable[..., tuple[np.ndarray, np.ndarray, list[np.ndarray], list[Solid]]]]
-    make = {"ball": _ball, "tube": _tube, "fold": _fold}
     edge = 10 ** rng.uniform(-1.9, -1.4)
-    faces, rest, cages, bodies = make[kind](rng, frames)
+    faces, rest, cages, bodies = {"ball": _ball, "tube": _tube, "fold": _fold}[kind](rng, frames)
     mesh = PolygonMesh(np.full(len(faces), faces.shape[1]), faces.ravel(), len(rest))
     if rng.random() < 0.5:
         triangles = mesh.triangulate().triangles
@@ -63,7 +57,8 @@ def moving_scene(rng: np.random.Generator, *, kind: str, frames: int, most_verti
     felt = (0,) if bodies else ()
     bent = bool(rng.random() < 0.3)
     garment = Garment("/Cloth", mesh, edge * rest, level, bent, one, one, one, one, 0.0 * one, felt)
-    fabric, guide = material(rng)
+    stretch, bend = 100.0 * 10 ** rng.normal(0.0, 0.5), 5e-6 * 10 ** rng.normal(0.0, 0.5)
+    fabric, guide = Fabric(stretch, bend, rng.uniform(0.08, 0.5)), 2000.0 * 10 ** rng.uniform(-0.5, 0.5)
     turn = Rotation.random(random_state=rng).as_matrix() if kind == "tube" else np.eye(3)
     colliders = (Collider("/Body", "mesh"),) if bodies else ()
     made = []
@@ -75,14 +70,11 @@ def moving_scene(rng: np.random.Generator, *, kind: str, frames: int, most_verti
     return Moving(f"{kind}, {level} levels", Scene((garment,), DOWN, times, colliders), tuple(made))
 
 
-def material(rng: np.random.Generator) -> tuple[Fabric, float]:
-    """A fabric, stiffnesses spread over what real ones have and beyond, and a guide stiffness [N/m^3]."""
-    stretch, bend = 100.0 * 10 ** rng.normal(0.0, 0.5), 5e-6 * 10 ** rng.normal(0.0, 0.5)
-    return Fabric(stretch, bend, rng.uniform(0.08, 0.5)), 2000.0 * 10 ** rng.uniform(-0.5, 0.5)
+Motion = tuple[np.ndarray, np.ndarray, list[np.ndarray], list[Solid]]
+"""Faces, rest shape, cage of each frame, and body of each frame or none; lengths in cage edges."""
 
 
-def _ball(rng: np.random.Generator, frames: int) -> tuple[np.ndarray, np.ndarray, list[np.ndarray], list[Solid]]:
-    """Sheets over an ellipsoid; lengths in cage edges."""
+def _ball(rng: np.random.Generator, frames: int) -> Motion:
     cells = int(rng.integers(7, 12))
     line = np.arange(cells + 1.0) - 0.5 * cells
     x, y = (each.ravel() for each in np.meshgrid(line, line))
@@ -108,8 +100,7 @@ def _ball(rng: np.random.Generator, frames: int) -> tuple[np.ndarray, np.ndarray
     return faces, rest, cages, bodies
 
 
-def _tube(rng: np.random.Generator, frames: int) -> tuple[np.ndarray, np.ndarray, list[np.ndarray], list[Solid]]:
-    """A sleeve about an arm that bends; lengths in cage edges."""
+def _tube(rng: np.random.Generator, frames: int) -> Motion:
     around, rows = int(rng.integers(10, 16)), int(rng.integers(8, 14))
     radius = around / (2.0 * np.pi)
     angle = 2.0 * np.pi * np.arange(around) / around
@@ -141,8 +132,7 @@ def _bent(points: np.ndarray, turn: float, radius: float) -> np.ndarray:
     return (1.0 - weight) * points + weight * Rotation.from_rotvec([0.0, 0.0, turn]).apply(points)
 
 
-def _fold(rng: np.random.Generator, frames: int) -> tuple[np.ndarray, np.ndarray, list[np.ndarray], list[Solid]]:
-    """A strip laid back over itself; lengths in cage edges."""
+def _fold(rng: np.random.Generator, frames: int) -> Motion:
     length, width = int(rng.integers(12, 18)), int(rng.integers(5, 9))
     x, y = (each.ravel() for each in np.meshgrid(np.arange(length + 1.0), np.arange(width + 1.0)))
     faces, rest = quad_grid(width + 1, length + 1), np.stack([x, y, 0.0 * x], axis=1)

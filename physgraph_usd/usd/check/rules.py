@@ -443,7 +443,6 @@ def _compare(clouds: Sequence[tuple[np.ndarray, np.ndarray, float | None]], name
 
 
 def _size(cloud: np.ndarray) -> float:
-    """Diagonal of a cloud's bounding box."""
     return float(np.linalg.norm(np.ptp(cloud, axis=0)))
 
 
@@ -470,7 +469,6 @@ def same_variants(layer: Sdf.Layer, shot: StageView, garments: Sequence[str]) ->
 
 
 def _coarse(shot: StageView, mask: Usd.StagePopulationMask, selections: Sequence[Sdf.Path]) -> Usd.Stage:
-    """A shot without refined layers, with given variant selections."""
     selected = Sdf.Layer.CreateAnonymous("selections.usda")
     for path in selections:
         name, selection = path.GetVariantSelection()

@@ -203,7 +203,6 @@ def _findings(
 
 
 def _as_problem(module: Any, found: Any) -> Problem:
-    """A USD finding as a `Problem`."""
     sites = found.GetSites()
     path = str(sites[0].GetProperty().GetPath() if sites and sites[0].IsProperty() else "")
     if sites and not path and sites[0].IsPrim():

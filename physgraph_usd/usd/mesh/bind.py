@@ -100,7 +100,6 @@ def _weights(point: np.ndarray, corners: np.ndarray) -> np.ndarray:
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Dot product along the last axis."""
     return np.einsum("...x,...x->...", a, b)
 
 
@@ -153,7 +152,6 @@ def _normals(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
-    """Vectors of length one, shape (N, 3); zero stays zero."""
     return vectors / np.maximum(np.sqrt(_dot(vectors, vectors)), _TINY)[:, None]
 
 

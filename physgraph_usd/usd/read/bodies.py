@@ -46,9 +46,6 @@ class _Faces:
     drawn: DrawnSurface
     wound: tuple[np.ndarray, np.ndarray]
 
-    def are_of(self, authored: tuple[np.ndarray, ...]) -> bool:
-        return all(map(np.array_equal, self.authored, authored))
-
 
 @dataclass(eq=False)
 class ColliderReader:
@@ -56,7 +53,6 @@ class ColliderReader:
 
     Attributes:
         collider: Constant data.
-        metres: Length of one stage unit [m].
         within: Allowed distance of the mesh from the drawn surface [m].
         always: Whether the collider counts even while invisible.
     """
@@ -76,10 +72,10 @@ class ColliderReader:
         """Pose at a time code, interpolated like USD; None, with a notice, without a usable pose.
 
         Args:
-            time: The time code, or None for the default.
             skinned: World positions of a mesh's points [m], to replace the authored points; or None.
         """
-        if not self.always and _is_invisible(self.prim, time):
+        visibility = UsdGeom.Imageable(self.prim).ComputeVisibility(timecode(time))
+        if not self.always and visibility == UsdGeom.Tokens.invisible:
             message = f"no collider where it is invisible, unless {COLLIDER['collider:enabled'].name} is set to true"
             return None, (Notice(self.collider.path, None, message),)
         matrix = self._matrix(timecode(time))
@@ -129,7 +125,7 @@ class ColliderReader:
 
         Subdivision and splitting of quads use the collider's first sample, whichever frame is read first.
         """
-        if self._faces is None or not self._faces.are_of(authored):
+        if self._faces is None or not all(map(np.array_equal, self._faces.authored, authored)):
             counts, indices, holes = authored
             mesh = UsdGeom.Mesh(self.prim)
             first = np.asarray(mesh.GetPointsAttr().Get(Usd.TimeCode.EarliestTime()), dtype=np.float64)
@@ -188,9 +184,6 @@ def read_collider(
     """Reader of a gprim as a collider, or None for an unsupported kind of prim, and notices.
 
     Args:
-        prim: A gprim.
-        metres: Length of one stage unit [m].
-        overrides: Values of ``--set``.
         offset: Least distance kept from colliders by a garment [m].
 
     Raises:
@@ -206,10 +199,6 @@ def read_collider(
     within = DRAWN_NEAR * max(offset + own, _LEAST_OFFSET)
     always = find_value(prim, COLLIDER["collider:enabled"], overrides).source != "fallback"
     return ColliderReader(prim, Collider(path, kind, own, side), metres, within, always), odd
-
-
-def _is_invisible(prim: Usd.Prim, time: float | None) -> bool:
-    return UsdGeom.Imageable(prim).ComputeVisibility(timecode(time)) == UsdGeom.Tokens.invisible
 
 
 def _control_mesh(mesh: UsdGeom.Mesh, polygons: PolygonMesh) -> ControlMesh:

@@ -37,13 +37,7 @@ MOST_BROKEN = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Cage:
-    """A garment's topology.
-
-    Attributes:
-        mesh: Kept faces, in authored order and winding.
-        kept_faces: Numbers of the kept faces among the authored faces, int32.
-        notices: Faces and features left out.
-    """
+    """A garment's topology: the kept faces, their numbers among the authored faces, int32, and notices."""
 
     mesh: PolygonMesh
     kept_faces: np.ndarray
@@ -192,9 +186,7 @@ class PointReader:
     def read(self, time: float | None, edges: np.ndarray) -> tuple[np.ndarray, tuple[Notice, ...]]:
         """Local positions [stage units] at a time code, shape (V, 3), float64, all finite, and notices of repairs.
 
-        Args:
-            time: Time code, or None for the default.
-            edges: Edges of the mesh, shape (E, 2).
+        ``edges`` are those of the mesh, shape (E, 2).
 
         Raises:
             GarmentError: When the number of points changes or too many are broken.
@@ -254,15 +246,10 @@ def as_points(value: object, path: str, name: str, *, time: float | None = None)
 
 
 def repair(points: np.ndarray, edges: np.ndarray, reference: np.ndarray | None) -> np.ndarray:
-    """Replace non-finite points, ring by ring inwards; finite points are unchanged to the bit.
+    """Replace non-finite points, shape (V, 3), ring by ring inwards; finite points are unchanged to the bit.
 
-    Args:
-        points: Positions, shape (V, 3).
-        edges: Edges, shape (E, 2).
-        reference: Positions at a sample with only finite points, shape (V, 3), or None.
-
-    Returns:
-        Positions, shape (V, 3); not finite if nothing is available for repair.
+    ``reference`` are the positions at a sample with only finite points, shape (V, 3), or None. Points for which nothing
+    is available stay as they are. Edges have shape (E, 2).
     """
     base = np.zeros_like(points) if reference is None else reference
     out = points.copy()

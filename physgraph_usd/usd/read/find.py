@@ -71,7 +71,6 @@ def find_colliders(
         wanted: As for ``find_garments``; empty: the targets of the garments' ``physgraph:colliders``, and for garments
             without targets every prim with PhysGraphColliderAPI or UsdPhysics' CollisionAPI.
         without: Prims that are never colliders, beside the garments.
-        overrides: Values of ``--set``.
 
     Raises:
         AbsentError: When a named collider does not exist.

@@ -48,7 +48,6 @@ class Request:
         bake: Baked skinning.
         frames: First and last time code, or None.
         level: Number of subdivisions for all, -1 for auto, or None.
-        overrides: Values of ``--set``.
         rest_frame: Time code of the rest shape's points, "auto" for a shape fitted to the shot, or None.
         assumed_units: Whether metersPerUnit is not authored.
     """
@@ -87,10 +86,6 @@ class GarmentReader:
         """The garment at a time code, and notices of repairs.
 
         All points of an absent garment are at one place, without contact: other garments may still have a frame.
-
-        Args:
-            metres: Length of one stage unit [m].
-            time: Time code, or None for the default.
         """
         notices: tuple[Notice, ...] = ()
         if time is not None and absence(prim, time):
@@ -142,7 +137,7 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], samples: Samples, re
     values = find_values(prim, request.units, request.overrides)
     constants, of_constants = _constants(prim, request)
     painted, cut = _painted(prim, weld, notices, values=values)
-    pieces, odd_pieces = _pieces(prim, weld, rest.points, cage.kept_faces[weld.faces])
+    pieces, odd_pieces = _pieces(prim, weld, rest.points, subsets := _subsets(prim, cage.kept_faces[weld.faces]))
     grain, lies = read_grain(prim, weld, rest.points, kept=cage.kept_faces, up=request.units.up, painted=cut)
     garment = Garment(
         str(prim.GetPath()),
@@ -161,10 +156,10 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], samples: Samples, re
         values.animated,
         left_out=tuple(time for time in every if time not in times),
         absent=absent,
-        velocities=has_velocities(prim, points.count),
-        subsets=(subsets := _subsets(prim, cage.kept_faces[weld.faces])),
+        velocities=_has_velocities(prim, points.count),
+        subsets=subsets,
         words=_words(prim, [name for name, faces in subsets.items() if 2 * len(faces) > len(weld.faces)]),
-        shell=_length(prim, "shell:thickness", request.overrides),
+        shell=float(find_value(prim, GARMENT["shell:thickness"], request.overrides).at(None) or 0.0),
     )
     return GarmentReader(garment, source, values, points, edges, weld, notices)
 
@@ -203,21 +198,21 @@ def _constants(prim: Usd.Prim, request: Request) -> tuple[dict[str, Any], dict[s
     return found, {name: value.source for name, value in each}
 
 
-def has_velocities(prim: Usd.Prim, count: int) -> bool:
+def _has_velocities(prim: Usd.Prim, count: int) -> bool:
     """Whether a mesh has velocities matching its point count, by default or at any sample."""
     attribute = UsdGeom.Mesh(prim).GetVelocitiesAttr()
     codes = (Usd.TimeCode.Default(), *map(Usd.TimeCode, attribute.GetTimeSamples()))
     return any(len(attribute.Get(code) or ()) == count for code in codes)
 
 
-def _pieces(prim: Usd.Prim, weld: Weld, rest: np.ndarray, kept: np.ndarray) -> tuple[dict[str, Any], list[Notice]]:
+def _pieces(
+    prim: Usd.Prim, weld: Weld, rest: np.ndarray, subsets: dict[str, np.ndarray]
+) -> tuple[dict[str, Any], list[Notice]]:
     """Closed pieces and rigid parts by field name, and notices about pieces."""
-    asked = np.zeros(len(kept), bool)
-    for subset in UsdGeom.Subset.GetGeomSubsets(UsdGeom.Imageable(prim), UsdGeom.Tokens.face):
-        attribute = subset.GetPrim().GetAttribute(RIGID)
-        if attribute and attribute.Get():
-            faces = subset.GetIndicesAttr().Get(Usd.TimeCode.EarliestTime())
-            asked |= np.isin(kept, [] if faces is None else np.asarray(faces))
+    asked = np.zeros(weld.mesh.face_count, bool)
+    for name, faces in subsets.items():
+        attribute = prim.GetChild(name).GetAttribute(RIGID)
+        asked[faces] |= bool(attribute and attribute.Get())
     found, path, notices = sort_pieces(weld.mesh, weld.joined(rest), asked), str(prim.GetPath()), []
     if count := int(found.rigid.max(initial=-1)) + 1:
         message = f"{counted(count, 'piece')} of it moved rigidly with the cloth under, as buttons are"
@@ -266,12 +261,7 @@ def _rest_and_weld(
 
 def seam_tolerance(prim: Usd.Prim, overrides: Sequence[Override]) -> float:
     """Distance within which a garment's open borders are sewn [m]."""
-    return _length(prim, "seam:tolerance", overrides)
-
-
-def _length(prim: Usd.Prim, name: str, overrides: Sequence[Override]) -> float:
-    """A length without animation [m]; 0 if unauthored."""
-    return float(find_value(prim, GARMENT[name], overrides).at(None) or 0.0)
+    return float(find_value(prim, GARMENT["seam:tolerance"], overrides).at(None) or 0.0)
 
 
 def _rest(prim: Usd.Prim, weld: Weld, animation: Animation, request: Request, *, matrix: np.ndarray) -> Rest:

@@ -7,14 +7,13 @@ garment. ``primvars:physgraph:grain`` turns the warp.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from pxr import Tf, Usd, UsdGeom
 
 from ...solver.mesh.topology import PolygonMesh, face_normals
 from ...solver.mesh.weld import Weld
 from ...solver.scene import Grain
+from ..mesh.attributes import kept_corners
 from ..stage import first_value
 
 SKEWED = 1.5
@@ -77,19 +76,12 @@ def _texture_coordinates(prim: Usd.Prim, mesh: PolygonMesh, kept: np.ndarray) ->
             continue
         values = np.zeros((0, 2)) if flat is None else np.asarray(flat, np.float64)
         if primvar.GetInterpolation() == UsdGeom.Tokens.faceVarying:
-            corners = _kept_corners(prim, kept)
+            corners = kept_corners(np.asarray(first_value(UsdGeom.Mesh(prim).GetFaceVertexCountsAttr())), kept)
             if len(corners) == len(mesh.indices) and corners.max(initial=-1) < len(values):
                 return name, values[corners]
         elif len(values) == mesh.vertex_count and primvar.GetInterpolation() != UsdGeom.Tokens.uniform:
             return name, values[mesh.indices]
     return None
-
-
-def _kept_corners(prim: Usd.Prim, kept: Sequence[int] | np.ndarray) -> np.ndarray:
-    """Numbers of the kept faces' corners among all authored corners."""
-    counts = np.asarray(first_value(UsdGeom.Mesh(prim).GetFaceVertexCountsAttr()), np.int64)
-    starts = np.concatenate([[0], np.cumsum(counts)])
-    return np.concatenate([np.arange(starts[face], starts[face + 1]) for face in kept]) if len(kept) else starts[:0]
 
 
 def _along_v(mesh: PolygonMesh, rest: np.ndarray, corners: np.ndarray) -> np.ndarray | None:

@@ -19,11 +19,6 @@ _REMEDY = "give the prim and its ancestors a scale other than zero there, or lea
 def to_metres(prim: Usd.Prim, metres: float, time: float | None) -> np.ndarray:
     """Matrix for column vectors from a prim's local space to world metres, shape (4, 4), float64.
 
-    Args:
-        prim: Any prim.
-        metres: Length of one stage unit [m].
-        time: Time code, or None for the default.
-
     Raises:
         GarmentError: When the matrix is not invertible.
     """

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from copy import copy
 from dataclasses import replace
@@ -112,11 +112,7 @@ class Shot:
         self._readers, self._bodies, self._request = tuple(readers), tuple(bodies), request
 
     def to_metres(self, index: int, time: float | None) -> np.ndarray:
-        """Matrix from a garment's local space to world metres, shape (4, 4), float64: ``world = M @ [local; 1]``.
-
-        Args:
-            index: Number of the garment.
-            time: Time code, or None for the default.
+        """Matrix from a garment's local space to world metres, by number, (4, 4), float64: ``world = M @ [local; 1]``.
 
         Raises:
             GarmentError: When the matrix is not invertible.
@@ -163,7 +159,7 @@ class Shot:
     @property
     def every_time(self) -> tuple[float, ...]:
         """Time codes with a sample of any garment, including outside the frame range."""
-        return merge(time for source in self.sources for time in (*source.times, *source.left_out))
+        return _every_time(self.sources)
 
     def frame(self, time: float | None) -> Frame:
         """Read one time code; None reads the default values.
@@ -315,7 +311,6 @@ def _of_prims(
 
 
 def _check_options(frames: tuple[float, float] | None, level: int | None, rest_frame: float | str | None) -> None:
-    """Refuse options invalid for every stage."""
     if frames is not None and not (all(map(math.isfinite, frames)) and frames[0] <= frames[1]):
         raise UsageError(f"frames {frames[0]:g}:{frames[1]:g} are no range; give FIRST:LAST")
     if level is not None:
@@ -380,14 +375,13 @@ def _sewn(
 ) -> list[GarmentReader]:
     """Garments with their seams; adds notices of adjacent borders not sewn."""
     prims = [stage.GetPrimAtPath(reader.source.path) for reader in readers]
-    every = _every_time(readers)
+    every = _every_time(reader.source for reader in readers)
 
     def poses(most: int) -> Iterator[list[np.ndarray | None]]:
         picks = np.linspace(0, len(every) - 1, min(most, len(every))).round().astype(int)
         for time in [every[pick] for pick in picks] or [None]:
             with suppress(StageError):
-                pairs = zip(readers, prims, strict=True)
-                cages = [reader.frame(prim, request.units.metres, time)[0].points for reader, prim in pairs]
+                cages = _cages(stage, readers, request.units.metres, time)
                 yield [points if np.ptp(points, axis=0).any() else None for points in cages]
 
     tolerances = [seam_tolerance(prim, request.overrides) for prim in prims]
@@ -396,9 +390,14 @@ def _sewn(
     return [replace(reader, garment=garment) for reader, garment in zip(readers, garments, strict=True)]
 
 
-def _every_time(readers: Sequence[GarmentReader]) -> tuple[float, ...]:
-    """Time codes with a sample of any garment, including outside the frame range."""
-    return merge(time for reader in readers for time in (*reader.source.times, *reader.source.left_out))
+def _every_time(sources: Iterable[GarmentSource]) -> tuple[float, ...]:
+    return merge(time for source in sources for time in (*source.times, *source.left_out))
+
+
+def _cages(stage: Usd.Stage, readers: Sequence[GarmentReader], metres: float, time: float | None) -> list[np.ndarray]:
+    """The cage of each garment at a time code [m]."""
+    prims = [stage.GetPrimAtPath(reader.source.path) for reader in readers]
+    return [reader.frame(prim, metres, time)[0].points for reader, prim in zip(readers, prims, strict=True)]
 
 
 def _with_sides(
@@ -422,13 +421,9 @@ def _first_cages(
     stage: Usd.Stage, readers: Sequence[GarmentReader], metres: float
 ) -> tuple[float | None, list[np.ndarray]]:
     """The first time code with all cages readable, and the cages [m]; None and empty cages if there is none."""
-    for time in _every_time(readers) or (None,):
-        try:
-            prims = [stage.GetPrimAtPath(reader.source.path) for reader in readers]
-            pairs = zip(readers, prims, strict=True)
-            return time, [reader.frame(prim, metres, time)[0].points for reader, prim in pairs]
-        except StageError:
-            continue
+    for time in _every_time(reader.source for reader in readers) or (None,):
+        with suppress(StageError):
+            return time, _cages(stage, readers, metres, time)
     return None, [np.zeros((0, 3))] * len(readers)
 
 

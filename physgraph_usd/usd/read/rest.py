@@ -127,16 +127,13 @@ def read_rest(
         message = f"the default points are {len(default)}, the mesh has {len(first)}; the rest shape is {rest.source}"
         rest = replace(rest, notices=(Notice(str(prim.GetPath()), None, message),))
     else:
-        rest = _from_default(prim, edges, place(default), first=first)
+        points = place(default)
+        rest = Rest(points, "default points")
+        if not np.isfinite(points).all():
+            message = "the default points have NaN or infinite values, repaired for the rest shape"
+            odd.append(Notice(str(prim.GetPath()), None, message))
+            rest = replace(rest, points=repair(points, edges, first))
     return _checked(prim, edges, replace(rest, notices=(*odd, *rest.notices)), first=first)
-
-
-def _from_default(prim: Usd.Prim, edges: np.ndarray, points: np.ndarray, *, first: np.ndarray) -> Rest:
-    """Rest shape of the points' default value [m], repaired from the first sample."""
-    if np.isfinite(points).all():
-        return Rest(points, "default points")
-    message = "the default points have NaN or infinite values, repaired for the rest shape"
-    return Rest(repair(points, edges, first), "default points", (Notice(str(prim.GetPath()), None, message),))
 
 
 def _fitted(weld: Weld, animation: Animation, *, by: str = "") -> Rest:

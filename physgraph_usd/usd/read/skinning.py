@@ -69,8 +69,9 @@ class Bake:
         paths = [*garments, *bodies]
         bound = [path for path in paths if skel_root(self._stage.GetPrimAtPath(path))]
         for path in bound:
-            make_editable(self._stage, self.layer, path)
-        found = {path: skinned for path in bound if (skinned := find_skinning(self._stage, path))}
+            while roots := instance_roots(self._stage.GetPrimAtPath(path)):
+                Sdf.CreatePrimInLayer(self.layer, roots[0]).instanceable = False
+        found = {path: skinned for path in bound if (skinned := _find_skinning(self._stage, path))}
         if found:
             cloth = merge(time for path in garments for time in _times_of(self._stage.GetPrimAtPath(path), found))
             wanted = {skinned: cloth if path in bodies else () for path, skinned in found.items()}
@@ -98,13 +99,7 @@ def skel_root(prim: Usd.Prim) -> Usd.Prim | None:
     return next((each for each in with_ancestors(prim) if UsdSkel.Root(each)), None)
 
 
-def make_editable(stage: Usd.Stage, layer: Sdf.Layer, path: Sdf.Path) -> None:
-    """Author ``instanceable = false`` in a layer for every instance containing a prim."""
-    while roots := instance_roots(stage.GetPrimAtPath(path)):
-        Sdf.CreatePrimInLayer(layer, roots[0]).instanceable = False
-
-
-def find_skinning(stage: Usd.Stage, path: Sdf.Path) -> Skinned | None:
+def _find_skinning(stage: Usd.Stage, path: Sdf.Path) -> Skinned | None:
     """The skinning of a mesh by UsdSkel, or None."""
     prim = stage.GetPrimAtPath(path)
     root = skel_root(prim)

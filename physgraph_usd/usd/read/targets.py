@@ -131,7 +131,6 @@ def read_targets(
         bound: From `find_bound`; prims bound to garments that are not refined are left out.
         garments: Path, mesh and first time code of each garment.
         cage: Places the garments.
-        metres: Length of one stage unit [m].
         skinned: Prims with baked points.
 
     Raises:
@@ -243,7 +242,6 @@ def points_at(prim: Usd.Prim, metres: float, time: float | None) -> np.ndarray |
 
 
 def _check_topology(prim: Usd.Prim) -> None:
-    """Refuse topology that changes over time."""
     points = UsdGeom.PointBased(prim).GetPointsAttr()
     counted = [UsdGeom.Mesh(prim).GetFaceVertexIndicesAttr()] if UsdGeom.Mesh(prim) else []
     counted += [UsdGeom.Curves(prim).GetCurveVertexCountsAttr()] if UsdGeom.Curves(prim) else []
@@ -260,12 +258,9 @@ def _check_topology(prim: Usd.Prim) -> None:
 
 def _mesh_of(prim: Usd.Prim) -> PolygonMesh | None:
     """The faces of a mesh with a polygon or more, else None."""
-    mesh = UsdGeom.Mesh(prim)
-    if not mesh:
-        return None
-    first = Usd.TimeCode.EarliestTime()
-    counts, indices = mesh.GetFaceVertexCountsAttr().Get(first), mesh.GetFaceVertexIndicesAttr().Get(first)
-    points = mesh.GetPointsAttr().Get(first)
+    mesh, first = UsdGeom.Mesh(prim), Usd.TimeCode.EarliestTime()
+    topology = (mesh.GetFaceVertexCountsAttr(), mesh.GetFaceVertexIndicesAttr(), mesh.GetPointsAttr())
+    counts, indices, points = (each.Get(first) if mesh else None for each in topology)
     if not counts or not indices or not points:
         return None
     made = PolygonMesh(np.asarray(counts, np.int32), np.asarray(indices, np.int32), len(points))

@@ -135,7 +135,6 @@ def publish(temporary: Path, target: Path) -> None:
 
 
 def _flush(path: Path) -> None:
-    """Flush a file or folder to disk."""
     flags = os.O_RDONLY if os.name != "nt" else os.O_RDWR
     handle = os.open(path, flags)
     try:

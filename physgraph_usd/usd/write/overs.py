@@ -103,12 +103,7 @@ def author_unskinned(stream: LayerStream, target: Sdf.Path, prim: Usd.Prim, *, s
         skeleton = spec.relationships.get("skel:skeleton") or Sdf.RelationshipSpec(spec, "skel:skeleton", False)
         skeleton.targetPathList.ClearEditsAndMakeExplicit()
     elif UsdSkel.BindingAPI(prim):
-        delete_schema(stream, target, "SkelBindingAPI")
-
-
-def delete_schema(stream: LayerStream, target: Sdf.Path, name: str) -> None:
-    """Remove an applied API schema, whichever weaker layer applies the schema."""
-    edit_schemas(stream, target, deleted=[name])
+        edit_schemas(stream, target, deleted=["SkelBindingAPI"])
 
 
 def edit_schemas(
@@ -152,7 +147,7 @@ def make_sibling(stream: LayerStream, prim: Usd.Prim) -> Sdf.Path:
         stream.set(where.AppendProperty("purpose"), purpose)
     relationship = Sdf.RelationshipSpec(spec, "proxyPrim", False)
     relationship.targetPathList.explicitItems = [coarse]
-    delete_schema(stream, path, GARMENT_API)
+    edit_schemas(stream, path, deleted=[GARMENT_API])
     for child in prim.GetFilteredChildren(Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate)):
         if UsdGeom.Xformable(child) or UsdSkel.BlendShape(child):
             # Only subsets and looks belong to both meshes; a nested mesh would be drawn twice.

@@ -16,6 +16,8 @@ from ..mesh.attributes import (
     corner_values,
     edge_subset,
     face_subset,
+    interpolated,
+    kept_corners,
     uniform_values,
     vertex_subset,
     vertex_values,
@@ -36,9 +38,6 @@ def carry_primvars(
     A primvar not matching its own mesh is hidden, because the values would match the fine mesh even less.
 
     Args:
-        target: Prim to author on.
-        prim: Coarse mesh as composed.
-        fine: Map to the fine mesh.
         span: First and last relevant time code, or None for all.
 
     Returns:
@@ -79,7 +78,6 @@ def _numbers_points(primvar: UsdGeom.Primvar) -> bool:
 
 
 def _hide(stream: LayerStream, target: Sdf.Path, primvar: UsdGeom.Primvar) -> None:
-    """Block a primvar's values and indices."""
     stream.block(target.AppendProperty(primvar.GetAttr().GetName()), primvar.GetTypeName())
     indices = primvar.GetIndicesAttr()
     if primvar.IsIndexed() and indices.GetTypeName():
@@ -177,7 +175,6 @@ class FineMap:
         """Prepare the map.
 
         Args:
-            cage: The coarse mesh before refinement.
             refinements: Coarse to fine; empty if the fine mesh is the cage.
             counts: Authored corners per face, shape (F,), including dropped faces.
             kept: Numbers of the authored faces in the cage, shape (F_cage,).
@@ -188,8 +185,7 @@ class FineMap:
         self.fine = self.sheet if shell is None else shell.mesh
         self._refinements = tuple(refinements)
         self._kept = np.asarray(kept, np.int64)
-        self._face_count = len(counts)
-        self._starts = np.concatenate([[0], np.cumsum(np.asarray(counts, np.int64))])
+        self._counts = counts
 
     @cached_property
     def stencil(self) -> sparse.csr_matrix | None:
@@ -219,9 +215,7 @@ class FineMap:
     @cached_property
     def kept_corners(self) -> np.ndarray:
         """Authored corner of each corner of the cage, shape (C,)."""
-        counts = np.asarray(self.cage.counts, np.int64)
-        first = np.repeat(self._starts[self._kept] - np.concatenate([[0], np.cumsum(counts)[:-1]]), counts)
-        return first + np.arange(len(first))
+        return kept_corners(self._counts, self._kept)
 
     @cached_property
     def nearest_corner(self) -> np.ndarray:
@@ -234,7 +228,7 @@ class FineMap:
     def count(self, interpolation: str) -> int:
         """Number of authored elements of an interpolation; ValueError for an interpolation independent of topology."""
         counts = dict.fromkeys(("vertex", "varying"), self.cage.vertex_count)
-        counts |= {"uniform": self._face_count, "faceVarying": int(self._starts[-1])}
+        counts |= {"uniform": len(self._counts), "faceVarying": int(np.sum(self._counts))}
         if interpolation not in counts:
             raise ValueError(f"has interpolation {interpolation!r}; known: constant, {', '.join(counts)}")
         return counts[interpolation]
@@ -270,10 +264,14 @@ class FineMap:
 
     def interpolate(self, values: np.ndarray) -> np.ndarray:
         """Refine floating-point values on vertices linearly, shape (V, ...) to (V_fine, ...), type kept."""
-        if self.stencil is None:
-            return values
-        flat = values.reshape(len(values), int(np.prod(values.shape[1:])))
-        return (self.stencil @ flat.astype(np.float64)).reshape(-1, *values.shape[1:]).astype(values.dtype)
+        return values if self.stencil is None else interpolated(self.stencil, values)
+
+    def vectors(self, value: Any) -> np.ndarray | None:
+        """Refine vectors authored on vertices, shape (V_fine, 3), float32; None unless there is a finite one each."""
+        if value is None or len(value) != self.cage.vertex_count:
+            return None
+        fine = self.interpolate(np.asarray(value, np.float32))
+        return fine if np.isfinite(fine).all() else None
 
     def _picked(
         self, interpolation: str, values: np.ndarray, indices: np.ndarray | None
@@ -309,7 +307,7 @@ class FineMap:
         indices = indices.astype(np.int64).reshape(-1)
         if element == "edge" and len(indices) % 2:
             raise ValueError(f"has {len(indices)} indices for edges, which need pairs")
-        limit = self._face_count if element == "face" else self.cage.vertex_count
+        limit = len(self._counts) if element == "face" else self.cage.vertex_count
         if len(indices) and not 0 <= indices.min() <= indices.max() < limit:
             raise ValueError(f"has {element} indices from {indices.min()} to {indices.max()}; the mesh has {limit}")
         if element == "face":

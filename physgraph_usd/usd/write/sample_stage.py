@@ -44,7 +44,6 @@ def write_stage(record: PlainStage, path: Path, *, overwrite: bool = False) -> P
 
 
 def _write_mesh(stage: Usd.Stage, record: PlainStage, mesh: PlainMesh) -> None:
-    """Author one mesh prim below the default prim."""
     prim_path = stage.GetDefaultPrim().GetPath().AppendChild(mesh.name)
     usd = UsdGeom.Mesh.Define(stage, prim_path)
     usd.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(mesh.counts.astype(np.int32)))
@@ -71,7 +70,6 @@ def _write_mesh(stage: Usd.Stage, record: PlainStage, mesh: PlainMesh) -> None:
 
 
 def _write_primvars(usd: UsdGeom.Mesh, mesh: PlainMesh) -> None:
-    """Author colour, UVs, pins and skin weights."""
     usd.CreateDisplayColorPrimvar("constant").Set([Gf.Vec3f(*mesh.look.color)])
     primvars = UsdGeom.PrimvarsAPI(usd)
     if mesh.uv is not None:
@@ -125,17 +123,14 @@ def _material(stage: Usd.Stage, look: Look) -> UsdShade.Material:
 
 
 def _write_garment(prim: Usd.Prim, mesh: PlainMesh) -> None:
-    """Apply the garment schema by name and author its values."""
     prim.AddAppliedSchema("PhysGraphGarmentAPI")
-    if mesh.level is not None:
-        name, whole = "physgraph:refine:level", Sdf.ValueTypeNames.Int
-        prim.CreateAttribute(name, whole, False, Sdf.VariabilityUniform).Set(mesh.level)
+    level = "physgraph:refine:level", Sdf.ValueTypeNames.Int, False, Sdf.VariabilityUniform
+    prim.CreateAttribute(*level).Set(mesh.level)
     for name, value in ({} if mesh.fabric is None else fabric_values(mesh.fabric)).items():
         prim.CreateAttribute(f"physgraph:material:{name}", Sdf.ValueTypeNames.Float, False).Set(value)
 
 
 def _write_bound(root: Usd.Prim, record: PlainStage) -> None:
-    """Bind the trims to the first garment."""
     paths = [root.GetPath().AppendChild(mesh.name) for mesh in record.meshes if mesh.role == "trim"]
     garment = next((mesh.name for mesh in record.meshes if mesh.role == "garment"), None)
     if paths and garment is not None:
@@ -143,7 +138,6 @@ def _write_bound(root: Usd.Prim, record: PlainStage) -> None:
 
 
 def _write_skeleton(stage: Usd.Stage, record: PlainStage, skeleton: Skeleton) -> None:
-    """Author the skeleton and its animation below the default prim."""
     root = stage.GetDefaultPrim().GetPath()
     usd = UsdSkel.Skeleton.Define(stage, root.AppendChild("Skeleton"))
     usd.CreateJointsAttr(list(skeleton.joints))

@@ -12,7 +12,7 @@ from pxr import Sdf, Usd, UsdGeom
 from ...errors import SchemaError, StageError, UsageError
 from ...solver.fabric import PRESETS
 from ..files import LAYER_SUFFIXES, check_suffix, check_targets, files_of
-from ..lookup import USER_PROPERTIES, check_limits
+from ..lookup import USER_PROPERTIES, check_known, check_limits
 from ..provenance import asset_path, export_layer
 from ..read.find import find_colliders, find_garments
 from ..read.reader import open_shot
@@ -65,9 +65,10 @@ def tag(
     """
     if not garments and not colliders and not bind and preset is None:
         raise UsageError("nothing to tag; name a garment or a collider")
-    _check_word("preset", preset, sorted(PRESETS))
-    _check_word("side", side, SIDES)
-    _check_word("asset path", asset_paths, ASSET_PATHS)
+    asked = [("preset", preset, sorted(PRESETS)), ("side", side, SIDES)]
+    for what, word, known in [each for each in asked if each[1] is not None]:
+        check_known(what, word, known)
+    check_known("asset path", asset_paths, ASSET_PATHS)
     if side is not None and not colliders:
         raise UsageError("a side is for colliders; name one")
     _check_values(values or {})
@@ -107,13 +108,7 @@ def _targets(shot: str, garments: Sequence[str], bind: Sequence[str]) -> dict[Sd
     return found
 
 
-def _check_word(what: str, word: str | None, words: Sequence[str]) -> None:
-    if word is not None and word not in words:
-        raise UsageError(f"unknown {what} {word!r}; known {what}s: {', '.join(words)}")
-
-
 def _check_values(values: Mapping[str, Mapping[str, float]]) -> None:
-    """Refuse values invalid for refining."""
     try:
         for path, items in values.items():
             for name, value in items.items():

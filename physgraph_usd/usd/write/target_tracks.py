@@ -39,11 +39,9 @@ class TargetTracks:
         absent: Sequence[float],
         velocities: bool,
     ) -> None:
-        """Bind the targets and author constant properties.
+        """Bind the targets of a garment, by number and refinements, coarse to fine, and author constant properties.
 
         Args:
-            index: Number of the garment.
-            steps: The garment's refinements, coarse to fine.
             absent: Time codes at which the garment is absent.
             velocities: Whether velocities are authored for all.
         """
@@ -69,11 +67,7 @@ class TargetTracks:
 
 
 class _TargetTrack:
-    """One target during writing.
-
-    Attributes:
-        notices: Properties changed, with the reason.
-    """
+    """One target during writing."""
 
     def __init__(
         self,
@@ -99,7 +93,9 @@ class _TargetTrack:
         moves = {"rate": rate, "absent": absent, "still": still, "margin": _half_width(prim)}
         self._normals = _TurnedNormals.of(stream, shot, target)
         given = None if self._normals is None else self._normals.path
-        rest = _default_points(prim, len(target.points))
+        default = shape.GetPointsAttr().Get(Usd.TimeCode.Default())
+        fits = default is not None and len(default) == len(target.points)
+        rest = np.asarray(default, np.float32) if fits else None
         self._track = PointTrack(stream, path, None, rest=rest, given_normals=given, **moves)
         self._hints = ModelHints(stream, shot.stage, path, purpose=UsdGeom.Imageable(prim).ComputePurpose())
 
@@ -171,11 +167,3 @@ def _half_width(prim: Usd.Prim) -> float:
             widths = shape.GetWidthsAttr().Get(_FIRST)
             return 0.5 * float(max(widths)) if widths else 0.0
     return 0.0
-
-
-def _default_points(prim: Usd.Prim, count: int) -> np.ndarray | None:
-    """Authored default points, shape (N, 3), float32; None without as many."""
-    value = UsdGeom.PointBased(prim).GetPointsAttr().Get(Usd.TimeCode.Default())
-    if value is None or len(value) != count:
-        return None
-    return np.asarray(value, np.float32)

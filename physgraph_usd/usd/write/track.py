@@ -88,7 +88,6 @@ class PointTrack:
         """Author the attributes, without values.
 
         Args:
-            target: Prim to author on.
             normals: Computes normals of local points; None without.
             rest: Local points for the default time, shape (V, 3); if None, the first sample's points.
             still: Whether the garment's input has no samples: only a default is written until the cloth moves.
@@ -296,7 +295,6 @@ class HeatTrack:
         """Author nothing yet.
 
         Args:
-            target: Prim to author on.
             count: Number of fine vertices.
             still: Whether the garment's input has no samples: a default is written instead of the first sample.
         """

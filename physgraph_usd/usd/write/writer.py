@@ -16,11 +16,12 @@ from typing import Any
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom
 
-from ...errors import LayerError, UsageError
+from ...errors import LayerError
 from ...solver.mesh.subdivide import Refinement
 from .. import provenance
 from ..check.validate import check_layer
 from ..files import check_targets, files_of
+from ..lookup import check_known
 from ..mesh.shell import Shell
 from ..read.absence import named_times
 from ..read.reader import Shot
@@ -73,8 +74,7 @@ class LayerWriter:
             UsageError: The mode is unknown, or the file exists or belongs to the shot.
             LayerError: The layer cannot be written.
         """
-        if mode not in MODES:
-            raise UsageError(f"unknown mode {mode!r}; known modes: {', '.join(MODES)}")
+        check_known("mode", mode, MODES)
         if len(refinements) != len(shot.scene.garments):
             raise LayerError(f"{len(refinements)} refinements for {len(shot.scene.garments)} garments")
         if out is not None:
@@ -163,8 +163,7 @@ class LayerWriter:
         if self._time == -np.inf:
             raise LayerError(f"no time code was written to {self._stream.target}")
         for mesh in self._meshes.values():
-            mesh.finish()
-            self.notices += mesh.unknown_velocities()
+            self.notices += mesh.finish()
         for bound in self._bound.values():
             bound.finish()
         facts = _facts(self._shot, self.targets, self._stream.target)
@@ -248,7 +247,9 @@ class _RefinedMesh:
         self.notices += carry_subsets(stream, target, prim, fine, span=span)
         self.notices += overs.author_rest_points(stream, target, prim, fine)
         left = UsdGeom.Mesh(prim).GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded
-        rest = None if source.skinned or self._shell or not source.times else _refined_default(prim, fine)
+        rest = None
+        if source.times and not (source.skinned or self._shell):
+            rest = fine.vectors(UsdGeom.Mesh(prim).GetPointsAttr().Get(Usd.TimeCode.Default()))
         self._sheet_normals = VertexNormals(sheet, left_handed=left, welded=sides)
         normals = self._sheet_normals
         if self._shell is not None:
@@ -284,12 +285,9 @@ class _RefinedMesh:
             raise LayerError(f"{place}: points have shape {points.shape}; the fine mesh has {count} vertices")
         self._heat.check(heat, time)
 
-    def finish(self) -> None:
-        """Author pending samples at the end."""
+    def finish(self) -> list[Notice]:
+        """Author pending samples at the end; a notice of samples between cuts for which no velocity is known."""
         self._track.finish()
-
-    def unknown_velocities(self) -> list[Notice]:
-        """A notice of samples isolated between cuts, for a shot without velocities at the samples."""
         if not self._track.unknown:
             return []
         message = f"its velocities are blocked at {named_times(self._track.unknown)}: it has no sample beside that one"
@@ -334,25 +332,9 @@ def _garments_in(shot: Shot, times: Sequence[float] | None) -> list[int]:
 
 
 def _own_velocities(prim: Usd.Prim, fine: FineMap, time: float | None) -> np.ndarray | None:
-    """Velocities of the coarse mesh at a time code between its first and last sample, refined linearly [units/s].
-
-    Returns:
-        Shape (V_fine, 3), float32; None without valid velocities.
-    """
+    """Velocities of the coarse mesh at a time code between its first and last sample, refined linearly [units/s]."""
     attribute = UsdGeom.Mesh(prim).GetVelocitiesAttr()
     samples, value = attribute.GetTimeSamples(), value_at(attribute, time)
     if time is not None and samples and not within([time], (samples[0], samples[-1])):
         return None
-    if value is None or len(value) != fine.cage.vertex_count:
-        return None
-    velocities = fine.interpolate(np.asarray(value, np.float32))
-    return velocities if np.isfinite(velocities).all() else None
-
-
-def _refined_default(prim: Usd.Prim, fine: FineMap) -> np.ndarray | None:
-    """Authored default points, refined linearly, shape (V_fine, 3), float32; None without valid points."""
-    value = UsdGeom.Mesh(prim).GetPointsAttr().Get(Usd.TimeCode.Default())
-    if value is None or len(value) != fine.cage.vertex_count:
-        return None
-    points = fine.interpolate(np.asarray(value, np.float32))
-    return points if np.isfinite(points).all() else None
+    return fine.vectors(value)

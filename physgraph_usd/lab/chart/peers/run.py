@@ -37,9 +37,8 @@ class Peer:
 
     Attributes:
         name: Its name in the chart.
-        adapter: The script that its Python runs.
+        adapter: The script that its Python runs, with options.
         note: How much of the problem it is given, in words.
-        options: Further arguments of its script.
         follows: Whether it computes where we do; otherwise on the CPU.
     """
 
@@ -158,7 +157,11 @@ def _problem(problem: Problem, frame: Frame, part: tuple[int, ...]) -> Iterator[
 
 
 def _level(index: int, level: Level, module: ForceModule, base: torch.Tensor) -> Iterator[tuple[str, Any]]:
-    """Springs, hinges and the linear rest of one level."""
+    """Springs, hinges and the linear rest of one level.
+
+    A hinge at a quad is handed over as hinges of four corners, one for each corner opposite to the edge, with its part
+    of the weight: for small bends of a planar quad at rest their mean angle is that of the hinge.
+    """
     springs = next((term for term in module.forces if isinstance(term, Stretch)), None)
     hinges = next(term for term in module.forces if isinstance(term, Bending))
     guide = next(term for term in module.forces if isinstance(term, Guide))
@@ -168,6 +171,10 @@ def _level(index: int, level: Level, module: ForceModule, base: torch.Tensor) ->
     load = torch.zeros_like(base)
     for term in others:
         term.add_force(base, load)
+    ends = level.hinges.long()
+    pairs = torch.stack([ends[:, [0, 1, k, other]] for k in (2, 3) for other in (4, 5)], dim=1)
+    owner = torch.arange(len(ends), device=ends.device).repeat_interleave(4)
+    corners, count = torch.unique(torch.cat([owner[:, None], pairs.reshape(-1, 4)], dim=1), dim=0, return_counts=True)
     values = {
         "base": base,
         "rest": level.rest,
@@ -177,29 +184,15 @@ def _level(index: int, level: Level, module: ForceModule, base: torch.Tensor) ->
         "springs": level.springs,
         "rest_length": level.spring_length,
         "spring": springs.stiffness,
-    } | _hinges_of_triangles(level, hinges.weight)
+        "hinges": corners[:, 1:],
+        "rest_angle": level.rest_angle[corners[:, 0]],
+        "hinge": hinges.weight[corners[:, 0]] * count / 4.0,
+    }
     for name, value in values.items():
         yield f"{name}{index}", value.double().cpu().numpy() if value.is_floating_point() else value.cpu().numpy()
     yield f"bound{index}", guide.rest_matrix().diagonal()
     yield f"diagonal{index}", springs.rest_matrix().diagonal()
     yield from _sparse("", index, guide.hessian())
-
-
-def _hinges_of_triangles(level: Level, weight: torch.Tensor) -> dict[str, torch.Tensor]:
-    """Hinges of four corners: of one at a quad each of the corners opposite to the edge, with its part of the weight.
-
-    For small bends of a planar quad at rest their mean angle is that of the hinge.
-    """
-    hinges = level.hinges.long()
-    pairs = torch.stack([hinges[:, [0, 1, k, other]] for k in (2, 3) for other in (4, 5)], dim=1)
-    owner = torch.arange(len(hinges), device=hinges.device).repeat_interleave(4)
-    rows = torch.cat([owner[:, None], pairs.reshape(-1, 4)], dim=1)
-    corners, count = torch.unique(rows, dim=0, return_counts=True)
-    return {
-        "hinges": corners[:, 1:],
-        "rest_angle": level.rest_angle[corners[:, 0]],
-        "hinge": weight[corners[:, 0]] * count / 4.0,
-    }
 
 
 def _sparse(prefix: str, index: int, matrix: sp.csr_matrix) -> Iterator[tuple[str, Any]]:
