@@ -93,7 +93,8 @@ def film(name: str, shown: Shown, folder: Path, out: Path) -> None:
     fine = DrawnStage(shot, layer)
     times = fine.times(tuple(garments))
     fine.bake(times)
-    sides = list(zip(times, smooth(name, fine, times), (fine.meshes(time) for time in times), strict=True))
+    refined = (fine.meshes(time, cages=garments) for time in times)
+    sides = list(zip(times, smooth(name, fine, times, garments), refined, strict=True))
     columns = ([left for _, left, _ in sides], [right for _, _, right in sides])
     counts = [sum(crossings(side, garments) for side in column) for column in columns]
     seconds = statistics.median(sum(each["garments"][0]["milliseconds"].values()) for each in report.frames) / 1e3
@@ -108,14 +109,14 @@ def film(name: str, shown: Shown, folder: Path, out: Path) -> None:
         first.save(out.with_suffix(".webp"), quality=55, method=3, **moving)
 
 
-def smooth(name: str, fine: DrawnStage, times: Sequence[float]) -> Iterator[Side]:
+def smooth(name: str, fine: DrawnStage, times: Sequence[float], garments: Sequence[str]) -> Iterator[Side]:
     """The fine meshes at the places that Loop's rules give them, one side a time."""
     shot = opened(name, LEVEL)
     problem = problem_of(shot)
     for time in times:
         places = problem.upsampled(shot.frame(time), smooth=True)
         points = {garment.path: each for garment, each in zip(shot.scene.garments, places, strict=True)}
-        yield [replace(mesh, points=points.get(mesh.path, mesh.points)) for mesh in fine.meshes(time)]
+        yield [replace(mesh, points=points.get(mesh.path, mesh.points)) for mesh in fine.meshes(time, cages=garments)]
 
 
 def crossings(side: Side, garments: Sequence[str]) -> int:

@@ -124,7 +124,9 @@ class Pictures:
         self._panel, self._size = (size[0] // len(self._stages), size[1]), size
         self.rate = self._stages[-1].rate
         self.times: list[float | None] = list(self._stages[-1].times(self._refined or self._garments))
+        self._cages = {*self._garments, *self._refined} if self._garments else None
         for stage in self._stages:
+            stage.surfaces = shown.surfaces
             stage.bake(tuple(code for code in (codes or self.times) if code is not None))
 
     def draw(self, codes: Sequence[float | None], camera: tuple[float, float] = CAMERA) -> list[Image.Image]:
@@ -135,7 +137,7 @@ class Pictures:
         """
         some = [self.times[i] for i in np.linspace(0, len(self.times) - 1, 5).astype(int)] if self.times else []
         spread = codes if len(codes) > 1 else [*codes, *some]  # Stills of one shot share their framing.
-        clouds = [self._in_picture(self._stages[0].meshes(code)) for code in spread]
+        clouds = [self._in_picture(self._stages[0].meshes(code, cages=self._cages)) for code in spread]
         if not any(map(len, clouds)):
             raise StageError("nothing to draw: the stage shows no mesh")
         points = np.concatenate(clouds)
@@ -175,7 +177,7 @@ class Pictures:
         return points[((points >= low - margin) & (points <= high + margin)).all(axis=1)]
 
     def _sides(self, code: float | None) -> list[list[DrawnMesh]]:
-        sides = [stage.meshes(code) for stage in self._stages]
+        sides = [stage.meshes(code, cages=self._cages) for stage in self._stages]
         faces = {mesh.path: mesh.mesh.face_count for mesh in sides[-1] if mesh.path in self._refined}
         coarse = [mesh.subdivided(faces.get(mesh.path, faces.get(f"{mesh.path}_refined", 0))) for mesh in sides[0]]
         return [coarse, *sides[1:]]

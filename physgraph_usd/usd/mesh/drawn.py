@@ -34,11 +34,13 @@ class DrawnSurface:
 
     Attributes:
         mesh: The faces without holes.
+        parents: The authored face of each face, shape (F,).
         stencil: Matrix from the authored points to the points of the faces, shape (V, V_authored); None for identity.
         error: Remaining distance from the limit surface over `NEAR_PART` of the surface, in the points' unit.
     """
 
     mesh: PolygonMesh
+    parents: np.ndarray
     stencil: sparse.csr_matrix | None = None
     error: float = 0.0
 
@@ -105,9 +107,10 @@ def drawn_surface(
         scheme: "catmullClark", "loop", or another word for flat faces.
         within: Allowed distance from the limit surface, in the points' unit.
     """
-    kept = ~np.isin(np.arange(cage.mesh.face_count), holes)
+    parents = np.arange(cage.mesh.face_count)
     if scheme not in ("catmullClark", "loop") or not cage.mesh.face_count:
-        return DrawnSurface(_some_faces(cage.mesh, kept))
+        kept = ~np.isin(parents, holes)
+        return DrawnSurface(_some_faces(cage.mesh, kept), parents[kept])
     cage = replace(cage, mesh=replace(cage.mesh, least_polygon=3 if scheme == "catmullClark" else 4))
     error = flatness(cage, points)
     wanted = 0 if error <= within else math.ceil(math.log(error / within, 4.0))
@@ -116,9 +119,10 @@ def drawn_surface(
     for _ in range(levels):
         step, stencil, cage = cage.subdivided()
         stencils.append(stencil)
-        kept = kept[step.parent_face]
+        parents = parents[step.parent_face]
     stencil = reduce(lambda product, each: each @ product, [*stencils, _to_limit(cage)])
-    return DrawnSurface(_some_faces(cage.mesh, kept), sparse.csr_matrix(stencil), error / 4.0**levels)
+    kept = ~np.isin(parents, holes)
+    return DrawnSurface(_some_faces(cage.mesh, kept), parents[kept], sparse.csr_matrix(stencil), error / 4.0**levels)
 
 
 def flatness(cage: ControlMesh, points: np.ndarray) -> float:

@@ -130,9 +130,8 @@ class ColliderReader:
             mesh = UsdGeom.Mesh(self.prim)
             first = np.asarray(mesh.GetPointsAttr().Get(Usd.TimeCode.EarliestTime()), dtype=np.float64)
             first = np.nan_to_num(first if first.shape == points.shape else points).astype(np.float64)
-            scheme = str(mesh.GetSubdivisionSchemeAttr().Get())
-            cage = _control_mesh(mesh, PolygonMesh(counts, indices, len(points)))
-            drawn = drawn_surface(cage, first, holes=holes, scheme=scheme, within=self.within / self._scale())
+            polygons, within = PolygonMesh(counts, indices, len(points)), self.within / self._scale()
+            drawn = surface_of(mesh, polygons, first, holes=holes, within=within)
             triangles = drawn.mesh.triangulate(drawn.place(first)).triangles
             self._faces = _Faces(authored, drawn, (triangles, np.ascontiguousarray(triangles[:, ::-1])))
         return self._faces
@@ -199,6 +198,22 @@ def read_collider(
     within = DRAWN_NEAR * max(offset + own, _LEAST_OFFSET)
     always = find_value(prim, COLLIDER["collider:enabled"], overrides).source != "fallback"
     return ColliderReader(prim, Collider(path, kind, own, side), metres, within, always), odd
+
+
+def surface_of(
+    mesh: UsdGeom.Mesh, polygons: PolygonMesh, points: np.ndarray, *, holes: np.ndarray, within: float
+) -> DrawnSurface:
+    """A mesh's faces as drawn.
+
+    Args:
+        mesh: The prim, with scheme, creases and corners.
+        polygons: Its faces.
+        points: Its points in any pose, shape (V, 3).
+        holes: Numbers of the faces that are holes.
+        within: Allowed distance from the limit surface, in the points' unit.
+    """
+    scheme = str(mesh.GetSubdivisionSchemeAttr().Get())
+    return drawn_surface(_control_mesh(mesh, polygons), points, holes=holes, scheme=scheme, within=within)
 
 
 def _control_mesh(mesh: UsdGeom.Mesh, polygons: PolygonMesh) -> ControlMesh:

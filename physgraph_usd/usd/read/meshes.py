@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -12,15 +13,19 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdSkel
 from ...errors import LayerError, StageError
 from ...solver.mesh.subdivide import smooth, subdivide
 from ...solver.mesh.topology import PolygonMesh, TriangleSplit
+from ..mesh.drawn import DrawnSurface
 from ..provenance import read_record, recorded_shot
 from ..schema import AXES
 from ..stage import bad_rate, list_meshes, open_layer, paths_in, pxr_errors, quiet, read_units, timecode
 from ..times import garment_times, merge
 from ..view import root_over
+from .bodies import surface_of
 from .find import has_schema, traverse, with_gravity
 from .placement import place
 from .reader import Shot
 
+DRAWN_WITHIN = 2e-4
+"""Distance of drawn bodies from their limit surface [m], as in contact at the usual offset."""
 NEUTRAL = (0.55, 0.54, 0.52)
 """Linear colour of a mesh without colour."""
 
@@ -97,6 +102,7 @@ class DrawnStage:
             meshes = [prim for prim in traverse(self.stage) if UsdGeom.Mesh(prim)]
             units = with_gravity(read_units(self.stage)[0], meshes, _gravity_of(layers[0]))
         self._scale, self.turn = units.metres, upright(units.up) if turn is None else turn
+        self.surfaces: dict[str, tuple[PolygonMesh, DrawnSurface]] = {}
 
     def times(self, paths: tuple[str, ...]) -> tuple[float, ...]:
         """Time codes at which prims, or all meshes when none are named, have points, transforms or skeletons.
@@ -131,8 +137,13 @@ class DrawnStage:
         applied = [prim for prim in traverse(self.stage) if has_schema(prim, "PhysGraphGarmentAPI")]
         return tuple(str(prim.GetPath()) for prim in applied if UsdGeom.Mesh(prim))
 
-    def meshes(self, time: float | None) -> list[DrawnMesh]:
-        """All visible meshes of purpose default or render at a time code, in stage order, if not empty."""
+    def meshes(self, time: float | None, *, cages: Collection[str] | None = None) -> list[DrawnMesh]:
+        """All visible meshes of purpose default or render at a time code, in stage order, if not empty.
+
+        Args:
+            cages: Paths of the meshes drawn by their authored polygons, the others by their subdivision's limit surface
+                as bodies are in contact; None for all meshes.
+        """
         code = timecode(time)
         transforms = UsdGeom.XformCache(code)
         drawn = []
@@ -143,11 +154,24 @@ class DrawnStage:
             if mesh.ComputeVisibility(code) == UsdGeom.Tokens.invisible:
                 continue
             matrix = np.array(transforms.GetLocalToWorldTransform(prim))
-            read = _read(mesh, code, matrix)
+            smooth = cages is not None and str(prim.GetPath()) not in cages
+            read = _read(mesh, code, matrix, self._surface if smooth else None)
             if read is not None:
                 points = self._scale * (read.points @ matrix[:3, :3] + matrix[3, :3]) @ self.turn.T
                 drawn.append(replace(read, points=points))
         return drawn
+
+    def _surface(self, mesh: UsdGeom.Mesh, polygons: PolygonMesh, points: np.ndarray, scale: float) -> DrawnSurface:
+        """A mesh's faces as drawn; cached while the topology stays the same."""
+        path = str(mesh.GetPath())
+        known = self.surfaces.get(path)
+        if known is None or not (
+            np.array_equal(known[0].counts, polygons.counts) and np.array_equal(known[0].indices, polygons.indices)
+        ):
+            holes = np.asarray(mesh.GetHoleIndicesAttr().Get() or [], np.int64)
+            found = surface_of(mesh, polygons, points, holes=holes, within=DRAWN_WITHIN / (scale * self._scale))
+            known = self.surfaces[path] = polygons, found
+        return known[1]
 
 
 def upright(up: np.ndarray) -> np.ndarray:
@@ -178,8 +202,10 @@ def refined_in(layer: Path) -> tuple[str, ...]:
     return tuple(sorted(str(path.GetPrimPath()) for path in paths if path.IsPropertyPath() and path.name == "points"))
 
 
-def _read(mesh: UsdGeom.Mesh, code: Usd.TimeCode, matrix: np.ndarray) -> DrawnMesh | None:
-    """One mesh in local space and units, or None if not drawable."""
+def _read(
+    mesh: UsdGeom.Mesh, code: Usd.TimeCode, matrix: np.ndarray, surface: Callable[..., DrawnSurface] | None
+) -> DrawnMesh | None:
+    """One mesh in local space and units, on the surface that is drawn if asked for; None if not drawable."""
     points, counts, indices = (
         attribute.Get(code)
         for attribute in (mesh.GetPointsAttr(), mesh.GetFaceVertexCountsAttr(), mesh.GetFaceVertexIndicesAttr())
@@ -193,12 +219,15 @@ def _read(mesh: UsdGeom.Mesh, code: Usd.TimeCode, matrix: np.ndarray) -> DrawnMe
     )
     if not usable or not np.isfinite(positions).all():
         return None
-    polygons = PolygonMesh(counts, indices, len(positions))
+    polygons, colors = PolygonMesh(counts, indices, len(positions)), _colors(mesh, code, len(counts))
+    if surface is not None and matrix[:3, :3].any():
+        drawn = surface(mesh, polygons, positions, float(np.linalg.norm(matrix[:3, :3], 2)))
+        polygons, positions, colors = drawn.mesh, drawn.place(positions), colors[drawn.parents]
     left = mesh.GetOrientationAttr().Get(code) == "leftHanded"
     # Use the determinant's sign only: the cube of a scale can overflow.
     if left != (np.linalg.slogdet(matrix[:3, :3])[0] < 0):
         polygons = replace(polygons, indices=polygons.indices[polygons.mirrored_corners])
-    return DrawnMesh(str(mesh.GetPath()), positions, polygons, _colors(mesh, code, len(counts)))
+    return DrawnMesh(str(mesh.GetPath()), positions, polygons, colors)
 
 
 def _colors(mesh: UsdGeom.Mesh, code: Usd.TimeCode, faces: int) -> np.ndarray:
