@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
+from scipy import sparse
 from scipy.ndimage import uniform_filter
 
 from ...solver.mesh.kernels import KERNELS, start_warp
@@ -33,6 +34,10 @@ SKY_MAPS, SKY_SIZE = 12, 256
 
 KEY_MAPS, KEY_SIZE = 6, 512
 """Depth maps of the key light, and the width of a map [pixels]: larger, because only key shadows have visible edges."""
+
+LIGHT_BLUR, LIGHT_WIDTH = 16, 0.01
+"""Averages over neighbours of the light at the vertices, and how near these are, in the visible size: the edge of a
+map's shadow is no step of brightness."""
 
 GROUND_CELLS, GROUND_BLUR = 84, 5
 """Cells along a side of the ground's square grid, and width in cells of the blur of the ground's light."""
@@ -183,6 +188,11 @@ def _shade(solid: Surface, ground: Surface, view: View, visible: np.ndarray) -> 
     normals = np.concatenate([vertex_normals(solid), up])
     spots, facing, towards = np.tile(points, (2, 1)), np.concatenate([normals, -normals]), _unit(KEY) @ view.axes
     sky, key = _light(solid, spots, facing, visible=visible, towards=towards)
+    mean = _mean_of_neighbours(solid, LIGHT_WIDTH * float(np.ptp(visible, axis=0).max()))
+    for side in (slice(0, len(solid.points)), slice(len(points), len(points) + len(solid.points))):
+        for light in (sky, key):
+            for _ in range(LIGHT_BLUR):
+                light[side] = mean @ light[side]
     front = np.einsum("vk,vk->v", facing, _unit(view.eye - spots)).clip(0, 1)
     warm, cool = np.array([1.04, 1.0, 0.95]), np.array([0.95, 1.0, 1.06])
     shade = (0.98 * (facing @ towards).clip(0, 1) * key)[:, None] * warm
@@ -191,10 +201,19 @@ def _shade(solid: Surface, ground: Surface, view: View, visible: np.ndarray) -> 
     below, grid = slice(len(solid.points), len(points)), (GROUND_CELLS + 1, GROUND_CELLS + 1)
     away = np.linalg.norm(ground.points - ground.points.mean(axis=0), axis=1) / (0.5 * np.ptp(ground.points[:, 0]))
     fade = np.clip(2.6 * (1.0 - away), 0.0, 1.0)
-    light = uniform_filter((0.62 * sky[below] + 0.38 * key[below]).reshape(grid), GROUND_BLUR, mode="nearest")
-    dark = 0.70 * (1.0 - light.ravel())
+    lit = uniform_filter((0.62 * sky[below] + 0.38 * key[below]).reshape(grid), GROUND_BLUR, mode="nearest")
+    dark = 0.70 * (1.0 - lit.ravel())
     shade[below] = (1.0 - fade * fade * (3 - 2 * fade) * dark)[:, None]
     return shade
+
+
+def _mean_of_neighbours(solid: Surface, width: float) -> sparse.csr_matrix:
+    """Mean over each vertex and its neighbours, weighted by a Gaussian of their distance, shape (V, V)."""
+    count, sides = len(solid.points), ((0, 1), (1, 2), (2, 0), (1, 0), (2, 1), (0, 2))
+    ends = np.concatenate([solid.triangles[:, side] for side in sides]).T
+    far = np.linalg.norm(np.subtract(*solid.points[ends]), axis=1) / max(width, 1e-30)
+    beside = sparse.csr_matrix((np.exp(-(far**2)), ends), shape=(count, count)) + sparse.eye(count)
+    return sparse.csr_matrix(sparse.diags(1.0 / np.asarray(beside.sum(axis=1)).ravel()) @ beside)
 
 
 def _light(
