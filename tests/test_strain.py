@@ -79,12 +79,13 @@ def test_cloth_in_its_own_size_is_not_warned_of(tmp_path: Path, default: bool, a
     assert "command" not in found
 
 
-@pytest.mark.parametrize("source", ["default points", f"{FITTED}: median edge lengths of 46 time codes"])
-def test_a_fitted_shape_is_not_asked_for_again_nor_one_of_a_frame(source: str):
-    (said,) = of_strain({SLEEVE: [StrainedPart("in its middle", 16, 1.19, 0.02)]}, source)
-    assert "author primvars:rest" in said
-    assert ("--rest auto" in said) == (source == "default points")
-    assert "--rest FRAME" not in said
+def test_a_fitted_shape_is_not_warned_of_and_the_others_are():
+    """Nothing comes nearer to the cages' sizes than a shape that is fitted to them."""
+    parts = [StrainedPart("in its middle", 16, 1.19, 0.02)]
+    (said,) = of_strain({"/a": parts, "/b": parts}, {"/a": "default points", "/b": f"{FITTED}: 46 time codes"})
+    assert "</a> (default points) 119%" in said
+    assert "</b>" not in said
+    assert "give --rest auto, or author primvars:rest" in said
 
 
 @pytest.mark.parametrize(("puff", "odd"), [(1.0, {}), (1.05, {}), (1.0, {1.0: 1.5, 7.0: 1.5})])

@@ -296,7 +296,7 @@ def _strained(opened: Shot, report: RefineReport, frames: Sequence[Frame]) -> li
     found = _strained_parts(opened, frames)
     for garment, parts in zip(report.garments, found.values(), strict=True):
         garment["strained"] = [dataclasses.asdict(part) for part in parts]
-    return of_strain(found, opened.sources[0].sources["rest"])
+    return of_strain(found, {str(source.path): source.sources["rest"] for source in opened.sources})
 
 
 def _strained_parts(opened: Shot, frames: Sequence[Frame]) -> dict[str, list[StrainedPart]]:

@@ -106,8 +106,8 @@ WARNINGS = {
     "strained": Kind(
         "in most frames the cage has not its rest shape's size",
         "`--rest auto`, or `primvars:rest` in the cloth's own size: refined cloth goes to its rest shape's size",
-        "in most frames the cage has not its rest shape's size ({source}), to which refined cloth goes: {parts}",
-        "{remedy}",
+        "in most frames the cage has not its rest shape's size, to which refined cloth goes: {parts}",
+        "give --rest auto, or author primvars:rest in the cloth's own size",
     ),
     "unfelt": Kind(
         "cloth is inside or near a mesh that it does not feel",
@@ -147,22 +147,20 @@ def advice_table() -> str:
     return "\n".join(["| it says | do |", "|---|---|", *rows]) + "\n"
 
 
-def of_strain(found: Mapping[str, Sequence[StrainedPart]], source: str) -> list[str]:
-    """A warning of parts larger than their rest shape in most frames, or far smaller.
+def of_strain(found: Mapping[str, Sequence[StrainedPart]], sources: Mapping[str, str]) -> list[str]:
+    """A warning of parts larger than their rest shape in most frames, or far smaller, unless the shape is fitted.
 
     Args:
         found: Strained parts of each garment, largest first, by path.
-        source: Source of the first garment's rest shape.
+        sources: Source of each garment's rest shape, by path.
     """
     named = []
     for path, parts in found.items():
-        large = [part for part in parts if part.needs_rest]
+        large = [part for part in parts if part.needs_rest and not sources[path].startswith(FITTED)]
         for part in large[:1]:
-            named.append(f"<{path}> {part.area_ratio:.0%} of its area on {counted(part.faces, 'face')} {part.where}")
-    authored = "author primvars:rest in the cloth's own size"
-    # One frame's points hold more parts at another size than a shape fitted to all frames.
-    remedy = authored if source.startswith(FITTED) else f"give --rest auto, or {authored}"
-    return [WARNINGS["strained"](source=source, parts=", ".join(named), remedy=remedy)] if named else []
+            size = f"{part.area_ratio:.0%} of its area on {counted(part.faces, 'face')} {part.where}"
+            named.append(f"<{path}> ({sources[path]}) {size}")
+    return [WARNINGS["strained"](parts=", ".join(named))] if named else []
 
 
 def of_gravity(garment: str, body: str, axis: str, *, pull: str, source: str) -> str:
