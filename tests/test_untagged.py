@@ -61,6 +61,18 @@ def test_it_is_named_with_what_to_type(stage: Usd.Stage, tmp_path: Path):
         assert session.warning == warning
 
 
+def test_animated_cloth_without_a_body_is_a_garment(tmp_path: Path):
+    stage = new_stage(tmp_path / "shot.usda", metres=0.1)
+    add_sheet(stage, times=(1.0, 2.0))
+    add_sheet(stage, "/World/backdrop", times=())
+    for name in ("cloth", "backdrop"):
+        stage.GetPrimAtPath(f"/World/{name}").RemoveAppliedSchema(GARMENT_API)
+    found = inspect_shot(save(stage))
+    assert shlex.split(found["command"])[-2:] == ["--garment", "/World/cloth"]
+    assert "/World/backdrop" not in found["command"]
+    assert found["exit_code"] == 0
+
+
 def test_the_command_that_is_printed_runs(stage: Usd.Stage):
     sheet = UsdGeom.Mesh(stage.GetPrimAtPath("/World/cloth"))
     sheet.GetPrim().RemoveAppliedSchema(GARMENT_API)

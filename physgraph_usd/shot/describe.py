@@ -158,11 +158,11 @@ def _command(opened: Shot, report: RefineReport, options: RefineOptions) -> dict
     return {"command": _command_of(opened.path, rest, named)}
 
 
-def _command_of(shot: str, rest: Sequence[str], named: Mapping[str, Iterable[str]]) -> str:
-    """The command to refine a shot, with the result of `_rest_options` and the paths given by each option."""
+def _command_of(shot: str, given: Sequence[str], named: Mapping[str, Iterable[str]]) -> str:
+    """The command to refine a shot, with options as words, and the paths given by each option."""
     out = str(Path(shot).with_suffix(".refined.usdc"))
     options = [word for name, values in named.items() for word in options_of(name, values)]
-    return join(["physgraph-usd", "refine", shot, "-o", out, *rest, *options])
+    return join(["physgraph-usd", "refine", shot, "-o", out, *given, *options])
 
 
 def _rest_options(opened: Shot, strained: Iterable[Sequence[StrainedPart]]) -> list[str]:
@@ -173,8 +173,9 @@ def _rest_options(opened: Shot, strained: Iterable[Sequence[StrainedPart]]) -> l
 
 
 def _proposal(shot: str | Stage, meshes: Sequence[str], frames: tuple[float, float] | None) -> str:
-    """The command for a shot without tags: open meshes, the largest first, lying on closed meshes are the garments.
+    """The command for a shot without tags.
 
+    Open meshes, the largest first, that lie on other meshes are the garments; if none does, those that are animated.
     "" if no garment is found or the meshes cannot be read together.
     """
     try:
@@ -182,11 +183,14 @@ def _proposal(shot: str | Stage, meshes: Sequence[str], frames: tuple[float, flo
             sampled = sample_frames(opened.every_time, opened.frame)
             found = [each for each in find_candidates(opened) if each.is_taken]
             lying = {path for each in found for path in each.shares}
-            garments = [garment.path for garment in opened.scene.garments if garment.path in lying]
+            moving = {str(source.path) for source in opened.sources if len(source.times) > 1}
+            garments = [garment.path for garment in opened.scene.garments if garment.path in (lying or moving)]
             strained = _strained_parts(opened, sampled)
-            rest = _rest_options(opened, [parts if path in lying else [] for path, parts in strained.items()])
+            options = _rest_options(opened, [parts if path in garments else [] for path, parts in strained.items()])
+            across = across_gravity(opened.scene, sampled, found)
+            options += [] if across is None else ["--gravity", f"-{across[2]}"]
             named = {"--garment": garments, "--collider": [each.path for each in found]}
-            return _command_of(opened.path, rest, named) if found else ""
+            return _command_of(opened.path, options, named) if garments else ""
     except StageError:
         return ""
 

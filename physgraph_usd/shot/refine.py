@@ -28,7 +28,7 @@ from .frames import kept_for
 from .options import RefineOptions, json_of
 from .page.report import write_folder
 from .processes import call_each, memory_is_named
-from .report import RefineReport, is_of_failure
+from .report import DONE, RefineReport, is_of_failure
 from .run import Run
 from .solve import open_for, time_frames
 from .warnings import WARNINGS
@@ -243,7 +243,8 @@ def inspect_shot(shot: str | Path | Stage, *, timed: bool = False, **given: Any)
 
     Returns:
         Plain values. If the shot cannot be refined as asked, ``problem`` gives the reason, ``meshes`` lists the stage's
-        meshes, and ``exit_code`` is 2 if a named garment or collider is missing, else 1.
+        meshes, and ``exit_code`` is 0 if ``command`` names what to refine, 2 if a named garment or collider is missing,
+        else 1.
 
     Raises:
         StageError: The file cannot be opened at all.
@@ -260,7 +261,8 @@ def inspect_shot(shot: str | Path | Stage, *, timed: bool = False, **given: Any)
                 found["timed"] = time_frames(opened, options, levels)
             return found
     except StageError as error:
-        return describe_meshes(source, str(error), options) | {"exit_code": error.exit_code}
+        found = describe_meshes(source, str(error), options)
+        return found | {"exit_code": DONE if "command" in found else error.exit_code}
 
 
 def _write_report(report: RefineReport, path: Path, opened: Shot) -> None:
