@@ -7,6 +7,7 @@ import logging
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -29,13 +30,6 @@ MOST_NAMED = 3
 _OF_PRIM = re.compile(r"<([^>]+)>(?=[: ])")
 _ALSO, _DIFFERS = re.compile(r"; also (?:at|in) .*$"), re.compile(r"<[^>]*>|[-+]?\d[\d,]*(?:\.\d+)?(?:e[-+]?\d+)?")
 _FRAME: dict[str, Any] = {"time": None, "read_ms": None, "garments": [], "error": ""}
-_GARMENT: dict[str, Any] = dict.fromkeys(
-    (
-        "start", "levels", "milliseconds", "energy_joules", "strain", "sharp_folds", "remaining_mm", "contact", "near",
-        "together", "collapsed", "broken_before", "jumped_from", "not_solved", "time_limit",
-    )
-)  # fmt: skip
-_CONTACT: dict[str, Any] = dict.fromkeys(("bodies", "cloth", "repaired", "projected"))
 
 
 def is_first(path: str, entry: Mapping[str, Any]) -> bool:
@@ -233,5 +227,16 @@ def _whole_frame(frame: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _whole_garment(entry: Mapping[str, Any]) -> dict[str, Any]:
-    whole = {**_GARMENT, **entry}
-    return whole | {"contact": {**_CONTACT, **entry["contact"]}} if "contact" in entry else whole
+    whole = {**_fields("garment_frame"), **entry}
+    return whole | {"contact": _fields("contact") | entry["contact"]} if "contact" in entry else whole
+
+
+@cache
+def _schema() -> dict[str, Any]:
+    found: dict[str, Any] = json.loads(SCHEMA.read_text(encoding="utf-8"))
+    return found
+
+
+def _fields(name: str) -> dict[str, Any]:
+    """The fields of a definition of the schema, without values."""
+    return dict.fromkeys(_schema()["$defs"][name]["properties"])
