@@ -11,6 +11,7 @@ from bodies import Soup, ball, box, distances, flipped, together
 from cloth import FABRIC, sheet
 from folds import frame_with, measured, named, refiner_with, square
 
+from physgraph_usd.errors import SolveError
 from physgraph_usd.solver.colliders.pose import Collider, Pose
 from physgraph_usd.solver.colliders.primitives import primitive
 from physgraph_usd.solver.contact.broad_phase import Bodies
@@ -96,6 +97,12 @@ class TestRest:
         assert measured(state)["inside"] == 0
         points = state.points[0]
         np.testing.assert_allclose(points[np.flatnonzero(pin)], draped(height)[pin > 0], atol=1e-7)
+
+
+def test_cloth_wholly_behind_a_plane_and_deeper_than_its_size_is_refused():
+    solver = refiner_with([SHEET], ["plane"], level=1)
+    with pytest.raises(SolveError, match=r"mm deep in <.*>, and only"):
+        solver.solve(frame_with([draped(-2.0)], SHAPES["plane"][0]))
 
 
 @pytest.mark.parametrize(("offset", "counts"), [(0.04, False), (0.06, True)])

@@ -95,7 +95,7 @@ def _jobs(ctx: click.Context, shots: tuple[str, ...], out: Path) -> list[Job]:
 
 
 def _each_or_none(shots: tuple[str, ...], to: Path | None, option: str, **known: Any) -> Sequence[Path | None]:
-    """Name one output per shot, as `_one_each` does, where any is asked for."""
+    """One output file per shot, as in `_one_each`; None for each shot without the option."""
     return [None] * len(shots) if to is None else _one_each(shots, to, option, **known)
 
 

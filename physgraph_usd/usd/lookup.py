@@ -73,7 +73,7 @@ class Found:
 
 
 def check_known(what: str, word: object, known: Collection[object]) -> None:
-    """Refuse (UsageError) a word that is none of the known ones, in their order."""
+    """Refuse (UsageError) an unknown word; the message lists the known words in order."""
     if word not in known:
         raise UsageError(f"unknown {what} '{word}'; known {what}s: {', '.join(map(str, known))}")
 

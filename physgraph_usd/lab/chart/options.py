@@ -235,7 +235,7 @@ class Clock:
         self._part, self._done, self._entered = part, 0.0, time.perf_counter()
 
     def say(self, what: str, done: float | None = None) -> None:
-        """Report what is being measured, and what fraction of the present part is done, where that is known."""
+        """Report the present measurement, and the finished fraction of its part; None for an unknown fraction."""
         self._done = self._done if done is None else done
         if not self._progress:
             return

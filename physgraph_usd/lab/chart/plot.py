@@ -103,7 +103,7 @@ def _curves(axes: Axes, chart: Chart, style: dict[str, Style]) -> None:
 
 
 def _warm(axes: Axes, chart: Chart, style: dict[str, Style]) -> None:
-    """Gap against time for frames that begin where the last one ended."""
+    """Gap against time of warm frames."""
     for name in dict.fromkeys(each.method for each in chart.warm):
         points = [each for each in chart.warm if each.method == name]
         _gaps(axes, name, points, style.get(name, Style(BASELINE, dashed=False)))

@@ -41,7 +41,7 @@ from .warm import ROW, measure_warm
 
 DEFAULTS = ChartOptions()
 WRITTEN = ("chart.png", "chart.svg", "chart.html", "chart.csv", "chart.json")
-"""Files that a chart leaves beside its rows."""
+"""Files written beside the chart's rows."""
 
 
 def chart_shot(shot: str | Path, folder: str | Path, options: ChartOptions = DEFAULTS) -> Chart:

@@ -152,7 +152,7 @@ class Chart:
         return tuple(best)
 
     def time_to(self, method: str, gap: float) -> float | None:
-        """Milliseconds that a method needs to a gap, between its budgets by powers; None where it never gets there."""
+        """Time of a method to a gap [ms], interpolated between budgets by a power law; None for a gap never reached."""
         best: list[Point] = []
         for point in self.curve(method):
             if not best or point.gap < best[-1].gap:

@@ -19,7 +19,7 @@ from .panel import Cut, sew
 from .shapes import CANVAS, Solid, ease, mesh
 
 FRAMES, RATE = 60, 24.0
-"""Samples in the shot, which is one turn, and their number a second."""
+"""Samples of the shot, a single turn, and samples per second."""
 BONES = {
     "hips": (None, (0.0, 0.96, 0.0)),
     "chest": ("hips", (0.0, 1.10, 0.0)),
@@ -49,7 +49,7 @@ CONES = (
 )
 """Round cones: joint, place [m] and radius [m] of either end. Those off the middle come with their mirror image."""
 BLEND = 0.016
-"""Width over which cones run into one another [m]."""
+"""Radius of the blend between neighbouring cones of the body [m]."""
 CELL = 0.02
 """Size of the body's faces [m]."""
 DRESS = Cut(0.196, 1.285, 1.470, 0.56, 0.15, 0.078, (22, 5, 23, 7), depth=(0.70, 0.90))

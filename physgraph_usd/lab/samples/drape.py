@@ -19,7 +19,7 @@ from .shapes import springs
 GRAVITY = np.array([0.0, -9.81, 0.0])
 """Gravity of the samples' simulations [m/s^2]; they are made with Y up."""
 RENEWALS = 3
-"""Iterations of a step after which it is settled which points touch something."""
+"""Iterations of a step that may still change the set of contacts."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ class Drape:
         return splu(system, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
 
     def _contact(self) -> np.ndarray:
-        """Stiffness that holds points where they were moved to [N/m]."""
+        """Stiffness of the springs to moved points [N/m]."""
         return self.options.contact * self.options.spring * self._touching
 
     def step(self, targets: np.ndarray) -> np.ndarray:

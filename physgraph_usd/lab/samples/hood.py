@@ -24,7 +24,7 @@ FRAMES = 24
 
 
 def build() -> PlainStage:
-    """One garment, pinned along its neckline; a head that moves by its transform and static shoulders."""
+    """A hood pinned along the neckline, a head with an animated transform, and static shoulders."""
     quads, used, uv = _faces()
     rest, worn = (points.reshape(-1, 3)[used] for points in (_hull(0.0, 0.39, 1.17), _hull(1.0, 0.315, 1.0)))
     times = np.arange(FRAMES) / 24.0

@@ -125,7 +125,7 @@ def lathe(rings: np.ndarray, ends: np.ndarray) -> Solid:
 
 
 def join(*solids: Solid) -> Solid:
-    """Several solids as one mesh; they may overlap."""
+    """Several solids, possibly overlapping, as one mesh."""
     starts = np.cumsum([0, *(len(solid.points) for solid in solids)])
     return Solid(
         np.concatenate([solid.points for solid in solids]),

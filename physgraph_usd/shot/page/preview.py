@@ -116,7 +116,7 @@ class Pictures:
             StageError: A stage cannot be opened.
         """
         shown = DrawnStage(layer) if shot is None else DrawnStage(shot, layer)
-        self._stages = [shown] if shot is None else [DrawnStage(shot, turn=shown.turn), shown]
+        self._stages = [shown] if shot is None else [DrawnStage(shot, beside=shown), shown]
         self._refined = () if shot is None else refined_in(layer)
         named = set(self._refined) & set(self._stages[0].paths())
         self._garments = tuple(sorted(named)) or self._stages[0].garments()
@@ -126,7 +126,6 @@ class Pictures:
         self.times: list[float | None] = list(self._stages[-1].times(self._refined or self._garments))
         self._cages = {*self._garments, *self._refined} if self._garments else None
         for stage in self._stages:
-            stage.surfaces = shown.surfaces
             stage.bake(tuple(code for code in (codes or self.times) if code is not None))
 
     def draw(self, codes: Sequence[float | None], camera: tuple[float, float] = CAMERA) -> list[Image.Image]:
@@ -185,7 +184,7 @@ class Pictures:
     def _compose(
         self, sides: Sequence[Sequence[DrawnMesh]], code: float | None, view: View, floor: float
     ) -> Image.Image:
-        """Draw all panels at one time and label them."""
+        """The labelled panels of a time code."""
         picture = Image.new("RGB", self._size, encode_color(tuple(BACKGROUND)))
         pen = ImageDraw.Draw(picture)
         for i, (title, meshes) in enumerate(zip(self._titles, sides, strict=True)):

@@ -142,7 +142,12 @@ class Bodies:
         if pose is None:
             return False
         if index not in self._bounds:
-            self._bounds[index] = bounds_of(pose.points[np.isfinite(pose.points).all(axis=1)])
+            points = pose.points[np.isfinite(pose.points).all(axis=1)]
+            if pose.endless:  # Cloth at any depth behind a plane is near the plane.
+                a, b, c = pose.points[:3]
+                away = FIXED.get(self.colliders[index].side, 1.0) * np.cross(b - a, c - a)
+                points = np.concatenate([points, points - float(np.ptp(points, axis=0).max()) * away])
+            self._bounds[index] = bounds_of(points)
         grow = margin + self.colliders[index].offset
         low, high = self._bounds[index]
         return bool((bounds[0] - grow <= high).all() and (low <= bounds[1] + grow).all())

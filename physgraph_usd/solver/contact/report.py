@@ -75,12 +75,12 @@ def _penetration(bodies: LevelBodies, index: int, x: Tensor, look: ContactState,
 def swallowed(
     bodies: LevelBodies, x: Float[Tensor, "vertices 3"], inside: Bool[Tensor, "bodies vertices"] | None
 ) -> list[tuple[float, str]]:
-    """Mean depth [m] and body path of each garment that is wholly inside a closed body at x [m]."""
+    """Mean depth [m] and body path of each garment that is wholly inside a body, or behind its fixed side, at x [m]."""
     found = [(0.0, "")] * len(bodies.level.spans)
     for index, own in enumerate(() if inside is None else inside):
         each = bodies.frame.touching[index]
         for place, span in enumerate(bodies.level.spans):
-            if each.surface.closed and span.stop > span.start and bool(own[span].all()):
+            if each.surface.has_inside and span.stop > span.start and bool(own[span].all()):
                 at = x[span] + bodies.frame.shifts[index]
                 near = each.surface.closest(at, torch.full_like(at[:, 0], float("inf")))
                 found[place] = max(found[place], (float(near.distance.mean()), each.path))

@@ -26,6 +26,8 @@ from .placement import is_flipped, place
 
 DRAWN_NEAR = 0.1
 """Largest error of a body's surface relative to the contact offset: a smaller error is invisible behind the offset."""
+DRAWN_WITHIN = DRAWN_NEAR * float(GARMENT["contact:offset"].fallback or 0.0)
+"""Largest error of a body's surface at the usual contact offset [m]."""
 _LEAST_OFFSET = 1e-3
 """Least offset for choosing a body's subdivision [m]: an offset of 0 would ask for unlimited subdivision."""
 _PLANE_START = ("plane", "start")
@@ -60,7 +62,7 @@ class ColliderReader:
     prim: Usd.Prim
     collider: Collider
     metres: float
-    within: float = DRAWN_NEAR * float(GARMENT["contact:offset"].fallback or 0.0)
+    within: float = DRAWN_WITHIN
     always: bool = False
     _faces: _Faces | None = None
 

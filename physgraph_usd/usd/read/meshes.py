@@ -19,13 +19,11 @@ from ..schema import AXES
 from ..stage import bad_rate, list_meshes, open_layer, paths_in, pxr_errors, quiet, read_units, timecode
 from ..times import garment_times, merge
 from ..view import root_over
-from .bodies import surface_of
+from .bodies import DRAWN_WITHIN, surface_of
 from .find import has_schema, traverse, with_gravity
 from .placement import place
 from .reader import Shot
 
-DRAWN_WITHIN = 2e-4
-"""Distance of drawn bodies from their limit surface [m], as in contact at the usual offset."""
 NEUTRAL = (0.55, 0.54, 0.52)
 """Linear colour of a mesh without colour."""
 
@@ -79,14 +77,14 @@ class DrawnStage:
     Args:
         shot: The shot's file, the source of units, axis and rates.
         over: A layer put over the shot, or None.
-        turn: Rotation of the world for drawing, shape (3, 3); None turns gravity of the shot, or of the layer,
-            downwards.
+        beside: A stage drawn beside this one, to share rotation of the world and subdivided surfaces; None turns
+            gravity of the shot, or of the layer, downwards.
 
     Raises:
         StageError: When a file cannot be opened, or its rate is invalid.
     """
 
-    def __init__(self, shot: Path, over: Path | None = None, *, turn: np.ndarray | None = None) -> None:
+    def __init__(self, shot: Path, over: Path | None = None, *, beside: DrawnStage | None = None) -> None:
         """Compose and open."""
         base = open_layer(shot, StageError)
         layers = [open_layer(path, StageError) for path in (over, shot) if path is not None]
@@ -101,8 +99,8 @@ class DrawnStage:
         with pxr_errors(f"cannot open {shot}"), quiet():
             meshes = [prim for prim in traverse(self.stage) if UsdGeom.Mesh(prim)]
             units = with_gravity(read_units(self.stage)[0], meshes, _gravity_of(layers[0]))
-        self._scale, self.turn = units.metres, upright(units.up) if turn is None else turn
-        self.surfaces: dict[str, tuple[PolygonMesh, DrawnSurface]] = {}
+        self._scale, self.turn = units.metres, upright(units.up) if beside is None else beside.turn
+        self._surfaces: dict[str, tuple[PolygonMesh, DrawnSurface]] = {} if beside is None else beside._surfaces
 
     def times(self, paths: tuple[str, ...]) -> tuple[float, ...]:
         """Time codes at which prims, or all meshes when none are named, have points, transforms or skeletons.
@@ -164,13 +162,13 @@ class DrawnStage:
     def _surface(self, mesh: UsdGeom.Mesh, polygons: PolygonMesh, points: np.ndarray, scale: float) -> DrawnSurface:
         """A mesh's faces as drawn; cached while the topology stays the same."""
         path = str(mesh.GetPath())
-        known = self.surfaces.get(path)
+        known = self._surfaces.get(path)
         if known is None or not (
             np.array_equal(known[0].counts, polygons.counts) and np.array_equal(known[0].indices, polygons.indices)
         ):
             holes = np.asarray(mesh.GetHoleIndicesAttr().Get() or [], np.int64)
             found = surface_of(mesh, polygons, points, holes=holes, within=DRAWN_WITHIN / (scale * self._scale))
-            known = self.surfaces[path] = polygons, found
+            known = self._surfaces[path] = polygons, found
         return known[1]
 
 
