@@ -2,7 +2,6 @@
 
     python -m benchmarks.step [--most 1000000]
     python -m benchmarks.step --device cuda --json benchmarks/results/step_cuda.json      on a machine with a GPU
-    python -m benchmarks.step --kernels      the CPU's kernels for eight elements at once, beside the plain ones
 
 A waved square sheet of triangles. Untrained networks of the sizes that ship: time does not depend on the weights.
 Medians: on CUDA of wall time, the device waited for after each step, the forces alone, quasi-Newton's and `physgraph`'s
@@ -26,7 +25,6 @@ from typing import Any, cast
 import numpy as np
 import torch
 
-from benchmarks.kernels import compare
 from benchmarks.rows import Row, say, under
 from physgraph_usd.lab.methods.paper_network import PaperConfig
 from physgraph_usd.shot.solve import prepare_device
@@ -63,12 +61,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--most", type=int, default=max(PAPER_MS), help="most edges")
     parser.add_argument("--paper-most", type=int, default=max(PAPER_MS), help="most edges for the paper's network")
     parser.add_argument("--json", type=Path, default=None, help="file for the figures")
-    parser.add_argument("--kernels", action="store_true", help="kernels for eight elements at once, instead")
     given = parser.parse_args(arguments)
     prepare_device(given.device)
-    if given.kernels:
-        compare(*sheet(100_000, "cpu"), SHIPPED)
-        return
     names = ["edges", "forces", "metric solve", *METHOD]
     say("| " + " | ".join(names) + " | the paper |\n" + "|---" * (len(names) + 1) + "|")
     lines = []

@@ -78,7 +78,7 @@ def test_no_backward_pass_is_compiled() -> None:
     root = Path(physgraph_usd.__file__).parent
     files = [path for path in root.rglob("*.py") if "@wp.kernel" in path.read_text() and "peers" not in path.parts]
     names = [".".join((root.name, *path.relative_to(root).with_suffix("").parts)) for path in files]
-    assert len(names) > 10
+    assert len(names) > 5
     options = {name: wp.get_module_options(import_module(name)) for name in names}
     assert not [name for name, each in options.items() if each["enable_backward"]]
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Protocol, cast, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import scipy.sparse as sp
 import torch
@@ -12,12 +12,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..level import Level
-from ..mesh.kernels import ALONE, KERNELS
-from ..mesh.simd import EIGHT, FOUR, on_cpu
-from ..mesh.stencil import QUAD, SCALAR, VECTOR, incidence, overloads, vectors
+from ..mesh.formula import SCALAR, VECTOR, block_size, kernel, native, one_by_one
+from ..mesh.stencil import incidence, vectors
 from ..mesh.threads import Launch
-
-wp.set_module_options(KERNELS)
 
 
 @runtime_checkable
@@ -130,54 +127,28 @@ class ForceModule:
         return sp.csr_matrix(total)
 
 
-@wp.kernel
-def _gather_corners(
-    first: wp.int32,
-    starts: wp.array(dtype=wp.int32),
-    slots: wp.array(dtype=wp.int32),
-    corner_force: wp.array(dtype=Any),
-    force: wp.array(dtype=Any),
-):
-    vertex = first + wp.tid()
-    total = force[vertex]
-    for k in range(starts[vertex], starts[vertex + 1]):
-        total += corner_force[slots[k]]
-    force[vertex] = total
+def _gather_kernel(dtype: torch.dtype) -> wp.Kernel:
+    """The kernel of (first, starts, slots, corner_force, force) adding the corners' forces at each vertex [N]."""
 
+    def of_vertex(vertex, starts, slots, corner_force, force): ...
 
-@wp.func_native(
-    on_cpu(
-        FOUR
-        + """
-    float* f = (float*)(force.data + vertex);
-    Four total = {f[0], f[1], f[2], 0.0f};
+    def gather(first, starts, slots, corner_force, force):
+        add(first + wp.tid(), starts, slots, corner_force, force)
+
+    source = """
+    Scalar* f = (Scalar*)(force.data + vertex);
+    Four total = three(f);
     for (int k = starts.data[vertex]; k < starts.data[vertex + 1]; ++k)
         total += *(const Four*)(corner_force.data + slots.data[k]);
     for (int i = 0; i < 3; ++i) f[i] = total[i];
     """
-    )
-)
-def _sum_corners(
-    vertex: wp.int32,
-    starts: wp.array(dtype=wp.int32),
-    slots: wp.array(dtype=wp.int32),
-    corner_force: wp.array(dtype=wp.vec3f),
-    force: wp.array(dtype=wp.vec3f),
-): ...
+    kinds = [wp.array(dtype=kind) for kind in (wp.int32, wp.int32, VECTOR[dtype], VECTOR[dtype])]
+    name = f"gather_corners_{SCALAR[dtype].__name__}"
+    add = native(of_vertex, name, one_by_one(source, dtype), *kinds)
+    return kernel(gather, name, *kinds)
 
 
-@wp.kernel(**ALONE)
-def _gather_corners_at_once(
-    first: wp.int32,
-    starts: wp.array(dtype=wp.int32),
-    slots: wp.array(dtype=wp.int32),
-    corner_force: wp.array(dtype=wp.vec3f),
-    force: wp.array(dtype=wp.vec3f),
-):
-    _sum_corners(first + wp.tid(), starts, slots, corner_force, force)
-
-
-_GATHER = overloads(_gather_corners, wp.int32, wp.int32, VECTOR, VECTOR)
+_GATHER = {dtype: _gather_kernel(dtype) for dtype in VECTOR}
 
 
 class Elements:
@@ -196,17 +167,15 @@ class Elements:
         self,
         kernels: Mapping[torch.dtype, wp.Kernel],
         corners: Int[Tensor, "elements corners"],
-        parameters: Sequence[Float[Tensor, " elements"] | Float[Tensor, "elements 3"] | Float[Tensor, "elements 4"]],
+        parameters: Sequence[Float[Tensor, " elements"] | Float[Tensor, "elements 4"]],
         *,
         level: Level,
-        eight: wp.Kernel | None = None,
     ) -> None:
         """Prepare the launches, gather tables and buffers on the level's device.
 
         Args:
-            kernels: For each scalar type, a kernel of (first, x, corners, *parameters, energy, corner_force).
-            parameters: The kernel's own arrays.
-            eight: A kernel of the same, of `eight_elements`, used on the CPU in single precision.
+            kernels: The kernels of `element_kernels`.
+            parameters: The kernel's two parameters.
         """
         self.count, width = corners.shape
         dtype, device, threads = level.dtype, level.device, level.threads
@@ -221,14 +190,11 @@ class Elements:
         arrays = [vectors(each) if each.ndim == 2 else wp.from_torch(each) for each in parameters]
         buffers = [wp.from_torch(self.energy), vectors(self.corner_force)]
         self._tensors = (corners, starts, slots, parameters)
-        single = device == "cpu" and dtype == torch.float32
-        kernel, at_once = (eight, EIGHT) if single and eight is not None else (kernels[dtype], 1)
-        self._elements = Launch(
-            kernel, self.count, [x, packed, *arrays, *buffers], device=device, threads=threads, at_once=at_once
-        )
+        place: dict[str, Any] = {"device": device, "threads": threads}
+        arrays = [x, packed, *arrays, *buffers]
+        self._elements = Launch(kernels[dtype], self.count, arrays, at_once=block_size(device), **place)
         inputs = [wp.from_torch(starts), wp.from_torch(slots), buffers[1], x]
-        gather = cast(wp.Kernel, _gather_corners_at_once) if single else _GATHER[dtype]
-        self._gather = Launch(gather, level.vertex_count, inputs, device=device, threads=threads)
+        self._gather = Launch(_GATHER[dtype], level.vertex_count, inputs, **place)
 
     def evaluate(self, x: Float[Tensor, "vertices 3"], force: Float[Tensor, "vertices 3"]) -> Float[Tensor, ""]:
         """Run the element kernel and gather: adds to ``force`` and returns the energy.
@@ -245,22 +211,3 @@ class Elements:
         self._elements({0: vectors(x)})
         self._gather({3: vectors(force)})
         return self.energy.sum(dtype=torch.float64)
-
-
-def element_overloads(
-    kernel: Any, *, width: int, parameters: int, vector_parameters: int = 0, quad_parameters: int = 0
-) -> dict[torch.dtype, wp.Kernel]:
-    """Instantiate a generic element kernel for float32 and float64.
-
-    Args:
-        kernel: Kernel of (first, x, corners, parameters..., energy, corner_force) with generic arrays.
-        parameters: Number of scalar arrays before energy.
-        vector_parameters: Number of arrays of vectors before the scalar arrays.
-        quad_parameters: Number of arrays of four values before the arrays of vectors.
-
-    Returns:
-        The concrete kernel for each torch scalar type.
-    """
-    corners = wp.types.vector(length=width, dtype=wp.int32)
-    arrays = [QUAD] * quad_parameters + [VECTOR] * vector_parameters + [SCALAR] * parameters
-    return overloads(kernel, VECTOR, corners, *arrays, SCALAR, VECTOR)

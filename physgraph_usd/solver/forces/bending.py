@@ -17,189 +17,81 @@ from theta0. Gradient after Bridson, Marino, Fedkiw, "Simulation of Clothing wit
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 import torch
-import warp as wp
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..grain import bending_factor
 from ..level import Level
-from ..mesh.kernels import KERNELS
-from ..mesh.simd import eight_elements
+from ..mesh.formula import SCALAR, element_kernels
 from ..mesh.stencil import add_at
-from .base import Elements, element_overloads
+from .base import Elements
 
-wp.set_module_options(KERNELS)
-
-TURN = 2.0 * math.pi
-"""A full turn [rad]."""
-PER_TURN = 1.0 / TURN
-_SIX = wp.types.vector(length=6, dtype=wp.int32)
-
-
-@wp.func
-def _angle(y: wp.float32, x: wp.float32) -> wp.float32:  # pyright: ignore[reportRedeclaration]
-    """The angle of (x, y) [rad], 0 for (0, 0), to 2e-7 rad; the same polynomial as for eight hinges."""
-    along = wp.abs(x)
-    across = wp.abs(y)
-    steep = across > along
-    a = wp.where(steep, along, across) / (wp.where(steep, across, along) + wp.float32(1.0e-37))
-    s = a * a
-    p = wp.float32(0.023040125) - wp.float32(0.0043554027) * s
-    p = wp.float32(-0.057773575) + p * s
-    p = wp.float32(0.09794234) + p * s
-    p = wp.float32(-0.13976581) + p * s
-    p = wp.float32(0.19962704) + p * s
-    p = wp.float32(-0.3333166) + p * s
-    angle = a + a * s * p
-    angle = wp.where(steep, wp.float32(math.pi / 2.0) - angle, angle)
-    angle = wp.where(x < wp.float32(0.0), wp.float32(math.pi) - angle, angle)
-    return wp.where(y < wp.float32(0.0), -angle, angle)
-
-
-@wp.func
-def _angle(y: wp.float64, x: wp.float64) -> wp.float64:
-    """The angle of (x, y) [rad], 0 for (0, 0): adding 0 removes the sign of a zero."""
-    zero = wp.float64(0.0)
-    return wp.float64(wp.atan2(y + zero, x + zero))
-
-
-@wp.func
-def _bent(axis: Any, ik: Any, il: Any, weight: Any, rest_angle: Any):
-    """Energy [J] of a hinge and the forces [N] on j, k and l, from the hinge's sides starting at i."""
-    one = type(weight)(1.0)
-    n1 = wp.cross(axis, ik)
-    n2 = wp.cross(il, axis)
-    square = wp.dot(axis, axis)
-    # The floors are relative to the hinge's own size: they act on collapsed triangles only.
-    tiny = type(weight)(1.0e-12) * (square + wp.dot(ik, ik) + wp.dot(il, il))
-    square = wp.max(square, tiny + type(weight)(1.0e-30))
-    length = wp.sqrt(square)  # pyright: ignore[reportArgumentType]
-    floor = tiny * square + type(weight)(1.0e-37)
-    s1 = wp.max(wp.dot(n1, n1), floor)
-    s2 = wp.max(wp.dot(n2, n2), floor)
-    # n1 x n2 . e / |e| is -|e| n1 . (x_l - x_i).
-    theta = _angle(-length * wp.dot(n1, il), wp.dot(n1, n2))
-    bent = theta - rest_angle
-    bent = bent - type(weight)(TURN) * wp.rint(bent * type(weight)(PER_TURN))
-    moment = weight * bent * length
-    at_k = n1 * (moment / s1)
-    at_l = n2 * (moment / s2)
-    per_square = one / square
-    at_j = at_k * (wp.dot(ik, axis) * per_square) + at_l * (wp.dot(il, axis) * per_square)
-    return type(weight)(0.5) * weight * bent * bent, -at_j, at_k, at_l
-
-
-@wp.kernel
-def _bending(
-    first: wp.int32,
-    x: wp.array(dtype=Any),
-    corners: wp.array(dtype=wp.vec4i),
-    weight: wp.array(dtype=Any),
-    rest_angle: wp.array(dtype=Any),
-    energy: wp.array(dtype=Any),
-    corner_force: wp.array(dtype=Any),
-):
-    h = first + wp.tid()
-    corner = corners[h]
-    xi = x[corner[0]]
-    axis, ik, il = x[corner[1]] - xi, x[corner[2]] - xi, x[corner[3]] - xi
-    stored, at_j, at_k, at_l = _bent(axis, ik, il, weight[h], rest_angle[h])
-    energy[h] = stored
-    corner_force[4 * h] = -at_j - at_k - at_l
-    corner_force[4 * h + 1] = at_j
-    corner_force[4 * h + 2] = at_k
-    corner_force[4 * h + 3] = at_l
-
-
-@wp.kernel
-def _bending_of_quads(
-    first: wp.int32,
-    x: wp.array(dtype=Any),
-    corners: wp.array(dtype=_SIX),
-    weight: wp.array(dtype=Any),
-    rest_angle: wp.array(dtype=Any),
-    energy: wp.array(dtype=Any),
-    corner_force: wp.array(dtype=Any),
-):
-    h = first + wp.tid()
-    half = weight.dtype(0.5)
-    corner = corners[h]
-    xi = x[corner[0]]
-    axis = x[corner[1]] - xi
-    # Differences first: in single precision differences are exact, sums of positions are not.
-    ik = ((x[corner[2]] - xi) + (x[corner[3]] - xi)) * half
-    il = ((x[corner[4]] - xi) + (x[corner[5]] - xi)) * half
-    stored, at_j, at_k, at_l = _bent(axis, ik, il, weight[h], rest_angle[h])
-    energy[h] = stored
-    corner_force[6 * h] = -at_j - at_k - at_l
-    corner_force[6 * h + 1] = at_j
-    corner_force[6 * h + 2] = at_k * half
-    corner_force[6 * h + 3] = at_k * half
-    corner_force[6 * h + 4] = at_l * half
-    corner_force[6 * h + 5] = at_l * half
-
-
-_EIGHT_BENT = r"""
+_BENT = r"""
 Vec n1 = cross(axis, ik), n2 = cross(il, axis);
-Eight square = dot(axis, axis);
-Eight tiny = 1.0e-12f * (square + dot(ik, ik) + dot(il, il));
+Number square = dot(axis, axis);
+// The floors are relative to the hinge's own size: they act on collapsed triangles only.
+Number tiny = 1.0e-12f * (square + dot(ik, ik) + dot(il, il));
 square = larger(square, tiny + 1.0e-30f);
-Eight length = root(square), floor = tiny * square + 1.0e-37f;
-Eight s1 = larger(dot(n1, n1), floor), s2 = larger(dot(n2, n2), floor);
+Number length = root(square), floor = tiny * square + 1.0e-37f;
+Number s1 = larger(dot(n1, n1), floor), s2 = larger(dot(n2, n2), floor);
 
-// The angle of (along, across) to 2e-7 rad, by a minimax polynomial of the arctangent on [0, 1].
-Eight across = -length * dot(n1, il), along = dot(n1, n2);
-auto steep = fabs(across) > fabs(along);
-Eight a = (steep ? fabs(along) : fabs(across)) / ((steep ? fabs(across) : fabs(along)) + 1.0e-37f), s = a * a;
-Eight p = 0.023040125f - 0.0043554027f * s;
-p = -0.057773575f + p * s;
-p = 0.09794234f + p * s;
-p = -0.13976581f + p * s;
-p = 0.19962704f + p * s;
-p = -0.3333166f + p * s;
-Eight theta = a + a * s * p;
-theta = steep ? 1.57079632679f - theta : theta;
-theta = along < 0.0f ? 3.14159265359f - theta : theta;
-theta = across < 0.0f ? -theta : theta;
+// n1 x n2 . e / |e| is -|e| n1 . (x_l - x_i).
+Number theta, across = -length * dot(n1, il), along = dot(n1, n2);
+if (sizeof(Scalar) == 8) {
+    theta = each([](Scalar y, Scalar x) { return wp::atan2(y + Scalar(0), x + Scalar(0)); }, across, along);
+} else {  // To 2e-7 rad, by a minimax polynomial of the arctangent on [0, 1].
+    auto steep = fabs(across) > fabs(along);
+    Number a = (steep ? fabs(along) : fabs(across)) / ((steep ? fabs(across) : fabs(along)) + 1.0e-37f), s = a * a;
+    Number p = 0.023040125f - 0.0043554027f * s;
+    p = -0.057773575f + p * s;
+    p = 0.09794234f + p * s;
+    p = -0.13976581f + p * s;
+    p = 0.19962704f + p * s;
+    p = -0.3333166f + p * s;
+    theta = a + a * s * p;
+    theta = steep ? 1.57079632679f - theta : theta;
+    theta = along < 0.0f ? 3.14159265359f - theta : theta;
+    theta = across < 0.0f ? -theta : theta;
+}
 
-Eight weight = load(parameter0), bent = theta - load(parameter1);
-bent = bent - 6.28318530718f * rint(bent * 0.159154943092f);
-Eight moment = weight * bent * length;
+const Scalar turn = 6.283185307179586, per_turn = 1.0 / 6.283185307179586;
+Number weight = load(parameter0), bent = theta - load(parameter1);
+bent = bent - turn * rint(bent * per_turn);
+Number moment = weight * bent * length;
 Vec at_k = n1 * (moment / s1), at_l = n2 * (moment / s2);
-Eight per_square = 1.0f / square;
+Number per_square = 1.0f / square;
 Vec at_j = -(at_k * (dot(ik, axis) * per_square) + at_l * (dot(il, axis) * per_square));
 Vec at_i = -at_j - at_k - at_l;
-Eight energy = 0.5f * weight * bent * bent;
+Number energy = 0.5f * weight * bent * bent;
 """
-"""`_bent` for eight hinges."""
-_EIGHT = eight_elements(
-    "eight_bending",
+"""Source of the energy [J] of a hinge and the forces [N] on its ends, from the hinge's sides starting at i."""
+_KERNELS = element_kernels(
+    "bending",
     """
     Vec xi = corner(0), axis = corner(1) - xi, ik = corner(2) - xi, il = corner(3) - xi;"""
-    + _EIGHT_BENT
+    + _BENT
     + "store(energy, {at_i, at_j, at_k, at_l});",
     corners=4,
+    parameter=SCALAR,
 )
-_EIGHT_OF_QUADS = eight_elements(
-    "eight_bending_of_quads",
+_KERNELS_OF_QUADS = element_kernels(
+    "bending_of_quads",
     """
-    Eight half = 0.5f + Eight{};
+    Number half = 0.5f + Number{};
     Vec xi = corner(0), axis = corner(1) - xi;
+    // Differences first: in single precision differences are exact, sums of positions are not.
     Vec ik = ((corner(2) - xi) + (corner(3) - xi)) * half, il = ((corner(4) - xi) + (corner(5) - xi)) * half;"""
-    + _EIGHT_BENT
+    + _BENT
     + "store(energy, {at_i, at_j, at_k * half, at_k * half, at_l * half, at_l * half});",
     corners=6,
+    parameter=SCALAR,
 )
-_KERNELS = element_overloads(_bending, width=4, parameters=2)
-_KERNELS_OF_QUADS = element_overloads(_bending_of_quads, width=6, parameters=2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,11 +146,11 @@ class Bending:
             _Kind(
                 which,
                 corners,
-                Elements(kernels, corners, [self.weight[which], level.rest_angle[which]], level=level, eight=eight),
+                Elements(kernels, corners, [self.weight[which], level.rest_angle[which]], level=level),
             )
-            for which, columns, kernels, eight in (
-                (torch.nonzero(narrow)[:, 0], [0, 1, 2, 4], _KERNELS, _EIGHT),
-                (torch.nonzero(~narrow)[:, 0], [0, 1, 2, 3, 4, 5], _KERNELS_OF_QUADS, _EIGHT_OF_QUADS),
+            for which, columns, kernels in (
+                (torch.nonzero(narrow)[:, 0], [0, 1, 2, 4], _KERNELS),
+                (torch.nonzero(~narrow)[:, 0], [0, 1, 2, 3, 4, 5], _KERNELS_OF_QUADS),
             )
             for corners in (level.hinges[which][:, columns],)
             if len(which)

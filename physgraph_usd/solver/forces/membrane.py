@@ -28,24 +28,19 @@ There is no barrier against inversion: cloth buckles long before inversion matte
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 import torch
-import warp as wp
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..fabric import Fabric
 from ..level import Level
-from ..mesh.kernels import KERNELS
-from ..mesh.simd import eight_elements
+from ..mesh.formula import QUAD, element_kernels
 from ..mesh.stencil import add_at
-from .base import Elements, Force, element_overloads
+from .base import Elements, Force
 from .stretch import Stretch
-
-wp.set_module_options(KERNELS)
 
 POISSON = 1.0 / 3.0
 """Poisson's ratio between warp and weft; edge springs have the same."""
@@ -61,91 +56,35 @@ NO_LIMIT = 1e9
 """A strain never reached."""
 
 
-@wp.func
-def _beyond(limit: Any, strain: Any, stiffness: Any):
-    """The additional stress beyond the limit, times the rest area [N m]."""
-    return wp.where(strain > limit, type(strain)(STIFFER) * stiffness * (strain - limit), type(strain)(0.0))
-
-
-@wp.kernel
-def _membrane(
-    first: wp.int32,
-    x: wp.array(dtype=Any),
-    corners: wp.array(dtype=wp.vec3i),
-    inverse: wp.array(dtype=Any),
-    stiffness: wp.array(dtype=Any),
-    energy: wp.array(dtype=Any),
-    corner_force: wp.array(dtype=Any),
-):
-    t = first + wp.tid()
-    one = energy.dtype(1.0)
-    tiny = energy.dtype(1.0e-6)
-    corner = corners[t]
-    x0 = x[corner[0]]
-    g = inverse[t]
-    c = stiffness[t]
-    side1 = x[corner[1]] - x0
-    side2 = x[corner[2]] - x0
-    f1 = side1 * g[0] + side2 * g[2]
-    f2 = side1 * g[1] + side2 * g[3]
-    q1 = wp.dot(f1, f1)
-    q2 = wp.dot(f2, f2)
-    l1, l2 = wp.sqrt(q1), wp.sqrt(q2)
-    e1, e2 = l1 - one, l2 - one
-    # The stiffnesses carry the rest area: s is stress times area.
-    limit = c[3]
-    coupling = energy.dtype(POISSON) * wp.sqrt(c[0] * c[1])
-    s1 = c[0] * e1 + coupling * e2
-    s2 = c[1] * e2 + coupling * e1
-    more1 = _beyond(limit, e1, c[0])
-    more2 = _beyond(limit, e2, c[1])
-    stored = s1 * e1 + s2 * e2 + more1 * (e1 - limit) + more2 * (e2 - limit)
-    # Shear by the angle between f1 and f2; directions fade for a vanishing vector.
-    rounding = energy.dtype(COLLAPSED_SIDE) * energy.dtype(COLLAPSED_SIDE)
-    n1 = q1 + rounding
-    n2 = q2 + rounding
-    r = one / wp.sqrt(n1 * n2)
-    sine = wp.dot(f1, f2) * r
-    turn = c[2] * (one + rounding) * (one + rounding) * sine * r
-    energy[t] = energy.dtype(0.5) * (stored + turn * wp.dot(f1, f2))
-    back = sine * turn * r
-    p1 = f1 * ((s1 + more1) / wp.where(l1 > tiny, l1, tiny) - back * n2) + f2 * turn
-    p2 = f2 * ((s2 + more2) / wp.where(l2 > tiny, l2, tiny) - back * n1) + f1 * turn
-    at1 = -(p1 * g[0] + p2 * g[1])
-    at2 = -(p1 * g[2] + p2 * g[3])
-    corner_force[3 * t] = -(at1 + at2)
-    corner_force[3 * t + 1] = at1
-    corner_force[3 * t + 2] = at2
-
-
-_KERNELS = element_overloads(_membrane, width=3, parameters=0, quad_parameters=2)
-_EIGHT = eight_elements(
-    "eight_membrane",
-    f"constexpr float POISSON = {POISSON}f, STIFFER = {STIFFER}f, COLLAPSED_SIDE = {COLLAPSED_SIDE}f;"
+_KERNELS = element_kernels(
+    "membrane",
+    f"constexpr Scalar POISSON = {POISSON}, STIFFER = {STIFFER}, COLLAPSED_SIDE = {COLLAPSED_SIDE};"
     """
     Vec x0 = corner(0), side1 = corner(1) - x0, side2 = corner(2) - x0;
     Quad g = load4(parameter0), c = load4(parameter1);
     Vec f1 = side1 * g[0] + side2 * g[2], f2 = side1 * g[1] + side2 * g[3];
-    Eight q1 = dot(f1, f1), q2 = dot(f2, f2), l1 = root(q1), l2 = root(q2);
-    Eight e1 = l1 - 1.0f, e2 = l2 - 1.0f, none = {};
+    Number q1 = dot(f1, f1), q2 = dot(f2, f2), l1 = root(q1), l2 = root(q2);
+    Number e1 = l1 - 1.0f, e2 = l2 - 1.0f, none = {};
 
-    Eight limit = c[3], coupling = POISSON * root(c[0] * c[1]);
-    Eight s1 = c[0] * e1 + coupling * e2, s2 = c[1] * e2 + coupling * e1;
-    Eight more1 = e1 > limit ? STIFFER * c[0] * (e1 - limit) : none;
-    Eight more2 = e2 > limit ? STIFFER * c[1] * (e2 - limit) : none;
-    Eight stored = s1 * e1 + s2 * e2 + more1 * (e1 - limit) + more2 * (e2 - limit);
+    // The stiffnesses carry the rest area: s is stress times area.
+    Number limit = c[3], coupling = POISSON * root(c[0] * c[1]);
+    Number s1 = c[0] * e1 + coupling * e2, s2 = c[1] * e2 + coupling * e1;
+    Number more1 = e1 > limit ? STIFFER * c[0] * (e1 - limit) : none;
+    Number more2 = e2 > limit ? STIFFER * c[1] * (e2 - limit) : none;
+    Number stored = s1 * e1 + s2 * e2 + more1 * (e1 - limit) + more2 * (e2 - limit);
 
-    constexpr float rounding = COLLAPSED_SIDE * COLLAPSED_SIDE;
-    Eight n1 = q1 + rounding, n2 = q2 + rounding, r = 1.0f / root(n1 * n2);
-    Eight sine = dot(f1, f2) * r, turn = c[2] * (1.0f + rounding) * (1.0f + rounding) * sine * r;
-    Eight back = sine * turn * r, tiny = 1.0e-6f + none;
+    // Shear by the angle between f1 and f2; directions fade for a vanishing vector.
+    constexpr Scalar rounding = COLLAPSED_SIDE * COLLAPSED_SIDE;
+    Number n1 = q1 + rounding, n2 = q2 + rounding, r = 1.0f / root(n1 * n2);
+    Number sine = dot(f1, f2) * r, turn = c[2] * (1.0f + rounding) * (1.0f + rounding) * sine * r;
+    Number back = sine * turn * r, tiny = 1.0e-6f + none;
     Vec p1 = f1 * ((s1 + more1) / larger(l1, tiny) - back * n2) + f2 * turn;
     Vec p2 = f2 * ((s2 + more2) / larger(l2, tiny) - back * n1) + f1 * turn;
     Vec at1 = -(p1 * g[0] + p2 * g[1]), at2 = -(p1 * g[2] + p2 * g[3]);
     store(0.5f * (stored + turn * dot(f1, f2)), {-(at1 + at2), at1, at2});
     """,
     corners=3,
-    parameter=wp.vec4f,
+    parameter=QUAD,
 )
 
 
@@ -189,7 +128,7 @@ class Membrane:
         self._level = level
         stiffness = [self.warp_stiffness, self.weft_stiffness, self.shear_stiffness, limits.to(level.rest)[owner]]
         parameters = [level.membrane_inverse.contiguous(), torch.stack(stiffness, dim=1)]
-        self._elements = Elements(_KERNELS, level.membrane, parameters, level=level, eight=_EIGHT)
+        self._elements = Elements(_KERNELS, level.membrane, parameters, level=level)
 
     def add_force(self, x: Float[Tensor, "vertices 3"], force: Float[Tensor, "vertices 3"]) -> Float[Tensor, ""]:
         """Add the force [N] in place and return the energy [J]."""

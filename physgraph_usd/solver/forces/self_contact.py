@@ -15,19 +15,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import Any
 
 import scipy.sparse as sp
 import torch
-import warp as wp
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..level import Level
-from ..mesh.kernels import KERNELS
-from .base import Elements, element_overloads
-
-wp.set_module_options(KERNELS)
+from ..mesh.formula import QUAD, element_kernels
+from .base import Elements
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,38 +81,19 @@ class PairConstraints:
         return (self.offset - (self.normal * self.vectors(x)).sum(dim=1)).clamp_min(0.0)
 
 
-@wp.kernel
-def _keep_apart(
-    first: wp.int32,
-    x: wp.array(dtype=Any),
-    corners: wp.array(dtype=wp.vec4i),
-    g0: wp.array(dtype=Any),
-    g1: wp.array(dtype=Any),
-    g2: wp.array(dtype=Any),
-    g3: wp.array(dtype=Any),
-    offset: wp.array(dtype=Any),
-    stiffness: wp.array(dtype=Any),
-    energy: wp.array(dtype=Any),
-    corner_force: wp.array(dtype=Any),
-):
-    i = first + wp.tid()
-    c = corners[i]
-    gap = wp.dot(g0[i], x[c[0]]) + wp.dot(g1[i], x[c[1]]) + wp.dot(g2[i], x[c[2]]) + wp.dot(g3[i], x[c[3]])
-    depth = wp.max(offset[i] - gap, offset.dtype(0.0))
-    push = stiffness[i] * depth
-    energy[i] = offset.dtype(0.5) * push * depth
-    corner_force[4 * i] = push * g0[i]
-    corner_force[4 * i + 1] = push * g1[i]
-    corner_force[4 * i + 2] = push * g2[i]
-    corner_force[4 * i + 3] = push * g3[i]
-
-
-_KEEP_APART = element_overloads(_keep_apart, width=4, parameters=2, vector_parameters=4)
-
-
-def _parameters(gaps: PairConstraints) -> list[Tensor]:
-    along = [(gaps.weight[:, i : i + 1] * gaps.normal).contiguous() for i in range(4)]
-    return [*along, gaps.offset, gaps.stiffness]
+_KERNELS = element_kernels(
+    "contact",
+    """
+    Quad w = load4(parameter0), plane = load4(parameter1);
+    Vec normal = {plane[0], plane[1], plane[2]}, at = {};
+    for (int k = 0; k < 4; ++k) at = at + corner(k) * w[k];
+    Number depth = larger(plane[3] - dot(normal, at), Number{});
+    Vec push = normal * depth;
+    store(0.5f * depth * depth, {push * w[0], push * w[1], push * w[2], push * w[3]});
+    """,
+    corners=4,
+    parameter=QUAD,
+)
 
 
 class SelfContact:
@@ -132,8 +109,10 @@ class SelfContact:
 
     @cached_property
     def _elements(self) -> Elements:
-        """The pairs as elements, built on first use."""
-        return Elements(_KEEP_APART, self.gaps.corners, _parameters(self.gaps), level=self._level)
+        """The pairs as elements of unit stiffness, built on first use."""
+        gaps = self.gaps
+        plane = torch.cat([gaps.normal, gaps.offset.unsqueeze(1)], dim=1) * gaps.stiffness.sqrt().unsqueeze(1)
+        return Elements(_KERNELS, gaps.corners, [gaps.weight.contiguous(), plane], level=self._level)
 
     def add_force(self, x: Float[Tensor, "vertices 3"], force: Float[Tensor, "vertices 3"]) -> Float[Tensor, ""]:
         """Add the force [N] in place and return the energy [J]."""

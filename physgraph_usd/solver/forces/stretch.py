@@ -13,57 +13,29 @@ Springs cannot express an independent shear stiffness: an isotropic sheet of spr
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import scipy.sparse as sp
 import torch
-import warp as wp
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..level import Level
-from ..mesh.kernels import KERNELS
-from ..mesh.simd import eight_elements
+from ..mesh.formula import SCALAR, element_kernels
 from ..mesh.stencil import add_at
-from .base import Elements, element_overloads
+from .base import Elements
 
-wp.set_module_options(KERNELS)
-
-
-@wp.kernel
-def _stretch(
-    first: wp.int32,
-    x: wp.array(dtype=Any),
-    corners: wp.array(dtype=wp.vec2i),
-    stiffness: wp.array(dtype=Any),
-    rest_length: wp.array(dtype=Any),
-    energy: wp.array(dtype=Any),
-    corner_force: wp.array(dtype=Any),
-):
-    e = first + wp.tid()
-    span = x[corners[e][1]] - x[corners[e][0]]
-    l0 = rest_length[e]
-    length = wp.length(span)
-    extension = length - l0
-    # A collapsed spring has no direction: below a millionth of its rest length its pull fades to zero.
-    pull = span * (stiffness[e] * extension / wp.max(length, l0 * stiffness.dtype(1.0e-6)))
-    energy[e] = stiffness.dtype(0.5) * stiffness[e] * extension * extension
-    corner_force[2 * e] = pull
-    corner_force[2 * e + 1] = -pull
-
-
-_KERNELS = element_overloads(_stretch, width=2, parameters=2)
-_EIGHT = eight_elements(
-    "eight_stretch",
+_KERNELS = element_kernels(
+    "stretch",
     """
     Vec span = corner(1) - corner(0);
-    Eight stiffness = load(parameter0), l0 = load(parameter1);
-    Eight length = root(dot(span, span)), extension = length - l0;
+    Number stiffness = load(parameter0), l0 = load(parameter1);
+    Number length = root(dot(span, span)), extension = length - l0;
+    // A collapsed spring has no direction: below a millionth of its rest length its pull fades to zero.
     Vec pull = span * (stiffness * extension / larger(length, l0 * 1.0e-6f));
     store(0.5f * stiffness * extension * extension, {pull, -pull});
     """,
     corners=2,
+    parameter=SCALAR,
 )
 
 
@@ -85,9 +57,7 @@ class Stretch:
         modulus = youngs.to(level.rest)[level.spring_garment.long()] * level.spring_scale
         self.stiffness = 3.0 * modulus * level.spring_area / level.spring_length**2
         self._level = level
-        self._elements = Elements(
-            _KERNELS, level.springs, [self.stiffness, level.spring_length], level=level, eight=_EIGHT
-        )
+        self._elements = Elements(_KERNELS, level.springs, [self.stiffness, level.spring_length], level=level)
 
     def add_force(self, x: Float[Tensor, "vertices 3"], force: Float[Tensor, "vertices 3"]) -> Float[Tensor, ""]:
         """Add the force [N] in place and return the energy [J]."""

@@ -1,13 +1,10 @@
-"""`Physgraph` as two kernels around a few matrix products, for CUDA.
+"""`Physgraph` as a single kernel: features and layers of a vertex stay in the cache or in registers.
 
-In torch a step at 26,000 vertices writes some forty arrays. Here one kernel computes normals, neighbour means and
-scalar products in a single pass, so values gathered from the neighbours are used while still cached. The layers are
-matrix products, and a second kernel combines. A normal part is a number times the normal; its products are computed
-from the number. On the CPU `eight_vertices` takes a single kernel.
+In torch a step at 26,000 vertices writes some forty arrays.
 """
 
 # Warp's kernels are typed by values that only Warp reads.
-# pyright: reportArgumentType=false, reportCallIssue=false, reportReturnType=false
+# pyright: reportArgumentType=false
 from __future__ import annotations
 
 import functools
@@ -20,10 +17,9 @@ import warp as wp
 from jaxtyping import Float
 from torch import Tensor
 
-from ..mesh.kernels import ALONE, KERNELS
+from ..mesh.formula import at_once, block_size, kernel, native
 from ..mesh.stencil import vectors
-from ..mesh.threads import Launch
-from .eight_vertices import EightPhysgraph
+from ..mesh.threads import Launch, argument
 from .network import (
     LOG_OFFSET,
     LOG_SCALE,
@@ -32,21 +28,71 @@ from .network import (
     Pairs,
     Parts,
     Physgraph,
+    PhysgraphConfig,
     clock_of,
     counted_families,
     in_rows,
     pairs_in,
 )
-from .vertex_frame import VertexFrame, normal_of
+from .vertex_frame import VertexFrame
 
-wp.set_module_options(KERNELS)
+_NORMAL = """
+Four area[BLOCK] = {};
+for (int i = 0; i < BLOCK; ++i) {
+    const int at = element[i];
+    const Four here = three(x.data[at]);
+    for (int k = corners.data[at]; k < corners.data[at + 1]; ++k) {
+        const Four a = three(x.data[others.data[k][0]]) - here, b = three(x.data[others.data[k][1]]) - here;
+        area[i] += turned(a * turned(b) - turned(a) * b);
+    }
+}
+across = vec([&](int i) { return &area[i]; });
+const Number length = root(dot(across, across));
+across = across * (length > 0.0f ? 1.0f / length : Number{});
+"""
+_MEANS = """
+Four mean[MEANS][BLOCK] = {};
+for (int i = 0; i < BLOCK; ++i) {
+    const int at = element[i], degree = ends.data[at + 1] - ends.data[at];
+    for (int k = ends.data[at]; k < ends.data[at + 1]; ++k)
+        for (int s = 0; s < MEANS; ++s) mean[s][i] += three(v.data[SMOOTHED[s] * vertices + far.data[k]]);
+    for (int s = 0; s < MEANS; ++s) mean[s][i] *= 1.0f / (degree > 1 ? degree : 1);
+}
+for (int s = 0; s < MEANS; ++s) row[WHOLES + s] = vec([&](int i) { return &mean[s][i]; });
+"""
+ROW = 8
+"""Numbers of a layer computed at once."""
+_LAYERS = (
+    f"constexpr int ROW = {ROW};"
+    """
+Number other[WIDEST];
+const float *weight = weights.data, *bias = biases.data;
+auto layer = [&](const Number* in, int inputs, Number* out, int outputs, bool last) {
+    for (int o = 0; o < outputs; o += ROW) {
+        Number sum[ROW];
+        for (int j = 0; j < ROW; ++j) sum[j] = bias[o + j] + Number{};
+        for (int i = 0; i < inputs; ++i)
+            for (int j = 0; j < ROW; ++j) sum[j] += in[i] * weight[i * outputs + o + j];
+        for (int j = 0; j < ROW; ++j) out[o + j] = last ? sum[j] : (sum[j] < 0.0f ? Number{} : sum[j]);
+    }
+    weight += inputs * outputs;
+    bias += outputs;
+};
+"""
+)
+_LIMITED = """
+move = move + across * lift;
+const Number length_of_move = root(dot(move, move)), most = longest * load(reach);
+move = move * (length_of_move > most ? most / length_of_move : 1.0f + Number{});
+put(out, move);
+"""
 
 
 class FusedPhysgraph:
-    """A network's weights and buffers for a given number of vertices, in float32.
+    """A network's weights for a given number of vertices.
 
     Attributes:
-        bases: Names of the input vectors; the kernels derive the other vectors as parts.
+        bases: Names of the input vectors; the kernel derives the other vectors as parts.
     """
 
     def __init__(self, network: Physgraph, vertices: int, longest: float, *, device: str, threads: int) -> None:
@@ -55,35 +101,27 @@ class FusedPhysgraph:
         Args:
             vertices: Number of vertices.
             longest: Longest displacement in local edge lengths.
-            device: "cpu" or a CUDA device.
-            threads: Most threads that a kernel uses on the CPU.
+            device: "cpu" or a CUDA device; the network is there.
+            threads: Most threads that the kernel uses on the CPU.
         """
-        names = network.config.vectors
-        self.bases, smoothed, parts = in_rows(names)
+        self.bases, smoothed, parts = in_rows(network.config.vectors)
         self._frames = bool(smoothed) or any(normal for _, normal in parts)
-        self._rows = torch.zeros((len(self.bases) + len(smoothed), vertices, 3), device=device)
+        self._rows = torch.zeros((len(self.bases), vertices, 3), device=device)
         self._out = torch.zeros((vertices, 3), device=device)
         layers: list[Any] = [network.encode, *network.hidden, network.decode]
-        # Transposed, so that each layer is one product whose rows are vertices.
-        self._weights = [layer.weight.detach().T.contiguous() for layer in layers]
-        self._biases = [layer.bias.detach().clone() for layer in layers]
-        self._biases[-1][0] += 1.0
-        self._clock = network.encode_means.weight.detach()[:, 0]
-        self._features = torch.zeros((vertices, len(self._weights[0])), device=device)
-        self._layers = [torch.zeros((vertices, len(bias)), device=device) for bias in self._biases]
-        flat, spacing = vectors(self._rows.reshape(-1, 3)), wp.zeros(vertices, dtype=wp.float32, device=device)
-        normal = wp.zeros(vertices if self._frames else 1, dtype=wp.vec3f, device=device)
+        widths = _widths(network.config)
+        bias = torch.cat([_padded(layer.bias, to) for layer, to in zip(layers, widths, strict=True)])
+        bias[-widths[-1]] += 1.0
+        self._bias, self._clock = bias, _padded(network.encode_means.weight[:, 0], len(bias))
+        inputs = (layers[0].in_features, *widths[:-1])
+        sizes = zip(layers, inputs, widths, strict=True)
+        self._weights = torch.cat([_padded(layer.weight.T, from_, to).reshape(-1) for layer, from_, to in sizes])
         x, others, number = (wp.zeros(1, dtype=kind, device=device) for kind in (wp.vec3f, wp.vec2i, wp.int32))
-        shared, place = [vertices, flat, spacing, normal], {"device": device, "threads": threads}
-        pairs, families = pairs_in(names), counted_families(names)
-        mesh = [x, number, others, number, number]
-        see = seeing(parts, pairs, smoothed, families)
-        self._see = Launch(see, vertices, [*shared, *mesh, wp.from_torch(self._features)], **place)
-        ends = [wp.from_torch(self._layers[-1]), longest, vectors(self._out)]
-        self._combine = Launch(combining(parts), vertices, [*shared, *ends], **place)
-        self._mesh: object = None
-        self._spacing: Tensor | None = None
-        self._reach: Tensor | None = None
+        length = wp.zeros(vertices, dtype=wp.float32, device=device)
+        places = [vectors(self._rows.reshape(-1, 3)), length, length, x, number, others, number, number]
+        learned = [argument(self._weights), argument(self._bias), longest, vectors(self._out)]
+        given: dict[str, Any] = {"device": device, "threads": threads, "at_once": block_size(device)}
+        self._launch = Launch(fused_kernel(network.config), vertices, [vertices, *places, *learned], **given)
 
     def __call__(
         self,
@@ -103,200 +141,132 @@ class FusedPhysgraph:
             step: Number of previous steps.
             frame: Gives the surroundings of the vertices; called only if parts need them.
         """
-        torch.stack(list(bases), out=self._rows[: len(self.bases)])
-        changed = {}
-        if self._spacing is not spacing:
-            self._spacing, changed[2] = spacing, wp.from_torch(spacing, requires_grad=False)
-        if self._reach is not reach:
-            self._reach = reach
-            self._combine.change({2: wp.from_torch(reach, requires_grad=False)})
+        torch.stack(list(bases), out=self._rows)
+        bias = self._bias + self._clock * clock_of(step)
+        changed = {2: argument(spacing), 3: argument(reach), 10: argument(bias)}
         if self._frames:
             surface = frame()
-            changed[4] = surface.positions
-            if self._mesh is not surface.mesh:
-                self._mesh = surface.mesh
-                changed |= dict(enumerate(surface.mesh, start=5))
-        self._see(changed)
-        h = self._features
-        biases = [self._biases[0] + self._clock * clock_of(step), *self._biases[1:]]
-        for place, (bias, weight, out) in enumerate(zip(biases, self._weights, self._layers, strict=True)):
-            h = torch.addmm(bias, h.relu_() if place else h, weight, out=out)
-        self._combine({})
+            changed |= {4: surface.positions} | dict(enumerate(surface.mesh, start=5))
+        self._launch(changed)
         return self._out.clone()
 
 
+def _padded(values: Tensor, *shape: int) -> Tensor:
+    """A tensor of given shape beginning with the values, 0 after them."""
+    out = values.new_zeros(shape)
+    out[tuple(map(slice, values.shape))] = values.detach()
+    return out
+
+
 @functools.lru_cache(maxsize=8)
-def fused_physgraph(
-    network: Physgraph, vertices: int, longest: float, *, device: str, threads: int
-) -> FusedPhysgraph | EightPhysgraph:
-    """The kernels for a device, reused in the next frame; the network's weights must stay constant."""
-    if device == "cpu":
-        return EightPhysgraph(network, vertices, longest, threads=threads)
+def fused_physgraph(network: Physgraph, vertices: int, longest: float, *, device: str, threads: int) -> FusedPhysgraph:
+    """The kernel for a device, reused in the next frame; the network's weights must stay constant."""
     return FusedPhysgraph(network, vertices, longest, device=device, threads=threads)
 
 
 @functools.cache
-def seeing(parts: Parts, pairs: Pairs, smoothed: tuple[int, ...], families: Families) -> wp.Kernel:
-    """The kernel computing the normal, the neighbours' means and the features of each vertex.
+def fused_kernel(config: PhysgraphConfig) -> wp.Kernel:
+    """The kernel of a network of a given size; an item is a block of vertices."""
+    names, name = config.vectors, f"physgraph_{hashlib.sha256(repr(config).encode()).hexdigest()[:16]}"
+    (_, smoothed, parts), families = in_rows(names), counted_families(names)
+    features = _features(parts, pairs_in(names), families)
+    sources = (_rows(parts, smoothed), _units(parts, families), features, _layers(_widths(config)), _combined(parts))
+    formula = "".join(line for lines in sources for line in lines)
 
-    Args:
-        parts: Row of each vector, and whether the vector is the normal part of the row.
-        pairs: Pairs of vectors with products as features.
-        smoothed: Rows with neighbour means in the last rows.
-        families: Family of each vector, whose mean square normalises the products, and whether the vector counts in the
-            mean.
-    """
-    # Warp's kernel hash misses some values captured by generic functions; the kernel's name includes them.
-    made = hashlib.sha256(repr((parts, pairs, smoothed, families)).encode()).hexdigest()[:16]
-    measure, compare = _measuring(1 + max(row for row, _ in parts), smoothed), _comparing(parts, families)
-    show = _showing(parts, pairs, 1 + max(families)[0])
+    def of_block(block, vertices, v, spacing, reach, x, corners, others, ends, far, weights, biases, longest, out): ...
 
-    @wp.kernel(name=f"see_{made}", **ALONE)
-    def see(
-        first: wp.int32,
-        vertices: wp.int32,
-        v: wp.array(dtype=wp.vec3f),
-        spacing: wp.array(dtype=wp.float32),
-        normal: wp.array(dtype=wp.vec3f),
-        x: wp.array(dtype=wp.vec3f),
-        corners: wp.array(dtype=wp.int32),
-        others: wp.array(dtype=wp.vec2i),
-        ends: wp.array(dtype=wp.int32),
-        far: wp.array(dtype=wp.int32),
-        features: wp.array(dtype=wp.float32, ndim=2),
-    ):
-        i = first + wp.tid()
-        across = wp.vec3f()
-        if wp.static(any(is_normal for _, is_normal in parts)):
-            across = normal_of(i, x, corners, others)
-            normal[i] = across
-        near = measure(i, vertices, ends, far, v, spacing)
-        unit, size = compare(near, across)
-        show(i, unit, size, across, features)
+    def physgraph(first, vertices, v, spacing, reach, x, corners, others, ends, far, weights, biases, longest, out):
+        block = first + wp.tid()
+        compute(block, vertices, v, spacing, reach, x, corners, others, ends, far, weights, biases, longest, out)
 
-    return see
+    number, index, vector, pair = (wp.array(dtype=kind) for kind in (wp.float32, wp.int32, wp.vec3f, wp.vec2i))
+    kinds = (wp.int32, vector, number, number, vector, index, pair, index, index, number, number, wp.float32, vector)
+    compute = native(of_block, name, at_once(formula, "vertices", torch.float32), *kinds)
+    return kernel(physgraph, name, *kinds)
 
 
-def _measuring(rows: int, smoothed: tuple[int, ...]) -> Any:
-    """The function computing a vertex's rows in local edges and writing its neighbour means."""
-    table = wp.types.matrix(shape=(rows, 3), dtype=wp.float32)
-    means = wp.types.matrix(shape=(max(len(smoothed), 1), 3), dtype=wp.float32)
+def _widths(config: PhysgraphConfig) -> tuple[int, ...]:
+    """Numbers after each layer, as multiples of `ROW`."""
+    return tuple(-(-each // ROW) * ROW for each in (*[config.width] * config.depth, len(config.vectors)))
+
+
+def _rows(parts: Parts, smoothed: tuple[int, ...]) -> list[str]:
+    """Source of the normal ``across``, 0 if no part needs it, and of the vectors ``row`` [m]."""
+    rows = 1 + max(row for row, _ in parts)
     wholes = rows - len(smoothed)
-
-    @wp.func
-    def measure(
-        i: wp.int32,
-        vertices: wp.int32,
-        ends: wp.array(dtype=wp.int32),
-        far: wp.array(dtype=wp.int32),
-        v: wp.array(dtype=wp.vec3f),
-        spacing: wp.array(dtype=wp.float32),
-    ):
-        near, total = table(), means()
-        scale = wp.float32(1.0) / spacing[i]
-        if wp.static(len(smoothed) > 0):
-            for k in range(ends[i], ends[i + 1]):
-                j = far[k]
-                for s in range(wp.static(len(smoothed))):
-                    total[s] += v[wp.static(smoothed[s]) * vertices + j]
-            part = wp.float32(1.0) / wp.float32(wp.max(ends[i + 1] - ends[i], 1))
-            for s in range(wp.static(len(smoothed))):
-                v[wp.static(wholes + s) * vertices + i] = part * total[s]
-        for u in range(wp.static(rows)):
-            near[u] = scale * v[u * vertices + i]
-        return near
-
-    return measure
+    lines = [
+        f"Vec across = {{}}, row[{rows}];\n",
+        f"for (int u = 0; u < {wholes}; ++u)\n",
+        "    row[u] = vec([&](int i) { return v.data + u * vertices + element[i]; });\n",
+    ]
+    if smoothed:
+        sizes = f"constexpr int MEANS = {len(smoothed)}, WHOLES = {wholes};\n"
+        lines += [sizes, f"constexpr int SMOOTHED[] = {{{', '.join(map(str, smoothed))}}};\n", _MEANS]
+    return [*lines, _NORMAL] if any(is_normal for _, is_normal in parts) else lines
 
 
-def _comparing(parts: Parts, families: Families) -> Any:
-    """The function dividing rows by the root mean square of their family's vectors, and returning the mean squares."""
-    kinds, rows = 1 + max(family for family, _ in families), 1 + max(row for row, _ in parts)
-    table = wp.types.matrix(shape=(rows, 3), dtype=wp.float32)
-    column = wp.types.vector(length=kinds, dtype=wp.float32)
+def _layers(widths: tuple[int, ...]) -> list[str]:
+    """Source of the layers: from the features ``seen`` to the coefficients ``last``."""
+    lines, now, after, inputs = [f"constexpr int WIDEST = {max(widths)};\n", _LAYERS], "seen", "other", "SEEN"
+    for place, width in enumerate(widths):
+        lines.append(f"layer({now}, {inputs}, {after}, {width}, {str(place + 1 == len(widths)).lower()});\n")
+        now, after, inputs = after, ("hidden" if after == "other" else "other"), str(width)
+    return [*lines[:1], "Number hidden[WIDEST];\n", *lines[1:], f"const Number* last = {now};\n"]
+
+
+def _combined(parts: Parts) -> list[str]:
+    """Source of the combination of the vectors, limited in length."""
+    lines = ["Vec move = {};\nNumber lift = {};\n"]
+    for a, (row, normal) in enumerate(parts):
+        term = (
+            f"lift += last[{a}] * dot(row[{row}], across);\n" if normal else f"move = move + row[{row}] * last[{a}];\n"
+        )
+        lines.append(term)
+    return [*lines, _LIMITED]
+
+
+def _units(parts: Parts, families: Families) -> list[str]:
+    """Source of the mean squares ``size`` and of the rows over the root mean square of their family, ``unit``.
+
+    A row is of the family of its first part, in local edges ``near``.
+    """
+    rows, kinds = 1 + max(row for row, _ in parts), 1 + max(family for family, _ in families)
+    lines = [
+        f"Number size[{kinds}], inverse[{kinds}], height[{len(parts)}];\nVec near[{rows}], unit[{rows}];\n",
+        f"const Number scale = 1.0f / load(spacing);\nfor (int u = 0; u < {rows}; ++u) near[u] = row[u] * scale;\n",
+    ]
+    for kind in range(kinds):
+        terms = [_square(*part) for part, each in zip(parts, families, strict=True) if each == (kind, True)]
+        lines.append(f"size[{kind}] = {1.0 / len(terms)!r}f * ({' + '.join(terms)}) + {ZERO_LENGTH**2!r}f;\n")
+        lines.append(f"inverse[{kind}] = 1.0f / root(size[{kind}]);\n")
     family_of = {row: family for (row, _), (family, _) in reversed(tuple(zip(parts, families, strict=True)))}
-    of = tuple(family_of.get(row, 0) for row in range(rows))
-    counts = tuple(a for a, (_, counts) in enumerate(families) if counts)
-    inverse_count = tuple(1.0 / sum(families[a][0] == kind for a in counts) for kind in range(kinds))
-
-    @wp.func
-    def compare(near: Any, across: wp.vec3f):
-        unit, size, inverse = table(), column(), column()
-        for k in range(wp.static(len(counts))):
-            w = near[wp.static(parts[counts[k]][0])]
-            if wp.static(parts[counts[k]][1]):
-                w = wp.dot(w, across) * across
-            size[wp.static(families[counts[k]][0])] += wp.dot(w, w)
-        for k in range(wp.static(kinds)):
-            size[k] = wp.float32(wp.static(inverse_count[k])) * size[k] + wp.float32(wp.static(ZERO_LENGTH**2))
-            inverse[k] = wp.float32(1.0) / wp.sqrt(size[k])
-        for u in range(wp.static(rows)):
-            unit[u] = inverse[wp.static(of[u])] * near[u]
-        return unit, size
-
-    return compare
+    lines += [f"unit[{row}] = near[{row}] * inverse[{family_of.get(row, 0)}];\n" for row in range(rows)]
+    return lines + [f"height[{a}] = dot(unit[{row}], across);\n" for a, (row, normal) in enumerate(parts) if normal]
 
 
-def _showing(parts: Parts, pairs: Pairs, kinds: int) -> Any:
-    """The function writing the network's features of a vertex: squares, products, logarithms of the mean squares."""
-    every = wp.types.vector(length=len(parts), dtype=wp.float32)
-    terms = (*((a, a) for a in range(len(parts))), *pairs)
-
-    @wp.func
-    def show(i: wp.int32, unit: Any, size: Any, across: wp.vec3f, features: wp.array(dtype=wp.float32, ndim=2)):
-        height = every()
-        for a in range(wp.static(len(parts))):
-            if wp.static(parts[a][1]):
-                height[a] = wp.dot(unit[wp.static(parts[a][0])], across)
-        for p in range(wp.static(len(terms))):
-            a, b = wp.static(terms[p][0]), wp.static(terms[p][1])
-            if wp.static(parts[terms[p][0]][1] and parts[terms[p][1]][1]):
-                product = height[a] * height[b]
-            elif wp.static(parts[terms[p][0]][1]):
-                product = height[a] * wp.dot(unit[wp.static(parts[terms[p][1]][0])], across)
-            elif wp.static(parts[terms[p][1]][1]):
-                product = height[b] * wp.dot(unit[wp.static(parts[terms[p][0]][0])], across)
-            else:
-                product = wp.dot(unit[wp.static(parts[terms[p][0]][0])], unit[wp.static(parts[terms[p][1]][0])])
-            features[i, p] = product
-        for k in range(wp.static(kinds)):
-            features[i, wp.static(len(terms)) + k] = wp.float32(wp.static(LOG_SCALE)) * wp.log(size[k]) + wp.float32(
-                wp.static(LOG_OFFSET)
-            )
-
-    return show
+def _square(row: int, normal: bool) -> str:
+    """Source of the square of a part of a row in local edges."""
+    along = f"dot(near[{row}], across)"
+    return f"{along} * {along}" if normal else f"dot(near[{row}], near[{row}])"
 
 
-@functools.cache
-def combining(parts: Parts) -> wp.Kernel:
-    """The kernel combining the vectors, given as rows and normal parts."""
+def _features(parts: Parts, pairs: Pairs, families: Families) -> list[str]:
+    """Source of the network's features ``seen``: squares, products, logarithms of the mean squares."""
 
-    @wp.kernel(**ALONE)
-    def combine(
-        first: wp.int32,
-        vertices: wp.int32,
-        v: wp.array(dtype=wp.vec3f),
-        reach: wp.array(dtype=wp.float32),
-        normal: wp.array(dtype=wp.vec3f),
-        coefficients: wp.array(dtype=wp.float32, ndim=2),
-        longest: wp.float32,
-        out: wp.array(dtype=wp.vec3f),
-    ):
-        i = first + wp.tid()
-        move, across = wp.vec3f(), wp.vec3f()
-        lift = wp.float32(0.0)
-        if wp.static(any(is_normal for _, is_normal in parts)):
-            across = normal[i]
-        for a in range(wp.static(len(parts))):
-            s = v[wp.static(parts[a][0]) * vertices + i]
-            if wp.static(parts[a][1]):
-                lift += coefficients[i, a] * wp.dot(s, across)
-            else:
-                move += coefficients[i, a] * s
-        move += lift * across
-        far, most = wp.length(move), longest * reach[i]
-        if far > most:
-            move = move * (most / far)
-        out[i] = move
+    def product(a: int, b: int) -> str:
+        (p, p_normal), (q, q_normal) = parts[a], parts[b]
+        if p_normal and q_normal:
+            return f"height[{a}] * height[{b}]"
+        if p_normal or q_normal:
+            return f"height[{a if p_normal else b}] * dot(unit[{q if p_normal else p}], across)"
+        return f"dot(unit[{p}], unit[{q}])"
 
-    return combine
+    terms = [product(a, b) for a, b in (*((a, a) for a in range(len(parts))), *pairs)]
+    kinds = 1 + max(family for family, _ in families)
+    logarithm = f"{LOG_SCALE!r}f * logarithm(size[%d]) + {LOG_OFFSET!r}f"
+    values = ", ".join([*terms, *(logarithm % kind for kind in range(kinds))])
+    return [
+        "auto logarithm = [&](Number a) { return each([](Scalar b) { return wp::log(b); }, a); };\n",
+        f"const Number seen[] = {{{values}}};\n",
+        f"constexpr int SEEN = {len(terms) + kinds};\n",
+    ]

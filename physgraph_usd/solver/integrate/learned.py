@@ -24,7 +24,6 @@ from torch import Tensor, nn
 from ...errors import SolveError
 from ..level import Level
 from .base import Carry, System
-from .eight_vertices import EightPhysgraph
 from .fused import FusedPhysgraph, fused_physgraph
 from .network import Physgraph
 from .quasi_newton import Dot, StepHistory, dot, secant_direction
@@ -85,7 +84,7 @@ class LearnedMetric:
         """The displacement of the next step [m]."""
         return self._combined(carry, system=system, fused=self._fused(system))
 
-    def _fused(self, system: System) -> FusedPhysgraph | EightPhysgraph | None:
+    def _fused(self, system: System) -> FusedPhysgraph | None:
         """The network as kernels, or None if not fused."""
         if not self._fuse or system.spacing.dtype != torch.float32:
             return None
@@ -93,7 +92,7 @@ class LearnedMetric:
         spacing = system.spacing
         return fused_physgraph(self._network, len(spacing), LONGEST_STEP, device=str(spacing.device), threads=threads)
 
-    def _combined(self, carry: Carry, *, system: System, fused: FusedPhysgraph | EightPhysgraph | None) -> Tensor:
+    def _combined(self, carry: Carry, *, system: System, fused: FusedPhysgraph | None) -> Tensor:
         """The network's combination of vectors [m]."""
         names, step = self._network.config.vectors, carry.memory.step
         frame = cache(lambda: VertexFrame(level_of(system), carry.x))

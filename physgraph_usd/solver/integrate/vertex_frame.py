@@ -23,11 +23,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..level import Level
-from ..mesh.kernels import KERNELS
-from ..mesh.stencil import VECTOR, Stencil, incidence, overloads, vectors
-from ..mesh.threads import Launch
-
-wp.set_module_options(KERNELS)
+from ..mesh.stencil import Stencil, add_at, incidence, vectors
 
 PARTS = ("normal", "smooth")
 
@@ -37,7 +33,7 @@ class VertexFrame:
 
     def __init__(self, level: Level, x: Float[Tensor, "vertices 3"]) -> None:
         """Take positions x [m]; no gradients flow through the normals."""
-        self._x = x.detach()
+        self._x, self._level = x.detach(), level
         if level not in _TABLES:
             _TABLES[level] = _Tables(level)
         self._tables = _TABLES[level]
@@ -51,9 +47,9 @@ class VertexFrame:
     @cached_property
     def normal(self) -> Float[Tensor, "vertices 3"]:
         """Area-weighted unit normals; zero at triangles without area."""
-        out = torch.empty_like(self._x)
-        self._tables.normals({2: vectors(self._x), 3: vectors(out)})
-        return out
+        area = self._level.normals(self._x).repeat_interleave(3, dim=0)
+        total = add_at(torch.zeros_like(self._x), self._level.triangles.long().reshape(-1), area)
+        return torch.nn.functional.normalize(total, dim=1, eps=torch.finfo(total.dtype).tiny)
 
     @property
     def positions(self) -> Any:
@@ -79,14 +75,12 @@ class _Tables:
             triangles[corner // 3], (corner[:, None] % 3 + np.array([1, 2], np.int32)) % 3, axis=1
         )
         far = edges[end // 2, 1 - end % 2].astype(np.int32)
-        x = vectors(torch.zeros_like(level.rest))
 
         def ints(values: np.ndarray, kind: Any = wp.int32) -> wp.array:
             return wp.array(np.ascontiguousarray(values, np.int32), dtype=kind, device=device)
 
         place = {"device": device, "threads": level.threads}
         self.mesh = (ints(corner_starts), ints(turned, wp.vec2i), ints(end_starts), ints(far))
-        self.normals = Launch(_NORMALS[dtype], count, [*self.mesh[:2], x, x], **place)
         degree = np.diff(end_starts)
         weights = 1.0 / np.repeat(np.maximum(degree, 1), degree)
         mean = sp.csr_matrix((weights, far, end_starts), shape=(count, count))
@@ -112,32 +106,3 @@ class _Smooth(torch.autograd.Function):
 
 
 _TABLES: WeakKeyDictionary[Level, _Tables] = WeakKeyDictionary()
-
-
-@wp.func
-def normal_of(
-    i: wp.int32,
-    x: wp.array(dtype=Any),
-    starts: wp.array(dtype=wp.int32),
-    others: wp.array(dtype=wp.vec2i),
-):
-    """Area-weighted unit normal of a vertex; zero at triangles without area."""
-    total = x[i] - x[i]
-    for k in range(starts[i], starts[i + 1]):
-        total += wp.cross(x[others[k][0]] - x[i], x[others[k][1]] - x[i])
-    return wp.normalize(total)
-
-
-@wp.kernel
-def _normals(
-    first: wp.int32,
-    starts: wp.array(dtype=wp.int32),
-    others: wp.array(dtype=wp.vec2i),
-    x: wp.array(dtype=Any),
-    out: wp.array(dtype=Any),
-):
-    i = first + wp.tid()
-    out[i] = normal_of(i, x, starts, others)
-
-
-_NORMALS = overloads(_normals, wp.int32, wp.vec2i, VECTOR, VECTOR)

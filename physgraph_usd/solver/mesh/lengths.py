@@ -10,8 +10,9 @@ import warp as wp
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from .formula import SCALAR, VECTOR
 from .kernels import KERNELS, start_warp
-from .stencil import SCALAR, VECTOR, overloads, vectors
+from .stencil import vectors
 from .threads import Launch
 
 wp.set_module_options(KERNELS)
@@ -40,7 +41,13 @@ def _normals(
     normal[t] = wp.cross(x[triangles[t][1]] - a, x[triangles[t][2]] - a)
 
 
-LENGTHS, NORMALS = overloads(_lengths, wp.vec2i, VECTOR, SCALAR), overloads(_normals, wp.vec3i, VECTOR, VECTOR)
+def _for_both(kernel: Any, corners: Any, kinds: Mapping[torch.dtype, Any]) -> dict[torch.dtype, wp.Kernel]:
+    """A generic kernel for float32 and float64."""
+    kind = {dtype: [corners, VECTOR[dtype], kinds[dtype]] for dtype in VECTOR}
+    return {dtype: wp.overload(kernel, [wp.int32, *(wp.array(dtype=each) for each in kind[dtype])]) for dtype in kind}
+
+
+LENGTHS, NORMALS = _for_both(_lengths, wp.vec2i, SCALAR), _for_both(_normals, wp.vec3i, VECTOR)
 """Kernels for `ElementValues`: edge lengths [m], and normals of twice the triangle's area [m^2]."""
 
 

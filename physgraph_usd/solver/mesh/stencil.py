@@ -6,7 +6,7 @@ Gathering keeps the order of each sum fixed, so a run repeats bit for bit on eit
 from __future__ import annotations
 
 from functools import cached_property
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -15,87 +15,34 @@ import warp as wp
 from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
-from .kernels import ALONE, KERNELS
-from .simd import FOUR, on_cpu
+from .formula import QUAD, SCALAR, VECTOR, kernel, native, one_by_one
 from .threads import Launch, argument
 
-wp.set_module_options(KERNELS)
 
+def _gather_kernel(dtype: torch.dtype) -> wp.Kernel:
+    """The kernel of (first, starts, columns, values, x, out) multiplying a row of a sparse matrix and vectors."""
 
-@wp.kernel
-def _gather_rows(
-    first: wp.int32,
-    starts: wp.array(dtype=wp.int32),
-    columns: wp.array(dtype=wp.int32),
-    values: wp.array(dtype=Any),
-    x: wp.array(dtype=Any),
-    out: wp.array(dtype=Any),
-):
-    row = first + wp.tid()
-    total = x[0] * values.dtype(0.0)
-    for k in range(starts[row], starts[row + 1]):
-        total += values[k] * x[columns[k]]
-    out[row] = total
+    def of_row(row, starts, columns, values, x, out): ...
 
+    def gather(first, starts, columns, values, x, out):
+        multiply(first + wp.tid(), starts, columns, values, x, out)
 
-@wp.func_native(
-    on_cpu(
-        FOUR
-        + """
+    source = """
     Four total = {};
     for (int k = starts.data[row]; k < starts.data[row + 1]; ++k) {
-        const wp::vec3f& at = x.data[columns.data[k]];
-        const Four part = Four{at[0], at[1], at[2], 0.0f} * values.data[k];
+        const Four part = three(x.data[columns.data[k]]) * values.data[k];
         total += part;
     }
-    out.data[row] = wp::vec3f(total[0], total[1], total[2]);
+    for (int i = 0; i < 3; ++i) out.data[row][i] = total[i];
     """
-    )
-)
-def _sum_row(
-    row: wp.int32,
-    starts: wp.array(dtype=wp.int32),
-    columns: wp.array(dtype=wp.int32),
-    values: wp.array(dtype=wp.float32),
-    x: wp.array(dtype=wp.vec3f),
-    out: wp.array(dtype=wp.vec3f),
-): ...
+    vector = VECTOR[dtype]
+    kinds = [wp.array(dtype=kind) for kind in (wp.int32, wp.int32, SCALAR[dtype], vector, vector)]
+    name = f"gather_rows_{SCALAR[dtype].__name__}"
+    multiply = native(of_row, name, one_by_one(source, dtype), *kinds)
+    return kernel(gather, name, *kinds)
 
 
-@wp.kernel(**ALONE)
-def _gather_rows_at_once(
-    first: wp.int32,
-    starts: wp.array(dtype=wp.int32),
-    columns: wp.array(dtype=wp.int32),
-    values: wp.array(dtype=wp.float32),
-    x: wp.array(dtype=wp.vec3f),
-    out: wp.array(dtype=wp.vec3f),
-):
-    _sum_row(first + wp.tid(), starts, columns, values, x, out)
-
-
-VECTOR = {torch.float32: wp.vec3f, torch.float64: wp.vec3d}
-"""Warp's 3-vector for each torch scalar type."""
-QUAD = {torch.float32: wp.vec4f, torch.float64: wp.vec4d}
-"""Warp's 4-vector for each torch scalar type."""
-SCALAR = {torch.float32: wp.float32, torch.float64: wp.float64}
-"""Warp's scalar for each torch scalar type."""
-
-
-def overloads(kernel: Any, *kinds: Any) -> dict[torch.dtype, wp.Kernel]:
-    """A generic kernel of (first, *arrays) for float32 and float64.
-
-    Args:
-        kinds: Element type of each array: a type, or `SCALAR` or `VECTOR`.
-    """
-
-    def arrays(dtype: torch.dtype) -> list[Any]:
-        return [wp.array(dtype=kind[dtype] if isinstance(kind, dict) else kind) for kind in kinds]
-
-    return {dtype: wp.overload(kernel, [wp.int32, *arrays(dtype)]) for dtype in VECTOR}
-
-
-_GATHER = overloads(_gather_rows, wp.int32, wp.int32, SCALAR, VECTOR, VECTOR)
+_GATHER = {dtype: _gather_kernel(dtype) for dtype in VECTOR}
 
 
 def three_columns(values: Shaped[Tensor, " rows"]) -> Shaped[Tensor, "rows 3"]:
@@ -148,9 +95,7 @@ class Stencil:
         values = wp.array(csr.data, dtype=SCALAR[dtype], device=device)
         x, out = (wp.zeros(count, dtype=VECTOR[dtype], device=device) for count in reversed(self.shape))
         inputs = [starts, columns, values, x, out]
-        single = device == "cpu" and dtype == torch.float32
-        gather = cast(wp.Kernel, _gather_rows_at_once) if single else _GATHER[dtype]
-        self._launch = Launch(gather, self.shape[0], inputs, device=device, threads=threads)
+        self._launch = Launch(_GATHER[dtype], self.shape[0], inputs, device=device, threads=threads)
 
     def alike(self, matrix: sp.csr_matrix) -> Stencil:
         """Another matrix, of equal type and on the same device."""
