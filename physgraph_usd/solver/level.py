@@ -20,7 +20,16 @@ from .mesh.defects import NO_AREA
 from .mesh.elements import QUAD_SPRING, ElasticElements, elastic_elements
 from .mesh.lengths import LENGTHS, NORMALS, ElementValues
 from .mesh.stencil import Stencil
-from .mesh.subdivide import Refinement, crease_mask, creases_of, halves_of, on_triangles, smooth, subdivide_times
+from .mesh.subdivide import (
+    Refinement,
+    crease_mask,
+    creases_of,
+    halves_of,
+    of_halves,
+    on_triangles,
+    smooth,
+    subdivide_times,
+)
 from .mesh.topology import PolygonMesh, TriangleSplit, edges_of, find_edges
 from .scene import Garment
 
@@ -245,6 +254,7 @@ class _GarmentLevel:
     edges: np.ndarray
     elements: ElasticElements
     bent: np.ndarray
+    pressed: np.ndarray
     vertex_values: dict[str, np.ndarray]
     warp: np.ndarray | None
     linear: sp.csr_matrix
@@ -257,7 +267,7 @@ class _GarmentLevel:
 def _garment_level(garment: Garment, whole: Sequence[Refinement], index: int) -> _GarmentLevel:
     """Carry one garment to a level, or to the end of a shorter chain of refinements."""
     chain = whole[:index]
-    mesh, face, creases, maps = _carried(garment, chain, stays=index > len(chain))
+    mesh, face, creases, pressed, maps = _carried(garment, chain, stays=index > len(chain))
     linear, smoothing = maps["linear"], maps["smooth"]
     rest, smooth_rest = (np.asarray(each @ np.asarray(garment.rest, dtype=np.float64)) for each in (linear, smoothing))
     split = _sound(mesh.triangulate(rest if not chain else None), rest, rigid=_is_rigid(garment, linear))
@@ -277,6 +287,7 @@ def _garment_level(garment: Garment, whole: Sequence[Refinement], index: int) ->
         edges=edges_of(split.triangles, mesh.vertex_count).vertices,
         elements=elements,
         bent=garment.bent_rest | (find_edges(creases, elements.hinges[:, :2]) >= 0),
+        pressed=pressed[find_edges(mesh.half_edges.edges, elements.hinges[:, :2])],
         vertex_values={name: np.asarray(linear @ each.astype(np.float64)) for name, each in painted.items()},
         warp=None if garment.grain is None else garment.grain.warp[face[elements.face]],
         **maps,
@@ -285,25 +296,28 @@ def _garment_level(garment: Garment, whole: Sequence[Refinement], index: int) ->
 
 def _carried(
     garment: Garment, chain: Sequence[Refinement], *, stays: bool
-) -> tuple[PolygonMesh, np.ndarray, np.ndarray, dict[str, sp.csr_matrix]]:
-    """A garment's mesh after subdivisions, the cage's face of each face, its creases, and its maps by name.
+) -> tuple[PolygonMesh, np.ndarray, np.ndarray, np.ndarray, dict[str, sp.csr_matrix]]:
+    """A garment's mesh after subdivisions, the cage's face of each face, its creases, pressed angles, maps by name.
 
     Maps from the level below are the identity where the garment stays at the end of its chain.
     """
     mesh, face = garment.mesh, np.arange(garment.mesh.face_count)
     linear = smoothing = linear_step = smooth_step = flat_step = sp.identity(mesh.vertex_count, format="csr")
-    creases = creases_of(mesh, garment.rest, garment.closed)
+    creases, edges = creases_of(mesh, garment.rest, garment.closed), mesh.half_edges.edges
+    pressed = np.full(len(edges), np.nan) if garment.pressed is None else garment.pressed
+    creases = np.unique(np.concatenate([creases, edges[np.isfinite(pressed)]]), axis=0).astype(np.int32)
     for number, refinement in enumerate(chain):
         flat_step = on_triangles(mesh, refinement, mesh.triangulate(None if number else garment.rest))
         linear_step = refinement.linear
         smooth_step = sp.csr_matrix(smooth(mesh, refinement, creased=crease_mask(mesh, creases)))
         smoothing, linear = sp.csr_matrix(smooth_step @ smoothing), sp.csr_matrix(linear_step @ linear)
         creases = halves_of(creases, mesh.vertex_count + find_edges(refinement.edges, creases))
+        pressed = of_halves(refinement, pressed)
         mesh, face = refinement.mesh, face[refinement.parent_face]
     if stays:
         linear_step = smooth_step = flat_step = sp.identity(mesh.vertex_count, format="csr")
     steps = {"linear_step": linear_step, "smooth_step": smooth_step, "flat_step": flat_step}
-    return mesh, face, creases, {"linear": linear, "smooth": smoothing} | steps
+    return mesh, face, creases, pressed, {"linear": linear, "smooth": smoothing} | steps
 
 
 def _metric_of(
@@ -459,7 +473,7 @@ def _measured(
     springs, triangles, hinges = (elements[name] for name in ("springs", "membrane", "hinges"))
     surface, metric = (np.concatenate([getattr(part, name) for part in parts]) for name in ("smooth_rest", "metric"))
     share, twists = (np.concatenate([getattr(part.elements, name) for part in parts]) for name in ("share", "twists"))
-    bent = np.concatenate([part.bent for part in parts])
+    bent, pressed = (np.concatenate([getattr(part, name) for part in parts]) for name in ("bent", "pressed"))
     corners = surface[triangles]
     vectors = np.concatenate([corners[:, 1:] - corners[:, :1], warp[:, None]], axis=1)
     vectors = _in_cloth(vectors, metric[triangles].mean(axis=1))
@@ -473,6 +487,7 @@ def _measured(
         np.concatenate([part.vertex_values[name] for part in parts]) for name in ("stretch_scale", "bend_scale", "pin")
     )
     return shape | {
+        "rest_angle": np.where(np.isnan(pressed), shape["rest_angle"], pressed),
         "rest": np.concatenate([part.rest for part in parts]),
         "membrane_inverse": triangle_inverse(corners, apart, vectors[:, 2]),
         "spring_scale": stretch[springs].mean(axis=1),

@@ -25,7 +25,7 @@ from .cage import PointReader, read_cage
 from .grain import read_grain
 from .materials import Values, find_values
 from .placement import check_matrix, check_placement, is_flipped, place, to_metres
-from .rest import Animation, Rest, read_rest, rests_bent
+from .rest import Animation, Rest, pressed_folds, read_rest, rests_bent
 from .skinning import Bake
 
 RIGID = "physgraph:rigid"
@@ -146,6 +146,7 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], samples: Samples, re
         flipped=is_flipped(prim, matrix),
         bent_rest=bent,
         grain=grain,
+        pressed=pressed_folds(weld.mesh, [weld.joined(pose) for pose in animation.poses().values()]),
         **constants | pieces | painted,
     )
     notices += [*rest.notices, *odd_pieces, *_size_notices(garment.path, animation.first, request)]

@@ -13,12 +13,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from jaxtyping import Float
 from pxr import Sdf, Usd, UsdGeom
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
 from ...errors import GarmentError
-from ...solver.mesh.topology import PolygonMesh, adjacency
+from ...solver.level import hinge_geometry
+from ...solver.mesh.elements import elastic_elements
+from ...solver.mesh.topology import PolygonMesh, adjacency, find_edges
 from ...solver.mesh.weld import Weld
 from ...solver.scene import out_of_bounds
 from ...solver.strain import COLLAPSED
@@ -40,6 +43,9 @@ SMOOTHNESS, SMOOTH_STEPS = (1.0, 0.3, 0.1, 0.03, 0.01, 0.003, 0.001), 25
 1,146 fine edges of a walking shirt rest at lengths over 15% off the cage's, with it 23; of a kilt 2,754 and 76."""
 HOLD = 1e-6
 """Stiffness holding a fitted shape in place, in mean stiffnesses: makes the matrix regular, keeps lengths."""
+FOLDED, ALIKE, MOST_POSES, FEWEST = np.radians(90.0), np.radians(30.0), 0.75, 3
+"""Angles of an edge that is pressed [rad]: the least, and the most off its median; in this fraction of the poses, of
+which there are this many at least."""
 SHORTEST = 1e-3
 """Length, in mean edges, below which edges pull no harder."""
 _AUTHORED = ("physics:restShapePoints", "primvars:rest", "primvars:Pref")
@@ -316,6 +322,31 @@ def median_shape(mesh: PolygonMesh, poses: Sequence[np.ndarray]) -> tuple[np.nda
             pace = 0.5 + np.sqrt(0.25 + last_pace**2)
             ahead = shape + (last_pace - 1.0) / pace * (shape - last)
     return shape, nearest
+
+
+def pressed_folds(mesh: PolygonMesh, poses: Sequence[np.ndarray]) -> Float[np.ndarray, " edges"] | None:
+    """The median angle of each edge that is folded sharply, and alike, in most poses [rad]; NaN at other edges.
+
+    Such are a collar over its stand, a cuff and a hem turned over; wrinkles wander.
+
+    Args:
+        mesh: The welded mesh.
+        poses: Positions of its vertices, each of shape (V, 3).
+
+    Returns:
+        Angles of the mesh's edges, shape (E,); None without such folds, or with too few poses to know.
+    """
+    if len(poses) < FEWEST:
+        return None
+    elements = elastic_elements(mesh, mesh.triangulate(poses[0]), poses[0])
+    hinges = elements.hinges[~elements.twists]
+    angles = np.array([hinge_geometry(pose, hinges)[0] for pose in poses])
+    median = np.median(angles, axis=0)
+    alike = (np.abs(angles) > FOLDED) & (np.abs(angles - median) < ALIKE)
+    pressed = alike.mean(axis=0) >= MOST_POSES
+    out = np.full(len(mesh.half_edges.edges), np.nan)
+    out[find_edges(mesh.half_edges.edges, hinges[pressed, :2])] = median[pressed]
+    return out if pressed.any() else None
 
 
 def _bent(mesh: PolygonMesh) -> sparse.csr_matrix:
