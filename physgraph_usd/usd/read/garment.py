@@ -28,6 +28,8 @@ from .placement import check_matrix, check_placement, is_flipped, place, to_metr
 from .rest import Animation, Rest, pressed_folds, read_rest, rests_bent
 from .skinning import Bake
 
+PRESSED = "physgraph:pressed"
+"""Attribute of an edge subset to mark pressed folds, or folds that are not, bool."""
 RIGID = "physgraph:rigid"
 """Attribute of a face subset to mark a rigid part, bool."""
 _SMALL, _LARGE = 0.01, 100.0
@@ -146,7 +148,9 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], samples: Samples, re
         flipped=is_flipped(prim, matrix),
         bent_rest=bent,
         grain=grain,
-        pressed=pressed_folds(weld.mesh, [weld.joined(pose) for pose in animation.poses().values()]),
+        pressed=pressed_folds(
+            weld.mesh, [weld.joined(pose) for pose in animation.poses().values()], _asked_edges(prim, weld)
+        ),
         **constants | pieces | painted,
     )
     notices += [*rest.notices, *odd_pieces, *_size_notices(garment.path, animation.first, request)]
@@ -236,6 +240,22 @@ def _subsets(prim: Usd.Prim, cage_faces: np.ndarray) -> dict[str, np.ndarray]:
         members = np.isin(cage_faces, [] if faces is None else np.asarray(faces))
         subsets[subset.GetPrim().GetName()] = np.flatnonzero(members)
     return subsets
+
+
+def _asked_edges(prim: Usd.Prim, weld: Weld) -> dict[tuple[int, int], bool]:
+    """Whether the edges in a mesh's subsets of edges are pressed, where a subset says so, by their welded vertices."""
+    asked = {}
+    for subset in UsdGeom.Subset.GetGeomSubsets(UsdGeom.Imageable(prim), UsdGeom.Tokens.edge):
+        attribute, ends = (
+            subset.GetPrim().GetAttribute(PRESSED),
+            subset.GetIndicesAttr().Get(Usd.TimeCode.EarliestTime()),
+        )
+        if not attribute or attribute.Get() is None or ends is None:
+            continue
+        ends = np.asarray(ends)[: len(ends) // 2 * 2].reshape(-1, 2)
+        ends = ends[((ends >= 0) & (ends < len(weld.number))).all(axis=1)]
+        asked |= {(int(low), int(high)): bool(attribute.Get()) for low, high in np.sort(weld.number[ends], axis=1)}
+    return asked
 
 
 def _words(prim: Usd.Prim, subsets: Sequence[str]) -> tuple[str, ...]:

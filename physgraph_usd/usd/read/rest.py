@@ -9,7 +9,7 @@ garment at its first time code, or by a skinned garment's bind transform.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -324,29 +324,35 @@ def median_shape(mesh: PolygonMesh, poses: Sequence[np.ndarray]) -> tuple[np.nda
     return shape, nearest
 
 
-def pressed_folds(mesh: PolygonMesh, poses: Sequence[np.ndarray]) -> Float[np.ndarray, " edges"] | None:
-    """The median angle of each edge that is folded sharply, and alike, in most poses [rad]; NaN at other edges.
+def pressed_folds(
+    mesh: PolygonMesh, poses: Sequence[np.ndarray], asked: Mapping[tuple[int, int], bool]
+) -> Float[np.ndarray, " edges"] | None:
+    """The median angle of each pressed edge [rad], and NaN at all others.
 
-    Such are a collar over its stand, a cuff and a hem turned over; wrinkles wander.
+    An edge that is folded sharply, and alike, in most poses is pressed, such as a collar over its stand, a cuff, a hem
+    turned over; wrinkles wander.
 
     Args:
         mesh: The welded mesh.
         poses: Positions of its vertices, each of shape (V, 3).
+        asked: Whether edges are pressed by their artist's word, by their vertices, lower first.
 
     Returns:
-        Angles of the mesh's edges, shape (E,); None without such folds, or with too few poses to know.
+        Angles of the mesh's edges, shape (E,); None without pressed edges.
     """
-    if len(poses) < FEWEST:
+    if not poses or (len(poses) < FEWEST and not asked):
         return None
-    elements = elastic_elements(mesh, mesh.triangulate(poses[0]), poses[0])
+    elements, edges = elastic_elements(mesh, mesh.triangulate(poses[0]), poses[0]), mesh.half_edges.edges
     hinges = elements.hinges[~elements.twists]
     angles = np.array([hinge_geometry(pose, hinges)[0] for pose in poses])
     median = np.median(angles, axis=0)
     alike = (np.abs(angles) > FOLDED) & (np.abs(angles - median) < ALIKE)
-    pressed = alike.mean(axis=0) >= MOST_POSES
-    out = np.full(len(mesh.half_edges.edges), np.nan)
-    out[find_edges(mesh.half_edges.edges, hinges[pressed, :2])] = median[pressed]
-    return out if pressed.any() else None
+    pressed = (alike.mean(axis=0) >= MOST_POSES) & (len(poses) >= FEWEST)
+    ends = np.sort(hinges[:, :2], axis=1)
+    pressed = [asked.get((int(low), int(high)), found) for (low, high), found in zip(ends, pressed, strict=True)]
+    out = np.full(len(edges), np.nan)
+    out[find_edges(edges, ends[pressed])] = median[pressed]
+    return out if any(pressed) else None
 
 
 def _bent(mesh: PolygonMesh) -> sparse.csr_matrix:

@@ -1,0 +1,104 @@
+"""Pressed folds: what is folded sharply in most frames rests folded; wrinkles that wander do not; an artist's word."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pxr import Sdf, UsdGeom, Vt
+from shots import fine, refine
+from stages import add_mesh, new_stage, save, vec3
+
+from physgraph_usd.shot.refine import inspect_shot
+from physgraph_usd.solver.level import build_levels, refine_garments
+from physgraph_usd.usd.read.reader import open_shot
+
+COLLAR, AROUND = "/World/collar", 20
+RADIUS = np.array([60.0, 60.0, 60.0, 60.2, 61.4, 62.4, 63.4, 66.0, 69.0]) / 1000
+HEIGHT = np.array([0.0, 12.0, 24.0, 34.0, 36.0, 34.0, 24.0, 12.0, 2.0]) / 1000
+"""Rows of a collar: the stand, from its seam to the fold in row 4, and the fall outside."""
+STAND, FALL = 2, 6
+TIMES = (1.0, 2.0, 3.0, 4.0)
+
+
+def collar(time: float, shift: int = 0) -> np.ndarray:
+    """Points of a collar [m], a little wider in each frame; its fold is moved on by rows."""
+    turn = 2 * np.pi * np.arange(AROUND) / AROUND
+    radius, height = (np.roll(each, shift)[:, None] * (1.0 + 0.01 * (time - 1.0)) for each in (RADIUS, HEIGHT))
+    return np.stack(np.broadcast_arrays(radius * np.cos(turn), height, radius * np.sin(turn)), axis=-1).reshape(-1, 3)
+
+
+def collar_shot(path: Path, *, wanders: bool = False, pressed: bool | None = None, row: int = 4) -> Path:
+    """A shot of it; with ``pressed``, a subset of the edges in a row says whether they are."""
+    stage = new_stage(path)
+    ids = np.arange(AROUND * len(RADIUS)).reshape(-1, AROUND)
+    across = np.roll(ids, -1, axis=1)
+    quads = np.stack([ids[:-1], ids[1:], across[1:], across[:-1]], axis=-1).reshape(-1, 4)
+    mesh = add_mesh(stage, COLLAR, collar(1.0), quads)
+    for time in TIMES:
+        mesh.GetPointsAttr().Set(vec3(collar(time, int(time) - 1 if wanders else 0)), time)
+    if pressed is not None:
+        ends = np.stack([ids[row], across[row]], axis=1).reshape(-1)
+        indices = Vt.IntArray.FromNumpy(ends.astype(np.int32))
+        subset = UsdGeom.Subset.CreateGeomSubset(mesh, "fold", UsdGeom.Tokens.edge, indices, "folds")
+        subset.GetPrim().CreateAttribute("physgraph:pressed", Sdf.ValueTypeNames.Bool).Set(pressed)
+    return Path(save(stage))
+
+
+def gaps(shot: Path, out: Path) -> np.ndarray:
+    """Distance of the fall from the stand in each frame [m], shape (times, AROUND)."""
+    refine(shot, out, level=1)
+    points = np.array([fine(shot, out, time, prim=COLLAR)[: AROUND * len(RADIUS)] for time in TIMES])
+    radius = np.hypot(points[..., 0], points[..., 2]).reshape(len(TIMES), -1, AROUND)
+    return radius[:, FALL] - radius[:, STAND]
+
+
+def edges_pressed(shot: Path) -> np.ndarray:
+    """Angles of a shot's pressed edges [rad]."""
+    found = open_shot(str(shot)).scene.garments[0].pressed
+    return np.zeros(0) if found is None else found[np.isfinite(found)]
+
+
+def test_a_collar_stays_over_its_stand(tmp_path: Path):
+    """The cage keeps 3.4 mm; without pressing it springs open to 6.4 mm."""
+    found = gaps(collar_shot(tmp_path / "shot.usda"), tmp_path / "fine.usdc")
+    assert found.min() > 3e-4
+    assert found.max() < 4.5e-3
+    said = inspect_shot(str(tmp_path / "shot.usda"))
+    assert f"{AROUND} edges of <{COLLAR}> pressed" in str(said)
+
+
+def test_an_artist_says_that_a_fold_is_not_pressed(tmp_path: Path):
+    shot = collar_shot(tmp_path / "shot.usda", pressed=False)
+    assert not len(edges_pressed(shot))
+    assert gaps(shot, tmp_path / "fine.usdc").max() > 4.5e-3
+
+
+def test_folds_that_wander_are_not_pressed(tmp_path: Path):
+    assert not len(edges_pressed(collar_shot(tmp_path / "shot.usda", wanders=True)))
+
+
+def test_an_artist_says_that_a_gentle_fold_is_pressed(tmp_path: Path):
+    """The third row is bent by a degree; its halves at finer levels rest at the same angle, all other edges flat."""
+    shot = open_shot(str(collar_shot(tmp_path / "shot.usda", pressed=True, row=2)))
+    garments = shot.scene.garments
+    pressed = garments[0].pressed
+    assert pressed is not None
+    gentle = np.abs(pressed) < np.radians(90.0)
+    assert gentle.sum() == AROUND
+    levels = build_levels(garments, refine_garments(garments, [2]))
+    angles = levels[-1].rest_angle.numpy()
+    for value in (pressed[gentle], pressed[np.isfinite(pressed) & ~gentle]):
+        assert np.isclose(angles[:, None], value, atol=1e-5).any(axis=1).sum() == 4 * AROUND
+    assert (angles != 0.0).sum() == 8 * AROUND
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_too_few_frames_press_nothing(tmp_path: Path, count: int):
+    shot = collar_shot(tmp_path / "shot.usda")
+    layer = Sdf.Layer.FindOrOpen(str(shot))
+    for time in TIMES[count:]:
+        layer.EraseTimeSample(f"{COLLAR}.points", time)
+    layer.Save()
+    assert not len(edges_pressed(shot))
