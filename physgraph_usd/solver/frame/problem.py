@@ -20,7 +20,7 @@ from ..integrate.stop import Budget
 from ..level import Level, Placed
 from .group import Group
 from .level_forces import LevelForces
-from .start import Start, start_of, torn
+from .start import Start, start_of
 from .values import Cage, FrameInput, FrameState
 
 
@@ -213,7 +213,7 @@ def begin(group: Group, frame: FrameInput, last: FrameState | None) -> Problem:
     contact = group.contact(frame, cage, given_up=frame.given_up if known is None else known.given_up)
     if contact is not None and last is not None and last.clean and before is not None:
         contact.at(group.levels[-1]).remember(before)
-    problem = Problem(
+    return Problem(
         began,
         group,
         frame,
@@ -227,5 +227,3 @@ def begin(group: Group, frame: FrameInput, last: FrameState | None) -> Problem:
         inside=last.inside if last is not None and bool(last.inside.any()) else None,
         tether=start.slowed * settings.tether * frame.rate**2 if settings.temporal == "tether" else None,
     )
-    why = torn(forces[-1].level, problem.carried, cage.points) if problem.warm else ""
-    return replace(problem, start=Start(why)) if why else problem

@@ -10,14 +10,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..level import Level
-from ..resolution import edge_strain
 from .from_cage import MovingFrames
 from .settings import Reset
 from .values import Cage, FrameState
 
-TORN_FACTOR, TORN = 2.0, 0.5
-"""Limits of the 99th percentile of edge strain with carried detail, relative to the upsampled cage's, and absolute. A
-frame starts cold above both: a crumpled cage tears carried detail."""
 STILL = 0.02
 """Largest motion of cage and bodies between samples, in mean cage edges, for a held pose: slow settling is visible in a
 held pose, so the cloth is slowed down."""
@@ -76,20 +72,6 @@ def start_of(
     held, slowed = slowing(state.held, farthest)
     why = f"at rest: the pose has been held for {held} frames" if slowed >= SLOWEST else "warm"
     return Start(why, detailed, held, slowed)
-
-
-def torn(finest: Level, carried: Float[Tensor, "vertices 3"], cage: Float[Tensor, "coarse 3"]) -> str:
-    """Reason for a cold start in place of carried positions that would tear the cloth; empty if they would not.
-
-    Args:
-        finest: The finest level.
-        carried: Positions with the last frame's detail, moved there safely [m].
-        cage: Cage positions [m].
-    """
-    strain, plain = (edge_strain(finest, x)["p99"] for x in (carried, finest.base.apply(cage)))
-    if strain <= max(TORN_FACTOR * plain, TORN):
-        return ""
-    return f"cold: carried detail strains the cloth by {strain:.3g}, the upsampled cage by {plain:.3g}"
 
 
 def slowing(held: int, motion: float) -> tuple[int, float]:
