@@ -6,7 +6,7 @@ Odd or repaired contents of a stage are reported by the stage's reader, as `usd.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from shlex import join
 from typing import Any
 
@@ -28,9 +28,11 @@ class Warned(str):
 
     Attributes:
         kind: Title of the kind.
+        options: Options of `RefineOptions` that mend the cause.
     """
 
     kind = ""
+    options: Mapping[str, str] = {}
 
 
 @dataclass(frozen=True)
@@ -42,12 +44,14 @@ class Kind:
         advice: Advice in docs/trouble.md.
         sentence: The warning, with figures in braces.
         remedy: The remedy in brief, or "".
+        options: The options of the remedy, with figures in braces.
     """
 
     title: str
     advice: str
     sentence: str
     remedy: str = ""
+    options: Mapping[str, str] = field(default_factory=dict)
 
     def __call__(self, path: str = "", times: Sequence[float | None] = (), **figures: Any) -> str:
         """The warning.
@@ -62,6 +66,7 @@ class Kind:
         parts = [self.sentence.format(**figures), self.remedy.format(**figures), _also(others)]
         warning = Warned((f"{place}: " if place else "") + "; ".join(filter(None, parts)))
         warning.kind = self.title
+        warning.options = {name: value.format(**figures) for name, value in self.options.items()}
         return warning
 
 
@@ -108,6 +113,7 @@ WARNINGS = {
         "`--rest auto`, or `primvars:rest` in the cloth's own size: refined cloth goes to its rest shape's size",
         "in most frames the cage has not its rest shape's size, to which refined cloth goes: {parts}",
         "give --rest auto, or author primvars:rest in the cloth's own size",
+        {"rest_frame": "auto"},
     ),
     "unfelt": Kind(
         "cloth is inside or near a mesh that it does not feel",
@@ -120,6 +126,7 @@ WARNINGS = {
         "set the stage's `upAxis` right, or give `--gravity` the axis; also where a body lies and gravity is right",
         "it and <{body}> inside it stand along {axis}, but gravity is {pull} by {source}",
         "give --gravity -{axis}, or mend the stage's upAxis",
+        {"gravity": "-{axis}"},
     ),
     "solved_anew": Kind(
         "finished frames are solved anew",
