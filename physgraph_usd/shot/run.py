@@ -12,7 +12,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from ..errors import NOTICE, AbsentError, SolveError, counted
+from ..errors import NOTICE, SolveError, counted
 from ..solver.level import refine_garments
 from ..solver.mesh.kernels import cards_for, kernels_are_compiled
 from ..solver.mesh.subdivide import Refinement
@@ -20,7 +20,7 @@ from ..solver.mesh.topology import PolygonMesh
 from ..solver.scene import Garment
 from ..usd.provenance import CROSSED, FAILED, UNSETTLED, UNSOLVED
 from ..usd.read.reader import Shot
-from ..usd.times import within
+from ..usd.times import none_within, within
 from ..usd.view import Layer
 from ..usd.write.writer import LayerWriter
 from .chunks import PREROLL, solve_in_chunks
@@ -271,9 +271,7 @@ def numbers_in(every: Sequence[float], frames: tuple[float, float] | None) -> ra
         return range(max(len(every), 1))
     times = within(every, frames)
     if not times:
-        message = "no sample of the shot lies in frames {:g}:{:g}".format(*frames)
-        ends = f"; its {len(every)} samples run from {every[0]:g} to {every[-1]:g}" if every else ""
-        raise AbsentError(message + ends)
+        raise none_within(every, frames)
     return range(every.index(times[0]), every.index(times[-1]) + 1)
 
 

@@ -41,7 +41,7 @@ from ..stage import (
     root_metadata,
     shot_name,
 )
-from ..times import merge, snap, within
+from ..times import merge, none_within, snap, within
 from ..view import StageView
 from .authored import authored_faults
 from .bodies import ColliderReader, read_collider
@@ -461,15 +461,14 @@ def _read(
         times = samples.times
         every += times
         if times and not within(times, request.frames):
-            span = f"its authored time codes run from {times[0]:g} to {times[-1]:g}"
+            span = f"its authored time codes run from {times[0]:g} to {times[-1]:g}; give --frames that hold one"
             notices.append(_left_out(prim, f"has no sample in the frame range; {span}"))
         elif skip_invisible and not is_visible(prim, within(times, request.frames)):
             notices.append(_left_out(prim, "is invisible"))
         else:
             readers.append(read_garment(prim, instances, samples, request))
     if request.frames and every and not within(every, request.frames):
-        message = "no sample of the shot lies in frames {:g}:{:g}".format(*request.frames)
-        raise AbsentError(f"{message}; its {len(merge(every))} samples run from {min(every):g} to {max(every):g}")
+        raise none_within(merge(every), request.frames)
     if not readers:
         reasons = "; ".join(str(notice) for notice in notices if "left out" in notice.message)
         raise StageError(f"no garment is left to refine: {reasons}")
