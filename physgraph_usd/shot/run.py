@@ -34,6 +34,7 @@ from .options import RefineOptions
 from .processes import Start, separate_processes
 from .report import LOG, RefineReport
 from .settled import unsettled_frames
+from .skin import Shown, frames_compared, of_polygons, shown_through
 from .solve import Outcomes, ShotSolver
 from .untagged import AUTO
 from .warnings import WARNINGS, of_frames
@@ -207,8 +208,11 @@ class Run:
         """Write each frame as soon as solved, then close the layer; a chunk's frames are already in its folder."""
         report, options = self.report, self.options
         written, shot, began = 0.0, {"shot": report.shot}, clock.perf_counter()
+        compared = frames_compared(count if options.contact != "off" else 0)
+        shown: list[Shown] = []
         for done, outcome in enumerate(solved, start=1):
             written += self._write_frame(writer, outcome)
+            shown += shown_through(self.shot, outcome) if done - 1 in compared else []
             LOG.info("frame %d of %d: time code %s", done, count, _name_of(outcome.time), extra=shot)
             if done == TIMED_FRAMES < count and (
                 message := ending(clock.perf_counter() - began, count, options.workers)
@@ -234,6 +238,7 @@ class Run:
         report.seconds["write"] = written
         report.warn(*of_frames(report))
         report.note(*of_folds(report.garments, report.frames), *of_energy(report.garments, report.frames))
+        report.note(*of_polygons(shown))
         (report.warn if options.strict else report.note)(*of_rest(report.unsettled, len(report.frames)))
         say_what_was(report)
 

@@ -44,7 +44,7 @@ from ..stage import (
 from ..times import merge, none_within, snap, within
 from ..view import StageView
 from .authored import authored_faults
-from .bodies import ColliderReader, read_collider
+from .bodies import ColliderReader, Polygons, read_collider
 from .find import (
     colliders_of,
     disabled_colliders,
@@ -188,6 +188,19 @@ class Shot:
         refuse_far(self.scene, frame)
         refuse_falling(self.scene, frame)
         return frame
+
+    def polygons(self, time: float | None) -> list[Polygons | None]:
+        """Authored polygons of each collider at a time code; None for one that is drawn as authored.
+
+        Raises:
+            StageError: When USD can no longer read the files.
+        """
+        with pxr_errors(f"cannot read {self.path}" + at_time(time)):
+            return [body.polygons(time) for body in self._bodies]
+
+    def offset(self, index: int, time: float | None) -> float:
+        """Distance kept from colliders by a garment, by number, at a time code [m]."""
+        return self._readers[index].values.number("contact:offset", time)
 
     def with_values(self, overrides: Sequence[str]) -> Shot:
         """A copy of the shot with other ``--set`` values in its frames; values read only on opening are kept.
