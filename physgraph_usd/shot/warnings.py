@@ -11,7 +11,7 @@ from shlex import join
 from typing import Any
 
 from ..errors import counted
-from ..solver.strain import StrainedPart
+from ..solver.strain import MOST_STRETCHED, StrainedPart
 from ..usd.read.rest import FITTED
 from ..usd.stage import at_time
 from .options import options_of
@@ -157,6 +157,8 @@ def advice_table() -> str:
 def of_strain(found: Mapping[str, Sequence[StrainedPart]], sources: Mapping[str, str]) -> list[str]:
     """A warning of parts larger than their rest shape in most frames, or far smaller, unless the shape is fitted.
 
+    Parts of `MOST_STRETCHED` of a garment or less are passed over.
+
     Args:
         found: Strained parts of each garment, largest first, by path.
         sources: Source of each garment's rest shape, by path.
@@ -164,7 +166,7 @@ def of_strain(found: Mapping[str, Sequence[StrainedPart]], sources: Mapping[str,
     named = []
     for path, parts in found.items():
         large = [part for part in parts if part.needs_rest and not sources[path].startswith(FITTED)]
-        for part in large[:1]:
+        for part in large[: sum(part.share for part in large) > MOST_STRETCHED]:
             size = f"{part.area_ratio:.0%} of its area on {counted(part.faces, 'face')} {part.where}"
             named.append(f"<{path}> ({sources[path]}) {size}")
     return [WARNINGS["strained"](parts=", ".join(named))] if named else []
