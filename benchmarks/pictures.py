@@ -4,8 +4,8 @@
 
 Refines some frames up to the time code that is drawn, at level 2. For samples about contact it prints what each panel
 says: free vertices deeper than 0.1 mm in the body, edges through faces of cloth and body, and of cloth and cloth, all
-measured by what the report measures with. The coarse panel's are those of the upsampled cage. The T-shirt and its trims
-are drawn by `preview`.
+measured by what the report measures with. The coarse panel's are those of the upsampled cage. The T-shirt is drawn by
+`preview`. Trims are drawn on the refined cloth twice: as they lie on the subdivided input, and bound to the cloth.
 """
 
 from __future__ import annotations
@@ -92,8 +92,19 @@ SHOWN = {
     "crossing": Shown(6.0, (0.0, 0.84, 0.0), (0.3, 0.28, 0.2), (78.0, 2.0), NO_BODY),
 }
 """The pictures of contact by sample."""
-PREVIEWED = {"tshirt": (24.0, 36.0), "trims": (8.0, 14.0)}
+PREVIEWED = {"tshirt": (24.0, 36.0)}
 """First frame and the one drawn by `preview`, by sample."""
+TRIMS = Shown(
+    34.0,
+    (-0.05, 0.08, 0.08),
+    (0.22, 0.2, 0.15),
+    (-22.0, 13.0),
+    {
+        "Trims on the subdivided input": RefineOptions(steps=0, contact="off", self_contact="off"),
+        "Trims bound to the refined cloth": RefineOptions(),
+    },
+)
+"""The picture of the sample `trims`."""
 
 
 def main() -> None:
@@ -101,10 +112,12 @@ def main() -> None:
     prepare_device("cpu")
     out = Path(sys.argv[1])
     out.mkdir(parents=True, exist_ok=True)
-    for name in sys.argv[2:] or [*SHOWN, *PREVIEWED]:
+    for name in sys.argv[2:] or [*SHOWN, *PREVIEWED, "trims"]:
         with tempfile.TemporaryDirectory() as folder:
             if name in PREVIEWED:
                 say(str(previewed(name, Path(folder), out / f"{name}.png")))
+            elif name == "trims":
+                say(str(trims(Path(folder), out / "trims.png")))
             else:
                 say(str(picture(name, SHOWN[name], Path(folder), out / f"contact_{name}.png")))
 
@@ -114,6 +127,24 @@ def previewed(name: str, folder: Path, out: Path) -> Path:
     shot, layer = write_sample(name, folder), folder / "refined.usdc"
     refine_shot(shot, layer, RefineOptions(frames=PREVIEWED[name]))
     return preview(layer, out, times=[PREVIEWED[name][1]], size=(1280, 640), overwrite=True)
+
+
+def trims(folder: Path, out: Path) -> Path:
+    """Draw buttons and piping on the refined render mesh, following the subdivided input and the refined cloth."""
+    shot, panels = write_sample("trims", folder), []
+    for number, options in enumerate(TRIMS.forms.values()):
+        layer = folder / f"{number}.usdc"
+        first = TRIMS.time - (PREROLL if options.steps else 0)
+        refine_shot(shot, layer, replace(options, frames=(first, TRIMS.time), level=LEVEL))
+        stage = DrawnStage(shot, layer)
+        stage.bake((TRIMS.time,))
+        found = stage.meshes(TRIMS.time, cages=[path for path in stage.paths() if not path.endswith("/Form")])
+        panels.append({mesh.path.rpartition("/")[2]: mesh for mesh in found})
+    refined = panels[-1]
+    drawn = [[refined["Form"], refined["Render"], each["Buttons"], each["Piping"]] for each in panels]
+    away = np.linalg.norm(panels[0]["Piping"].points - refined["Piping"].points, axis=1).max()
+    _save(out, _draw(drawn, TRIMS), [*TRIMS.forms], notes=[[f"piping up to {1e3 * away:.0f} mm off the cloth"], []])
+    return out
 
 
 def picture(name: str, shown: Shown, folder: Path, out: Path) -> Path:

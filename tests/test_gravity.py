@@ -50,6 +50,9 @@ def test_a_stage_across_its_bodies_is_told_with_an_option_that_mends_it(tmp_path
         assert f"</World/body> inside it stand along {axis}, but gravity is 9.81 m/s^2 towards -{up}" in each
         assert f"give --gravity -{axis}" in each
     assert warned(shot, gravity=f"-{axis}") == warned(shot, gravity=f"-{up}") == []
+    command = inspect_shot(shot, level=0)["command"]
+    assert command.endswith(f" --gravity -{axis}") == (up != axis)
+    assert " --level 0" in command
 
 
 def across(shot: Path, folder: Path) -> str:

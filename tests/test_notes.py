@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import shlex
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
@@ -10,9 +12,11 @@ from pxr import UsdGeom, UsdShade
 from shots import run
 from stages import add_sheet, author, new_stage, save
 
+from physgraph_usd.errors import UsageError
 from physgraph_usd.shot.refine import inspect_shot
-from physgraph_usd.solver.fabric import NAMED, PRESETS
+from physgraph_usd.solver.fabric import NAMED, PRESETS, WORN
 from physgraph_usd.usd.read.reader import open_shot
+from physgraph_usd.usd.schema import GARMENT, fabric_values
 
 
 def notes(shot: str, *garments: str) -> list[str]:
@@ -27,6 +31,10 @@ def notes(shot: str, *garments: str) -> list[str]:
         ("/World/coat/geo", "", "wool"),
         ("/World/cloth", "M_Silk", "silk"),
         ("/World/BeltGirl/char/shirt", "cottage", ""),
+        ("/World/Coat", "M_Leather", "leather"),
+        ("/World/Scarf", "M_Silk", "silk"),
+        ("/World/fleeceHoodie", "", "rib"),
+        ("/World/coat", "jersey_mat", ""),
     ],
 )
 def test_a_preset_is_proposed_by_the_nearest_name_that_says_what_it_is(
@@ -51,14 +59,48 @@ def test_a_subset_counts_where_it_is_most_of_a_garment_and_the_command_works(tmp
         mesh = add_sheet(stage, f"/World/{name}", tagged=False)
         UsdGeom.Subset.CreateGeomSubset(mesh, "denim", UsdGeom.Tokens.face, list(range(part)))
     (said,) = notes(save(stage), "/World/one", "/World/two")
-    _, _, command = said.partition("to refine it so: ")
-    words = shlex.split(command)
-    assert "named like denim: </World/two> (denim)" in said
-    assert words[0] == "physgraph-usd"
-    assert run(*words[1:]).exit_code == 0
-    fabric = open_shot(words[words.index("-o") + 1]).frame(1.0).garments[0].fabric
-    assert fabric.stretch == PRESETS["denim"].stretch
+    assert said == "named like denim: </World/two> (denim); --set /World/two.preset=denim refines it so"
+    shot = open_shot(save(stage), garments=["/World/one", "/World/two"], overrides=["/World/two.preset=denim"])
+    fabrics = [each.fabric for each in shot.frame(1.0).garments]
+    assert [each.stretch for each in fabrics] == [PRESETS[name].stretch for name in ("jersey", "denim")]
+
+
+@pytest.mark.parametrize("tagged", [True, False])
+def test_the_command_gives_each_garment_the_fabric_that_its_names_say(tmp_path: Path, tagged: bool):
+    """As printed, from a folder with a space in its name, it runs without a warning, and needs no other command."""
+    (folder := tmp_path / "a shot").mkdir()
+    stage = new_stage(folder / "s.usda")
+    named = {"/World/Hoodie": "rib", "/World/Scarf_geo": "wool", "/World/top": "leather", "/World/skirt": "jersey"}
+    for number, path in enumerate(named):
+        sheet = add_sheet(stage, path, tagged=tagged, times=(1.0, 2.0))
+        sheet.AddTranslateOp().Set((0.0, 0.0, 5.0 * number))
+        if (mesh := sheet.GetPrim()).GetName() == "top":
+            author(mesh, "physgraph:material:thickness", 2e-3)
+            UsdShade.MaterialBindingAPI.Apply(mesh).Bind(UsdShade.Material.Define(stage, "/World/M_Leather"))
+    found = inspect_shot(save(stage))
+    words = shlex.split(found["command"])
+    report = folder / "r.json"
+    done = run(*words[1:], "--level", "0", "--report", report)
+    assert (done.exit_code, done.stderr) == (0, "")
+    written = {each["path"]: each["fabric"] for each in json.loads(report.read_text())["garments"]}
+    for path, preset in named.items():
+        wanted = {"stretch": PRESETS[preset].stretch, "bend": PRESETS[preset].bend, "density": PRESETS[preset].density}
+        assert {name: written[path][name] for name in wanted} == pytest.approx(wanted)
+        assert written[path]["thickness"] == pytest.approx(2e-3 if path == "/World/top" else 1e-3)
+
+
+def test_a_preset_hides_what_another_has_authored(tmp_path: Path):
+    stage = new_stage(tmp_path / "s.usda")
+    mesh = add_sheet(stage).GetPrim()
+    for name, value in fabric_values(PRESETS["denim"]).items():
+        author(mesh, GARMENT[name].name, value)
+    shot = save(stage)
+    for overrides, preset in (([], "denim"), (["preset=jersey"], "jersey")):
+        fabric = open_shot(shot, overrides=overrides).frame(1.0).garments[0].fabric
+        assert asdict(fabric) == pytest.approx(asdict(PRESETS[preset]))
+    with pytest.raises(UsageError, match=r"unknown preset 'jeans'; known presets: cotton, "):
+        open_shot(shot, overrides=["/World/cloth.preset=jeans"])
 
 
 def test_every_word_is_of_a_preset():
-    assert set(NAMED.values()) <= set(PRESETS)
+    assert {*NAMED.values(), *WORN.values()} <= set(PRESETS)

@@ -340,7 +340,7 @@ def test_garments_outside_the_frame_range_are_left_out(tmp_path: Path) -> None:
     shot = open_shot(path, frames=(9.0, 20.0))
     assert [garment.path for garment in shot.scene.garments] == ["/World/late"]
     assert "authored time codes run from 1 to 3" in said(shot)
-    with pytest.raises(StageError, match="no sample of the shot lies in frames 4:5; its 5 samples run from 1 to 11"):
+    with pytest.raises(StageError, match=r"frames 4:5; its 5 samples run from 1 to 11.*--frames 1:11"):
         open_shot(path, frames=(4.0, 5.0))
 
 

@@ -17,8 +17,10 @@ pytest.importorskip("pxr", reason="shots are read with usd-core")
 from browser import opened
 from pxr import Gf, Usd, UsdGeom
 from shots import CLOTH, EDGE, TIMES, cloth_shot, refine
+from stages import add_mesh, add_sheet, author, new_stage, save
 
-from physgraph_usd.shot.page.worst import verdict, worst_place
+from physgraph_usd.shot.page.preview import Pictures
+from physgraph_usd.shot.page.worst import CloseUp, close_up, verdict
 from physgraph_usd.shot.report import RefineReport
 from physgraph_usd.usd.read.meshes import RefinedLayer
 from physgraph_usd.usd.read.reader import open_shot
@@ -60,7 +62,9 @@ def test_what_was_left_out_and_why(made: tuple[Path, Path, RefineReport]):
 def test_the_page_begins_with_a_verdict_and_ends_its_times_with_the_report(made: tuple[Path, Path, RefineReport]):
     text = text_of(made)
     assert re.search(
-        r"</h1><p id='verdict'>1 of 8 frames could not be solved; 7 frames refined, nothing crosses, ", text
+        r"</h1><p id='verdict'>1 of 8 frames could not be solved; 7 frames refined, nothing crosses, "
+        r"[\d.e+-]+ s of wall time a frame",
+        text,
     )
     assert f"<tr><td>report</td><td class=number>{made[2].seconds['report']:.2f}</td></tr>" in text
     assert made[2].seconds["total"] > made[2].seconds["frames"] + made[2].seconds["report"] > 0.0
@@ -76,15 +80,57 @@ def test_the_close_picture_is_of_cloth_in_a_body(tmp_path: Path):
     stage.Save()
     report = refine(shot, layer, colliders=["/World/Ball"], contact="off", report=tmp_path / "report")
     with closing(open_shot(str(shot), garments=[CLOTH], colliders=["/World/Ball"])) as opened_shot:
-        worst = worst_place(report, opened_shot)
+        worst = close_up(report, opened_shot)
         assert worst is not None
         points = RefinedLayer(layer).points(opened_shot, 0, worst.time)
         centre = opened_shot.to_metres(0, worst.time)[:3, :3] @ np.asarray(corner, float)
     assert points is not None
     assert worst.path == CLOTH
-    assert np.linalg.norm(points[worst.vertex] - centre) < 2.0 * EDGE  # The radius and a fine edge's length.
-    assert "inside bodies" in worst.reason
-    assert verdict(report).startswith(worst.reason.partition(" edges")[0].partition(" vertices")[0])
+    assert np.linalg.norm(points[worst.vertices[0]] - centre) < 2.0 * EDGE  # The radius and a fine edge's length.
+    title, _, fault = worst.caption.partition(": ")
+    assert title == "The worst place"
+    assert "inside bodies" in fault
+    assert verdict(report).startswith(fault.partition(" edges")[0].partition(" vertices")[0])
+
+
+@pytest.mark.parametrize("seam", [False, True])
+def test_where_nothing_is_wrong_the_close_picture_is_of_the_best_fold(tmp_path: Path, seam: bool):
+    """Two strips, one longer than its cage by ease: where it folds is the best fold, not at a crease of the cage."""
+    stage = new_stage(tmp_path / "s.usda")
+    cells, edge = 12, 0.02
+    x, y = np.meshgrid(np.arange(cells + 1.0), np.arange(cells + 1.0))
+    flat = edge * np.stack([x, y, 0.0 * x], axis=-1).reshape(-1, 3)
+    ids = np.arange(len(flat)).reshape(cells + 1, -1)
+    quads = np.stack([ids[:-1, :-1], ids[:-1, 1:], ids[1:, 1:], ids[1:, :-1]], axis=-1).reshape(-1, 4)
+    creased = flat * [1.0, 1.0, 0.0] + [0.0, 0.0, 1.0] * np.abs(flat[:, :1] - edge * cells / 2)
+    for name, points, ease in (("creased", creased + np.array([1.0, 0.0, 0.0]), 0.0), ("eased", flat, 5.0)):
+        apart = points, quads
+        if seam:
+            parts = [quads[quads[:, 0] % (cells + 1) < cells // 2], quads[quads[:, 0] % (cells + 1) >= cells // 2]]
+            apart = np.concatenate([points, points]), np.concatenate([parts[0], parts[1] + len(points)])
+        mesh = add_mesh(stage, f"/World/{name}", *apart)
+        author(mesh.GetPrim(), "physgraph:rest:weftEase", ease)
+    shot, layer = Path(save(stage)), tmp_path / "fine.usdc"
+    report = refine(shot, layer, level=2, steps=6, report=tmp_path / "report")
+    with closing(open_shot(str(shot))) as opened_shot:
+        close = close_up(report, opened_shot)
+    assert close is not None
+    assert (close.path, close.caption) == ("/World/eased", "The best fold")
+    assert "<figcaption>The best fold</figcaption>" in (tmp_path / "report" / "report.html").read_text(encoding="utf-8")
+
+
+def test_the_close_picture_is_of_a_place_that_nothing_hides(tmp_path: Path):
+    stage = new_stage(tmp_path / "s.usda", metres=0.1)
+    add_sheet(stage, times=(1.0,))
+    add_mesh(stage, "/World/plate", [(0, 0, 2), (2, 0, 2), (2, 3, 2), (0, 3, 2)], [[0, 1, 2, 3]], schema=None)
+    shot, layer = Path(save(stage)), tmp_path / "fine.usdc"
+    refine(shot, layer, level=0, frames=(1.0, 1.0))
+    pictures = Pictures(layer, shot, (320, 160), codes=[1.0])
+    hidden, shown = 6, 18  # Vertices of a grid of 5 by 4; the plate covers x below 2.
+    tried = [hidden, shown], [shown], [hidden]
+    taken = [np.asarray(pictures.draw_close(CloseUp(1.0, CLOTH, each, ""))) for each in tried]
+    assert np.array_equal(taken[0], taken[1])
+    assert not np.array_equal(taken[0], taken[2])
 
 
 @pytest.mark.browser

@@ -352,7 +352,10 @@ def test_the_command_of_inspect_keeps_what_is_bound(shot: Path):
     stage.GetPrimAtPath(CLOTH).RemoveProperty(TARGETS)
     beside(stage, "/World/body", (3.0, 2.0, -2.0), radius=2.0)
     stage.Save()
-    assert inspect_shot(shot, bind=[BUTTON])["command"].endswith(f"--collider /World/body --bind {BUTTON}")
+    given = {"bind": [BUTTON], "frames": (1.0, 2.5), "level": -1, "rest_frame": 1.0, "overrides": ["detail=2"]}
+    _, found, words = inspect_shot(shot, **given)["command"].partition(" --frames ")
+    assert found
+    assert words == f"1:2.5 --collider /World/body --bind {BUTTON} --level auto --set detail=2 --rest 1"
 
 
 def spread(stage: Usd.Stage) -> None:

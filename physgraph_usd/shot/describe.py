@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import closing
 from pathlib import Path
 from shlex import join
@@ -21,7 +21,6 @@ from ..solver.scene import Frame, Garment, GarmentFrame
 from ..solver.strain import StrainedPart, strained_parts
 from ..usd.read.find import GRAVITY_OPTION
 from ..usd.read.reader import Shot, open_shot
-from ..usd.read.rest import FITTED
 from ..usd.read.survey import survey
 from ..usd.read.targets import DETAIL, FOLLOW, Target
 from ..usd.schema import GARMENT
@@ -29,8 +28,8 @@ from ..usd.stage import GarmentSource
 from ..usd.times import within
 from ..usd.view import Stage
 from .estimate import cannot_fit, estimate
-from .notes import of_fabrics, of_slack, of_trims
-from .options import RefineOptions, options_of
+from .notes import of_fabrics, of_slack, of_trims, preset_overrides
+from .options import RefineOptions, scene_words
 from .report import RefineReport, of_a_kind
 from .untagged import FAR, Candidate, find_candidates
 from .up_axis import across_gravity
@@ -74,7 +73,7 @@ def begin_report(report: RefineReport, opened: Shot, options: RefineOptions) -> 
     known += _across(opened, frames, beside)
     follow = {each.path: each.follows for each in candidates if each.follows}
     slack = of_slack([garment.path for garment in opened.scene.garments], choices)
-    report.note(*slack, *of_fabrics(opened), *of_trims(follow))
+    report.note(*slack, *of_fabrics(opened.sources), *of_trims(follow))
     report.modelled = _modelled(opened, report, options)
     report.left_out = _left_out(opened, report)
     report.variants = list(opened.selections)
@@ -123,6 +122,8 @@ def describe(opened: Shot, options: RefineOptions) -> dict[str, Any]:
     report = RefineReport(opened.path, None, options.plain())
     warnings = begin_report(report, opened, options)
     large = too_large(opened, report, options)
+    unfelt = dict.fromkeys(path for garment in report.garments for path in garment.get("unfelt", ()))
+    felt = dataclasses.replace(options, colliders=[*opened.colliders, *unfelt]) if unfelt else options
     return {
         "shot": opened.path,
         **({"problem": str(large)} if large else {}),
@@ -138,59 +139,37 @@ def describe(opened: Shot, options: RefineOptions) -> dict[str, Any]:
         "defects": {garment.path: in_brief(defects(garment.mesh, garment.rest)) for garment in opened.scene.garments},
         "warnings": [*of_a_kind(warnings)],
         "notes": report.notes,
-        **_command(opened, report, options),
+        "command": _command(opened, opened.sources, felt, warnings),
     }
 
 
-def _command(opened: Shot, report: RefineReport, options: RefineOptions) -> dict[str, str]:
-    """The command with touched but unnamed colliders added, and the rest shape option if the garments need one."""
-    unfelt = dict.fromkeys(path for garment in report.garments for path in garment.get("unfelt", ()))
-    rest = _rest_options(
-        opened, [[StrainedPart(**part) for part in garment["strained"]] for garment in report.garments]
-    )
-    if not (unfelt or rest):
-        return {}
-    named = {
-        "--garment": options.garments,
-        "--collider": [*opened.colliders, *unfelt] if unfelt else options.colliders,
-        "--bind": options.bind,
-    }
-    return {"command": _command_of(opened.path, rest, named)}
+def _command(opened: Shot, garments: Sequence[GarmentSource], options: RefineOptions, warnings: Iterable[str]) -> str:
+    """The command to refine garments of a shot with some options, those of the warnings, and the presets named."""
+    mended = {name: value for each in warnings for name, value in getattr(each, "options", {}).items()}
+    given = dataclasses.replace(options, overrides=[*options.overrides, *preset_overrides(garments)], **mended)
+    out = str(Path(opened.path).with_suffix(".refined.usdc"))
+    return join(["physgraph-usd", "refine", opened.path, "-o", out, *scene_words(given)])
 
 
-def _command_of(shot: str, given: Sequence[str], named: Mapping[str, Iterable[str]]) -> str:
-    """The command to refine a shot, with options as words, and the paths given by each option."""
-    out = str(Path(shot).with_suffix(".refined.usdc"))
-    options = [word for name, values in named.items() for word in options_of(name, values)]
-    return join(["physgraph-usd", "refine", shot, "-o", out, *given, *options])
-
-
-def _rest_options(opened: Shot, strained: Iterable[Sequence[StrainedPart]]) -> list[str]:
-    """``--rest auto`` as words of a command, if a garment with the given strained parts needs the option."""
-    fitted = [source.sources["rest"].startswith(FITTED) for source in opened.sources]
-    wrong = any(part.needs_rest for fits, parts in zip(fitted, strained, strict=True) if not fits for part in parts)
-    return ["--rest", "auto"] if wrong else []
-
-
-def _proposal(shot: str | Stage, meshes: Sequence[str], frames: tuple[float, float] | None) -> str:
+def _proposal(shot: str | Stage, meshes: Sequence[str], options: RefineOptions) -> str:
     """The command for a shot without tags.
 
     Open meshes, the largest first, that lie on other meshes are the garments; if none does, those that are animated.
     "" if no garment is found or the meshes cannot be read together.
     """
     try:
-        with closing(open_shot(shot, garments=meshes[:MOST_ASKED], frames=frames)) as opened:
+        asked = {name: getattr(options, name) for name in ("frames", "gravity", "rest_frame")}
+        with closing(open_shot(shot, garments=meshes[:MOST_ASKED], **asked)) as opened:
             sampled = sample_frames(opened.every_time, opened.frame)
             found = [each for each in find_candidates(opened) if each.is_taken]
             lying = {path for each in found for path in each.shares}
             moving = {str(source.path) for source in opened.sources if len(source.times) > 1}
-            garments = [garment.path for garment in opened.scene.garments if garment.path in (lying or moving)]
+            garments = [source for source in opened.sources if str(source.path) in (lying or moving)]
             strained = _strained_parts(opened, sampled)
-            options = _rest_options(opened, [parts if path in garments else [] for path, parts in strained.items()])
-            across = across_gravity(opened.scene, sampled, found)
-            options += [] if across is None else ["--gravity", f"-{across[2]}"]
-            named = {"--garment": garments, "--collider": [each.path for each in found]}
-            return _command_of(opened.path, options, named) if garments else ""
+            named = {"garments": [str(source.path) for source in garments], "colliders": [each.path for each in found]}
+            warnings = of_strain({path: strained[path] for path in named["garments"]}, _rests(garments))
+            warnings += _across(opened, sampled, found)
+            return _command(opened, garments, dataclasses.replace(options, **named), warnings) if garments else ""
     except StageError:
         return ""
 
@@ -205,7 +184,7 @@ def describe_meshes(shot: str | Stage, problem: str, options: RefineOptions) -> 
     if not options.garments and not any(mesh.garment for mesh in found.meshes):
         cloth = [mesh for mesh in found.meshes if mesh.is_open and not mesh.problem]
         cloth.sort(key=lambda mesh: -mesh.faces)
-        command = _proposal(shot, [mesh.path for mesh in cloth], options.frames)
+        command = _proposal(shot, [mesh.path for mesh in cloth], options)
     return {
         "shot": found.path,
         "metres_per_unit": found.metres_per_unit,
@@ -300,7 +279,12 @@ def _strained(opened: Shot, report: RefineReport, frames: Sequence[Frame]) -> li
     found = _strained_parts(opened, frames)
     for garment, parts in zip(report.garments, found.values(), strict=True):
         garment["strained"] = [dataclasses.asdict(part) for part in parts]
-    return of_strain(found, {str(source.path): source.sources["rest"] for source in opened.sources})
+    return of_strain(found, _rests(opened.sources))
+
+
+def _rests(garments: Iterable[GarmentSource]) -> dict[str, str]:
+    """By path of each garment, the source of its rest shape."""
+    return {str(source.path): source.sources["rest"] for source in garments}
 
 
 def _strained_parts(opened: Shot, frames: Sequence[Frame]) -> dict[str, list[StrainedPart]]:

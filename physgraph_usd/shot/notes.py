@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from shlex import join
 from typing import Any
 
 from ..errors import counted
-from ..solver.fabric import NAMED
+from ..solver.fabric import NAMED, PRESETS, WORN, Fabric
 from ..solver.resolution import SHARP_FRACTION, LevelChoice
-from ..usd.read.reader import Shot
+from ..usd.lookup import PRESET
 from ..usd.schema import GARMENT
-from ..usd.stage import at_time
+from ..usd.stage import GarmentSource, at_time
 from .options import options_of
 from .report import is_first
 from .settled import COLLAPSED, LIMITED, UNSOLVED, in_words
@@ -54,24 +53,35 @@ def of_trims(found: Mapping[str, str]) -> list[str]:
     return [f"{listed} {stay} beside the refined {cloth}; {options} carries {them} along"]
 
 
-def of_fabrics(shot: Shot) -> list[str]:
-    """A note for each preset whose name appears in garments without authored fabric values.
+def of_fabrics(sources: Iterable[GarmentSource]) -> list[str]:
+    """A note for each preset whose fabric is named in garments without authored fabric values.
 
     Args:
-        shot: An open shot.
+        sources: Where the garments come from.
     """
-    named: dict[str, dict[str, str]] = {}
-    for source in shot.sources:
-        word = next((word for word in source.words if word in NAMED), None)
-        if word and all(source.sources[name] == "fallback" for name in MATERIALS):
-            named.setdefault(NAMED[word], {})[str(source.path)] = word
+    named: dict[str, list[tuple[GarmentSource, str]]] = {}
+    for source, word, preset in _named(sources):
+        named.setdefault(preset, []).append((source, word))
     notes = []
-    for preset, words in named.items():
-        listed = ", ".join(f"<{path}> ({word})" for path, word in words.items())
-        out = str(Path(shot.path).with_suffix(f".{preset}.usda"))
-        tag = ["physgraph-usd", "tag", shot.path, "-o", out, "--preset", preset, *options_of("--garment", words)]
-        notes.append(f"named like {preset}: {listed}; to refine it so: {join(tag)}")
+    for preset, found in named.items():
+        listed = ", ".join(f"<{source.path}> ({word})" for source, word in found)
+        options = join(options_of("--set", preset_overrides(source for source, _ in found)))
+        notes.append(f"named like {preset}: {listed}; {options} refines {'it' if len(found) == 1 else 'them'} so")
     return notes
+
+
+def preset_overrides(sources: Iterable[GarmentSource]) -> list[str]:
+    """Values of ``--set`` that give garments the fabric they are named after."""
+    return [f"{source.path}.{PRESET}={preset}" for source, _, preset in _named(sources)]
+
+
+def _named(sources: Iterable[GarmentSource]) -> Iterator[tuple[GarmentSource, str, str]]:
+    """The garments without authored fabric values and named like a preset, with the word and the preset."""
+    for source in sources:
+        named = ((word, known[word]) for known in (NAMED, WORN) for word in source.words if word in known)
+        word, preset = next(named, ("", ""))
+        if preset and PRESETS[preset] != Fabric() and all(source.sources[name] == "fallback" for name in MATERIALS):
+            yield source, word, preset
 
 
 def of_rest(unsettled: Sequence[Mapping[str, Any]], frames: int) -> list[str]:

@@ -102,7 +102,7 @@ class RefineOptions:
     device: str = _solver("cpu", "Where to compute; auto: on the card where there is one.", metavar="cpu|cuda|auto")
     overrides: Sequence[str] = _scene(
         (),
-        f"Override an attribute of garments or colliders, such as bendStiffness=2e-4 for all garments{LIST}.",
+        f"Override a value of garments or colliders, such as bendStiffness=2e-4 or preset=denim for all{LIST}.",
         flag="set",
         metavar="PRIM.ATTR=VALUE",
     )
@@ -257,6 +257,26 @@ def _check(name: str, value: Any, option: Option) -> None:
 def json_of(report: Path) -> Path:
     """The JSON file of a report: the path itself if named ``.json``, else `REPORT_NAME` in a folder at the path."""
     return report if report.suffix == ".json" and not report.is_dir() else report / REPORT_NAME
+
+
+def scene_words(options: RefineOptions) -> list[str]:
+    """The options that say what of the shot to refine, where they are not the default, as words of a command."""
+    words = []
+    for field in dataclasses.fields(options):
+        value, option = getattr(options, field.name), OPTIONS[field.name]
+        if option.heading == "Scene" and value != field.default:
+            values = value if field.default == () else [_text(value)]
+            words += options_of("--" + (option.flag or field.name), values)
+    return words
+
+
+def _text(value: Any) -> str:
+    """A level, a time code, a range of them or a word, as the command line takes it."""
+    if isinstance(value, tuple):
+        return ":".join(map(_text, value))
+    if value == -1 and isinstance(value, int):
+        return "auto"
+    return value if isinstance(value, str) else f"{value:.15g}"
 
 
 def options_of(name: str, values: Iterable[str]) -> list[str]:

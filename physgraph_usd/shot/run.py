@@ -12,7 +12,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from ..errors import NOTICE, AbsentError, SolveError, counted
+from ..errors import NOTICE, SolveError, counted
 from ..solver.level import refine_garments
 from ..solver.mesh.kernels import cards_for, kernels_are_compiled
 from ..solver.mesh.subdivide import Refinement
@@ -20,7 +20,7 @@ from ..solver.mesh.topology import PolygonMesh
 from ..solver.scene import Garment
 from ..usd.provenance import CROSSED, FAILED, UNSETTLED, UNSOLVED
 from ..usd.read.reader import Shot
-from ..usd.times import within
+from ..usd.times import none_within, within
 from ..usd.view import Layer
 from ..usd.write.writer import LayerWriter
 from .chunks import PREROLL, solve_in_chunks
@@ -34,6 +34,7 @@ from .options import RefineOptions
 from .processes import Start, separate_processes
 from .report import LOG, RefineReport
 from .settled import unsettled_frames
+from .skin import Shown, frames_compared, of_polygons, shown_through
 from .solve import Outcomes, ShotSolver
 from .untagged import AUTO
 from .warnings import WARNINGS, of_frames
@@ -207,8 +208,11 @@ class Run:
         """Write each frame as soon as solved, then close the layer; a chunk's frames are already in its folder."""
         report, options = self.report, self.options
         written, shot, began = 0.0, {"shot": report.shot}, clock.perf_counter()
+        compared = frames_compared(count if options.contact != "off" else 0)
+        shown: list[Shown] = []
         for done, outcome in enumerate(solved, start=1):
             written += self._write_frame(writer, outcome)
+            shown += shown_through(self.shot, outcome) if done - 1 in compared else []
             LOG.info("frame %d of %d: time code %s", done, count, _name_of(outcome.time), extra=shot)
             if done == TIMED_FRAMES < count and (
                 message := ending(clock.perf_counter() - began, count, options.workers)
@@ -234,6 +238,7 @@ class Run:
         report.seconds["write"] = written
         report.warn(*of_frames(report))
         report.note(*of_folds(report.garments, report.frames), *of_energy(report.garments, report.frames))
+        report.note(*of_polygons(shown))
         (report.warn if options.strict else report.note)(*of_rest(report.unsettled, len(report.frames)))
         say_what_was(report)
 
@@ -271,9 +276,7 @@ def numbers_in(every: Sequence[float], frames: tuple[float, float] | None) -> ra
         return range(max(len(every), 1))
     times = within(every, frames)
     if not times:
-        message = "no sample of the shot lies in frames {:g}:{:g}".format(*frames)
-        ends = f"; its {len(every)} samples run from {every[0]:g} to {every[-1]:g}" if every else ""
-        raise AbsentError(message + ends)
+        raise none_within(every, frames)
     return range(every.index(times[0]), every.index(times[-1]) + 1)
 
 

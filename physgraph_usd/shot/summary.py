@@ -117,7 +117,7 @@ def _is_summary(path: Path) -> bool:
 
 def table_of(rows: Sequence[Row]) -> list[str]:
     """Rows as lines of a table."""
-    head = ("shot", "state", "frames", "s a frame", "crossings", "warnings", "exit code")
+    head = ("shot", "state", "frames", "wall s a frame", "crossings", "warnings", "exit code")
     cells = [head, *(_cells(row) for row in rows)]
     widths = [max(len(line[column]) for line in cells) for column in range(len(head))]
     return [

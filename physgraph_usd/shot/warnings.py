@@ -6,12 +6,12 @@ Odd or repaired contents of a stage are reported by the stage's reader, as `usd.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from shlex import join
 from typing import Any
 
 from ..errors import counted
-from ..solver.strain import StrainedPart
+from ..solver.strain import MOST_STRETCHED, StrainedPart
 from ..usd.read.rest import FITTED
 from ..usd.stage import at_time
 from .options import options_of
@@ -28,9 +28,11 @@ class Warned(str):
 
     Attributes:
         kind: Title of the kind.
+        options: Options of `RefineOptions` that mend the cause.
     """
 
     kind = ""
+    options: Mapping[str, str] = {}
 
 
 @dataclass(frozen=True)
@@ -42,12 +44,14 @@ class Kind:
         advice: Advice in docs/trouble.md.
         sentence: The warning, with figures in braces.
         remedy: The remedy in brief, or "".
+        options: The options of the remedy, with figures in braces.
     """
 
     title: str
     advice: str
     sentence: str
     remedy: str = ""
+    options: Mapping[str, str] = field(default_factory=dict)
 
     def __call__(self, path: str = "", times: Sequence[float | None] = (), **figures: Any) -> str:
         """The warning.
@@ -62,6 +66,7 @@ class Kind:
         parts = [self.sentence.format(**figures), self.remedy.format(**figures), _also(others)]
         warning = Warned((f"{place}: " if place else "") + "; ".join(filter(None, parts)))
         warning.kind = self.title
+        warning.options = {name: value.format(**figures) for name, value in self.options.items()}
         return warning
 
 
@@ -108,6 +113,7 @@ WARNINGS = {
         "`--rest auto`, or `primvars:rest` in the cloth's own size: refined cloth goes to its rest shape's size",
         "in most frames the cage has not its rest shape's size, to which refined cloth goes: {parts}",
         "give --rest auto, or author primvars:rest in the cloth's own size",
+        {"rest_frame": "auto"},
     ),
     "unfelt": Kind(
         "cloth is inside or near a mesh that it does not feel",
@@ -120,6 +126,7 @@ WARNINGS = {
         "set the stage's `upAxis` right, or give `--gravity` the axis; also where a body lies and gravity is right",
         "it and <{body}> inside it stand along {axis}, but gravity is {pull} by {source}",
         "give --gravity -{axis}, or mend the stage's upAxis",
+        {"gravity": "-{axis}"},
     ),
     "solved_anew": Kind(
         "finished frames are solved anew",
@@ -150,6 +157,8 @@ def advice_table() -> str:
 def of_strain(found: Mapping[str, Sequence[StrainedPart]], sources: Mapping[str, str]) -> list[str]:
     """A warning of parts larger than their rest shape in most frames, or far smaller, unless the shape is fitted.
 
+    Parts of `MOST_STRETCHED` of a garment or less are passed over.
+
     Args:
         found: Strained parts of each garment, largest first, by path.
         sources: Source of each garment's rest shape, by path.
@@ -157,7 +166,7 @@ def of_strain(found: Mapping[str, Sequence[StrainedPart]], sources: Mapping[str,
     named = []
     for path, parts in found.items():
         large = [part for part in parts if part.needs_rest and not sources[path].startswith(FITTED)]
-        for part in large[:1]:
+        for part in large[: sum(part.share for part in large) > MOST_STRETCHED]:
             size = f"{part.area_ratio:.0%} of its area on {counted(part.faces, 'face')} {part.where}"
             named.append(f"<{path}> ({sources[path]}) {size}")
     return [WARNINGS["strained"](parts=", ".join(named))] if named else []

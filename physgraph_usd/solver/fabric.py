@@ -64,13 +64,20 @@ PRESETS: dict[str, Fabric] = {
 """Fabrics by name. Those whose shear stiffness lies within a fifth of an isotropic sheet's are edge springs."""
 
 NAMED: dict[str, str] = {
-    **dict.fromkeys(("leather", "belt", "suede"), "leather"),
+    **dict.fromkeys(("leather", "suede"), "leather"),
     **dict.fromkeys(("denim", "jeans"), "denim"),
-    **dict.fromkeys(("wool", "coat", "overcoat", "tweed"), "wool"),
+    **dict.fromkeys(("wool", "woollen", "woolen", "tweed", "tartan", "cashmere"), "wool"),
     **dict.fromkeys(("silk", "satin", "chiffon"), "silk"),
-    **dict.fromkeys(("cotton", "linen"), "cotton"),
+    **dict.fromkeys(("cotton", "linen", "poplin"), "cotton"),
     **dict.fromkeys(("polyester", "nylon"), "polyester"),
-    **dict.fromkeys(("rib", "sweater", "pullover"), "rib"),
-    "paper": "paper",
+    **dict.fromkeys(("rib", "knit", "knitted", "knitwear", "fleece"), "rib"),
+    **{name: name for name in ("jersey", "paper")},
 }
-"""Preset that a word in the name of a prim, material or subset stands for."""
+"""Preset that a word for a fabric in the name of a prim, material or subset stands for."""
+WORN: dict[str, str] = {
+    "belt": "leather",
+    **dict.fromkeys(("coat", "overcoat", "scarf", "kilt"), "wool"),
+    **dict.fromkeys(("sweater", "pullover", "cardigan", "hoodie", "sweatshirt"), "rib"),
+}
+"""Preset that a word for a garment stands for, where no name says the fabric. Skirts, dresses, shirts and trousers are
+of any fabric."""

@@ -15,13 +15,18 @@ import numpy as np
 from pxr import Sdf, Usd, UsdShade
 
 from ..errors import SchemaError, UsageError
-from .schema import AUTO_LEVEL, COLLIDER, GARMENT, MATERIAL, Property, find_property
+from ..solver.fabric import PRESETS
+from .schema import AUTO_LEVEL, COLLIDER, GARMENT, MATERIAL, Property, every_fabric_value, find_property
 from .stage import at_time, in_brief, timecode
 
 _OVERRIDE = re.compile(r"^(?:<?(?P<prim>/[^<>=.]*)>?\.)?(?P<name>[A-Za-z_][\w:]*)=(?P<value>.*)$")
 _WORDS = {"true": 1.0, "on": 1.0, "yes": 1.0, "false": 0.0, "off": 0.0, "no": 0.0}
 USER_PROPERTIES = "userProperties:"
 """Blender's namespace for exported custom properties."""
+PRESET = "preset"
+"""Name by which ``--set`` takes the values of a preset, as in ``preset=denim``."""
+_OWN = ("thickness", "rest:warpEase", "rest:weftEase")
+"""Values that a preset without such a value of its own leaves as the garment has them."""
 
 
 @dataclass(frozen=True)
@@ -30,11 +35,12 @@ class Override:
 
     Attributes:
         prim: Prim path at or above the affected garments or colliders; "/" means all.
+        value: The value; None for a value that a preset leaves unset.
     """
 
     prim: Sdf.Path
     row: Property
-    value: float | str
+    value: float | str | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,23 +85,31 @@ def check_known(what: str, word: object, known: Collection[object]) -> None:
 
 
 def parse_overrides(texts: Sequence[str]) -> tuple[Override, ...]:
-    """Read ``</prim>.attribute=value`` or ``attribute=value`` texts; UsageError names an invalid text."""
-    return tuple(_parse_override(text) for text in texts)
+    """Read ``</prim>.attribute=value`` or ``attribute=value`` texts; UsageError names an invalid text.
+
+    `PRESET` stands for the values of a fabric.
+    """
+    return tuple(override for text in texts for override in _parse_override(text))
 
 
-def _parse_override(text: str) -> Override:
+def _parse_override(text: str) -> list[Override]:
     match = _OVERRIDE.match(text.strip())
     if match is None:
         raise UsageError(f"cannot read {text!r}; write </prim>.attribute=value or attribute=value")
-    row, word = find_property(match["name"]), match["value"].strip().lower()
+    prim, word = Sdf.Path(match["prim"] or "/"), match["value"].strip().lower()
+    if match["name"] == PRESET:
+        check_known(PRESET, word, sorted(PRESETS))
+        values = [(GARMENT[name], value) for name, value in every_fabric_value(PRESETS[word]).items()]
+        return [Override(prim, row, v) for row, v in values if row.short not in _OWN or v not in (None, row.fallback)]
+    row = find_property(match["name"])
     if row.type == "rel" or row.interpolation or (row.type == "token" and row is not COLLIDER["collider:side"]):
         raise UsageError(f"{row.name} is not a single number; author it on the prim")
     try:
         if row.type == "token":
-            return Override(Sdf.Path(match["prim"] or "/"), row, check_token(row, word, text))
+            return [Override(prim, row, check_token(row, word, text))]
         words = _WORDS | ({"auto": AUTO_LEVEL} if row is GARMENT["refine:level"] else {})
         value = words[word] if word in words else float(word)
-        return Override(Sdf.Path(match["prim"] or "/"), row, check_limits(row, value, text))
+        return [Override(prim, row, check_limits(row, value, text))]
     except (ValueError, SchemaError) as error:
         raise UsageError(f"cannot use {text!r}: {error}") from error
 
@@ -161,7 +175,7 @@ def find_value(prim: Usd.Prim, row: Property, overrides: Sequence[Override] = ()
     """
     override = _override(prim, row, overrides)
     if override is not None:
-        return Found(row, "--set", None, float(override.value))
+        return Found(row, "--set", None, None if override.value is None else float(override.value))
     attribute = nearest(prim, row.name)
     if attribute is None and row.name.startswith(MATERIAL):
         materials = bound_materials(prim)

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from pxr import Usd, UsdGeom
 
+from ..errors import AbsentError
 from .lookup import with_ancestors
 
 SAME_TIME = 1e-6
@@ -49,6 +50,20 @@ def _spline_times(attribute: Usd.Attribute) -> list[float]:
         return []
     knots = [float(time) for time in get_spline().GetKnots().keys()]
     return [*knots, *map(float, range(math.ceil(min(knots)), math.floor(max(knots)) + 1))] if knots else []
+
+
+def none_within(every: Sequence[float], frames: tuple[float, float]) -> AbsentError:
+    """The error of a frame range without a sample.
+
+    Args:
+        every: All time codes of the shot, ascending.
+        frames: First and last time code.
+    """
+    message = "no sample of the shot lies in frames {:g}:{:g}".format(*frames)
+    if not every:
+        return AbsentError(f"{message}; it has none: leave out --frames")
+    span = f"its {len(every)} samples run from {every[0]:g} to {every[-1]:g}"
+    return AbsentError(f"{message}; {span}; give a range that holds one, such as --frames {every[0]:g}:{every[-1]:g}")
 
 
 def merge(times: Iterable[float]) -> tuple[float, ...]:

@@ -282,3 +282,44 @@ class TestSet:
     def test_one_for_no_collider_is_refused_by_name(self, stage: Usd.Stage):
         with pytest.raises(UsageError, match=f"no such collider; colliders: {BODY}"):
             felt(stage, overrides=["</World/other>.collider:offset=0.003"])
+
+
+class TestPolygons:
+    """A body whose limit surface has `RADIUS` and whose corners stand 4.7 mm outside, under a skirt that lies on it."""
+
+    AROUND = 12
+
+    def notes(self, stage: Usd.Stage, folder: Path, *options: str) -> tuple[list[str], float]:
+        """Notes of viewports, and by how much the body's polygons stand above the skirt at its rows [m]."""
+        shot, out = Path(save(stage)), folder / "fine.usdc"
+        how = {"garments": [SKIRT], "colliders": [BODY], "frames": (2.0, 2.0), "overrides": options, "level": 2}
+        report = refine(shot, out, overwrite=True, **how)
+        cloth = fine(shot, out, 2.0, prim=SKIRT)
+        turn = 2.0 * np.pi / self.AROUND
+        angle = np.mod(np.arctan2(cloth[:, 2], cloth[:, 0]), turn) - 0.5 * turn
+        corners = float(
+            np.linalg.norm(np.asarray(UsdGeom.Mesh(stage.GetPrimAtPath(BODY)).GetPointsAttr().Get())[0, ::2])
+        )
+        above = corners * np.cos(0.5 * turn) / np.cos(angle) - np.linalg.norm(cloth[:, ::2], axis=1)
+        return [note for note in report.notes if "viewports" in note], float(above.max())
+
+    def body(self, stage: Usd.Stage, scheme: str, around: int = AROUND) -> None:
+        outside = 3.0 / (2.0 + np.cos(2.0 * np.pi / around)) if scheme != "none" else 1.0
+        add(stage, BODY, tube(outside * RADIUS, -0.1, 0.3, around=around, rows=9), scheme=scheme)
+
+    def test_that_show_through_are_told_once_with_an_offset_that_hides_them(self, stage: Usd.Stage, tmp_path: Path):
+        self.body(stage, "catmullClark")
+        (note,), above = self.notes(stage, tmp_path)
+        height = float(note.partition("by up to ")[2].partition(" mm")[0])
+        assert note.startswith(f"viewports that draw <{BODY}> unsubdivided show it through <{SKIRT}> by up to ")
+        assert height == pytest.approx(1e3 * above, rel=0.15)
+        option, _, rest = note.partition("--set ")[2].partition(" ")
+        assert rest == "hides it"
+        notes, above = self.notes(stage, tmp_path, option)
+        assert notes == []
+        assert above < 2e-4
+
+    @pytest.mark.parametrize(("scheme", "around"), [("none", AROUND), ("catmullClark", 32)])
+    def test_that_stay_below_the_cloth_are_not_told(self, stage: Usd.Stage, tmp_path: Path, scheme: str, around: int):
+        self.body(stage, scheme, around)
+        assert self.notes(stage, tmp_path)[0] == []

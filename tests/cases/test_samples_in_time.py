@@ -176,6 +176,28 @@ class TestSamplesOfBodies:
         body.GetPrim().AddAppliedSchema(COLLIDER_API)
         warnings = [each for each in inspect_shot(save(stage))["warnings"] if "</World/floor>: its samples" in each]
         assert [message in each for each in warnings] == [True] * bool(message)
+        assert all(each.endswith("export its samples at the time codes from 1 to 4") for each in warnings)
+
+    @pytest.mark.parametrize(
+        ("frames", "message"),
+        [
+            ((1.0, 3.0), ""),
+            ((2.0, 6.0), "from 0 to 4, those of </World/cloth> from 1 to 6; it stands still after 4; export its"),
+        ],
+    )
+    def test_a_frame_range_cuts_no_samples_off_in_words(
+        self, tmp_path: Path, frames: tuple[float, float], message: str
+    ):
+        """Whether a body stands still is asked of the frames refined, and told with all samples of the garment."""
+        stage = new_stage(tmp_path / "s.usda")
+        add_sheet(stage, times=range(1, 7))
+        add_sheet(stage, "/World/floor", times=range(5), tagged=False).GetPrim().AddAppliedSchema(COLLIDER_API)
+        warnings = [
+            each
+            for each in inspect_shot(save(stage), frames=frames)["warnings"]
+            if "</World/floor>: its samples" in each
+        ]
+        assert [message in each for each in warnings] == [True] * bool(message)
 
     def test_that_a_file_of_another_rate_moves_are_named(self, tmp_path: Path):
         for name, rate in (("cloth", 25.0), ("floor", None)):

@@ -15,7 +15,7 @@ from ...usd.files import check_targets, files_of
 from ...usd.read.meshes import DrawnMesh, DrawnStage, refined_in, shot_of
 from ...usd.write.atomic import check_place, make_file, prepare_target, publish, temporary_path
 from .drawing import BACKGROUND, View, draw, encode_color, fit_view, vertex_normals
-from .worst import CLOSE, Worst
+from .worst import CLOSE, CloseUp
 
 STILL, LOOP = ".png", ".gif"
 """Formats by suffix."""
@@ -144,26 +144,24 @@ class Pictures:
         floor = float(points[:, 1].min() - 0.03 * np.ptp(points, axis=0).max())
         return [self._compose(self._sides(code), code, view, floor) for code in codes]
 
-    def draw_close(self, worst: Worst) -> Image.Image:
-        """Draw both sides around a place in refined cloth, seen from the cloth's outer side.
+    def draw_close(self, close: CloseUp) -> Image.Image:
+        """Draw both sides around a place in refined cloth, seen from its outer side, the first in open view if any.
 
         Raises:
             StageError: The stage does not show the mesh.
         """
-        sides = self._sides(worst.time)
-        mesh = next((each for each in sides[-1] if each.path == worst.path), None)
+        sides = self._sides(close.time)
+        mesh = next((each for each in sides[-1] if each.path == close.path), None)
         if mesh is None:
-            raise StageError(f"nothing to draw: <{worst.path}> is not shown")
-        place, middle = mesh.points[worst.vertex], mesh.points.mean(axis=0)
-        outward = vertex_normals(mesh)[worst.vertex]
-        outward *= 1.0 if outward @ (place - middle) >= 0 else -1.0
+            raise StageError(f"nothing to draw: <{close.path}> is not shown")
         radius = CLOSE * float(np.linalg.norm(np.ptp(mesh.points, axis=0)))
-        azimuth, elevation = np.degrees([np.arctan2(outward[0], outward[2]), np.arcsin(np.clip(outward[1], -1.0, 1.0))])
+        normals = vertex_normals(mesh)
+        views = [(mesh.points[vertex], _angles(mesh.points, vertex, normals[vertex])) for vertex in close.vertices]
+        place, angles = next((each for each in views if _is_open(sides[-1], *each, radius=radius)), views[0])
         ball = place + radius * np.concatenate([np.eye(3), -np.eye(3)])
-        angles = {"azimuth": float(azimuth), "elevation": float(np.clip(elevation, *ELEVATIONS))}
-        view = fit_view(ball, self._panel[0] / self._panel[1], **angles)
+        view = fit_view(ball, self._panel[0] / self._panel[1], azimuth=angles[0], elevation=angles[1])
         view = replace(view, nearest=float(np.linalg.norm(place - view.eye)) - 2.0 * radius)
-        return self._compose(sides, worst.time, view, -np.inf)
+        return self._compose(sides, close.time, view, -np.inf)
 
     def _in_picture(self, meshes: Sequence[DrawnMesh]) -> np.ndarray:
         """Points in a box a little larger than the garments, to show the surrounding body."""
@@ -197,6 +195,36 @@ class Pictures:
             place = (self._size[0] - self._size[1] // 36, self._size[1] - self._size[1] // 24)
             pen.text(place, f"{code:g}", FAINT, ImageFont.load_default(max(self._size[1] // 40, 8)), anchor="rs")
         return picture
+
+
+def _angles(points: np.ndarray, vertex: int, normal: np.ndarray) -> tuple[float, float]:
+    """Azimuth and elevation of the outer side of a mesh at a vertex [degrees]."""
+    outward = normal if normal @ (points[vertex] - points.mean(axis=0)) >= 0 else -normal
+    elevation = float(np.degrees(np.arcsin(np.clip(outward[1], -1.0, 1.0))))
+    return float(np.degrees(np.arctan2(outward[0], outward[2]))), float(np.clip(elevation, *ELEVATIONS))
+
+
+def _is_open(meshes: Sequence[DrawnMesh], place: np.ndarray, angles: tuple[float, float], *, radius: float) -> bool:
+    """Whether no vertex beside the line of sight, and no face across it, stands before a place.
+
+    Args:
+        angles: Azimuth and elevation of the line of sight [degrees].
+        radius: Radius of the picture [m]; what stands less than a quarter of it before the place belongs to the place.
+    """
+    azimuth, elevation = np.radians(angles)
+    way = np.array([np.sin(azimuth) * np.cos(elevation), np.sin(elevation), np.cos(azimuth) * np.cos(elevation)])
+    right = np.array([np.cos(azimuth), 0.0, -np.sin(azimuth)])
+    for mesh in meshes:
+        x, y, before = np.stack([right, np.cross(way, right), way]) @ (mesh.points - place).T
+        hides = before > 0.25 * radius
+        if (hides & (np.hypot(x, y) < 0.5 * radius)).any():
+            return False
+        a = mesh.triangles[hides[mesh.triangles].all(axis=1)]
+        b = np.roll(a, 1, axis=1)
+        turns = np.sign(x[a] * y[b] - x[b] * y[a])
+        if (np.abs(turns.sum(axis=1)) == 3.0).any():
+            return False
+    return True
 
 
 def label(pen: ImageDraw.ImageDraw, corner: tuple[int, int], height: int, *, lines: Sequence[str]) -> None:

@@ -20,7 +20,7 @@ from ..report import RefineReport
 from .document import document, table
 from .plot import SCRIPT, plot
 from .series import Series, add_jerk, read_series
-from .worst import verdict, worst_place
+from .worst import close_up, verdict
 
 SIZE = (1280, 640)
 PLOTS = (
@@ -31,7 +31,7 @@ PLOTS = (
     ("depth", "Deepest vertex inside bodies [mm]"),
     ("crossings", "Edges through faces"),
     ("jerk", "Jerk of the detail: third difference between samples, RMS [fine edges]"),
-    ("time", "Time [ms]"),
+    ("time", "Wall time [ms]"),
 )
 
 
@@ -115,17 +115,17 @@ def _warnings(report: RefineReport) -> str:
 
 
 def _pictures(report: RefineReport, shot: Shot) -> str:
-    """A close picture of the worst place, and coarse beside fine at a few time codes."""
+    """A close picture of the worst place or the best fold, and coarse beside fine at a few time codes."""
     title = "<h2>Before and after</h2>"
     if find_spec("PIL") is None:
         return f"{title}<p class='note'>No pictures: PIL is missing; pip install 'physgraph-usd[preview]'</p>"
     kind = importlib.import_module(".preview", __package__).Pictures  # Needs an optional extra.
     written = [frame["time"] for frame in report.frames if "garments" in frame]
     times = [written[0], written[-1]][: len(written)]
-    worst = worst_place(report, shot)
+    place = close_up(report, shot)
     try:
         pictures = kind(report.out, Path(report.shot), SIZE, codes=[time for time in written if time is not None])
-        close = "" if worst is None else _figure(pictures.draw_close(worst), f"The worst place: {worst.reason}")
+        close = "" if place is None else _figure(pictures.draw_close(place), place.caption)
         drawn = pictures.draw(times) if times else []
     except (StageError, LayerError) as error:
         return f"{title}<p class='note'>No pictures: {html.escape(str(error))}</p>"
@@ -145,7 +145,7 @@ def _figure(picture: Any, caption: str) -> str:
 
 def _times(report: RefineReport) -> str:
     rows = [(name, f"{seconds:.2f}") for name, seconds in report.seconds.items()]
-    return "<h2>Time</h2>" + table("time", ("stage", "seconds"), rows, numbers=[1])
+    return "<h2>Time</h2>" + table("time", ("stage", "seconds of wall time"), rows, numbers=[1])
 
 
 def _model(report: RefineReport) -> str:

@@ -1,4 +1,4 @@
-"""Head of a report's page: a one-sentence verdict, and the worst place in the refined cloth."""
+"""Head of a report's page: a one-sentence verdict, and the worst place in the refined cloth or its best fold."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from ...solver.frame.scene_frame import SceneCloth
 from ...solver.frame.settings import SolveSettings
 from ...solver.level import Level, build_levels, hinge_geometry, refine_garments
 from ...solver.mesh.elements import hinges_of
+from ...solver.mesh.subdivide import smooth
 from ...solver.scene import recentred
 from ...usd.read.meshes import RefinedLayer
 from ...usd.read.reader import Shot
@@ -24,23 +25,25 @@ from ..report import RefineReport
 
 CLOSE = 0.12
 """Radius of a close picture relative to the diagonal of the mesh's bounds: large enough to show the surroundings."""
+MOST_TRIED = 24
+"""Most places tried for the best fold in open view."""
 CROSSINGS, INSIDE = "edges pass through faces", "vertices are inside bodies"
 
 
 @dataclass(frozen=True)
-class Worst:
-    """A place in refined cloth.
+class CloseUp:
+    """A place in refined cloth for a close picture.
 
     Attributes:
         path: Prim of the refined mesh.
-        vertex: Number of the vertex.
-        reason: Description of the fault.
+        vertices: Numbers of the vertices, the best first; the first in open view is shown.
+        caption: Title of the picture.
     """
 
     time: float | None
     path: str
-    vertex: int
-    reason: str
+    vertices: Sequence[int]
+    caption: str
 
 
 def verdict(report: RefineReport) -> str:
@@ -57,13 +60,13 @@ def verdict(report: RefineReport) -> str:
             right.append(nothing)
     if report.unsettled:
         wrong.append(f"{counted(len({each['time'] for each in report.unsettled}), 'frame')} did not settle")
-    pace = [f"{report.seconds.get('frames', 0.0) / count:.2g} s a frame"] if count else []
+    pace = [f"{report.seconds.get('frames', 0.0) / count:.2g} s of wall time a frame"] if count else []
     sentence = "; ".join([*wrong, ", ".join([*right, *pace])])
     return f"{sentence[:1].upper()}{sentence[1:]}."
 
 
-def worst_place(report: RefineReport, shot: Shot) -> Worst | None:
-    """The place with most crossings and vertices inside bodies; without any, the place with most folds.
+def close_up(report: RefineReport, shot: Shot) -> CloseUp | None:
+    """The place with most crossings and vertices inside bodies; without any, the place that refinement folds most.
 
     Args:
         report: The report of a run with a written layer.
@@ -74,20 +77,24 @@ def worst_place(report: RefineReport, shot: Shot) -> Worst | None:
         return None
     frame = max(frames, key=lambda each: sum(_left(report, each).values()))
     left = {name: count for name, count in _left(report, frame).items() if count}
-    frame = frame if left else max(frames, key=_folds)
+    frame = frame if left else max(frames, key=_bending)
     layer, time = RefinedLayer(report.out), frame["time"]
-    points = [layer.points(shot, index, time) for index in range(len(report.garments))]
+    welds = [source.weld.subdivided(level)[1] for source, level in zip(shot.sources, _levels(report), strict=True)]
+    points = [layer.points(shot, index, time) for index in range(len(welds))]
     if any(each is None for each in points):
         return None
-    cloth = [each for each in points if each is not None]
+    pairs = zip(welds, points, strict=True)  # A shell's outer side comes first.
+    cloth = [weld.joined(each[: len(weld.number)]) for weld, each in pairs if each is not None]
     marks = _faults(report, shot, time, cloth) if left else []
-    reason = "; ".join(f"{count:,} {name}" for name, count in left.items())
+    caption = "The worst place: " + "; ".join(f"{count:,} {name}" for name, count in left.items())
     if not any(each.any() for each in marks):
-        marks, reason = _angles(report, shot, cloth), reason or "nothing is wrong: the sharpest folds"
+        marks, caption = _folds(report, shot, time, cloth), caption if left else "The best fold"
     places = [_densest(each, weight) for each, weight in zip(cloth, marks, strict=True)]
     index = max(range(len(places)), key=lambda each: places[each][1])
+    most = 1 if left else MOST_TRIED
     path = layer.target(shot, index)
-    return None if path is None else Worst(time, path, places[index][0], f"{reason}{at_time(time)}")
+    vertices = [int(np.flatnonzero(welds[index].number == each)[0]) for each in places[index][0][:most]]
+    return None if path is None else CloseUp(time, path, vertices, f"{caption}{at_time(time)}")
 
 
 def _left(report: RefineReport, frame: dict[str, Any]) -> dict[str, int]:
@@ -103,8 +110,10 @@ def _left(report: RefineReport, frame: dict[str, Any]) -> dict[str, int]:
     return found
 
 
-def _folds(frame: dict[str, Any]) -> float:
-    return max(entry.get("sharp_folds") or 0.0 for entry in frame["garments"])
+def _bending(frame: dict[str, Any]) -> float:
+    """Largest bending energy of a garment in a frame [J]."""
+    energies = [(entry.get("energy_joules") or {}).get("output", {}) for entry in frame["garments"]]
+    return max(each.get("bending", 0.0) for each in energies)
 
 
 def _faults(report: RefineReport, shot: Shot, time: float | None, points: Sequence[np.ndarray]) -> list[np.ndarray]:
@@ -123,23 +132,30 @@ def _faults(report: RefineReport, shot: Shot, time: float | None, points: Sequen
     return [(each["penetration"] > 0) + 1.0 * (each["crossing"] > 0) for each in heat]
 
 
-def _angles(report: RefineReport, shot: Shot, points: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Squares of the angles by which the edges at each vertex fold, summed, shape (V,) for each garment."""
-    found = []
-    for garment, level, each in zip(shot.scene.garments, _levels(report), points, strict=True):
-        chain = refine_garments([garment], [level])[0]
-        hinges = hinges_of((chain[-1].mesh if chain else garment.mesh).triangulate().triangles)
-        squares = hinge_geometry(each, hinges)[0] ** 2
-        found.append(np.bincount(hinges[:, :2].ravel(), np.repeat(squares, 2), minlength=len(each)))
+def _folds(report: RefineReport, shot: Shot, time: float | None, points: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Squares of the angles by which the edges at each vertex fold, summed, shape (V,) for each garment.
+
+    Folds of the smoothly subdivided input are subtracted: the input's own corners and hems are no folds of the cloth.
+    """
+    found, cages = [], shot.frame(time).garments
+    for garment, level, fine, cage in zip(shot.scene.garments, _levels(report), points, cages, strict=True):
+        mesh, given = garment.mesh, cage.points
+        for step in refine_garments([garment], [level])[0]:
+            given, mesh = smooth(mesh, step) @ given, step.mesh
+        hinges = hinges_of(mesh.triangulate().triangles)
+        squares, before = (hinge_geometry(each, hinges)[0] ** 2 for each in (fine, given))
+        more = np.maximum(squares - before, 0.0)
+        found.append(np.bincount(hinges[:, :2].ravel(), np.repeat(more, 2), minlength=len(fine)))
     return found
 
 
-def _densest(points: np.ndarray, weights: np.ndarray) -> tuple[int, float]:
-    """The heaviest vertex in the heaviest cube the size of a close picture, and the cube's weight."""
+def _densest(points: np.ndarray, weights: np.ndarray) -> tuple[list[int], float]:
+    """The heaviest vertex of each cube the size of a close picture, the heaviest cube first, and that cube's weight."""
     size = CLOSE * float(np.linalg.norm(np.ptp(points, axis=0)))
     cell = np.unique(np.floor(points / max(size, 1e-9)), axis=0, return_inverse=True)[1].reshape(-1)
     sums = np.bincount(cell, weights)
-    return int(np.where(cell == sums.argmax(), weights, -1.0).argmax()), float(sums.max())
+    heaviest = [int(np.where(cell == each, weights, -1.0).argmax()) for each in np.argsort(-sums)[:MOST_TRIED]]
+    return heaviest, float(sums.max())
 
 
 def _finest(report: RefineReport, shot: Shot) -> Level:

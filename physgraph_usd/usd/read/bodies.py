@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from pxr import Usd, UsdGeom
@@ -47,6 +48,28 @@ class _Faces:
     authored: tuple[np.ndarray, ...]
     drawn: DrawnSurface
     wound: tuple[np.ndarray, np.ndarray]
+
+    @cached_property
+    def authored_triangles(self) -> np.ndarray:
+        """Triangles of the authored faces that are no holes, shape (T, 3)."""
+        counts, indices, _ = self.authored
+        split = PolygonMesh(counts, indices, int(indices.max()) + 1).triangulate()
+        return split.triangles[np.isin(split.face, self.drawn.parents)]
+
+
+@dataclass(frozen=True, eq=False)
+class Polygons:
+    """A subdivided body's authored polygons at one time code, without holes.
+
+    Attributes:
+        points: World positions [m], shape (V, 3).
+        limit: Positions of the same points on the limit surface [m], shape (V, 3).
+        triangles: Corners of the polygons' triangles, shape (T, 3).
+    """
+
+    points: np.ndarray
+    limit: np.ndarray
+    triangles: np.ndarray
 
 
 @dataclass(eq=False)
@@ -121,6 +144,15 @@ class ColliderReader:
         if skinned is not None and skinned.shape == placed.shape:
             placed = skinned
         return Pose(faces.drawn.place(placed), triangles), self._coarse(faces.drawn)
+
+    def polygons(self, time: float | None) -> Polygons | None:
+        """The authored polygons at a time code; None for a body that is drawn as authored, or without a pose."""
+        pose, faces = self.pose(time)[0], self._faces
+        if pose is None or faces is None or faces.drawn.stencil is None:
+            return None
+        points = np.asarray(_array(UsdGeom.Mesh(self.prim).GetPointsAttr(), time), dtype=np.float64)
+        placed = place(points, self._matrix(timecode(time)))
+        return Polygons(placed, pose.points[: len(placed)], faces.authored_triangles)
 
     def _faces_of(self, points: np.ndarray, authored: tuple[np.ndarray, ...]) -> _Faces:
         """The drawn faces; cached while the topology stays the same.

@@ -41,10 +41,10 @@ from ..stage import (
     root_metadata,
     shot_name,
 )
-from ..times import merge, snap, within
+from ..times import merge, none_within, snap, within
 from ..view import StageView
 from .authored import authored_faults
-from .bodies import ColliderReader, read_collider
+from .bodies import ColliderReader, Polygons, read_collider
 from .find import (
     colliders_of,
     disabled_colliders,
@@ -188,6 +188,19 @@ class Shot:
         refuse_far(self.scene, frame)
         refuse_falling(self.scene, frame)
         return frame
+
+    def polygons(self, time: float | None) -> list[Polygons | None]:
+        """Authored polygons of each collider at a time code; None for one that is drawn as authored.
+
+        Raises:
+            StageError: When USD can no longer read the files.
+        """
+        with pxr_errors(f"cannot read {self.path}" + at_time(time)):
+            return [body.polygons(time) for body in self._bodies]
+
+    def offset(self, index: int, time: float | None) -> float:
+        """Distance kept from colliders by a garment, by number, at a time code [m]."""
+        return self._readers[index].values.number("contact:offset", time)
 
     def with_values(self, overrides: Sequence[str]) -> Shot:
         """A copy of the shot with other ``--set`` values in its frames; values read only on opening are kept.
@@ -461,15 +474,14 @@ def _read(
         times = samples.times
         every += times
         if times and not within(times, request.frames):
-            span = f"its authored time codes run from {times[0]:g} to {times[-1]:g}"
+            span = f"its authored time codes run from {times[0]:g} to {times[-1]:g}; give --frames that hold one"
             notices.append(_left_out(prim, f"has no sample in the frame range; {span}"))
         elif skip_invisible and not is_visible(prim, within(times, request.frames)):
             notices.append(_left_out(prim, "is invisible"))
         else:
             readers.append(read_garment(prim, instances, samples, request))
     if request.frames and every and not within(every, request.frames):
-        message = "no sample of the shot lies in frames {:g}:{:g}".format(*request.frames)
-        raise AbsentError(f"{message}; its {len(merge(every))} samples run from {min(every):g} to {max(every):g}")
+        raise none_within(merge(every), request.frames)
     if not readers:
         reasons = "; ".join(str(notice) for notice in notices if "left out" in notice.message)
         raise StageError(f"no garment is left to refine: {reasons}")

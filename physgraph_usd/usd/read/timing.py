@@ -30,20 +30,21 @@ def timing_notices(
 
 def _misses(body: Usd.Prim, garment: GarmentSource, bake: Bake) -> Iterator[str]:
     """Faults of a body's sample times compared with a garment's, in words."""
-    own, cloth = _own_times(body, bake), garment.times
+    own, cloth, every = _own_times(body, bake), garment.times, merge([*garment.times, *garment.left_out])
     if not cloth and UsdGeom.Mesh(body) and UsdGeom.Mesh(body).GetPointsAttr().Get() is None and own:
         yield f"has no points by default, at which still garments are read; its sample at {own[0]:g} is used"
     if len(own) < 2 or not cloth:
         return
-    spans = f"its samples run from {own[0]:g} to {own[-1]:g}, those of <{garment.path}> from {cloth[0]:g} to"
-    spans = f"{spans} {cloth[-1]:g}"
+    spans = f"its samples run from {own[0]:g} to {own[-1]:g}, those of <{garment.path}> from {every[0]:g} to"
+    spans = f"{spans} {every[-1]:g}"
     late, early = own[0] - cloth[0] > SAME_TIME, cloth[-1] - own[-1] > SAME_TIME
     still = " and ".join([f"before {own[0]:g}"] * late + [f"after {own[-1]:g}"] * early)
     held = f"; it stands still {still}" if still else "; its poses are interpolated"
-    if len(merge([*own, *cloth])) == len(own) + len(cloth):
-        yield f"{spans}, and share no time{held}"
+    remedy = f"; export its samples at the time codes from {cloth[0]:g} to {cloth[-1]:g}"
+    if len(merge([*own, *every])) == len(own) + len(every):
+        yield f"{spans}, and share no time{held}{remedy}"
     elif still:
-        yield f"{spans}{held}"
+        yield f"{spans}{held}{remedy}"
 
 
 def _own_times(prim: Usd.Prim, bake: Bake) -> tuple[float, ...]:

@@ -1,0 +1,116 @@
+"""Finds where the polygons of a body would show through cloth that lies on the body's smooth surface.
+
+Cloth keeps its distance from the limit surface of a subdivided body, as renderers draw the body. A viewport that draws
+the authored polygons shows corners outside that surface.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from shlex import join
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from ..errors import counted
+from ..usd.mesh.bind import closest
+from ..usd.read.bodies import DRAWN_WITHIN, Polygons
+from ..usd.read.reader import Shot
+from ..usd.schema import GARMENT
+from ..usd.stage import at_time
+from .frames import Outcome
+from .options import options_of
+
+MOST_FRAMES, EVERY = 8, 8
+"""Most frames of a run in which bodies are compared with the cloth, and least step between them: a comparison takes
+about 30 ms."""
+STEP = 5e-4
+"""Step of the offsets proposed [m]."""
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A body whose polygons stand above a garment in a frame.
+
+    Attributes:
+        garment: Path of the garment.
+        body: Path of the body.
+        height: Largest height of a polygon above the cloth [m].
+        offset: The garment's contact offset at which the cloth covers the polygons [m].
+    """
+
+    garment: str
+    body: str
+    time: float | None
+    height: float
+    offset: float
+
+
+def shown_through(shot: Shot, outcome: Outcome) -> list[Shown]:
+    """Bodies whose polygons stand above refined cloth by more than a body's surface may be off."""
+    found, bodies = [], shot.polygons(outcome.time) if outcome.points else []
+    for index, (garment, cloth) in enumerate(zip(shot.scene.garments, outcome.points, strict=False)):
+        for number in garment.colliders:
+            body, collider = bodies[number], shot.scene.colliders[number]
+            if cloth is None or body is None:
+                continue
+            height, lift = _height(body, cloth, kept=shot.offset(index, outcome.time) + collider.offset)
+            if height > DRAWN_WITHIN:
+                offset = STEP * math.ceil((lift - collider.offset) / STEP)
+                found.append(Shown(garment.path, collider.path, outcome.time, height, offset))
+    return found
+
+
+def _height(body: Polygons, cloth: np.ndarray, *, kept: float) -> tuple[float, float]:
+    """Largest height of polygons above cloth, and of their corners above the limit surface [m]; 0 where none stands.
+
+    Args:
+        cloth: Fine positions [m], shape (V, 3).
+        kept: Distance kept from the limit surface [m]; corners nearer to the surface are below the cloth.
+    """
+    lift = np.linalg.norm(body.points - body.limit, axis=1)
+    raised = np.flatnonzero(lift > kept)
+    if not len(raised):
+        return 0.0, 0.0
+    faces = body.triangles[np.isin(body.triangles, raised).any(axis=1) & np.isfinite(lift[body.triangles]).all(axis=1)]
+    sides = np.linalg.norm(body.points[faces] - body.points[np.roll(faces, 1, axis=1)], axis=2)
+    reach = np.zeros(len(lift))
+    np.maximum.at(reach, faces, 0.5 * sides.max(axis=1, keepdims=True))  # Beyond, the other corner is as near.
+    reach = (reach + lift)[raised]
+    tree = cKDTree(cloth, balanced_tree=False)
+    beside = [np.asarray(each, np.int64) for each in tree.query_ball_point(body.points[raised], reach)]
+    near = cloth[np.unique(np.concatenate(beside))]
+    faces = faces[np.isin(faces, raised[[len(each) > 0 for each in beside]]).any(axis=1)]
+    if not len(faces):
+        return 0.0, 0.0
+    found = closest(near, body.points, faces)
+    corners = faces[found.triangle]
+    place, smooth = (np.einsum("nk,nkd->nd", found.weights, each[corners]) for each in (body.points, body.limit))
+    above = (np.einsum("nd,nd->n", place - near, near - smooth) > 0.0) & (found.distance < lift[corners].max(axis=1))
+    return float(found.distance[above].max(initial=0.0)), float(lift[corners[above]].max(initial=0.0))
+
+
+def frames_compared(count: int) -> range:
+    """Numbers of the frames compared of a run's."""
+    return range(0, count, max(EVERY, math.ceil(count / MOST_FRAMES)))
+
+
+def of_polygons(found: Sequence[Shown]) -> list[str]:
+    """A note of the bodies that viewports without subdivision show through garments, with offsets that hide them."""
+    if not found:
+        return []
+    worst = max(found, key=lambda each: each.height)
+    offsets: dict[str, float] = {}
+    for each in found:
+        offsets[each.garment] = max(offsets.get(each.garment, 0.0), each.offset)
+    others = len(offsets) - 1
+    through = f"<{worst.garment}>" + (f" and {counted(others, 'other garment')}" if others else "")
+    shows = f"viewports that draw <{worst.body}> unsubdivided show it through {through}"
+    return [f"{shows} by up to {1e3 * worst.height:.1f} mm{at_time(worst.time)}; {_options(offsets.items())} hides it"]
+
+
+def _options(offsets: Iterable[tuple[str, float]]) -> str:
+    name = GARMENT["contact:offset"].short
+    return join(options_of("--set", [f"{path}.{name}={offset:.4g}" for path, offset in offsets]))
