@@ -31,7 +31,6 @@ from physgraph_usd.lab.chart.measure import (
     DEFAULT,
     SMOOTH,
     UPSAMPLED,
-    find_curves,
 )
 from physgraph_usd.lab.chart.options import ChartOptions
 from physgraph_usd.lab.chart.peers.run import PEERS, Peer, parse_peers
@@ -39,9 +38,6 @@ from physgraph_usd.lab.chart.reference import Solutions
 from physgraph_usd.lab.chart.run import chart_shot
 from physgraph_usd.lab.chart.table import Chart
 from physgraph_usd.lab.chart.words import settings
-from physgraph_usd.lab.methods import METHODS
-from physgraph_usd.solver.integrate import Method
-from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton
 from physgraph_usd.solver.scene import Frame
 
 ECHO = """
@@ -213,17 +209,6 @@ def test_the_page_in_a_browser(made: tuple[Path, Path, Chart]):
         left = panels * (len(chart.methods) - 1) + beside
         page.wait_for_function(f"document.querySelectorAll('#curves .scatterlayer .trace').length == {left}")
         assert "contact" in page.locator("#terms").text_content()
-
-
-def test_every_integrator_is_found_when_the_chart_is_made(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setitem(METHODS, "newcomer", Method(lambda: QuasiNewton(history=2), nested=True))
-    curves = {curve.name: curve.method.nested for curve in find_curves()}
-    assert set(METHODS) <= set(curves)
-    assert curves["newcomer, flat"] is False
-    assert curves["gd, nested"] is True
-    assert "quasi-newton, flat" not in curves
-    with pytest.raises(UsageError, match="unknown integrator 'nobody'"):
-        find_curves(["nobody"])
 
 
 @pytest.mark.parametrize("changes", [{"count": 0}, {"budget_minutes": -1.0}, {"device": "tpu"}, {"clock": "sun"}])

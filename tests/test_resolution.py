@@ -19,7 +19,7 @@ from stages import add_sheet, author, new_stage, save
 
 from physgraph_usd.shot.notes import of_slack
 from physgraph_usd.solver.fabric import PRESETS, Fabric
-from physgraph_usd.solver.folds import EDGES_PER_WAVE, FOLDING, carried_bend, raised_by
+from physgraph_usd.solver.folds import EDGES_PER_WAVE, raised_by
 from physgraph_usd.solver.forces import elastic_terms
 from physgraph_usd.solver.forces.bending import Bending
 from physgraph_usd.solver.level import Level, build_levels, hinge_geometry, refine_garments
@@ -107,13 +107,6 @@ def test_a_cage_without_slack_is_noted_with_what_makes_folds(squeeze: float):
     assert of_slack(["/coat"], [eased]) == []
 
 
-def test_few_frames_are_read_first_and_last_among_them():
-    _, read = choose(0.1, times=tuple(float(t) for t in range(1001, 1101)))
-    assert len(read) <= 5
-    assert (read[0], read[-1]) == (1001.0, 1100.0)
-    assert choose(0.1)[1] == [None]
-
-
 DENIM = PRESETS["denim"]
 
 
@@ -125,14 +118,6 @@ def level_of(edge: float, **fields: object) -> Level:
 def weight(level: Level, fabric: Fabric, *, raised: bool) -> torch.Tensor:
     terms = elastic_terms(level, [fabric], raised=[raised])
     return next(each for each in terms if isinstance(each, Bending)).weight
-
-
-@pytest.mark.parametrize("fabric", PRESETS.values(), ids=PRESETS)
-def test_the_stiffness_raised_folds_in_five_edges(fabric: Fabric):
-    edge = 0.02
-    stiffest = max(fabric.stretch, fabric.weft_stretch or 0.0)
-    wave = 2.0 * math.pi * math.sqrt(carried_bend(fabric, edge) / (stiffest * FOLDING))
-    assert wave == pytest.approx(EDGES_PER_WAVE * edge)
 
 
 def test_fine_edges_have_the_fabrics_own_bending_to_the_bit():
