@@ -11,7 +11,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 pytest.importorskip("pxr", reason="charts read stages with usd-core")
@@ -27,18 +26,12 @@ from shots import cloth_shot, refine
 from physgraph_usd import cli
 from physgraph_usd.errors import UsageError
 from physgraph_usd.lab.chart.journal import Journal
-from physgraph_usd.lab.chart.measure import (
-    DEFAULT,
-    SMOOTH,
-    UPSAMPLED,
-)
+from physgraph_usd.lab.chart.measure import DEFAULT, SMOOTH, UPSAMPLED
 from physgraph_usd.lab.chart.options import ChartOptions
 from physgraph_usd.lab.chart.peers.run import PEERS, Peer, parse_peers
-from physgraph_usd.lab.chart.reference import Solutions
 from physgraph_usd.lab.chart.run import chart_shot
 from physgraph_usd.lab.chart.table import Chart
 from physgraph_usd.lab.chart.words import settings
-from physgraph_usd.solver.scene import Frame
 
 ECHO = """
 import sys
@@ -121,15 +114,6 @@ def test_shapes_come_nearer_to_the_reference(made: tuple[Path, Path, Chart], tmp
     assert near is not None
     assert 0.0 < near < 0.5 * far
     assert not chart.likeness, "it is drawn where there are solvers outside"
-
-
-def test_positions_of_a_reference_are_found_again_and_not_of_another_chart(tmp_path: Path):
-    points = (np.zeros((4, 3)), np.ones((2, 3)))
-    frame = Frame(time=2.5, garments=(), colliders=())
-    Solutions(tmp_path, fresh=True).keep(2.5, points)
-    moved = tuple(each + np.array([0.003, 0.0, 0.004]) for each in points)
-    assert Solutions(tmp_path, fresh=False).apart_mm(frame, moved) == pytest.approx(5.0)
-    assert Solutions(tmp_path, fresh=True).apart_mm(frame, moved) is None
 
 
 @pytest.mark.slow

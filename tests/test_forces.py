@@ -300,9 +300,7 @@ def gaps_of(x: torch.Tensor, count: int = 40, *, lack: float | None = None, seed
     b, st = rng.dirichlet(np.ones(3), count), rng.uniform(0, 1, (count, 2))
     face = np.arange(count)[:, None] < count // 2
     weight = np.where(
-        face,
-        np.column_stack([np.ones(count), -b]),
-        np.column_stack([1 - st[:, 0], st[:, 0], st[:, 1] - 1, -st[:, 1]]),
+        face, np.column_stack([np.ones(count), -b]), np.column_stack([1 - st[:, 0], st[:, 0], st[:, 1] - 1, -st[:, 1]])
     )
     normal = rng.normal(size=(count, 3))
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)

@@ -25,8 +25,7 @@ def edit(shot: Path) -> tuple[Usd.Stage, UsdGeom.Mesh]:
 
 
 @pytest.mark.parametrize(
-    ("how", "bad"),
-    [("one point", 1e24), ("one point", np.nan), ("scale", 1e24), ("place", 3e38), ("place", np.nan)],
+    ("how", "bad"), [("one point", 1e24), ("one point", np.nan), ("scale", 1e24), ("place", 3e38), ("place", np.nan)]
 )
 def test_a_body_out_of_bounds_is_left_out_there_with_a_word(tmp_path: Path, how: str, bad: float):
     shot = cloth_shot(tmp_path / "shot.usda", times=(1.0, 2.0))

@@ -49,12 +49,7 @@ def test_no_steps_is_the_linear_placement():
 class TestReuse:
     @pytest.mark.parametrize(
         "change",
-        [
-            {"points": wave(REST) + 1e-12},
-            {"fabric": replace(FABRIC, bend=5e-6)},
-            {"guide": 2001.0},
-            {"detail": 0.5},
-        ],
+        [{"points": wave(REST) + 1e-12}, {"fabric": replace(FABRIC, bend=5e-6)}, {"guide": 2001.0}, {"detail": 0.5}],
     )
     def test_anything_that_differs_is_solved_anew(self, change: dict[str, object]):
         one = refiner()

@@ -98,19 +98,6 @@ def test_animated_and_mirrored_parents_are_followed_at_each_time(tmp_path: Path)
         np.testing.assert_allclose(world(shot, time), 0.01 * (held @ matrix[:3, :3].T + matrix[:3, 3]), atol=1e-6)
 
 
-@pytest.mark.parametrize(("metres", "up"), [(1e-3, "Y"), (0.0254, "Z"), (1.0, "Y")])
-def test_s7_the_same_cloth_in_any_unit_and_axis(tmp_path: Path, metres: float, up: str) -> None:
-    stage = new_stage(tmp_path / "s.usda", metres=metres, up=up)
-    mesh = add_sheet(stage, times=())
-    mesh.GetPointsAttr().Set(vec3(sheet_points(1.0) / metres), 1.0)
-    mesh.GetPointsAttr().Set(vec3(sheet_points() / metres))
-    shot = open_shot(save(stage))
-    np.testing.assert_allclose(world(shot, 1.0), sheet_points(1.0), atol=1e-4 * 1e-2)
-    np.testing.assert_allclose(shot.scene.garments[0].rest, sheet_points(), atol=1e-4 * 1e-2)
-    np.testing.assert_allclose(shot.scene.gravity, [0, -9.81, 0] if up == "Y" else [0, 0, -9.81])
-    assert shot.metres_per_unit == metres
-
-
 def test_unauthored_units_are_centimetres_with_the_size_told(tmp_path: Path) -> None:
     stage = new_stage(tmp_path / "s.usda", metres=None)
     add_sheet(stage)

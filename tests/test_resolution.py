@@ -19,10 +19,8 @@ from stages import add_sheet, author, new_stage, save
 
 from physgraph_usd.shot.notes import of_slack
 from physgraph_usd.solver.fabric import PRESETS, Fabric
-from physgraph_usd.solver.folds import EDGES_PER_WAVE, raised_by
-from physgraph_usd.solver.forces import elastic_terms
-from physgraph_usd.solver.forces.bending import Bending
-from physgraph_usd.solver.level import Level, build_levels, hinge_geometry, refine_garments
+from physgraph_usd.solver.folds import EDGES_PER_WAVE
+from physgraph_usd.solver.level import build_levels, hinge_geometry
 from physgraph_usd.solver.mesh.elements import hinges_of
 from physgraph_usd.solver.mesh.subdivide import subdivide_times
 from physgraph_usd.solver.resolution import AUTO, MOST, LevelChoice, choose_levels, sample_frames, sharp_folds
@@ -108,22 +106,6 @@ def test_a_cage_without_slack_is_noted_with_what_makes_folds(squeeze: float):
 
 
 DENIM = PRESETS["denim"]
-
-
-def level_of(edge: float, **fields: object) -> Level:
-    garment = replace(garment_of(*sheet(6, 6, edge)), **fields)
-    return build_levels([garment], refine_garments([garment], [0]))[0]
-
-
-def weight(level: Level, fabric: Fabric, *, raised: bool) -> torch.Tensor:
-    terms = elastic_terms(level, [fabric], raised=[raised])
-    return next(each for each in terms if isinstance(each, Bending)).weight
-
-
-def test_fine_edges_have_the_fabrics_own_bending_to_the_bit():
-    level = level_of(0.004)
-    assert raised_by(DENIM, 0.004) == 1.0
-    assert torch.equal(weight(level, DENIM, raised=True), weight(level, DENIM, raised=False))
 
 
 def test_stiff_cloth_does_not_crumple_where_its_folds_are_not_resolved():

@@ -39,7 +39,7 @@ def test_variants_show_the_same_cloth(sample: Callable[[str], Path], variant: st
     np.testing.assert_allclose(other_normals, normals, atol=1e-7)
 
 
-HEAVY = ("dancer", "torus", "skirt", "block")
+HEAVY = ("dancer", "torus", "skirt", "block", "trims")
 """Samples that take seconds to make."""
 
 

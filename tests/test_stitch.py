@@ -152,8 +152,7 @@ def test_the_old_name_of_the_option_works_and_no_help_shows_it(tmp_path: Path):
 
 class TestRefused:
     @pytest.mark.parametrize(
-        ("order", "message"),
-        [((0, 2), "frames 9:16 are in no chunk"), ((1,), "frames 1:8, 17:24 are in no chunk")],
+        ("order", "message"), [((0, 2), "frames 9:16 are in no chunk"), ((1,), "frames 1:8, 17:24 are in no chunk")]
     )
     def test_a_missing_chunk_by_its_frames(self, runs: Runs, tmp_path: Path, order: tuple[int, ...], message: str):
         with pytest.raises(UsageError, match=message) as caught:

@@ -223,11 +223,7 @@ def test_a_rest_shape_of_another_size_is_told(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("value", "bent", "renamed"),
-    [
-        ("restShape", True, None),
-        ("restShapeDefault", True, "restShape"),
-        (None, False, None),
-    ],
+    [("restShape", True, None), ("restShapeDefault", True, "restShape"), (None, False, None)],
 )
 def test_hinges_rest_flat_or_bent(tmp_path: Path, value: str | None, bent: bool, renamed: str | None) -> None:
     stage = new_stage(tmp_path / "s.usda")

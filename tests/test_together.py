@@ -59,10 +59,7 @@ class TestGarments:
     def test_excluded_from_one_another_they_are_solved_apart_even_when_they_cross(self):
         cloths = [square(4), square(4)]
         cages = [cloths[0][1], cloths[1][1] @ rotation(3).T]
-        garments = [
-            named(cloths[0], "A", apart_from=("/World/B",)),
-            named(cloths[1], "B", apart_from=("/World/A",)),
-        ]
+        garments = [named(cloths[0], "A", apart_from=("/World/B",)), named(cloths[1], "B", apart_from=("/World/A",))]
         together = self.solve(cages, garments)
         for number, alone in enumerate(self.apart(cages, cloths)):
             assert together.points[number].tobytes() == alone.tobytes()

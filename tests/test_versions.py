@@ -17,12 +17,7 @@ from shots import CLOTH, EDGE, cloth_shot
 
 from benchmarks.judge_shot import Job, judged, rippled
 from benchmarks.verdicts import BETTER, EQUAL, FIGURES, UNKNOWN, WORSE, Band, overall, ratio, verdict
-from benchmarks.versions import (
-    RIPPLES,
-    bands_of,
-    main,
-    tables,
-)
+from benchmarks.versions import RIPPLES, bands_of, main, tables
 
 SMALL: dict[str, Any] = {"level": 1, "count": 3}
 

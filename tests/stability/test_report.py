@@ -17,13 +17,7 @@ def test_every_case_of_the_list_has_a_row():
         assert bool(case.bound) == measured, case.number
 
 
-ANEW = (
-    (11, "physgraph"),
-    (11, "adam"),
-    (13, "physgraph"),
-    (15, "adam"),
-    (17, "physgraph"),
-)
+ANEW = ((11, "physgraph"), (11, "adam"), (13, "physgraph"), (15, "adam"), (17, "physgraph"))
 """Cells that take half a second each, two of them failed: turned cloth far away, wrinkles, a crumpled ball, pins."""
 
 
