@@ -235,33 +235,22 @@ def test_the_solve_stops_under_its_tolerance_and_not_before(tolerance: float):
     assert all(move >= tolerance for move in moves[:-1])
 
 
-def held_by_pins(level: int) -> tuple[Metric, np.ndarray, np.ndarray, list[np.ndarray]]:
-    """A metric whose cloth has a fixed side, its matrix, what is free (0 or 1), and the maps between its levels."""
+@pytest.mark.parametrize("level", [0, 1, 2])
+def test_sewn_vertices_move_together_and_the_solve_is_symmetric(level: int):
+    """With a side of the cloth fixed, and a stiffness ten times the cloth's at a third of its vertices."""
     mesh, rest = sheet(6, 5)
     system, _ = finest_system(group_of(mesh, rest, level=level, dtype=torch.float64), wave(rest))
     assert system.level is not None
     assert isinstance(system.field, ForceModule)
     side = system.level.rest[:, :1] > system.level.rest[:, 0].min() + 1e-6
-    matrix, ups = on_edges(system.field.rest_matrix(), system.level.springs.numpy()), system.level.ups
-    metric = Metric(matrix, free=side, dtype=torch.float64, ups=ups)
-    free = side[:, 0].numpy().astype(float)
-    return metric, free[:, None] * matrix.toarray() * free, free, [up.matrix.toarray() for up in ups]
-
-
-def touched(metric: Metric) -> torch.Tensor:
-    """A stiffness at a third of the vertices, ten times the cloth's."""
-    rng = np.random.default_rng(1)
-    some = rng.random(len(metric.diagonal)) < 0.3
-    return torch.as_tensor(some * rng.random(len(some)) * 10.0 * float(metric.diagonal.mean()))
-
-
-@pytest.mark.parametrize("level", [0, 1, 2])
-def test_sewn_vertices_move_together_and_the_solve_is_symmetric(level: int):
-    metric, _, free, _ = held_by_pins(level)
-    label = np.arange(len(free))
+    matrix = on_edges(system.field.rest_matrix(), system.level.springs.numpy())
+    metric = Metric(matrix, free=side, dtype=torch.float64, ups=system.level.ups)
+    rng, label = np.random.default_rng(1), np.arange(len(side))
     label[5], label[9] = 3, 3
-    held = HeldMetric(metric.merged(label), touched(metric))
-    forces = torch.as_tensor(free[:, None, None] * np.random.default_rng(4).normal(size=(len(free), 2, 3)))
+    some = rng.random(len(side)) < 0.3
+    touched = torch.as_tensor(some * rng.random(len(some)) * 10.0 * float(metric.diagonal.mean()))
+    held = HeldMetric(metric.merged(label), touched)
+    forces = side[:, :, None] * torch.as_tensor(np.random.default_rng(4).normal(size=(len(side), 2, 3)))
     moves = [held.solve(forces[:, number].contiguous()) for number in range(2)]
     for move in moves:
         assert torch.equal(move[5], move[3])

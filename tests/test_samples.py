@@ -44,7 +44,7 @@ HEAVY = ("dancer", "torus", "skirt", "block", "trims")
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.slow) if name == "dancer" else name for name in SAMPLES]
+    "name", [pytest.param(name, marks=pytest.mark.slow) if name in ("dancer", "trims") else name for name in SAMPLES]
 )
 def test_stage_is_complete_and_valid(sample: Callable[[str], Path], name: str) -> None:
     validation = pytest.importorskip("pxr.UsdValidation", reason="pxr before 24.11 cannot validate")

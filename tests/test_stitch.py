@@ -307,7 +307,7 @@ def authored(file: Path) -> dict[str, object]:
     }
 
 
-@pytest.mark.parametrize("velocities", [True, False])
+@pytest.mark.parametrize("velocities", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_every_attribute_is_that_of_one_run_where_frames_stand_alone(
     odd_shot: Path, tmp_path: Path, *, velocities: bool
 ):

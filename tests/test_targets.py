@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from layers import errors, open_over, world_metres
+from meshes import grid
 from numpy.typing import ArrayLike
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
 from shots import CLOTH, EDGE, cloth_shot, only, refine, run
@@ -454,12 +455,8 @@ def test_the_sample_keeps_thickness_area_and_buttons(tmp_path: Path, monkeypatch
 
 def sheet(cells: int) -> tuple[np.ndarray, np.ndarray]:
     """A unit square in triangles: positions [m] and corners."""
-    line = np.linspace(0.0, 1.0, cells + 1)
-    y, x = (each.ravel() for each in np.meshgrid(line, line, indexing="ij"))
-    number = np.arange((cells + 1) ** 2).reshape(cells + 1, -1)
-    a, b, c, d = (each.ravel() for each in (number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]))
-    triangles = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
-    return np.stack([x, y, 0.0 * x], axis=1), triangles
+    mesh, points = grid(cells, cells, "triangles")
+    return points / cells, mesh.indices.reshape(-1, 3)
 
 
 def cloud(count: int, depth: float) -> np.ndarray:
