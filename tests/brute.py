@@ -70,35 +70,3 @@ def between(x: Sequence[np.ndarray], faces: Sequence[np.ndarray]) -> int:
                 both = np.concatenate([x[a], x[b]])
                 total += len(crossing_points(both, edges, faces[b] + len(x[a]))[0])
     return total
-
-
-def on_segments(a: np.ndarray, b: np.ndarray, p: np.ndarray) -> np.ndarray:
-    """Place along segments that is closest to points, 0 to 1."""
-    along = b - a
-    return (((p - a) * along).sum(axis=-1) / np.maximum((along**2).sum(axis=-1), 1e-300)).clip(0.0, 1.0)
-
-
-def on_triangles(p: np.ndarray, a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
-    """Closest points of triangles to points: inside where the foot is, else on the best side."""
-    normal = np.cross(b - a, c - a)
-    size = (normal**2).sum(axis=-1)
-    foot = p - ((p - a) * normal).sum(axis=-1, keepdims=True) / size[..., None] * normal
-    inside = np.ones(size.shape, bool)
-    best, least = foot, np.full(size.shape, np.inf)
-    for u, v in ((a, b), (b, c), (c, a)):
-        inside &= (np.cross(v - u, foot - u) * normal).sum(axis=-1) >= 0
-        there = u + on_segments(u, v, p)[..., None] * (v - u)
-        distance = np.linalg.norm(there - p, axis=-1)
-        nearer = distance < least
-        best, least = np.where(nearer[..., None], there, best), np.where(nearer, distance, least)
-    return np.where(inside[..., None], foot, best)
-
-
-def between_edges(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Places along two lines where they are closest, unclamped, by least squares; nan for parallel ones."""
-    u, v, w = b - a, d - c, a - c
-    uu, uv, vv = ((i * j).sum(axis=-1) for i, j in ((u, u), (u, v), (v, v)))
-    wu, wv = (w * u).sum(axis=-1), (w * v).sum(axis=-1)
-    det = uu * vv - uv * uv
-    det = np.where(det > 1e-10 * uu * vv, det, np.nan)
-    return (uv * wv - vv * wu) / det, (uu * wv - uv * wu) / det

@@ -30,11 +30,7 @@ def grid(columns: int = 4, rows: int = 3) -> tuple[np.ndarray, np.ndarray, np.nd
 
 
 def make_shot(
-    path: Path,
-    *,
-    times: Sequence[float] = TIMES,
-    matrix: Gf.Matrix4d | None = None,
-    orientation: str = "rightHanded",
+    path: Path, *, times: Sequence[float] = TIMES, matrix: Gf.Matrix4d | None = None, orientation: str = "rightHanded"
 ) -> Usd.Stage:
     """A coat under a moving rig, in memory of a new layer; saved, and returned for more edits."""
     stage = new_stage(path, metres=0.01, up="Z", rate=30.0)

@@ -250,9 +250,7 @@ def hanging_chain(kind: str, length: float, span: float, fabric: Fabric) -> floa
     """Sag [m] of a narrow strip whose short sides are pinned a span apart."""
     edge = length / 30
     level = level_of_kind(
-        kind,
-        (length, 2 * edge, edge),
-        pinned=lambda p: (p[:, 0] < 0.6 * edge) | (p[:, 0] > p[:, 0].max() - 0.6 * edge),
+        kind, (length, 2 * edge, edge), pinned=lambda p: (p[:, 0] < 0.6 * edge) | (p[:, 0] > p[:, 0].max() - 0.6 * edge)
     )
     points = level.rest.numpy()
     along = points[:, 0] / points[:, 0].max() - 0.5

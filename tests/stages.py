@@ -94,7 +94,13 @@ def add_sheet(
 
 
 def add_mesh(
-    stage: Usd.Stage, path: str, points: ArrayLike, faces: Iterable[Iterable[int]], *, schema: str | None = GARMENT_API
+    stage: Usd.Stage,
+    path: str,
+    points: ArrayLike,
+    faces: Iterable[Iterable[int]],
+    *,
+    schema: str | None = GARMENT_API,
+    scheme: str | None = None,
 ) -> UsdGeom.Mesh:
     """A mesh of faces, by their corners, with default points; a garment unless it gets another schema, or none."""
     mesh, corners = UsdGeom.Mesh.Define(stage, path), [list(map(int, face)) for face in faces]
@@ -103,6 +109,8 @@ def add_mesh(
     mesh.CreatePointsAttr(vec3(np.asarray(points)))
     if schema is not None:
         mesh.GetPrim().AddAppliedSchema(schema)
+    if scheme is not None:
+        mesh.CreateSubdivisionSchemeAttr(scheme)
     return mesh
 
 

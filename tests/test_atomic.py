@@ -50,12 +50,6 @@ def test_a_committed_layer_is_whole(tmp_path: Path, suffix: str) -> None:
     assert list(Sdf.Layer.OpenAsAnonymous(str(target)).ListTimeSamplesForPath(POINTS)) == [0.0, 1.0, 2.0]
 
 
-def test_an_error_leaves_nothing(tmp_path: Path) -> None:
-    with pytest.raises(KeyboardInterrupt):
-        interrupt(tmp_path / "out.usdc")
-    assert names(tmp_path) == []
-
-
 def test_an_error_keeps_the_file_that_was_there(tmp_path: Path) -> None:
     target = tmp_path / "out.usdc"
     target.write_text("old")

@@ -11,6 +11,7 @@ from bodies import box
 from pxr import Sdf, Usd, UsdGeom, UsdPhysics, Vt
 from stages import (
     COLLIDER_API,
+    add_mesh,
     add_sheet,
     add_skeleton,
     author,
@@ -32,14 +33,9 @@ BODY = "/World/body"
 def add_box(stage: Usd.Stage, path: str = BODY, *, times: tuple[float, ...] = ()) -> UsdGeom.Mesh:
     """A box of triangles tagged as a collider; it moves along x by its time."""
     points, triangles = box((1.0, 2.0, 3.0))
-    mesh = UsdGeom.Mesh.Define(stage, path)
-    mesh.CreateSubdivisionSchemeAttr("none")
-    mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(triangles), 3, np.int32)))
-    mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(triangles.ravel()))
-    mesh.CreatePointsAttr(vec3(points))
+    mesh = add_mesh(stage, path, points, triangles, schema=COLLIDER_API, scheme="none")
     for time in times:
         mesh.GetPointsAttr().Set(vec3(points + np.array([time, 0.0, 0.0])), time)
-    mesh.GetPrim().AddAppliedSchema(COLLIDER_API)
     return mesh
 
 

@@ -11,7 +11,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 pytest.importorskip("pxr", reason="charts read stages with usd-core")
@@ -27,22 +26,12 @@ from shots import cloth_shot, refine
 from physgraph_usd import cli
 from physgraph_usd.errors import UsageError
 from physgraph_usd.lab.chart.journal import Journal
-from physgraph_usd.lab.chart.measure import (
-    DEFAULT,
-    SMOOTH,
-    UPSAMPLED,
-    find_curves,
-)
+from physgraph_usd.lab.chart.measure import DEFAULT, SMOOTH, UPSAMPLED
 from physgraph_usd.lab.chart.options import ChartOptions
 from physgraph_usd.lab.chart.peers.run import PEERS, Peer, parse_peers
-from physgraph_usd.lab.chart.reference import Solutions
 from physgraph_usd.lab.chart.run import chart_shot
 from physgraph_usd.lab.chart.table import Chart
 from physgraph_usd.lab.chart.words import settings
-from physgraph_usd.lab.methods import METHODS
-from physgraph_usd.solver.integrate import Method
-from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton
-from physgraph_usd.solver.scene import Frame
 
 ECHO = """
 import sys
@@ -127,15 +116,6 @@ def test_shapes_come_nearer_to_the_reference(made: tuple[Path, Path, Chart], tmp
     assert not chart.likeness, "it is drawn where there are solvers outside"
 
 
-def test_positions_of_a_reference_are_found_again_and_not_of_another_chart(tmp_path: Path):
-    points = (np.zeros((4, 3)), np.ones((2, 3)))
-    frame = Frame(time=2.5, garments=(), colliders=())
-    Solutions(tmp_path, fresh=True).keep(2.5, points)
-    moved = tuple(each + np.array([0.003, 0.0, 0.004]) for each in points)
-    assert Solutions(tmp_path, fresh=False).apart_mm(frame, moved) == pytest.approx(5.0)
-    assert Solutions(tmp_path, fresh=True).apart_mm(frame, moved) is None
-
-
 @pytest.mark.slow
 def test_terms_tell_what_is_worse_without_them(made: tuple[Path, Path, Chart]):
     rows = {row["term"]: row for row in made[2].terms}
@@ -213,17 +193,6 @@ def test_the_page_in_a_browser(made: tuple[Path, Path, Chart]):
         left = panels * (len(chart.methods) - 1) + beside
         page.wait_for_function(f"document.querySelectorAll('#curves .scatterlayer .trace').length == {left}")
         assert "contact" in page.locator("#terms").text_content()
-
-
-def test_every_integrator_is_found_when_the_chart_is_made(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setitem(METHODS, "newcomer", Method(lambda: QuasiNewton(history=2), nested=True))
-    curves = {curve.name: curve.method.nested for curve in find_curves()}
-    assert set(METHODS) <= set(curves)
-    assert curves["newcomer, flat"] is False
-    assert curves["gd, nested"] is True
-    assert "quasi-newton, flat" not in curves
-    with pytest.raises(UsageError, match="unknown integrator 'nobody'"):
-        find_curves(["nobody"])
 
 
 @pytest.mark.parametrize("changes", [{"count": 0}, {"budget_minutes": -1.0}, {"device": "tpu"}, {"clock": "sun"}])

@@ -14,12 +14,10 @@ import numpy as np
 import pytest
 from cloth import rms
 from frame_solvers import counting
-from hypothesis import given
-from hypothesis import strategies as st
 from shots import EDGE, cloth_shot, faults, fine, interrupted, refine, run, sample_times
 
 from physgraph_usd.errors import LayerError, SolveError
-from physgraph_usd.shot.chunks import chunks_of, solve_in_chunks
+from physgraph_usd.shot.chunks import solve_in_chunks
 from physgraph_usd.shot.frames import FrameFolder, Outcome
 from physgraph_usd.shot.processes import cores, memory_is_named, result_of, separate_processes
 from physgraph_usd.solver.mesh.kernels import cards_for
@@ -27,15 +25,6 @@ from physgraph_usd.solver.mesh.kernels import cards_for
 SEAM = 5e-2
 """Largest difference that the number of workers makes, RMS over a frame, in fine edge lengths; 0.036 was measured."""
 LONG = tuple(float(time) for time in range(1, 25))
-
-
-@given(missing=st.sets(st.integers(0, 60)), workers=st.integers(1, 80))
-def test_chunks_cover_what_is_missing_once_evenly(missing: set[int], workers: int):
-    chunks = chunks_of(sorted(missing), workers)
-    assert [index for chunk in chunks for part in chunk for index in part] == sorted(missing)
-    sizes = [sum(map(len, chunk)) for chunk in chunks]
-    assert len(chunks) <= workers
-    assert not sizes or max(sizes) - min(sizes) <= 1
 
 
 @pytest.mark.parametrize(

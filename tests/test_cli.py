@@ -10,10 +10,8 @@ import sys
 import sysconfig
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import fields
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -23,24 +21,10 @@ from pxr import Usd
 from shots import CLOTH, cloth_shot, run
 
 from physgraph_usd import cli, errors
-from physgraph_usd.cli.refine import refine
 from physgraph_usd.shot.report import RefineReport
 
 Sample = Callable[[str], Path]
 SMALL = ("--frames", "1:2", "--level", "1")
-
-
-@pytest.fixture
-def refined(monkeypatch: pytest.MonkeyPatch) -> list[SimpleNamespace]:
-    """Calls of refine_shot, which does nothing here."""
-    calls: list[SimpleNamespace] = []
-
-    def refine_shot(shot: str, out: Path, options: object) -> RefineReport:
-        calls.append(SimpleNamespace(shot=shot, out=out, options=options))
-        return RefineReport(shot, out, {})
-
-    monkeypatch.setattr("physgraph_usd.shot.refine.refine_shot", refine_shot)
-    return calls
 
 
 class TestInstalled:
@@ -72,13 +56,6 @@ class TestInstalled:
             subprocess.run([script, "--help"], capture_output=True, check=True)
             seconds.append(sum(os.times()[2:4]) - start)
         assert min(seconds) < 0.5
-
-
-def test_module_is_the_command() -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "physgraph_usd", "--version"], capture_output=True, text=True, check=True
-    )
-    assert done.stdout.startswith("physgraph-usd, version")
 
 
 @pytest.mark.parametrize("command", sorted(cli.main.commands))
@@ -139,13 +116,6 @@ class TestRefine:
             assert result.stderr.startswith("error: cannot write"), result.stderr
         assert [file.name for file in tmp_path.iterdir()] == ["file"]
 
-    def test_every_option_is_one_of_the_call(self) -> None:
-        from physgraph_usd.shot.options import RefineOptions
-
-        own = {"shots", "out", "summary", "config", "verbose", "log_file", "seam_bound", "openjd", "debug"}
-        declared = {parameter.name for parameter in refine.params} - own
-        assert declared == {field.name for field in fields(RefineOptions)} - {"sources"}
-
 
 class TestSeveralShots:
     @pytest.fixture
@@ -159,13 +129,6 @@ class TestSeveralShots:
 
         monkeypatch.setattr("physgraph_usd.shot.refine.refine_shots", refine_shots)
         return asked
-
-    def test_each_gets_its_files(self, jobs: list[tuple[str, Path, Any]], tmp_path: Path) -> None:
-        result = run("refine", "a/one.usda", "b/two.usd", "-o", tmp_path / "out", "--report", tmp_path / "reports")
-        assert result.exit_code == 0
-        assert [out.name for _, out, _ in jobs] == ["one.refined.usdc", "two.refined.usdc"]
-        assert [options.report for *_, options in jobs] == [tmp_path / "reports" / name for name in ("one", "two")]
-        assert not list(tmp_path.iterdir()), "folders that nothing came into stay"
 
     def test_an_interruption_while_folders_are_made_leaves_none(
         self, jobs: list[tuple[str, Path, Any]], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
@@ -221,26 +184,6 @@ class TestErrors:
         assert (type(there), str(there), vars(there)) == (kind, str(error), vars(error))
 
     @pytest.mark.parametrize(
-        ("error", "code"),
-        [
-            (errors.UsageError("unknown integrator 'x'"), 2),
-            (errors.StageError("cannot open"), 1),
-            (errors.GarmentError("/A", "NaN", time=4.0), 1),
-            (errors.SolveError("energy is not finite"), 1),
-            (errors.LayerError("disk full"), 1),
-        ],
-    )
-    def test_code_and_message(
-        self, error: errors.PhysGraphError, code: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-    ) -> None:
-        def fail(*_: object) -> None:
-            raise error
-
-        monkeypatch.setattr("physgraph_usd.shot.refine.refine_shot", fail)
-        result = run("refine", "a.usda", "-o", tmp_path / "a.usdc")
-        assert (result.exit_code, result.stdout, result.stderr) == (code, "", f"error: {error}\n")
-
-    @pytest.mark.parametrize(
         "args",
         [
             ("refine", "a.usda"),
@@ -268,18 +211,6 @@ class TestErrors:
         assert (result.exit_code, result.stdout) == (2, "")
         assert result.stderr == f"error: no such file: {tmp_path / 'missing.usda'}\n"
         assert not list(tmp_path.iterdir())
-
-    def test_done_in_part_is_3(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-        report = RefineReport("a.usda", tmp_path / "a.usdc", {}, failed={"3": "is torn"})
-        report.frames, report.seconds = [{}, {}], {"frames": 1.0}
-
-        def refine_shot(*_: object) -> RefineReport:
-            report.warn("frame 3 failed")
-            return report
-
-        monkeypatch.setattr("physgraph_usd.shot.refine.refine_shot", refine_shot)
-        result = run("refine", "a.usda", "-o", report.out)
-        assert (result.exit_code, result.stderr) == (3, "warning: frame 3 failed\n")
 
     def test_missing_extra_is_named(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
         monkeypatch.delitem(sys.modules, "physgraph_usd.shot.page.preview", raising=False)
@@ -315,11 +246,6 @@ class TestOtherCommands:
         stage.Save()
         result = run("inspect", shot)
         assert (result.exit_code, f"<{CLOTH}>.physgraph:colliders: no prim at </World/gone>" in result.stdout) == (1, 1)
-
-    def test_preview(self, sample: Sample, tmp_path: Path) -> None:
-        picture = tmp_path / "picture.png"
-        result = run("preview", sample("swatch"), "-o", picture, "--size", "160x80")
-        assert (result.exit_code, result.stdout) == (0, f"{picture}\n")
 
 
 def test_a_terminal_has_each_message_on_a_line_of_its_own(tmp_path: Path) -> None:

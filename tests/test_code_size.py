@@ -131,6 +131,22 @@ def test_docstrings_begin_with_what_the_thing_is() -> None:
     assert not {text for text in texts if re.search(r": (The same|As|What)\b", text)}
 
 
+def test_a_name_means_one_thing() -> None:
+    """A constant or a class of the solver has a name of its own."""
+    places: dict[str, set[str]] = {}
+    for file, tree in trees().items():
+        for node in tree.body if file.startswith(f"{PACKAGE}/solver/") else ():
+            targets = [node.target] if isinstance(node, ast.AnnAssign) else getattr(node, "targets", [])
+            names = [each for target in targets for each in getattr(target, "elts", [target])]
+            found = [each.id for each in names if isinstance(each, ast.Name) and each.id.isupper()]
+            found += [node.name] if isinstance(node, ast.ClassDef) else []
+            for name in found:
+                if not name.startswith("_"):
+                    places.setdefault(name, set()).add(file)
+    assert places
+    assert {name: files for name, files in places.items() if len(files) > 1} == {}
+
+
 def test_no_paths_of_one_machine() -> None:
     assert MACHINE_PATH.search("see " + "/".join(["", "home", "someone"]))
     assert not MACHINE_PATH.search("#!/usr/bin/env bash, </World/work/Coat>, ../tmp/x, https://example.org/opt/x")

@@ -10,8 +10,8 @@ import pytest
 from bodies import around, ball, flipped, pane, signed, split, surfaces, together, tube
 from cloth import sheet
 from folds import frame_with, measured, named, refiner_with
-from pxr import Usd, UsdGeom, Vt
-from stages import COLLIDER_API, add_sheet, author, new_stage, save, set_matrix, vec3
+from pxr import Usd, UsdGeom
+from stages import COLLIDER_API, add_mesh, add_sheet, author, new_stage, save, set_matrix
 
 from physgraph_usd.errors import SchemaError
 from physgraph_usd.solver.contact.broad_phase import Bodies
@@ -101,12 +101,7 @@ class TestOnStages:
     def stage(self, tmp_path: Path) -> Usd.Stage:
         made = new_stage(tmp_path / "s.usda")
         add_sheet(made)
-        points, triangles = pane()
-        mesh = UsdGeom.Mesh.Define(made, BODY)
-        mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(triangles), 3, np.int32)))
-        mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(triangles.ravel()))
-        mesh.CreatePointsAttr(vec3(points))
-        mesh.GetPrim().AddAppliedSchema(COLLIDER_API)
+        add_mesh(made, BODY, *pane(), schema=COLLIDER_API)
         return made
 
     def side(self, stage: Usd.Stage) -> str:

@@ -13,10 +13,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from cloth import sheet
-from pxr import UsdGeom, Vt
 from sheets import garment_of
 from shots import cloth_shot, command, fine, refine, run
-from stages import add_sheet, new_stage, save, sheet_faces, vec3
+from stages import add_sheet, new_stage, save, vec3
 
 from physgraph_usd.errors import GarmentError
 from physgraph_usd.shot.estimate import cannot_fit, estimate
@@ -95,16 +94,13 @@ SIZE = (156, 40)
 def long_shot(path: Path, frames: int) -> Path:
     """A banner whose waves travel: every frame differs."""
     stage = new_stage(path, metres=0.02)
-    mesh = UsdGeom.Mesh.Define(stage, "/World/cloth")
-    counts, indices = sheet_faces("quads", SIZE)
-    mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(counts))
-    mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(indices))
+    mesh = add_sheet(stage, times=(), size=SIZE)
     x, y = (grid.ravel() for grid in np.meshgrid(np.arange(SIZE[0] + 1.0), np.arange(SIZE[1] + 1.0)))
-    points = mesh.CreatePointsAttr(vec3(np.stack([x, y, 0 * x], axis=1)))
+    points = mesh.GetPointsAttr()
+    points.Set(vec3(np.stack([x, y, 0 * x], axis=1)))
     for frame in range(frames):
         wave = 0.8 * np.sin(0.3 * x + 0.1 * y - 0.2 * frame)
         points.Set(vec3(np.stack([0.95 * x, y, wave], axis=1)), float(frame))
-    mesh.GetPrim().AddAppliedSchema("PhysGraphGarmentAPI")
     return Path(save(stage))
 
 

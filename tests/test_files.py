@@ -111,8 +111,7 @@ def test_links_and_detours_lead_to_the_same_file(
 
 
 @pytest.mark.parametrize(
-    "targets",
-    [("-o", "fine.usda", "--root", "fine.usda"), ("-o", "a/fine.usdc", "--root", "b/fine.usdc")],
+    "targets", [("-o", "fine.usda", "--root", "fine.usda"), ("-o", "a/fine.usdc", "--root", "b/fine.usdc")]
 )
 def test_two_results_are_not_one_file(tmp_path: Path, targets: tuple[str, ...]) -> None:
     shot = cloth_shot(tmp_path / "shot.usdc")

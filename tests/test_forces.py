@@ -16,7 +16,7 @@ from sheets import KINDS, Sheet, garment_of, irregular, level_of, quality, rotat
 from torch import Tensor
 
 from physgraph_usd.solver.forces.base import Force, ForceModule
-from physgraph_usd.solver.forces.bending import Bending, hinge_jacobian
+from physgraph_usd.solver.forces.bending import Bending
 from physgraph_usd.solver.forces.gravity import Gravity
 from physgraph_usd.solver.forces.guide import Guide, GuideMap
 from physgraph_usd.solver.forces.membrane import Membrane
@@ -160,67 +160,25 @@ def test_a_module_that_remembers_evaluates_its_own_terms_once_at_the_same_positi
     assert own.asked == 3
 
 
-CORNERS = [0, 1, 2, 4]
-"""Columns of hinges between triangles, without the corners that stand twice."""
-
-
 def sheet(kind: str = "irregular") -> Sheet:
     points, triangles = KINDS[kind](0.5, 0.4, 0.1)
     return points @ rotation(5).T + 0.3, triangles
 
 
-def dense(force: Force, x: Tensor) -> np.ndarray:
-    """Hessian by finite differences, shape (V, 3, V, 3)."""
-    flat = plain_hessian(force, x)
-    return flat.reshape(len(x), 3, len(x), 3)
-
-
-def matrix_of(force: Force) -> np.ndarray:
-    matrix = force.rest_matrix()
-    assert matrix is not None
-    return matrix.toarray()
-
-
-def plain_hessian(force: Force, x: Tensor, step: float = 1e-6) -> np.ndarray:
-    columns = []
-    for v in range(len(x)):
-        for axis in range(3):
-            moved = x.clone()
-            moved[v, axis] += step
-            ahead = evaluate(force, moved)[1]
-            moved[v, axis] -= 2 * step
-            columns.append(((evaluate(force, moved)[1] - ahead) / (2 * step)).reshape(-1).numpy())
-    return np.array(columns)
-
-
-@pytest.mark.parametrize("name", ["membrane", "bending"])
-def test_diagonal_away_from_rest(name: str):
-    """The stretched membrane's block without the curvature of its sine; bending's without that of its angle."""
-    points, triangles = sheet()
-    level = level_of(points, triangles)
-    force = force_of(name, level)
-    if name == "membrane":
-        x = 1.2 * level.rest + 0.01 * crumple(points, 0.2, 4)
-        expected = np.einsum("vava->v", dense(force, x)) / 3
-    else:
-        assert isinstance(force, Bending)
-        x = crumple(points, 0.02, 4)
-        hinges = level.hinges[:, CORNERS]
-        jacobian = hinge_jacobian(x, hinges)
-        expected = np.zeros(len(x))
-        for hinge, rows, weight in zip(hinges.tolist(), jacobian.numpy(), force.weight.tolist(), strict=True):
-            for vertex, row in zip(hinge, rows, strict=True):
-                expected[vertex] += weight * row @ row / 3
-    assert np.allclose(force.diagonal(x).numpy(), expected, rtol=5e-3 if name == "membrane" else 1e-5)
-
-
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", INTERNAL)
 def test_rest_matrix_is_the_trace_of_the_flat_hessian(name: str, kind: str):
-    level = level_of(*sheet(kind))
-    force = force_of(name, level)
-    trace = np.einsum("vawa->vw", dense(force, level.rest))
-    assert np.allclose(matrix_of(force), trace, atol=1e-6 * np.abs(trace).max())
+    level, step = level_of(*sheet(kind)), 1e-6
+    force, trace = force_of(name, level), np.zeros((level.vertex_count,) * 2)
+    for v in range(len(trace)):
+        for axis in range(3):
+            shift = torch.zeros_like(level.rest)
+            shift[v, axis] = step
+            behind, ahead = (evaluate(force, level.rest + sign * shift)[1] for sign in (-1, 1))
+            trace[v] += ((behind - ahead) / (2 * step))[:, axis].numpy()
+    matrix = force.rest_matrix()
+    assert matrix is not None
+    assert np.allclose(matrix.toarray(), trace, atol=1e-6 * np.abs(trace).max())
 
 
 def refined() -> Level:
@@ -260,9 +218,11 @@ def null_vector(matrix: np.ndarray, fixed: np.ndarray) -> np.ndarray:
     return np.linalg.svd(constraints)[2][-1]
 
 
-def levels_of(mesh: PolygonMesh, rest: np.ndarray, depth: int = 0) -> tuple[Level, ...]:
+def levels_of(
+    mesh: PolygonMesh, rest: np.ndarray, depth: int = 0, *, dtype: torch.dtype = torch.float64
+) -> tuple[Level, ...]:
     garment = garment_of(mesh, rest, bent=True)
-    return build_levels([garment], refine_garments([garment], [depth]), dtype=torch.float64)
+    return build_levels([garment], refine_garments([garment], [depth]), dtype=dtype)
 
 
 def test_no_corner_of_a_quad_is_the_first():
@@ -280,10 +240,14 @@ def test_no_corner_of_a_quad_is_the_first():
 
 @pytest.mark.parametrize("name", INTERNAL)
 def test_forces_of_triangles_beside_quads_are_minus_the_gradient(name: str):
+    """In single precision they are the same forces."""
     mesh, flat = grid(4, 2, "mixed")
-    level = levels_of(mesh, flat + np.random.default_rng(0).normal(scale=0.05, size=flat.shape))[0]
-    force, x = force_of(name, level), crumple(flat, 0.1, 2)
-    assert apart(evaluate(force, x)[1], difference_force(force, x, 1e-3)) < 1e-6
+    rest = flat + np.random.default_rng(0).normal(scale=0.05, size=flat.shape)
+    single, double = (force_of(name, levels_of(mesh, rest, dtype=dtype)[0]) for dtype in (torch.float32, torch.float64))
+    x = crumple(flat, 0.1, 2)
+    force = evaluate(double, x)[1]
+    assert apart(force, difference_force(double, x, 1e-3)) < 1e-6
+    assert apart(evaluate(single, x.float())[1].double(), force) < 3e-5
 
 
 @pytest.mark.parametrize(
@@ -319,9 +283,7 @@ def gaps_of(x: torch.Tensor, count: int = 40, *, lack: float | None = None, seed
     b, st = rng.dirichlet(np.ones(3), count), rng.uniform(0, 1, (count, 2))
     face = np.arange(count)[:, None] < count // 2
     weight = np.where(
-        face,
-        np.column_stack([np.ones(count), -b]),
-        np.column_stack([1 - st[:, 0], st[:, 0], st[:, 1] - 1, -st[:, 1]]),
+        face, np.column_stack([np.ones(count), -b]), np.column_stack([1 - st[:, 0], st[:, 0], st[:, 1] - 1, -st[:, 1]])
     )
     normal = rng.normal(size=(count, 3))
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
@@ -359,36 +321,3 @@ def test_they_turn_with_the_cloth():
     energy_there, force_there = evaluate(turned, moved)
     assert energy_there == pytest.approx(energy, rel=1e-9)
     assert apart(force_there, force @ turn.T) < 1e-9
-
-
-class TestRoom:
-    """Constraints on one vertex 1 mm above a floor that wants 3 mm."""
-
-    X = torch.tensor([[0.0, 1e-3, 0.0], [1.0, 0.0, 0.0]], dtype=torch.float64)
-
-    def depths(self, normal: list[float], offset: float, *, side: float = 1.0) -> list[float]:
-        """Depths of the floor's constraint and of another once both share the room [m]."""
-        normals = torch.tensor([[0.0, 1.0, 0.0], normal], dtype=torch.float64)
-        offsets, one = torch.tensor([3e-3, offset], dtype=torch.float64), torch.ones(2, dtype=torch.float64)
-        corners, weight = torch.zeros((2, 4), dtype=torch.int32), torch.zeros((2, 4), dtype=torch.float64)
-        weight[:, 0] = torch.tensor([1.0, side])
-        both = PairConstraints(corners, weight, normals, offsets, one).sharing_room(self.X)
-        return (both.offset - (both.normal * both.vectors(self.X)).sum(dim=1)).tolist()
-
-    def test_a_ceiling_too_low_leaves_the_vertex_the_middle(self):
-        """The ceiling at 2 mm wants 3 mm, too: the vertex is in the middle and nothing pushes."""
-        assert self.depths([0.0, -1.0, 0.0], 1e-3) == pytest.approx([0.0, 0.0], abs=1e-12)
-
-    def test_the_vertex_may_be_the_second_point(self):
-        """A vertex of the ceiling over the cloth: the vector between them points up."""
-        assert self.depths([0.0, 1.0, 0.0], 1e-3, side=-1.0) == pytest.approx([0.0, 0.0], abs=1e-12)
-        assert self.depths([0.0, -1.0, 0.0], 5e-3, side=-1.0)[0] == pytest.approx(2e-3, abs=1e-12)
-
-    def test_whichever_side_the_vertex_is_on(self):
-        """The ceiling at 1 mm below the floor: the middle is 1.5 mm lower, and only the ceiling pushes."""
-        assert self.depths([0.0, -1.0, 0.0], 4e-3) == pytest.approx([-1.5e-3, 1.5e-3], abs=1e-12)
-
-    @pytest.mark.parametrize(("normal", "offset"), [([0.0, -1.0, 0.0], -4e-3), ([0.6, 0.8, 0.0], 5e-3)])
-    def test_what_does_not_contradict_stays(self, normal: list[float], offset: float):
-        """A high ceiling, and a wall that leans the same way."""
-        assert self.depths(normal, offset)[0] == pytest.approx(2e-3, abs=1e-12)

@@ -9,9 +9,7 @@ from pathlib import Path
 
 import pytest
 from fuzz.bases import BASES, write_bases
-from fuzz.files import sizes
 from fuzz.kinds import KINDS
-from fuzz.mutant import make
 from fuzz.trial import GOOD, attempt
 from shots import faults, refine
 
@@ -52,16 +50,6 @@ def test_a_loose_point_does_not_hold_up_the_last_resort(bases: Path, tmp_path: P
     outcome = attempt(40414, (kind,), bases, tmp_path / "loose")
     assert outcome.said == ["shot 'bodies'", "/World/cloth: 2 pairs at one place, 1 loose points, 6 faces"]
     assert outcome.result == "done"
-
-
-def test_a_number_is_always_the_same_mutant(bases: Path, tmp_path: Path):
-    for number in (0, 16, 21, 40):
-        one, two = (make(number, KINDS, bases, tmp_path / f"{number}{copy}")[1] for copy in "ab")
-        assert sizes(one.folder) == sizes(two.folder)
-        assert one.said == two.said
-        assert {k: v for k, v in one.options.items() if k != "root"} == {
-            k: v for k, v in two.options.items() if k != "root"
-        }
 
 
 @pytest.mark.slow

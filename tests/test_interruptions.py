@@ -81,20 +81,22 @@ def finishes(shot: Path, out: Path, whole: bytes, *more: str) -> None:
     assert [file.name for file in out.parent.iterdir()] == [out.name]
 
 
-@pytest.mark.parametrize("seed", [pytest.param(0, marks=pytest.mark.slow), 1])
-def test_a_killed_run_leaves_nothing_under_the_name_and_a_rerun_finishes(
-    shot: Path, whole: bytes, tmp_path: Path, seed: int
+@pytest.mark.parametrize(("seed", "workers"), [pytest.param(0, "1", marks=pytest.mark.slow), (1, "2")])
+def test_a_killed_run_leaves_nothing_under_the_name_nor_a_process_and_a_rerun_finishes(
+    shot: Path, whole: bytes, seed: int, workers: str
 ):
     """At a random moment of the writing; the rerun has the bytes of a run that was left alone (S34)."""
     folder = shot.parent / f"killed{seed}"
     folder.mkdir()
     out = folder / "fine.usdc"
-    with running(shot, out) as process:
+    with running(shot, out, "--workers", workers) as process:
         time.sleep(float(np.random.default_rng(seed).uniform(0.0, 0.25)))
-        alive = process.poll() is None
+        alive, started = process.poll() is None, psutil.Process(process.pid).children(recursive=True)
         process.send_signal(signal.SIGKILL)
         process.wait()
+        assert not psutil.wait_procs(started, timeout=PATIENCE_SECONDS)[1], "workers outlive the run"
     assert alive, "the run was over before it was killed: make it longer"
+    assert started or workers == "1"
     assert (frames_folder(out) / LOCK).exists()
     assert not out.exists()
     finishes(shot, out, whole, *(() if seed else ("--resume",)))
@@ -282,18 +284,7 @@ def test_a_signal_leaves_no_empty_folder(shot: Path, tmp_path: Path, number: sig
     assert [row["state"] for row in json.loads(summary.read_text())["shots"]] == ["not done"] * 2
 
 
-def test_a_killed_run_with_workers_leaves_no_process(shot: Path, tmp_path: Path):
-    with running(shot, tmp_path / "fine.usdc", "--workers", "2") as process:
-        workers = psutil.Process(process.pid).children()
-        process.kill()
-        process.wait()
-        assert not psutil.wait_procs(workers, timeout=PATIENCE_SECONDS)[1], "workers outlive the run"
-
-
-@pytest.mark.parametrize(
-    ("megabytes", "workers"),
-    [(0.3, "1"), pytest.param(0.005, "2", marks=pytest.mark.slow)],
-)
+@pytest.mark.parametrize(("megabytes", "workers"), [(0.3, "1"), pytest.param(0.005, "2", marks=pytest.mark.slow)])
 def test_a_full_disk_is_a_clear_error_and_costs_no_finished_frame(
     shot: Path, whole: bytes, tmp_path: Path, megabytes: float, workers: str
 ):

@@ -33,20 +33,6 @@ def test_paint_is_the_mean_of_the_vertices():
     assert torch.allclose(level.bend_scale, paint[level.hinges[:, :2].long()].mean(dim=1))
 
 
-@pytest.mark.parametrize("depths", [(2, 2), (2, 0), (0, 1)])
-def test_maps_between_levels_compose(depths: tuple[int, int]):
-    levels = two_garments(depths)
-    assert len(levels) == max(depths) + 1
-    cage = torch.randn((levels[0].vertex_count, 3), dtype=torch.float64)
-    x = cage
-    for level in levels[1:]:
-        assert level.from_below is not None
-        x = level.from_below.apply(x)
-        assert torch.allclose(x, level.base.apply(cage))
-        assert torch.allclose(level.smooth_base.apply(torch.ones_like(cage)), torch.ones_like(level.rest))
-    assert levels[0].from_below is None
-
-
 @pytest.mark.parametrize("name", ["stretch", "membrane"])
 def test_uniform_strain_costs_the_same_at_every_level(name: str):
     """A stiffness means the same at every level; of triangles smooth subdivision rounds the corners off."""

@@ -18,7 +18,6 @@ from pxr import Usd
 from shots import CLOTH, cloth_shot
 
 from physgraph_usd.errors import UsageError
-from physgraph_usd.solver.fabric import PRESETS
 from physgraph_usd.studio.live import changes_in
 from physgraph_usd.studio.session import TuneSession
 from physgraph_usd.studio.takes import Shown
@@ -221,15 +220,3 @@ sys.stdout.write("after")
 def test_what_is_refused(session: TuneSession, request_: dict[str, Any]):
     with pytest.raises(UsageError):
         changes_in(request_, session, save=lambda _: None)
-
-
-def test_the_shots_own_values_come_back(session: TuneSession):
-    own = session.value(CLOTH, "bendStiffness")
-    session.set_value(CLOTH, "guide:stiffness", 100.0)
-    for change in changes_in({"authored": [CLOTH], "preset": {CLOTH: "denim"}}, session, save=lambda _: None):
-        change(session)
-    assert session.value(CLOTH, "bendStiffness") == pytest.approx(PRESETS["denim"].bend)
-    assert session.value(CLOTH, "guide:stiffness") == 2000.0
-    (change,) = changes_in({"authored": [CLOTH]}, session, save=lambda _: None)
-    change(session)
-    assert session.value(CLOTH, "bendStiffness") == own

@@ -16,7 +16,6 @@ from physgraph_usd.solver.fabric import PRESETS
 from physgraph_usd.usd.lookup import check_overrides, parse_overrides
 from physgraph_usd.usd.read.materials import Values, find_values
 from physgraph_usd.usd.read.reader import open_shot
-from physgraph_usd.usd.schema import NAMESPACE, PROPERTIES, RETIRED
 from physgraph_usd.usd.stage import read_units
 
 BEND = "physgraph:material:bendStiffness"
@@ -174,11 +173,6 @@ def test_a_retired_attribute_is_told_with_what_replaced_it(stage: Usd.Stage, nam
     author(cloth(stage), name, 1, kind="int")
     instead = "the order of layers is found in the animation, not authored; it can be removed"
     assert told(stage) == [f"</World/rig/cloth>: {name} is no attribute any more: {instead}"]
-
-
-def test_retired_names_are_those_of_no_attribute() -> None:
-    assert not RETIRED.keys() & {row.name for row in PROPERTIES}
-    assert all(name.startswith(NAMESPACE) for name in RETIRED)
 
 
 def test_a_connection_is_followed_one_step(stage: Usd.Stage) -> None:

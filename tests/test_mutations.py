@@ -32,19 +32,3 @@ def test_it_applies_to_the_present_text(mutation: Mutation):
         for name in names:
             (found,) = (each for each in body if isinstance(each, DEFINITIONS) and each.name == name)
             body = found.body
-
-
-def test_a_defect_is_found_where_its_text_was_moved_to(tmp_path: Path):
-    folder = tmp_path / "physgraph_usd" / "inner"
-    folder.mkdir(parents=True)
-    (folder / "new.py").write_text("a = 1\nb = 2\n")
-    mutation = Mutation("x", "old.py", "b = 2", "b = 3", "b", ["tests/test_b.py"])
-    assert place_of(mutation, tmp_path) == folder / "new.py"
-    assert mutated(mutation, tmp_path) == "a = 1\nb = 3\n"
-    (folder / "other.py").write_text("b = 2\n")
-    with pytest.raises(LookupError, match="in 2 files"):
-        place_of(mutation, tmp_path)
-    (folder / "other.py").write_text("")
-    (folder / "new.py").write_text("b = 2\nb = 2\n")
-    with pytest.raises(LookupError, match="2 times"):
-        place_of(mutation, tmp_path)

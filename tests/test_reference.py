@@ -51,11 +51,3 @@ def test_a_bounded_search_compares_two_starts_at_least(found: Reference, bounded
         assert less.seconds < found.seconds
         assert less.apart is not None
         assert 0.0 <= found.gap(less.least) < 0.1
-
-
-def test_who_finds_less_lowers_it():
-    known = Reference(10.0, 2.0, {"stretch": 2.0}, "many steps", 0.001)
-    assert known.lowered({"stretch": 2.0}, "another") is known
-    less = known.lowered({"stretch": 1.5, "bending": -0.5}, "another, 3 steps")
-    assert (less.least, less.by, less.apart) == (1.0, "another, 3 steps", pytest.approx(1.0 / 9.0))
-    assert Reference.of(less.plain()) == less

@@ -12,7 +12,7 @@ import torch
 from layers import world_metres
 from pxr import Sdf, Usd, UsdGeom
 from shots import CLOTH, FAST, TIMES, cloth_shot, fine, refine
-from stages import GARMENT_API, add_sheet, add_skeleton, author, bind_skin, new_stage, sheet_faces, sheet_points, vec3
+from stages import add_sheet, add_skeleton, author, bind_skin, new_stage, sheet_points, vec3
 
 import physgraph_usd as pg
 from physgraph_usd.shot.options import RefineOptions
@@ -159,13 +159,7 @@ class TestStateOfTheStage:
 def test_a_stage_without_any_file():
     stage = Usd.Stage.CreateInMemory("made.usda")
     UsdGeom.SetStageMetersPerUnit(stage, 0.05)
-    mesh = UsdGeom.Mesh.Define(stage, "/cloth")
-    counts, indices = sheet_faces()
-    mesh.CreateFaceVertexCountsAttr(counts)
-    mesh.CreateFaceVertexIndicesAttr(indices)
-    for time in (1.0, 2.0):
-        mesh.CreatePointsAttr().Set(vec3(sheet_points(time)), time)
-    mesh.GetPrim().AddAppliedSchema(GARMENT_API)
+    add_sheet(stage, "/cloth", times=(1.0, 2.0), default=False)
     layer = refined(stage)
     record = layer.customLayerData["physgraph"]
     assert (record.get("shot"), list(record["unsaved"])) == (None, ["made.usda"])

@@ -19,10 +19,8 @@ from stages import add_sheet, author, new_stage, save
 
 from physgraph_usd.shot.notes import of_slack
 from physgraph_usd.solver.fabric import PRESETS, Fabric
-from physgraph_usd.solver.folds import EDGES_PER_WAVE, FOLDING, carried_bend, raised_by
-from physgraph_usd.solver.forces import elastic_terms
-from physgraph_usd.solver.forces.bending import Bending
-from physgraph_usd.solver.level import Level, build_levels, hinge_geometry, refine_garments
+from physgraph_usd.solver.folds import EDGES_PER_WAVE
+from physgraph_usd.solver.level import build_levels, hinge_geometry
 from physgraph_usd.solver.mesh.elements import hinges_of
 from physgraph_usd.solver.mesh.subdivide import subdivide_times
 from physgraph_usd.solver.resolution import AUTO, MOST, LevelChoice, choose_levels, sample_frames, sharp_folds
@@ -107,38 +105,7 @@ def test_a_cage_without_slack_is_noted_with_what_makes_folds(squeeze: float):
     assert of_slack(["/coat"], [eased]) == []
 
 
-def test_few_frames_are_read_first_and_last_among_them():
-    _, read = choose(0.1, times=tuple(float(t) for t in range(1001, 1101)))
-    assert len(read) <= 5
-    assert (read[0], read[-1]) == (1001.0, 1100.0)
-    assert choose(0.1)[1] == [None]
-
-
 DENIM = PRESETS["denim"]
-
-
-def level_of(edge: float, **fields: object) -> Level:
-    garment = replace(garment_of(*sheet(6, 6, edge)), **fields)
-    return build_levels([garment], refine_garments([garment], [0]))[0]
-
-
-def weight(level: Level, fabric: Fabric, *, raised: bool) -> torch.Tensor:
-    terms = elastic_terms(level, [fabric], raised=[raised])
-    return next(each for each in terms if isinstance(each, Bending)).weight
-
-
-@pytest.mark.parametrize("fabric", PRESETS.values(), ids=PRESETS)
-def test_the_stiffness_raised_folds_in_five_edges(fabric: Fabric):
-    edge = 0.02
-    stiffest = max(fabric.stretch, fabric.weft_stretch or 0.0)
-    wave = 2.0 * math.pi * math.sqrt(carried_bend(fabric, edge) / (stiffest * FOLDING))
-    assert wave == pytest.approx(EDGES_PER_WAVE * edge)
-
-
-def test_fine_edges_have_the_fabrics_own_bending_to_the_bit():
-    level = level_of(0.004)
-    assert raised_by(DENIM, 0.004) == 1.0
-    assert torch.equal(weight(level, DENIM, raised=True), weight(level, DENIM, raised=False))
 
 
 def test_stiff_cloth_does_not_crumple_where_its_folds_are_not_resolved():

@@ -11,10 +11,9 @@ from physgraph_usd.errors import UsageError
 from physgraph_usd.lab.train.bundle import RoundBundle, deal
 from physgraph_usd.lab.train.loop import TrainConfig, Trainer
 from physgraph_usd.lab.train.patches import PatchConfig
-from physgraph_usd.lab.train.rounds import Round, RoundConfig, make_rounds, system_of
-from physgraph_usd.solver.contact.metric import HeldMetric
+from physgraph_usd.lab.train.rounds import Round, RoundConfig, make_rounds
 from physgraph_usd.solver.integrate.network import PhysgraphConfig
-from physgraph_usd.solver.integrate.weights import NETWORKS, integrator_of, random_network, shipped_network
+from physgraph_usd.solver.integrate.weights import NETWORKS, shipped_network
 
 FEW = RoundConfig(scenes=2, reference_steps=15, most_vertices=1)
 
@@ -26,27 +25,6 @@ def rounds() -> list[Round]:
 
 def touching(rounds: list[Round]) -> list[Round]:
     return max(deal([each for each in rounds if each.touches], 8), key=len)
-
-
-def test_rounds_side_by_side_move_as_they_do_alone(rounds: list[Round]):
-    some = touching(rounds)
-    assert len(some) > 1
-    bundle = RoundBundle(some, device="cpu", through_forces=True)
-    system, level = bundle.systems[0], bundle.systems[0].level
-    assert isinstance(system.metric, HeldMetric)
-    assert level is not None
-    integrator = integrator_of(random_network(PhysgraphConfig(width=8), seed=1, scale=0.1))
-    together = integrator.start(system, torch.cat([torch.as_tensor(each.x) for each in some]))
-    start = system.energies[-1].clone()
-    together = integrator.step(system, together)
-    for number, (each, span) in enumerate(zip(some, level.spans, strict=True)):
-        alone = system_of([each], device="cpu")
-        carry = integrator.start(alone, torch.as_tensor(each.x))
-        assert carry.energy == pytest.approx(each.start, rel=1e-4)
-        assert float(start[number]) == pytest.approx(each.start, rel=1e-4)
-        carry = integrator.step(alone, carry)
-        apart = float((carry.x - together.x[span]).abs().max())
-        assert apart < 1e-3 * float(alone.spacing.mean())
 
 
 def test_the_energys_gradient_is_minus_the_force(rounds: list[Round]):

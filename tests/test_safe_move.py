@@ -145,15 +145,6 @@ class TestWhatIsFreeToGoGoes:
         scenes = Scenes(4, gap=1e-3, far=0.0, dtype=torch.float64)
         assert not scenes.go(scenes.start + EDGE * np.array([30.0, 7.0, -11.0])).any()
 
-    def test_what_is_in_the_way_holds_up_only_what_it_meets(self):
-        scenes = Scenes(2, gap=0.5, far=0.0, dtype=torch.float64)
-        wanted = scenes.start.copy()
-        first = scenes.owner == 0
-        wanted[first] = mirrored(wanted[first], np.random.default_rng(5))
-        short = scenes.go(wanted)
-        assert short[first].any()
-        assert not short[~first].any()
-
     def test_what_stops_stops_what_comes_behind_it(self):
         """Two sheets fly as fast as one another; the first meets a wall, to which the second would not come."""
         points, faces, count = [], [], 0

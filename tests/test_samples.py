@@ -39,12 +39,12 @@ def test_variants_show_the_same_cloth(sample: Callable[[str], Path], variant: st
     np.testing.assert_allclose(other_normals, normals, atol=1e-7)
 
 
-HEAVY = ("dancer", "torus", "skirt", "block")
+HEAVY = ("dancer", "torus", "skirt", "block", "trims")
 """Samples that take seconds to make."""
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.slow) if name == "dancer" else name for name in SAMPLES]
+    "name", [pytest.param(name, marks=pytest.mark.slow) if name in ("dancer", "trims") else name for name in SAMPLES]
 )
 def test_stage_is_complete_and_valid(sample: Callable[[str], Path], name: str) -> None:
     validation = pytest.importorskip("pxr.UsdValidation", reason="pxr before 24.11 cannot validate")

@@ -102,20 +102,6 @@ def test_an_editor_shows_what_refining_takes_or_nothing(prims: dict[str, Usd.Pri
         assert shown is not None or "cloth" not in givers, row.name
 
 
-@pytest.mark.parametrize("row", [row for row in PROPERTIES if row.soft])
-def test_limits_reach_usd_where_it_knows_them(prims: dict[str, Usd.Prim], row: Property) -> None:
-    attribute = prims[row.schema].GetAttribute(row.name)
-    hard_limits, soft_limits = (getattr(attribute, name, None) for name in ("GetHardLimits", "GetSoftLimits"))
-    if hard_limits is None or soft_limits is None:
-        pytest.skip("limits are native from USD 25.11")
-    for limits, ends in ((hard_limits(), (row.minimum, row.maximum)), (soft_limits(), row.soft or ())):
-        written = {"minimum": limits.GetMinimum(), "maximum": limits.GetMaximum()}
-        for value, end in zip(written.values(), ends, strict=True):
-            own = list(value) if row.interpolation else value
-            assert own == (None if end is None else pytest.approx([end] if row.interpolation else end))
-        assert limits.Validate({key: value for key, value in written.items() if value is not None})
-
-
 def test_schemas_apply_only_where_they_belong(prims: dict[str, Usd.Prim]) -> None:
     xform = UsdGeom.Xform.Define(prims[GARMENT_API].GetStage(), "/x").GetPrim()
     for schema in TYPES:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from pathlib import Path
 
@@ -12,7 +11,6 @@ from pxr import Sdf, Usd, UsdGeom
 from shots import CLOTH, TIMES, cloth_shot, faults, fine, only, refine, sample_times
 
 from physgraph_usd.errors import UsageError
-from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.refine import inspect_shot
 from physgraph_usd.usd.check.validate import validate_layer
 
@@ -36,26 +34,6 @@ class TestDone:
         assert len(target.GetPointsAttr().Get(1.0)) == 13 * 9
         assert sample_times(out, str(target.GetPath())) == TIMES
         assert json.loads(told.read_text())["exit_code"] == 0
-
-    def test_report_in_json(self, shot: Path, tmp_path: Path):
-        told = tmp_path / "fine.json"
-        report = refine(shot, tmp_path / "fine.usdc", report=told)
-        data = json.loads(told.read_text())
-        assert data == json.loads(report.to_json())
-        assert {"shot", "out", "exit_code", "options", "garments", "modelled", "left_out", "frames", "failed"} <= set(
-            data
-        )
-        assert [frame["time"] for frame in data["frames"]] == list(TIMES)
-        levels = data["frames"][0]["garments"][0]["levels"]
-        assert all(entry["energy_after"] <= entry["energy_before"] for entry in levels)
-        assert all(entry["stopped"] for entry in levels)
-        assert data["garments"][0]["path"] == CLOTH
-        assert data["garments"][0]["sources"]
-        assert data["seconds"]["total"] >= data["seconds"]["frames"] > 0
-        assert data["peak_memory_mb"] > 10
-        assert {"contact", "self contact"} <= set(data["left_out"])
-        assert "network" in data["modelled"]
-        assert not (tmp_path / "fine.json.part").exists()
 
     @pytest.mark.parametrize("frames", [None, (2.0, 3.0)])
     def test_what_is_known_before_the_first_frame_is_what_inspect_says_of_the_whole_shot(
@@ -165,16 +143,6 @@ class TestOptions:
         with pytest.raises(UsageError, match="--device auto or cpu"):
             refine(shot, tmp_path / "fine.usdc", device="cuda")
         assert only(tmp_path, "shot.usdc")
-
-    def test_options_that_decide_the_result_are_in_the_record(self, shot: Path, tmp_path: Path):
-        refine(shot, tmp_path / "fine.usdc", steps=3)
-        record = Sdf.Layer.FindOrOpen(str(tmp_path / "fine.usdc")).customLayerData["physgraph"]
-        plain = RefineOptions(level=1, steps=3, heat_map=True, preroll=0).plain()
-        assert set(plain) == {field.name for field in dataclasses.fields(RefineOptions)} - {
-            "progress", "report", "overwrite", "dry_run", "workers", "root", "weights", "asset_paths", "resume",
-            "gravity", "keep_frames", "strict", "skip_existing", "sources", "scheduler",
-        }  # fmt: skip
-        assert json.loads(json.dumps(record, default=str))
 
     def test_an_existing_layer_is_kept_unless_told(self, shot: Path, tmp_path: Path):
         out = tmp_path / "fine.usdc"

@@ -52,24 +52,6 @@ class TestFramesThatFail:
             refine(shot, tmp_path / "fine.usdc")
         assert only(tmp_path, "shot.usdc")
 
-    def test_a_frame_that_cannot_be_read_fails_alone(self, tmp_path: Path):
-        """More than a tenth of the points NaN in the middle of the shot."""
-        shot = cloth_shot(tmp_path / "shot.usdc", broken={4.0: float("nan")})
-        report = refine(shot, tmp_path / "fine.usdc")
-        assert (report.exit_code, list(report.failed)) == (3, ["4"])
-        assert "NaN" in report.failed["4"]
-
-    def test_an_exception_nobody_foresaw_leaves_nothing(
-        self, shot: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ):
-        def fail(*_: object) -> None:
-            raise KeyboardInterrupt
-
-        monkeypatch.setattr("physgraph_usd.solver.frame.refiner.Refiner.solve", fail)
-        with pytest.raises(KeyboardInterrupt):
-            refine(shot, tmp_path / "fine.usdc")
-        assert only(tmp_path, "shot.usdc")
-
 
 CUT = """
 import os, sys

@@ -58,18 +58,6 @@ def test_transforms_between_animation_samples_are_skinned_exactly_there(tmp_path
         np.testing.assert_allclose(points(shot, time), 0.01 * expected, atol=1e-6)
 
 
-def test_the_whole_shot_is_baked_for_any_part_and_other_meshes_are_not(tmp_path: Path) -> None:
-    """What is known of a shot before its first frame is the same whatever part of it is refined."""
-    stage = skinned_stage(tmp_path / "s.usda", tuple(map(float, range(1, 21))))
-    bind_skin(add_sheet(stage, f"{ROOT}/body", times=(), tagged=False), ROOT, joints=JOINTS)
-    shot = open_shot(save(stage), frames=(5.0, 7.0))
-    assert shot.scene.times == (5.0, 6.0, 7.0)
-    cloth, body = (UsdGeom.Mesh.Get(shot.stage, f"{ROOT}/{name}").GetPointsAttr() for name in ("cloth", "body"))
-    assert tuple(cloth.GetTimeSamples()) == shot.every_time == tuple(map(float, range(1, 21)))
-    assert body.GetTimeSamples() == []
-    assert shot.stage.GetPrimAtPath(f"{ROOT}/body").IsActive()
-
-
 def test_a_rigid_mesh_keeps_its_own_transform_and_moves_by_its_points(tmp_path: Path) -> None:
     stage = skinned_stage(tmp_path / "s.usda")
     mesh = UsdGeom.Mesh.Get(stage, f"{ROOT}/cloth")

@@ -16,7 +16,7 @@ from pxr import Sdf, Usd, UsdGeom
 from shots import CLOTH, EDGE, cloth_shot, faults, fine, interrupted, refine, run, sample_times
 from stages import add_sheet, new_stage, save, vec3
 
-from physgraph_usd.errors import AbsentError, LayerError, PhysGraphError, UsageError
+from physgraph_usd.errors import LayerError, PhysGraphError, UsageError
 from physgraph_usd.shot.frames import Finished, kept_for
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.refine import refine_shot
@@ -96,13 +96,6 @@ class TestOneLayer:
                 same = np.allclose(held, fine(runs.shot, runs.joined, time), rtol=0, atol=1e-7)
                 assert same == (time + 6 <= span[1] or time > 16), time
 
-    @pytest.mark.slow
-    def test_holds_the_positions_of_as_many_workers(self, runs: Runs, tmp_path: Path):
-        refine(runs.shot, tmp_path / "workers.usdc", workers=3)
-        for time in TIMES:
-            by_workers = points(tmp_path / "workers.usdc", time)
-            assert np.allclose(by_workers, points(runs.joined, time), rtol=0, atol=1e-6)
-
     def test_is_valid_and_records_what_it_was_made_from(self, runs: Runs):
         assert validate_layer(runs.joined) == []
         record, one = record_of(runs.joined), record_of(runs.one)
@@ -159,8 +152,7 @@ def test_the_old_name_of_the_option_works_and_no_help_shows_it(tmp_path: Path):
 
 class TestRefused:
     @pytest.mark.parametrize(
-        ("order", "message"),
-        [((0, 2), "frames 9:16 are in no chunk"), ((1,), "frames 1:8, 17:24 are in no chunk")],
+        ("order", "message"), [((0, 2), "frames 9:16 are in no chunk"), ((1,), "frames 1:8, 17:24 are in no chunk")]
     )
     def test_a_missing_chunk_by_its_frames(self, runs: Runs, tmp_path: Path, order: tuple[int, ...], message: str):
         with pytest.raises(UsageError, match=message) as caught:
@@ -229,13 +221,6 @@ class TestRefused:
             stitch(chunks, tmp_path / "joined.usdc")
         assert stitch(chunks, tmp_path / "joined.usdc", seam_bound=float("inf"))[1] == []
         assert faults(tmp_path / "joined.usdc", shot) == []
-
-    def test_a_range_without_a_frame(self, tmp_path: Path):
-        shot = cloth_shot(tmp_path / "shot.usdc")
-        with pytest.raises(
-            AbsentError, match=r"no sample of the shot lies in frames 7:9; its 6 samples run from 1 to 6"
-        ):
-            refine_chunks(shot, tmp_path, [(7.0, 9.0)])
 
 
 def test_frames_that_failed_are_named_and_leave_their_seam_unknown(tmp_path: Path):
@@ -322,7 +307,7 @@ def authored(file: Path) -> dict[str, object]:
     }
 
 
-@pytest.mark.parametrize("velocities", [True, False])
+@pytest.mark.parametrize("velocities", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_every_attribute_is_that_of_one_run_where_frames_stand_alone(
     odd_shot: Path, tmp_path: Path, *, velocities: bool
 ):

@@ -11,9 +11,8 @@ from brute import Soup, crossings
 from folds import EDGE, SHAPES, curved, folded, levels_of, named, placed, promise_of, square, strip, view_of
 from scenes import shot
 
-from physgraph_usd.solver.collide.distance import weights
 from physgraph_usd.solver.collide.pairs import Pairs
-from physgraph_usd.solver.contact.along import COMES, ApproachLimits, along
+from physgraph_usd.solver.contact.along import ApproachLimits, along
 from physgraph_usd.solver.contact.cloth import ClothView
 from physgraph_usd.solver.contact.promise import Promise
 from physgraph_usd.solver.forces.self_contact import PairConstraints, SelfContact
@@ -92,12 +91,6 @@ class TestMoves:
         noise = torch.as_tensor(np.random.default_rng(4).normal(size=(len(base), 3)))
         x = promise_of(levels, garments).move(Placed(base), base + size * EDGE * noise)
         assert 0 <= len(crossings(Soup.of(level, x))) <= len(crossings(Soup.of(level, base)))
-
-    @pytest.mark.parametrize("name", ["flat", "curved", "folded", "rolled"])
-    def test_what_is_safe_is_gone_to_itself(self, name: str):
-        _, promise, base = crossed_strip(name)
-        x = base + 1e-4 * torch.sin(100 * base)
-        assert promise.move(Placed(base), x) is x
 
     def test_only_what_is_near_what_would_cross_is_held_back(self):
         """A smooth wave that pushes the upper half of a fold through the lower one in one corner."""
@@ -231,33 +224,6 @@ class TestLayersThatMoveTogether:
 
 
 class TestAlong:
-    def scene(self) -> tuple[torch.Tensor, torch.Tensor, Pairs]:
-        """A vertex over a face, and two edges, that all move up, the lower parts faster."""
-        face = [[0.3, 0.1, 0.3], [0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
-        edges = [[5.0, 0.1, 0.4], [6.0, 0.1, 0.5], [5.5, 0.0, 0.0], [5.4, 0.0, 1.0]]
-        x = torch.tensor(face + edges, dtype=torch.float64)
-        way = torch.zeros_like(x)
-        way[:, 1] = torch.tensor([10.0, 11.0, 11.0, 11.0, 10.0, 10.0, 12.0, 11.0])
-        corners = torch.arange(8, dtype=torch.int32).reshape(2, 4)
-        return x, way, Pairs(corners, torch.ones(2, dtype=torch.float64), torch.tensor([True, False]))
-
-    def test_no_pair_comes_nearer_than_it_may_and_together_they_go_as_far(self):
-        x, way, pairs = self.scene()
-        out = along(way, ApproachLimits.of(x, x, pairs, FLOOR), free=torch.ones(8, 1, dtype=torch.bool))
-        weight = weights(x, pairs.corners, pairs.face)
-        nearer = -(weight * out[pairs.corners.long(), 1]).sum(dim=1)
-        assert torch.allclose(nearer, torch.full_like(nearer, COMES * (0.1 - FLOOR)), atol=1e-6)
-        assert torch.allclose(out.sum(dim=0), way.sum(dim=0))
-
-    def test_what_is_held_goes_its_own_way(self):
-        x, way, pairs = self.scene()
-        free = torch.ones(8, 1, dtype=torch.bool)
-        free[0] = False
-        out = along(way, ApproachLimits.of(x, x, pairs, FLOOR), free=free)
-        assert torch.equal(out[0], way[0])
-        weight = weights(x, pairs.corners, pairs.face)
-        assert float(-(weight[0] * out[pairs.corners[0].long(), 1]).sum()) <= COMES * (0.1 - FLOOR) + 1e-6
-
     def test_what_turns_on_its_way_is_held_where_it_meets_what_it_meets(self):
         """An edge over another slides along until its end, which goes down, is over it: no plane of its middle sees
         that."""

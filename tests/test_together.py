@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,6 @@ from physgraph_usd.shot.refine import inspect_shot
 from physgraph_usd.solver.contact.broad_phase import TouchingGroups
 from physgraph_usd.solver.contact.settings import ContactSettings
 from physgraph_usd.solver.scene import Garment, GarmentFrame
-from physgraph_usd.usd.read.find import felt_by, find_colliders
 
 OFF = ContactSettings(cloth="off")
 QUIET = {"flat": flat, "curved": curved, "half a turn": lambda points: curved(points, np.pi)}
@@ -61,10 +59,7 @@ class TestGarments:
     def test_excluded_from_one_another_they_are_solved_apart_even_when_they_cross(self):
         cloths = [square(4), square(4)]
         cages = [cloths[0][1], cloths[1][1] @ rotation(3).T]
-        garments = [
-            named(cloths[0], "A", apart_from=("/World/B",)),
-            named(cloths[1], "B", apart_from=("/World/A",)),
-        ]
+        garments = [named(cloths[0], "A", apart_from=("/World/B",)), named(cloths[1], "B", apart_from=("/World/A",))]
         together = self.solve(cages, garments)
         for number, alone in enumerate(self.apart(cages, cloths)):
             assert together.points[number].tobytes() == alone.tobytes()
@@ -108,7 +103,6 @@ class TestGarments:
 
 
 MESH, REST = sheet(2, 2)
-FEW, FACTOR = 40, 8
 
 
 def sheets(path: Path, count: int) -> Usd.Stage:
@@ -123,47 +117,10 @@ def sheets(path: Path, count: int) -> Usd.Stage:
     return stage
 
 
-def calls(run: Callable[[], Any]) -> int:
-    """How many calls of functions something makes: time that no other process disturbs."""
-    count = 0
-
-    def one(frame: object, event: str, argument: object) -> None:
-        nonlocal count
-        count += event.endswith("call")
-
-    sys.setprofile(one)
-    try:
-        run()
-    finally:
-        sys.setprofile(None)
-    return count
-
-
-def linear(run: Callable[[int], Any]) -> bool:
-    """Whether the calls made for many are at most as many times those for a few as there are more, and a half."""
-    return calls(lambda: run(FACTOR * FEW)) < 1.5 * FACTOR * calls(lambda: run(FEW))
-
-
 def scattered(count: int, spread: float) -> tuple[list[Garment], list[GarmentFrame]]:
     places = np.random.default_rng(3).uniform(0.0, spread, (count, 3))
     garments = [replace(garment_of(MESH, REST), path=f"/World/g{index}") for index in range(count)]
     return garments, [frame_of(REST + place).garments[0] for place in places]
-
-
-@pytest.fixture(scope="module")
-def stages(tmp_path_factory: pytest.TempPathFactory) -> dict[int, Usd.Stage]:
-    folder = tmp_path_factory.mktemp("many")
-    return {count: sheets(folder / f"{count}.usda", count) for count in (FEW, FACTOR * FEW)}
-
-
-@pytest.mark.parametrize("look", [find_colliders, felt_by])
-def test_what_they_touch_is_looked_for_in_time_that_grows_with_their_number(
-    stages: dict[int, Usd.Stage], look: Callable[..., Any]
-):
-    def run(count: int) -> None:
-        look(stages[count], [stages[count].GetPrimAtPath(f"/World/g{index}") for index in range(count)])
-
-    assert linear(run)
 
 
 @pytest.mark.parametrize("spread", [0.5, 2.0, 8.0])

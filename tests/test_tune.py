@@ -95,17 +95,6 @@ def test_a_rough_solve_shows_each_round_and_ends_near_the_settled_cloth(session:
     assert rms(rough - settled) < 0.3 * rms(start - settled)
 
 
-def test_a_first_frame_is_settled_at_once_and_matches_refine(session: TuneSession, shot: Path):
-    shown = session.solve()
-    assert shown.settled
-    assert session.settle() is shown
-    with closing(open_shot(str(shot), garments=[CLOTH])) as opened:
-        settings = RefineOptions().solve_settings()
-        (known,) = Refiner(opened.scene, settings, levels=session.setting.levels).solve(opened.frame(1.0)).points
-    assert known is not None
-    assert np.abs(known - points(shown)).max() < 1e-7
-
-
 def test_old_materials_are_forgotten(session: TuneSession):
     """Each one kept a Cholesky factor."""
     session.settle()
@@ -273,14 +262,6 @@ def test_a_drag_is_one_step_of_undo():
         steps.append(history.undone_next)
         history.undo()
     assert steps == ["Pin", "Pin", "Density", "Density"]
-
-
-def test_a_value_told_twice_is_one_step_of_undo(session: TuneSession):
-    session.history._seconds = iter(range(0, 100, 10)).__next__
-    session.set_value(CLOTH, "density", 0.9)
-    session.set_value(CLOTH, "density", 0.9)
-    session.undo()
-    assert session.history.undone_next == ""
 
 
 def test_a_value_is_taken_from_the_shot_again(session: TuneSession):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,7 @@ from shots import CLOTH, cloth_shot, fine, refine, run
 from test_report_format import checked
 
 from physgraph_usd import refine_stage
-from physgraph_usd.errors import At, GarmentError, Place, UnexpectedError, exceptions_named, place_of
+from physgraph_usd.errors import At, Place, UnexpectedError, exceptions_named
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.processes import result_of, separate_processes
 from physgraph_usd.shot.report import RefineReport
@@ -59,7 +58,7 @@ def place_in(report: dict[str, Any]) -> tuple[str, list[str], float]:
     return report["failure"]["kind"], report["failure"]["prims"], report["failure"]["time"]
 
 
-@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize("workers", [pytest.param(1, marks=pytest.mark.slow), 2])
 def test_one_ends_with_a_line_and_a_report_and_keeps_what_is_finished(tmp_path: Path, workers: int):
     """Two workers have three frames each, so that the fault is in the first frame of the second one.
 
@@ -175,28 +174,6 @@ def test_an_exception_that_cannot_travel_reaches_the_parent():
 
 
 class TestPlace:
-    def place(self, error: Exception, *around: At) -> Place:
-        """Where an error is noted that goes through blocks, the innermost last."""
-
-        def inside(blocks: Iterator[At]) -> None:
-            if (block := next(blocks, None)) is None:
-                raise error
-            with block:
-                inside(blocks)
-
-        with pytest.raises(type(error)) as found:
-            inside(iter(around))
-        return place_of(found.value)
-
-    def test_the_innermost_goes_first(self):
-        outer = At(prims=("/A", "/B"), time=1.0)
-        assert self.place(ValueError(), outer, At(prims=("/B",))) == Place(("/B",), 1.0)
-        assert self.place(ValueError(), outer) == Place(("/A", "/B"), 1.0)
-        assert self.place(ValueError()) == Place()
-
-    def test_a_garment_that_is_broken_names_itself(self):
-        assert self.place(GarmentError("/A", "is torn", time=2.0), At(prims=("/B",), time=1.0)) == Place(("/A",), 2.0)
-
     def test_prims_without_number_and_long_texts_stay_one_line(self):
         place = Place(tuple(f"/World/coat{k}" for k in range(500)))
         text = str(UnexpectedError("ValueError", "wrong\n" * 1000, place=place))

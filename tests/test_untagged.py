@@ -8,36 +8,23 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from bodies import box
 from click.testing import CliRunner
-from pxr import Usd, UsdGeom, Vt
+from pxr import Usd, UsdGeom
 from shots import refine
-from stages import COLLIDER_API, GARMENT_API, add_sheet, author, new_stage, save, vec3
+from stages import COLLIDER_API, GARMENT_API, add_mesh, add_sheet, author, new_stage, save
 
 from physgraph_usd.cli import main
 from physgraph_usd.shot.refine import inspect_shot
 from physgraph_usd.studio.session import TuneSession
 
-COUNTS = [4] * 6
-FACES = [0, 2, 3, 1, 4, 5, 7, 6, 0, 1, 5, 4, 2, 6, 7, 3, 0, 4, 6, 2, 1, 3, 7, 5]
-
-
-def corners(low: tuple[float, float, float], high: tuple[float, float, float]) -> np.ndarray:
-    """The corners of a box, x fastest."""
-    return np.array([[x, y, z] for z in (low[2], high[2]) for y in (low[1], high[1]) for x in (low[0], high[0])])
-
-
-UNDER = corners((-1.0, 0.0, -3.0), (5.0, 3.0, -0.4))
+UNDER = box((6.0, 3.0, 2.6))[0] + [2.0, 1.5, -1.7]
 """Under the sheet, which comes down to -0.3 units: 10 mm where a unit is 10 cm."""
 
 
 def add_box(stage: Usd.Stage, path: str = "/World/body", points: np.ndarray = UNDER) -> UsdGeom.Mesh:
     """A box without a mark."""
-    mesh = UsdGeom.Mesh.Define(stage, path)
-    mesh.CreateSubdivisionSchemeAttr("none")
-    mesh.CreateFaceVertexCountsAttr(Vt.IntArray(COUNTS))
-    mesh.CreateFaceVertexIndicesAttr(Vt.IntArray(FACES))
-    mesh.CreatePointsAttr(vec3(points))
-    return mesh
+    return add_mesh(stage, path, points, box()[1], schema=None, scheme="none")
 
 
 @pytest.fixture
@@ -101,7 +88,7 @@ def away(stage: Usd.Stage) -> None:
 
 
 def sky(stage: Usd.Stage) -> None:
-    add_box(stage, points=corners((-90.0, -90.0, -90.0), (90.0, 90.0, 90.0)))
+    add_box(stage, points=box((180.0, 180.0, 180.0))[0])
 
 
 def switched_off(stage: Usd.Stage) -> None:

@@ -3,38 +3,20 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 pytest.importorskip("pxr", reason="the judge reads stages with usd-core")
 
 from click.testing import CliRunner
-from pxr import Usd, UsdGeom
-from shots import CLOTH, EDGE, cloth_shot
+from shots import cloth_shot
 
-from benchmarks.judge_shot import Job, Motion, judged, rippled
+from benchmarks.judge_shot import Job, judged
 from benchmarks.verdicts import BETTER, EQUAL, FIGURES, UNKNOWN, WORSE, Band, overall, ratio, verdict
-from benchmarks.versions import (
-    RIPPLES,
-    SHOTS,
-    Task,
-    bands_of,
-    chosen,
-    job_of,
-    kept_runs,
-    main,
-    run_one,
-    tables,
-    tasks_of,
-)
-from physgraph_usd.lab.samples import SAMPLES
-from physgraph_usd.usd.read.reader import open_shot
+from benchmarks.versions import RIPPLES, bands_of, main, tables
 
-ROOT = Path(__file__).resolve().parents[1]
 SMALL: dict[str, Any] = {"level": 1, "count": 3}
 
 
@@ -57,43 +39,6 @@ def runs_of(version: str, figures: list[dict[str, float | None]], **changed: flo
         }
         for ripple, each in zip(RIPPLES, figures, strict=True)
     ]
-
-
-def test_a_ripple_moves_each_vertex_by_its_size_and_equally_in_all_samples(tmp_path: Path):
-    shot = cloth_shot(tmp_path / "sheet.usda")
-    text = shot.read_bytes()
-    layer = rippled(shot, [CLOTH], tmp_path / "ripple.usdc", size=0.002, seed=1)
-    before, after = Usd.Stage.Open(str(shot)), Usd.Stage.Open(str(layer))
-    points = [UsdGeom.Mesh(stage.GetPrimAtPath(CLOTH)).GetPointsAttr() for stage in (before, after)]
-    assert points[0].GetTimeSamples() == points[1].GetTimeSamples()
-    offsets = [
-        np.array(points[1].Get(code)) - np.array(points[0].Get(code))
-        for code in (*points[0].GetTimeSamples(), Usd.TimeCode.Default())
-    ]
-    assert np.linalg.norm(offsets[0], axis=1) == pytest.approx(0.002, rel=0.1), "squares have a side of 1"
-    assert np.abs(np.array(offsets) - offsets[0]).max() < 1e-6
-    assert np.abs(offsets[0].mean(axis=0)).max() < 0.001, "the directions differ"
-    assert UsdGeom.GetStageMetersPerUnit(after) == EDGE
-    assert after.GetTimeCodesPerSecond() == before.GetTimeCodesPerSecond()
-    assert after.GetDefaultPrim().GetPath() == before.GetDefaultPrim().GetPath()
-    assert shot.read_bytes() == text
-    other = Usd.Stage.Open(str(rippled(shot, [CLOTH], tmp_path / "other.usdc", size=0.002, seed=2)))
-    moved = np.array(UsdGeom.Mesh(other.GetPrimAtPath(CLOTH)).GetPointsAttr().Get(1.0))
-    assert np.abs(moved - np.array(points[1].Get(1.0))).max() > 1e-4, "another seed, other directions"
-
-
-def test_a_ripple_moves_a_skinned_garment_by_its_default_points(sample: Callable[[str], Path], tmp_path: Path):
-    shot = sample("tshirt")
-    opened = open_shot(str(shot))
-    prim, time = str(opened.sources[0].path), opened.scene.times[3]
-    layer = rippled(shot, [prim], tmp_path / "ripple.usdc", size=0.002, seed=1)
-    stage = Usd.Stage.Open(str(layer))
-    assert not UsdGeom.Mesh(stage.GetPrimAtPath(prim)).GetPointsAttr().GetTimeSamples()
-    moved = open_shot(str(layer)).cage(0, time) - opened.cage(0, time)
-    edges = opened.scene.garments[0].mesh.half_edges.edges
-    cage = opened.cage(0, time)
-    edge = np.linalg.norm(cage[edges[:, 0]] - cage[edges[:, 1]], axis=1).mean()
-    assert np.median(np.linalg.norm(moved, axis=1)) == pytest.approx(0.002 * edge, rel=0.2)
 
 
 def test_a_version_beside_itself_is_equal_in_every_figure(figures: list[dict[str, float | None]]):
@@ -129,72 +74,6 @@ def test_a_verdict_needs_more_than_the_noise_and_more_than_a_hundredth():
     assert ratio(Band(-1.0, 0.0), Band(1.0, 0.0)) is None
     pair = {"warm": Band(100.0, 1.0)}, {"warm": Band(80.0, 1.0)}
     assert "| warm frame [ms] | 0.800 | 1 | 0 | 0 | a | - |" in overall({"a": pair})
-
-
-def test_motion_counts_jumps_and_what_moves_over_a_standing_cage(sample: Callable[[str], Path]):
-    shot = open_shot(str(sample("sleeve")))
-    garment, cage = shot.scene.garments[0], shot.cage(0, shot.scene.times[0])
-    motion = Motion(shot.scene.garments, 1)
-    fine = motion._upsampled(0, cage)
-    edge = motion._edges[0]
-    assert edge == pytest.approx(0.02, rel=0.5)
-    motion.add([cage], [fine])
-    moved = fine.copy()
-    moved[:7, 1] += 1.1 * edge
-    moved[7:11, 1] += 0.9 * edge
-    motion.add([cage], [moved])
-    assert motion.jumps == 7
-    assert motion.still == pytest.approx(1e3 * float(np.percentile(np.linalg.norm(moved - fine, axis=1), 99.0)))
-    up = np.array([0.0, 2.0 * edge, 0.0])
-    before = motion.still
-    motion.add([cage + up], [moved + up])
-    assert motion.jumps == 7, "the cloth goes with its cage"
-    assert motion.still == before, "the cage does not stand"
-    motion.add([cage + up], [None])
-    motion.add([cage], [fine])
-    assert motion.jumps == 7, "nothing is known of the frame before"
-    assert garment.mesh.vertex_count < len(fine)
-
-
-def test_a_run_in_a_process_of_its_own_gives_the_same_figures(figures: list[dict[str, float | None]], tmp_path: Path):
-    shot = cloth_shot(tmp_path / "sheet.usda")
-    task = Task("sheet", "this", ROOT, "", Job(str(shot), **SMALL, ripple=RIPPLES[0], seed=0))
-    run = run_one(task, 0, limit=200.0, files=tmp_path / "run")
-    times = ("warm", "first")
-    assert {name: value for name, value in run["figures"].items() if name not in times} == {
-        name: value for name, value in figures[0].items() if name not in times
-    }
-    assert run_one(task, None, limit=0.01, files=tmp_path / "late") == {"over": 0.01}
-    package = tmp_path / "physgraph_usd"
-    package.mkdir()
-    (package / "__init__.py").write_text("raise ImportError('no such version')", "utf-8")
-    broken = Task("sheet", "other", tmp_path, "", task.job)
-    failed = broken.asked | run_one(broken, None, limit=200.0, files=tmp_path / "broken")
-    shown = tables([failed, task.asked | {"over": 300.0}])
-    assert "sheet: other, ripple 0.15%: failed: ImportError: no such version" in shown
-    assert "sheet: this, ripple 0.15%: over 300 s" in shown
-    file = tmp_path / "figures.json"
-    file.write_text(json.dumps({"runs": [task.asked | run, failed]}), "utf-8")
-    assert list(kept_runs(file)) == [json.dumps(task.asked)]
-
-
-def test_long_shots_go_first_and_versions_side_by_side(tmp_path: Path):
-    rows = [row for row in SHOTS if row.name in ("sleeve", "skirt", "skirt@36")]
-    jobs = [Job(row.source, first=row.first) for row in rows]
-    tasks = tasks_of([ROOT, ROOT], rows, jobs)
-    assert [(task.row, task.version) for task in tasks[:2]] == [("skirt", ROOT.name), ("skirt", f"{ROOT.name} (1)")]
-    assert [task.job.ripple for task in tasks[:6]] == [each for each in RIPPLES for _ in "ab"]
-    assert len({json.dumps(task.asked) for task in tasks}) == len(tasks) == 18
-
-
-def test_what_is_missing_is_named_and_left_out(capsys: pytest.CaptureFixture[str], tmp_path: Path):
-    assert [row.name for row in chosen(("sleeve", "01", "nothing"), tmp_path)] == ["sleeve"]
-    shown = capsys.readouterr().err
-    assert "01 is left out" in shown
-    assert "nothing is left out" in shown
-    every = {row.name for row in chosen((), None)}
-    assert every == {row.name for row in SHOTS if row.source in SAMPLES}
-    assert job_of(chosen(("skirt",), None)[0], tmp_path, None, 4).first == 20
 
 
 def test_the_command_prints_a_file_of_figures_again(figures: list[dict[str, float | None]], tmp_path: Path):

@@ -20,11 +20,10 @@ from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.refine import refine_shot
 from physgraph_usd.solver.contact.settings import ContactSettings
-from physgraph_usd.solver.frame import solve as frame_solve
 from physgraph_usd.solver.frame.group import Group
 from physgraph_usd.solver.frame.lead_in import lead_in
 from physgraph_usd.solver.frame.refiner import Refiner
-from physgraph_usd.solver.frame.solve import RunawayError, solve_frame, solve_soundly
+from physgraph_usd.solver.frame.solve import solve_frame, solve_soundly
 from physgraph_usd.solver.frame.start import STILL, Start, start_of
 from physgraph_usd.solver.frame.values import Cage, FrameInput, FrameState, Solved
 from physgraph_usd.solver.integrate.stop import EARLY, NEAR, ROUND, TOUCHING
@@ -118,9 +117,8 @@ def test_one_frame_is_as_low_in_energy_as_in_the_whole_shot(skirt: Path, tmp_pat
     assert energies[36.0] < energies[26.0] + 1e-2
 
 
-@pytest.mark.parametrize(
-    ("broken", "begun"), [(34.0, 32.0), *(pytest.param(each, 34.0, marks=pytest.mark.slow) for each in (None, 32.0))]
-)
+@pytest.mark.parametrize(("broken", "begun"), [(34.0, 32.0), (None, 34.0), (32.0, 34.0)])
+@pytest.mark.slow
 def test_a_frame_that_cannot_be_read_is_passed_over(skirt: Path, broken: float | None, begun: float):
     shot = open_shot(str(skirt), frames=(36.0, 40.0))
     cages = Refiner(shot.scene, RefineOptions().solve_settings(), levels=[0])
@@ -191,27 +189,3 @@ def test_cloth_caught_on_the_wrong_side_is_started_anew(
     assert mended.telemetry["start"].startswith(f"cold: started anew, since {why}")
     energies = [sum(each.telemetry["energy_joules"]["output"].values()) for each in (mended, alone)]
     assert energies[0] < 0.1 * energies[1]
-
-
-def stand_in(monkeypatch: pytest.MonkeyPatch, warm: tuple[int, float], cold: tuple[int, float]) -> list[bool]:
-    """Frames that end with given crossings and energies [J], by their start; whether each was warm."""
-    made: list[bool] = []
-
-    def solve(_group: Any, _frame: Any, last: FrameState | None) -> Solved:
-        made.append(last is not None)
-        count, energy = cold if last is None else warm
-        told = {"energy_joules": {"input": {"stretch": 1.0, "self_contact": 1.0}, "output": {"stretch": energy}}}
-        told |= {"contact": {"cloth": {"after": {"crossings": count}}}, "start": "cold" if last is None else "warm"}
-        nothing = torch.zeros(0, 3)
-        return Solved([np.zeros((0, 3))], FrameState(nothing, nothing, nothing[:, 0] > 0, nothing[:, 0] > 0), told, [])
-
-    monkeypatch.setattr(frame_solve, "solve_frame", solve)
-    return made
-
-
-def test_cloth_that_runs_away_from_any_start_is_told(
-    layers: tuple[Group, FrameInput, FrameState], monkeypatch: pytest.MonkeyPatch
-):
-    stand_in(monkeypatch, (0, 4.0), (0, 4.0))
-    with pytest.raises(RunawayError, match="3 J more than its upsampled cage has, and a start from the cage ends no"):
-        solve_soundly(*layers)

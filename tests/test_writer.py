@@ -160,13 +160,6 @@ def test_texture_coordinates_follow_the_points(dropped: int | None, indexed: boo
     np.testing.assert_allclose(flat, fine.interpolate(POINTS)[fine.fine.indices][:, :2], atol=1e-12)
 
 
-def test_the_wrong_number_of_values_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"has 5 elements; vertex needs 12"):
-        fine_map().primvar("vertex", np.zeros(5))
-    with pytest.raises(ValueError, match=r"indices from 0 to 9 into 2 values"):
-        fine_map().primvar("vertex", np.zeros(2), indices=np.full(12, 9) * (np.arange(12) > 0))
-
-
 def test_a_partition_of_points_stays_one() -> None:
     fine = fine_map()
     halves = [np.arange(5), np.arange(5, len(POINTS))]

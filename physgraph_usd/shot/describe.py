@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import GarmentError, StageError, counted
+from ..errors import GarmentError, StageError
 from ..solver.fabric import Fabric
 from ..solver.integrate import LEARNED
 from ..solver.mesh.defects import defects, in_brief
@@ -299,10 +299,8 @@ def _strained_parts(opened: Shot, frames: Sequence[Frame]) -> dict[str, list[Str
 
 def _modelled(opened: Shot, report: RefineReport, options: RefineOptions) -> dict[str, str]:
     angles = "rest shape" if any(garment.bent_rest for garment in opened.scene.garments) else "flat"
-    pressed = {
-        each.path: int(np.isfinite(each.pressed).sum()) for each in opened.scene.garments if each.pressed is not None
-    }
-    angles += "".join(f"; {counted(count, 'edge')} of <{path}> pressed" for path, count in pressed.items())
+    folded = [garment.path for garment in opened.scene.garments if garment.pressed is not None]
+    angles += "".join(f"; pressed folds of <{path}>" for path in folded)
     modelled = {
         **_in_plane(report),
         "bending": f"dihedral angles, {angles}",

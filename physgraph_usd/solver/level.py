@@ -25,7 +25,6 @@ from .mesh.subdivide import (
     crease_mask,
     creases_of,
     halves_of,
-    of_halves,
     on_triangles,
     smooth,
     subdivide_times,
@@ -267,7 +266,7 @@ class _GarmentLevel:
 def _garment_level(garment: Garment, whole: Sequence[Refinement], index: int) -> _GarmentLevel:
     """Carry one garment to a level, or to the end of a shorter chain of refinements."""
     chain = whole[:index]
-    mesh, face, creases, pressed, maps = _carried(garment, chain, stays=index > len(chain))
+    mesh, face, creases, maps = _carried(garment, chain, stays=index > len(chain))
     linear, smoothing = maps["linear"], maps["smooth"]
     rest, smooth_rest = (np.asarray(each @ np.asarray(garment.rest, dtype=np.float64)) for each in (linear, smoothing))
     split = _sound(mesh.triangulate(rest if not chain else None), rest, rigid=_is_rigid(garment, linear))
@@ -287,37 +286,45 @@ def _garment_level(garment: Garment, whole: Sequence[Refinement], index: int) ->
         edges=edges_of(split.triangles, mesh.vertex_count).vertices,
         elements=elements,
         bent=garment.bent_rest | (find_edges(creases, elements.hinges[:, :2]) >= 0),
-        pressed=pressed[find_edges(mesh.half_edges.edges, elements.hinges[:, :2])],
+        pressed=_pressed_angles(garment, elements, linear=linear, smoothing=smoothing),
         vertex_values={name: np.asarray(linear @ each.astype(np.float64)) for name, each in painted.items()},
         warp=None if garment.grain is None else garment.grain.warp[face[elements.face]],
         **maps,
     )
 
 
+def _pressed_angles(
+    garment: Garment, elements: ElasticElements, *, linear: sp.csr_matrix, smoothing: sp.csr_matrix
+) -> np.ndarray:
+    """Rest angles of pressed folds [rad], shape (H,): those of the smooth folded cage, fading within a cage edge."""
+    if garment.pressed is None or garment.folded is None or garment.bent_rest:
+        return np.zeros(len(elements.hinges))
+    angle = hinge_geometry(np.asarray(smoothing @ garment.folded), elements.hinges)[0]
+    share = np.asarray(linear @ garment.pressed.astype(np.float64))
+    return angle * share[elements.hinges[:, :2]].mean(axis=1)
+
+
 def _carried(
     garment: Garment, chain: Sequence[Refinement], *, stays: bool
-) -> tuple[PolygonMesh, np.ndarray, np.ndarray, np.ndarray, dict[str, sp.csr_matrix]]:
-    """A garment's mesh after subdivisions, the cage's face of each face, its creases, pressed angles, maps by name.
+) -> tuple[PolygonMesh, np.ndarray, np.ndarray, dict[str, sp.csr_matrix]]:
+    """A garment's mesh after subdivisions, the cage's face of each face, its creases, and its maps by name.
 
     Maps from the level below are the identity where the garment stays at the end of its chain.
     """
     mesh, face = garment.mesh, np.arange(garment.mesh.face_count)
     linear = smoothing = linear_step = smooth_step = flat_step = sp.identity(mesh.vertex_count, format="csr")
-    creases, edges = creases_of(mesh, garment.rest, garment.closed), mesh.half_edges.edges
-    pressed = np.full(len(edges), np.nan) if garment.pressed is None else garment.pressed
-    creases = np.unique(np.concatenate([creases, edges[np.isfinite(pressed)]]), axis=0).astype(np.int32)
+    creases = creases_of(mesh, garment.rest, garment.closed)
     for number, refinement in enumerate(chain):
         flat_step = on_triangles(mesh, refinement, mesh.triangulate(None if number else garment.rest))
         linear_step = refinement.linear
         smooth_step = sp.csr_matrix(smooth(mesh, refinement, creased=crease_mask(mesh, creases)))
         smoothing, linear = sp.csr_matrix(smooth_step @ smoothing), sp.csr_matrix(linear_step @ linear)
         creases = halves_of(creases, mesh.vertex_count + find_edges(refinement.edges, creases))
-        pressed = of_halves(refinement, pressed)
         mesh, face = refinement.mesh, face[refinement.parent_face]
     if stays:
         linear_step = smooth_step = flat_step = sp.identity(mesh.vertex_count, format="csr")
     steps = {"linear_step": linear_step, "smooth_step": smooth_step, "flat_step": flat_step}
-    return mesh, face, creases, pressed, {"linear": linear, "smooth": smoothing} | steps
+    return mesh, face, creases, {"linear": linear, "smooth": smoothing} | steps
 
 
 def _metric_of(
@@ -487,7 +494,7 @@ def _measured(
         np.concatenate([part.vertex_values[name] for part in parts]) for name in ("stretch_scale", "bend_scale", "pin")
     )
     return shape | {
-        "rest_angle": np.where(np.isnan(pressed), shape["rest_angle"], pressed),
+        "rest_angle": shape["rest_angle"] + pressed,
         "rest": np.concatenate([part.rest for part in parts]),
         "membrane_inverse": triangle_inverse(corners, apart, vectors[:, 2]),
         "spring_scale": stretch[springs].mean(axis=1),

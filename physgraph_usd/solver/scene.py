@@ -70,8 +70,8 @@ class Garment:
         sewn_at: Places of the vertices that are sewn to others, in a pose in which the seams are closed [m], NaN at
             all other vertices, shape (V, 3). Vertices of any garments at one place are sewn together, and vertices on
             another border's edge to that edge. None without seams.
-        pressed: Angle at which each edge of the cage is pressed [rad], in the order of the mesh's edges, NaN at all
-            others, shape (E,); None without pressed folds.
+        pressed: Whether each vertex is at a pressed fold, shape (V,); None without pressed folds.
+        folded: A pose in which pressed folds are as they rest [m], shape (V, 3); None without.
         closed: Whether each vertex belongs to a closed piece, whose sharp edges stay sharp, shape (V,); None without
             such pieces.
         rigid: Number of the rigid part that each vertex belongs to, -1 for cloth, shape (V,); None without parts.
@@ -95,6 +95,7 @@ class Garment:
     raises_bending: bool = True
     sewn_at: np.ndarray | None = None
     pressed: np.ndarray | None = None
+    folded: np.ndarray | None = None
     closed: np.ndarray | None = None
     rigid: np.ndarray | None = None
     flipped: bool = False

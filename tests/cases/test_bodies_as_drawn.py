@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from pxr import Usd, UsdGeom, Vt
+from pxr import Usd, UsdGeom
 from shots import fine, refine
-from stages import COLLIDER_API, author, new_stage, save, vec3
+from stages import COLLIDER_API, add_mesh, author, new_stage, save, vec3
 
 from physgraph_usd.errors import UsageError
 from physgraph_usd.shot.refine import inspect_shot
@@ -59,13 +59,7 @@ def spline(count: int, *, parts: int) -> np.ndarray:
 
 def add(stage: Usd.Stage, path: str, shape: tuple[np.ndarray, Faces], *, scheme: str = "none") -> UsdGeom.Mesh:
     """A mesh that stands still."""
-    points, faces = shape
-    mesh = UsdGeom.Mesh.Define(stage, path)
-    mesh.CreateSubdivisionSchemeAttr(scheme)
-    mesh.CreateFaceVertexCountsAttr([len(face) for face in faces])
-    mesh.CreateFaceVertexIndicesAttr(Vt.IntArray([corner for face in faces for corner in face]))
-    mesh.CreatePointsAttr(vec3(points))
-    return mesh
+    return add_mesh(stage, path, *shape, schema=None, scheme=scheme)
 
 
 def add_moving(stage: Usd.Stage, path: str, shape: tuple[np.ndarray, Faces], *samples: np.ndarray) -> UsdGeom.Mesh:

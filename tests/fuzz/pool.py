@@ -98,13 +98,7 @@ class Child:
 
 
 def run_all(
-    numbers: Sequence[int],
-    bases: Path,
-    work: Path,
-    *,
-    jobs: int,
-    seconds: float,
-    done: Callable[[Outcome], None],
+    numbers: Sequence[int], bases: Path, work: Path, *, jobs: int, seconds: float, done: Callable[[Outcome], None]
 ) -> None:
     """Try mutants in child processes; `done` is called with each outcome, by one thread at a time."""
     waiting, lock = list(reversed(numbers)), threading.Lock()

@@ -12,8 +12,7 @@ from cloth import Watched, finest_system, group_of, sheet, wave
 
 from physgraph_usd.solver.integrate.base import Carry, System
 from physgraph_usd.solver.integrate.descend import solve_level
-from physgraph_usd.solver.integrate.guard import PATIENCE, Guard
-from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton
+from physgraph_usd.solver.integrate.guard import Guard
 from physgraph_usd.solver.integrate.stop import Budget
 
 Proposal = Callable[[Carry, torch.Generator], torch.Tensor]
@@ -84,27 +83,3 @@ def test_s37_energy_never_rises(name: str):
     # Where the proposals are worthless, the fallback has worked.
     if name != "still":
         assert carries[-1].energy < carries[0].energy
-
-
-def test_s37_after_corrections_in_a_row_the_spare_makes_the_steps():
-    system, x = problem()
-    carries: list[Carry] = []
-    guard = Guard(Adversary(PROPOSALS["huge"]), spare=QuasiNewton())
-    _, report = solve_level(system, Watched(guard, carries.append), x, level=0, budget=Budget(12))
-    assert [carry.mover for carry in carries[1:]] == ["fallback"] * PATIENCE + ["quasi-newton"] * (12 - PATIENCE)
-    assert all(after.energy < before.energy for before, after in pairwise(carries))
-    again = guard.step(system, guard.resume(system, carries[-1]))
-    assert (again.mover, report.movers) == ("quasi-newton", {"fallback": PATIENCE, "quasi-newton": 12 - PATIENCE})
-    alone = descent(system, x, PROPOSALS["huge"], steps=12)
-    assert carries[-1].energy < alone[-1].energy
-
-
-def test_s37_a_good_direction_that_overshoots_is_halved_or_quartered():
-    system, x = problem()
-    image = system.apply_metric_inverse(system.energy_and_force(x)[1])
-    movers = set()
-    for factor in (1.0, 3.0, 6.0, 12.0):
-        carries = descent(system, x, lambda carry, _, by=factor: carry.x + by * image, steps=1)
-        movers.add(carries[-1].mover)
-        assert carries[-1].energy < carries[0].energy
-    assert movers >= {"adversary", "halved"} or movers >= {"adversary", "quartered"}

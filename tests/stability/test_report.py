@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import re
 from functools import partial
-from pathlib import Path
 
 import pytest
 import report
-from report_solver import Result
 
 
 def test_every_case_of_the_list_has_a_row():
@@ -19,28 +17,7 @@ def test_every_case_of_the_list_has_a_row():
         assert bool(case.bound) == measured, case.number
 
 
-def test_a_cell_that_is_known_is_not_measured_again(tmp_path: Path):
-    file, calls = tmp_path / "cells.jsonl", []
-
-    def measure() -> Result:
-        calls.append(1)
-        return Result(False, "bad")
-
-    first = report.Cells(file).get(7, "one", measure)
-    file.write_text(file.read_text() + '["S8 one", tr', encoding="utf-8")  # cut off
-    assert report.Cells(file).get(7, "one", measure) == first == (False, "**fail** bad")
-    assert len(calls) == 1
-    report.Cells(file).get(7, "two", measure)
-    assert len(calls) == 2
-
-
-ANEW = (
-    (11, "physgraph"),
-    (11, "adam"),
-    (13, "physgraph"),
-    (15, "adam"),
-    (17, "physgraph"),
-)
+ANEW = ((11, "physgraph"), (11, "adam"), (13, "physgraph"), (15, "adam"), (17, "physgraph"))
 """Cells that take half a second each, two of them failed: turned cloth far away, wrinkles, a crumpled ball, pins."""
 
 
@@ -60,18 +37,6 @@ def test_the_page_counts_its_cells_and_names_its_commit():
     assert counted is not None
     assert (int(counted[1]), int(counted[2])) == (sum(cells.values()), len(cells))
     assert re.search(r"case by case, at commit [0-9a-f]{7,}(, with changes)?\.", page)
-
-
-def test_a_page_is_read_cell_by_cell():
-    names = ["one", "two"]
-    results = {"one": Result(True, "0 of 7"), "two": Result(False, "7 of 7")}
-    case = report.Case(3, "what", "bound", by_method=results.__getitem__)
-    held, line = report.row(case, names)
-    assert report.cells_of(f"| case | what | passes | all | one | two |\n|---|---|---|---|---|---|\n{line}\n") == {
-        ("S3", "one"): True,
-        ("S3", "two"): False,
-    }
-    assert held == [True, False]
 
 
 BEYOND = {

@@ -343,14 +343,6 @@ def halves_of(edges: Int[np.ndarray, "edges 2"], middle: Int[np.ndarray, " edges
     return halves[np.lexsort((halves[:, 1], halves[:, 0]))].astype(np.int32)
 
 
-def of_halves(refinement: Refinement, values: Float[np.ndarray, " edges"]) -> Float[np.ndarray, " children"]:
-    """Values of a parent's edges at the child's edges that are their halves; NaN at all other edges of the child."""
-    low, high = refinement.mesh.half_edges.edges.T
-    parent = np.clip(high - refinement.parent_vertex_count, 0, len(values) - 1)
-    half = (high - refinement.parent_vertex_count == parent) & (refinement.edges[parent] == low[:, None]).any(axis=1)
-    return np.where(half, values[parent], np.nan)
-
-
 def crease_mask(mesh: PolygonMesh, creases: Int[np.ndarray, "creases 2"]) -> Bool[np.ndarray, " edges"] | None:
     """Whether each edge of a mesh is a crease; None without creases."""
     return find_edges(creases, mesh.half_edges.edges) >= 0 if len(creases) else None

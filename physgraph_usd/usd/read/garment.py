@@ -141,6 +141,9 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], samples: Samples, re
     painted, cut = _painted(prim, weld, notices, values=values)
     pieces, odd_pieces = _pieces(prim, weld, rest.points, subsets := _subsets(prim, cage.kept_faces[weld.faces]))
     grain, lies = read_grain(prim, weld, rest.points, kept=cage.kept_faces, up=request.units.up, painted=cut)
+    folds = pressed_folds(
+        weld.mesh, [weld.joined(each) for each in animation.poses().values()], _asked_edges(prim, weld)
+    )
     garment = Garment(
         str(prim.GetPath()),
         weld.mesh,
@@ -148,9 +151,7 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], samples: Samples, re
         flipped=is_flipped(prim, matrix),
         bent_rest=bent,
         grain=grain,
-        pressed=pressed_folds(
-            weld.mesh, [weld.joined(pose) for pose in animation.poses().values()], _asked_edges(prim, weld)
-        ),
+        **dict(zip(("pressed", "folded"), folds or (), strict=False)),
         **constants | pieces | painted,
     )
     notices += [*rest.notices, *odd_pieces, *_size_notices(garment.path, animation.first, request)]

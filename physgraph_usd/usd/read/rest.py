@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from pxr import Sdf, Usd, UsdGeom
 from scipy import sparse
 from scipy.sparse.linalg import splu
@@ -21,7 +21,7 @@ from scipy.sparse.linalg import splu
 from ...errors import GarmentError
 from ...solver.level import hinge_geometry
 from ...solver.mesh.elements import elastic_elements
-from ...solver.mesh.topology import PolygonMesh, adjacency, find_edges
+from ...solver.mesh.topology import PolygonMesh, adjacency
 from ...solver.mesh.weld import Weld
 from ...solver.scene import out_of_bounds
 from ...solver.strain import COLLAPSED
@@ -326,8 +326,8 @@ def median_shape(mesh: PolygonMesh, poses: Sequence[np.ndarray]) -> tuple[np.nda
 
 def pressed_folds(
     mesh: PolygonMesh, poses: Sequence[np.ndarray], asked: Mapping[tuple[int, int], bool]
-) -> Float[np.ndarray, " edges"] | None:
-    """The median angle of each pressed edge [rad], and NaN at all others.
+) -> tuple[Bool[np.ndarray, " vertices"], Float[np.ndarray, "vertices 3"]] | None:
+    """Vertices at pressed folds, and the pose that has the folds as they rest.
 
     An edge that is folded sharply, and alike, in most poses is pressed, such as a collar over its stand, a cuff, a hem
     turned over; wrinkles wander.
@@ -338,21 +338,24 @@ def pressed_folds(
         asked: Whether edges are pressed by their artist's word, by their vertices, lower first.
 
     Returns:
-        Angles of the mesh's edges, shape (E,); None without pressed edges.
+        Whether each vertex is at a pressed edge, and the pose nearest to the median angles; None without pressed edges.
     """
     if not poses or (len(poses) < FEWEST and not asked):
         return None
-    elements, edges = elastic_elements(mesh, mesh.triangulate(poses[0]), poses[0]), mesh.half_edges.edges
+    elements = elastic_elements(mesh, mesh.triangulate(poses[0]), poses[0])
     hinges = elements.hinges[~elements.twists]
     angles = np.array([hinge_geometry(pose, hinges)[0] for pose in poses])
     median = np.median(angles, axis=0)
     alike = (np.abs(angles) > FOLDED) & (np.abs(angles - median) < ALIKE)
     pressed = (alike.mean(axis=0) >= MOST_POSES) & (len(poses) >= FEWEST)
     ends = np.sort(hinges[:, :2], axis=1)
-    pressed = [asked.get((int(low), int(high)), found) for (low, high), found in zip(ends, pressed, strict=True)]
-    out = np.full(len(edges), np.nan)
-    out[find_edges(edges, ends[pressed])] = median[pressed]
-    return out if any(pressed) else None
+    pressed = np.array(
+        [asked.get((int(low), int(high)), found) for (low, high), found in zip(ends, pressed, strict=True)], bool
+    )
+    if not pressed.any():
+        return None
+    nearest = np.abs(angles - median)[:, pressed].sum(axis=1).argmin()
+    return np.isin(np.arange(mesh.vertex_count), ends[pressed]), np.asarray(poses[nearest])
 
 
 def _bent(mesh: PolygonMesh) -> sparse.csr_matrix:
