@@ -130,10 +130,9 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], samples: Samples, re
     every, times = samples.times, within(samples.times, request.frames)
     points = PointReader(prim, times[0] if times else None)
     cage = read_cage(prim, points.count, times)
-    edges = cage.mesh.half_edges.edges
     placement = check_placement(prim, request.units.metres, times)
     matrix = to_metres(prim, request.units.metres, every[0] if every else None)
-    animation = _animation(prim, points, request, edges=edges, every=samples.own, times=times)
+    animation = _animation(prim, points, request, edges=cage.mesh.half_edges.edges, every=samples.own, times=times)
     rest, weld = _rest_and_weld(prim, cage.mesh, animation, request, matrix=matrix)
     (bent, odd), absent = rests_bent(prim), within(samples.absent, request.frames)
     notices = [*samples.notices(str(prim.GetPath()), absent), *cage.notices, *odd, *placement]
@@ -149,9 +148,7 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], samples: Samples, re
         flipped=is_flipped(prim, matrix),
         bent_rest=bent,
         grain=grain,
-        pressed=pressed_folds(
-            weld.mesh, [weld.joined(pose) for pose in animation.poses().values()], _asked_edges(prim, weld)
-        ),
+        pressed=_pressed(prim, weld, animation),
         **constants | pieces | painted,
     )
     notices += [*rest.notices, *odd_pieces, *_size_notices(garment.path, animation.first, request)]
@@ -168,7 +165,13 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], samples: Samples, re
         words=_words(prim, [name for name, faces in subsets.items() if 2 * len(faces) > len(weld.faces)]),
         shell=float(find_value(prim, GARMENT["shell:thickness"], request.overrides).at(None) or 0.0),
     )
-    return GarmentReader(garment, source, values, points, edges, weld, notices)
+    return GarmentReader(garment, source, values, points, cage.mesh.half_edges.edges, weld, notices)
+
+
+def _pressed(prim: Usd.Prim, weld: Weld, animation: Animation) -> np.ndarray | None:
+    """Angles of the pressed edges as in `pressed_folds`, over the garment's own time codes."""
+    poses = [weld.joined(pose) for pose in animation.poses().values()]
+    return pressed_folds(weld.mesh, poses, _asked_edges(prim, weld))
 
 
 def _animation(
