@@ -11,7 +11,8 @@
     |-- LayerError          the output layer cannot be written or is invalid
     `-- UnexpectedError     any other exception: a fault of the program
 
-A message gives the value, the place and the choices, in one line each; `counted` puts numbers of things into words.
+A message gives the value, the place and the choices, in one line each; `counted` puts numbers of things into words,
+`named_time` time codes.
 """
 
 from __future__ import annotations
@@ -79,7 +80,7 @@ class GarmentError(StageError):
     def __init__(self, path: str, problem: str, *, time: float | None = None, remedy: str = "") -> None:
         """Compose the message from place, problem and remedy."""
         self.path, self.problem, self.time, self.remedy = path, problem, time, remedy
-        where = f"<{path}>" if time is None else f"<{path}> at time code {time:g}"
+        where = f"<{path}>" if time is None else f"<{path}> at time code {named_time(time)}"
         super().__init__(f"{where}: {problem}" + (f"; {remedy}" if remedy else ""))
 
 
@@ -146,7 +147,7 @@ class Place:
         """The beginning of a message, such as "</World/Coat> at time code 3: "; "" if nothing is known."""
         named, more = ", ".join(f"<{path}>" for path in self.prims[:MOST_NAMED]), len(self.prims) - MOST_NAMED
         prims = f"{named} and {more:,} more" if more > 0 else named
-        parts = [prims] * bool(prims) + ([] if self.time is None else [f"at time code {self.time:g}"])
+        parts = [prims] * bool(prims) + ([] if self.time is None else [f"at time code {named_time(self.time)}"])
         return f"{' '.join(parts)}: " if parts else ""
 
 
@@ -231,3 +232,8 @@ def counted(number: int, noun: str, plural: str = "") -> str:
         plural: Several; the noun with an "s" where it is left out.
     """
     return f"{number:,} {noun if number == 1 else plural or noun + 's'}"
+
+
+def named_time(time: float | None) -> str:
+    """A time code in words, "default" for None; different time codes never read alike, not even about a jump."""
+    return "default" if time is None else f"{time:.12g}"

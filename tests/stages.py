@@ -228,6 +228,26 @@ def instanced_shot(folder: Path, *, skinned: bool = False) -> str:
     return save(stage)
 
 
+def loop_shot(folder: Path, *, size: tuple[int, int] = SIZE, step: float = 1.0, metres: float = 1.0) -> str:
+    """A shot whose clip of a sheet that moves along x, by a step a frame, starts again at 3 and at 6."""
+    clip = Usd.Stage.CreateNew(str(folder / "walk.usda"))
+    points = UsdGeom.Mesh(clip.OverridePrim("/World/cloth")).CreatePointsAttr()
+    for time in range(4):
+        points.Set(vec3(sheet_points(time, size) + np.array([step * time, 0.0, 0.0])), time)
+    clip.Save()
+    manifest = Usd.Stage.CreateNew(str(folder / "manifest.usda"))
+    UsdGeom.Mesh(manifest.OverridePrim("/World/cloth")).CreatePointsAttr()
+    manifest.Save()
+    stage = new_stage(folder / "shot.usda", metres=metres)
+    clips = Usd.ClipsAPI(add_sheet(stage, times=(), default=False, size=size).GetPrim())
+    clips.SetClipAssetPaths([Sdf.AssetPath("./walk.usda")])
+    clips.SetClipManifestAssetPath(Sdf.AssetPath("./manifest.usda"))
+    clips.SetClipPrimPath("/World/cloth")
+    clips.SetClipActive([Gf.Vec2d(0.0, 0.0)])
+    clips.SetClipTimes([Gf.Vec2d(*pair) for pair in ((0, 0), (3, 3), (3, 0), (6, 3), (6, 0), (8, 2))])
+    return save(stage)
+
+
 def clip_shot(folder: Path, times: Sequence[float] = (1.0, 2.0, 3.0)) -> str:
     """A shot whose points come from one value clip per time code."""
     for number, time in enumerate(times):

@@ -326,7 +326,7 @@ def test_garments_outside_the_frame_range_are_left_out(tmp_path: Path) -> None:
     path = save(stage)
     shot = open_shot(path, frames=(9.0, 20.0))
     assert [garment.path for garment in shot.scene.garments] == ["/World/late"]
-    assert "authored time codes run from 1 to 3" in said(shot)
+    assert "its time codes run from 1 to 3" in said(shot)
     with pytest.raises(StageError, match=r"frames 4:5; its 5 samples run from 1 to 11.*--frames 1:11"):
         open_shot(path, frames=(4.0, 5.0))
 
@@ -337,6 +337,17 @@ def test_a_range_that_is_none_is_refused(tmp_path: Path, frames: tuple[float, fl
         open_shot(sheet_shot(tmp_path / "s.usda"), frames=frames)
 
 
-def test_times_that_differ_by_rounding_are_one_and_sub_frames_stay_apart() -> None:
-    assert merge([2.0, 1.0, 1.0 + 1e-9, 2.0 - 1e-9, 3.0]) == (1.0, 2.0, 3.0)
-    assert merge([1.0, 1.001, 1.25]) == (1.0, 1.001, 1.25)
+def test_times_that_differ_by_rounding_are_one_and_the_first_given_stays() -> None:
+    assert merge([1.0, 2.0, 3.0], [1.0 + 1e-9, 2.0 - 9e-4]) == (1.0, 2.0, 3.0)
+    assert merge([1.0 + 1e-9], [1.0]) == (1.0 + 1e-9,)
+    assert merge() == merge([]) == ()
+
+
+@pytest.mark.parametrize("others", [[4.0], [3.9999], [4.0004, 5.0]])
+def test_both_sides_of_a_jump_stay(others: list[float]) -> None:
+    for sources in ([[3.0, 4.0 - 1e-9, 4.0], others], [others, [3.0, 4.0 - 1e-9, 4.0]]):
+        assert merge(*sources)[:3] == (3.0, 4.0 - 1e-9, 4.0)
+
+
+def test_sub_frames_stay_apart() -> None:
+    assert merge([1.0, 1.25], [1.002]) == (1.0, 1.002, 1.25)

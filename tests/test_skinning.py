@@ -29,10 +29,10 @@ def points(shot: Shot, time: float, index: int = 0) -> np.ndarray:
 
 
 @pytest.mark.parametrize("rate", [24.0, 30.0, 12.0])
-def test_skinned_points_are_the_closed_form_at_the_animation_s_own_times(tmp_path: Path, rate: float) -> None:
+def test_skinned_points_are_the_closed_form_at_own_times_and_whole_frames(tmp_path: Path, rate: float) -> None:
     shot = open_shot(save(skinned_stage(tmp_path / "s.usda", (1.0, 2.5, 7.0), rate=rate)))
     assert shot.sources[0].skinned
-    assert shot.scene.times == (1.0, 2.5, 7.0)
+    assert shot.scene.times == (1.0, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 7.0)
     for time in shot.scene.times:
         np.testing.assert_allclose(points(shot, time), 0.01 * skinned_points(sheet_points(), JOINTS, time), atol=1e-7)
     np.testing.assert_allclose(shot.scene.garments[0].rest, 0.01 * sheet_points(), atol=1e-9)
@@ -52,7 +52,7 @@ def test_transforms_between_animation_samples_are_skinned_exactly_there(tmp_path
     for time in (1.0, 3.5, 6.0):
         set_matrix(stage.GetPrimAtPath("/World"), affine(np.eye(3), (time, 0, 0)), time)
     shot = open_shot(save(stage))
-    assert shot.scene.times == (1.0, 3.5, 6.0, 9.0)
+    assert shot.scene.times == (1.0, 2.0, 3.0, 3.5, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0)
     for time in (3.5, 6.0):
         expected = skinned_points(sheet_points(), JOINTS, time) + np.array([time, 0, 0])
         np.testing.assert_allclose(points(shot, time), 0.01 * expected, atol=1e-6)

@@ -11,6 +11,7 @@ import numpy as np
 
 from ..errors import GarmentError
 from ..solver.frame.settings import Reset
+from ..solver.scene import SAME_TIME
 from ..usd.read.reader import Shot
 
 JUMP = Reset().move
@@ -45,14 +46,14 @@ class Cuts:
 def jumps(opened: Shot, index: int) -> frozenset[float]:
     """Time codes to which a garment's cage, by number, jumps in its own space.
 
-    A step is compared with the previous and next step, so even motion is no jump at any speed. If a shot has only two
-    steps, the larger step is the jump.
+    A step between two poses at the same time is a jump. Others are compared with the previous and next step, so even
+    motion is no jump at any speed. If a shot has only two steps, the larger step is the jump.
     """
     ends, lasted, lengths, away = _steps(_samples(opened, index))
+    found = {end for end, time in zip(ends, lasted, strict=True) if time <= SAME_TIME}
     if len(ends) < 2:
-        return frozenset()
+        return frozenset(found)
     least = JUMP * _mean_edge(opened, index)
-    found = set[float]()
     for step, end in enumerate(ends):
         beside = [other for other in (step - 1, step + 1) if 0 <= other < len(ends)]
         departs = lasted[step] * min(away[min(step, other)] for other in beside) > least

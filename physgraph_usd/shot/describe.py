@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import GarmentError, StageError
+from ..errors import GarmentError, StageError, named_time
 from ..solver.fabric import Fabric
 from ..solver.integrate import LEARNED
 from ..solver.mesh.defects import defects, in_brief
@@ -255,7 +255,7 @@ def _bound(target: Target) -> dict[str, Any]:
         "points": len(target.points),
         "rigid_parts": target.parts,
         "distance_mm": round(1e3 * target.distance, 2),
-        "pose": "default" if target.time is None else f"{target.time:g}",
+        "pose": named_time(target.time),
         "mode": DETAIL if target.detail else FOLLOW,
     }
 

@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from ..errors import named_time
 from ..interrupts import leave_if_asked
 from .frames import Outcome
 
@@ -46,7 +47,8 @@ class Joint:
     @property
     def warnings(self) -> list[str]:
         """A warning if the cloth jumps."""
-        jump = f"the cloth jumps after time code {self.frames[-1].time:g}, where the work of two processes meets"
+        last = named_time(self.frames[-1].time)
+        jump = f"the cloth jumps after time code {last}, where the work of two processes meets"
         return [f"{jump}: {self.why}"] if self.why else []
 
 

@@ -18,7 +18,7 @@ from functools import partial
 from multiprocessing.context import BaseContext
 from typing import Any
 
-from ..errors import PhysGraphError, SolveError, exceptions_named, named
+from ..errors import PhysGraphError, SolveError, exceptions_named, named, named_time
 from ..interrupts import exit_code_of, leave_if_asked, signals_noted
 
 POLL_SECONDS = 0.02
@@ -128,7 +128,7 @@ def result_of(future: Future[Any], *, time: float | None = None) -> Any:
     while not future.done():
         leave_if_asked()
         wait([future], POLL_SECONDS)
-    at = "" if time is None else f" at time code {time:g}"
+    at = "" if time is None else f" at time code {named_time(time)}"
     if future.cancelled():
         raise SolveError(f"a call was cancelled{at}: the farm's scheduler is gone, or dropped the call")
     error = future.exception()

@@ -12,7 +12,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from ..errors import NOTICE, SolveError, counted
+from ..errors import NOTICE, SolveError, counted, named_time
 from ..solver.level import refine_garments
 from ..solver.mesh.kernels import cards_for, kernels_are_compiled
 from ..solver.mesh.subdivide import Refinement
@@ -213,7 +213,7 @@ class Run:
         for done, outcome in enumerate(solved, start=1):
             written += self._write_frame(writer, outcome)
             shown += shown_through(self.shot, outcome) if done - 1 in compared else []
-            LOG.info("frame %d of %d: time code %s", done, count, _name_of(outcome.time), extra=shot)
+            LOG.info("frame %d of %d: time code %s", done, count, named_time(outcome.time), extra=shot)
             if done == TIMED_FRAMES < count and (
                 message := ending(clock.perf_counter() - began, count, options.workers)
             ):
@@ -246,7 +246,7 @@ class Run:
         """Write the result of one time code and record the result; returns the seconds spent writing."""
         self.report.frames.append(outcome.record)
         if not outcome.points:
-            name, error = _name_of(outcome.time), str(outcome.record["error"])
+            name, error = named_time(outcome.time), str(outcome.record["error"])
             self.report.failed[name] = error
             self.report.warn(WARNINGS["failed"](name=name, error=error))
             return 0.0
@@ -283,10 +283,6 @@ def numbers_in(every: Sequence[float], frames: tuple[float, float] | None) -> ra
 def fine_meshes(garments: Sequence[Garment], refinements: Sequence[Sequence[Refinement]]) -> list[PolygonMesh]:
     """The finest mesh of each garment."""
     return [[cage, *steps][-1].mesh for cage, steps in zip(garments, refinements, strict=True)]
-
-
-def _name_of(time: float | None) -> str:
-    return "default" if time is None else f"{time:g}"
 
 
 def ending(seconds: float, count: int, workers: int) -> str:

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import LayerError, UsageError, counted
+from ..errors import LayerError, UsageError, counted, named_time
 from ..solver.level import refine_garments
 from ..usd.read.reader import Shot
 from .chunks import frames_in_order
@@ -165,7 +165,7 @@ class _Joins:
         alone = self.run["options"].get("temporal") == "off" or not np.isfinite(self.bound)
         for part in () if alone else self.parts:
             if part.numbers[0] - 1 in self.chunks and part.times[0] not in known:
-                unknown = f"nothing tells how far the seam at {part.times[0]:g} moves"
+                unknown = f"nothing tells how far the seam at {named_time(part.times[0])} moves"
                 remedy = "refine it with --preroll 1 or more, or give --seam-bound inf"
                 raise LayerError(
                     f"{unknown}: {part.folder} has no pre-roll that ended in the frame before it; {remedy}"
@@ -352,7 +352,7 @@ def _check_frames(parts: Sequence[_Chunk], frames: tuple[float, float] | None) -
 
 def _span(times: Sequence[float]) -> str:
     """First and last of some time codes, as in ``--frames``."""
-    return f"{min(times):g}:{max(times):g}" if times else "none"
+    return f"{named_time(min(times))}:{named_time(max(times))}" if times else "none"
 
 
 def _spans(times: Sequence[float], every: Sequence[float]) -> str:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from shlex import join
 from typing import Any
 
-from ..errors import counted
+from ..errors import counted, named_time
 from ..solver.strain import MOST_STRETCHED, StrainedPart
 from ..usd.read.rest import FITTED
 from ..usd.stage import at_time
@@ -100,13 +100,13 @@ WARNINGS = {
         "leaves its place for this frame alone",
         "mend the cage or the body in that frame; the next frame starts from the one before it",
         "the garment or a body leaves its place for this frame alone",
-        "mend it. Time code {next:g} starts from the frame before it",
+        "mend it. Time code {next} starts from the frame before it",
     ),
     "jumped_from": Kind(
         "jumps from this first frame to the next",
         "if the first frame is broken: `--frames` without it",
         "the garment or a body jumps from this first frame to the next",
-        "if it is broken, leave it out with --frames. Time code {next:g} starts anew",
+        "if it is broken, leave it out with --frames. Time code {next} starts anew",
     ),
     "strained": Kind(
         "in most frames the cage has not its rest shape's size",
@@ -206,7 +206,7 @@ def _of_jumps(garment: Mapping[str, Any], entries: Entries) -> Iterator[str]:
     for name in ("broken_before", "jumped_from"):
         for time, entry in entries.items():
             if entry.get(name) is not None and time is not None:
-                yield WARNINGS[name](garment["path"], [entry[name]], next=time)
+                yield WARNINGS[name](garment["path"], [entry[name]], next=named_time(time))
 
 
 def of_contact(garment: Mapping[str, Any], entries: Entries) -> Iterator[str]:
@@ -249,6 +249,6 @@ def _also(times: Sequence[float | None]) -> str:
     """Text listing the other time codes of a warning; "" without any."""
     if len(times) > MOST_NAMED:
         return f"also in {counted(len(times), 'other frame')}"
-    names = ["default" if time is None else f"{time:g}" for time in times]
+    names = [*map(named_time, times)]
     listed = " and ".join(filter(None, (", ".join(names[:-1]), *names[-1:])))
     return f"also at time code{'s' if len(names) > 1 else ''} {listed}" if names else ""

@@ -284,9 +284,7 @@ def _of_levels(given: Any, session: TuneSession) -> list[Change]:
 
 
 def _of_time(given: Any, session: TuneSession) -> list[Change]:
-    time = None if given is None else _number(given, "time")
-    if time not in session.times:
-        raise UsageError(f"no sample at time code {given}; they run from {session.times[0]} to {session.times[-1]}")
+    time = session.sampled(None if given is None else _number(given, "time"))
     return [methodcaller("set_time", time)]
 
 

@@ -92,9 +92,7 @@ class TuneSession(Tuning):
         Raises:
             UsageError: The shot has no sample there.
         """
-        if time not in self.times:
-            raise UsageError(f"no sample at time code {time}; they run from {self.times[0]} to {self.times[-1]}")
-        self.time, self._shown = time, None
+        self.time, self._shown = (time := self.sampled(time)), None
         if take := self.takes.fresh(time, self.setting):
             self.solver, self._solves = copy(take.start.solver), take.setting
             self._shown = take.setting, take.shown

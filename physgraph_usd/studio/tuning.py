@@ -8,12 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import UsageError
+from ..errors import UsageError, named_time
 from ..solver.fabric import PRESETS
 from ..solver.resolution import choose_levels, sample_frames
 from ..usd.lookup import check_known
 from ..usd.read.reader import Shot
 from ..usd.schema import AUTO_LEVEL, FABRIC, GARMENT, fabric_values
+from ..usd.times import found_among, within
 from .setting import History, Setting
 from .tried import TriedShot
 from .values import MAPS, TUNABLES
@@ -61,9 +62,21 @@ class Tuning:
         """The shot's time codes; () for a shot without samples."""
         return tuple(time for time in self.times if time is not None)
 
+    def sampled(self, time: float | None) -> float | None:
+        """The shot's own time code for one given; None for a shot without samples.
+
+        Raises:
+            UsageError: The shot has no sample there.
+        """
+        found = None if time is None else found_among(time, self.codes)
+        if found not in self.times:
+            message = f"no sample at time code {named_time(time)}; they run from"
+            raise UsageError(f"{message} {named_time(self.times[0])} to {named_time(self.times[-1])}")
+        return found
+
     def codes_in(self, span: tuple[float, float] | None) -> list[float]:
         """The time codes from the first to the last of a range; none without a range."""
-        return [time for time in self.codes if span and span[0] <= time <= span[1]]
+        return [*within(self.codes, span)] if span else []
 
     def value(self, garment: str, name: str) -> float | None:
         """A tunable value of a garment in the frame, SI; None if not set."""

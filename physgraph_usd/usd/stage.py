@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from pxr import Ar, Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdUtils
 
-from ..errors import AbsentError, LayerError, PhysGraphError, StageError
+from ..errors import AbsentError, LayerError, PhysGraphError, StageError, named_time
 from .view import StageView
 
 if TYPE_CHECKING:
@@ -71,7 +71,7 @@ class Notice:
 
 def at_time(time: float | None) -> str:
     """Suffix of a place in messages: " at time code 3", or "" for None."""
-    return "" if time is None else f" at time code {time:g}"
+    return "" if time is None else f" at time code {named_time(time)}"
 
 
 def timecode(time: float | None) -> Usd.TimeCode:
@@ -104,16 +104,17 @@ class GarmentSource:
         kept_faces: Authored faces kept by the garment (no holes, three corners or more), order kept, int32.
         skinned: Whether the points came from baking UsdSkel skinning.
         instance_roots: Prims to author as ``instanceable = false`` in the output.
-        times: The garment's own authored times in range; empty for a still garment.
+        times: Time codes in range at which the garment is solved; empty for a still garment without moving bodies.
         sources: Source of each value, by short name.
         animated: Short names of the values whose source has time samples.
         apart_from: Colliders and garments excluded from contact, by path, with the excluding target.
-        left_out: Authored times outside the range; the layer holds the garment still there.
+        left_out: The garment's time codes outside the range; the layer holds the garment still there.
         velocities: Whether the shot has velocities for the garment.
-        absent: Authored times in range at which the garment has no shape, ascending; blocked in the layer.
+        absent: Time codes in range at which the garment has no shape, ascending; blocked in the layer.
         subsets: Faces of the cage in each GeomSubset, by name.
         weld: The mesh as authored and as solved, without holes.
         words: Words in the names of the prim, its parent, its materials, and subsets covering most of the mesh.
+        still: Whether the garment itself has no samples.
         shell: Thickness of the shell that is written in place of a sheet [m]; 0 for the sheet.
     """
 
@@ -132,12 +133,14 @@ class GarmentSource:
     words: tuple[str, ...] = ()
     absent: tuple[float, ...] = ()
     shell: float = 0.0
+    still: bool = False
 
     @property
     def left_out_words(self) -> str:
         """Number and range of samples outside the frame range; "" without any."""
-        before, after = ([f"{t:g}" for t in self.left_out if (t < self.times[0]) == early] for early in (True, False))
-        spans = " and ".join(" to ".join(dict.fromkeys([span[0], span[-1]])) for span in (before, after) if span)
+        before, after = ([t for t in self.left_out if (t < self.times[0]) == early] for early in (True, False))
+        ends = [dict.fromkeys([span[0], span[-1]]) for span in (before, after) if span]
+        spans = " and ".join(" to ".join(map(named_time, each)) for each in ends)
         return f"{len(self.left_out)} of {len(self.left_out) + len(self.times)} samples, {spans}" if spans else ""
 
 

@@ -1,18 +1,139 @@
-"""Time codes of garments, in composed stage time."""
+"""Time codes of garments, in composed stage time: the time codes at which a shot is solved are chosen here alone.
+
+Time codes within `SAME_TIME` of each other are the same. A jump has two: two samples of one attribute nearer than that,
+with different values, are the pose before the jump and the pose after it.
+"""
 
 from __future__ import annotations
 
 import math
+from bisect import bisect_left, bisect_right
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import groupby, pairwise
+from operator import itemgetter
 
 import numpy as np
 from pxr import Usd, UsdGeom
 
-from ..errors import AbsentError
+from ..errors import AbsentError, named_time
+from ..solver.scene import FARTHEST, SAME_TIME
 from .lookup import with_ancestors
 
-SAME_TIME = 1e-6
-"""Time codes closer than this count as equal: layer offsets leave rounding errors."""
+_SHAPE = ("points", "radius", "radiusTop", "radiusBottom", "height", "size")
+"""Attributes of a mesh's or another shape's form."""
+_TURNING = ("rotate", "orient")
+_SLOWEST, _FASTEST, _FRAME_RATE = 12.0, 120.0, 24.0
+"""Least and most frames a second, and how many where none of the stage's rates is between [1/s]."""
+_MOST = 10_000
+"""Most whole frames between two keys: a key farther away is a stray one."""
+_ALIKE = 1e-6
+"""Largest difference of two equal values, relative to the largest number: the rounding of single precision."""
+
+
+@dataclass(frozen=True)
+class FrameGrid:
+    """Whole frames of a stage: whole time codes, unless these are too long or too short for frames, as seconds are.
+
+    Attributes:
+        length: Length of a frame in time codes.
+        first: Time code of a whole frame.
+    """
+
+    length: float = 1.0
+    first: float = 0.0
+
+    @staticmethod
+    def of(stage: Usd.Stage) -> FrameGrid:
+        """The frames of a stage."""
+        rate, start = stage.GetTimeCodesPerSecond(), stage.GetStartTimeCode()
+        rates = (rate, stage.GetFramesPerSecond())
+        frames = next((each for each in rates if _SLOWEST <= each <= _FASTEST), _FRAME_RATE)
+        return FrameGrid(rate / frames, float(round(start)) if abs(start) <= FARTHEST else 0.0)
+
+    def inside(self, start: float, end: float) -> list[float]:
+        """Whole frames between two time codes, if these are over a frame apart and not too many."""
+        if not self.length + SAME_TIME < end - start <= _MOST * self.length:
+            return []
+        low, high = ((time - self.first) / self.length for time in (start + SAME_TIME, end - SAME_TIME))
+        return [self.first + number * self.length for number in range(math.ceil(low), math.floor(high) + 1)]
+
+    def has(self, time: float) -> bool:
+        """Whether a time code is a whole frame."""
+        number = (time - self.first) / self.length
+        return abs(number - round(number)) * self.length <= SAME_TIME
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Time codes of what moves a prim.
+
+    Attributes:
+        times: Authored time codes, as by `merge`.
+        arcs: Spans of time codes in which points may leave the straight line between samples.
+    """
+
+    times: tuple[float, ...] = ()
+    arcs: tuple[tuple[float, float], ...] = ()
+
+    @staticmethod
+    def joined(motions: Iterable[Motion]) -> Motion:
+        """The motion by several things, the most important first."""
+        motions = [*motions]
+        arcs = dict.fromkeys(arc for motion in motions for arc in motion.arcs)
+        return Motion(merge(*(motion.times for motion in motions)), tuple(arcs))
+
+
+def motion_of(prim: Usd.Prim, *, shape: bool = True) -> Motion:
+    """Motion of a prim by its transforms, before which its form counts, if ``shape``."""
+    form = [prim.GetAttribute(name) for name in _SHAPE if shape and prim.HasAttribute(name)]
+    ops = [op for transform in transform_chain(prim) for op in transform.GetOrderedXformOps()]
+    turning = [op.GetOpTypeToken(op.GetOpType()).startswith(_TURNING) for op in ops]
+    placed = [motion_by(op.GetAttr(), turns=turns) for op, turns in zip(ops, turning, strict=True)]
+    return Motion.joined([*map(motion_by, form), *placed])
+
+
+def motion_by(attribute: Usd.Attribute, *, turns: bool = False) -> Motion:
+    """Motion by an attribute: its samples, or the knots of its spline; on arcs if it turns what it moves."""
+    has_spline, get_spline = (getattr(attribute, name, None) for name in ("HasSpline", "GetSpline"))
+    if has_spline is not None and get_spline is not None and has_spline():
+        knots = sorted(float(time) for time in get_spline().GetKnots().keys())
+        return Motion(tuple(knots), tuple(pairwise(knots)))
+    times = attribute.GetTimeSamples()
+    double = {a for a, b in pairwise(times) if b - a <= SAME_TIME and _alike(attribute.Get(a), attribute.Get(b))}
+    inside = FrameGrid.of(attribute.GetStage()).inside if turns and len(times) > 1 else None
+    spans = [span for span in pairwise(times) if inside and inside(*span)]
+    arcs = [(a, b) for a, b in spans if not _alike(attribute.Get(a), attribute.Get(b))]
+    return Motion(tuple(time for time in times if time not in double), tuple(arcs))
+
+
+def solve_times(cloth: Motion, bodies: Iterable[Motion], frames: FrameGrid) -> tuple[float, ...]:
+    """Time codes at which a garment is solved, ascending: its own, and whole frames between them.
+
+    Whole frames are those on an arc of the garment or of a body it meets, and those at which such a body has a sample.
+    A garment that stands still has its bodies' samples as its own.
+    """
+    moves = len(cloth.times) > 1
+    if moves and not any(frames.inside(*span) for span in pairwise(cloth.times)):
+        return cloth.times
+    moving = [body for body in bodies if len(body.times) > 1]
+    own = cloth.times if moves else merge(cloth.times, *(body.times for body in moving))
+    between = [time for span in pairwise(own) for time in frames.inside(*span)]
+    arcs = [arc for motion in (cloth, *moving) for arc in motion.arcs]
+    sampled = merge(*(body.times for body in moving))
+    wanted = [time for time in between if is_among(time, sampled) or any(a < time < b for a, b in arcs)]
+    return merge(own, wanted)
+
+
+def found_among(time: float, times: Sequence[float]) -> float | None:
+    """The time code among others, ascending, that is the same as one, the nearest of two; None without any."""
+    same = times[bisect_left(times, time - SAME_TIME) : bisect_right(times, time + SAME_TIME)]
+    return min(same, key=lambda each: abs(each - time), default=None)
+
+
+def is_among(time: float, times: Sequence[float]) -> bool:
+    """Whether a time code is the same as one of others, ascending."""
+    return found_among(time, times) is not None
 
 
 def transform_chain(prim: Usd.Prim) -> list[UsdGeom.Xformable]:
@@ -27,29 +148,20 @@ def transform_chain(prim: Usd.Prim) -> list[UsdGeom.Xformable]:
     return chain
 
 
-def garment_times(prim: Usd.Prim) -> tuple[float, ...]:
-    """All authored time codes of the points and of the prim's transforms, ascending."""
-    return merge([*UsdGeom.Mesh(prim).GetPointsAttr().GetTimeSamples(), *transform_times(prim)])
+def merge(*sources: Iterable[float]) -> tuple[float, ...]:
+    """Sort the time codes of several sources; the same time code is kept as the earliest source has it.
 
-
-def transform_times(prim: Usd.Prim) -> list[float]:
-    """All authored time codes of a prim's transforms, unordered.
-
-    A transform animated by a spline contributes the knots and the whole time codes between the knots.
+    Of a source with two, which are the sides of a jump, both are kept.
     """
-    chain = transform_chain(prim)
-    sampled = [time for transform in chain for time in transform.GetTimeSamples()]
-    return sampled + [
-        time for transform in chain for op in transform.GetOrderedXformOps() for time in _spline_times(op.GetAttr())
-    ]
-
-
-def _spline_times(attribute: Usd.Attribute) -> list[float]:
-    has_spline, get_spline = (getattr(attribute, name, None) for name in ("HasSpline", "GetSpline"))
-    if has_spline is None or get_spline is None or not has_spline():
-        return []
-    knots = [float(time) for time in get_spline().GetKnots().keys()]
-    return [*knots, *map(float, range(math.ceil(min(knots)), math.floor(max(knots)) + 1))] if knots else []
+    ranked = sorted({(time, rank) for rank, source in enumerate(sources) for time in source})
+    kept, start = list[float](), 0
+    while start < len(ranked):
+        end = bisect_right(ranked, ranked[start][0] + SAME_TIME, key=itemgetter(0))
+        same = sorted(ranked[start:end], key=itemgetter(1))
+        each = [[time for time, _ in group] for _, group in groupby(same, key=itemgetter(1))]
+        kept += next((times for times in each if len(times) > 1), each[0])
+        start = end
+    return tuple(kept)
 
 
 def none_within(every: Sequence[float], frames: tuple[float, float]) -> AbsentError:
@@ -59,32 +171,32 @@ def none_within(every: Sequence[float], frames: tuple[float, float]) -> AbsentEr
         every: All time codes of the shot, ascending.
         frames: First and last time code.
     """
-    message = "no sample of the shot lies in frames {:g}:{:g}".format(*frames)
+    message = f"no sample of the shot lies in frames {':'.join(map(named_time, frames))}"
     if not every:
         return AbsentError(f"{message}; it has none: leave out --frames")
-    span = f"its {len(every)} samples run from {every[0]:g} to {every[-1]:g}"
-    return AbsentError(f"{message}; {span}; give a range that holds one, such as --frames {every[0]:g}:{every[-1]:g}")
-
-
-def merge(times: Iterable[float]) -> tuple[float, ...]:
-    """Sort time codes and drop near duplicates of earlier input entries."""
-    merged: list[tuple[float, int]] = []
-    for time, rank in sorted((time, rank) for rank, time in enumerate(times)):
-        if merged and time - merged[-1][0] <= SAME_TIME:
-            merged[-1] = min(merged[-1], (time, rank), key=lambda pair: pair[1])
-        else:
-            merged.append((time, rank))
-    return tuple(time for time, _ in merged)
+    first, last = named_time(every[0]), named_time(every[-1])
+    span = f"its {len(every)} samples run from {first} to {last}"
+    return AbsentError(f"{message}; {span}; give a range that holds one, such as --frames {first}:{last}")
 
 
 def snap(times: Iterable[float], merged: Sequence[float]) -> tuple[float, ...]:
-    """Replace each time code by the nearest time code kept by ``merge``."""
+    """Replace each time code by the nearest time code kept by ``merge``, once each."""
     known = np.asarray(merged)
-    return tuple(float(known[np.abs(known - time).argmin()]) for time in times)
+    return tuple(dict.fromkeys(float(known[np.abs(known - time).argmin()]) for time in times))
 
 
 def within(times: Iterable[float], frames: tuple[float, float] | None) -> tuple[float, ...]:
-    """Time codes inside a closed range, up to rounding; all time codes without a range."""
+    """Time codes inside a closed range; all time codes without a range."""
     if frames is None:
         return tuple(times)
     return tuple(time for time in times if frames[0] - SAME_TIME <= time <= frames[1] + SAME_TIME)
+
+
+def _alike(a: object, b: object) -> bool:
+    """Whether two values of an attribute are equal up to rounding."""
+    try:
+        first, second = (np.asarray(value, dtype=np.float64) for value in (a, b))
+    except (TypeError, ValueError):  # A quaternion, or a value that is blocked.
+        return a == b
+    most = _ALIKE * float(np.abs(first[np.isfinite(first)]).max(initial=0.0))
+    return first.shape == second.shape and np.allclose(first, second, rtol=0.0, atol=most, equal_nan=True)

@@ -15,6 +15,7 @@ from stages import (
     bind_skin,
     clip_shot,
     instanced_shot,
+    loop_shot,
     new_stage,
     save,
     sheet_points,
@@ -142,6 +143,51 @@ def _clips(folder: Path) -> None:
     clip_shot(folder, TIMES)
 
 
+def _sparse(folder: Path) -> None:
+    """A skeleton with two keys, and a body that another one turns."""
+    stage = new_stage(folder / "shot.usda", metres=METRES)
+    points = sheet_points(None, SIZE)
+    for root, tagged in (("/World/rig", True), ("/World/other", False)):
+        add_skeleton(stage, root, (1.0, 4.0) if tagged else (1.0, 2.5, 6.0))
+        mesh = add_sheet(stage, f"{root}/cloth", times=(), size=SIZE, tagged=tagged)
+        bind_skin(mesh, root, joints=[int(x > 1) for x in points[:, 0]])
+    stage.GetPrimAtPath("/World/other/cloth").AddAppliedSchema(COLLIDER_API)
+    UsdGeom.XformCommonAPI(stage.GetPrimAtPath("/World/other")).SetTranslate((0.0, 0.0, -0.2))
+    save(stage)
+
+
+def _rounded(folder: Path) -> None:
+    """Cloth at float seconds under transforms at whole frames, and a sphere that turns about the world."""
+    stage = new_stage(folder / "shot.usda", metres=METRES)
+    rig = UsdGeom.Xform.Define(stage, "/World/rig")
+    for time in TIMES:
+        UsdGeom.XformCommonAPI(rig).SetTranslate((time, 0.0, 0.0), time)
+    add_sheet(stage, "/World/rig/cloth", times=(1.0 - 3e-5, 2.0 + 3e-5), size=SIZE)
+    turn = UsdGeom.Xform.Define(stage, "/World/turn").AddRotateZOp()
+    turn.Set(0.0, 1.0)
+    turn.Set(90.0, 3.0)
+    sphere = UsdGeom.Sphere.Define(stage, "/World/turn/sphere")
+    sphere.CreateRadiusAttr(0.5)
+    UsdGeom.XformCommonAPI(sphere).SetTranslate((3.0, 0.0, 0.0))
+    sphere.GetPrim().AddAppliedSchema(COLLIDER_API)
+    save(stage)
+
+
+def _curtain(folder: Path) -> None:
+    """Cloth that stands still, and a sphere that moves into it."""
+    stage = new_stage(folder / "shot.usda", metres=METRES)
+    add_sheet(stage, CLOTH, times=(), size=SIZE)
+    sphere = UsdGeom.Sphere.Define(stage, "/World/sphere")
+    sphere.GetPrim().AddAppliedSchema(COLLIDER_API)
+    for time in (1.0, 2.0, 2.5):
+        UsdGeom.XformCommonAPI(sphere).SetTranslate((1.5, 1.0, -2.5 + 0.5 * time), time)
+    save(stage)
+
+
+def _loops(folder: Path) -> None:
+    loop_shot(folder, size=SIZE, metres=METRES)
+
+
 BASES: dict[str, Callable[[Path], None]] = {
     "plain": _plain,
     "still": _still,
@@ -152,6 +198,10 @@ BASES: dict[str, Callable[[Path], None]] = {
     "several": _several,
     "instanced": _instanced,
     "clips": _clips,
+    "sparse": _sparse,
+    "rounded": _rounded,
+    "curtain": _curtain,
+    "loops": _loops,
 }
 """What writes each sound shot, ``shot.usda``, into a folder."""
 

@@ -9,7 +9,9 @@ from pathlib import Path
 from .damage import NAN, ODD_DOUBLES, ODD_INTS
 from .mutant import Draft, Kind
 
-ALL = ("plain", "still", "dressed", "bodies", "skinned", "layered", "several", "instanced", "clips")
+TIMED = ("sparse", "rounded", "curtain", "loops")
+"""Shots whose garments are not solved at their own samples alone."""
+ALL = ("plain", "still", "dressed", "bodies", "skinned", "layered", "several", "instanced", "clips", *TIMED)
 _NUMBER = re.compile(rb"(?<![\w.])-?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?![\w.])")
 _WORD = re.compile(rb"[A-Za-z_][\w:]*")
 _TYPES = (b"int[]", b"float[]", b"point3f[]", b"string", b"token", b"double", b"matrix4d", b"quatf[]", b"half3[]")

@@ -6,8 +6,11 @@ import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 from stages import vec3
 
+from physgraph_usd.usd.stage import paths_in
+
 from .bases import garments_of
 from .damage import INF, NAN, numbers
+from .files import TIMED
 from .meshes import OWN, a_mesh
 from .mutant import Draft, Kind
 
@@ -157,6 +160,42 @@ def _size(draft: Draft) -> None:
     draft.save(stage, f"{metres:g} m per unit")
 
 
+def _retimed(draft: Draft) -> None:
+    """Samples of what moves, cloth or body, at other times; at other rates, in a range."""
+    stage = draft.open()
+    layer = stage.GetRootLayer()
+    moving = [path for path in paths_in(layer) if layer.ListTimeSamplesForPath(path)]
+    hows = ["seconds"] if draft.chance(0.2) else ["rounded", "jump", "sparse", "far", "one", "blocked"]
+    for path in moving if draft.chance(0.5) or hows == ["seconds"] else moving[:1]:
+        samples = {time: layer.QueryTimeSample(path, time) for time in layer.ListTimeSamplesForPath(path)}
+        how = draft.pick(hows)
+        changed = _other_times(draft, samples, how)
+        for time in samples:
+            layer.EraseTimeSample(path, time)
+        for time, value in changed.items():
+            layer.SetTimeSample(path, time, value)
+        draft.said.append(f"{path}: {how}")
+    if hows == ["seconds"] or draft.chance(0.3):
+        layer.timeCodesPerSecond = draft.pick([1000.0, 48.0, 25.0]) if len(hows) > 1 else 1.0
+    if draft.chance(0.3):
+        draft.options["frames"] = draft.pick([(1.0, 2.0), (2.0, 2.0), (1.0, 1e6), (2.5, 3.0)])
+    draft.save(stage, f"{len(moving)} sampled")
+
+
+def _other_times(draft: Draft, samples: dict[float, object], how: str) -> dict[float, object]:
+    """Samples rounded, with a jump, sparse, far away, in seconds, one alone, or with a block."""
+    first, last = min(samples), max(samples)
+    return {
+        "rounded": lambda: {time + draft.pick([3e-5, -9e-4, 0.0]): each for time, each in samples.items()},
+        "jump": lambda: samples | {last - draft.pick([1e-9, 9e-4]): samples[first]},
+        "sparse": lambda: {first: samples[first], last + draft.pick([4.0, 11.5]): samples[last]},
+        "far": lambda: samples | {draft.pick([-1e5, 1e7, 40.0]): samples[first]},
+        "seconds": lambda: {time / 24.0: each for time, each in samples.items()},
+        "one": lambda: {first: samples[first]},
+        "blocked": lambda: samples | {draft.pick([first, last, last + 2.0]): Sdf.ValueBlock()},
+    }[how]()
+
+
 KINDS = (
     Kind("odd: painted extremes", _paint, OWN),
     Kind("odd: variants", _variants, OWN),
@@ -165,4 +204,5 @@ KINDS = (
     Kind("odd: glitch frames", _glitch, ("plain", "bodies", "dressed", "several")),
     Kind("odd: points at one place", _coincident, OWN),
     Kind("odd: size of the shot", _size, OWN),
+    Kind("odd: times of samples", _retimed, (*TIMED, "bodies", "skinned", "dressed", "layered")),
 )

@@ -8,6 +8,8 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from ...errors import named_time
+
 WIDTH, HEIGHT = 1120, 190
 LEFT, RIGHT, TOP, BOTTOM = 64, 12, 8, 24
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7a5195", "#8c6d31", "#6e6e6e")
@@ -77,7 +79,7 @@ def plot(name: str, title: str, times: Sequence[float], lines: Mapping[str, Sequ
     )
     data = {
         "width": WIDTH,
-        "times": [f"{time:g}" for time in times],
+        "times": [*map(named_time, times)],
         "at": [round(across.at(time), 2) for time in times],
         "values": [[None if v is None else f"{v:.4g}" for v in values] for values in shown.values()],
     }
@@ -112,7 +114,8 @@ def _frame(ticks: Sequence[float], times: Sequence[float], across: Axis, up: Axi
     count = min(len(times), 9)
     picks = sorted({round(i * (len(times) - 1) / max(count - 1, 1)) for i in range(count)})
     columns = "".join(
-        f"<text x='{across.at(times[i]):.1f}' y='{HEIGHT - 6}' text-anchor='middle'>{times[i]:g}</text>" for i in picks
+        f"<text x='{across.at(times[i]):.1f}' y='{HEIGHT - 6}' text-anchor='middle'>{named_time(times[i])}</text>"
+        for i in picks
     )
     return rows + columns
 

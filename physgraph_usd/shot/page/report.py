@@ -12,7 +12,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from ...errors import LayerError, StageError
+from ...errors import LayerError, StageError, named_time
 from ...usd.read.reader import Shot
 from ...usd.write.atomic import write_text
 from ..options import PAGE_NAME, REPORT_NAME
@@ -97,7 +97,7 @@ def _largest_remaining(report: RefineReport) -> str:
     if not left:
         return ""
     most, time = max(left, key=lambda each: each[0])
-    place = "the only frame" if time is None else f"time code {time:g}"
+    place = "the only frame" if time is None else f"time code {named_time(time)}"
     return f" The end of a frame's solve leaves a move of at most {most:.2g} mm (RMS over the cloth), in {place}."
 
 
@@ -129,7 +129,7 @@ def _pictures(report: RefineReport, shot: Shot) -> str:
         drawn = pictures.draw(times) if times else []
     except (StageError, LayerError) as error:
         return f"{title}<p class='note'>No pictures: {html.escape(str(error))}</p>"
-    captions = ["the only frame" if time is None else f"time code {time:g}" for time in times]
+    captions = ["the only frame" if time is None else f"time code {named_time(time)}" for time in times]
     return close + title + "".join(map(_figure, drawn, captions))
 
 

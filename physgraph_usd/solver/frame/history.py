@@ -11,9 +11,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ...errors import named_time
 from ..colliders.pose import Pose
 from ..rigid import AT_REST, Rigid, best_motion
-from ..scene import Frame, GarmentFrame
+from ..scene import SAME_TIME, Frame, GarmentFrame
 from .values import FrameState, join
 
 RETURNED = 0.25
@@ -105,19 +106,20 @@ class Origin:
         return known[0].colliders if one else ()
 
     def elapsed(self, time: float | None, seconds: float) -> float:
-        """Longest time from a garment's start frame to a time code [s]; 0 without either.
+        """Longest time from a garment's start frame to a time code [s]; 0 without either, and across a jump.
 
         Args:
             seconds: Length of one time code [s].
         """
         starts = [each.time for each in self.frames if each is not None and each.time is not None]
-        return 0.0 if time is None or not starts else seconds * (time - min(starts))
+        passed = 0.0 if time is None or not starts else time - min(starts)
+        return seconds * passed if abs(passed) > SAME_TIME else 0.0
 
     def telemetry(self, walked_from: float | None) -> dict[str, object]:
         """Telemetry of the start, given the time code from which a cold frame's cage was advanced, or None."""
         found: dict[str, object] = {"start": "cold: the time between samples is too long"} if self.gap else {}
         if walked_from is not None:
-            found["start"] = f"cold: the cage walked here from time code {walked_from:g}"
+            found["start"] = f"cold: the cage walked here from time code {named_time(walked_from)}"
         if self.broken is not None:
             found["broken_before"] = self.broken
         if self.jumped is not None:

@@ -9,7 +9,7 @@ from functools import reduce
 import numpy as np
 import torch
 
-from ...errors import At, GarmentError, SolveError
+from ...errors import At, GarmentError, SolveError, named_time
 from ..contact.bodies import Touching
 from ..contact.broad_phase import Bodies, TouchingGroups, bounds_of, reach_of
 from ..contact.report import body_crossings, penetration_map
@@ -280,5 +280,5 @@ class SceneFrame:
             last = self.memories[index].last
             before = None if last is None else last.frame.points
             if wrong := strayed(self.frame.garments[index].points, fine, before=before):
-                when = "" if self.frame.time is None else f" at time code {self.frame.time:g}"
+                when = "" if self.frame.time is None else f" at time code {named_time(self.frame.time)}"
                 raise SolveError(f"<{self.cloth.scene.garments[index].path}>{when}: {wrong}")

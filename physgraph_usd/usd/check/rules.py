@@ -18,7 +18,7 @@ from ..read.absence import absence
 from ..read.authored import beyond_limits
 from ..read.skinning import skel_root
 from ..stage import at_time, paths_in, root_metadata, timecode
-from ..times import SAME_TIME, garment_times
+from ..times import FrameGrid, is_among, motion_of
 from ..view import StageView
 from ..write.normals import VertexNormals
 from ..write.overs import EMPTIED
@@ -404,10 +404,11 @@ def against_shot(layer: Sdf.Layer, coarse: Usd.Prim, target: Sdf.Path) -> Iterat
             return
     if skel_root(coarse) is not None:  # The points of a skinned mesh are a bind pose.
         return
-    authored = np.array(garment_times(coarse))
+    authored, frames = motion_of(coarse).times, FrameGrid.of(coarse.GetStage())
     for time in written:
-        if not len(authored) or np.abs(authored - time).min() > SAME_TIME:
-            yield _error("is a sample at a time that the shot does not author", name, time)
+        between = len(authored) > 1 and authored[0] < time < authored[-1] and frames.has(time)
+        if len(authored) > 1 and not (between or is_among(time, authored)):  # Else the bodies' samples count.
+            yield _error("is a sample neither at a time that the shot authors nor at a whole frame between", name, time)
             break
     spec, clouds = layer.GetAttributeAtPath(name), []
     for time in written[:1] + written[-1:] if written else [None]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from pxr import Usd, UsdGeom
 
-from ...errors import counted
+from ...errors import counted, named_time
 from ..stage import Notice, timecode
 from ..times import transform_chain
 from .placement import flattened
@@ -20,22 +20,25 @@ _MOST_NAMED = 3
 
 @dataclass(frozen=True)
 class Samples:
-    """Authored time codes of a garment.
+    """Time codes of a garment.
 
     Attributes:
         times: Time codes with a shape, ascending.
         absent: Time codes without a shape, ascending, with the reason in words.
+        own: Time codes with a shape that the garment itself has samples at, ascending.
     """
 
     times: tuple[float, ...] = ()
     absent: Mapping[float, str] = field(default_factory=dict)
+    own: tuple[float, ...] = ()
 
     @staticmethod
-    def of(prim: Usd.Prim, times: Iterable[float]) -> Samples:
-        """Sort the time codes of a garment's mesh prim."""
+    def of(prim: Usd.Prim, times: Iterable[float], own: Iterable[float] = ()) -> Samples:
+        """Sort the time codes of a garment's mesh prim, among them its own."""
         reasons = {time: absence(prim, time) for time in times}
         there = tuple(time for time, reason in reasons.items() if not reason)
-        return Samples(there, {time: reason for time, reason in reasons.items() if reason})
+        absent = {time: reason for time, reason in reasons.items() if reason}
+        return Samples(there, absent, tuple(time for time in own if time in there))
 
     def notices(self, path: str, times: Sequence[float]) -> list[Notice]:
         """Notices of the garment's absences among some time codes, one for each reason."""
@@ -76,7 +79,7 @@ def missing_value(prim: Usd.Prim, time: float) -> str:
 
 def named_times(times: Sequence[float]) -> str:
     """Time codes in words, the first few of many."""
-    names = [f"{time:g}" for time in times]
+    names = [*map(named_time, times)]
     if len(names) == 1:
         return f"time code {names[0]}"
     if len(names) > _MOST_NAMED:

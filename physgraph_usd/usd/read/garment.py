@@ -19,7 +19,7 @@ from ..lookup import Found, Override, bound_materials, check_limits, find_value
 from ..mesh.pieces import sort_pieces
 from ..schema import GARMENT
 from ..stage import GarmentSource, Notice, Units
-from ..times import garment_times, merge, transform_times, within
+from ..times import within
 from .absence import Samples, absence
 from .cage import PointReader, read_cage
 from .grain import read_grain
@@ -106,12 +106,14 @@ class GarmentReader:
         return GarmentFrame(points, fabric, guide, detail, offset), notices
 
 
-def samples_of(prim: Usd.Prim, bake: Bake) -> Samples:
-    """Authored time codes of a garment; a skinned garment has its skeleton's, without samples added by baking."""
-    skinned = bake.skinned.get(prim.GetPath())
-    times = merge([*skinned.times, *transform_times(prim)]) if skinned else garment_times(prim)
-    samples = Samples.of(prim, times)
-    if times and not samples.times:
+def samples_of(prim: Usd.Prim, own: Sequence[float], times: Sequence[float]) -> Samples:
+    """Time codes at which a garment is solved, given its own and all, without those at which it has no shape.
+
+    Raises:
+        GarmentError: When the garment has a shape at none of its own time codes.
+    """
+    samples = Samples.of(prim, times, own)
+    if own and not samples.times:
         time, reason = next(iter(samples.absent.items()))
         message, remedy = f"{reason}; it is there at no time code", "give it points and a scale other than zero"
         raise GarmentError(str(prim.GetPath()), message, time=time, remedy=remedy)
@@ -125,14 +127,12 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], samples: Samples, re
         GarmentError: When the garment is broken.
         SchemaError: When a value of the garment is invalid.
     """
-    every = samples.times
-    times, first = within(every, request.frames), every[0] if every else None
+    every, times = samples.times, within(samples.times, request.frames)
     points = PointReader(prim, times[0] if times else None)
     cage = read_cage(prim, points.count, times)
-    edges = cage.mesh.half_edges.edges
     placement = check_placement(prim, request.units.metres, times)
-    matrix = to_metres(prim, request.units.metres, first)
-    animation = _animation(prim, points, request, edges=edges, every=every, times=times)
+    matrix = to_metres(prim, request.units.metres, every[0] if every else None)
+    animation = _animation(prim, points, request, edges=cage.mesh.half_edges.edges, every=samples.own, times=times)
     rest, weld = _rest_and_weld(prim, cage.mesh, animation, request, matrix=matrix)
     (bent, odd), absent = rests_bent(prim), within(samples.absent, request.frames)
     notices = [*samples.notices(str(prim.GetPath()), absent), *cage.notices, *odd, *placement]
@@ -141,9 +141,6 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], samples: Samples, re
     painted, cut = _painted(prim, weld, notices, values=values)
     pieces, odd_pieces = _pieces(prim, weld, rest.points, subsets := _subsets(prim, cage.kept_faces[weld.faces]))
     grain, lies = read_grain(prim, weld, rest.points, kept=cage.kept_faces, up=request.units.up, painted=cut)
-    folds = pressed_folds(
-        weld.mesh, [weld.joined(each) for each in animation.poses().values()], _asked_edges(prim, weld)
-    )
     garment = Garment(
         str(prim.GetPath()),
         weld.mesh,
@@ -151,7 +148,7 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], samples: Samples, re
         flipped=is_flipped(prim, matrix),
         bent_rest=bent,
         grain=grain,
-        **dict(zip(("pressed", "folded"), folds or (), strict=False)),
+        **_pressed(prim, weld, animation),
         **constants | pieces | painted,
     )
     notices += [*rest.notices, *odd_pieces, *_size_notices(garment.path, animation.first, request)]
@@ -160,14 +157,15 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], samples: Samples, re
         *(prim.GetPath(), cage.kept_faces, weld, prim.GetPath() in request.bake.skinned, tuple(roots), times),
         {"rest": rest.source, "grain": lies} | values.sources | of_constants,
         values.animated,
-        left_out=tuple(time for time in every if time not in times),
+        still=not samples.own,
+        left_out=tuple(time for time in every if time not in times) if times else (),
         absent=absent,
         velocities=_has_velocities(prim, points.count),
         subsets=subsets,
         words=_words(prim, [name for name, faces in subsets.items() if 2 * len(faces) > len(weld.faces)]),
         shell=float(find_value(prim, GARMENT["shell:thickness"], request.overrides).at(None) or 0.0),
     )
-    return GarmentReader(garment, source, values, points, edges, weld, notices)
+    return GarmentReader(garment, source, values, points, cage.mesh.half_edges.edges, weld, notices)
 
 
 def _animation(
@@ -179,7 +177,7 @@ def _animation(
     every: Sequence[float],
     times: Sequence[float],
 ) -> Animation:
-    """A garment's points over the shot, given all its time codes and the refined time codes; each is read once."""
+    """A garment's points over the shot, given its own time codes and the refined time codes; each is read once."""
 
     @cache
     def read(time: float | None) -> tuple[np.ndarray, tuple[Notice, ...]]:
@@ -241,6 +239,13 @@ def _subsets(prim: Usd.Prim, cage_faces: np.ndarray) -> dict[str, np.ndarray]:
         members = np.isin(cage_faces, [] if faces is None else np.asarray(faces))
         subsets[subset.GetPrim().GetName()] = np.flatnonzero(members)
     return subsets
+
+
+def _pressed(prim: Usd.Prim, weld: Weld, animation: Animation) -> dict[str, np.ndarray]:
+    """Pressed vertices and the pose with the folds as they rest, by field name; empty without pressed folds."""
+    poses = [weld.joined(pose) for pose in animation.poses().values()]
+    found = pressed_folds(weld.mesh, poses, _asked_edges(prim, weld))
+    return {} if found is None else {"pressed": found[0], "folded": found[1]}
 
 
 def _asked_edges(prim: Usd.Prim, weld: Weld) -> dict[tuple[int, int], bool]:

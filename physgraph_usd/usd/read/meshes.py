@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -17,7 +17,7 @@ from ..mesh.drawn import DrawnSurface
 from ..provenance import read_record, recorded_shot
 from ..schema import AXES
 from ..stage import bad_rate, list_meshes, open_layer, paths_in, pxr_errors, quiet, read_units, timecode
-from ..times import garment_times, merge
+from ..times import merge, motion_of, within
 from ..view import root_over
 from .bodies import DRAWN_WITHIN, surface_of
 from .find import has_schema, traverse, with_gravity
@@ -89,7 +89,7 @@ class DrawnStage:
         base = open_layer(shot, StageError)
         layers = [open_layer(path, StageError) for path in (over, shot) if path is not None]
         points = [] if over is None else [f"{path}.points" for path in refined_in(over)]
-        self._refined = merge(time for name in points for time in layers[0].ListTimeSamplesForPath(name))
+        self._refined = merge(*(layers[0].ListTimeSamplesForPath(name) for name in points))
         self._root = root_over(base, [layer.identifier for layer in layers])
         with pxr_errors(f"cannot open {shot}"), quiet():
             self.stage = Usd.Stage.Open(self._root)
@@ -107,16 +107,14 @@ class DrawnStage:
 
         Under a refined layer, only time codes from its first to its last sample: outside, the layer holds still.
         """
-        found: list[float] = []
+        found: list[Iterable[float]] = []
         for prim in traverse(self.stage):
             if (UsdGeom.Mesh(prim) and not paths) or str(prim.GetPath()) in paths:
-                found.extend(garment_times(prim))
+                found.append(motion_of(prim).times)
             elif animation := UsdSkel.Animation(prim):
                 for attribute in (animation.GetRotationsAttr(), animation.GetTranslationsAttr()):
-                    found.extend(attribute.GetTimeSamples())
-        if self._refined:
-            found = [time for time in found if self._refined[0] <= time <= self._refined[-1]]
-        return merge(found)
+                    found.append(attribute.GetTimeSamples())
+        return within(merge(*found), (self._refined[0], self._refined[-1]) if self._refined else None)
 
     def bake(self, times: tuple[float, ...]) -> None:
         """Skin the skinned meshes for the given times, in the anonymous root."""

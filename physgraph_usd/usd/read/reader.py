@@ -15,13 +15,13 @@ import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from copy import copy
-from dataclasses import replace
-from functools import cached_property
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
 
 import numpy as np
 from pxr import Sdf, Usd
 
-from ...errors import AbsentError, SchemaError, StageError, UsageError
+from ...errors import AbsentError, SchemaError, StageError, UsageError, named_time
 from ...interrupts import leave_if_asked
 from ...solver.colliders.orient import choose_side
 from ...solver.scene import Frame, Scene, refuse_falling, refuse_far
@@ -41,7 +41,7 @@ from ..stage import (
     root_metadata,
     shot_name,
 )
-from ..times import merge, none_within, snap, within
+from ..times import FrameGrid, Motion, merge, none_within, snap, solve_times, within
 from ..view import StageView
 from .authored import authored_faults
 from .bodies import ColliderReader, Polygons, read_collider
@@ -102,10 +102,8 @@ class Shot:
         self.bound: tuple[Bound, ...] = ()
         self.warnings: list[Notice] = []
         self.metres_per_unit, self.gravity_source = request.units.metres, request.units.gravity_source
-        times = merge(time for reader in readers for time in reader.source.times)
-        self.sources: tuple[GarmentSource, ...] = tuple(
-            replace(reader.source, times=snap(reader.source.times, times)) for reader in readers
-        )
+        times = tuple(sorted({time for reader in readers for time in reader.source.times}))
+        self.sources: tuple[GarmentSource, ...] = tuple(reader.source for reader in readers)
         colliders = tuple(body.collider for body in bodies)
         seconds, gravity = 1.0 / stage.GetTimeCodesPerSecond(), request.units.gravity
         self.scene = Scene(tuple(reader.garment for reader in readers), gravity, times, colliders, seconds)
@@ -292,19 +290,19 @@ def open_shot(
         units, odd = read_units(stage)
         units = with_gravity(units, prims, gravity)
         assumed = root_metadata(stage, "metersPerUnit") is None
-        bake = Bake(stage)
-        request = Request(units, bake, frames, level, asked, rest_frame, assumed)
+        request = Request(units, Bake(stage), frames, level, asked, rest_frame, assumed)
         bodies = [prim.GetPath() for prim in found]
         moved = [*bodies, *(each.path for each in bound)]
-        readers = _read(stage, prims, request, bodies=moved, notices=notices, skip_invisible=skip_invisible)
-        readers, solids = _link(stage, readers, bodies, wanted=colliders, request=request, notices=notices)
+        contacts = _contacts(stage, prims, colliders, request, notices=notices)
+        given = {"request": request, "contacts": contacts, "notices": notices}
+        readers = _read(stage, moved, skip_invisible=skip_invisible, **given)
+        readers, solids = _link(stage, readers, bodies, **given)
         opened = Shot(path, stage, view, request=request, readers=readers, bodies=_with_sides(stage, readers, solids))
         opened.bound = tuple(bound)
-        notices += _timing(stage, readers, solids, bake=bake)
-        read = [*(source.path for source in opened.sources), *moved, *bake.prims()]
+        notices += _timing(stage, readers, solids, bake=request.bake)
+        read = [*(source.path for source in opened.sources), *moved, *request.bake.prims()]
         opened.selections = selections(map(stage.GetPrimAtPath, read))
-    opened.unsaved = unsaved
-    opened.colliders = tuple(str(path) for path in bodies)
+    opened.unsaved, opened.colliders = unsaved, tuple(map(str, bodies))
     read_notices = [notice for reader in readers for notice in reader.notices]
     opened.warnings.extend(dict.fromkeys([*notices, *odd, *read_notices]))
     return opened
@@ -325,7 +323,7 @@ def _of_prims(
 
 def _check_options(frames: tuple[float, float] | None, level: int | None, rest_frame: float | str | None) -> None:
     if frames is not None and not (all(map(math.isfinite, frames)) and frames[0] <= frames[1]):
-        raise UsageError(f"frames {frames[0]:g}:{frames[1]:g} are no range; give FIRST:LAST")
+        raise UsageError(f"frames {':'.join(map(named_time, frames))} are no range; give FIRST:LAST")
     if level is not None:
         try:
             check_limits(GARMENT["refine:level"], level, "--level")
@@ -346,38 +344,59 @@ def _find(stage: Usd.Stage, garments: Sequence[str], notices: Sequence[Notice]) 
         raise kind(f"{error}; missing: {'; '.join(notice.message for notice in notices)}") from error
 
 
+@dataclass(frozen=True)
+class _Contact:
+    """Bodies of a garment: all gprims named or marked, and those excluded from contact, with the excluding target."""
+
+    near: frozenset[Sdf.Path]
+    excluded: Mapping[Sdf.Path, str]
+
+    @property
+    def felt(self) -> frozenset[Sdf.Path]:
+        """Gprims that may push the garment."""
+        return self.near - self.excluded.keys()
+
+
+def _contacts(
+    stage: Usd.Stage, prims: Sequence[Usd.Prim], wanted: Sequence[str], request: Request, *, notices: list[Notice]
+) -> dict[Sdf.Path, _Contact]:
+    """The bodies of each enabled garment, by its path; adds notices of the others and of missing targets."""
+    on = [prim for prim in prims if is_on(prim, GARMENT["enabled"], request.overrides)]
+    near, (excluded, odd) = felt_by(stage, on, wanted, overrides=request.overrides), read_apart(stage, on)
+    notices += [*(_left_out(prim, "is disabled") for prim in prims if prim not in on), *odd]
+    pairs = zip(on, near, excluded, strict=True)
+    return {prim.GetPath(): _Contact(felt, targets) for prim, felt, targets in pairs}
+
+
 def _link(
     stage: Usd.Stage,
     readers: Sequence[GarmentReader],
     paths: Sequence[Sdf.Path],
     *,
-    wanted: Sequence[str],
     request: Request,
+    contacts: Mapping[Sdf.Path, _Contact],
     notices: list[Notice],
 ) -> tuple[list[GarmentReader], list[ColliderReader]]:
     """Garments with their seams and the numbers of their colliders, and the colliders."""
     readers = _sewn(stage, readers, request, notices)
-    prims = [stage.GetPrimAtPath(reader.source.path) for reader in readers]
-    cloth = {prim.GetPath() for prim in prims}
-    reachable = felt_by(stage, prims, wanted, overrides=request.overrides)
-    excluded, odd = read_apart(stage, prims)
-    notices += odd
-    felt = [near - targets.keys() for near, targets in zip(reachable, excluded, strict=True)]
+    cloth = {reader.source.path for reader in readers}
+    felt = {body for path in cloth for body in contacts[path].felt}
     times = [reader.source.times[0] if reader.source.times else None for reader in readers]
     offset = min(reader.values.number("contact:offset", time) for reader, time in zip(readers, times, strict=True))
     given = {"overrides": request.overrides, "offset": offset}
     bodies = []
     for path in paths:
-        if any(path in near for near in felt):
+        if path in felt:
             body, odd = read_collider(stage.GetPrimAtPath(path), request.units.metres, **given)
             notices += odd
             bodies += [body] if body is not None else []
     numbers = {body.prim.GetPath(): number for number, body in enumerate(bodies)}
     linked = []
-    for reader, near, targets in zip(readers, reachable, excluded, strict=True):
-        apart = {str(path): target for path, target in targets.items() if path in near | cloth}
-        others = tuple(str(path) for path in targets if path in cloth)
-        colliders = tuple(sorted(numbers[path] for path in (near - targets.keys()) & numbers.keys()))
+    for reader in readers:
+        each = contacts[reader.source.path]
+        apart = {str(path): target for path, target in each.excluded.items() if path in each.near | cloth}
+        others = tuple(str(path) for path in each.excluded if path in cloth)
+        colliders = tuple(sorted(numbers[path] for path in each.felt & numbers.keys()))
         garment = replace(reader.garment, colliders=colliders, apart_from=others)
         linked.append(replace(reader, garment=garment, source=replace(reader.source, apart_from=apart)))
     return linked, bodies
@@ -404,7 +423,7 @@ def _sewn(
 
 
 def _every_time(sources: Iterable[GarmentSource]) -> tuple[float, ...]:
-    return merge(time for source in sources for time in (*source.times, *source.left_out))
+    return tuple(sorted({time for source in sources for time in (*source.times, *source.left_out)}))
 
 
 def _cages(stage: Usd.Stage, readers: Sequence[GarmentReader], metres: float, time: float | None) -> list[np.ndarray]:
@@ -454,38 +473,53 @@ def _timing(
 
 def _read(
     stage: Usd.Stage,
-    prims: Sequence[Usd.Prim],
-    request: Request,
+    moved: Sequence[Sdf.Path],
     *,
-    bodies: Sequence[Sdf.Path],
+    request: Request,
+    contacts: Mapping[Sdf.Path, _Contact],
     notices: list[Notice],
     skip_invisible: bool,
 ) -> list[GarmentReader]:
-    """Bake the skinning of garments and bodies and read every enabled garment."""
-    on = [prim for prim in prims if is_on(prim, GARMENT["enabled"], request.overrides)]
-    notices += [_left_out(prim, "is disabled") for prim in prims if prim not in on]
-    roots: dict[Sdf.Path, tuple[Sdf.Path, ...]] = {prim.GetPath(): instance_roots(prim) for prim in on}
+    """Bake the skinning of garments, bodies and bound prims, and read every garment."""
+    roots = {path: instance_roots(stage.GetPrimAtPath(path)) for path in contacts}
+    notices += request.bake.bind([*roots, *moved])
+    own, solved = _times(stage, contacts, moved, bake=request.bake)
     # Bake the whole shot: the chosen level and the plan must not depend on the frame range.
-    notices += request.bake.add([*roots], None, bodies=bodies)
+    request.bake.bake(every_time := merge(*solved.values()))
     readers, every = [], []
     for path, instances in roots.items():
         prim = stage.GetPrimAtPath(path)
-        samples = samples_of(prim, request.bake)
+        samples = samples_of(prim, snap(own[path], every_time), snap(solved[path], every_time))
         times = samples.times
         every += times
-        if times and not within(times, request.frames):
-            span = f"its authored time codes run from {times[0]:g} to {times[-1]:g}; give --frames that hold one"
-            notices.append(_left_out(prim, f"has no sample in the frame range; {span}"))
+        if samples.own and not within(times, request.frames):
+            span = f"its time codes run from {named_time(times[0])} to {named_time(times[-1])}"
+            notices.append(_left_out(prim, f"has no sample in the frame range; {span}; give --frames that hold one"))
         elif skip_invisible and not is_visible(prim, within(times, request.frames)):
             notices.append(_left_out(prim, "is invisible"))
         else:
             readers.append(read_garment(prim, instances, samples, request))
     if request.frames and every and not within(every, request.frames):
-        raise none_within(merge(every), request.frames)
+        raise none_within(sorted({*every}), request.frames)
     if not readers:
         reasons = "; ".join(str(notice) for notice in notices if "left out" in notice.message)
         raise StageError(f"no garment is left to refine: {reasons}")
     return readers
+
+
+def _times(
+    stage: Usd.Stage, contacts: Mapping[Sdf.Path, _Contact], bodies: Sequence[Sdf.Path], *, bake: Bake
+) -> tuple[dict[Sdf.Path, tuple[float, ...]], dict[Sdf.Path, tuple[float, ...]]]:
+    """Each garment's own time codes, and those at which it is solved, by path."""
+    frames, known = FrameGrid.of(stage), {*bodies}
+
+    @cache
+    def motion(path: Sdf.Path) -> Motion:
+        return bake.motion(stage.GetPrimAtPath(path))
+
+    felt = {path: map(motion, sorted(each.felt & known)) for path, each in contacts.items()}
+    solved = {path: solve_times(motion(path), bodies, frames) for path, bodies in felt.items()}
+    return {path: motion(path).times for path in contacts}, solved
 
 
 def _left_out(prim: Usd.Prim, why: str) -> Notice:

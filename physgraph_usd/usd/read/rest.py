@@ -18,7 +18,7 @@ from pxr import Sdf, Usd, UsdGeom
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
-from ...errors import GarmentError
+from ...errors import GarmentError, named_time
 from ...solver.level import hinge_geometry
 from ...solver.mesh.elements import elastic_elements
 from ...solver.mesh.topology import PolygonMesh, adjacency
@@ -125,7 +125,7 @@ def read_rest(
         rest = _fitted(weld, animation, by=" (--rest)")
     elif asked is not None:
         points, notices = animation.read(float(asked))
-        rest = Rest(points, f"points at time code {float(asked):g} (--rest)", notices)
+        rest = Rest(points, f"points at time code {named_time(float(asked))} (--rest)", notices)
     elif (authored := _authored(prim, len(first), odd)) is not None:
         rest = Rest(place(authored[0]), authored[1])
     elif (default := _default_points(prim, baked)) is None:
@@ -154,7 +154,7 @@ def _fitted(weld: Weld, animation: Animation, *, by: str = "") -> Rest:
     if len(found) < 2:
         return Rest(weld.split(found[0]) if found else animation.first, f"the only sample of points{by}")
     shape, nearest = median_shape(weld.mesh, found)
-    message = f"median edge lengths of {len(poses)} time codes, from the points at {[*poses][nearest]:g}"
+    message = f"median edge lengths of {len(poses)} time codes, from the points at {named_time([*poses][nearest])}"
     return Rest(weld.split(shape), f"{FITTED}: {message}{by}")
 
 

@@ -6,7 +6,7 @@ samples, in its own local space.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,8 +15,11 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
 from ...errors import GarmentError
 from ..lookup import with_ancestors
 from ..stage import TRAVERSAL, Notice, timecode
-from ..times import SAME_TIME, garment_times, merge, transform_times
+from ..times import Motion, merge, motion_by, motion_of
 from .find import instance_roots
+
+_ANIMATED = ("rotations", "translations", "scales", "blendShapeWeights")
+"""Attributes of an animation. Translations alone, and weights of shapes without in-betweens, move points straight."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,13 +27,13 @@ class Skinned:
     """A mesh deformed by UsdSkel.
 
     Attributes:
-        times: Authored time codes of the skeleton's animation and placement, ascending.
+        motion: Motion of the mesh by the skeleton's animation, and by the transforms of skeleton and mesh.
         query: UsdSkel's query of the binding.
     """
 
     path: Sdf.Path
     root: Sdf.Path
-    times: tuple[float, ...]
+    motion: Motion
     query: UsdSkel.SkinningQuery
     skeleton: Sdf.Path
     animation: Sdf.Path | None
@@ -53,33 +56,34 @@ class Bake:
         self.layer.timeCodesPerSecond = stage.GetTimeCodesPerSecond()
         stage.GetSessionLayer().subLayerPaths.insert(0, self.layer.identifier)
 
-    def add(
-        self, garments: Sequence[Sdf.Path], frames: tuple[float, float] | None, *, bodies: Sequence[Sdf.Path] = ()
-    ) -> list[Notice]:
-        """Bake the skinned prims, bodies also at the garments' times; notices of prims with unused joint influences.
+    def bind(self, paths: Sequence[Sdf.Path]) -> list[Notice]:
+        """Find the skinned among mesh prims, to be baked; notices of prims with unused joint influences.
 
-        Args:
-            garments: Mesh prims; prims inside instances become editable in the anonymous layer.
-            frames: First and last time code, or None for all.
-            bodies: Colliders.
-
-        Raises:
-            GarmentError: When UsdSkel bakes nothing for a skinned mesh.
+        Prims inside instances become editable in the anonymous layer.
         """
-        paths = [*garments, *bodies]
         bound = [path for path in paths if skel_root(self._stage.GetPrimAtPath(path))]
         for path in bound:
             while roots := instance_roots(self._stage.GetPrimAtPath(path)):
                 Sdf.CreatePrimInLayer(self.layer, roots[0]).instanceable = False
-        found = {path: skinned for path in bound if (skinned := _find_skinning(self._stage, path))}
-        if found:
-            cloth = merge(time for path in garments for time in _times_of(self._stage.GetPrimAtPath(path), found))
-            wanted = {skinned: cloth if path in bodies else () for path, skinned in found.items()}
-            _bake(self._stage, self.layer, wanted, frames=frames)
-        for skinned in found.values():
-            _check(self._stage, self.layer, skinned, frames=frames)
-        self.skinned.update(found)
-        return [notice for path in paths if path not in found for notice in _unskinned(self._stage.GetPrimAtPath(path))]
+        self.skinned.update({path: skinned for path in bound if (skinned := _find_skinning(self._stage, path))})
+        bare = [path for path in paths if path not in self.skinned]
+        return [notice for path in bare for notice in _unskinned(self._stage.GetPrimAtPath(path))]
+
+    def motion(self, prim: Usd.Prim) -> Motion:
+        """Motion of a prim; a skinned prim's own points do not count."""
+        skinned = self.skinned.get(prim.GetPath())
+        return skinned.motion if skinned else motion_of(prim)
+
+    def bake(self, times: Sequence[float]) -> None:
+        """Bake the skinned prims at the samples of their animation, and at the time codes given.
+
+        Raises:
+            GarmentError: When UsdSkel bakes nothing for a skinned mesh.
+        """
+        if self.skinned:
+            _bake(self._stage, self.layer, [*self.skinned.values()], times)
+        for skinned in self.skinned.values():
+            _check(self._stage, self.layer, skinned)
 
     def prims(self) -> list[Sdf.Path]:
         """Paths of the skeletons and animations of the baked meshes."""
@@ -111,31 +115,26 @@ def _find_skinning(stage: Usd.Stage, path: Sdf.Path) -> Skinned | None:
         for query in binding.GetSkinningTargets():
             if query.GetPrim() == prim and (query.HasJointInfluences() or query.HasBlendShapes()):
                 skeleton = cache.GetSkelQuery(binding.GetSkeleton())
-                animation, times = skeleton.GetAnimQuery(), transform_times(skeleton.GetPrim())
-                if animation:
-                    times += [*animation.GetJointTransformTimeSamples(), *animation.GetBlendShapeWeightTimeSamples()]
-                moved_by = animation.GetPrim().GetPath() if animation else None
-                skeleton_path = skeleton.GetPrim().GetPath()
-                return Skinned(path, root.GetPath(), merge(times), query, skeleton_path, moved_by)
+                query_of_animation, bones = skeleton.GetAnimQuery(), skeleton.GetPrim()
+                animation = query_of_animation.GetPrim() if query_of_animation else None
+                values = [animation.GetAttribute(name) for name in _ANIMATED] if animation else []
+                bent = {"rotations", "scales"} | ({"blendShapeWeights"} if _has_inbetweens(prim) else set())
+                by = [motion_by(each, turns=each.GetName() in bent) for each in values if each]
+                motion = Motion.joined([*by, motion_of(bones), motion_of(prim, shape=False)])
+                moved_by = animation.GetPath() if animation else None
+                return Skinned(path, root.GetPath(), motion, query, bones.GetPath(), moved_by)
     return None
 
 
-def _times_of(prim: Usd.Prim, found: Mapping[Sdf.Path, Skinned]) -> Sequence[float]:
-    """Time codes of a garment before baking."""
-    skinned = found.get(prim.GetPath())
-    return garment_times(prim) if skinned is None else [*skinned.times, *transform_times(prim)]
+def _has_inbetweens(prim: Usd.Prim) -> bool:
+    """Whether a mesh has a blend shape with in-between shapes."""
+    targets = UsdSkel.BindingAPI(prim).GetBlendShapeTargetsRel().GetTargets()
+    shapes = (UsdSkel.BlendShape(prim.GetStage().GetPrimAtPath(path)) for path in targets)
+    return any(shape and shape.GetInbetweens() for shape in shapes)
 
 
-def _bake(
-    stage: Usd.Stage,
-    layer: Sdf.Layer,
-    wanted: Mapping[Skinned, Sequence[float]],
-    *,
-    frames: tuple[float, float] | None,
-) -> None:
-    """Bake each skel root once, with unwanted skinned prims deactivated meanwhile; some at additional time codes."""
-    first, last = frames or (-np.inf, np.inf)
-    interval = Gf.Interval(first - SAME_TIME, last + SAME_TIME)
+def _bake(stage: Usd.Stage, layer: Sdf.Layer, wanted: Sequence[Skinned], times: Sequence[float]) -> None:
+    """Bake each skel root once, with unwanted skinned prims deactivated meanwhile."""
     keep = [skinned.path for skinned in wanted]
     roots = list(dict.fromkeys(skinned.root for skinned in wanted))
     mask = Sdf.Layer.CreateAnonymous("physgraph-mask.usda")
@@ -145,34 +144,32 @@ def _bake(
     session = stage.GetSessionLayer()
     session.subLayerPaths.insert(0, mask.identifier)
     try:
-        for skinned, times in wanted.items():
-            _sample_animation(stage, mask, skinned, times, interval=interval)
+        for skinned in wanted:
+            _sample_animation(stage, mask, skinned, times)
         with Usd.EditContext(stage, layer):
             for root in roots:
-                UsdSkel.BakeSkinning(UsdSkel.Root.Get(stage, root), interval)
+                UsdSkel.BakeSkinning(UsdSkel.Root.Get(stage, root), Gf.Interval.GetFullInterval())
     finally:
         session.subLayerPaths.remove(mask.identifier)
 
 
-def _sample_animation(
-    stage: Usd.Stage, layer: Sdf.Layer, skinned: Skinned, times: Sequence[float], *, interval: Gf.Interval
-) -> None:
-    """In a temporary layer, sample the animation at the time codes of transforms and cloth too.
+def _sample_animation(stage: Usd.Stage, layer: Sdf.Layer, skinned: Skinned, times: Sequence[float]) -> None:
+    """In a temporary layer, sample the animation at the time codes of transforms and of the shot too.
 
     UsdSkel bakes at the animation's samples; in between, baked points would move along a chord.
     """
     animation = stage.GetPrimAtPath(skinned.animation) if skinned.animation else None
     if animation is None or animation.IsInstanceProxy():
         return
-    attributes = [animation.GetAttribute(name) for name in ("rotations", "translations", "scales", "blendShapeWeights")]
+    attributes = [animation.GetAttribute(name) for name in _ANIMATED]
     attribute = next((each for each in attributes if each and each.GetNumTimeSamples()), None)
     if attribute is None:
         return
     samples = attribute.GetTimeSamples()
-    every = merge([*samples, *skinned.times, *transform_times(stage.GetPrimAtPath(skinned.path)), *times])
+    every = {*samples, *merge(samples, skinned.motion.times, times)}
     if len(every) == len(samples):
         return
-    values = {time: attribute.Get(time) for time in every if interval.Contains(time) or time in samples}
+    values = {time: attribute.Get(time) for time in every}
     with Usd.EditContext(stage, layer):
         for time, value in values.items():
             attribute.Set(value, time)
@@ -185,17 +182,15 @@ def _others(stage: Usd.Stage, roots: Iterable[Sdf.Path], keep: Sequence[Sdf.Path
     return [path for path in skinnable if not any(each.HasPrefix(path) for each in keep)]
 
 
-def _check(stage: Usd.Stage, layer: Sdf.Layer, skinned: Skinned, *, frames: tuple[float, float] | None) -> None:
-    """Convert a rigid mesh's baked transform to points; GarmentError if baking in range produced neither."""
+def _check(stage: Usd.Stage, layer: Sdf.Layer, skinned: Skinned) -> None:
+    """Convert a rigid mesh's baked transform to points; GarmentError if baking produced neither."""
     if layer.GetAttributeAtPath(skinned.path.AppendProperty("points")) is not None:
         return
     if layer.GetAttributeAtPath(skinned.path.AppendProperty(UsdGeom.Tokens.xformOpOrder)) is not None:
         _rigid_points(stage, layer, skinned.path)
         return
-    low, high = frames or (-np.inf, np.inf)
-    if any(low <= time <= high for time in skinned.times) or not skinned.times:
-        remedy = "check skel:skeleton, skel:animationSource and the joint influences"
-        raise GarmentError(str(skinned.path), "is skinned, but UsdSkel baked no points for it", remedy=remedy)
+    remedy = "check skel:skeleton, skel:animationSource and the joint influences"
+    raise GarmentError(str(skinned.path), "is skinned, but UsdSkel baked no points for it", remedy=remedy)
 
 
 def _rigid_points(stage: Usd.Stage, layer: Sdf.Layer, path: Sdf.Path) -> None:

@@ -10,7 +10,7 @@ from ...errors import StageError
 from ...solver.colliders.orient import pieces_of
 from ..schema import GARMENT_API
 from ..stage import Notice, list_meshes, open_stage, pxr_errors, quiet, read_units, shot_name
-from ..times import garment_times
+from ..times import motion_of
 from .absence import Samples
 from .cage import PointReader, read_cage
 from .find import has_schema
@@ -73,7 +73,7 @@ def _survey_mesh(prim: Usd.Prim, metres: float) -> MeshReport:
     garment, count = has_schema(prim, GARMENT_API), 0
     try:
         with pxr_errors(f"cannot read <{path}>"):
-            samples = Samples.of(prim, garment_times(prim))
+            samples = Samples.of(prim, motion_of(prim).times)
             times = samples.times or tuple(samples.absent)  # A mesh absent at all times: reading raises the reason.
             first = times[0] if times else None
             points = PointReader(prim, first)

@@ -12,7 +12,7 @@ from ...errors import GarmentError, SchemaError
 from ...solver.mesh.topology import PolygonMesh, edges_of, joined_by
 from ..mesh.bind import closest
 from ..stage import timecode
-from ..times import garment_times
+from ..times import motion_of
 from .find import find_paths, targets_of
 from .placement import place, to_metres
 
@@ -183,7 +183,7 @@ def _poses(
     path, mesh, first = garments[number]
     stage = prim.GetStage()
     default = UsdGeom.PointBased(stage.GetPrimAtPath(path)).GetPointsAttr().Get(Usd.TimeCode.Default()) is not None
-    moves = bool(garment_times(prim))
+    moves = bool(motion_of(prim).times)
     for time in [first, None] if default and first is not None else [first]:
         points = points_at(prim, metres, time)
         if points is None:

@@ -6,8 +6,9 @@ from collections.abc import Iterator, Sequence
 
 from pxr import Sdf, Usd, UsdGeom
 
+from ...errors import counted, named_time
 from ..stage import GarmentSource, Notice
-from ..times import SAME_TIME, garment_times, merge, transform_chain, transform_times
+from ..times import SAME_TIME, is_among, transform_chain
 from .skinning import Bake
 
 
@@ -30,29 +31,25 @@ def timing_notices(
 
 def _misses(body: Usd.Prim, garment: GarmentSource, bake: Bake) -> Iterator[str]:
     """Faults of a body's sample times compared with a garment's, in words."""
-    own, cloth, every = _own_times(body, bake), garment.times, merge([*garment.times, *garment.left_out])
+    own, cloth, every = bake.motion(body).times, garment.times, tuple(sorted([*garment.times, *garment.left_out]))
     if not cloth and UsdGeom.Mesh(body) and UsdGeom.Mesh(body).GetPointsAttr().Get() is None and own:
-        yield f"has no points by default, at which still garments are read; its sample at {own[0]:g} is used"
+        yield f"has no points by default, at which still garments are read; its sample at {named_time(own[0])} is used"
     if len(own) < 2 or not cloth:
         return
-    spans = f"its samples run from {own[0]:g} to {own[-1]:g}, those of <{garment.path}> from {every[0]:g} to"
-    spans = f"{spans} {every[-1]:g}"
+    first, last = ([named_time(times[end]) for times in (own, every)] for end in (0, -1))
+    spans = f"its samples run from {first[0]} to {last[0]}, those of <{garment.path}> from {first[1]} to {last[1]}"
     late, early = own[0] - cloth[0] > SAME_TIME, cloth[-1] - own[-1] > SAME_TIME
-    still = " and ".join([f"before {own[0]:g}"] * late + [f"after {own[-1]:g}"] * early)
+    still = " and ".join([f"before {first[0]}"] * late + [f"after {last[0]}"] * early)
     held = f"; it stands still {still}" if still else "; its poses are interpolated"
-    remedy = f"; export its samples at the time codes from {cloth[0]:g} to {cloth[-1]:g}"
-    if len(merge([*own, *every])) == len(own) + len(every):
+    remedy = f"; export its samples at the time codes from {named_time(cloth[0])} to {named_time(cloth[-1])}"
+    unsolved = [time for time in own if cloth[0] < time < cloth[-1] and not is_among(time, cloth)]
+    if not any(is_among(time, every) for time in own):
         yield f"{spans}, and share no time{held}{remedy}"
     elif still:
         yield f"{spans}{held}{remedy}"
-
-
-def _own_times(prim: Usd.Prim, bake: Bake) -> tuple[float, ...]:
-    """All authored time codes of a body; a skinned body has its skeleton's."""
-    skinned = bake.skinned.get(prim.GetPath())
-    if skinned:
-        return merge([*skinned.times, *transform_times(prim)])
-    return garment_times(prim) if UsdGeom.Mesh(prim) else merge(transform_times(prim))
+    elif unsolved:
+        message = f"has {counted(len(unsolved), 'sample')} at time codes at which <{garment.path}> is not solved"
+        yield f"{message}, the first at {named_time(unsolved[0])}; sample the garment there, too"
 
 
 def _rates(prim: Usd.Prim, bake: Bake) -> list[str]:

@@ -46,7 +46,7 @@ class TargetTracks:
             velocities: Whether velocities are authored for all.
         """
         self._bindings = GarmentBindings(shot, index, steps)
-        given = {"still": not shot.sources[index].times, "absent": absent, "velocities": velocities}
+        given = {"still": shot.sources[index].still, "absent": absent, "velocities": velocities}
         self._tracks = [_TargetTrack(stream, shot, target, **given) for target in self._bindings.targets]
         self.notices = [notice for track in self._tracks for notice in track.notices]
 

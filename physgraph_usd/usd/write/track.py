@@ -16,6 +16,7 @@ from pxr import Sdf, Usd, UsdGeom, Vt
 from ...errors import LayerError
 from ..lookup import with_ancestors
 from ..stage import at_time, timecode
+from ..times import SAME_TIME
 from .normals import VertexNormals
 from .stream import LayerStream
 
@@ -90,7 +91,7 @@ class PointTrack:
         Args:
             normals: Computes normals of local points; None without.
             rest: Local points for the default time, shape (V, 3); if None, the first sample's points.
-            still: Whether the garment's input has no samples: only a default is written until the cloth moves.
+            still: Whether the garment itself has no samples: only a default is written until the cloth moves.
             rate: Time codes per second for velocities; None leaves velocities out.
             given_normals: Attribute of normals given with each sample, authored by the caller; None without.
             margin: Distance by which the extent exceeds the points, such as half the width of curves.
@@ -239,7 +240,8 @@ class PointTrack:
     def _author_velocity(self, at: _Sample, before: _Sample, after: _Sample) -> None:
         """Author the velocity of a sample by finite differences [units/s], or the shot's own for an isolated sample."""
         seconds = (after.time - before.time) / (self._rate or 24.0)
-        velocity = (after.points.astype(np.float64) - before.points) / seconds if seconds else self._own(at.time)
+        moves = after.time - before.time > SAME_TIME
+        velocity = (after.points.astype(np.float64) - before.points) / seconds if moves else self._own(at.time)
         if velocity is not None:
             self._set_velocity(at.time, velocity)
         else:
@@ -296,7 +298,7 @@ class HeatTrack:
 
         Args:
             count: Number of fine vertices.
-            still: Whether the garment's input has no samples: a default is written instead of the first sample.
+            still: Whether the garment itself has no samples: a default is written instead of the first sample.
         """
         self._stream, self._target, self._count, self._still = stream, target, count, still
         self._runs: dict[str, tuple[np.ndarray, float | None]] = {}

@@ -248,7 +248,7 @@ class _RefinedMesh:
         self.notices += overs.author_rest_points(stream, target, prim, fine)
         left = UsdGeom.Mesh(prim).GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded
         rest = None
-        if source.times and not (source.skinned or self._shell):
+        if not (source.still or source.skinned or self._shell):
             rest = fine.vectors(UsdGeom.Mesh(prim).GetPointsAttr().Get(Usd.TimeCode.Default()))
         self._sheet_normals = VertexNormals(sheet, left_handed=left, welded=sides)
         normals = self._sheet_normals
@@ -257,8 +257,8 @@ class _RefinedMesh:
         rate = shot.stage.GetTimeCodesPerSecond() if velocities or source.velocities else None
         self.notices += overs.speed_notices(prim, written=rate is not None)
         moves = {"rate": rate, "own": partial(_own_velocities, prim, fine), "absent": absent}
-        self._track = PointTrack(stream, target, normals, rest=rest, still=not source.times, **moves)
-        self._heat = HeatTrack(stream, target, self._weld.mesh.vertex_count, still=not source.times)
+        self._track = PointTrack(stream, target, normals, rest=rest, still=source.still, **moves)
+        self._heat = HeatTrack(stream, target, self._weld.mesh.vertex_count, still=source.still)
         purpose = "render" if sibling else UsdGeom.Imageable(prim).ComputePurpose()
         self._hints = ModelHints(stream, shot.stage, source.path, purpose=purpose)
         self._shot, self._index = shot, index

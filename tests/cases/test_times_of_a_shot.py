@@ -1,0 +1,238 @@
+"""Time codes at which cloth is solved: between sparse keys, at the samples of bodies, about jumps, rounded."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from layers import errors, open_over
+from pxr import Gf, Usd, UsdGeom
+from shots import CLOTH, EDGE, fine, refine, sample_times
+from stages import (
+    COLLIDER_API,
+    add_sheet,
+    add_skeleton,
+    bind_skin,
+    loop_shot,
+    new_stage,
+    said,
+    save,
+    sheet_points,
+    skinned_points,
+    vec3,
+)
+
+from physgraph_usd.errors import AbsentError
+from physgraph_usd.shot.report import RefineReport
+from physgraph_usd.usd.read.reader import open_shot
+
+SIZE = (6, 6)
+CENTRE = np.array([3.0, 3.0, 0.0])
+RADIUS = 1.0
+"""Radius of the ball that pushes into the middle of a sheet of unit squares."""
+
+
+def flat(stage: Usd.Stage, path: str = CLOTH, *, times: Sequence[float] = ()) -> UsdGeom.Mesh:
+    """A sheet without waves that stands still, at its samples too."""
+    mesh = add_sheet(stage, path, times=(), size=SIZE)
+    points = vec3(sheet_points(None, SIZE) * np.array([1.0, 1.0, 0.0]))
+    for time in (None, *times):
+        mesh.GetPointsAttr().Set(points, Usd.TimeCode.Default() if time is None else time)
+    return mesh
+
+
+def add_ball(stage: Usd.Stage, path: str, places: Mapping[float, Sequence[float]]) -> UsdGeom.Sphere:
+    """A ball that pushes cloth, with its centre at some times."""
+    ball = UsdGeom.Sphere.Define(stage, path)
+    ball.CreateRadiusAttr(RADIUS)
+    ball.GetPrim().AddAppliedSchema(COLLIDER_API)
+    for time, place in places.items():
+        UsdGeom.XformCommonAPI(ball).SetTranslate(Gf.Vec3d(*map(float, place)), time)
+    return ball
+
+
+def depth(shot: Path, layer: Path, time: float, centre: Sequence[float]) -> float:
+    """Depth of a refined sheet inside a ball about a centre [EDGE] at a time code, in the composed stage [m]."""
+    return EDGE * RADIUS - float(np.linalg.norm(fine(shot, layer, time) - EDGE * np.asarray(centre), axis=1).min())
+
+
+def refined(stage: Usd.Stage, tmp_path: Path, **options: object) -> tuple[Path, Path, RefineReport]:
+    """The saved shot, a sound layer and the report."""
+    shot, out = Path(save(stage)), tmp_path / "fine.usdc"
+    report = refine(shot, out, **options)
+    assert report.exit_code == 0
+    assert errors(out, shot) == []
+    return shot, out, report
+
+
+def turn(prim: Usd.Prim, kind: str, degrees: dict[float, float]) -> None:
+    """Turn a prim about x by a rotation of Euler angles, or by a quaternion."""
+    xform = UsdGeom.Xformable(prim)
+    op = xform.AddRotateXOp() if kind == "rotate" else xform.AddOrientOp()
+    for time, angle in degrees.items():
+        half = np.deg2rad(angle) / 2.0
+        quat = Gf.Quatf(float(np.cos(half)), float(np.sin(half)), 0.0, 0.0)
+        op.Set(angle if kind == "rotate" else quat, time)
+
+
+class TestBetweenSparseKeys:
+    def test_skinned_cloth_moves_on_the_arcs_of_its_skeleton(self, tmp_path: Path):
+        """Keys at 1 and 13 turn half of a sheet by 69 degrees: the chord is 17% of the radius off."""
+        stage = new_stage(tmp_path / "s.usda", metres=EDGE)
+        joints = [int(x > 2) for x in sheet_points(None, SIZE)[:, 0]]
+        add_skeleton(stage, "/World/rig", (1.0, 13.0))
+        mesh = add_sheet(stage, "/World/rig/cloth", times=(), size=SIZE)
+        bind_skin(mesh, "/World/rig", joints=joints)
+        shot, out, _ = refined(stage, tmp_path, frames=(6.0, 8.0), steps=3)
+        assert sample_times(out, "/World/rig/cloth") == (6.0, 7.0, 8.0)
+        cage = skinned_points(sheet_points(None, SIZE), joints, 7.0)
+        away = fine(shot, out, 7.0, prim="/World/rig/cloth")[: len(cage)] - EDGE * cage
+        end = sheet_points(None, SIZE)[:, 0] == SIZE[0]
+        assert np.median(np.linalg.norm(away[end], axis=1)) < 0.2 * EDGE
+
+    @pytest.mark.parametrize("kind", ["rotate", "orient"])
+    @pytest.mark.parametrize("turned", ["/World/rig", "/World/arm"])
+    def test_cloth_meets_bodies_where_an_ancestor_of_either_turns(self, tmp_path: Path, kind: str, turned: str):
+        """The ball is in the cloth half-way along the arc, at neither key."""
+        stage = new_stage(tmp_path / "s.usda", metres=EDGE)
+        rig, arm = (UsdGeom.Xform.Define(stage, path).GetPrim() for path in ("/World/rig", "/World/arm"))
+        flat(stage, "/World/rig/cloth", times=() if turned == "/World/rig" else (1.0, 5.0))
+        turn(rig if turned == "/World/rig" else arm, kind, {1.0: -60.0, 5.0: 60.0})
+        add_ball(stage, "/World/arm/ball", {1.0: (3.0, 3.0, 0.7)})
+        shot, out, report = refined(stage, tmp_path, steps=3)
+        assert [frame["time"] for frame in report.frames] == [1.0, 2.0, 3.0, 4.0, 5.0]
+        points = fine(shot, out, 3.0, prim="/World/rig/cloth")
+        assert np.linalg.norm(points - EDGE * np.array([3.0, 3.0, 0.7]), axis=1).min() > 0.99 * EDGE * RADIUS
+
+    def test_nothing_is_added_where_nothing_turns_or_a_key_is_a_stray_one(self, tmp_path: Path):
+        stage = new_stage(tmp_path / "s.usda")
+        rig = UsdGeom.Xform.Define(stage, "/World/rig").GetPrim()
+        turn(rig, "rotate", {-1e6: 10.0, 1.0: 30.0, 5.0: 30.0, 7.0: 40.0})
+        add_sheet(stage, "/World/rig/cloth", times=(1.5, 5.0, 5.5, 6.5))
+        assert open_shot(save(stage)).scene.times == (-1e6, 1.0, 1.5, 5.0, 5.5, 6.5, 7.0)
+
+    def test_frames_of_a_stage_in_seconds_are_its_frames(self, tmp_path: Path):
+        stage = new_stage(tmp_path / "s.usda", rate=1.0)
+        stage.SetFramesPerSecond(25.0)
+        turn(UsdGeom.Xform.Define(stage, "/World/rig").GetPrim(), "rotate", {1.0: 0.0, 1.2: 30.0})
+        add_sheet(stage, "/World/rig/cloth", times=())
+        np.testing.assert_allclose(open_shot(save(stage)).scene.times, 1.0 + np.arange(6) / 25.0, atol=1e-9)
+
+
+class TestSamplesOfBodies:
+    THROUGH = {1.0 + k: (3.0, 3.0, height) for k, height in enumerate((-4.0, -0.9, -0.6, -0.9, -4.0))}  # noqa: RUF012
+
+    def test_between_those_of_the_cloth_are_solved(self, tmp_path: Path):
+        stage = new_stage(tmp_path / "s.usda", metres=EDGE)
+        flat(stage, times=(1.0, 5.0))
+        add_ball(stage, "/World/ball", self.THROUGH)
+        shot, out, report = refined(stage, tmp_path)
+        assert sample_times(out) == (1.0, 2.0, 3.0, 4.0, 5.0)
+        assert max(depth(shot, out, time, place) for time, place in self.THROUGH.items()) < 0.01 * EDGE
+        assert not any("ball" in warning for warning in report.warnings)
+
+    def test_are_those_of_cloth_that_stands_still(self, tmp_path: Path):
+        stage = new_stage(tmp_path / "s.usda", metres=EDGE)
+        flat(stage)
+        flat(stage, "/World/far").AddTranslateOp().Set((50.0, 0.0, 0.0))
+        add_ball(stage, "/World/ball", self.THROUGH | {2.5: (3.0, 3.0, -0.7)})
+        shot, out, report = refined(stage, tmp_path)
+        assert [frame["time"] for frame in report.frames] == [1.0, 2.0, 2.5, 3.0, 4.0, 5.0]
+        assert max(depth(shot, out, time, place) for time, place in self.THROUGH.items()) < 0.01 * EDGE
+        assert sample_times(out, "/World/far") == ()
+        assert sample_times(refine_range(shot, tmp_path, (2.0, 3.0))) == (2.0, 2.5, 3.0)
+
+    def test_of_bodies_apart_from_the_cloth_or_with_one_sample_do_not_count(self, tmp_path: Path):
+        stage = new_stage(tmp_path / "s.usda")
+        cloth = flat(stage).GetPrim()
+        add_ball(stage, "/World/ball", self.THROUGH)
+        add_ball(stage, "/World/still", {3.0: (3.0, 3.0, -4.0)})
+        cloth.CreateRelationship("physgraph:contact:exclude").SetTargets(["/World/ball"])
+        assert open_shot(save(stage)).scene.times == ()
+
+    def test_that_change_their_size_count(self, tmp_path: Path):
+        stage = new_stage(tmp_path / "s.usda")
+        flat(stage)
+        ball = add_ball(stage, "/World/ball", {1.0: (3.0, 3.0, -4.0)})
+        for time in (2.0, 7.0):
+            ball.GetRadiusAttr().Set(time / 2.0, time)
+        assert open_shot(save(stage)).scene.times == (1.0, 2.0, 7.0)
+
+    def test_that_are_not_solved_get_one_word(self, tmp_path: Path):
+        stage = new_stage(tmp_path / "s.usda")
+        flat(stage, times=(1.0, 2.0, 3.0))
+        add_ball(stage, "/World/ball", {time: (3.0, 3.0, -4.0 - time) for time in (1.0, 1.25, 2.0, 2.25, 3.0)})
+        shot = open_shot(save(stage))
+        assert shot.scene.times == (1.0, 2.0, 3.0)
+        word = "</World/ball>: has 2 samples at time codes at which </World/cloth> is not solved, the first at 1.25"
+        assert said(shot).count(word) == 1
+
+
+def refine_range(shot: Path, folder: Path, frames: tuple[float, float]) -> Path:
+    out = folder / f"range{frames[0]:g}.usdc"
+    refine(shot, out, frames=frames)
+    return out
+
+
+class TestJumps:
+    def test_have_both_sides_and_show_the_pose_after_at_the_whole_frame(self, tmp_path: Path):
+        """A clip in a loop: the sheet goes back by 3 of its squares at 3 and 6."""
+        shot, out = Path(loop_shot(tmp_path, size=SIZE, metres=EDGE)), tmp_path / "fine.usdc"
+        report = refine(shot, out, velocities=True)
+        assert report.exit_code == 0
+        assert errors(out, shot) == []
+        times = sample_times(out)
+        assert [round(time, 3) for time in times] == [0.0, 1.0, 2.0, 3.0, 3.0, 4.0, 5.0, 6.0, 6.0, 7.0, 8.0]
+        stage = Usd.Stage.Open(str(shot))
+        cage = UsdGeom.Mesh(stage.GetPrimAtPath(CLOTH)).GetPointsAttr()
+        for time in (*times, 2.5, 2.999):
+            away = fine(shot, out, time)[: len(sheet_points(None, SIZE))] - EDGE * np.asarray(cage.Get(time))
+            assert np.linalg.norm(away, axis=1).max() < 0.3 * EDGE
+        composed = open_over(shot, out)
+        speeds = UsdGeom.Mesh(composed.GetPrimAtPath(CLOTH)).GetVelocitiesAttr()
+        assert all(np.isclose(np.mean(speeds.Get(time), axis=0)[0], 24.0, atol=2.0) for time in times)
+
+    def test_of_bodies_are_known_to_cloth_that_stands_still(self, tmp_path: Path):
+        stage = new_stage(tmp_path / "s.usda", metres=EDGE)
+        flat(stage)
+        places = {1.0: (3.0, 3.0, -0.8), 2.9999: (3.0, 3.0, -0.6), 3.0: (3.0, 3.0, -9.0), 4.0: (3.0, 3.0, -9.5)}
+        add_ball(stage, "/World/ball", places)
+        shot, out, _ = refined(stage, tmp_path)
+        assert max(depth(shot, out, time, place) for time, place in places.items()) < 0.01 * EDGE
+        assert np.abs(fine(shot, out, 3.0)[:, 2]).max() < 0.2 * EDGE < np.abs(fine(shot, out, 2.9)[:, 2]).max()
+
+    def test_that_are_none_have_one_side(self, tmp_path: Path):
+        stage = new_stage(tmp_path / "s.usda")
+        mesh = add_sheet(stage, times=(1.0, 2.0, 3.0))
+        mesh.GetPointsAttr().Set(mesh.GetPointsAttr().Get(2.0), 2.0 - 1e-8)
+        assert open_shot(save(stage)).scene.times == (1.0, 2.0, 3.0)
+
+
+class TestRoundedTimes:
+    FLOATS = (1000.99997, 1002.0, 1003.00003, 1003.99997)
+
+    @pytest.fixture
+    def shot(self, tmp_path: Path) -> Path:
+        """Cloth at float seconds below a transform at whole frames."""
+        stage = new_stage(tmp_path / "s.usda", metres=EDGE)
+        rig = UsdGeom.Xform.Define(stage, "/World/rig")
+        for number, time in enumerate(self.FLOATS):
+            UsdGeom.XformCommonAPI(rig).SetTranslate((float(number), 0.0, 0.0), round(time))
+        add_sheet(stage, "/World/rig/cloth", times=self.FLOATS)
+        return Path(save(stage))
+
+    def test_are_whole_ones(self, shot: Path, tmp_path: Path):
+        refine(shot, tmp_path / "fine.usdc")
+        assert sample_times(tmp_path / "fine.usdc", "/World/rig/cloth") == self.FLOATS
+        assert errors(tmp_path / "fine.usdc", shot) == []
+
+    @pytest.mark.parametrize(("first", "last"), [(1, 1), (1, 2), (2, 3), (3, 4), (4, 4)])
+    def test_lie_in_ranges_that_name_the_frame(self, shot: Path, first: int, last: int):
+        times = open_shot(str(shot), frames=(1000.0 + first, 1000.0 + last)).scene.times
+        assert times == self.FLOATS[first - 1 : last]
+
+    def test_are_told_apart_in_messages(self, shot: Path):
+        with pytest.raises(AbsentError, match=r"frames 1004.002:1005; its 4 samples run from 1000.99997 to 1003.9"):
+            open_shot(str(shot), frames=(1004.002, 1005.0))
