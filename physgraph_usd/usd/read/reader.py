@@ -19,7 +19,7 @@ from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
-from pxr import Sdf, Usd
+from pxr import Sdf, Usd, UsdGeom
 
 from ...errors import AbsentError, SchemaError, StageError, UsageError
 from ...interrupts import leave_if_asked
@@ -57,6 +57,7 @@ from .find import (
     with_gravity,
 )
 from .garment import GarmentReader, Request, is_visible, read_garment, samples_of, seam_tolerance
+from .instances import instanced_gprims, instancer_above
 from .materials import find_values
 from .placement import place, to_metres
 from .rest import AUTO
@@ -282,7 +283,10 @@ def open_shot(
         bake = Bake(stage)
         request = Request(units, bake, frames, level, asked, rest_frame, assumed)
         bodies = [prim.GetPath() for prim in found]
-        moved = [*bodies, *(each.path for each in bound)]
+        instanced = [
+            each.GetPath() for prim in found if UsdGeom.PointInstancer(prim) for each in instanced_gprims(prim)
+        ]
+        moved = [*bodies, *instanced, *(each.path for each in bound)]
         readers = _read(stage, prims, request, bodies=moved, notices=notices, skip_invisible=skip_invisible)
         readers, solids = _link(stage, readers, bodies, wanted=colliders, request=request, notices=notices)
         opened = Shot(path, stage, view, request=request, readers=readers, bodies=_with_sides(stage, readers, solids))
@@ -352,11 +356,12 @@ def _link(
     felt = [near - targets.keys() for near, targets in zip(reachable, excluded, strict=True)]
     times = [reader.source.times[0] if reader.source.times else None for reader in readers]
     offset = min(reader.values.number("contact:offset", time) for reader, time in zip(readers, times, strict=True))
-    given = {"overrides": request.overrides, "offset": offset}
+    given = {"overrides": request.overrides, "offset": offset, "near": _swept(stage, readers, paths, request)}
     bodies = []
     for path in paths:
-        if any(path in near for near in felt):
-            body, odd = read_collider(stage.GetPrimAtPath(path), request.units.metres, **given)
+        by = next((prim for prim, near in zip(prims, felt, strict=True) if path in near), None)
+        if by is not None:
+            body, odd = read_collider(stage.GetPrimAtPath(path), request.units.metres, beside=by, **given)
             notices += odd
             bodies += [body] if body is not None else []
     numbers = {body.prim.GetPath(): number for number, body in enumerate(bodies)}
@@ -368,6 +373,25 @@ def _link(
         garment = replace(reader.garment, colliders=colliders, apart_from=others)
         linked.append(replace(reader, garment=garment, source=replace(reader.source, apart_from=apart)))
     return linked, bodies
+
+
+def _swept(
+    stage: Usd.Stage, readers: Sequence[GarmentReader], paths: Sequence[Sdf.Path], request: Request
+) -> np.ndarray | None:
+    """Bounds of the garments over the shot [m], half as large again, shape (2, 3); None without instancers to read."""
+    prims = map(stage.GetPrimAtPath, paths)
+    if not any(UsdGeom.PointInstancer(prim) or instancer_above(prim) for prim in prims):
+        return None
+    ends = []
+    for time in _every_time(reader.source for reader in readers) or (None,):
+        with suppress(StageError):
+            cages = [cage for cage in _cages(stage, readers, request.units.metres, time) if len(cage)]
+            ends += [point for cage in cages for point in (cage.min(axis=0), cage.max(axis=0))]
+    if not ends:
+        return None
+    low, high = np.min(ends, axis=0), np.max(ends, axis=0)
+    margin = 0.25 * float(np.linalg.norm(high - low))
+    return np.stack([low - margin, high + margin])
 
 
 def _sewn(

@@ -8,6 +8,7 @@ from pxr import Sdf, Usd, UsdGeom
 
 from ..stage import GarmentSource, Notice
 from ..times import SAME_TIME, garment_times, merge, transform_chain, transform_times
+from .instances import instance_times
 from .skinning import Bake
 
 
@@ -51,6 +52,8 @@ def _own_times(prim: Usd.Prim, bake: Bake) -> tuple[float, ...]:
     skinned = bake.skinned.get(prim.GetPath())
     if skinned:
         return merge([*skinned.times, *transform_times(prim)])
+    if UsdGeom.PointInstancer(prim):
+        return instance_times(prim)
     return garment_times(prim) if UsdGeom.Mesh(prim) else merge(transform_times(prim))
 
 
