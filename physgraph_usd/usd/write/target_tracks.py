@@ -98,7 +98,7 @@ class _TargetTrack:
         self._turned = turned.of(stream, shot, target)
         given, points = None if self._turned is None else self._turned.path, points_attribute(prim)
         default = points.Get(Usd.TimeCode.Default())
-        fits = default is not None and len(default) == len(target.points)
+        fits = default is not None and len(default) == len(target.points) and not still
         rest = np.asarray(default, np.float32) if fits else None
         self._track = PointTrack(stream, path, None, rest=rest, turned=given, points=points.GetName(), **moves)
         self._hints = ModelHints(stream, shot.stage, path, purpose=UsdGeom.Imageable(prim).ComputePurpose())

@@ -155,7 +155,7 @@ class PointTrack:
         self._matrix = to_metres
         points = to_local(points, to_metres, str(self._paths["points"].GetPrimPath()), time)
         if not self._has_default:
-            self._author(None, points if self._rest is None else self._rest)
+            self._author(None, points if self._rest is None else self._rest, normals if self._still else None)
             self._has_default, self._rest = True, None
             if self._still and self._rate is not None and (velocity := self._own(time)) is not None:
                 self._set_velocity(None, velocity)
