@@ -124,11 +124,11 @@ def _body(
             points = np.zeros((0, 3)) if posed is None else posed.corners()
         return points[np.isfinite(points).all(axis=1)]
 
-    said = "" if kind else str(prim.GetTypeName())
+    unread = "" if kind else str(prim.GetTypeName())
     if _moves(prim, reader):
-        return OtherBody(str(path), unread=said, pose=pose, hull=hull)
+        return OtherBody(str(path), unread=unread, pose=pose, hull=hull)
     still = hull(0)
-    return OtherBody(str(path), unread=said, pose=lambda _: pose(0), hull=lambda _: still)
+    return OtherBody(str(path), unread=unread, pose=lambda _: pose(0), hull=lambda _: still)
 
 
 def _moves(prim: Usd.Prim, reader: ColliderReader) -> bool:

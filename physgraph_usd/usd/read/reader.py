@@ -283,10 +283,7 @@ def open_shot(
         bake = Bake(stage)
         request = Request(units, bake, frames, level, asked, rest_frame, assumed)
         bodies = [prim.GetPath() for prim in found]
-        instanced = [
-            each.GetPath() for prim in found if UsdGeom.PointInstancer(prim) for each in instanced_gprims(prim)
-        ]
-        moved = [*bodies, *instanced, *(each.path for each in bound)]
+        moved = [*bodies, *_instanced(found), *(each.path for each in bound)]
         readers = _read(stage, prims, request, bodies=moved, notices=notices, skip_invisible=skip_invisible)
         readers, solids = _link(stage, readers, bodies, wanted=colliders, request=request, notices=notices)
         opened = Shot(path, stage, view, request=request, readers=readers, bodies=_with_sides(stage, readers, solids))
@@ -299,6 +296,11 @@ def open_shot(
     read_notices = [notice for reader in readers for notice in reader.notices]
     opened.warnings.extend(dict.fromkeys([*notices, *odd, *read_notices]))
     return opened
+
+
+def _instanced(prims: Iterable[Usd.Prim]) -> list[Sdf.Path]:
+    """Paths of the gprims drawn by the point instancers among some prims."""
+    return [each.GetPath() for prim in prims if UsdGeom.PointInstancer(prim) for each in instanced_gprims(prim)]
 
 
 def _of_prims(
