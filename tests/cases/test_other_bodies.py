@@ -98,8 +98,8 @@ class TestInstances:
         (points,), _ = posed(stage, "/World/set/outer", time=2.0)
         box = UsdGeom.BBoxCache(2.0, [UsdGeom.Tokens.default_]).ComputeWorldBound(outer.GetPrim())
         found = box.ComputeAlignedRange()
-        assert np.allclose(points.min(axis=0), found.GetMin(), atol=2e-4)
-        assert np.allclose(points.max(axis=0), found.GetMax(), atol=2e-4)
+        assert np.allclose(points.min(axis=0), np.array(found.GetMin()), atol=2e-4)
+        assert np.allclose(points.max(axis=0), np.array(found.GetMax()), atol=2e-4)
         ends = np.array([[0.11, 0.09, 0.01], [0.1, 0.11, 0.015], [-0.11, 0.15, 0.01], [-0.1, 0.13, 0.015]])
         assert np.allclose(middles(points, 4), ends, atol=1e-5)
 

@@ -37,7 +37,7 @@ def primitive(kind: str, size: np.ndarray, *, turn: np.ndarray, centre: np.ndarr
 
 def segments(radius: float, within: float) -> int:
     """Fewest segments about an axis, a multiple of 4, with faces at most a distance inside the circle [both in m]."""
-    turn = np.arccos(1.0 - min(within / max(radius, within), 1.0))
+    turn = max(np.arccos(1.0 - min(within / max(radius, within), 1.0)), np.pi / AROUND)
     return int(np.clip(4 * np.ceil(np.pi / turn / 4.0), LEAST_AROUND, AROUND))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import product
 
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom
@@ -124,6 +125,25 @@ def code_of(instancer: Usd.Prim, time: float | None) -> Usd.TimeCode:
     """USD's time code for a number; for None the default, or the first sample of positions without a default."""
     default = UsdGeom.PointInstancer(instancer).GetPositionsAttr().Get() is not None
     return timecode(time) if time is not None or default else Usd.TimeCode.EarliestTime()
+
+
+def instance_reach(instancer: Usd.Prim) -> float:
+    """Greatest distance along an axis of the instances' bounds beyond the positions' [units of the instancer]."""
+    code, stage = code_of(instancer, None), instancer.GetStage()
+    places = np.array(UsdGeom.PointInstancer(instancer).GetPositionsAttr().Get(code) or [], float).reshape(-1, 3)
+    world = np.array(UsdGeom.XformCache(code).GetLocalToWorldTransform(instancer)).T
+    inverse = np.linalg.pinv(np.where(np.isfinite(world), world, 0.0))
+    corners = [places]
+    for path, matrices in (placements(instancer, None) or {}).items():
+        shape = UsdGeom.Boundable(stage.GetPrimAtPath(path))
+        ends = np.array(UsdGeom.Boundable.ComputeExtentFromPlugins(shape, code) or [], float).reshape(-1, 3)
+        if len(ends) == 2:
+            eight = np.array([[*point, 1.0] for point in product(*ends.T)])
+            corners.append(np.einsum("nxy,cy->ncx", inverse @ matrices, eight)[:, :, :3].reshape(-1, 3))
+    every = np.concatenate(corners)
+    if not len(places) or not np.isfinite(every).all():
+        return 0.0
+    return float(max((places.min(axis=0) - every.min(axis=0)).max(), (every.max(axis=0) - places.max(axis=0)).max()))
 
 
 def _is_hidden(prim: Usd.Prim, root: Usd.Prim, code: Usd.TimeCode) -> bool:

@@ -12,11 +12,11 @@ from ...solver.mesh.subdivide import Refinement
 from ..mesh.bind import Follower
 from ..read.bindings import GarmentBindings, PlacedTarget
 from ..read.find import instance_roots
-from ..read.instances import code_of
+from ..read.instances import instance_reach
 from ..read.placement import to_metres
 from ..read.reader import Shot
 from ..read.targets import Target, points_attribute
-from ..stage import quiet, timecode
+from ..stage import timecode
 from . import overs
 from .primvars import hide_influences
 from .stream import LayerStream
@@ -208,13 +208,8 @@ def _owners(target: Target, interpolation: str) -> np.ndarray | None:
 
 def _half_width(prim: Usd.Prim) -> float:
     """Half the greatest width of curves or points, or the reach of instances about their positions; 0 of a mesh."""
-    if instancer := UsdGeom.PointInstancer(prim):
-        code = code_of(prim, None)
-        with quiet():
-            extent = np.array(instancer.ComputeExtentAtTime(code, code) or np.zeros((0, 3)), float)
-        places = np.array(instancer.GetPositionsAttr().Get(code) or np.zeros((0, 3)), float)
-        fits = len(extent) == 2 and len(places) and np.isfinite(extent).all() and np.isfinite(places).all()
-        return float(np.abs(extent - [places.min(axis=0), places.max(axis=0)]).max()) if fits else 0.0
+    if UsdGeom.PointInstancer(prim):
+        return instance_reach(prim)
     for kind in (UsdGeom.Curves, UsdGeom.Points):
         if shape := kind(prim):
             widths = shape.GetWidthsAttr().Get(_FIRST)
