@@ -142,11 +142,11 @@ def points(fine: Fine) -> Iterator[Problem]:
 
 def instances(fine: Fine) -> Iterator[Problem]:
     """Positions and unit orientations are finite, and as many as there are instances."""
-    expected = len(fine.entries("protoIndices", fine.times[-1]))
+    expected = fine.entries("protoIndices", fine.times[-1]).size
     for time in fine.times:
         for name in ("positions", "orientations", "orientationsf"):
             array = fine.array(name, time)
-            if array is None or not len(array):
+            if array is None or array.ndim != 2:
                 continue
             if len(array) != expected:
                 yield fine.problem(name, f"has {len(array)} entries for {expected} instances", time)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import product
 
 import numpy as np
-from pxr import Sdf, Usd, UsdGeom
+from pxr import Sdf, Usd, UsdGeom, Vt
 
 from ..lookup import with_ancestors
 from ..stage import quiet, timecode
@@ -90,7 +90,7 @@ def _place(
     shape, code, own = UsdGeom.PointInstancer(instancer), code_of(instancer, time), own_transforms(instancer, time)
     if own is None or instancer.GetPath() in above:
         return own is not None
-    kinds, mask = np.asarray(shape.GetProtoIndicesAttr().Get(code) or (), np.int64), shape.ComputeMaskAtTime(code)
+    kinds, mask = np.asarray(_kinds(instancer, code), np.int64), shape.ComputeMaskAtTime(code)
     visible = np.asarray(mask, bool) if len(mask) == len(kinds) else np.ones(len(kinds), bool)
     cache, fits = UsdGeom.XformCache(code), True
     for number, root in enumerate(prototypes_of(instancer)):
@@ -115,10 +115,16 @@ def own_transforms(instancer: Usd.Prim, time: float | None) -> np.ndarray | None
     Masked instances are included. None if the arrays do not fit together.
     """
     shape, code = UsdGeom.PointInstancer(instancer), code_of(instancer, time)
-    count = len(shape.GetProtoIndicesAttr().Get(code) or ())
+    count = len(_kinds(instancer, code))
     with_prototype, all_instances = UsdGeom.PointInstancer.IncludeProtoXform, UsdGeom.PointInstancer.IgnoreMask
     found = shape.ComputeInstanceTransformsAtTime(code, code, with_prototype, all_instances) if count else ()
     return np.array(found, np.float64).reshape(-1, 4, 4) if len(found) == count else None
+
+
+def _kinds(instancer: Usd.Prim, code: Usd.TimeCode) -> Sequence[int]:
+    """Number of each instance's prototype; () for a value of another type."""
+    value = UsdGeom.PointInstancer(instancer).GetProtoIndicesAttr().Get(code)
+    return value if isinstance(value, Vt.IntArray) else ()
 
 
 def code_of(instancer: Usd.Prim, time: float | None) -> Usd.TimeCode:
@@ -130,7 +136,8 @@ def code_of(instancer: Usd.Prim, time: float | None) -> Usd.TimeCode:
 def instance_reach(instancer: Usd.Prim) -> float:
     """Greatest distance along an axis of the instances' bounds beyond the positions' [units of the instancer]."""
     code, stage = code_of(instancer, None), instancer.GetStage()
-    places = np.array(UsdGeom.PointInstancer(instancer).GetPositionsAttr().Get(code) or [], float).reshape(-1, 3)
+    value = UsdGeom.PointInstancer(instancer).GetPositionsAttr().Get(code)
+    places = np.array(value if isinstance(value, Vt.Vec3fArray) else [], float).reshape(-1, 3)
     world = np.array(UsdGeom.XformCache(code).GetLocalToWorldTransform(instancer)).T
     inverse = np.linalg.pinv(np.where(np.isfinite(world), world, 0.0))
     corners = [places]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom
@@ -239,8 +240,11 @@ def points_at(prim: Usd.Prim, metres: float, time: float | None) -> np.ndarray |
         GarmentError: A point is not finite, or the prim cannot be placed.
     """
     value = points_attribute(prim).Get(timecode(time))
-    if value is None or not len(value):
+    if value is None or not np.size(value):
         return None
+    if np.ndim(value) != 2 or np.shape(value)[1] != 3:
+        kind = points_attribute(prim).GetTypeName()
+        raise GarmentError(str(prim.GetPath()), f"its points are of type {kind}", remedy="author them as point3f[]")
     points = place(np.asarray(value, np.float64), to_metres(prim, metres, time))
     if not np.isfinite(points).all():
         first = int(np.argwhere(~np.isfinite(points))[0][0])
@@ -259,10 +263,14 @@ def _check_topology(prim: Usd.Prim) -> None:
         first = attribute.Get(times[0]) if times else None
         for time in times[1:]:
             value = attribute.Get(time)
-            changed = len(value or ()) != len(first or ()) or (attribute is not points and value != first)
+            changed = _count(value) != _count(first) or (attribute is not points and value != first)
             if changed:
                 remedy = "bind a mesh of one topology, or leave this one out"
                 raise GarmentError(str(prim.GetPath()), "its topology changes", time=time, remedy=remedy)
+
+
+def _count(value: Any) -> int:
+    return 0 if value is None else np.size(value)
 
 
 def _mesh_of(prim: Usd.Prim) -> PolygonMesh | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from pxr import Sdf, Usd, UsdGeom
+from pxr import Sdf, Usd, UsdGeom, Vt
 from scipy.spatial.transform import Rotation
 
 from ...solver.mesh.subdivide import Refinement
@@ -172,8 +172,11 @@ class _Orientations:
         prim, code = shot.stage.GetPrimAtPath(target.path), timecode(target.time)
         names = "orientationsf", "orientations"
         name = next((name for name in names if prim.GetAttribute(name).HasAuthoredValue()), names[1])
-        values = prim.GetAttribute(name).Get(code) or ()
-        given = [[*each.GetImaginary(), each.GetReal()] for each in values] if len(values) == len(target.points) else []
+        values = prim.GetAttribute(name).Get(code)
+        known = (
+            values if isinstance(values, Vt.QuathArray | Vt.QuatfArray) and len(values) == len(target.points) else ()
+        )
+        given = [[*each.GetImaginary(), each.GetReal()] for each in known]
         fits = len(given) > 0 and np.isfinite(given).all() and np.linalg.norm(given, axis=1).all()
         local = Rotation.from_quat(given).as_matrix() if fits else np.tile(np.eye(3), (len(target.points), 1, 1))
         single = name == names[0]
