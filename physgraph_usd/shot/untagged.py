@@ -35,7 +35,9 @@ FAR = f"no cloth comes within {1e3 * NEAR:.0f} mm of it"
 LOOKED = 0.2
 """Distance within which the gap between cloth and a body is measured [m], to pass over frames without contact."""
 MOST_FRAMES = 10
-"""Most frames, spread over the shot, in which a body is compared with cloth that it may move with."""
+"""Most frames, spread over the shot, in which a body that touches cloth is looked at again."""
+LITTLE = 0.1
+"""Fraction of a garment in the first frame with contact below which the largest of `MOST_FRAMES` is reported."""
 MOST_POINTS = 20_000
 """Most points of a body that are compared."""
 LIES_ALONG = 2.0
@@ -51,9 +53,9 @@ class Candidate:
 
     Attributes:
         reason: Why `AUTO` takes or leaves the body.
-        shares: For each touching garment, the fraction of its vertices inside or near the body, in the first frame with
+        shares: For each touching garment, the fraction of its vertices inside or near the body, in an early frame with
             contact; empty for a body left out.
-        pose: Pose of the body in the first frame with contact, or None.
+        pose: Pose of the body in that frame, or None.
         follows: Path of the garment on which the body lies and with which it moves, or "".
         unread: Type of a body near cloth whose shape is not read, or "".
     """
@@ -152,13 +154,14 @@ def _judged(body: OtherBody, cloth: _Cloth) -> Candidate | None:
         near = [_nearness(solid, pose, cage) for cage in cages]
         fractions = [fraction for fraction, _ in near]
         if any(fractions):
-            return _touched(body, cloth, index, fractions)
+            return _touched(body, solid, cloth, (index, fractions))
         apart = min(gap for _, gap in near), cages, hull
     return None if body.unread else Candidate(body.path, f"{FAR} in {counted(len(cloth.times), 'frame')}")
 
 
-def _touched(body: OtherBody, cloth: _Cloth, index: int, fractions: Sequence[float]) -> Candidate:
-    """The candidate of a body that touches cloth in a frame by number, given the fraction of each garment."""
+def _touched(body: OtherBody, solid: MeshBody, cloth: _Cloth, first: tuple[int, Sequence[float]]) -> Candidate:
+    """The candidate of a body that touches cloth, given the first frame with contact and each garment's fraction."""
+    index, fractions = first
     most = int(np.argmax(fractions))
     garment, later = cloth.shot.scene.garments[most], [number for number in body.frames if number > index]
     picks = np.linspace(0, len(later) - 1, min(MOST_FRAMES, len(later))).round().astype(int)
@@ -169,6 +172,12 @@ def _touched(body: OtherBody, cloth: _Cloth, index: int, fractions: Sequence[flo
         return Candidate(body.path, why, follows=garment.path)
     if body.unread:
         return Candidate(body.path, UNREAD, unread=body.unread)
+    for number in frames[1:] if fractions[most] < LITTLE else ():
+        pose = body.pose(number)
+        other = [0.0 if pose is None else _nearness(solid, pose, cage)[0] for cage in cloth.cages(number)]
+        index, fractions = max((index, fractions), (number, other), key=lambda each: max(each[1]))
+    most = int(np.argmax(fractions))
+    garment = cloth.shot.scene.garments[most]
     where = f"{percent(fractions[most])} of <{garment.path}> is inside or within {1e3 * NEAR:.0f} mm"
     shares = {g.path: part for g, part in zip(cloth.shot.scene.garments, fractions, strict=True) if part}
     return Candidate(body.path, where + at_time(cloth.times[index]), shares, body.pose(index))

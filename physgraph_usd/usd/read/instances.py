@@ -72,7 +72,7 @@ def placements(instancer: Usd.Prim, time: float | None) -> dict[Sdf.Path, np.nda
     """
     world = np.array(UsdGeom.XformCache(timecode(time)).GetLocalToWorldTransform(instancer))
     found: dict[Sdf.Path, list[np.ndarray]] = {}
-    with quiet():
+    with quiet(), np.errstate(all="ignore"):
         fits = _place(instancer, world[None], time, found, ())
     if not fits:
         return None
