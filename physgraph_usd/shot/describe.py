@@ -33,7 +33,7 @@ from .options import RefineOptions, scene_words
 from .report import RefineReport, of_a_kind
 from .untagged import FAR, Candidate, find_candidates
 from .up_axis import across_gravity
-from .warnings import of_gravity, of_strain, of_unfelt
+from .warnings import of_gravity, of_strain, of_unfelt, of_unread
 
 MOST_ASKED = 32
 """Most open meshes tried as garments."""
@@ -70,6 +70,7 @@ def begin_report(report: RefineReport, opened: Shot, options: RefineOptions) -> 
     }
     beside = [each for each in candidates if each.is_taken]
     known += _unfelt(report, beside) if options.contact != "off" else []
+    known += of_unread(candidates) if options.contact != "off" else []
     known += _across(opened, frames, beside)
     follow = {each.path: each.follows for each in candidates if each.follows}
     slack = of_slack([garment.path for garment in opened.scene.garments], choices)
@@ -261,7 +262,7 @@ def _bound(target: Target) -> dict[str, Any]:
 
 
 def _unfelt(report: RefineReport, beside: Sequence[Candidate]) -> list[str]:
-    """Add to the report the meshes touched by garments but not used as colliders; returns a warning."""
+    """Add to the report the bodies touched by garments but not used as colliders; returns a warning."""
     for garment in report.garments:
         garment["unfelt"] = [each.path for each in beside if garment["path"] in each.shares]
     return of_unfelt(beside)

@@ -1,53 +1,63 @@
-"""Finds meshes touched by garments but not named as colliders; the collider ``auto`` uses such meshes."""
+"""Finds bodies touched by garments but not named as colliders; the collider ``auto`` uses such bodies."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import closing
+from collections.abc import Mapping, Sequence
+from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
 
-from ..errors import counted
+from ..errors import StageError, counted
 from ..solver.colliders.mesh import MeshBody
 from ..solver.colliders.pose import Pose
 from ..solver.contact.broad_phase import bounds_of
 from ..solver.mesh.kernels import start_warp
 from ..solver.resolution import sample_frames
-from ..solver.scene import Frame, Garment, GarmentFrame
-from ..usd.read.other_meshes import other_meshes
+from ..solver.scene import Garment
+from ..usd.read.other_bodies import OtherBody, other_bodies
 from ..usd.read.reader import Shot, open_shot
 from ..usd.stage import at_time
 from ..usd.view import Stage
 
 AUTO = "auto"
-"""Pseudo-collider: all colliders named by the shot, and the meshes touched by garments."""
+"""Pseudo-collider: all colliders named by the shot, and the bodies touched by garments."""
+UNREAD = "its shape is not read: convert it to a Mesh"
+"""Reason given for leaving a shape that is not read."""
 NEAR = 0.025
 """Distance within which cloth lies on a body [m]: solvers keep up to 2 cm, plus rounding."""
 FAR = f"no cloth comes within {1e3 * NEAR:.0f} mm of it"
-"""Reason given for leaving a mesh not touched by cloth."""
+"""Reason given for leaving a body not touched by cloth."""
+LOOKED = 0.2
+"""Distance within which the gap between cloth and a body is measured [m], to pass over frames without contact."""
 MOST_FRAMES = 10
-"""Most frames, spread over the shot, searched for contact."""
+"""Most frames, spread over the shot, in which a body that touches cloth is looked at again."""
+LITTLE = 0.1
+"""Fraction of a garment in the first frame with contact below which the largest of `MOST_FRAMES` is reported."""
+MOST_POINTS = 20_000
+"""Most points of a body that are compared."""
 LIES_ALONG = 2.0
-"""Distance within which a mesh lies along cloth, relative to the cloth's offset plus thickness. The outer skin of a
+"""Distance within which a body lies along cloth, relative to the cloth's offset plus thickness. The outer skin of a
 thick export, or a button on the cloth, is about twice as far as the cloth keeps from a body."""
 MOST_OF = 0.95
-"""Least fraction of a mesh's points lying along cloth and moving with the cloth."""
+"""Least fraction of a body's points lying along cloth and moving with the cloth."""
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A mesh that is neither a garment nor a collider.
+    """A body that is neither a garment nor a collider.
 
     Attributes:
-        reason: Why `AUTO` takes or leaves the mesh.
-        shares: For each touching garment, the fraction of its vertices inside or near the mesh, in the first examined
-            frame with contact; empty for a mesh left out.
-        pose: Pose of the mesh in the first frame with contact, or None.
-        follows: Path of the garment on which the mesh lies and with which it moves, or "".
+        reason: Why `AUTO` takes or leaves the body.
+        shares: For each touching garment, the fraction of its vertices inside or near the body, in an early frame with
+            contact; empty for a body left out.
+        pose: Pose of the body in that frame, or None.
+        follows: Path of the garment on which the body lies and with which it moves, or "".
+        unread: Type of a body near cloth whose shape is not read, or "".
     """
 
     path: str
@@ -55,22 +65,24 @@ class Candidate:
     shares: Mapping[str, float] = field(default_factory=dict)
     pose: Pose | None = None
     follows: str = ""
+    unread: str = ""
 
     @property
     def is_taken(self) -> bool:
-        """Whether `AUTO` takes the mesh."""
+        """Whether `AUTO` takes the body."""
         return bool(self.shares)
 
     @property
     def garment(self) -> str:
-        """Path of the garment touching the mesh most."""
+        """Path of the garment touching the body most."""
         return max(self.shares, key=lambda path: self.shares[path])
 
 
 def find_candidates(shot: Shot) -> list[Candidate]:
-    """Meshes that are neither garments nor colliders, taken if cloth overlaps the mesh or comes within `NEAR`.
+    """Bodies that are neither garments nor colliders, taken if cloth overlaps the body or comes within `NEAR`.
 
-    Invisible meshes are not taken, nor trims and second skins, which lie along the cloth and move with the cloth.
+    Every sample of the garments is searched. Invisible bodies are not taken, nor trims and second skins, which lie
+    along the cloth and move with the cloth, nor shapes that are not read.
 
     Args:
         shot: An open shot.
@@ -81,59 +93,134 @@ def find_candidates(shot: Shot) -> list[Candidate]:
     Raises:
         StageError: USD can no longer read the files.
     """
-    frames = sample_frames(shot.every_time, shot.frame, most=MOST_FRAMES)
-    if not frames:
+    cloth = _Cloth.of(shot)
+    if cloth is None:
         return []
-    boxes = [bounds_of(np.concatenate([garment.points for garment in frame.garments])) for frame in frames]
-    boxes = [box + np.array([[-NEAR], [NEAR]]) for box in boxes]
-    found = []
-    for path, why, poses in other_meshes(shot, [frame.time for frame in frames], boxes):
-        found.append(Candidate(path, why) if why else _judged(path, poses, shot.scene.garments, frames=frames))
-    return sorted(found, key=lambda each: -max(each.shares.values(), default=0.0))
+    bodies = other_bodies(shot, cloth.times, cloth.boxes)
+    found = [Candidate(body.path, body.why) if body.why else _judged(body, cloth) for body in bodies]
+    shown = [each for each in found if each is not None]
+    return sorted(shown, key=lambda each: -max(each.shares.values(), default=0.0))
 
 
-def _judged(
-    path: str, poses: Iterator[tuple[int, Pose]], garments: Sequence[Garment], *, frames: Sequence[Frame]
-) -> Candidate:
-    """Judge a visible mesh, given its poses by frame number: taken or left."""
+@dataclass(frozen=True, eq=False)
+class _Cloth:
+    """The cages of a shot's garments at every sample.
+
+    Attributes:
+        times: Time codes of the frames that can be read.
+        boxes: Bounds of all cages and their neighbourhood in each frame [m], each of shape (2, 3).
+        along: Distance within which a body lies along each garment [m].
+    """
+
+    shot: Shot
+    times: Sequence[float | None]
+    boxes: Sequence[np.ndarray]
+    along: Sequence[float]
+
+    @classmethod
+    def of(cls, shot: Shot) -> _Cloth | None:
+        """The cloth of a shot; None if no frame can be read."""
+        boxes: dict[float | None, np.ndarray] = {}
+        for time in shot.every_time or (None,):
+            with suppress(StageError):
+                cages = [shot.cage(index, time) for index in range(len(shot.sources))]
+                boxes[time] = bounds_of(np.concatenate(cages)) + np.array([[-NEAR], [NEAR]])
+        first = sample_frames(shot.every_time, shot.frame, most=1) if boxes else []
+        if not first:
+            return None
+        along = [LIES_ALONG * (cage.offset + cage.fabric.thickness) for cage in first[0].garments]
+        return cls(shot, [*boxes], [*boxes.values()], along)
+
+    def cages(self, index: int) -> list[np.ndarray]:
+        """Positions of each cage in a frame by number [m], each of shape (V, 3)."""
+        return [self.shot.cage(number, self.times[index]) for number in range(len(self.shot.sources))]
+
+
+def _judged(body: OtherBody, cloth: _Cloth) -> Candidate | None:
+    """Judge a visible body: taken or left; None for a shape that is not read and not near cloth.
+
+    After a frame in which cloth and body are apart, frames are passed over while neither has moved far enough to meet.
+    """
     start_warp()
-    body = MeshBody(device="cpu", threads=1)
-    for index, pose in poses:
-        cages = [cage.points for cage in frames[index].garments]
-        fractions = [_fraction_at(body, pose, cage) for cage in cages]
+    solid = MeshBody(device="cpu", threads=1)
+    apart: tuple[float, list[np.ndarray], np.ndarray] | None = None
+    for index in body.frames:
+        cages, hull = cloth.cages(index), body.hull(index)
+        if apart is not None and apart[0] - _moved([*apart[1], apart[2]], [*cages, hull]) > NEAR:
+            continue
+        pose = body.pose(index)
+        if pose is None:
+            continue
+        near = [_nearness(solid, pose, cage) for cage in cages]
+        fractions = [fraction for fraction, _ in near]
         if any(fractions):
-            most = int(np.argmax(fractions))
-            garment = garments[most]
-            seen = [(index, pose), *poses]
-            if _moves_with(garment, [(frames[k].garments[most], each) for k, each in seen]):
-                why = f"it lies on <{garment.path}> and moves with it: a trim, or the garment's own skin"
-                return Candidate(path, why, follows=garment.path)
-            where = f"{fractions[most]:.0%} of <{garment.path}> is inside or within {1e3 * NEAR:.0f} mm"
-            shares = {g.path: fraction for g, fraction in zip(garments, fractions, strict=True) if fraction}
-            return Candidate(path, where + at_time(frames[index].time), shares, pose)
-    return Candidate(path, f"{FAR} in {counted(len(frames), 'frame')}")
+            return _touched(body, solid, cloth, (index, fractions))
+        apart = min(gap for _, gap in near), cages, hull
+    return None if body.unread else Candidate(body.path, f"{FAR} in {counted(len(cloth.times), 'frame')}")
 
 
-def _moves_with(garment: Garment, frames: Sequence[tuple[GarmentFrame, Pose]]) -> bool:
-    """Whether a mesh lies along a cage in the first frame, and stays near the same places of the cage in all frames."""
-    (cloth, pose), *later = frames
+def _touched(body: OtherBody, solid: MeshBody, cloth: _Cloth, first: tuple[int, Sequence[float]]) -> Candidate:
+    """The candidate of a body that touches cloth, given the first frame with contact and each garment's fraction."""
+    index, fractions = first
+    most = int(np.argmax(fractions))
+    garment, later = cloth.shot.scene.garments[most], [number for number in body.frames if number > index]
+    picks = np.linspace(0, len(later) - 1, min(MOST_FRAMES, len(later))).round().astype(int)
+    frames = [index, *(later[pick] for pick in picks)]
+    pairs = ((cloth.cages(number)[most], body.pose(number)) for number in frames)
+    if _moves_with(garment, [(cage, pose) for cage, pose in pairs if pose is not None], reach=cloth.along[most]):
+        why = f"it lies on <{garment.path}> and moves with it: a trim, or the garment's own skin"
+        return Candidate(body.path, why, follows=garment.path)
+    if body.unread:
+        return Candidate(body.path, UNREAD, unread=body.unread)
+    for number in frames[1:] if fractions[most] < LITTLE else ():
+        pose = body.pose(number)
+        other = [0.0 if pose is None else _nearness(solid, pose, cage)[0] for cage in cloth.cages(number)]
+        index, fractions = max((index, fractions), (number, other), key=lambda each: max(each[1]))
+    most = int(np.argmax(fractions))
+    garment = cloth.shot.scene.garments[most]
+    where = f"{percent(fractions[most])} of <{garment.path}> is inside or within {1e3 * NEAR:.0f} mm"
+    shares = {g.path: part for g, part in zip(cloth.shot.scene.garments, fractions, strict=True) if part}
+    return Candidate(body.path, where + at_time(cloth.times[index]), shares, body.pose(index))
+
+
+def percent(fraction: float) -> str:
+    """A fraction above 0 in words."""
+    return f"{fraction:.0%}" if fraction >= 0.005 else "under 1%"
+
+
+def _moved(before: Sequence[np.ndarray], after: Sequence[np.ndarray]) -> float:
+    """Sum of the largest move of the cages and of the body [m], the last of the arrays; infinite for unlike arrays."""
+    if any(a.shape != b.shape for a, b in zip(before, after, strict=True)):
+        return np.inf
+    moves = [float(np.linalg.norm(b - a, axis=1).max(initial=0.0)) for a, b in zip(before, after, strict=True)]
+    return max(moves[:-1], default=0.0) + moves[-1]
+
+
+def _moves_with(garment: Garment, frames: Sequence[tuple[np.ndarray, Pose]], *, reach: float) -> bool:
+    """Whether a body lies along a cage in the first frame, and stays near the same places of the cage in all frames.
+
+    Args:
+        frames: Positions of the cage [m], shape (V, 3), and the body's pose.
+        reach: Distance from the cage [m].
+    """
+    (cage, pose), *later = frames
     triangles = garment.mesh.triangulate(garment.rest).triangles
-    surfaces = MeshBody(side="start", device="cpu", threads=1).pose(Pose(cloth.points, triangles))
+    surfaces = MeshBody(side="start", device="cpu", threads=1).pose(Pose(cage, triangles))
     if not surfaces:
         return False
-    used = np.unique(pose.triangles)
+    used = np.unique(pose.triangles) if len(pose.triangles) else np.arange(len(pose.points))
+    used = used[:: max(1, len(used) // MOST_POINTS)]
     points = torch.as_tensor(pose.points[used] - surfaces[0].origin)
-    reach = LIES_ALONG * (cloth.offset + cloth.fabric.thickness)
     found = surfaces[0].closest(points, torch.full_like(points[:, 0], reach))
     near = found.distance.isfinite().numpy()
     if near.mean() < MOST_OF:
         return False
     corners = surfaces[0].triangles[found.face.numpy()[near]]
-    weights = _weights(cloth.points[corners], found.point.numpy()[near] + surfaces[0].origin)
+    weights = _weights(cage[corners], found.point.numpy()[near] + surfaces[0].origin)
     for other, moved in later:
         if moved.points.shape != pose.points.shape:
             return False
-        places = np.einsum("nk,nkd->nd", weights, other.points[corners])
+        places = np.einsum("nk,nkd->nd", weights, other[corners])
         away = np.linalg.norm(moved.points[used][near] - places, axis=1)
         if np.quantile(away, MOST_OF) > reach:
             return False
@@ -166,21 +253,29 @@ def open_with_colliders(shot: str | os.PathLike[str] | Stage, *, colliders: Sequ
     return open_shot(shot, colliders=named, **options)
 
 
-def _fraction_at(body: MeshBody, pose: Pose, cage: np.ndarray) -> float:
-    """Fraction of a cage's vertices inside a body's closed part, or near the body.
+def _nearness(body: MeshBody, pose: Pose, cage: np.ndarray) -> tuple[float, float]:
+    """Fraction of a cage's vertices inside a body's closed part, or near the body; and the least distance [m].
 
     Args:
+        pose: The body's pose; without triangles, its points count.
         cage: Positions of the cage [m], shape (V, 3).
 
     Returns:
-        The fraction; 0 without contact. A room or a sky around the whole cage, with no walls nearby, counts as no
-        contact.
+        The fraction, 0 without contact, and the distance, at most `LOOKED`. A room or a sky around the whole cage, with
+        no walls nearby, counts as no contact.
     """
-    fraction = 0.0
+    fraction, gap = 0.0, LOOKED
+    if not len(pose.triangles):
+        points = pose.points[np.isfinite(pose.points).all(axis=1)]
+        away = cKDTree(points).query(cage, distance_upper_bound=LOOKED)[0] if len(points) else np.full(1, LOOKED)
+        return float(np.mean(away <= NEAR)), min(gap, float(np.min(away)))
     for surface in body.pose(pose):
         x = torch.as_tensor(cage - surface.origin)
         near = surface.closest(x, torch.full_like(x[:, 0], NEAR)).distance.isfinite()
         inside = surface.inside(x)
         touches = near.any() or (inside.any() and not inside.all())
-        fraction = max(fraction, float((near | inside).double().mean())) if bool(touches) else fraction
-    return fraction
+        if bool(touches):
+            fraction = max(fraction, float((near | inside).double().mean()))
+        elif not fraction:
+            gap = min(gap, float(surface.closest(x, torch.full_like(x[:, 0], LOOKED)).distance.min()))
+    return fraction, gap

@@ -17,7 +17,7 @@ from ..usd.stage import at_time
 from .options import options_of
 from .report import MOST_NAMED, RefineReport, is_first
 from .settled import COLLAPSED, LIMITED, UNSOLVED, in_words
-from .untagged import AUTO, NEAR, Candidate
+from .untagged import AUTO, NEAR, Candidate, percent
 
 Entries = Mapping[float | None, Mapping[str, Any]]
 """A garment's telemetry by time code."""
@@ -116,10 +116,16 @@ WARNINGS = {
         {"rest_frame": "auto"},
     ),
     "unfelt": Kind(
-        "cloth is inside or near a mesh that it does not feel",
+        "cloth is inside or near a body that it does not feel",
         "`--collider auto`, or the command that the warning names",
-        "cloth is inside or within {near:.0f} mm of {meshes} that it does not feel, for {why}: {named}",
+        "cloth is inside or within {near:.0f} mm of {bodies} that it does not feel, for {why}: {named}",
         "give --collider {auto}, or by name {options}",
+    ),
+    "unread": Kind(
+        "a shape that is not read may touch cloth",
+        "convert it to a mesh, or put a mesh in its place; curves and points on cloth: `--bind`",
+        "{named} may touch cloth and {are} not read",
+        "convert {them} to a Mesh, or put one in {their} place",
     ),
     "gravity": Kind(
         "gravity pulls across it",
@@ -178,16 +184,27 @@ def of_gravity(garment: str, body: str, axis: str, *, pull: str, source: str) ->
 
 
 def of_unfelt(found: Sequence[Candidate]) -> list[str]:
-    """A warning of meshes touched by cloth but not used as colliders, with the options to type."""
+    """A warning of bodies touched by cloth but not used as colliders, with the options to type."""
     if not found:
         return []
-    named = [f"<{each.path}> ({each.shares[each.garment]:.0%} of <{each.garment}>)" for each in found[:MOST_NAMED]]
+    named = [f"<{each.path}> ({percent(each.shares[each.garment])} of <{each.garment}>)" for each in found[:MOST_NAMED]]
     named += [f"{len(found) - MOST_NAMED} more"] if len(found) > MOST_NAMED else []
     options = join(options_of("--collider", [each.path for each in found[:MOST_NAMED]]))
     one = len(found) == 1
-    meshes, why = ("a mesh", "it is no collider") if one else ("meshes", "they are no colliders")
+    bodies, why = ("a body", "it is no collider") if one else ("bodies", "they are no colliders")
     figures = {"named": ", ".join(named), "options": options, "near": 1e3 * NEAR, "auto": AUTO}
-    return [WARNINGS["unfelt"](meshes=meshes, why=why, **figures)]
+    return [WARNINGS["unfelt"](bodies=bodies, why=why, **figures)]
+
+
+def of_unread(found: Sequence[Candidate]) -> list[str]:
+    """A warning of shapes near cloth that are not read."""
+    named = [f"<{each.path}> ({each.unread})" for each in found if each.unread]
+    if not named:
+        return []
+    more = [f"{len(named) - MOST_NAMED} more"] if len(named) > MOST_NAMED else []
+    words = ("is", "it", "its") if len(named) == 1 else ("are", "them", "their")
+    figures = dict(zip(("are", "them", "their"), words, strict=True))
+    return [WARNINGS["unread"](named=", ".join([*named[:MOST_NAMED], *more]), **figures)]
 
 
 def of_frames(report: RefineReport) -> list[str]:

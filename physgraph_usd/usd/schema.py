@@ -218,7 +218,7 @@ PROPERTIES: tuple[Property, ...] = (
     ),
     Property(
         GARMENT_API, "physgraph:bind:targets", "rel", None, "", None, None,
-        "Meshes, curves and points that follow the refined cloth: render meshes, trims, piping, buttons.",
+        "Meshes, curves, points and instancers that follow the refined cloth: render meshes, trims, piping, buttons.",
         "Bound Prims", REFINEMENT,
     ),
     Property(

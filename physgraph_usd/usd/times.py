@@ -20,8 +20,9 @@ from ..errors import AbsentError, named_time
 from ..solver.scene import FARTHEST, SAME_TIME
 from .lookup import with_ancestors
 
-_SHAPE = ("points", "radius", "radiusTop", "radiusBottom", "height", "size")
-"""Attributes of a mesh's or another shape's form."""
+_PLACED = ("protoIndices", "ids", "invisibleIds", "positions", "orientations", "orientationsf", "scales")
+_SHAPE = ("points", "radius", "radiusTop", "radiusBottom", "height", "size", *_PLACED)
+"""Attributes of a mesh's or another shape's form, and of an instancer's instances."""
 _TURNING = ("rotate", "orient")
 _SLOWEST, _FASTEST, _FRAME_RATE = 12.0, 120.0, 24.0
 """Least and most frames a second, and how many where none of the stage's rates is between [1/s]."""

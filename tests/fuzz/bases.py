@@ -97,6 +97,30 @@ def _bodies(folder: Path) -> None:
     save(stage)
 
 
+def _instances(folder: Path) -> None:
+    """A sheet over instanced rocks and two tapered shapes, with stones that hang on it."""
+    stage = new_stage(folder / "shot.usda", metres=METRES)
+    cloth = add_sheet(stage, CLOTH, times=TIMES, size=SIZE)
+    for path, below, radius in (("/World/rocks", -0.8, 0.4), ("/World/stones", 0.02, 0.02)):
+        made = UsdGeom.PointInstancer.Define(stage, path)
+        UsdGeom.Sphere.Define(stage, f"{path}/protos/ball").CreateRadiusAttr(radius)
+        made.CreatePrototypesRel().SetTargets([f"{path}/protos/ball"])
+        made.CreateProtoIndicesAttr([0, 0, 0])
+        for time in TIMES:
+            points = sheet_points(time, SIZE)[[1, 5, 6]] + np.array([0.0, 0.0, below], np.float32)
+            made.CreatePositionsAttr().Set(vec3(points), time)
+        made.CreateOrientationsAttr([Gf.Quath(1, 0, 0, 0)] * 3)
+        made.CreateScalesAttr([(1, 1, 1)] * 3)
+    for name, kind in (("limb", "Capsule_1"), ("horn", "Cylinder_1")):
+        prim = stage.DefinePrim(f"/World/{name}", kind)
+        UsdGeom.XformCommonAPI(prim).SetTranslate((1.0, 1.0, -2.0))
+        prim.GetAttribute("radiusTop").Set(0.3)
+    names = ("rocks", "limb", "horn")
+    cloth.GetPrim().CreateRelationship("physgraph:colliders").SetTargets([f"/World/{name}" for name in names])
+    cloth.GetPrim().CreateRelationship("physgraph:bind:targets").SetTargets(["/World/stones"])
+    save(stage)
+
+
 def _skinned(folder: Path) -> None:
     stage = new_stage(folder / "shot.usda", metres=METRES)
     add_skeleton(stage, "/World/rig", TIMES, blend=True)
@@ -193,6 +217,7 @@ BASES: dict[str, Callable[[Path], None]] = {
     "still": _still,
     "dressed": _dressed,
     "bodies": _bodies,
+    "instances": _instances,
     "skinned": _skinned,
     "layered": _layered,
     "several": _several,

@@ -2,6 +2,15 @@
 
 from __future__ import annotations
 
-from . import files, meshes, odd, records, shown, values, wholes
+from . import files, instances, meshes, odd, records, shown, values, wholes
 
-KINDS = (*files.KINDS, *meshes.KINDS, *values.KINDS, *wholes.KINDS, *odd.KINDS, *records.KINDS, *shown.KINDS)
+KINDS = (
+    *files.KINDS,
+    *meshes.KINDS,
+    *values.KINDS,
+    *wholes.KINDS,
+    *instances.KINDS,
+    *odd.KINDS,
+    *records.KINDS,
+    *shown.KINDS,
+)

@@ -143,6 +143,11 @@ class MeshSurface:
         """True if places are disallowed wherever cloth starts: inside a closed surface, behind a fixed side."""
         return self.closed or self.fixed_side is not None
 
+    @property
+    def lift(self) -> float:
+        """Height above a face at which the surface is tested for being buried [m]."""
+        return LIFT * float(np.ptp(self.bounds, axis=0).max())
+
     def repose(self, pose: Pose) -> None:
         """Move the surface to another pose of equal topology; a rigid motion keeps the known self-intersections."""
         wp.copy(self.mesh.points, wp.array(self._place(pose), dtype=wp.vec3f, device=self.device))
@@ -213,9 +218,8 @@ class MeshSurface:
         if not self.closed or not len(x):
             return found
         way = self._closest_bare(x, found, whole=False) if bool(self._faces.is_buried(found.face).any()) else found
-        lift = LIFT * float(np.ptp(self.bounds, axis=0).max())
         doubtful = torch.nonzero(self._faces.is_unsure(way.face)).squeeze(1)
-        doubtful = doubtful[self.inside(way.point[doubtful] + lift * way.normal[doubtful])]
+        doubtful = doubtful[self.inside(way.point[doubtful] + self.lift * way.normal[doubtful])]
         if not len(doubtful):
             return way
         return way.with_those(doubtful, self._closest_bare(x[doubtful], way.some(doubtful), whole=True))

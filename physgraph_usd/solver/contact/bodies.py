@@ -11,7 +11,7 @@ is inside or outside as a whole.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import reduce
 
 import numpy as np
@@ -22,6 +22,7 @@ from torch import Tensor
 from ..collide.crossings import Pierced
 from ..colliders.base import Nearest, Solid
 from ..colliders.mesh import MeshSurface
+from ..colliders.pose import Pose
 from ..forces.self_contact import PairConstraints
 from ..level import Level
 from ..mesh.topology import joined_by, patches_with
@@ -63,6 +64,7 @@ class FrameBodies:
         longest: Longest way out from between overlapping parts of a body [m].
         settings: Contact settings, with the stiffness in SI.
         sides: Allowed side of each open surface for each cage vertex, shape (C,); zeros if undecided or meaningless.
+        unions: Cache of closed surfaces that overlap, as one surface, by their numbers.
     """
 
     touching: tuple[Touching, ...]
@@ -72,6 +74,7 @@ class FrameBodies:
     longest: float
     settings: ContactSettings
     sides: tuple[Float[Tensor, " coarse"], ...]
+    unions: dict[tuple[int, ...], MeshSurface] = field(default_factory=dict)
 
     @staticmethod
     def begin(
@@ -99,6 +102,68 @@ class FrameBodies:
         longest = settings.way_out * float(cage.spacing.mean())
         whole = len(known) == len(touching)
         return FrameBodies(tuple(touching), shifts, points, before if whole else None, longest, settings, sides)
+
+    def exits(self, index: int, at: Float[Tensor, "points 3"]) -> tuple[Nearest, Nearest]:
+        """Closest points of a closed surface, and closest points on its exposed faces, for points inside.
+
+        A way out that ends inside other bodies leads to the exposed faces of all of them, as where parts of one body
+        overlap.
+
+        Args:
+            at: The points in the surface's coordinates [m].
+        """
+        surface = self.touching[index].surface
+        found = surface.closest(at, torch.full_like(at[:, 0], float("inf")))
+        way, others = surface.exit(at, found), self._beside(index)
+        if not others:
+            return found, way
+        out = way.point + surface.lift * way.normal
+        blocked = torch.zeros_like(found.rim)
+        for other in others:
+            there = self.touching[other].surface
+            blocked |= there.inside(out + torch.as_tensor(surface.origin - there.origin).to(out))
+        which = torch.nonzero(blocked & way.distance.isfinite()).squeeze(1)
+        if not len(which):
+            return found, way
+        union = self._union((index, *others))
+        shift = torch.as_tensor(surface.origin - union.origin).to(at)
+        near = union.closest(at[which] + shift, torch.full_like(at[which, 0], float("inf")))
+        both = near, union.exit(at[which] + shift, near)
+        near, beyond = (replace(each, point=each.point - shift) for each in both)
+        return found.with_those(which, near), way.with_those(which, beyond)
+
+    def parts_around(self, index: int, at: Float[Tensor, "points 3"]) -> Int[Tensor, " points"]:
+        """Number of parts around points in a surface's coordinates [m]: up to 2 of the surface, and of those beside."""
+        surface = self.touching[index].surface
+        count = surface.inside(at).long() + surface.inside(at, parts=2).long()
+        for other in self._beside(index):
+            there = self.touching[other].surface
+            count += there.inside(at + torch.as_tensor(surface.origin - there.origin).to(at)).long()
+        return count
+
+    def _beside(self, index: int) -> tuple[int, ...]:
+        """Other closed surfaces for the same garments with bounds that meet those of a closed surface."""
+        own = self.touching[index]
+        return tuple(
+            number
+            for number, each in enumerate(self.touching)
+            if number != index and each.surface.closed and own.surface.closed
+            if [np.isfinite(offset) for offset in each.offset] == [np.isfinite(offset) for offset in own.offset]
+            if _meet(each.surface, own.surface)
+        )
+
+    def _union(self, numbers: tuple[int, ...]) -> MeshSurface:
+        """Closed surfaces as one."""
+        key = tuple(sorted(numbers))
+        if key not in self.unions:
+            members = [self.touching[number].surface for number in key]
+            firsts = np.cumsum([0, *(len(each.world) for each in members[:-1])])
+            shifted = [each.solid.faces + first for each, first in zip(members, firsts, strict=True)]
+            triangles = np.concatenate(shifted).astype(np.int32)
+            pose = Pose(np.concatenate([each.world for each in members]), triangles)
+            place = {"device": members[0].device, "threads": members[0].threads}
+            self.unions[key] = MeshSurface(pose, triangles, None, **place)
+        return self.unions[key]
 
     @property
     def solids(self) -> tuple[Solid, ...]:
@@ -183,8 +248,10 @@ class LevelBodies:
             Unit directions out, depths [m], and a mask of pinched points, which stay.
         """
         surface, at = self.frame.touching[index].surface, x + self.frame.shifts[index]
-        found = surface.closest(at, torch.full_like(at[:, 0], float("inf")))
-        way = surface.exit(at, found) if surface.closed else found
+        if surface.closed:
+            found, way = self.frame.exits(index, at)
+        else:
+            found = way = surface.closest(at, torch.full_like(at[:, 0], float("inf")))
         stays = ~way.distance.isfinite()
         if surface.closed:
             stays |= pinched(found, way, longest=self.frame.longest)
@@ -300,10 +367,9 @@ class LevelBodies:
         if not len(which) or not surface.closed:
             return some
         at = x[which] + self.frame.shifts[index]
-        found = surface.closest(at, torch.full_like(at[:, 0], float("inf")))
-        between = torch.nonzero(is_between(found, surface.exit(at, found))).squeeze(1)
+        between = torch.nonzero(is_between(*self.frame.exits(index, at))).squeeze(1)
         some[which[between]] = True
-        seeds[which[between[surface.inside(at[between], parts=2)]]] = True
+        seeds[which[between[self.frame.parts_around(index, at[between]) > 1]]] = True
         masks = (each.cpu().numpy() for each in (some, seeds))
         return torch.as_tensor(patches_with(self.level.edges.cpu().numpy(), *masks), device=x.device)
 
@@ -321,6 +387,12 @@ class Chords:
     body: Int[Tensor, " chords"]
     corners: Int[Tensor, "chords 4"]
     weight: Float[Tensor, "chords 4"]
+
+
+def _meet(one: MeshSurface, other: MeshSurface) -> bool:
+    """Whether the bounds of two surfaces meet."""
+    a, b = one.bounds + one.origin, other.bounds + other.origin
+    return bool((a[0] <= b[1]).all() and (b[0] <= a[1]).all())
 
 
 def _spread(piece: Int[np.ndarray, " vertices"]) -> tuple[np.ndarray, np.ndarray]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -12,6 +13,8 @@ from ..colliders.base import Nearest
 from ..colliders.mesh import MeshSurface
 from ..level import Level
 
+Exits = Callable[[Tensor], tuple[Nearest, Nearest]]
+"""Finds the closest points of a surface, and on exposed faces, for points inside [m]."""
 DETOUR = 1.05
 """Ratio of the way out to the closest distance above which the closest face counts as buried."""
 DEEP = 1e-4
@@ -51,6 +54,7 @@ def penetration(
     longest: float,
     crossings: int,
     lost: Bool[Tensor, " vertices"] | None = None,
+    exits: Exits | None = None,
 ) -> Penetration:
     """Measure one garment group against one surface.
 
@@ -60,9 +64,10 @@ def penetration(
         longest: Way out from between overlapping parts above which a vertex counts as pinched [m].
         crossings: Number of edges through faces.
         lost: Vertices of cloth between overlapping parts, or None.
+        exits: As for `depths`.
     """
     free = level.free[:, 0]
-    depth, stays = depths(surface, x, inside, longest, lost=lost)
+    depth, stays = depths(surface, x, inside, longest, lost=lost, exits=exits)
     deep = (depth > DEEP) & ~stays
     count = int((deep & free).sum())
     deepest = float((depth * (free & ~stays)).max()) if len(depth) else 0.0
@@ -83,6 +88,7 @@ def depths(
     longest: float,
     *,
     lost: Bool[Tensor, " vertices"] | None = None,
+    exits: Exits | None = None,
 ) -> tuple[Float[Tensor, " vertices"], Bool[Tensor, " vertices"]]:
     """Length of each vertex's way out of a surface with an inside [m], 0 outside, and a mask of pinched vertices.
 
@@ -91,12 +97,16 @@ def depths(
         inside: The vertices inside.
         longest: Way out from between overlapping parts above which a vertex counts as pinched [m].
         lost: Vertices of cloth between overlapping parts, or None.
+        exits: Closest points of the surface and on exposed faces; None for the surface alone.
     """
     depth, stays = torch.zeros_like(x[:, 0]), torch.zeros_like(inside)
     within = torch.nonzero(inside).squeeze(1) if surface.has_inside else depth.long()[:0]
     if len(within):
-        found = surface.closest(x[within], torch.full_like(depth[within], float("inf")))
-        way = surface.exit(x[within], found)
+        if exits is None:
+            found = surface.closest(x[within], torch.full_like(depth[within], float("inf")))
+            way = surface.exit(x[within], found)
+        else:
+            found, way = exits(x[within])
         known = None if lost is None else lost[within]
         depth[within], stays[within] = way.distance, pinched(found, way, longest=longest, lost=known)
     return depth, stays

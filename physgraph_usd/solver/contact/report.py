@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict
+from functools import partial
 
 import numpy as np
 import torch
@@ -69,7 +70,8 @@ def _penetration(bodies: LevelBodies, index: int, x: Tensor, look: ContactState,
     count = 0 if look.pierced is None else int((look.pierced.body == index).sum())
     known = {"longest": bodies.frame.longest, "lost": lost, "crossings": count}
     surface, at = bodies.frame.touching[index].surface, x + bodies.frame.shifts[index]
-    return penetration(surface, bodies.level, at, inside, **known)
+    exits = partial(bodies.frame.exits, index) if surface.closed else None
+    return penetration(surface, bodies.level, at, inside, exits=exits, **known)
 
 
 def swallowed(

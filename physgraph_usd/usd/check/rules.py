@@ -140,6 +140,21 @@ def points(fine: Fine) -> Iterator[Problem]:
             yield fine.problem("points", f"point {bad[0]} is not finite: {array[bad[0]].tolist()}", time)
 
 
+def instances(fine: Fine) -> Iterator[Problem]:
+    """Positions and unit orientations are finite, and as many as there are instances."""
+    expected = fine.entries("protoIndices", fine.times[-1]).size
+    for time in fine.times:
+        for name in ("positions", "orientations", "orientationsf"):
+            array = fine.array(name, time)
+            if array is None or array.ndim != 2:
+                continue
+            if len(array) != expected:
+                yield fine.problem(name, f"has {len(array)} entries for {expected} instances", time)
+            bad = np.flatnonzero(~np.isfinite(array.astype(np.float64)).all(axis=-1))
+            if len(bad):
+                yield fine.problem(name, f"entry {bad[0]} is not finite: {array[bad[0]].tolist()}", time)
+
+
 def normals(fine: Fine) -> Iterator[Problem]:
     """Normals are per vertex, unit, on the outer side, and sampled with the points."""
     if fine.prim.GetAttribute("normals").GetMetadata("interpolation") != UsdGeom.Tokens.vertex:
@@ -324,6 +339,8 @@ RULES: tuple[Callable[[Fine], Iterator[Problem]], ...] = (
 
 BOUND_RULES = (points, skinning)
 """Rules for curves and points that follow a garment."""
+BOUND_INSTANCER_RULES = (instances,)
+"""Rules for point instancers whose instances follow a garment."""
 BOUND_MESH_RULES = (topology, *BOUND_RULES, extent)
 """Rules for meshes that follow a garment; samples must fit the shot's topology."""
 
@@ -384,14 +401,15 @@ def same_metadata(layer: Sdf.Layer, shot: Usd.Stage) -> Iterator[Problem]:
             yield _error(f"{key} is {found!r}; the shot has {expected!r}")
 
 
-def prim_fault(path: str, composed: Usd.Stage, kind: type[UsdGeom.PointBased] = UsdGeom.Mesh) -> str:
-    """The reason for a path without an editable prim of a kind, or ""."""
+def prim_fault(path: str, composed: Usd.Stage, kinds: Sequence[type] = (UsdGeom.Mesh,)) -> str:
+    """The reason for a path without an editable prim of some kinds, or ""."""
     prim = composed.GetPrimAtPath(path)
     if not prim:
         return "is not on the stage: the layer is not over the shot that it was made from"
     if prim.IsInstanceProxy():
         return "lies in an instance, where overs are ignored; its instance root must be instanceable = false"
-    return "" if kind(prim) else f"is of type {prim.GetTypeName() or 'none'}, not {kind.__name__}"
+    names = " or ".join(kind.__name__ for kind in kinds)
+    return "" if any(kind(prim) for kind in kinds) else f"is of type {prim.GetTypeName() or 'none'}, not {names}"
 
 
 def against_shot(layer: Sdf.Layer, coarse: Usd.Prim, target: Sdf.Path) -> Iterator[Problem]:

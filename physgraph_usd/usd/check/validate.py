@@ -12,9 +12,11 @@ from pxr import Sdf, Usd, UsdGeom
 
 from ...errors import LayerError
 from ..provenance import read_record, recorded_shot
+from ..read.targets import FOLLOWERS
 from ..stage import USD_ERRORS, bad_rate, is_there, open_layer, paths_in, pxr_errors, quiet
 from ..view import StageView
 from .rules import (
+    BOUND_INSTANCER_RULES,
     BOUND_MESH_RULES,
     BOUND_RULES,
     LAYER_RULES,
@@ -97,19 +99,20 @@ def check_layer(layer: Sdf.Layer, shot: StageView | None, *, samples: int | None
         if coarse:
             problems += _named("against_shot", against_shot(layer, coarse, Sdf.Path(path)))
     for path in bound:
-        fault = prim_fault(path, composed, UsdGeom.PointBased)
+        fault = prim_fault(path, composed, FOLLOWERS)
         fine = None if fault else Fine(composed.GetPrimAtPath(path), layer, _times(layer, path, samples))
         if fine is None:
             problems.append(Problem("error", path, None, fault, "composition"))
             continue
-        for rule in BOUND_MESH_RULES if UsdGeom.Mesh(fine.prim) else BOUND_RULES:
+        rules = BOUND_INSTANCER_RULES if UsdGeom.PointInstancer(fine.prim) else BOUND_RULES
+        for rule in BOUND_MESH_RULES if UsdGeom.Mesh(fine.prim) else rules:
             problems += _named(rule.__name__, rule(fine))
     return problems
 
 
 def _times(layer: Sdf.Layer, path: str, samples: int | None) -> tuple[float | None, ...]:
-    """The default and time codes of a prim's points to check, spread over the range."""
-    written = times_with_values(layer, f"{path}.points")
+    """The default and time codes of a prim's points or positions to check, spread over the range."""
+    written = times_with_values(layer, f"{path}.points") or times_with_values(layer, f"{path}.positions")
     if samples is not None and len(written) > samples:
         written = [written[i] for i in np.linspace(0, len(written) - 1, samples).astype(int)]
     return (None, *written)

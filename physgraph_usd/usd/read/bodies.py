@@ -1,28 +1,32 @@
-"""Reads colliders from meshes and primitives, posed in world metres.
+"""Reads colliders from meshes, primitives and point instancers: triangles posed in world metres.
 
-A mesh is read as rendered: without holes, and subdivided by its scheme. An unusable pose is left out at its time, with
-a notice. A primitive transformed into a shape without a name, such as an ellipsoid, becomes a mesh.
+A mesh is read as rendered: without holes, and subdivided by its scheme. A point instancer is the triangles of its
+instances; a prim below an instancer is drawn at the instances only. An unusable pose is left out at its time, with a
+notice. A primitive transformed into a shape without a name, such as an ellipsoid, becomes a mesh.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import product
 
 import numpy as np
-from pxr import Usd, UsdGeom
+from pxr import Sdf, Usd, UsdGeom
 
 from ...solver.colliders.orient import FIXED
 from ...solver.colliders.pose import Collider, Pose
-from ...solver.colliders.primitives import KINDS, primitive
+from ...solver.colliders.primitives import AROUND, KINDS, primitive, segments
 from ...solver.mesh.topology import PolygonMesh
 from ...solver.scene import FARTHEST, out_of_bounds
-from ..lookup import Override, find_token, find_value
+from ..lookup import Override, find_token, find_value, is_on
 from ..mesh.drawn import MOST_VERTICES, ControlMesh, DrawnSurface, drawn_surface
 from ..schema import COLLIDER, GARMENT
 from ..stage import Notice, timecode, value_at
 from .absence import missing_value
+from .find import is_drawn
+from .instances import instanced_gprims, instancer_above, placements
 from .placement import is_flipped, place
 
 DRAWN_NEAR = 0.1
@@ -31,6 +35,9 @@ DRAWN_WITHIN = DRAWN_NEAR * float(GARMENT["contact:offset"].fallback or 0.0)
 """Largest error of a body's surface at the usual contact offset [m]."""
 _LEAST_OFFSET = 1e-3
 """Least offset for choosing a body's subdivision [m]: an offset of 0 would ask for unlimited subdivision."""
+MOST_INSTANCED = 1_000_000
+"""Most vertices of an instancer's instances near the cloth, 40 times those of a mesh: a body's hierarchy is built once
+and refitted in each frame in which an instance moves."""
 _PLANE_START = ("plane", "start")
 
 UPRIGHT = {
@@ -77,9 +84,14 @@ class ColliderReader:
     """A collider with everything needed for posing.
 
     Attributes:
+        prim: A gprim or a point instancer.
         collider: Constant data.
         within: Allowed distance of the mesh from the drawn surface [m].
         always: Whether the collider counts even while invisible.
+        instancer: Outermost point instancer that draws the prim; None for a gprim in its own place.
+        parts: Gprims at the instances, by path.
+        near: Bounds of the cloth over the shot [m], shape (2, 3): instances beyond are left out; None keeps all.
+        unit: Length of the longest unit of a part's space at any instance [m]; None for a gprim in its own place.
     """
 
     prim: Usd.Prim
@@ -87,11 +99,17 @@ class ColliderReader:
     metres: float
     within: float = DRAWN_WITHIN
     always: bool = False
+    instancer: Usd.Prim | None = None
+    parts: Mapping[Sdf.Path, ColliderReader] = field(default_factory=dict)
+    near: np.ndarray | None = None
+    unit: float | None = None
     _faces: _Faces | None = None
+    _triangles: np.ndarray | None = None
 
     def on_side(self, side: str) -> ColliderReader:
         """A reader of the collider on a different side, one of `schema.SIDES`."""
-        return replace(self, collider=replace(self.collider, side=side))
+        parts = {path: part.on_side(side) for path, part in self.parts.items()}
+        return replace(self, collider=replace(self.collider, side=side), parts=parts)
 
     def pose(self, time: float | None, skinned: np.ndarray | None = None) -> tuple[Pose | None, tuple[Notice, ...]]:
         """Pose at a time code, interpolated like USD; None, with a notice, without a usable pose.
@@ -99,25 +117,73 @@ class ColliderReader:
         Args:
             skinned: World positions of a mesh's points [m], to replace the authored points; or None.
         """
-        visibility = UsdGeom.Imageable(self.prim).ComputeVisibility(timecode(time))
+        visibility = UsdGeom.Imageable(self.instancer or self.prim).ComputeVisibility(timecode(time))
         if not self.always and visibility == UsdGeom.Tokens.invisible:
             message = f"no collider where it is invisible, unless {COLLIDER['collider:enabled'].name} is set to true"
             return None, (Notice(self.collider.path, None, message),)
-        matrix = self._matrix(timecode(time))
-        if time is not None and (why := missing_value(self.prim, time)):
+        if self.instancer is not None:
+            pose, odd = self._instances(self.instancer, time)
+        elif time is not None and (why := missing_value(self.prim, time)):
             return None, (self._out(time, why),)
+        else:
+            pose, odd = self._placed(self._matrix(timecode(time)), time, skinned)
+        if pose is None:
+            return None, odd
+        pose, beyond = self._bounded(pose, time)
+        return pose, (*odd, *beyond)
+
+    def _placed(
+        self, matrix: np.ndarray, time: float | None, skinned: np.ndarray | None = None
+    ) -> tuple[Pose | None, tuple[Notice, ...]]:
+        """A gprim placed by a matrix from its own space to world metres, shape (4, 4)."""
         if not matrix[:3, :3].any():
             return None, (self._out(time, "its transform to the world scales it to nothing"),)
         if not np.isfinite(matrix).all() or not np.allclose(matrix[3], [0.0, 0.0, 0.0, 1.0]):
             return None, (self._out(time, "its transform to the world is not an affine one"),)
         if self.collider.kind == "mesh":
-            pose, odd = self._mesh(matrix, time, skinned)
-        else:
-            pose, odd = self._shape(matrix, time)
-        if pose is None:
-            return None, odd
-        pose, beyond = self._bounded(pose, time)
-        return pose, (*odd, *beyond)
+            return self._mesh(matrix, time, skinned)
+        return self._shape(matrix, time)
+
+    def _instances(self, instancer: Usd.Prim, time: float | None) -> tuple[Pose | None, tuple[Notice, ...]]:
+        """The triangles of all instances near the cloth; an instance of scale 0 is not drawn."""
+        found = placements(instancer, time)
+        if found is None:
+            return None, (self._out(time, f"arrays of <{instancer.GetPath()}> do not fit together"),)
+        notices: dict[Notice, None] = {}
+        poses: list[Pose] = []
+        count = 0
+        for path, part in self.parts.items():
+            for matrix in part._near(found.get(path, np.zeros((0, 4, 4))), time, self.near):
+                pose, odd = part._placed(matrix, time)
+                notices |= dict.fromkeys(odd)
+                poses += [] if pose is None else [pose]
+                count += 0 if pose is None else len(pose.points)
+                if count > MOST_INSTANCED:
+                    why = (
+                        f"its instances near the cloth have over {MOST_INSTANCED:,} vertices; hide those that no cloth"
+                    )
+                    return None, (self._out(time, f"{why} touches by invisibleIds, or refine with less of them"),)
+        if not poses:
+            return None, tuple(notices)
+        firsts = np.cumsum([0, *(len(pose.points) for pose in poses[:-1])])
+        shifted = [pose.triangles + np.int32(first) for pose, first in zip(poses, firsts, strict=True)]
+        triangles = np.concatenate(shifted)
+        if self._triangles is None or not np.array_equal(self._triangles, triangles):
+            self._triangles = triangles
+        return Pose(np.concatenate([pose.points for pose in poses]), self._triangles), tuple(notices)
+
+    def _near(self, matrices: np.ndarray, time: float | None, bounds: np.ndarray | None) -> np.ndarray:
+        """Matrices to world metres, shape (N, 4, 4), of the instances with bounds that meet the given bounds [m]."""
+        scaled = matrices.copy()
+        scaled[:, :3] *= self.metres
+        scaled = scaled[np.isfinite(scaled).all(axis=(1, 2)) & scaled[:, :3, :3].any(axis=(1, 2))]
+        local = self._placed(np.eye(4), time)[0] if bounds is not None and len(scaled) else None
+        if local is None or bounds is None or not len(local.points):
+            return scaled
+        ends = np.stack([np.nanmin(local.points, axis=0), np.nanmax(local.points, axis=0)])
+        corners = np.array([[ends[i, 0], ends[j, 1], ends[k, 2]] for i, j, k in product((0, 1), repeat=3)])
+        world = np.einsum("nxy,cy->ncx", scaled[:, :3, :3], corners) + scaled[:, None, :3, 3]
+        return scaled[(world.min(axis=1) <= bounds[1]).all(axis=1) & (bounds[0] <= world.max(axis=1)).all(axis=1)]
 
     def _matrix(self, code: Usd.TimeCode) -> np.ndarray:
         matrix = np.array(UsdGeom.XformCache(code).GetLocalToWorldTransform(self.prim), dtype=np.float64).T
@@ -172,6 +238,8 @@ class ColliderReader:
 
     def _scale(self) -> float:
         """Length in metres of the longest unit of the prim's space, in the first sample."""
+        if self.unit is not None:
+            return self.unit
         linear = self._matrix(Usd.TimeCode.EarliestTime())[:3, :3]
         return float(np.linalg.norm(linear, 2)) if np.isfinite(linear).all() and linear.any() else self.metres
 
@@ -194,7 +262,8 @@ class ColliderReader:
             if not np.linalg.norm(normal) > 0:
                 return None, (self._out(time, "its transform flattens it"),)
             linear = _frame_about(normal)
-        return primitive(kind, size, turn=linear, centre=matrix[:3, 3]), ()
+        around = AROUND if self.unit is None else segments(float(size[:2].max()) * self.unit, self.within)
+        return primitive(kind, size, turn=linear, centre=matrix[:3, 3], around=around), ()
 
     def _bounded(self, pose: Pose, time: float | None) -> tuple[Pose | None, tuple[Notice, ...]]:
         """The pose without out-of-bounds parts: without the faces at such points, or None for a primitive."""
@@ -212,26 +281,76 @@ class ColliderReader:
 
 
 def read_collider(
-    prim: Usd.Prim, metres: float, *, overrides: Sequence[Override], offset: float
+    prim: Usd.Prim,
+    metres: float,
+    *,
+    overrides: Sequence[Override],
+    offset: float,
+    beside: Usd.Prim | None = None,
+    near: np.ndarray | None = None,
 ) -> tuple[ColliderReader | None, tuple[Notice, ...]]:
-    """Reader of a gprim as a collider, or None for an unsupported kind of prim, and notices.
+    """Reader of a gprim or a point instancer as a collider, or None for an unsupported kind of prim, and notices.
 
     Args:
         offset: Least distance kept from colliders by a garment [m].
+        beside: A garment; drawn by the same point instancer as the collider, it meets the collider in its own place.
+        near: Bounds of the cloth over the shot [m], shape (2, 3): instances beyond are left out; None keeps all.
 
     Raises:
         SchemaError: When the collider's offset or side is invalid.
     """
-    path, kind = str(prim.GetPath()), str(prim.GetTypeName()).removesuffix("_1")
-    if not UsdGeom.Mesh(prim) and kind.lower() not in KINDS:
-        return None, (Notice(path, None, f"a {kind} is no collider that cloth can rest on; left out"),)
-    kind = "mesh" if UsdGeom.Mesh(prim) else kind.lower()
+    path, kind = str(prim.GetPath()), kind_of(prim)
+    instancer = instancer_above(prim, beside) or (prim if kind == "instancer" else None)
+    if kind is None:
+        return None, (Notice(path, None, f"{unread(prim)}; left out"),)
     own = find_value(prim, COLLIDER["collider:offset"], overrides).at(None) or 0.0
     side, _ = find_token(prim, COLLIDER["collider:side"], overrides)
     odd = (Notice(path, None, "a plane has no start side; its front is used"),) if (kind, side) == _PLANE_START else ()
     within = DRAWN_NEAR * max(offset + own, _LEAST_OFFSET)
     always = find_value(prim, COLLIDER["collider:enabled"], overrides).source != "fallback"
-    return ColliderReader(prim, Collider(path, kind, own, side), metres, within, always), odd
+    collider = Collider(path, kind if instancer is None else "mesh", own, side)
+    reader = ColliderReader(prim, collider, metres, within, always, instancer, near=near)
+    if instancer is None:
+        return reader, odd
+    reader.parts, left = parts_of(reader, instancer, overrides)
+    return (reader if reader.parts else None), (*odd, *left)
+
+
+def parts_of(
+    reader: ColliderReader, instancer: Usd.Prim, overrides: Sequence[Override] = ()
+) -> tuple[dict[Sdf.Path, ColliderReader], tuple[Notice, ...]]:
+    """Readers of the gprims at an instancer's instances, and a notice for each that is not read."""
+    gprims = instanced_gprims(reader.prim) if UsdGeom.PointInstancer(reader.prim) else [reader.prim]
+    gprims = [prim for prim in gprims if is_on(prim, COLLIDER["collider:enabled"], overrides)]
+    parts, notices = {}, []
+    for prim in [each for each in gprims if is_drawn(each)] or gprims:
+        kind = kind_of(prim)
+        if kind is None or kind == "plane":
+            why = "a Plane is endless; put a Mesh in its place" if kind else unread(prim)
+            notices.append(Notice(reader.collider.path, None, f"instances of <{prim.GetPath()}> are left out: {why}"))
+            continue
+        collider = replace(reader.collider, kind=kind)
+        parts[prim.GetPath()] = ColliderReader(prim, collider, reader.metres, reader.within, unit=reader.metres)
+    if not gprims:
+        message = f"the prototypes of <{instancer.GetPath()}> have no shapes; left out"
+        notices.append(Notice(reader.collider.path, None, message))
+    for path, matrices in (placements(instancer, None) or {}).items():
+        if path in parts and np.isfinite(matrices).all() and matrices[:, :3, :3].any():
+            parts[path].unit = reader.metres * float(np.linalg.norm(matrices[:, :3, :3], 2, axis=(1, 2)).max())
+    return parts, tuple(notices)
+
+
+def kind_of(prim: Usd.Prim) -> str | None:
+    """Kind of a body: "mesh", "instancer" or one of `KINDS`; None for a shape that is not read."""
+    if UsdGeom.PointInstancer(prim):
+        return "instancer"
+    kind = str(prim.GetTypeName()).removesuffix("_1").lower()
+    return "mesh" if UsdGeom.Mesh(prim) else kind if kind in KINDS else None
+
+
+def unread(prim: Usd.Prim) -> str:
+    """The message of a shape that is not read, with the remedy."""
+    return f"a {prim.GetTypeName()} is no collider that cloth can rest on: convert it to a Mesh"
 
 
 def surface_of(
@@ -290,10 +409,11 @@ def _measures(prim: Usd.Prim, time: float | None) -> tuple[str, np.ndarray, np.n
 
     kind = str(prim.GetTypeName()).removesuffix("_1").lower()
     half_height = 0.5 * number("height", 1.0 if kind == "capsule" else 2.0)
-    top, bottom = number("radiusTop", -1.0), number("radiusBottom", -1.0)
-    radius = max(top, bottom) if top >= 0 else number("radius", 0.5 if kind == "capsule" else 1.0)
+    radius = 0.5 if kind == "capsule" else 1.0
+    tapered = str(prim.GetTypeName()).endswith("_1")
+    radii = [number(name, radius) for name in (("radiusBottom", "radiusTop") if tapered else ("radius", "radius"))]
     half = 0.5 * number("size", 2.0)
-    size = {"sphere": [radius] * 3, "cube": [half] * 3}.get(kind, [radius, radius, half_height])
+    size = {"sphere": [*radii, radii[0]], "cube": [half] * 3}.get(kind, [*radii, half_height])
     axis = prim.GetAttribute("axis").Get() if prim.GetAttribute("axis") else "Z"
     return kind, np.array(size, dtype=np.float64), UPRIGHT.get(str(axis or "Z"))
 

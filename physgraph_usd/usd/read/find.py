@@ -20,6 +20,10 @@ _SHOWN = 20
 MARKS = (GARMENT_API, COLLIDER_API, "PhysicsCollisionAPI")
 """Schemas that, on a prim or an ancestor, decide about contact with cloth."""
 EXCLUDE = "physgraph:contact:exclude"
+Kinds = tuple[type, ...]
+"""Classes of UsdGeom."""
+BODIES: Kinds = (UsdGeom.Gprim, UsdGeom.PointInstancer)
+"""Prims that can be colliders."""
 
 
 def has_schema(prim: Usd.Prim, name: str) -> bool:
@@ -39,7 +43,7 @@ def find_garments(stage: Usd.Stage, wanted: Sequence[str] = ()) -> list[Usd.Prim
         StageError: When nothing is named and nothing found.
     """
     if wanted:
-        chosen = {path for item in wanted for path in find_paths(stage, item, UsdGeom.Mesh)}
+        chosen = {path for item in wanted for path in find_paths(stage, item, (UsdGeom.Mesh,))}
         return [prim for prim in traverse(stage) if prim.GetPath() in chosen]
     found = [prim for prim in traverse(stage) if has_schema(prim, GARMENT_API)]
     if not found:
@@ -62,7 +66,7 @@ def find_colliders(
     without: Sequence[Sdf.Path] = (),
     overrides: Sequence[Override] = (),
 ) -> list[Usd.Prim]:
-    """Find the gprims garments may collide with, in stage order.
+    """Find the gprims and point instancers garments may collide with, in stage order.
 
     Invisible prims are included because they may be visible at different times; inactive and disabled prims are not.
 
@@ -87,7 +91,7 @@ def felt_by(
     *,
     overrides: Sequence[Override] = (),
 ) -> list[frozenset[Sdf.Path]]:
-    """For each garment, paths of the gprims felt by the garment; arguments as for ``find_colliders``.
+    """For each garment, paths of the bodies felt by the garment; arguments as for ``find_colliders``.
 
     Raises:
         AbsentError: When a collider in ``wanted`` does not exist.
@@ -118,9 +122,9 @@ def _colliders_named(stage: Usd.Stage, named: Sequence[str], overrides: Sequence
 def _named_or_marked(stage: Usd.Stage, named: Sequence[str]) -> list[Sdf.Path]:
     """Named gprims, or else all colliders of the stage."""
     if named:
-        return list(dict.fromkeys(path for item in named for path in find_paths(stage, item, UsdGeom.Gprim)))
+        return list(dict.fromkeys(path for item in named for path in find_paths(stage, item, BODIES)))
     marked = (prim for prim in traverse(stage) if _collides(prim))
-    return [each.GetPath() for prim in marked for each in _drawn(_below(prim, UsdGeom.Gprim))]
+    return [each.GetPath() for prim in marked for each in _drawn(_below(prim, BODIES))]
 
 
 def purpose_notices(prims: Iterable[Usd.Prim], named: Sequence[str]) -> list[Notice]:
@@ -205,11 +209,11 @@ def _collides(prim: Usd.Prim) -> bool:
     return bool(collision) and bool(UsdGeom.Imageable(prim)) and collision.GetCollisionEnabledAttr().Get() is not False
 
 
-def find_paths(stage: Usd.Stage, item: str, kind: type, *, drawn: bool = True) -> list[Sdf.Path]:
-    """Paths of the prims of a UsdGeom class named by an item, as in `find_garments`.
+def find_paths(stage: Usd.Stage, item: str, kinds: Kinds, *, drawn: bool = True) -> list[Sdf.Path]:
+    """Paths of the prims of some UsdGeom classes named by an item, as in `find_garments`.
 
     Args:
-        kind: The class.
+        kinds: The classes; with point instancers among them, prims below instancers are named by their own path only.
         drawn: Whether proxies and guides are skipped unless named by path or name, or unless nothing else is named.
 
     Raises:
@@ -217,15 +221,15 @@ def find_paths(stage: Usd.Stage, item: str, kind: type, *, drawn: bool = True) -
     """
     pick = _drawn if drawn else list
     if _COLLECTION in item:  # Members only, not prims below: excluded prims stay out.
-        found = pick([prim for prim in _collection(stage, item) if kind(prim)])
+        found = pick([prim for prim in _collection(stage, item) if _is_a(prim, kinds)])
     elif any(letter in item for letter in "*?["):
         matching = (prim for prim in traverse(stage) if fnmatch.fnmatchcase(str(prim.GetPath()), item))
-        found = pick([prim for root in matching for prim in _below(root, kind)])
+        found = pick([prim for root in matching for prim in _below(root, kinds)])
     else:
         named = [_at_path(stage, item)] if item.startswith("/") else _named(stage, item)
-        found = [prim for root in named for prim in pick(_below(root, kind))]
+        found = [prim for root in named for prim in pick(_below(root, kinds))]
     if not found:
-        raise AbsentError(f"{item!r} names no {kind.__name__}; {_mesh_list(stage)}")
+        raise AbsentError(f"{item!r} names no {' or '.join(kind.__name__ for kind in kinds)}; {_mesh_list(stage)}")
     return [prim.GetPath() for prim in found]
 
 
@@ -233,9 +237,21 @@ def _named(stage: Usd.Stage, name: str) -> list[Usd.Prim]:
     return [prim for prim in traverse(stage) if prim.GetName() == name]
 
 
-def _below(root: Usd.Prim, kind: type) -> list[Usd.Prim]:
-    """The prim itself if of the kind, else all prims of the kind below."""
-    return [root] if kind(root) else [prim for prim in Usd.PrimRange(root, TRAVERSAL) if kind(prim)]
+def _below(root: Usd.Prim, kinds: Kinds) -> list[Usd.Prim]:
+    """The prim itself if of the kinds, else all prims of the kinds below."""
+    if _is_a(root, kinds):
+        return [root]
+    found, prims = [], iter(Usd.PrimRange(root, TRAVERSAL))
+    for prim in prims:
+        if _is_a(prim, kinds):
+            found.append(prim)
+            if UsdGeom.PointInstancer(prim):
+                prims.PruneChildren()
+    return found
+
+
+def _is_a(prim: Usd.Prim, kinds: Kinds) -> bool:
+    return any(kind(prim) for kind in kinds)
 
 
 def _drawn(prims: list[Usd.Prim]) -> list[Usd.Prim]:
@@ -308,7 +324,7 @@ def _excluded_by(stage: Usd.Stage, prim: Usd.Prim) -> tuple[dict[Sdf.Path, str],
     message = f"<{prim.GetPath()}>.{EXCLUDE}"
     for target in targets_of(prim, EXCLUDE):
         try:
-            paths = find_paths(stage, str(target), UsdGeom.Gprim, drawn=False)
+            paths = find_paths(stage, str(target), BODIES, drawn=False)
         except StageError as error:
             notices.append(Notice(str(prim.GetPath()), None, f"{EXCLUDE} excludes nothing by <{target}>: {error}"))
             continue

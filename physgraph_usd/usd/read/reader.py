@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 from functools import cache, cached_property
 
 import numpy as np
-from pxr import Sdf, Usd
+from pxr import Sdf, Usd, UsdGeom
 
 from ...errors import AbsentError, SchemaError, StageError, UsageError, named_time
 from ...interrupts import leave_if_asked
@@ -57,6 +57,7 @@ from .find import (
     with_gravity,
 )
 from .garment import GarmentReader, Request, is_visible, read_garment, samples_of, seam_tolerance
+from .instances import instanced_gprims, instancer_above
 from .materials import find_values
 from .placement import place, to_metres
 from .rest import AUTO
@@ -292,7 +293,7 @@ def open_shot(
         assumed = root_metadata(stage, "metersPerUnit") is None
         request = Request(units, Bake(stage), frames, level, asked, rest_frame, assumed)
         bodies = [prim.GetPath() for prim in found]
-        moved = [*bodies, *(each.path for each in bound)]
+        moved = [*bodies, *_instanced(found), *(each.path for each in bound)]
         contacts = _contacts(stage, prims, colliders, request, notices=notices)
         given = {"request": request, "contacts": contacts, "notices": notices}
         readers = _read(stage, moved, skip_invisible=skip_invisible, **given)
@@ -306,6 +307,11 @@ def open_shot(
     read_notices = [notice for reader in readers for notice in reader.notices]
     opened.warnings.extend(dict.fromkeys([*notices, *odd, *read_notices]))
     return opened
+
+
+def _instanced(prims: Iterable[Usd.Prim]) -> list[Sdf.Path]:
+    """Paths of the gprims drawn by the point instancers among some prims."""
+    return [each.GetPath() for prim in prims if UsdGeom.PointInstancer(prim) for each in instanced_gprims(prim)]
 
 
 def _of_prims(
@@ -379,27 +385,47 @@ def _link(
 ) -> tuple[list[GarmentReader], list[ColliderReader]]:
     """Garments with their seams and the numbers of their colliders, and the colliders."""
     readers = _sewn(stage, readers, request, notices)
-    cloth = {reader.source.path for reader in readers}
-    felt = {body for path in cloth for body in contacts[path].felt}
+    cloth = dict.fromkeys(reader.source.path for reader in readers)
     times = [reader.source.times[0] if reader.source.times else None for reader in readers]
     offset = min(reader.values.number("contact:offset", time) for reader, time in zip(readers, times, strict=True))
-    given = {"overrides": request.overrides, "offset": offset}
+    given = {"overrides": request.overrides, "offset": offset, "near": _swept(stage, readers, paths, request)}
     bodies = []
     for path in paths:
-        if path in felt:
-            body, odd = read_collider(stage.GetPrimAtPath(path), request.units.metres, **given)
+        by = next((each for each in cloth if path in contacts[each].felt), None)
+        if by is not None:
+            beside = stage.GetPrimAtPath(by)
+            body, odd = read_collider(stage.GetPrimAtPath(path), request.units.metres, beside=beside, **given)
             notices += odd
             bodies += [body] if body is not None else []
     numbers = {body.prim.GetPath(): number for number, body in enumerate(bodies)}
     linked = []
     for reader in readers:
         each = contacts[reader.source.path]
-        apart = {str(path): target for path, target in each.excluded.items() if path in each.near | cloth}
+        apart = {str(path): target for path, target in each.excluded.items() if path in each.near | cloth.keys()}
         others = tuple(str(path) for path in each.excluded if path in cloth)
         colliders = tuple(sorted(numbers[path] for path in each.felt & numbers.keys()))
         garment = replace(reader.garment, colliders=colliders, apart_from=others)
         linked.append(replace(reader, garment=garment, source=replace(reader.source, apart_from=apart)))
     return linked, bodies
+
+
+def _swept(
+    stage: Usd.Stage, readers: Sequence[GarmentReader], paths: Sequence[Sdf.Path], request: Request
+) -> np.ndarray | None:
+    """Bounds of the garments over the shot [m], half as large again, shape (2, 3); None without instancers to read."""
+    prims = map(stage.GetPrimAtPath, paths)
+    if not any(UsdGeom.PointInstancer(prim) or instancer_above(prim) for prim in prims):
+        return None
+    ends = []
+    for time in _every_time(reader.source for reader in readers) or (None,):
+        with suppress(StageError):
+            cages = [cage for cage in _cages(stage, readers, request.units.metres, time) if len(cage)]
+            ends += [point for cage in cages for point in (cage.min(axis=0), cage.max(axis=0))]
+    if not ends:
+        return None
+    low, high = np.min(ends, axis=0), np.max(ends, axis=0)
+    margin = 0.25 * float(np.linalg.norm(high - low))
+    return np.stack([low - margin, high + margin])
 
 
 def _sewn(

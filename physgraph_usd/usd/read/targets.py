@@ -1,9 +1,10 @@
-"""Finds targets of ``physgraph:bind:targets``: render meshes, trims, curves and points that follow refined garments."""
+"""Finds targets of ``physgraph:bind:targets``: meshes, curves, points and instances that follow refined garments."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom
@@ -16,6 +17,8 @@ from ..times import motion_of
 from .find import find_paths, targets_of
 from .placement import place, to_metres
 
+FOLLOWERS = (UsdGeom.PointBased, UsdGeom.PointInstancer)
+"""Classes of prims that can follow: of a point instancer, positions and orientations."""
 TARGETS, RIGID, MODE = "physgraph:bind:targets", "physgraph:bind:rigid", "physgraph:bind:mode"
 FOLLOW, DETAIL = "follow", "detail"
 """Modes: the cloth's motion in place of the target's own, or the difference of refined cloth and cage beside it."""
@@ -35,14 +38,14 @@ Cage = Callable[[int, float | None], np.ndarray]
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """A mesh, curves or points that follow a garment.
+    """A mesh, curves, points or instances that follow a garment.
 
     Attributes:
         garment: Number of the garment.
         on: Parent target, a mesh; None for the cloth.
         time: Time code of the bind pose; None for the default.
         points: Positions in the bind pose [m], world space, shape (N, 3).
-        mesh: Faces; None for curves and points.
+        mesh: Faces; None for curves, points and instances.
         rigid: Number of the rigid part of each point, or -1, shape (N,).
         detail: Whether the difference of refined cloth and cage is added to the target's own motion.
         skinned: Whether the points came from baking UsdSkel skinning.
@@ -94,7 +97,7 @@ def find_bound(stage: Usd.Stage, garments: Sequence[Usd.Prim], wanted: Sequence[
     cloth = {prim.GetPath() for prim in garments}
     found = [each for prim in garments for each in _below(stage, prim)]
     listed = {each.path for each in found}
-    asked = dict.fromkeys(path for item in wanted for path in find_paths(stage, item, UsdGeom.PointBased))
+    asked = dict.fromkeys(path for item in wanted for path in find_paths(stage, item, FOLLOWERS))
     found += [Bound(path, None) for path in asked if path not in listed | cloth]
     seen: dict[Sdf.Path, Sdf.Path | None] = {}
     for each in found:
@@ -111,7 +114,7 @@ def find_bound(stage: Usd.Stage, garments: Sequence[Usd.Prim], wanted: Sequence[
 
 def _below(stage: Usd.Stage, prim: Usd.Prim) -> list[Bound]:
     """Prims named by a garment's or target's relationship."""
-    named = [path for item in targets_of(prim, TARGETS) for path in find_paths(stage, str(item), UsdGeom.PointBased)]
+    named = [path for item in targets_of(prim, TARGETS) for path in find_paths(stage, str(item), FOLLOWERS)]
     return [Bound(path, prim.GetPath()) for path in dict.fromkeys(named)]
 
 
@@ -224,15 +227,23 @@ def _on_target(prim: Usd.Prim, parent: Target, metres: float, *, skinned: bool) 
     return _placed(prim, pose, parent.path, skinned=skinned)
 
 
+def points_attribute(prim: Usd.Prim) -> Usd.Attribute:
+    """The attribute of a target's points, or of its instances' positions."""
+    return prim.GetAttribute("positions" if UsdGeom.PointInstancer(prim) else "points")
+
+
 def points_at(prim: Usd.Prim, metres: float, time: float | None) -> np.ndarray | None:
     """World positions [m] of a prim's points at a time code, shape (N, 3), float64; None without points.
 
     Raises:
         GarmentError: A point is not finite, or the prim cannot be placed.
     """
-    value = UsdGeom.PointBased(prim).GetPointsAttr().Get(timecode(time))
-    if value is None or not len(value):
+    value = points_attribute(prim).Get(timecode(time))
+    if value is None or not np.size(value):
         return None
+    if np.ndim(value) != 2 or np.shape(value)[1] != 3:
+        kind = points_attribute(prim).GetTypeName()
+        raise GarmentError(str(prim.GetPath()), f"its points are of type {kind}", remedy="author them as point3f[]")
     points = place(np.asarray(value, np.float64), to_metres(prim, metres, time))
     if not np.isfinite(points).all():
         first = int(np.argwhere(~np.isfinite(points))[0][0])
@@ -242,18 +253,23 @@ def points_at(prim: Usd.Prim, metres: float, time: float | None) -> np.ndarray |
 
 
 def _check_topology(prim: Usd.Prim) -> None:
-    points = UsdGeom.PointBased(prim).GetPointsAttr()
+    points = points_attribute(prim)
     counted = [UsdGeom.Mesh(prim).GetFaceVertexIndicesAttr()] if UsdGeom.Mesh(prim) else []
     counted += [UsdGeom.Curves(prim).GetCurveVertexCountsAttr()] if UsdGeom.Curves(prim) else []
+    counted += [UsdGeom.PointInstancer(prim).GetIdsAttr()] if UsdGeom.PointInstancer(prim) else []
     for attribute in [points, *counted]:
         times = attribute.GetTimeSamples()
         first = attribute.Get(times[0]) if times else None
         for time in times[1:]:
             value = attribute.Get(time)
-            changed = len(value or ()) != len(first or ()) or (attribute is not points and value != first)
+            changed = _count(value) != _count(first) or (attribute is not points and value != first)
             if changed:
                 remedy = "bind a mesh of one topology, or leave this one out"
                 raise GarmentError(str(prim.GetPath()), "its topology changes", time=time, remedy=remedy)
+
+
+def _count(value: Any) -> int:
+    return 0 if value is None else np.size(value)
 
 
 def _mesh_of(prim: Usd.Prim) -> PolygonMesh | None:

@@ -1,19 +1,22 @@
-"""Writes targets, frame after frame: points, normals, extents and velocities."""
+"""Writes targets, frame after frame: points, or instances, with normals or orientations, extents and velocities."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 import numpy as np
-from pxr import Sdf, Usd, UsdGeom
+from pxr import Sdf, Usd, UsdGeom, Vt
+from scipy.spatial.transform import Rotation
 
 from ...solver.mesh.subdivide import Refinement
 from ..mesh.bind import Follower
 from ..read.bindings import GarmentBindings, PlacedTarget
 from ..read.find import instance_roots
+from ..read.instances import instance_reach
 from ..read.placement import to_metres
 from ..read.reader import Shot
-from ..read.targets import Target
+from ..read.targets import Target, points_attribute
+from ..stage import timecode
 from . import overs
 from .primvars import hide_influences
 from .stream import LayerStream
@@ -81,28 +84,29 @@ class _TargetTrack:
     ) -> None:
         """Author constant properties, and start the track."""
         prim, path = shot.stage.GetPrimAtPath(target.path), target.path
-        shape = UsdGeom.PointBased(prim)
         self._metres, self._prim = shot.metres_per_unit, prim
         self.notices = overs.open_instances(stream, path, instance_roots(prim))
         overs.author_unskinned(stream, path, prim, skinned=target.skinned)
         hide_influences(stream, path, prim)
-        authored = shape.GetVelocitiesAttr().HasAuthoredValue()
+        authored = prim.GetAttribute("velocities").HasAuthoredValue()
         rate = shot.stage.GetTimeCodesPerSecond() if velocities or authored else None
-        if shape.GetAccelerationsAttr().HasAuthoredValue():
-            stream.block(path.AppendProperty("accelerations"), Sdf.ValueTypeNames.Vector3fArray)
+        for name in ("accelerations", "angularVelocities"):
+            if prim.GetAttribute(name).HasAuthoredValue():
+                stream.block(path.AppendProperty(name), Sdf.ValueTypeNames.Vector3fArray)
         moves = {"rate": rate, "absent": absent, "still": still, "margin": _half_width(prim)}
-        self._normals = _TurnedNormals.of(stream, shot, target)
-        given = None if self._normals is None else self._normals.path
-        default = shape.GetPointsAttr().Get(Usd.TimeCode.Default())
-        fits = default is not None and len(default) == len(target.points)
+        turned = _Orientations if UsdGeom.PointInstancer(prim) else _TurnedNormals
+        self._turned = turned.of(stream, shot, target)
+        given, points = None if self._turned is None else self._turned.path, points_attribute(prim)
+        default = points.Get(Usd.TimeCode.Default())
+        fits = default is not None and len(default) == len(target.points) and not still
         rest = np.asarray(default, np.float32) if fits else None
-        self._track = PointTrack(stream, path, None, rest=rest, given_normals=given, **moves)
+        self._track = PointTrack(stream, path, None, rest=rest, turned=given, points=points.GetName(), **moves)
         self._hints = ModelHints(stream, shot.stage, path, purpose=UsdGeom.Imageable(prim).ComputePurpose())
 
     def write(self, time: float | None, placed: PlacedTarget, *, changed: bool, cut: bool) -> None:
         """Write one time code; ``changed`` and ``cut`` are those of the cloth, as in `PointTrack.write`."""
         to_world = to_metres(self._prim, self._metres, time)
-        normals = None if self._normals is None else self._normals.at(placed.follower, to_world)
+        normals = None if self._turned is None else self._turned.at(placed.follower, to_world)
         moves = {"changed": changed or placed.target.detail, "cut": cut}
         self._track.write(time, placed.points, to_world, normals=normals, **moves)
         self._hints.write(time, self._track.box)
@@ -150,6 +154,51 @@ class _TurnedNormals:
         return (turned / np.maximum(lengths, 1e-30)).astype(np.float32)
 
 
+class _Orientations:
+    """Orientations of instances, turned with their positions.
+
+    Attributes:
+        path: The attribute, orientations or orientationsf.
+    """
+
+    def __init__(self, path: Sdf.Path, axes: np.ndarray, kind: type) -> None:
+        """Take the axes of each instance in world space in the bind pose, shape (N, 3, 3), and the type of numbers."""
+        self.path, self._axes, self._kind = path, axes, kind
+        self._last = np.zeros((len(axes), 4))
+
+    @classmethod
+    def of(cls, stream: LayerStream, shot: Shot, target: Target) -> _Orientations:
+        """The orientations of a target; of one without, none turned in the bind pose."""
+        prim, code = shot.stage.GetPrimAtPath(target.path), timecode(target.time)
+        names = "orientationsf", "orientations"
+        name = next((name for name in names if prim.GetAttribute(name).HasAuthoredValue()), names[1])
+        values = prim.GetAttribute(name).Get(code)
+        known = (
+            values if isinstance(values, Vt.QuathArray | Vt.QuatfArray) and len(values) == len(target.points) else ()
+        )
+        given = [[*each.GetImaginary(), each.GetReal()] for each in known]
+        fits = len(given) > 0 and np.isfinite(given).all() and np.linalg.norm(given, axis=1).all()
+        local = Rotation.from_quat(given).as_matrix() if fits else np.tile(np.eye(3), (len(target.points), 1, 1))
+        single = name == names[0]
+        path, types = target.path.AppendProperty(name), Sdf.ValueTypeNames
+        stream.attribute(path, types.QuatfArray if single else types.QuathArray)
+        axes = to_metres(prim, shot.metres_per_unit, target.time)[:3, :3] @ local
+        return cls(path, axes, np.float32 if single else np.float16)
+
+    def at(self, follower: Follower, to_world: np.ndarray) -> np.ndarray:
+        """Quaternions with the real part last in local space, shape (N, 4), by the matrix to world metres."""
+        count = len(self._axes)
+        vectors = self._axes.swapaxes(1, 2).reshape(-1, 3)
+        turned = follower.turned(vectors, np.repeat(np.arange(count), 3)) * np.linalg.norm(vectors, axis=1)[:, None]
+        local = np.linalg.inv(to_world[:3, :3]) @ turned.reshape(-1, 3, 3).swapaxes(1, 2)
+        u, _, v = np.linalg.svd(local)
+        u[:, :, 2] *= np.linalg.det(u @ v)[:, None]
+        found = Rotation.from_matrix(u @ v).as_quat()
+        found *= np.where(np.einsum("nq,nq->n", found, self._last) < 0.0, -1.0, 1.0)[:, None]
+        self._last = found
+        return found.astype(self._kind)
+
+
 def _owners(target: Target, interpolation: str) -> np.ndarray | None:
     """The point of each value of an interpolation; None where values have no point."""
     if interpolation in ("vertex", "varying"):
@@ -161,7 +210,9 @@ def _owners(target: Target, interpolation: str) -> np.ndarray | None:
 
 
 def _half_width(prim: Usd.Prim) -> float:
-    """Half the greatest width of curves or points [stage units]; 0 of a mesh."""
+    """Half the greatest width of curves or points, or the reach of instances about their positions; 0 of a mesh."""
+    if UsdGeom.PointInstancer(prim):
+        return instance_reach(prim)
     for kind in (UsdGeom.Curves, UsdGeom.Points):
         if shape := kind(prim):
             widths = shape.GetWidthsAttr().Get(_FIRST)

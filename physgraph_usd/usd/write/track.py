@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
+from typing import Any
 
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom, Vt
@@ -37,7 +38,7 @@ _PURPOSES = ("default", "render", "proxy", "guide")
 
 @dataclass(frozen=True, eq=False)
 class _Sample:
-    """Local points at one time code, shape (V, 3), and given normals, shape (M, 3), or None; float32."""
+    """Local points at one time code, shape (V, 3), and given normals or orientations, shape (M, 3 or 4), or None."""
 
     time: float
     points: np.ndarray
@@ -54,7 +55,8 @@ def refuse_not_finite(values: np.ndarray, place: str) -> None:
 def _set_sample(stream: LayerStream, path: Sdf.Path, values: np.ndarray, time: float | None) -> None:
     """Author solved values; all solved values enter the layer here, checked to be finite."""
     refuse_not_finite(values, f"<{path}>" + at_time(time))
-    kind = Vt.FloatArray if values.ndim == 1 else Vt.Vec3fArray
+    kind: Any = Vt.FloatArray if values.ndim == 1 else {"f2": Vt.QuathArray, "f4": Vt.QuatfArray}[values.dtype.str[1:]]
+    kind = Vt.Vec3fArray if values.shape[1:] == (3,) else kind
     stream.set(path, kind.FromNumpy(values), time=time)
 
 
@@ -82,7 +84,8 @@ class PointTrack:
         still: bool,
         rate: float | None,
         margin: float = 0.0,
-        given_normals: Sdf.Path | None = None,
+        turned: Sdf.Path | None = None,
+        points: str = "points",
         own: Callable[[float | None], np.ndarray | None] = lambda _: None,
         absent: Sequence[float] = (),
     ) -> None:
@@ -93,20 +96,21 @@ class PointTrack:
             rest: Local points for the default time, shape (V, 3); if None, the first sample's points.
             still: Whether the garment itself has no samples: only a default is written until the cloth moves.
             rate: Time codes per second for velocities; None leaves velocities out.
-            given_normals: Attribute of normals given with each sample, authored by the caller; None without.
+            turned: Attribute of normals or orientations given with each sample, authored by the caller; None without.
+            points: Name of the attribute of the points.
             margin: Distance by which the extent exceeds the points, such as half the width of curves.
             own: The shot's velocities at a time code [units/s], shape (V, 3), float32; None without velocities.
             absent: Time codes to block, ascending: the garment is absent.
         """
         self._stream, self._normals, self._margin = stream, normals, np.float32(margin)
-        self._paths = {name: target.AppendProperty(name) for name in TYPES}
+        self._paths = {name: target.AppendProperty(points if name == "points" else name) for name in TYPES}
         stream.attribute(self._paths["points"], TYPES["points"])
         if normals is not None:
             stream.attribute(self._paths["normals"], TYPES["normals"], interpolation=UsdGeom.Tokens.vertex)
         stream.attribute(self._paths["extent"], TYPES["extent"])
-        self._has_normals = normals is not None or given_normals is not None
-        if given_normals is not None:
-            self._paths["normals"] = given_normals
+        self._has_normals = normals is not None or turned is not None
+        if turned is not None:
+            self._paths["normals"] = turned
         self._rest, self._still, self._rate, self._own = rest, still, rate, own
         self._absent = list(absent)
         self.unknown: list[float] = []
@@ -133,7 +137,8 @@ class PointTrack:
             time: Time code, or None for the default of a shot without samples.
             points: Fine points [m], world space, shape (V, 3).
             to_metres: Local space to world metres, shape (4, 4), for column vectors.
-            normals: Local normals, shape (M, 3), float32, for a track of given normals.
+            normals: For a track of given ones, local normals, shape (M, 3), or orientations, quaternions with the real
+                part last, shape (M, 4).
             changed: False when the world points are known to equal the previous sample's.
             cut: Whether the cloth jumps to this sample from the previous sample.
 
@@ -151,7 +156,7 @@ class PointTrack:
         self._matrix = to_metres
         points = to_local(points, to_metres, str(self._paths["points"].GetPrimPath()), time)
         if not self._has_default:
-            self._author(None, points if self._rest is None else self._rest)
+            self._author(None, points if self._rest is None else self._rest, normals if self._still else None)
             self._has_default, self._rest = True, None
             if self._still and self._rate is not None and (velocity := self._own(time)) is not None:
                 self._set_velocity(None, velocity)
