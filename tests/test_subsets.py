@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from pxr import Sdf, Usd, UsdGeom, UsdShade, Vt
 from shots import fine, refine
-from stages import add_mesh, author, new_stage, save, vec3
+from stages import add_mesh, author, new_stage, said, save, vec3
 
 from physgraph_usd.shot.refine import inspect_shot
 from physgraph_usd.solver.fabric import Fabric
@@ -104,11 +104,13 @@ def test_the_fabric_of_most_faces_is_the_garments_and_others_are_multiples(tmp_p
     assert garment["fabric"]["bend"] == pytest.approx(2e-5)
     assert garment["sources"]["thickness"] == "</World/looks/body>.physgraph:material:thickness"
     assert garment["sources"]["bendStiffness of trim"] == f"</World/looks/trim>.{BEND}"
-    said = f"<{CLOTH}/trim>: 20 faces of another fabric: bendStiffness times 5; not used: its shearStiffness, thickness"
-    assert said in found["notes"]
+    note = f"<{CLOTH}/trim>: 20 faces of another fabric: bendStiffness times 5; not used: its shearStiffness, thickness"
+    assert note in found["notes"]
     shot = open_shot(save(stage), overrides=["bendStiffness=4e-5"])
     assert shot.frame(1.0).garments[0].fabric.bend == pytest.approx(4e-5)
-    assert np.unique(shot.scene.garments[0].fabric_scale[:, 1]) == pytest.approx([1.0, 5.0])
+    scale = shot.scene.garments[0].fabric_scale
+    assert scale is not None
+    assert np.unique(scale[:, 1]) == pytest.approx([1.0, 5.0])
 
 
 def test_faces_of_no_subset_keep_the_fallbacks(tmp_path: Path):
@@ -116,6 +118,7 @@ def test_faces_of_no_subset_keep_the_fallbacks(tmp_path: Path):
     add_subset(stage, "leather", FACES[:, 2:].ravel(), density=0.65)
     shot = open_shot(save(stage))
     fabric, scale = shot.frame(1.0).garments[0].fabric, shot.scene.garments[0].fabric_scale
+    assert scale is not None
     assert fabric.density * scale[FACES[0], 2] == pytest.approx([Fabric().density] * 2 + [0.65] * 8)
 
 
@@ -127,3 +130,13 @@ def test_materials_without_values_leave_the_garments(tmp_path: Path):
     shot = open_shot(save(stage))
     assert shot.scene.garments[0].fabric_scale is None
     assert not shot.sources[0].fabrics
+
+
+def test_values_that_change_are_held_and_misspelt_ones_named(tmp_path: Path):
+    stage = sheet(tmp_path / "s.usda", grid())
+    add_subset(stage, "trim", RIGHT, bendStifness=1e-4)
+    for time in (1.0, 2.0):
+        author(stage.GetPrimAtPath("/World/looks/trim"), BEND, 1e-5 * time, time=time)
+    shot = open_shot(save(stage))
+    assert "bendStiffness as at the first time code" in shot.sources[0].fabrics["trim"]
+    assert "</World/looks/trim>: physgraph:material:bendStifness" in said(shot)

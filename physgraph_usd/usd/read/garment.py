@@ -28,7 +28,7 @@ from .materials import Values, find_values
 from .placement import check_matrix, check_placement, is_flipped, place, to_metres
 from .rest import Animation, Rest, pressed_folds, read_rest, rests_bent
 from .skinning import Bake
-from .subsets import read_fabrics, read_subsets
+from .subsets import read_subsets
 
 PRESSED = "physgraph:pressed"
 """Attribute of an edge subset to mark pressed folds, or folds that are not, bool."""
@@ -36,8 +36,8 @@ RIGID = "physgraph:rigid"
 """Attribute of a face subset to mark a rigid part, bool."""
 _SMALL, _LARGE = 0.01, 100.0
 """Sizes between which anything of cloth is believed [m]."""
-_WORN, _USUAL = (0.03, 10.0), 0.7
-"""Sizes of a garment on a body, from a figurine's to a train, and a usual one [m]."""
+_WORN, _USUAL = (0.02, 10.0), 0.7
+"""Sizes of a garment on a body, from a doll's hat to a train, and a usual one [m]."""
 _UNITS = (1.0, 0.01, 0.001)
 """Units that shots come in [m]."""
 _PER_EDGE, _PER_SIZE = 5.0, 400.0
@@ -129,20 +129,16 @@ class GarmentReader:
         return min(value, self.fitting) if self.values.found[name].source == "fallback" else value
 
     def contact_notices(self) -> list[Notice]:
-        """Notices of a thickness, and of an offset from bodies that it feels, large for the garment when it begins."""
-        notices, time = [], next(iter(self.source.times), None)
+        """A notice of a thickness, and an offset from bodies that it feels, large for the garment when it begins."""
+        found, time, most = [], next(iter(self.source.times), None), 1e3 * self.fitting
         for row in (GARMENT[name] for name in ("thickness", "contact:offset")[: 2 if self.garment.colliders else 1]):
             value, kept = (1e3 * each for each in (self.values.number(row.short, time), self.kept(row.short, time)))
-            most = 1e3 * self.fitting
             if kept < value:
-                message = f"{kept:.2g} mm is taken in place of {value:g} mm; author {row.name} for another"
+                found.append(f"{row.name} is taken as {kept:.2g} mm, not {value:g}; author it for another")
             elif value > _STANDS_OFF * most:
-                message = f"{value:.3g} mm hides folds of such cloth; author {row.name} of at most {most:.2g} mm"
-            else:
-                continue
-            edge = f"{row.label.lower()}, with edges of {1e3 * mean_edge(self.garment):.2g} mm"
-            notices.append(Notice(self.garment.path, None, f"{edge}: {message}"))
-        return notices
+                found.append(f"{row.name} of {value:.3g} mm hides its folds; at most {most:.2g} mm suits it")
+        small = f"its edges are of {1e3 * mean_edge(self.garment):.2g} mm: {'; '.join(found)}"
+        return [Notice(self.garment.path, None, small)] if found else []
 
 
 def samples_of(prim: Usd.Prim, bake: Bake) -> Samples:
@@ -168,19 +164,17 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], samples: Samples, re
     times, first = within(every, request.frames), every[0] if every else None
     points = PointReader(prim, times[0] if times else None)
     cage = read_cage(prim, points.count, times)
-    edges = cage.mesh.half_edges.edges
     placement = check_placement(prim, request.units.metres, times)
     matrix = to_metres(prim, request.units.metres, first)
-    animation = _animation(prim, points, request, edges=edges, every=every, times=times)
+    animation = _animation(prim, points, request, edges=cage.mesh.half_edges.edges, every=every, times=times)
     rest, weld = _rest_and_weld(prim, cage.mesh, animation, request, matrix=matrix)
     (bent, odd), absent = rests_bent(prim), within(samples.absent, request.frames)
     notices = [*samples.notices(str(prim.GetPath()), absent), *cage.notices, *odd, *placement]
     values = find_values(prim, request.units, request.overrides)
     constants, of_constants = _constants(prim, request)
     painted, cut = _painted(prim, weld, notices, values=values)
-    subsets = read_subsets(prim, cage.kept_faces[weld.faces])
-    fabrics = read_fabrics(prim, subsets, len(weld.faces), units=request.units, time=next(iter(times), None))
-    pieces = _pieces(prim, weld, rest.points, subsets, notices)
+    subsets = read_subsets(prim, cage.kept_faces[weld.faces], units=request.units, time=times[0] if times else None)
+    pieces = _pieces(prim, weld, rest.points, subsets.faces, notices)
     grain, lies = read_grain(prim, weld, rest.points, kept=cage.kept_faces, up=request.units.up, painted=cut)
     garment = Garment(
         str(prim.GetPath()),
@@ -189,22 +183,22 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], samples: Samples, re
         flipped=is_flipped(prim, matrix),
         bent_rest=bent,
         grain=grain,
-        **{"pressed": _pressed(prim, weld, animation), "fabric_scale": fabrics.scale},
+        **{"pressed": _pressed(prim, weld, animation), "fabric_scale": subsets.scale},
         **constants | pieces | painted,
     )
     notices += [*rest.notices, *_size_notices(prim, animation.first, matrix, request), *values.notices]
     source = GarmentSource(
         *(prim.GetPath(), cage.kept_faces, weld, prim.GetPath() in request.bake.skinned, tuple(roots), times),
-        {"rest": rest.source, "grain": lies} | values.sources | fabrics.sources | of_constants,
+        {"rest": rest.source, "grain": lies} | values.sources | subsets.sources | of_constants,
         values.animated,
         left_out=tuple(time for time in every if time not in times),
         absent=absent,
         velocities=_has_velocities(prim, points.count),
-        **{"subsets": subsets, "fabrics": fabrics.words},
-        words=_words(prim, [name for name, faces in subsets.items() if 2 * len(faces) > len(weld.faces)]),
+        **{"subsets": subsets.faces, "fabrics": subsets.words},
+        words=_words(prim, [name for name, faces in subsets.faces.items() if 2 * len(faces) > len(weld.faces)]),
         shell=float(find_value(prim, GARMENT["shell:thickness"], request.overrides).at(None) or 0.0),
     )
-    return GarmentReader(garment, source, values, points, edges, weld, notices)
+    return GarmentReader(garment, source, values, points, cage.mesh.half_edges.edges, weld, notices)
 
 
 def _animation(

@@ -23,49 +23,48 @@ _ROUNDING = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
-class SubsetFabrics:
-    """Fabrics of a garment's subsets that are not the garment's own.
+class Subsets:
+    """A garment's subsets of faces, and their fabrics that are not the garment's own.
 
     Attributes:
+        faces: Faces of the cage in each subset, by name.
         scale: Multipliers of stretch, bending and density on each face of the cage, shape (F, 3); None if all are 1.
-        words: How each of these subsets differs from the garment, in words, by name; "" are the faces of none.
+        words: How each subset of another fabric differs from the garment, in words, by name; "" are other faces.
         sources: Source of each of their values, as "bendStiffness of leather".
     """
 
+    faces: dict[str, np.ndarray]
     scale: np.ndarray | None
     words: dict[str, str]
     sources: dict[str, str]
 
 
-def read_subsets(prim: Usd.Prim, cage_faces: np.ndarray) -> dict[str, np.ndarray]:
-    """Faces of the cage in each of a mesh's subsets of faces, by name.
+def read_subsets(prim: Usd.Prim, cage_faces: np.ndarray, *, units: Units, time: float | None) -> Subsets:
+    """Read a garment's subsets, and compare their fabrics with its own.
+
+    Fabrics are compared without ``--set``, which changes all in proportion.
 
     Args:
-        prim: The mesh.
+        prim: The garment.
         cage_faces: Authored face of each face of the cage, shape (F,).
+        units: The stage's units.
+        time: Time code at which values are read; the multipliers are constant.
+
+    Raises:
+        SchemaError: A value is invalid.
     """
     subsets = {}
     for subset in UsdGeom.Subset.GetGeomSubsets(UsdGeom.Imageable(prim), UsdGeom.Tokens.face):
         faces = subset.GetIndicesAttr().Get(Usd.TimeCode.EarliestTime())
         members = np.isin(cage_faces, [] if faces is None else np.asarray(faces))
         subsets[subset.GetPrim().GetName()] = np.flatnonzero(members)
-    return subsets
+    return Subsets(subsets, *_fabrics(prim, subsets, len(cage_faces), units=units, time=time))
 
 
-def read_fabrics(
+def _fabrics(
     prim: Usd.Prim, subsets: Mapping[str, np.ndarray], count: int, *, units: Units, time: float | None
-) -> SubsetFabrics:
-    """Compare the fabrics of subsets with their garment's, both without ``--set``, which changes all in proportion.
-
-    Args:
-        prim: The garment.
-        subsets: Faces of the cage in each subset, by name.
-        count: Number of the cage's faces.
-        time: Time code at which values are read; the multipliers are constant.
-
-    Raises:
-        SchemaError: A value is invalid.
-    """
+) -> tuple[np.ndarray | None, dict[str, str], dict[str, str]]:
+    """`Subsets.scale`, ``words`` and ``sources`` of a garment with a number of faces."""
     own, scale, words, sources = find_values(prim, units, ()), np.ones((count, 3)), {}, {}
     fabric = own.fabric(time)
     for name, faces, found in _parts(prim, subsets, count, units):
@@ -78,7 +77,7 @@ def read_fabrics(
             words[name] = f"{counted(len(faces), 'face')}{place} of another fabric: {_in_words(fabric, other, ratios)}"
             words[name] += f"; {', '.join(held)} as at the first time code" if held else ""
             sources |= {f"{short} of {name or 'other faces'}": found.sources[short] for short in asked}
-    return SubsetFabrics(scale if (scale != 1.0).any() else None, words, sources)
+    return scale if (scale != 1.0).any() else None, words, sources
 
 
 def _parts(
