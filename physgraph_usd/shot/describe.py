@@ -28,7 +28,7 @@ from ..usd.stage import GarmentSource
 from ..usd.times import within
 from ..usd.view import Stage
 from .estimate import cannot_fit, estimate
-from .notes import of_fabrics, of_slack, of_trims, preset_overrides
+from .notes import of_fabrics, of_slack, of_subsets, of_trims, preset_overrides
 from .options import RefineOptions, scene_words
 from .report import RefineReport, of_a_kind
 from .untagged import FAR, Candidate, find_candidates
@@ -74,7 +74,7 @@ def begin_report(report: RefineReport, opened: Shot, options: RefineOptions) -> 
     known += _across(opened, frames, beside)
     follow = {each.path: each.follows for each in candidates if each.follows}
     slack = of_slack([garment.path for garment in opened.scene.garments], choices)
-    report.note(*slack, *of_fabrics(opened.sources), *of_trims(follow))
+    report.note(*slack, *of_fabrics(opened.sources), *of_subsets(opened.sources), *of_trims(follow))
     report.modelled = _modelled(opened, report, options)
     report.left_out = _left_out(opened, report)
     report.variants = list(opened.selections)

@@ -70,6 +70,15 @@ def of_fabrics(sources: Iterable[GarmentSource]) -> list[str]:
     return notes
 
 
+def of_subsets(sources: Iterable[GarmentSource]) -> list[str]:
+    """A note for each subset of faces whose fabric is not its garment's."""
+    return [
+        f"<{source.path.AppendChild(name) if name else source.path}>: {words}"
+        for source in sources
+        for name, words in source.fabrics.items()
+    ]
+
+
 def preset_overrides(sources: Iterable[GarmentSource]) -> list[str]:
     """Values of ``--set`` that give garments the fabric they are named after."""
     return [f"{source.path}.{PRESET}={preset}" for source, _, preset in _named(sources)]

@@ -76,8 +76,10 @@ class Level:
         vertex_area: A third of the areas of the incident elastic triangles [m^2], shape (V,).
         spacing: Mean rest length of the incident springs [m], shape (V,).
         spring_garment, hinge_garment, vertex_garment, membrane_garment: Garment number of each element.
-        spring_scale, membrane_scale: Painted multiplier of the stretch stiffness, shapes (S,) and (M,).
-        bend_scale: Painted multiplier, shape (H,).
+        spring_scale, membrane_scale: Painted multiplier of the stretch stiffness, times that of the faces' fabrics,
+            shapes (S,) and (M,).
+        bend_scale: Likewise of the bending stiffness, shape (H,).
+        density_scale: Multiplier of the density by the faces' fabrics, shape (V,).
         pin: Painted pin weight, shape (V,); fixed where it is 1.
         from_coarse: Linear map from the cage, shape (V, C).
         smooth_from_coarse: Smooth map from the cage, shape (V, C).
@@ -112,6 +114,7 @@ class Level:
     spring_scale: Float[Tensor, " springs"]
     membrane_scale: Float[Tensor, " membrane"]
     bend_scale: Float[Tensor, " hinges"]
+    density_scale: Float[Tensor, " vertices"]
     pin: Float[Tensor, " vertices"]
     from_coarse: sp.csr_matrix
     smooth_from_coarse: sp.csr_matrix
@@ -256,6 +259,7 @@ class _GarmentLevel:
     pressed: np.ndarray
     vertex_values: dict[str, np.ndarray]
     warp: np.ndarray | None
+    fabric: np.ndarray
     linear: sp.csr_matrix
     smooth: sp.csr_matrix
     linear_step: sp.csr_matrix
@@ -277,6 +281,7 @@ def _garment_level(garment: Garment, whole: Sequence[Refinement], index: int) ->
     painted = {name: getattr(garment, name) for name in ("stretch_scale", "bend_scale", "pin")}
     if garment.grain is not None:
         painted |= {"ease_scale": garment.grain.ease_scale, "gather": garment.grain.gather}
+    scale = np.ones((garment.mesh.face_count, 3)) if garment.fabric_scale is None else garment.fabric_scale
     return _GarmentLevel(
         vertex_count=mesh.vertex_count,
         rest=rest,
@@ -289,6 +294,7 @@ def _garment_level(garment: Garment, whole: Sequence[Refinement], index: int) ->
         pressed=_pressed_angles(garment, elements, linear=linear, smoothing=smoothing),
         vertex_values={name: np.asarray(linear @ each.astype(np.float64)) for name, each in painted.items()},
         warp=None if garment.grain is None else garment.grain.warp[face[elements.face]],
+        fabric=scale[face[elements.face]],
         **maps,
     )
 
@@ -493,15 +499,34 @@ def _measured(
     stretch, bend, pin = (
         np.concatenate([part.vertex_values[name] for part in parts]) for name in ("stretch_scale", "bend_scale", "pin")
     )
+    fabric = np.concatenate([part.fabric for part in parts])
+    of_stretch, of_bend, of_density = np.repeat(fabric, 3, axis=0).T
+    sides = find_edges(springs, triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2))
+    at_hinges = mean_at(sides, of_bend, len(springs))[find_edges(springs, hinges[:, :2])]
     return shape | {
         "rest_angle": shape["rest_angle"] + pressed,
         "rest": np.concatenate([part.rest for part in parts]),
         "membrane_inverse": triangle_inverse(corners, apart, vectors[:, 2]),
-        "spring_scale": stretch[springs].mean(axis=1),
-        "membrane_scale": stretch[triangles].mean(axis=1),
-        "bend_scale": bend[hinges[:, :2]].mean(axis=1),
+        "spring_scale": stretch[springs].mean(axis=1) * mean_at(sides, of_stretch, len(springs)),
+        "membrane_scale": stretch[triangles].mean(axis=1) * fabric[:, 0],
+        "bend_scale": bend[hinges[:, :2]].mean(axis=1) * at_hinges,
+        "density_scale": mean_at(triangles.ravel(), of_density, len(surface), weight=np.repeat(cloth["area"], 3)),
         "pin": pin,
     }
+
+
+def mean_at(which: np.ndarray, values: np.ndarray, count: int, *, weight: np.ndarray | None = None) -> np.ndarray:
+    """Mean of the values at each of some elements, shape (count,); 1 at an element without values.
+
+    Args:
+        which: Element of each value, shape (K,).
+        values: Shape (K,).
+        count: Number of elements.
+        weight: Weight of each value, shape (K,); None for equal weights.
+    """
+    weight = np.ones(len(which)) if weight is None else weight
+    total = np.bincount(which, weight, count)
+    return np.divide(np.bincount(which, weight * values, count), total, out=np.ones(count), where=total > 0)
 
 
 def rest_shape(

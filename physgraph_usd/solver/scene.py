@@ -78,6 +78,8 @@ class Garment:
         closed: Whether each vertex belongs to a closed piece, whose sharp edges stay sharp, shape (V,); None without
             such pieces.
         rigid: Number of the rigid part that each vertex belongs to, -1 for cloth, shape (V,); None without parts.
+        fabric_scale: Multipliers of the fabric's stretch, bending and density on each face of the cage, shape (F, 3);
+            None for one fabric.
         flipped: Whether the authored winding is clockwise seen from outside: flat compressed cloth buckles to one side.
     """
 
@@ -101,6 +103,7 @@ class Garment:
     folded: np.ndarray | None = None
     closed: np.ndarray | None = None
     rigid: np.ndarray | None = None
+    fabric_scale: np.ndarray | None = None
     flipped: bool = False
 
     @staticmethod
@@ -199,6 +202,13 @@ def recentred(garment: Garment) -> Garment:
     if not len(garment.rest):
         return garment
     return replace(garment, rest=garment.rest - garment.rest.mean(axis=0))
+
+
+def mean_edge(garment: Garment) -> float:
+    """Mean edge of the cage [m], 0 without edges."""
+    ends = garment.mesh.half_edges.edges
+    lengths = np.linalg.norm(garment.rest[ends[:, 1]] - garment.rest[ends[:, 0]], axis=1)
+    return float(lengths.mean()) if len(ends) else 0.0
 
 
 def out_of_bounds(points: np.ndarray) -> str:

@@ -168,17 +168,19 @@ def bound_materials(prim: Usd.Prim) -> tuple[Usd.Prim, ...]:
     return tuple(found)
 
 
-def find_value(prim: Usd.Prim, row: Property, overrides: Sequence[Override] = ()) -> Found:
+def find_value(
+    prim: Usd.Prim, row: Property, overrides: Sequence[Override] = (), *, materials: Sequence[Usd.Prim] | None = None
+) -> Found:
     """Find the source of a garment's or a collider's value: ``--set``, a prim, or else the fallback as a constant.
 
-    The bound material counts for ``physgraph:material:`` values only.
+    Materials count for ``physgraph:material:`` values only; None: those bound to the prim.
     """
     override = _override(prim, row, overrides)
     if override is not None:
         return Found(row, "--set", None, None if override.value is None else float(override.value))
     attribute = nearest(prim, row.name)
     if attribute is None and row.name.startswith(MATERIAL):
-        materials = bound_materials(prim)
+        materials = bound_materials(prim) if materials is None else materials
         attribute = next((found for each in materials if (found := authored(each, row.name))), None)
     if attribute is not None:
         return Found(row, source_name(attribute), attribute)

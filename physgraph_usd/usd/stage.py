@@ -112,6 +112,7 @@ class GarmentSource:
         velocities: Whether the shot has velocities for the garment.
         absent: Time codes in range at which the garment has no shape, ascending; blocked in the layer.
         subsets: Faces of the cage in each GeomSubset, by name.
+        fabrics: How the fabrics of subsets differ from the garment's, in words, by the subset's name.
         weld: The mesh as authored and as solved, without holes.
         words: Words in the names of the prim, its parent, its materials, and subsets covering most of the mesh.
         still: Whether the garment itself has no samples.
@@ -130,6 +131,7 @@ class GarmentSource:
     left_out: tuple[float, ...] = ()
     velocities: bool = False
     subsets: dict[str, np.ndarray] = field(default_factory=dict)
+    fabrics: dict[str, str] = field(default_factory=dict)
     words: tuple[str, ...] = ()
     absent: tuple[float, ...] = ()
     shell: float = 0.0

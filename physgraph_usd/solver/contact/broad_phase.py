@@ -15,7 +15,7 @@ from ..colliders.mesh import MeshBody, MeshSurface
 from ..colliders.orient import FIXED
 from ..colliders.pose import Collider, Pose
 from ..rigid import AT_REST, Rigid
-from ..scene import Garment, GarmentFrame
+from ..scene import Garment, GarmentFrame, mean_edge
 from ..strain import has_collapsed
 from .bodies import Touching
 
@@ -190,13 +190,6 @@ class Bodies:
 def reach_of(garment: Garment, frame: GarmentFrame) -> float:
     """Distance from the cage's bounds within which a body is near [m]: offset plus expected move of the cloth."""
     return frame.offset + REACH * mean_edge(garment)
-
-
-def mean_edge(garment: Garment) -> float:
-    """Mean edge of the cage [m], 0 without edges."""
-    ends = garment.mesh.half_edges.edges
-    lengths = np.linalg.norm(garment.rest[ends[:, 1]] - garment.rest[ends[:, 0]], axis=1)
-    return float(lengths.mean()) if len(ends) else 0.0
 
 
 def bounds_of(points: np.ndarray) -> np.ndarray:

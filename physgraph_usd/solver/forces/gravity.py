@@ -1,6 +1,6 @@
 """Gravity.
 
-    E = - sum_v m_v g . x_v,   m_v = density a_v
+    E = - sum_v m_v g . x_v,   m_v = density a_v, times the scale of the faces' fabrics
 
 The solver recentres each frame on the mean of its coarse positions, so the energy is relative to the input's mean
 height.
@@ -42,7 +42,7 @@ class Gravity:
         self._owner = level.vertex_garment
         owner = self._owner.long()
         self.density = density.to(level.rest)
-        mass = self.density[owner] * level.vertex_area
+        mass = self.density[owner] * level.density_scale * level.vertex_area
         self.weight = mass.unsqueeze(1) * torch.as_tensor(gravity, dtype=level.dtype, device=level.device)
 
     def add_force(self, x: Float[Tensor, "vertices 3"], force: Float[Tensor, "vertices 3"]) -> Float[Tensor, ""]:

@@ -45,7 +45,8 @@ class Tether:
             predicted: Positions [m].
         """
         self._level = level
-        self._density, self._area = density.to(level.rest)[level.vertex_garment.long()], level.vertex_area
+        self._density = density.to(level.rest)[level.vertex_garment.long()] * level.density_scale
+        self._area = level.vertex_area
         self._weight = stiffness * self._density * self._area
         self._pull = three_columns(self._weight)
         self.predicted, self.stiffness = predicted, stiffness

@@ -21,7 +21,7 @@ _BLENDERS = {name.replace("physgraph:", "physgraph_") for name in _NAMES if name
 
 
 def authored_faults(garments: Sequence[Usd.Prim], colliders: Sequence[Usd.Prim]) -> list[Notice]:
-    """Notices of unread or out-of-limit properties on prims, their ancestors or their materials.
+    """Notices of unread or out-of-limit properties on prims, their ancestors, and materials of prims and subsets.
 
     A notice of an unread property suggests the most similar name.
     """
@@ -29,7 +29,8 @@ def authored_faults(garments: Sequence[Usd.Prim], colliders: Sequence[Usd.Prim])
     for prim in (*garments, *colliders):
         for each in with_ancestors(prim):
             notices |= dict.fromkeys(_unread_on(each, material=False))
-        for each in bound_materials(prim):
+        subsets = UsdGeom.Subset.GetAllGeomSubsets(UsdGeom.Imageable(prim))
+        for each in (found for part in (prim, *(s.GetPrim() for s in subsets)) for found in bound_materials(part)):
             notices |= dict.fromkeys(_unread_on(each, material=True))
     for schema, prims in ((GARMENT_API, garments), (COLLIDER_API, colliders)):
         for attribute, fault, _ in (each for prim in prims for each in beyond_limits(prim, schema)):

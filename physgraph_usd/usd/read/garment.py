@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache, partial
+from functools import cache, cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from pxr import Sdf, Usd, UsdGeom
 from ...errors import GarmentError, SchemaError, counted
 from ...solver.mesh.topology import PolygonMesh
 from ...solver.mesh.weld import Weld, seam_reach, weld
-from ...solver.scene import Garment, GarmentFrame
+from ...solver.scene import Garment, GarmentFrame, mean_edge
 from ..lookup import Found, Override, bound_materials, check_limits, find_value
 from ..mesh.pieces import sort_pieces
 from ..schema import GARMENT
@@ -27,12 +28,23 @@ from .materials import Values, find_values
 from .placement import check_matrix, check_placement, is_flipped, place, to_metres
 from .rest import Animation, Rest, pressed_folds, read_rest, rests_bent
 from .skinning import Bake
+from .subsets import read_subsets
 
 PRESSED = "physgraph:pressed"
 """Attribute of an edge subset to mark pressed folds, or folds that are not, bool."""
 RIGID = "physgraph:rigid"
 """Attribute of a face subset to mark a rigid part, bool."""
 _SMALL, _LARGE = 0.01, 100.0
+"""Sizes between which anything of cloth is believed [m]."""
+_WORN, _USUAL = (0.02, 10.0), 0.7
+"""Sizes of a garment on a body, from a doll's hat to a train, and a usual one [m]."""
+_UNITS = (1.0, 0.01, 0.001)
+"""Units that shots come in [m]."""
+_PER_EDGE, _PER_SIZE = 5.0, 400.0
+"""Inverse of the largest contact distance that is not authored, relative to the cage's mean edge and to its size; the
+larger one counts. A coat with edges of 10 mm keeps the full offset, a doll's of 1:12 a quarter of it."""
+_STANDS_OFF = 2.5
+"""Multiple of that distance from which an authored offset or thickness is large for a garment."""
 _WORD = re.compile("[A-Z]?[a-z]+|[A-Z]+(?![a-z])")
 """A word of a name such as "LeatherBelt_geo1"."""
 _THICK = 10.0
@@ -95,15 +107,38 @@ class GarmentReader:
         else:
             local, notices = self.points.read(time, self.edges)
             points = self.weld.joined(place(local, to_metres(prim, metres, time)))
-        names = ("guide:stiffness", "refine:detail", "contact:offset")
-        guide, detail, offset = (self.values.number(name, time) for name in names)
+        guide, detail = (self.values.number(name, time) for name in ("guide:stiffness", "refine:detail"))
+        offset, thickness = (self.kept(name, time) for name in ("contact:offset", "thickness"))
         fabric, most = self.values.fabric(time), float(np.linalg.norm(np.ptp(self.garment.rest, axis=0))) / _THICK
-        if max(fabric.thickness, offset) > most:
+        if max(thickness, offset) > most:
             message = f"contact keeps {1e3 * most:.3g} mm, a {_THICK:g}th of the cloth's size, for a thickness of"
-            message += f" {1e3 * fabric.thickness:.3g} mm and an offset of {1e3 * offset:.3g} mm; check metersPerUnit"
+            message += f" {1e3 * thickness:.3g} mm and an offset of {1e3 * offset:.3g} mm; check metersPerUnit"
             notices = (*notices, Notice(self.garment.path, None, message))
-        fabric, offset = replace(fabric, thickness=min(fabric.thickness, most)), min(offset, most)
+        fabric, offset = replace(fabric, thickness=min(thickness, most)), min(offset, most)
         return GarmentFrame(points, fabric, guide, detail, offset), notices
+
+    @cached_property
+    def fitting(self) -> float:
+        """Largest contact distance that suits the cage's size and edges [m]."""
+        size = float(np.linalg.norm(np.ptp(self.garment.rest, axis=0)))
+        return max(mean_edge(self.garment) / _PER_EDGE, size / _PER_SIZE)
+
+    def kept(self, name: str, time: float | None) -> float:
+        """Contact offset or thickness at a time code [m], by short name; unless authored, at most `fitting`."""
+        value = self.values.number(name, time)
+        return min(value, self.fitting) if self.values.found[name].source == "fallback" else value
+
+    def contact_notices(self) -> list[Notice]:
+        """A notice of a thickness, and an offset from bodies that it feels, large for the garment when it begins."""
+        found, time, most = [], next(iter(self.source.times), None), 1e3 * self.fitting
+        for row in (GARMENT[name] for name in ("thickness", "contact:offset")[: 2 if self.garment.colliders else 1]):
+            value, kept = (1e3 * each for each in (self.values.number(row.short, time), self.kept(row.short, time)))
+            if kept < value:
+                found.append(f"{row.name} is taken as {kept:.2g} mm, not {value:g}; author it for another")
+            elif value > _STANDS_OFF * most:
+                found.append(f"{row.name} of {value:.3g} mm hides its folds; at most {most:.2g} mm suits it")
+        small = f"its edges are of {1e3 * mean_edge(self.garment):.2g} mm: {'; '.join(found)}"
+        return [Notice(self.garment.path, None, small)] if found else []
 
 
 def samples_of(prim: Usd.Prim, own: Sequence[float], times: Sequence[float]) -> Samples:
@@ -139,7 +174,8 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], samples: Samples, re
     values = find_values(prim, request.units, request.overrides)
     constants, of_constants = _constants(prim, request)
     painted, cut = _painted(prim, weld, notices, values=values)
-    pieces, odd_pieces = _pieces(prim, weld, rest.points, subsets := _subsets(prim, cage.kept_faces[weld.faces]))
+    subsets = read_subsets(prim, cage.kept_faces[weld.faces], units=request.units, time=times[0] if times else None)
+    pieces = _pieces(prim, weld, rest.points, subsets.faces, notices)
     grain, lies = read_grain(prim, weld, rest.points, kept=cage.kept_faces, up=request.units.up, painted=cut)
     garment = Garment(
         str(prim.GetPath()),
@@ -149,20 +185,20 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], samples: Samples, re
         bent_rest=bent,
         grain=grain,
         **_pressed(prim, weld, animation),
+        fabric_scale=subsets.scale,
         **constants | pieces | painted,
     )
-    notices += [*rest.notices, *odd_pieces, *_size_notices(garment.path, animation.first, request)]
-    notices += [*_unit_notices(prim, matrix, request), *values.notices]
+    notices += [*rest.notices, *_size_notices(prim, animation.first, matrix, request), *values.notices]
     source = GarmentSource(
         *(prim.GetPath(), cage.kept_faces, weld, prim.GetPath() in request.bake.skinned, tuple(roots), times),
-        {"rest": rest.source, "grain": lies} | values.sources | of_constants,
+        {"rest": rest.source, "grain": lies} | values.sources | subsets.sources | of_constants,
         values.animated,
         still=not samples.own,
         left_out=tuple(time for time in every if time not in times) if times else (),
         absent=absent,
         velocities=_has_velocities(prim, points.count),
-        subsets=subsets,
-        words=_words(prim, [name for name, faces in subsets.items() if 2 * len(faces) > len(weld.faces)]),
+        **{"subsets": subsets.faces, "fabrics": subsets.words},
+        words=_words(prim, [name for name, faces in subsets.faces.items() if 2 * len(faces) > len(weld.faces)]),
         shell=float(find_value(prim, GARMENT["shell:thickness"], request.overrides).at(None) or 0.0),
     )
     return GarmentReader(garment, source, values, points, cage.mesh.half_edges.edges, weld, notices)
@@ -210,14 +246,14 @@ def _has_velocities(prim: Usd.Prim, count: int) -> bool:
 
 
 def _pieces(
-    prim: Usd.Prim, weld: Weld, rest: np.ndarray, subsets: dict[str, np.ndarray]
-) -> tuple[dict[str, Any], list[Notice]]:
-    """Closed pieces and rigid parts by field name, and notices about pieces."""
+    prim: Usd.Prim, weld: Weld, rest: np.ndarray, subsets: dict[str, np.ndarray], notices: list[Notice]
+) -> dict[str, Any]:
+    """Closed pieces and rigid parts by field name; adds to the notices."""
     asked = np.zeros(weld.mesh.face_count, bool)
     for name, faces in subsets.items():
         attribute = prim.GetChild(name).GetAttribute(RIGID)
         asked[faces] |= bool(attribute and attribute.Get())
-    found, path, notices = sort_pieces(weld.mesh, weld.joined(rest), asked), str(prim.GetPath()), []
+    found, path = sort_pieces(weld.mesh, weld.joined(rest), asked), str(prim.GetPath())
     if count := int(found.rigid.max(initial=-1)) + 1:
         message = f"{counted(count, 'piece')} of it moved rigidly with the cloth under, as buttons are"
         notices.append(Notice(path, None, message))
@@ -227,18 +263,7 @@ def _pieces(
     if found.joined:
         message = f"{RIGID} is for pieces that share no vertices with cloth; paint bendScale to stiffen the others"
         notices.append(Notice(path, None, message))
-    fields = {"closed": found.closed if found.closed.any() else None, "rigid": found.rigid if count else None}
-    return fields, notices
-
-
-def _subsets(prim: Usd.Prim, cage_faces: np.ndarray) -> dict[str, np.ndarray]:
-    """Faces of the cage in each of the mesh's subsets of faces, by name."""
-    subsets = {}
-    for subset in UsdGeom.Subset.GetGeomSubsets(UsdGeom.Imageable(prim), UsdGeom.Tokens.face):
-        faces = subset.GetIndicesAttr().Get(Usd.TimeCode.EarliestTime())
-        members = np.isin(cage_faces, [] if faces is None else np.asarray(faces))
-        subsets[subset.GetPrim().GetName()] = np.flatnonzero(members)
-    return subsets
+    return {"closed": found.closed if found.closed.any() else None, "rigid": found.rigid if count else None}
 
 
 def _pressed(prim: Usd.Prim, weld: Weld, animation: Animation) -> dict[str, np.ndarray]:
@@ -321,14 +346,33 @@ def _painted(
     return joined, {name: arrays[name] for name in cut}
 
 
-def _size_notices(path: str, points: np.ndarray, request: Request) -> list[Notice]:
-    """A notice of the size in metres if units were assumed or the size is implausible for a garment."""
-    size = np.ptp(points, axis=0)
-    largest = float(size.max())
-    if not request.assumed_units and _SMALL <= largest <= _LARGE:
+def _size_notices(prim: Usd.Prim, points: np.ndarray, matrix: np.ndarray, request: Request) -> list[Notice]:
+    """Notices of units: assumed ones, a size implausible for cloth, and layers with other units."""
+    notices, path = _unit_notices(prim, matrix, request), str(prim.GetPath())
+    if request.assumed_units or not _SMALL <= float(np.ptp(points, axis=0).max()) <= _LARGE:
+        notices.insert(0, Notice(path, None, f"{_measures(points, request.units.metres)}; check metersPerUnit"))
+    return notices
+
+
+def worn_notices(garment: Garment, metres: float) -> list[Notice]:
+    """A notice of a garment that feels bodies and is too small or too large to be worn, with the likely units.
+
+    Args:
+        garment: The garment, with its colliders.
+        metres: Metres per unit of the stage.
+    """
+    largest = float(np.ptp(garment.rest, axis=0).max())
+    if not garment.colliders or not _SMALL <= largest <= _LARGE or _WORN[0] <= largest <= _WORN[1]:
         return []
-    message = " x ".join(f"{length:.3g}" for length in size)
-    return [Notice(path, None, f"measures {message} m with {request.units.metres:g} m per unit; check metersPerUnit")]
+    likely = min(_UNITS, key=lambda unit: abs(math.log(largest * unit / metres / _USUAL)))
+    message = f"{_measures(garment.rest, metres)}; garments on bodies are believed from {_WORN[0]:g} to {_WORN[1]:g} m:"
+    message += f" set metersPerUnit to {likely:g}, with which its longest side is {largest * likely / metres:.3g} m"
+    return [Notice(garment.path, None, message)]
+
+
+def _measures(points: np.ndarray, metres: float) -> str:
+    """Size of points [m] in words."""
+    return f"measures {' x '.join(f'{length:.3g}' for length in np.ptp(points, axis=0))} m with {metres:g} m per unit"
 
 
 def _unit_notices(prim: Usd.Prim, matrix: np.ndarray, request: Request) -> list[Notice]:

@@ -21,6 +21,7 @@ M v [N/m], bending M m^2 v [N m], E M/m v [Pa], volumetric density M/m^3 v [kg/m
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -126,12 +127,34 @@ class Values:
 
 
 def find_values(prim: Usd.Prim, units: Units, overrides: Sequence[Override]) -> Values:
-    """Find the source of every fabric value, the guide's stiffness and the detail's gain."""
-    materials = bound_materials(prim)
-    found: dict[str, Found] = {name: find_value(prim, GARMENT[name], overrides) for name in _FRAME_VALUES}
+    """Find the source of every fabric value, the guide's stiffness and the detail's gain.
+
+    What neither the garment nor its materials give is that of the materials of most of its faces.
+    """
+    return values_by(prim, prim, _materials_of_most(prim), units=units, overrides=overrides)
+
+
+def _materials_of_most(prim: Usd.Prim) -> list[Usd.Prim]:
+    """Materials bound to a garment, then those bound to most of its faces by subsets."""
+    bound, counts = bound_materials(prim), Counter[tuple[Usd.Prim, ...]]()
+    left = len(first_value(UsdGeom.Mesh(prim).GetFaceVertexCountsAttr()) or ())
+    for subset in UsdGeom.Subset.GetGeomSubsets(UsdGeom.Imageable(prim), UsdGeom.Tokens.face):
+        own = tuple(each for each in bound_materials(subset.GetPrim()) if each not in bound)
+        size = len(subset.GetIndicesAttr().Get(Usd.TimeCode.EarliestTime()) or ()) if own else 0
+        counts[own] += size
+        left -= size
+    most, count = counts.most_common(1)[0] if counts else ((), 0)
+    return [*bound, *(most if count > left else ())]
+
+
+def values_by(
+    prim: Usd.Prim, mesh: Usd.Prim, materials: Sequence[Usd.Prim], *, units: Units, overrides: Sequence[Override] = ()
+) -> Values:
+    """The values of a garment or of one of its subsets, by their materials, the first one first."""
+    found = {name: find_value(prim, GARMENT[name], overrides, materials=materials) for name in _FRAME_VALUES}
     open_rows = [name for name in _FRAME_VALUES if found[name].source == "fallback"]
     relative, notices = None, ()
-    if "thickness" in open_rows and (thick := read_thickness(prim, materials, GARMENT["thickness"], units=units)):
+    if "thickness" in open_rows and (thick := read_thickness(mesh, materials, GARMENT["thickness"], units=units)):
         found["thickness"], relative, notices = thick
     for name in STIFFNESSES:
         if name in open_rows:

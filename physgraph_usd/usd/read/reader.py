@@ -56,7 +56,7 @@ from .find import (
     read_apart,
     with_gravity,
 )
-from .garment import GarmentReader, Request, is_visible, read_garment, samples_of, seam_tolerance
+from .garment import GarmentReader, Request, is_visible, read_garment, samples_of, seam_tolerance, worn_notices
 from .instances import instanced_gprims, instancer_above
 from .materials import find_values
 from .placement import place, to_metres
@@ -199,7 +199,7 @@ class Shot:
 
     def offset(self, index: int, time: float | None) -> float:
         """Distance kept from colliders by a garment, by number, at a time code [m]."""
-        return self._readers[index].values.number("contact:offset", time)
+        return self._readers[index].kept("contact:offset", time)
 
     def with_values(self, overrides: Sequence[str]) -> Shot:
         """A copy of the shot with other ``--set`` values in its frames; values read only on opening are kept.
@@ -387,7 +387,7 @@ def _link(
     readers = _sewn(stage, readers, request, notices)
     cloth = dict.fromkeys(reader.source.path for reader in readers)
     times = [reader.source.times[0] if reader.source.times else None for reader in readers]
-    offset = min(reader.values.number("contact:offset", time) for reader, time in zip(readers, times, strict=True))
+    offset = min(reader.kept("contact:offset", time) for reader, time in zip(readers, times, strict=True))
     given = {"overrides": request.overrides, "offset": offset, "near": _swept(stage, readers, paths, request)}
     bodies = []
     for path in paths:
@@ -406,6 +406,7 @@ def _link(
         colliders = tuple(sorted(numbers[path] for path in each.felt & numbers.keys()))
         garment = replace(reader.garment, colliders=colliders, apart_from=others)
         linked.append(replace(reader, garment=garment, source=replace(reader.source, apart_from=apart)))
+        notices += [*worn_notices(garment, request.units.metres), *linked[-1].contact_notices()]
     return linked, bodies
 
 

@@ -1,0 +1,123 @@
+"""Reads a garment's subsets of faces, and how their fabrics differ from the garment's."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from pxr import Usd, UsdGeom
+
+from ...errors import counted
+from ...solver.fabric import Fabric
+from ..lookup import authored, bound_materials
+from ..schema import GARMENT, every_fabric_value
+from ..stage import Units
+from .materials import Values, find_values, values_by
+
+_SCALED = {"stretchStiffness": "stretch", "bendStiffness": "bend", "density": "density"}
+"""Values with a multiplier on each face, and their fields in a fabric."""
+_ROUNDING = 1e-6
+"""Relative difference up to which two values are equal: attributes are in single precision."""
+
+
+@dataclass(frozen=True, eq=False)
+class Subsets:
+    """A garment's subsets of faces, and their fabrics that are not the garment's own.
+
+    Attributes:
+        faces: Faces of the cage in each subset, by name.
+        scale: Multipliers of stretch, bending and density on each face of the cage, shape (F, 3); None if all are 1.
+        words: How each subset of another fabric differs from the garment, in words, by name; "" are other faces.
+        sources: Source of each of their values, as "bendStiffness of leather".
+    """
+
+    faces: dict[str, np.ndarray]
+    scale: np.ndarray | None
+    words: dict[str, str]
+    sources: dict[str, str]
+
+
+def read_subsets(prim: Usd.Prim, cage_faces: np.ndarray, *, units: Units, time: float | None) -> Subsets:
+    """Read a garment's subsets, and compare their fabrics with its own.
+
+    Fabrics are compared without ``--set``, which changes all in proportion.
+
+    Args:
+        prim: The garment.
+        cage_faces: Authored face of each face of the cage, shape (F,).
+        units: The stage's units.
+        time: Time code at which values are read; the multipliers are constant.
+
+    Raises:
+        SchemaError: A value is invalid.
+    """
+    subsets = {}
+    for subset in UsdGeom.Subset.GetGeomSubsets(UsdGeom.Imageable(prim), UsdGeom.Tokens.face):
+        faces = subset.GetIndicesAttr().Get(Usd.TimeCode.EarliestTime())
+        members = np.isin(cage_faces, [] if faces is None else np.asarray(faces))
+        subsets[subset.GetPrim().GetName()] = np.flatnonzero(members)
+    return Subsets(subsets, *_fabrics(prim, subsets, len(cage_faces), units=units, time=time))
+
+
+def _fabrics(
+    prim: Usd.Prim, subsets: Mapping[str, np.ndarray], count: int, *, units: Units, time: float | None
+) -> tuple[np.ndarray | None, dict[str, str], dict[str, str]]:
+    """`Subsets.scale`, ``words`` and ``sources`` of a garment with a number of faces."""
+    own, scale, words, sources = find_values(prim, units, ()), np.ones((count, 3)), {}, {}
+    fabric = own.fabric(time)
+    for name, faces, found in _parts(prim, subsets, count, units):
+        asked = [short for short in every_fabric_value(fabric) if found.sources[short] != own.sources[short]]
+        if asked and len(faces):
+            other = found.fabric(time)
+            scale[faces] = ratios = [_ratio(getattr(other, each), getattr(fabric, each)) for each in _SCALED.values()]
+            held = [short for short in asked if found.found[short].animated]
+            place = "" if name else " of no such subset"
+            words[name] = f"{counted(len(faces), 'face')}{place} of another fabric: {_in_words(fabric, other, ratios)}"
+            words[name] += f"; {', '.join(held)} as at the first time code" if held else ""
+            sources |= {f"{short} of {name or 'other faces'}": found.sources[short] for short in asked}
+    return scale if (scale != 1.0).any() else None, words, sources
+
+
+def _parts(
+    prim: Usd.Prim, subsets: Mapping[str, np.ndarray], count: int, units: Units
+) -> Iterator[tuple[str, np.ndarray, Values]]:
+    """Name, faces and values of each subset with a material or values of its own, then those of all other faces."""
+    bound, others = bound_materials(prim), np.ones(count, bool)
+    for name, faces in subsets.items():
+        subset = prim.GetChild(name)
+        materials = bound_materials(subset)
+        if {*materials} - {*bound} or any(
+            authored(subset, GARMENT[short].name) for short in every_fabric_value(Fabric())
+        ):
+            others[faces] = False
+            yield name, faces, values_by(subset, prim, [*materials, *bound], units=units)
+    if not others.all():
+        yield "", np.flatnonzero(others), values_by(prim, prim, bound, units=units)
+
+
+def _ratio(value: float, own: float) -> float:
+    """A subset's value over the garment's; 1 where the garment has none to multiply."""
+    return 1.0 if own <= 0.0 or math.isclose(value, own, rel_tol=_ROUNDING) else value / own
+
+
+def _in_words(fabric: Fabric, other: Fabric, ratios: list[float]) -> str:
+    """Which values of another fabric are multiples of a garment's, and which are not used."""
+    stretch, bend, density = ratios
+    shear, weft_stretch = (None if each is None else stretch * each for each in (fabric.shear, fabric.weft_stretch))
+    scaled = replace(
+        fabric,
+        stretch=stretch * fabric.stretch,
+        shear=shear,
+        weft_stretch=weft_stretch,
+        bend=bend * fabric.bend,
+        weft_bend=None if fabric.weft_bend is None else bend * fabric.weft_bend,
+        density=density * fabric.density,
+    )
+    used, wanted = every_fabric_value(scaled), every_fabric_value(other)
+    unused = [name for name in used if not math.isclose(used[name] or 0.0, wanted[name] or 0.0, rel_tol=_ROUNDING)]
+    times = [f"{name} times {ratio:.3g}" for name, ratio in zip(_SCALED, ratios, strict=True) if ratio != 1.0]
+    return ", ".join(times or ["none of its values differ"]) + (
+        f"; not used: its {', '.join(unused)}" if unused else ""
+    )
