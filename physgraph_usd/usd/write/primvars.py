@@ -24,10 +24,11 @@ from ..mesh.attributes import (
 )
 from ..mesh.shell import Shell
 from ..stage import Notice, timecode
+from .attribute_rules import BLOCKED, action_on
 from .stream import LayerStream
 
-STALE = ("primvars:normals", "primvars:skel:jointIndices", "primvars:skel:jointWeights")
-"""Primvars hidden instead of refined: the first is replaced by our normals, the rest would skin the mesh twice."""
+INFLUENCES = ("primvars:skel:jointIndices", "primvars:skel:jointWeights")
+"""Primvars that would skin the mesh twice."""
 
 
 def carry_primvars(
@@ -46,7 +47,7 @@ def carry_primvars(
     notices = []
     for primvar in UsdGeom.PrimvarsAPI(prim).GetPrimvarsWithAuthoredValues():
         attribute = primvar.GetAttr()
-        if attribute.GetName() in STALE:
+        if action_on(attribute) == BLOCKED:
             _hide(stream, target, primvar)
         elif fine.stencil is not None and _numbers_points(primvar):
             _hide(stream, target, primvar)
@@ -63,7 +64,7 @@ def carry_primvars(
 
 def hide_influences(stream: LayerStream, target: Sdf.Path, prim: Usd.Prim) -> None:
     """Block joint influences of a prim whose points are skinned already."""
-    for name in STALE[1:]:
+    for name in INFLUENCES:
         primvar = UsdGeom.PrimvarsAPI(prim).GetPrimvar(name)
         if primvar and primvar.HasAuthoredValue():
             _hide(stream, target, primvar)
