@@ -193,8 +193,10 @@ def test_cloth_caught_on_the_wrong_side_is_started_anew(
     assert energies[0] < 0.1 * energies[1]
 
 
-def stand_in(monkeypatch: pytest.MonkeyPatch, warm: tuple[int, float], cold: tuple[int, float]) -> list[bool]:
-    """Frames that end with given crossings and energies [J], by their start; whether each was warm."""
+def stand_in(
+    monkeypatch: pytest.MonkeyPatch, warm: tuple[int, float], cold: tuple[int, float], *, moving: float = 0.0
+) -> list[bool]:
+    """Frames that end with given crossings, energies [J] and remaining move, by their start; whether each was warm."""
     made: list[bool] = []
 
     def solve(_group: Any, _frame: Any, last: FrameState | None) -> Solved:
@@ -202,6 +204,7 @@ def stand_in(monkeypatch: pytest.MonkeyPatch, warm: tuple[int, float], cold: tup
         count, energy = cold if last is None else warm
         told = {"energy_joules": {"input": {"stretch": 1.0, "self_contact": 1.0}, "output": {"stretch": energy}}}
         told |= {"contact": {"cloth": {"after": {"crossings": count}}}, "start": "cold" if last is None else "warm"}
+        told |= {"levels": [{"remaining_move": moving}]}
         nothing = torch.zeros(0, 3)
         return Solved([np.zeros((0, 3))], FrameState(nothing, nothing, nothing[:, 0] > 0, nothing[:, 0] > 0), told, [])
 
@@ -215,3 +218,23 @@ def test_cloth_that_runs_away_from_any_start_is_told(
     stand_in(monkeypatch, (0, 4.0), (0, 4.0))
     with pytest.raises(RunawayError, match="3 J more than its upsampled cage has, and a start from the cage ends no"):
         solve_soundly(*layers)
+
+
+@pytest.mark.parametrize(
+    ("moving", "cold", "start"),
+    [
+        (0.2, (0, 0.4), "cold: started anew, since it would still move by 0.2 edges"),
+        (0.2, (0, 0.6), "warm"),
+        (0.2, (1, 0.4), "warm"),
+        (0.05, (0, 0.4), "warm"),
+    ],
+)
+def test_cloth_far_from_rest_is_started_anew_where_that_ends_lower(
+    layers: tuple[Group, FrameInput, FrameState],
+    monkeypatch: pytest.MonkeyPatch,
+    moving: float,
+    cold: tuple[int, float],
+    start: str,
+):
+    stand_in(monkeypatch, (0, 0.5), cold, moving=moving)
+    assert solve_soundly(*layers).telemetry["start"] == start

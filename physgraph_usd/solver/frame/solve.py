@@ -38,6 +38,8 @@ EQUAL_ENERGY = 1e-3
 """Fraction of the energies' size below which two energies count as equal: sums are in single precision."""
 MORE = 2
 """Crossings with a body allowed for each one of the cage: cloth pinched by bodies crosses them about as often."""
+MOVING = 0.1
+"""Remaining move, in edge lengths, above which cloth carried from the last frame is far from rest."""
 MOST_WAIT = 64
 """Most frames between two starts from the cage. The wait doubles with each unsuccessful start, so such starts cost
 little in a shot with cloth impossible to pull apart."""
@@ -204,11 +206,12 @@ class RunawayError(SolveError):
 def solve_soundly(group: Group, frame: FrameInput, last: FrameState | None) -> Solved:
     """Solve a frame, and once more from the cage if the result is unsound.
 
-    A result is unsound if cloth crosses cloth, or a body over `MORE` times as often as the upsampled cage does, or if
+    A result is unsound if cloth crosses cloth, or a body over `MORE` times as often as the upsampled cage does, if
     its energy is above the upsampled cage's energy without self contact (the self contact energy is as large as the
-    cage's own crossings are deep). The second result is used if it has fewer crossings of cloth with cloth. If it has
-    as many: if the first alone crosses bodies too often (a few crossings less are no reason to change the folds); or
-    if neither does, the first energy is above the cage's, and the second is lower.
+    cage's own crossings are deep), or if it starts from the last frame and would still move by over `MOVING`. The
+    second result is used if it has fewer crossings of cloth with cloth. If it has as many: if the first alone crosses
+    bodies too often (a few crossings less are no reason to change the folds); or if neither does, the first energy is
+    above the cage's, or the first still moves and the second crosses bodies no more, and the second energy is lower.
 
     Args:
         group: Garments solved together.
@@ -245,8 +248,15 @@ def _unsound(telemetry: Mapping[str, Any]) -> str:
     """Why a result is unsound; "" if sound."""
     if crossings := _crossings(telemetry) + _through_bodies(telemetry):
         return f"it kept {crossings:,} crossings"
-    excess = _excess(telemetry)
-    return f"it ended with {excess:.3g} J more than its upsampled cage has" if excess > 0.0 else ""
+    if (excess := _excess(telemetry)) > 0.0:
+        return f"it ended with {excess:.3g} J more than its upsampled cage has"
+    return f"it would still move by {moving:.2g} edges" if (moving := _moving(telemetry)) else ""
+
+
+def _moving(telemetry: Mapping[str, Any]) -> float:
+    """Remaining move of a frame from the last frame's detail, in edge lengths; 0 if up to `MOVING`."""
+    left = telemetry["levels"][-1]["remaining_move"] if telemetry["start"] == "warm" and telemetry["levels"] else 0.0
+    return left if left > MOVING else 0.0
 
 
 def _is_better(fresh: Mapping[str, Any], solved: Mapping[str, Any]) -> bool:
@@ -257,7 +267,8 @@ def _is_better(fresh: Mapping[str, Any], solved: Mapping[str, Any]) -> bool:
     bodies = _through_bodies(fresh), _through_bodies(solved)
     if any(bodies):
         return not bodies[0]
-    return _excess(solved) > 0.0 and _energy(fresh) < _energy(solved)
+    moving = _moving(solved) > 0.0 and _through_bodies(fresh, more=0) <= _through_bodies(solved, more=0)
+    return (_excess(solved) > 0.0 or moving) and _energy(fresh) < _energy(solved)
 
 
 def _crossings(telemetry: Mapping[str, Any], *, given_up: bool = False) -> int:
@@ -266,10 +277,10 @@ def _crossings(telemetry: Mapping[str, Any], *, given_up: bool = False) -> int:
     return int(after.get("crossings", 0) - (0 if given_up else after.get("given_up", 0)))
 
 
-def _through_bodies(telemetry: Mapping[str, Any]) -> int:
-    """Sum over bodies of the result's crossings beyond `MORE` times those of the upsampled cage."""
+def _through_bodies(telemetry: Mapping[str, Any], *, more: int = MORE) -> int:
+    """Sum over bodies of the result's crossings beyond ``more`` times those of the upsampled cage."""
     bodies = telemetry.get("contact", {}).get("bodies", {}).values()
-    return sum(max(each["after"]["crossings"] - MORE * each["before"]["crossings"], 0) for each in bodies)
+    return sum(max(each["after"]["crossings"] - more * each["before"]["crossings"], 0) for each in bodies)
 
 
 def _excess(telemetry: Mapping[str, Any], *, whole: bool = False) -> float:
