@@ -171,6 +171,7 @@ class FineMap:
         counts: np.ndarray,
         kept: np.ndarray,
         *,
+        indices: np.ndarray,
         shell: Shell | None = None,
     ) -> None:
         """Prepare the map.
@@ -179,6 +180,7 @@ class FineMap:
             refinements: Coarse to fine; empty if the fine mesh is the cage.
             counts: Authored corners per face, shape (F,), including dropped faces.
             kept: Numbers of the authored faces in the cage, shape (F_cage,).
+            indices: Authored vertices of all corners, shape (C,).
             shell: Shell of the refined sheet that is the fine mesh; None if the sheet is.
         """
         self.cage, self._shell = cage, shell
@@ -186,7 +188,7 @@ class FineMap:
         self.fine = self.sheet if shell is None else shell.mesh
         self._refinements = tuple(refinements)
         self._kept = np.asarray(kept, np.int64)
-        self._counts = counts
+        self._counts, self._indices = counts, indices
 
     @cached_property
     def stencil(self) -> sparse.csr_matrix | None:
@@ -216,7 +218,7 @@ class FineMap:
     @cached_property
     def kept_corners(self) -> np.ndarray:
         """Authored corner of each corner of the cage, shape (C,)."""
-        return kept_corners(self._counts, self._kept)
+        return kept_corners(self._counts, self._indices, self._kept)
 
     @cached_property
     def nearest_corner(self) -> np.ndarray:

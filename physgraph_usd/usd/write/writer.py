@@ -25,7 +25,7 @@ from ..lookup import check_known
 from ..mesh.shell import Shell
 from ..read.absence import named_times
 from ..read.reader import Shot
-from ..stage import Notice, at_time, first_value, pxr_errors, value_at
+from ..stage import Notice, at_time, authored_topology, pxr_errors, value_at
 from ..times import within
 from . import overs
 from .attribute_rules import notes_of
@@ -238,11 +238,11 @@ class _RefinedMesh:
         """
         source, times = shot.sources[index], shot.scene.times
         prim, span = shot.stage.GetPrimAtPath(source.path), (times[0], times[-1]) if times else None
-        counts = np.asarray(first_value(UsdGeom.Mesh(prim).GetFaceVertexCountsAttr()))
+        counts, indices = authored_topology(prim)
         steps, self._weld = source.weld.subdivided(len(steps))
         sheet, sides = steps[-1].mesh if steps else source.weld.apart, self._weld.sides
         self._shell = Shell.of(sheet, self._weld.number) if source.shell else None
-        fine = FineMap(source.weld.apart, steps, counts, source.kept_faces, shell=self._shell)
+        fine = FineMap(source.weld.apart, steps, counts, source.kept_faces, indices=indices, shell=self._shell)
         self.notices = overs.open_instances(stream, source.path, source.instance_roots)
         self.target = target = overs.make_sibling(stream, prim) if sibling else source.path
         overs.author_topology(stream, target, prim, fine)
