@@ -15,7 +15,7 @@ import pytest
 from shots import run
 from stages import add_mesh, add_sheet, new_stage, save
 
-from docs import warnings_table
+from docs import tables
 from physgraph_usd.cli import main
 from physgraph_usd.shot.options import OPTIONS
 
@@ -144,8 +144,8 @@ def test_advice_names_what_there_is(name: str):
 
 
 def test_the_table_of_warnings_is_the_one_of_the_code():
-    page = warnings_table.PAGE.read_text("utf-8")
-    assert warnings_table.page_with_table(page) == page, "run python -m docs.warnings_table"
+    for page in tables.PAGES:
+        assert tables.page_with_table(page) == page.read_text("utf-8"), "run python -m docs.tables"
 
 
 def test_the_gallery_has_its_films_and_they_are_short():

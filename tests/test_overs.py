@@ -155,3 +155,65 @@ def test_animated_subsets_and_deformable_rest_shapes(dressed: Path, tmp_path: Pa
     assert [len(indices.Get(time)) for time in (1.0, 4.0)] == [4, 8]
     assert len(composed.GetPrimAtPath(COAT).GetAttribute("physics:restShapePoints").Get()) == 63
     assert any("studio:mask has one entry per vertex" in str(notice) for notice in writer.notices)
+
+
+def subdividing(prim: Usd.Prim) -> dict[str, object]:
+    """Values of the renderers' attributes that subdivide a mesh, its ancestors' too."""
+    found = UsdGeom.PrimvarsAPI(prim).FindPrimvarsWithInheritance()
+    return {each.GetPrimvarName(): each.Get() for each in found if each.GetInterpolation() == "constant"}
+
+
+@pytest.mark.parametrize("mode", ["over", "sibling"])
+def test_renderers_do_not_subdivide_again(tmp_path: Path, mode: str) -> None:
+    """Arnold's, MoonRay's and Redshift's attributes, animated or from an ancestor, are off; others stay."""
+    path, out, types = tmp_path / "shot.usda", tmp_path / "out.usdc", Sdf.ValueTypeNames
+    stage = make_shot(path)
+    mesh, rig = (UsdGeom.PrimvarsAPI(stage.GetPrimAtPath(each)) for each in (COAT, "/World/rig"))
+    mesh.CreatePrimvar("arnold:subdiv_type", types.String, "constant").Set("catclark")
+    mesh.CreatePrimvar("arnold:subdiv_iterations", types.UChar, "constant").Set(3, 1.0)
+    rig.CreatePrimvar("moonray:mesh_resolution", types.Float, "constant").Set(8.0)
+    rig.CreatePrimvar("redshift:object:RS_objprop_rstess_enable", types.Bool, "constant").Set(True)
+    mesh.CreatePrimvar("karma:object:dicingquality", types.Float, "constant").Set(2.0)
+    stage.GetPrimAtPath(COAT).CreateAttribute("arnold:subdiv_type", types.Token).Set("catclark")
+    stage.Save()
+    writer = write_shot(open_shot(str(path), level=1), out, mode=mode)
+    composed = open_over(path, out)
+    prim = composed.GetPrimAtPath(str(writer.targets[0]))
+    assert subdividing(prim) == {
+        "arnold:subdiv_type": "none",
+        "arnold:subdiv_iterations": 0,
+        "moonray:mesh_resolution": 1.0,
+        "redshift:object:RS_objprop_rstess_enable": False,
+        "karma:object:dicingquality": 2.0,
+    }
+    assert prim.GetAttribute("arnold:subdiv_type").Get() == "none"
+    assert prim.GetAttribute("primvars:arnold:subdiv_iterations").Get(1.0) == 0
+    assert errors(out) == []
+    assert sum("arnold:subdiv_iterations" in str(note) for note in writer.notes) == 1
+    layer = Sdf.Layer.FindOrOpen(str(out))
+    layer.GetAttributeAtPath(f"{writer.targets[0]}.primvars:arnold:subdiv_type").default = "catclark"
+    layer.Save()
+    assert any("a render subdivides again" in error for error in errors(out))
+
+
+def test_vectors_of_the_coarse_surface_are_blocked_and_names_of_faces_carried(tmp_path: Path) -> None:
+    path, out, types = tmp_path / "shot.usda", tmp_path / "out.usdc", Sdf.ValueTypeNames
+    stage = make_shot(path)
+    make = UsdGeom.PrimvarsAPI(stage.GetPrimAtPath(COAT)).CreatePrimvar
+    for name in ("tangents", "bitangents", "tangentu", "velocities", "accelerations"):
+        make(name, types.Vector3fArray, "vertex").Set([(1, 0, 0)] * 20)
+    make("crypto_asset", types.StringArray, "uniform").Set([f"part{face % 3}" for face in range(12)])
+    make("lightgroup", types.IntArray, "uniform").Set(list(range(12)))
+    make("tangentScale", types.FloatArray, "vertex").Set([1.0] * 20)
+    stage.Save()
+    writer = write_shot(open_shot(str(path), level=1), out)
+    composed = open_over(path, out)
+    prim = composed.GetPrimAtPath(COAT)
+    api = UsdGeom.PrimvarsAPI(prim)
+    names = {each.GetPrimvarName() for each in api.GetPrimvarsWithAuthoredValues()}
+    assert names == {"crypto_asset", "lightgroup", "tangentScale"}
+    groups = list(api.GetPrimvar("lightgroup").ComputeFlattened())
+    assert sorted(groups) == sorted(list(range(12)) * 4)
+    assert list(api.GetPrimvar("crypto_asset").ComputeFlattened()) == [f"part{face % 3}" for face in groups]
+    assert ["tangentu" in str(note) for note in writer.notes] == [True]
+    assert errors(out) == []

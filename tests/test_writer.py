@@ -142,7 +142,7 @@ def fine_map(levels: int = 2, *, dropped: int | None = None) -> FineMap:
     kept = np.array([face for face in range(len(COUNTS)) if face != dropped])
     indices = INDICES.reshape(-1, 4)[kept].reshape(-1)
     cage = PolygonMesh(COUNTS[kept], indices, len(POINTS))
-    return FineMap(cage, subdivide_times(cage, levels), COUNTS, kept)
+    return FineMap(cage, subdivide_times(cage, levels), COUNTS, kept, indices=INDICES)
 
 
 @pytest.mark.parametrize(("dropped", "indexed"), [(None, True), (2, False)])
@@ -294,3 +294,25 @@ def test_no_area_takes_the_neighbours_and_stays_unit() -> None:
     normals = VertexNormals(mesh)(points)
     np.testing.assert_allclose(normals[:4], np.tile([0, 0, 1], (4, 1)), atol=1e-6)
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("level", [0, 1])
+def test_corners_given_twice_leave_no_faces_without_area(tmp_path: Path, level: int) -> None:
+    """Triangles given as quads: the layer is that of the triangles, values at corners too."""
+    stages = []
+    for name, last in (("twice", [0, 1, 6, 6, 0, 6, 5, 5]), ("clean", [0, 1, 6, 0, 6, 5])):
+        path = tmp_path / f"{name}.usda"
+        stage = make_shot(path)
+        mesh = UsdGeom.Mesh(stage.GetPrimAtPath(COAT))
+        corners = 4 if name == "twice" else 3
+        indices = [*last, *mesh.GetFaceVertexIndicesAttr().Get()[4:]]
+        mesh.GetFaceVertexCountsAttr().Set([corners, corners, *[4] * 11])
+        mesh.GetFaceVertexIndicesAttr().Set(indices)
+        uv = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar("st", Sdf.ValueTypeNames.TexCoord2fArray, "faceVarying")
+        uv.Set([(float(p[0]), float(p[1])) for p in np.asarray(mesh.GetPointsAttr().Get())[indices]])
+        stage.Save()
+        stages.append(open_over(path, write_layer(path, tmp_path / f"{name}.usdc", level=level)))
+        assert errors(tmp_path / f"{name}.usdc") == []
+    for name in ("points", "faceVertexCounts", "faceVertexIndices", "normals", "primvars:st"):
+        found, expected = (np.asarray(each.GetPrimAtPath(COAT).GetAttribute(name).Get(1.0)) for each in stages)
+        np.testing.assert_array_equal(found, expected)

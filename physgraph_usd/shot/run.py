@@ -32,7 +32,7 @@ from .frames import CHUNK, FrameFolder, Outcome, frames_folder
 from .notes import of_energy, of_folds, of_rest
 from .options import RefineOptions
 from .processes import Start, separate_processes
-from .report import LOG, RefineReport
+from .report import LOG, RefineReport, of_a_kind
 from .settled import unsettled_frames
 from .skin import Shown, frames_compared, of_polygons, shown_through
 from .solve import Outcomes, ShotSolver
@@ -234,6 +234,7 @@ class Run:
         if writer is not None:
             writer.close(lacking=lacking)
             report.warn(*map(str, writer.notices))
+            report.note(*of_a_kind(map(str, writer.notes)))
         report.seconds["close"] = clock.perf_counter() - start
         report.seconds["write"] = written
         report.warn(*of_frames(report))

@@ -96,6 +96,13 @@ def first_value(attribute: Usd.Attribute) -> Any:
     return next((value for value in later if value is not None and np.size(value)), first)
 
 
+def authored_topology(prim: Usd.Prim) -> tuple[np.ndarray, np.ndarray]:
+    """Corners of each face of a mesh, shape (F,), and the vertices of all corners, shape (C,), at the first sample."""
+    mesh = UsdGeom.Mesh(prim)
+    counts, indices = mesh.GetFaceVertexCountsAttr(), mesh.GetFaceVertexIndicesAttr()
+    return np.asarray(first_value(counts)), np.asarray(first_value(indices))
+
+
 @dataclass(frozen=True, eq=False)
 class GarmentSource:
     """The place of one garment on its stage; same order as ``Scene.garments``.

@@ -20,9 +20,9 @@ from ..read.skinning import skel_root
 from ..stage import at_time, paths_in, root_metadata, timecode
 from ..times import FrameGrid, is_among, motion_of
 from ..view import StageView
+from ..write.attribute_rules import BLOCKED, EMPTIED, action_on, values_off, with_action
 from ..write.normals import VertexNormals
-from ..write.overs import EMPTIED
-from ..write.primvars import STALE
+from ..write.primvars import INFLUENCES
 from ..write.track import HEAT, PREFIX, extent_of
 
 TOGETHER = ("points", "faceVertexCounts", "faceVertexIndices", "extent", "normals", "subdivisionScheme")
@@ -207,7 +207,7 @@ def primvars(fine: Fine) -> Iterator[Problem]:
     sizes = fine.sizes
     for primvar in UsdGeom.PrimvarsAPI(fine.prim).GetPrimvarsWithAuthoredValues():
         name, interpolation = primvar.GetAttr().GetName(), primvar.GetInterpolation()
-        if name in STALE or not primvar.GetTypeName().isArray or interpolation not in sizes:
+        if action_on(primvar.GetAttr()) == BLOCKED or not primvar.GetTypeName().isArray or interpolation not in sizes:
             continue
         for time in (each for each in fine.times if each is None or each in primvar.GetTimeSamples()):
             if fault := _primvar_fault(primvar, time, sizes[interpolation]):
@@ -279,10 +279,13 @@ def leftovers(fine: Fine) -> Iterator[Problem]:
     """Nothing that belonged to the coarse topology shows through."""
     if fine.value("subdivisionScheme", None) != "none":
         yield fine.problem("subdivisionScheme", f"is {fine.value('subdivisionScheme', None)!r}, not 'none'")
-    for name in EMPTIED:
-        for time in (None, *fine.prim.GetAttribute(name).GetTimeSamples()):
-            if len(fine.entries(name, time)):
-                yield fine.problem(name, "still holds the coarse mesh's entries", time)
+    for attribute in with_action(fine.prim, EMPTIED):
+        for time in (None, *attribute.GetTimeSamples()):
+            if len(fine.entries(attribute.GetName(), time)):
+                yield fine.problem(attribute.GetName(), "still holds the coarse mesh's entries", time)
+    for attribute, off in values_off(fine.prim):
+        if (value := attribute.Get()) != off:
+            yield fine.problem(attribute.GetName(), f"is {value!r}, not {off!r}: a render subdivides again")
     if fine.prim.GetAttribute("accelerations").HasAuthoredValue():
         yield fine.problem("accelerations", "still holds the coarse mesh's values")
     if fine.prim.GetAttribute("primvars:normals").HasAuthoredValue():
@@ -310,7 +313,7 @@ def skinning(fine: Fine) -> Iterator[Problem]:
     cut_off = skeleton and skeleton.HasAuthoredTargets() and not skeleton.GetTargets()
     if UsdSkel.BindingAPI(fine.prim) and not cut_off:
         yield fine.problem("", "SkelBindingAPI is still applied; the mesh would be skinned twice")
-    for name in STALE[1:]:
+    for name in INFLUENCES:
         if len(fine.entries(name, None)):
             yield fine.problem(name, "still holds influences; the mesh would be skinned twice")
 

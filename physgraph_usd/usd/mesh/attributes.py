@@ -64,11 +64,25 @@ def corner_values(
     return chain[-1].mesh.indices, vertex_values(chain, values)
 
 
-def kept_corners(counts: np.ndarray, kept: np.ndarray) -> np.ndarray:
-    """Numbers of the kept faces' corners, in order, among those of all faces, which have so many each, shape (F,)."""
+def single_corners(counts: np.ndarray, indices: np.ndarray) -> np.ndarray:
+    """Whether each corner is at another vertex than the corner before it in its face, shape (C,)."""
     counts = np.asarray(counts, np.int64)
-    before = (np.cumsum(counts) - counts)[kept] - (np.cumsum(counts[kept]) - counts[kept])
-    return np.repeat(before, counts[kept]) + np.arange(counts[kept].sum())
+    ends = np.cumsum(counts)
+    before = np.arange(-1, len(indices) - 1)
+    before[(ends - counts)[counts > 0]] = ends[counts > 0] - 1
+    return np.asarray(indices) != np.asarray(indices)[before]
+
+
+def kept_corners(counts: np.ndarray, indices: np.ndarray, kept: np.ndarray) -> np.ndarray:
+    """Numbers of the kept faces' corners, in order, without corners given twice in a row.
+
+    Args:
+        counts: Corners of each authored face, shape (F,).
+        indices: Vertices of all corners, shape (C,).
+        kept: Numbers of the kept faces, ascending.
+    """
+    of_kept = np.repeat(np.isin(np.arange(len(counts)), kept), counts)
+    return np.flatnonzero(of_kept & single_corners(counts, indices))
 
 
 def face_subset(refinements: Sequence[Refinement], faces: np.ndarray) -> np.ndarray:

@@ -1,6 +1,7 @@
 """Reads the coarse cage: a mesh prim's topology, checked, and its points at a time code, with broken points repaired.
 
-Holes and faces with fewer than three corners are left out. An unusable topology is refused.
+Holes and faces with fewer than three corners are left out, and corners given twice in a row become one. An unusable
+topology is refused.
 
 Repair: a non-finite point moves with its finite neighbours since the last good sample: its old position plus the
 neighbours' mean displacement. Without finite neighbours the point keeps its old position; without an earlier good
@@ -19,6 +20,7 @@ from pxr import Usd, UsdGeom
 from ...errors import GarmentError, counted
 from ...interrupts import leave_if_asked
 from ...solver.mesh.topology import PolygonMesh
+from ..mesh.attributes import kept_corners, single_corners
 from ..stage import Notice, value_at
 from .absence import missing_value
 
@@ -60,15 +62,17 @@ def read_cage(prim: Usd.Prim, vertex_count: int, times: Sequence[float]) -> Cage
     check_topology(path, counts, indices, vertex_count=vertex_count, time=time)
     holes = read_integers(holes_attr, time)
     valid_holes = np.unique(holes[(holes >= 0) & (holes < len(counts))])
-    keep = counts >= 3
-    notices = _left_out(path, keep, len(holes) - np.isin(holes, valid_holes).sum())
+    notices = _left_out(path, counts >= 3, len(holes) - np.isin(holes, valid_holes).sum())
+    sizes = np.bincount(np.repeat(np.arange(len(counts)), counts), single_corners(counts, indices), len(counts))
+    keep = sizes >= 3
     keep[valid_holes] = False
     if not keep.any():
         raise GarmentError(path, f"every one of its {len(counts)} faces is a hole", remedy="clear holeIndices")
     _refuse_large_faces(path, counts, indices, keep)
-    kept_indices = indices[np.repeat(keep, counts)]
-    mesh = PolygonMesh(counts[keep], kept_indices, vertex_count)
-    return Cage(mesh, np.flatnonzero(keep).astype(np.int32), (*notices, *_not_carried(usd), *_odd_controls(usd)))
+    kept = np.flatnonzero(keep).astype(np.int32)
+    kept_indices = indices[kept_corners(counts, indices, kept)]
+    mesh = PolygonMesh(sizes[keep].astype(np.int32), kept_indices, vertex_count)
+    return Cage(mesh, kept, (*notices, *_not_carried(usd), *_odd_controls(usd)))
 
 
 def read_integers(attribute: Usd.Attribute, time: float | None) -> np.ndarray:

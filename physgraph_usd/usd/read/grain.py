@@ -14,7 +14,7 @@ from ...solver.mesh.topology import PolygonMesh, face_normals
 from ...solver.mesh.weld import Weld
 from ...solver.scene import Grain
 from ..mesh.attributes import kept_corners
-from ..stage import first_value
+from ..stage import authored_topology
 
 SKEWED = 1.5
 """Ratio of a face's two texture stretches from which the texture coordinates count as not shape-preserving."""
@@ -76,7 +76,7 @@ def _texture_coordinates(prim: Usd.Prim, mesh: PolygonMesh, kept: np.ndarray) ->
             continue
         values = np.zeros((0, 2)) if flat is None else np.asarray(flat, np.float64)
         if primvar.GetInterpolation() == UsdGeom.Tokens.faceVarying:
-            corners = kept_corners(np.asarray(first_value(UsdGeom.Mesh(prim).GetFaceVertexCountsAttr())), kept)
+            corners = kept_corners(*authored_topology(prim), kept)
             if len(corners) == len(mesh.indices) and corners.max(initial=-1) < len(values):
                 return name, values[corners]
         elif len(values) == mesh.vertex_count and primvar.GetInterpolation() != UsdGeom.Tokens.uniform:

@@ -11,21 +11,12 @@ from ...errors import LayerError
 from ...solver.scene import Garment, GarmentFrame
 from ..schema import GARMENT, GARMENT_API, fabric_values
 from ..stage import GarmentSource, Notice, value_at
+from .attribute_rules import BLOCKED, CARRIED, EMPTIED, PREFIX, action_on, turn_off, with_action
 from .primvars import FineMap
 from .stream import LayerStream
 
 _TYPES = Sdf.ValueTypeNames
-EMPTIED = {
-    "holeIndices": _TYPES.IntArray,
-    "creaseIndices": _TYPES.IntArray,
-    "creaseLengths": _TYPES.IntArray,
-    "creaseSharpnesses": _TYPES.FloatArray,
-    "cornerIndices": _TYPES.IntArray,
-    "cornerSharpnesses": _TYPES.FloatArray,
-}
-"""Written as empty arrays if authored: a block would read as None at the default time."""
-_REWRITTEN = {"points", "normals", "velocities", "accelerations", "extent", "faceVertexCounts", "faceVertexIndices"}
-_ELSEWHERE = ("primvars:", "skel:", "xformOp", "physgraph:")
+_ELSEWHERE = (PREFIX, "skel:", "xformOp", "physgraph:")
 REST_POINTS = "physics:restShapePoints"
 
 
@@ -41,13 +32,21 @@ def author_topology(stream: LayerStream, target: Sdf.Path, prim: Usd.Prim, fine:
     path = target.AppendProperty("subdivisionScheme")
     stream.attribute(path, _TYPES.Token, uniform=True)
     stream.set(path, "none")
-    for name, type_name in EMPTIED.items():
-        if prim.GetAttribute(name).HasAuthoredValue():
-            stream.attribute(target.AppendProperty(name), type_name)
-            stream.set(target.AppendProperty(name), type(type_name.defaultValue)())
-    for name in ("velocities", "accelerations"):
-        if prim.GetAttribute(name).HasAuthoredValue():
-            stream.block(target.AppendProperty(name), _TYPES.Vector3fArray)
+    _author_rules(stream, target, prim)
+
+
+def _author_rules(stream: LayerStream, target: Sdf.Path, prim: Usd.Prim) -> None:
+    """Empty, block and turn off attributes of a coarse mesh by the table of rules; `carry_primvars` blocks primvars."""
+    for attribute in with_action(prim, EMPTIED):
+        path, kind = target.AppendProperty(attribute.GetName()), attribute.GetTypeName()
+        stream.attribute(path, kind)
+        stream.set(path, type(kind.defaultValue)())
+    for attribute in with_action(prim, BLOCKED):
+        if not attribute.GetName().startswith(PREFIX):
+            stream.block(target.AppendProperty(attribute.GetName()), attribute.GetTypeName())
+    if prim.GetAttribute("velocities").HasAuthoredValue():
+        stream.block(target.AppendProperty("velocities"), _TYPES.Vector3fArray)
+    turn_off(stream, target, prim)
 
 
 def speed_notices(prim: Usd.Prim, *, written: bool) -> list[Notice]:
@@ -71,7 +70,8 @@ def author_rest_points(stream: LayerStream, target: Sdf.Path, prim: Usd.Prim, fi
     sizes = {fine.count(kind): kind for kind in ("faceVarying", "uniform", "vertex")}
     for attribute in prim.GetAuthoredAttributes():
         name = attribute.GetName()
-        if not attribute.GetTypeName().isArray or name in EMPTIED or name in _REWRITTEN or name.startswith(_ELSEWHERE):
+        elsewhere = name.startswith(_ELSEWHERE) or action_on(attribute) not in ("", CARRIED)
+        if elsewhere or not attribute.GetTypeName().isArray:
             continue
         value = value_at(attribute, None)
         if value is None or len(value) < 2:

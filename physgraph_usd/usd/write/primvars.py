@@ -24,10 +24,11 @@ from ..mesh.attributes import (
 )
 from ..mesh.shell import Shell
 from ..stage import Notice, timecode
+from .attribute_rules import BLOCKED, action_on
 from .stream import LayerStream
 
-STALE = ("primvars:normals", "primvars:skel:jointIndices", "primvars:skel:jointWeights")
-"""Primvars hidden instead of refined: the first is replaced by our normals, the rest would skin the mesh twice."""
+INFLUENCES = ("primvars:skel:jointIndices", "primvars:skel:jointWeights")
+"""Primvars that would skin the mesh twice."""
 
 
 def carry_primvars(
@@ -46,7 +47,7 @@ def carry_primvars(
     notices = []
     for primvar in UsdGeom.PrimvarsAPI(prim).GetPrimvarsWithAuthoredValues():
         attribute = primvar.GetAttr()
-        if attribute.GetName() in STALE:
+        if action_on(attribute) == BLOCKED:
             _hide(stream, target, primvar)
         elif fine.stencil is not None and _numbers_points(primvar):
             _hide(stream, target, primvar)
@@ -63,7 +64,7 @@ def carry_primvars(
 
 def hide_influences(stream: LayerStream, target: Sdf.Path, prim: Usd.Prim) -> None:
     """Block joint influences of a prim whose points are skinned already."""
-    for name in STALE[1:]:
+    for name in INFLUENCES:
         primvar = UsdGeom.PrimvarsAPI(prim).GetPrimvar(name)
         if primvar and primvar.HasAuthoredValue():
             _hide(stream, target, primvar)
@@ -170,6 +171,7 @@ class FineMap:
         counts: np.ndarray,
         kept: np.ndarray,
         *,
+        indices: np.ndarray,
         shell: Shell | None = None,
     ) -> None:
         """Prepare the map.
@@ -178,6 +180,7 @@ class FineMap:
             refinements: Coarse to fine; empty if the fine mesh is the cage.
             counts: Authored corners per face, shape (F,), including dropped faces.
             kept: Numbers of the authored faces in the cage, shape (F_cage,).
+            indices: Authored vertices of all corners, shape (C,).
             shell: Shell of the refined sheet that is the fine mesh; None if the sheet is.
         """
         self.cage, self._shell = cage, shell
@@ -185,7 +188,7 @@ class FineMap:
         self.fine = self.sheet if shell is None else shell.mesh
         self._refinements = tuple(refinements)
         self._kept = np.asarray(kept, np.int64)
-        self._counts = counts
+        self._counts, self._indices = counts, indices
 
     @cached_property
     def stencil(self) -> sparse.csr_matrix | None:
@@ -215,7 +218,7 @@ class FineMap:
     @cached_property
     def kept_corners(self) -> np.ndarray:
         """Authored corner of each corner of the cage, shape (C,)."""
-        return kept_corners(self._counts, self._kept)
+        return kept_corners(self._counts, self._indices, self._kept)
 
     @cached_property
     def nearest_corner(self) -> np.ndarray:

@@ -25,9 +25,10 @@ from ..lookup import check_known
 from ..mesh.shell import Shell
 from ..read.absence import named_times
 from ..read.reader import Shot
-from ..stage import Notice, at_time, first_value, pxr_errors, value_at
+from ..stage import Notice, at_time, authored_topology, pxr_errors, value_at
 from ..times import within
 from . import overs
+from .attribute_rules import notes_of
 from .normals import VertexNormals
 from .overs import author_used_values
 from .primvars import FineMap, carry_primvars, carry_subsets
@@ -43,6 +44,7 @@ class LayerWriter:
 
     Attributes:
         notices: Properties hidden, emptied or changed, with the reason.
+        notes: Attributes that a render takes from elsewhere.
     """
 
     def __init__(
@@ -84,6 +86,7 @@ class LayerWriter:
         self._record = {"mode": mode} | dict(provenance or {})
         self._times, self._meshes, self._bound = times, dict[int, _RefinedMesh](), dict[int, TargetTracks]()
         self.notices: list[Notice] = []
+        self.notes: list[Notice] = []
         with ExitStack() as stack:
             self._stream = stack.enter_context(LayerStream(out, overwrite=overwrite))
             self._author_still(refinements)
@@ -105,6 +108,7 @@ class LayerWriter:
                 bound = TargetTracks(self._stream, self._shot, index, steps=refinements[index], **moves)
                 self._bound[index] = bound
                 self.notices += [*mesh.notices, *bound.notices]
+                self.notes += notes_of(self._shot.stage.GetPrimAtPath(self._shot.sources[index].path))
 
     def write(
         self,
@@ -234,11 +238,11 @@ class _RefinedMesh:
         """
         source, times = shot.sources[index], shot.scene.times
         prim, span = shot.stage.GetPrimAtPath(source.path), (times[0], times[-1]) if times else None
-        counts = np.asarray(first_value(UsdGeom.Mesh(prim).GetFaceVertexCountsAttr()))
+        counts, indices = authored_topology(prim)
         steps, self._weld = source.weld.subdivided(len(steps))
         sheet, sides = steps[-1].mesh if steps else source.weld.apart, self._weld.sides
         self._shell = Shell.of(sheet, self._weld.number) if source.shell else None
-        fine = FineMap(source.weld.apart, steps, counts, source.kept_faces, shell=self._shell)
+        fine = FineMap(source.weld.apart, steps, counts, source.kept_faces, indices=indices, shell=self._shell)
         self.notices = overs.open_instances(stream, source.path, source.instance_roots)
         self.target = target = overs.make_sibling(stream, prim) if sibling else source.path
         overs.author_topology(stream, target, prim, fine)
