@@ -17,7 +17,7 @@ from torch import Tensor
 from .fabric import Fabric
 from .grain import SHORTEST, LevelGrain, axes, edge_cosines
 from .mesh.defects import NO_AREA
-from .mesh.elements import QUAD_SPRING, ElasticElements, elastic_elements
+from .mesh.elements import QUAD_SPRING, ElasticElements, elastic_elements, hinge_geometry
 from .mesh.lengths import LENGTHS, NORMALS, ElementValues
 from .mesh.stencil import Stencil
 from .mesh.subdivide import (
@@ -604,20 +604,3 @@ def triangle_inverse(rest: np.ndarray, triangles: np.ndarray, warp: np.ndarray |
     whole = double > 1e-12 * sides
     adjugate = np.stack([d, -b, -c, a], axis=1)
     return np.where(whole, adjugate / np.where(whole, double, 1.0), 0.0)
-
-
-def hinge_corners(x: np.ndarray, hinges: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Positions of each hinge's edge, i and j, and of the middles k and l of what is opposite to it, shapes (H, 3)."""
-    i, j, k, other_k, ell, other_l = (x[hinges[:, corner]] for corner in range(6))
-    return i, j, 0.5 * (k + other_k), 0.5 * (ell + other_l)
-
-
-def hinge_geometry(x: np.ndarray, hinges: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Signed angle [rad], both triangle areas [m^2] and edge length [m] of each hinge."""
-    i, j, k, ell = hinge_corners(x, hinges)
-    axis = j - i
-    n1, n2 = np.cross(axis, k - i), np.cross(ell - i, axis)
-    length = np.linalg.norm(axis, axis=1)
-    sine = np.einsum("hc,hc->h", np.cross(n1, n2), axis) / np.maximum(length, np.finfo(float).tiny)
-    angle = np.arctan2(sine, np.einsum("hc,hc->h", n1, n2))
-    return angle, 0.5 * np.linalg.norm(n1, axis=1), 0.5 * np.linalg.norm(n2, axis=1), length

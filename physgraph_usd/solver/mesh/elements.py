@@ -115,3 +115,20 @@ def hinges_of(triangles: np.ndarray, quads: np.ndarray | None = None) -> np.ndar
     one, two = table[order[first]], table[order[first + 1]]
     hinges = np.concatenate([one, two[:, 2:]], axis=1).astype(np.int32)
     return hinges[(np.sort(hinges[:, 2:4], axis=1) != np.sort(hinges[:, 4:], axis=1)).any(axis=1)]
+
+
+def hinge_corners(x: np.ndarray, hinges: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Positions of each hinge's edge, i and j, and of the middles k and l of what is opposite to it, shapes (H, 3)."""
+    i, j, k, other_k, ell, other_l = (x[hinges[:, corner]] for corner in range(6))
+    return i, j, 0.5 * (k + other_k), 0.5 * (ell + other_l)
+
+
+def hinge_geometry(x: np.ndarray, hinges: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Signed angle [rad], both triangle areas [m^2] and edge length [m] of each hinge."""
+    i, j, k, ell = hinge_corners(x, hinges)
+    axis = j - i
+    n1, n2 = np.cross(axis, k - i), np.cross(ell - i, axis)
+    length = np.linalg.norm(axis, axis=1)
+    sine = np.einsum("hc,hc->h", np.cross(n1, n2), axis) / np.maximum(length, np.finfo(float).tiny)
+    angle = np.arctan2(sine, np.einsum("hc,hc->h", n1, n2))
+    return angle, 0.5 * np.linalg.norm(n1, axis=1), 0.5 * np.linalg.norm(n2, axis=1), length

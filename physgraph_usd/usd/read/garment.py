@@ -184,9 +184,8 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], samples: Samples, re
         flipped=is_flipped(prim, matrix),
         bent_rest=bent,
         grain=grain,
-        **_pressed(prim, weld, animation),
         fabric_scale=subsets.scale,
-        **constants | pieces | painted,
+        **constants | pieces | painted | _pressed(prim, weld, animation),
     )
     notices += [*rest.notices, *_size_notices(prim, animation.first, matrix, request), *values.notices]
     source = GarmentSource(

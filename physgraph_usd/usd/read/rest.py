@@ -19,8 +19,7 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 
 from ...errors import GarmentError, named_time
-from ...solver.level import hinge_geometry
-from ...solver.mesh.elements import elastic_elements
+from ...solver.mesh.elements import elastic_elements, hinge_geometry
 from ...solver.mesh.topology import PolygonMesh, adjacency
 from ...solver.mesh.weld import Weld
 from ...solver.scene import out_of_bounds
