@@ -265,7 +265,7 @@ def _pieces(
     return {"closed": found.closed if found.closed.any() else None, "rigid": found.rigid if count else None}
 
 
-def _pressed(prim: Usd.Prim, weld: Weld, animation: Animation) -> dict[str, np.ndarray]:
+def _pressed(prim: Usd.Prim, weld: Weld, animation: Animation) -> dict[str, Any]:
     """Pressed vertices and the pose with the folds as they rest, by field name; empty without pressed folds."""
     poses = [weld.joined(pose) for pose in animation.poses().values()]
     found = pressed_folds(weld.mesh, poses, _asked_edges(prim, weld))
