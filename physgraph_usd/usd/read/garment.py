@@ -31,7 +31,7 @@ from .skinning import Bake
 from .subsets import read_subsets
 
 PRESSED = "physgraph:pressed"
-"""Attribute of an edge subset to mark pressed folds, or folds that are not, bool."""
+"""Attribute of an edge subset to mark pressed folds, bool."""
 RIGID = "physgraph:rigid"
 """Attribute of a face subset to mark a rigid part, bool."""
 _SMALL, _LARGE = 0.01, 100.0
@@ -272,20 +272,17 @@ def _pressed(prim: Usd.Prim, weld: Weld, animation: Animation) -> dict[str, Any]
     return {} if found is None else {"pressed": found[0], "folded": found[1]}
 
 
-def _asked_edges(prim: Usd.Prim, weld: Weld) -> dict[tuple[int, int], bool]:
-    """Whether the edges in a mesh's subsets of edges are pressed, where a subset says so, by their welded vertices."""
-    asked = {}
+def _asked_edges(prim: Usd.Prim, weld: Weld) -> np.ndarray:
+    """Welded vertices of the edges in a mesh's subsets of pressed edges, lower first, ascending, shape (E, 2)."""
+    asked = [np.zeros((0, 2), np.int64)]
     for subset in UsdGeom.Subset.GetGeomSubsets(UsdGeom.Imageable(prim), UsdGeom.Tokens.edge):
-        attribute, ends = (
-            subset.GetPrim().GetAttribute(PRESSED),
-            subset.GetIndicesAttr().Get(Usd.TimeCode.EarliestTime()),
-        )
-        if not attribute or attribute.Get() is None or ends is None:
-            continue
-        ends = np.asarray(ends)[: len(ends) // 2 * 2].reshape(-1, 2)
-        ends = ends[((ends >= 0) & (ends < len(weld.number))).all(axis=1)]
-        asked |= {(int(low), int(high)): bool(attribute.Get()) for low, high in np.sort(weld.number[ends], axis=1)}
-    return asked
+        attribute = subset.GetPrim().GetAttribute(PRESSED)
+        ends = subset.GetIndicesAttr().Get(Usd.TimeCode.EarliestTime())
+        if attribute and attribute.Get() and ends is not None:
+            ends = np.asarray(ends)[: len(ends) // 2 * 2].reshape(-1, 2)
+            ends = ends[((ends >= 0) & (ends < len(weld.number))).all(axis=1)]
+            asked.append(np.sort(weld.number[ends], axis=1))
+    return np.unique(np.concatenate(asked), axis=0)
 
 
 def _words(prim: Usd.Prim, subsets: Sequence[str]) -> tuple[str, ...]:

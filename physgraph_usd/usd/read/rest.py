@@ -9,18 +9,18 @@ garment at its first time code, or by a skinned garment's bind transform.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from pxr import Sdf, Usd, UsdGeom
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
 from ...errors import GarmentError, named_time
 from ...solver.mesh.elements import elastic_elements, hinge_geometry
-from ...solver.mesh.topology import PolygonMesh, adjacency
+from ...solver.mesh.topology import PolygonMesh, adjacency, find_edges
 from ...solver.mesh.weld import Weld
 from ...solver.scene import out_of_bounds
 from ...solver.strain import COLLAPSED
@@ -42,9 +42,6 @@ SMOOTHNESS, SMOOTH_STEPS = (1.0, 0.3, 0.1, 0.03, 0.01, 0.003, 0.001), 25
 1,146 fine edges of a walking shirt rest at lengths over 15% off the cage's, with it 23; of a kilt 2,754 and 76."""
 HOLD = 1e-6
 """Stiffness holding a fitted shape in place, in mean stiffnesses: makes the matrix regular, keeps lengths."""
-FOLDED, ALIKE, MOST_POSES, FEWEST = np.radians(90.0), np.radians(30.0), 0.75, 3
-"""Angles of an edge that is pressed [rad]: the least, and the most off its median; in this fraction of the poses, of
-which there are this many at least."""
 SHORTEST = 1e-3
 """Length, in mean edges, below which edges pull no harder."""
 _AUTHORED = ("physics:restShapePoints", "primvars:rest", "primvars:Pref")
@@ -324,37 +321,28 @@ def median_shape(mesh: PolygonMesh, poses: Sequence[np.ndarray]) -> tuple[np.nda
 
 
 def pressed_folds(
-    mesh: PolygonMesh, poses: Sequence[np.ndarray], asked: Mapping[tuple[int, int], bool]
+    mesh: PolygonMesh, poses: Sequence[np.ndarray], asked: Int[np.ndarray, "edges 2"]
 ) -> tuple[Bool[np.ndarray, " vertices"], Float[np.ndarray, "vertices 3"]] | None:
     """Vertices at pressed folds, and the pose that has the folds as they rest.
-
-    An edge that is folded sharply, and alike, in most poses is pressed, such as a collar over its stand, a cuff, a hem
-    turned over; wrinkles wander.
 
     Args:
         mesh: The welded mesh.
         poses: Positions of its vertices, each of shape (V, 3).
-        asked: Whether edges are pressed by their artist's word, by their vertices, lower first.
+        asked: Vertices of the edges that are pressed, lower first.
 
     Returns:
         Whether each vertex is at a pressed edge, and the pose nearest to the median angles; None without pressed edges.
     """
-    if not poses or (len(poses) < FEWEST and not asked):
+    if not poses or not len(asked):
         return None
     elements = elastic_elements(mesh, mesh.triangulate(poses[0]), poses[0])
     hinges = elements.hinges[~elements.twists]
-    angles = np.array([hinge_geometry(pose, hinges)[0] for pose in poses])
-    median = np.median(angles, axis=0)
-    alike = (np.abs(angles) > FOLDED) & (np.abs(angles - median) < ALIKE)
-    pressed = (alike.mean(axis=0) >= MOST_POSES) & (len(poses) >= FEWEST)
-    ends = np.sort(hinges[:, :2], axis=1)
-    pressed = np.array(
-        [asked.get((int(low), int(high)), found) for (low, high), found in zip(ends, pressed, strict=True)], bool
-    )
-    if not pressed.any():
+    hinges = hinges[find_edges(asked, np.sort(hinges[:, :2], axis=1)) >= 0]
+    if not len(hinges):
         return None
-    nearest = np.abs(angles - median)[:, pressed].sum(axis=1).argmin()
-    return np.isin(np.arange(mesh.vertex_count), ends[pressed]), np.asarray(poses[nearest])
+    angles = np.array([hinge_geometry(pose, hinges)[0] for pose in poses])
+    nearest = np.abs(angles - np.median(angles, axis=0)).sum(axis=1).argmin()
+    return np.isin(np.arange(mesh.vertex_count), hinges[:, :2]), np.asarray(poses[nearest])
 
 
 def _bent(mesh: PolygonMesh) -> sparse.csr_matrix:
