@@ -65,7 +65,7 @@ def refine(
 
 
 def _check_seams(layers: Sequence[Path], bound: float | None, *, openjd: bool) -> None:
-    """Say how far the seams of chunks to those beside them move, and fail where one moves too far."""
+    """Print how far seams between neighbouring chunks move; exit with an error beyond the bound."""
     if bound is None:
         return
     from ..shot.stitch import check_seams

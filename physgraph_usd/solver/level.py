@@ -303,7 +303,7 @@ def _pressed_angles(
     garment: Garment, elements: ElasticElements, *, linear: sp.csr_matrix, smoothing: sp.csr_matrix
 ) -> np.ndarray:
     """Rest angles of pressed folds [rad], shape (H,): those of the smooth folded cage, fading within a cage edge."""
-    if garment.pressed is None or garment.folded is None or garment.bent_rest:
+    if garment.pressed is None or garment.folded is None:
         return np.zeros(len(elements.hinges))
     angle = hinge_geometry(np.asarray(smoothing @ garment.folded), elements.hinges)[0]
     share = np.asarray(linear @ garment.pressed.astype(np.float64))
@@ -424,7 +424,7 @@ def _join(
     device: str,
     threads: int,
 ) -> Level:
-    """Concatenate garments into one level and measure its rest shape."""
+    """Concatenate garments into one level, with lengths, areas and angles at rest."""
     counts = [part.vertex_count for part in parts]
     starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
     elements = {
@@ -504,7 +504,7 @@ def _measured(
     sides = find_edges(springs, triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2))
     at_hinges = mean_at(sides, of_bend, len(springs))[find_edges(springs, hinges[:, :2])]
     return shape | {
-        "rest_angle": shape["rest_angle"] + pressed,
+        "rest_angle": np.where(bent, shape["rest_angle"], pressed),
         "rest": np.concatenate([part.rest for part in parts]),
         "membrane_inverse": triangle_inverse(corners, apart, vectors[:, 2]),
         "spring_scale": stretch[springs].mean(axis=1) * mean_at(sides, of_stretch, len(springs)),

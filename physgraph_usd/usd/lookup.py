@@ -26,7 +26,7 @@ USER_PROPERTIES = "userProperties:"
 PRESET = "preset"
 """Name by which ``--set`` takes the values of a preset, as in ``preset=denim``."""
 _OWN = ("thickness", "rest:warpEase", "rest:weftEase")
-"""Values that a preset without such a value of its own leaves as the garment has them."""
+"""Garment values kept under a preset that has no thickness or ease."""
 
 
 @dataclass(frozen=True)

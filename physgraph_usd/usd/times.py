@@ -86,7 +86,7 @@ class Motion:
 
 
 def motion_of(prim: Usd.Prim, *, shape: bool = True) -> Motion:
-    """Motion of a prim by its transforms, before which its form counts, if ``shape``."""
+    """Motion of a prim by its transforms and, if ``shape``, by its form, whose time codes come first in `merge`."""
     form = [prim.GetAttribute(name) for name in _SHAPE if shape and prim.HasAttribute(name)]
     ops = [op for transform in transform_chain(prim) for op in transform.GetOrderedXformOps()]
     turning = [op.GetOpTypeToken(op.GetOpType()).startswith(_TURNING) for op in ops]
@@ -95,7 +95,7 @@ def motion_of(prim: Usd.Prim, *, shape: bool = True) -> Motion:
 
 
 def motion_by(attribute: Usd.Attribute, *, turns: bool = False) -> Motion:
-    """Motion by an attribute: its samples, or the knots of its spline; on arcs if it turns what it moves."""
+    """Motion by an attribute: its time samples or spline knots; arcs between samples of a rotation."""
     has_spline, get_spline = (getattr(attribute, name, None) for name in ("HasSpline", "GetSpline"))
     if has_spline is not None and get_spline is not None and has_spline():
         knots = sorted(float(time) for time in get_spline().GetKnots().keys())
@@ -109,10 +109,10 @@ def motion_by(attribute: Usd.Attribute, *, turns: bool = False) -> Motion:
 
 
 def solve_times(cloth: Motion, bodies: Iterable[Motion], frames: FrameGrid) -> tuple[float, ...]:
-    """Time codes at which a garment is solved, ascending: its own, and whole frames between them.
+    """Time codes at which a garment is solved, ascending: the garment's samples, and whole frames between two samples.
 
-    Whole frames are those on an arc of the garment or of a body it meets, and those at which such a body has a sample.
-    A garment that stands still has its bodies' samples as its own.
+    Whole frames are solved on arcs of the garment or of touching bodies, and at samples of touching bodies. A still
+    garment takes the samples of touching bodies.
     """
     moves = len(cloth.times) > 1
     if moves and not any(frames.inside(*span) for span in pairwise(cloth.times)):

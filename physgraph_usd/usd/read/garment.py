@@ -267,8 +267,9 @@ def _pieces(
 
 def _pressed(prim: Usd.Prim, weld: Weld, animation: Animation) -> dict[str, Any]:
     """Pressed vertices and the pose with the folds as they rest, by field name; empty without pressed folds."""
-    poses = [weld.joined(pose) for pose in animation.poses().values()]
-    found = pressed_folds(weld.mesh, poses, _asked_edges(prim, weld))
+    asked = _asked_edges(prim, weld)
+    poses = [weld.joined(pose) for pose in animation.poses().values()] if len(asked) else []
+    found = pressed_folds(weld.mesh, poses, asked)
     return {} if found is None else {"pressed": found[0], "folded": found[1]}
 
 

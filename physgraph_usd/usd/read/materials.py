@@ -150,7 +150,7 @@ def _materials_of_most(prim: Usd.Prim) -> list[Usd.Prim]:
 def values_by(
     prim: Usd.Prim, mesh: Usd.Prim, materials: Sequence[Usd.Prim], *, units: Units, overrides: Sequence[Override] = ()
 ) -> Values:
-    """The values of a garment or of one of its subsets, by their materials, the first one first."""
+    """Fabric values of a garment or a subset of faces; the first material with a value gives the value."""
     found = {name: find_value(prim, GARMENT[name], overrides, materials=materials) for name in _FRAME_VALUES}
     open_rows = [name for name in _FRAME_VALUES if found[name].source == "fallback"]
     relative, notices = None, ()

@@ -537,7 +537,7 @@ def _read(
 def _times(
     stage: Usd.Stage, contacts: Mapping[Sdf.Path, _Contact], bodies: Sequence[Sdf.Path], *, bake: Bake
 ) -> tuple[dict[Sdf.Path, tuple[float, ...]], dict[Sdf.Path, tuple[float, ...]]]:
-    """Each garment's own time codes, and those at which it is solved, by path."""
+    """Sample time codes and solved time codes of each garment, by path."""
     frames, known = FrameGrid.of(stage), {*bodies}
 
     @cache

@@ -103,7 +103,7 @@ def _ratio(value: float, own: float) -> float:
 
 
 def _in_words(fabric: Fabric, other: Fabric, ratios: list[float]) -> str:
-    """Which values of another fabric are multiples of a garment's, and which are not used."""
+    """Multiples of the garment's stretch, bending and density, and the unused values, in words."""
     stretch, bend, density = ratios
     shear, weft_stretch = (None if each is None else stretch * each for each in (fabric.shear, fabric.weft_stretch))
     scaled = replace(

@@ -57,17 +57,17 @@ RULES = (
     Rule(("*moonray:mesh_resolution",), OFF, "subdivided already", noted=True, number=1),
     Rule((f"{PREFIX}*", "physics:restShapePoints"), CARRIED, "words and integers copied, constants kept"),
 )
-"""The first that fits an attribute holds; attributes that none fits stay as authored."""
+"""Rules in order of precedence; attributes without a rule stay as authored."""
 
 
 def rule_of(name: str) -> Rule | None:
-    """The rule of an attribute by its name; None where it stays as authored."""
+    """First rule that matches an attribute's name; None for attributes that stay as authored."""
     fits = (rule for rule in RULES if any(fnmatchcase(name.lower(), pattern.lower()) for pattern in rule.names))
     return next(fits, None)
 
 
 def action_on(attribute: Usd.Attribute) -> str:
-    """Action on an attribute; "" where it stays as authored."""
+    """Action on an attribute; "" for an attribute that stays as authored."""
     rule = rule_of(attribute.GetName())
     return "" if rule is None or (rule.action == OFF and attribute.GetTypeName().isArray) else rule.action
 
