@@ -1,8 +1,9 @@
-"""The films of docs/gallery.md: smooth subdivision of a sample's cage beside the refined cloth.
+"""The films of docs/gallery.md: smooth subdivision of a shot's cage beside the refined cloth.
 
-    python -m benchmarks.films docs/films [NAME...]
+    python -m benchmarks.films docs/films [NAME...] [--folder SHOTS]
 
-Refines some frames of a sample at level 2 and writes NAME.mp4, a loop, and NAME.jpg, one of its frames. Prints how
+Refines some frames of a sample, or of a real shot below the folder, at level 2 and writes NAME.mp4, a loop, and
+NAME.jpg, one of its frames. Prints how
 many frames did not settle, the median time a frame, and the edges through faces of cloth and of bodies in all frames of
 both sides, counted by `benchmarks.crossing_count`. Takes the program ffmpeg with libx264. The dancer is also written as
 an animated picture, for README.md.
@@ -19,12 +20,13 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import click
 import numpy as np
 from PIL import Image, ImageDraw
 
 from benchmarks.crossing_count import crossing_count
 from benchmarks.rows import say
-from benchmarks.shots import opened, problem_of
+from benchmarks.shots import problem_of
 from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.page.drawing import View, draw, fit_view
@@ -32,6 +34,7 @@ from physgraph_usd.shot.page.preview import label
 from physgraph_usd.shot.refine import refine_shot
 from physgraph_usd.shot.solve import prepare_device
 from physgraph_usd.usd.read.meshes import DrawnMesh, DrawnStage
+from physgraph_usd.usd.read.reader import open_shot
 
 LEVEL, PANEL, QUALITY = 2, (480, 540), "25"
 """Subdivisions, one side's size [pixels], and x264's rate factor."""
@@ -41,7 +44,7 @@ LOOP, QUADS = "Cage, Loop subdivision", "Cage, Catmull-Clark subdivision"
 
 @dataclass(frozen=True)
 class Shown:
-    """What of a sample is filmed.
+    """What of a shot is filmed.
 
     Attributes:
         frames: First and last time code.
@@ -49,6 +52,11 @@ class Shown:
         still: Time code of the picture that stands for the film.
         title: Of the left side.
         rate: Frames a second; shots have 24.
+        source: Path of a real shot below the folder; "" for the sample of the film's name.
+        garments: Prim paths of the garments; () for all that are tagged.
+        bodies: Prim paths of the bodies, likewise.
+        presets: Values, as `--set` takes them.
+        near: Heights between which the picture is filled, as fractions of the whole's; None for the whole.
     """
 
     frames: tuple[float, float]
@@ -56,8 +64,25 @@ class Shown:
     still: float
     title: str = LOOP
     rate: int = 12
+    source: str = ""
+    garments: tuple[str, ...] = ()
+    bodies: tuple[str, ...] = ()
+    presets: tuple[str, ...] = ()
+    near: tuple[float, float] | None = None
 
 
+WALK = Shown(
+    (1001.0, 1036.0),
+    (35.0, 6.0),
+    1018.0,
+    QUADS,
+    source="20_trousers_belt_shirt_walk_cm.usdc",
+    garments=("/char/cloth/shirt", "/char/cloth/trousers", "/char/cloth/belt"),
+    bodies=("/char/skin/body",),
+    presets=tuple(
+        f"/char/cloth/{each}" for each in ("shirt.preset=cotton", "trousers.preset=denim", "belt.preset=leather")
+    ),
+)
 SHOWN = {
     "dancer": Shown((1.0, 60.0), (20.0, 7.0), 33.0, QUADS, 24),
     "tshirt": Shown((1.0, 36.0), (15.0, 8.0), 17.0, QUADS),
@@ -66,8 +91,20 @@ SHOWN = {
     "skirt": Shown((1.0, 32.0), (25.0, 6.0), 24.0),
     "flag": Shown((1.0, 30.0), (25.0, 10.0), 24.0, QUADS),
     "block": Shown((1.0, 24.0), (40.0, 22.0), 16.0, QUADS),
+    "walk": WALK,
+    "walk_near": replace(WALK, camera=(15.0, 4.0), near=(0.42, 0.72)),
+    "coat": Shown(
+        (1001.0, 1040.0),
+        (30.0, 6.0),
+        1020.0,
+        QUADS,
+        source="21_open_coat_skinned.usdc",
+        garments=("/shot/hero/geo/coat",),
+        bodies=("/shot/hero/geo/body",),
+        presets=("preset=wool",),
+    ),
 }
-"""The films by sample."""
+"""The films by name."""
 
 README = "dancer"
 """The film that README.md shows: pages of repositories play animated pictures, no films."""
@@ -75,26 +112,40 @@ README = "dancer"
 Side = list[DrawnMesh]
 
 
-def main() -> None:
-    """Film the samples."""
+@click.command()
+@click.argument("out", type=click.Path(file_okay=False, path_type=Path))
+@click.argument("names", nargs=-1, type=click.Choice(list(SHOWN)))
+@click.option("--folder", type=click.Path(exists=True, file_okay=False, path_type=Path), help="Real shots.")
+def main(out: Path, names: Sequence[str], folder: Path | None) -> None:
+    """Film the shots; without the folder, samples alone."""
     prepare_device("cpu")
-    out = Path(sys.argv[1])
     out.mkdir(parents=True, exist_ok=True)
-    for name in sys.argv[2:] or SHOWN:
-        with tempfile.TemporaryDirectory() as folder:
-            film(name, SHOWN[name], Path(folder), out / f"{name}.mp4")
+    for name in names or SHOWN:
+        shown = SHOWN[name]
+        if shown.source and folder is None:
+            say(f"{name} is left out: it is a real shot; give --folder")
+            continue
+        with tempfile.TemporaryDirectory() as place:
+            shot = (folder or Path()) / shown.source if shown.source else write_sample(name, Path(place))
+            film(name, shot, shown, Path(place) / "refined.usdc", out / f"{name}.mp4")
 
 
-def film(name: str, shown: Shown, folder: Path, out: Path) -> None:
-    """Refine a sample, draw each frame of it, and print its figures."""
-    shot, layer = write_sample(name, folder), folder / "refined.usdc"
-    report = refine_shot(shot, layer, RefineOptions(frames=shown.frames, level=LEVEL))
+def film(name: str, shot: Path, shown: Shown, layer: Path, out: Path) -> None:
+    """Refine a shot into a layer, draw each of its frames, and print its figures."""
+    options = RefineOptions(
+        frames=shown.frames,
+        level=LEVEL,
+        garments=shown.garments,
+        colliders=shown.bodies,
+        overrides=shown.presets,
+    )
+    report = refine_shot(shot, layer, options)
     garments = [each["path"] for each in report.garments]
     fine = DrawnStage(shot, layer)
     times = fine.times(tuple(garments))
     fine.bake(times)
     refined = (fine.meshes(time, cages=garments) for time in times)
-    sides = list(zip(times, smooth(name, fine, times, garments), refined, strict=True))
+    sides = list(zip(times, smooth(shot, fine, times, garments), refined, strict=True))
     columns = ([left for _, left, _ in sides], [right for _, _, right in sides])
     counts = [sum(crossings(side, garments) for side in column) for column in columns]
     seconds = statistics.median(sum(each["garments"][0]["milliseconds"].values()) for each in report.frames) / 1e3
@@ -109,13 +160,13 @@ def film(name: str, shown: Shown, folder: Path, out: Path) -> None:
         first.save(out.with_suffix(".webp"), quality=55, method=3, **moving)
 
 
-def smooth(name: str, fine: DrawnStage, times: Sequence[float], garments: Sequence[str]) -> Iterator[Side]:
-    """The fine meshes at the places that Loop's rules give them, one side a time."""
-    shot = opened(name, LEVEL)
-    problem = problem_of(shot)
+def smooth(shot: Path, fine: DrawnStage, times: Sequence[float], garments: Sequence[str]) -> Iterator[Side]:
+    """The fine meshes at the places that the rules of subdivision give them, one side a time."""
+    coarse = open_shot(str(shot), level=LEVEL, garments=garments)
+    problem = problem_of(coarse)
     for time in times:
-        places = problem.upsampled(shot.frame(time), smooth=True)
-        points = {garment.path: each for garment, each in zip(shot.scene.garments, places, strict=True)}
+        places = problem.upsampled(coarse.frame(time), smooth=True)
+        points = {garment.path: each for garment, each in zip(coarse.scene.garments, places, strict=True)}
         yield [replace(mesh, points=points.get(mesh.path, mesh.points)) for mesh in fine.meshes(time, cages=garments)]
 
 
@@ -141,8 +192,11 @@ def edges_of(mesh: DrawnMesh) -> np.ndarray:
 def pictures(sides: Sequence[tuple[float, Side, Side]], shown: Shown) -> Iterator[tuple[float, np.ndarray]]:
     """The pixels at each time, both sides from one camera."""
     points = np.concatenate([mesh.points for _, _, side in sides for mesh in side])
-    view: View = fit_view(points, PANEL[0] / PANEL[1], azimuth=shown.camera[0], elevation=shown.camera[1])
     floor = float(points[:, 1].min()) - 0.02
+    if shown.near is not None:
+        low, high = floor + np.array(shown.near) * np.ptp(points[:, 1])
+        points = points[(points[:, 1] > low) & (points[:, 1] < high)]
+    view: View = fit_view(points, PANEL[0] / PANEL[1], azimuth=shown.camera[0], elevation=shown.camera[1])
     for time, *both in sides:
         sheet = Image.new("RGB", (2 * PANEL[0], PANEL[1]))
         pen = ImageDraw.Draw(sheet)
