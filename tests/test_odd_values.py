@@ -9,6 +9,7 @@ import pytest
 from fuzz.damage import replace
 from layers import COAT, dress_up, errors, make_shot, write_layer
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, Vt
+from shots import refine
 from stages import COLLIDER_API, add_sheet, new_stage, save, sheet_shot
 
 from physgraph_usd.errors import GarmentError, StageError
@@ -60,6 +61,15 @@ def test_a_rest_shape_that_is_no_array_is_refused_by_name(tmp_path: Path, name: 
     retype(stage, f"{CLOTH}.{name}", kind, value)
     with pytest.raises(GarmentError, match=f"<{CLOTH}>.*{name}.*not an array of positions"):
         open_shot(save(stage))
+
+
+def test_a_body_whose_faces_are_a_single_number_is_left_out_by_name(tmp_path: Path):
+    stage = new_stage(tmp_path / "s.usda")
+    add_sheet(stage, CLOTH)
+    add_sheet(stage, "/World/floor", tagged=False).GetPrim().AddAppliedSchema(COLLIDER_API)
+    retype(stage, "/World/floor.faceVertexIndices", "int", 7)
+    report = refine(save(stage), tmp_path / "fine.usdc", level=1, steps=1)
+    assert any("its points and faces do not fit together" in str(each) for each in report.warnings)
 
 
 @pytest.mark.parametrize("scale", [1e150, 1e-150])

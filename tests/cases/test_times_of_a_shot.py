@@ -236,3 +236,15 @@ class TestRoundedTimes:
     def test_are_told_apart_in_messages(self, shot: Path):
         with pytest.raises(AbsentError, match=r"frames 1004.002:1005; its 4 samples run from 1000.99997 to 1003.9"):
             open_shot(str(shot), frames=(1004.002, 1005.0))
+
+
+def test_cloth_that_stands_still_is_solved_where_a_prototype_moves(tmp_path: Path):
+    stage = new_stage(tmp_path / "shot.usda")
+    flat(stage)
+    rocks = UsdGeom.PointInstancer.Define(stage, "/World/rocks")
+    add_ball(stage, "/World/rocks/ball", {1.0: (0.0, 0.0, 0.0), 2.0: (0.0, 0.01, 0.0), 3.0: (0.0, 0.0, 0.0)})
+    rocks.CreatePrototypesRel().SetTargets(["/World/rocks/ball"])
+    rocks.CreateProtoIndicesAttr([0])
+    rocks.CreatePositionsAttr([(0.0, 0.0, 0.0)])
+    shot = open_shot(save(stage), colliders=("/World/rocks",))
+    assert shot.scene.times == (1.0, 2.0, 3.0)

@@ -132,6 +132,31 @@ def _pieces(draft: Draft) -> None:
     draft.save(stage, f"{mesh.GetPath()}: a box of {size:g}" + ", alone" * alone)
 
 
+def _doubled(draft: Draft) -> None:
+    """Faces that give corners twice, in a row or apart, once or as their last ones; points doubled beside them."""
+    stage = draft.open()
+    mesh = a_mesh(draft, stage)
+    faces, changed = _faces(mesh), list[np.ndarray]()
+    part, how = draft.pick([0.2, 1.0]), draft.pick(["next", "next", "apart", "all", "point"])
+    source = [*range(1 + max((int(face.max()) for face in faces if len(face)), default=0))]
+    for face in faces:
+        at = int(draft.rng.integers(max(len(face), 1)))
+        if not len(face) or not draft.chance(part):
+            changed.append(face)
+        elif how == "point":
+            changed.append(np.insert(face, at, len(source)))
+            source.append(int(face[at]))
+        else:
+            extra = {"next": face[at], "apart": face[at - 2], "all": face[at - 1]}[how]
+            changed.append(np.repeat(face, 2) if how == "all" else np.insert(face, at, extra))
+    _set_faces(mesh, changed)
+    for code in (Usd.TimeCode.Default(), *map(Usd.TimeCode, mesh.GetPointsAttr().GetTimeSamples())):
+        points = numbers(mesh.GetPointsAttr().Get(code)).reshape(-1, 3)
+        if how == "point" and len(points):
+            mesh.GetPointsAttr().Set(vec3(points[np.minimum(source, len(points) - 1)]), code)
+    draft.save(stage, f"{mesh.GetPath()}: corners twice, {how}")
+
+
 KINDS = (
     Kind("shown: purposes", _purpose, OWN),
     Kind("shown: blocked samples", _blocks, OWN),
@@ -139,4 +164,5 @@ KINDS = (
     Kind("shown: open bodies", _open_bodies, OWN),
     Kind("shown: cut along edges", _cut, OWN),
     Kind("shown: loose pieces", _pieces, OWN),
+    Kind("shown: corners twice", _doubled, OWN),
 )

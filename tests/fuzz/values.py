@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from pxr import Gf, Sdf, Usd, UsdGeom, Vt
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, Vt
 
 from physgraph_usd.usd.schema import PROPERTIES
 
@@ -130,6 +130,29 @@ def _subsets(draft: Draft) -> None:
     draft.save(stage, f"{subset.GetPath()}: {kind} {values.tolist()}")
 
 
+def _fabrics(draft: Draft) -> None:
+    """Subsets bound to materials of their own, whose values are odd, animated, of another type, or of the proposal."""
+    stage = draft.open()
+    prim = draft.pick(garments_of(stage))
+    count = len(numbers(UsdGeom.Mesh(prim).GetFaceVertexCountsAttr().Get()))
+    binding = UsdShade.MaterialBindingAPI.Apply(prim)
+    for index in range(draft.pick([1, 2, 3])):
+        faces = draft.rng.permutation(count)[: draft.pick([0, 1, count // 2, count])].astype(np.int32)
+        if draft.chance(0.2):
+            faces = spoiled(draft, faces, ODD_INTS)
+        subset = binding.CreateMaterialBindSubset(f"part{index}", Vt.IntArray.FromNumpy(faces))
+        material = UsdShade.Material.Define(stage, f"/World/fabrics/part{index}")
+        path = material.GetPath() if draft.chance(0.9) else draft.pick([prim.GetPath(), Sdf.Path("/Nowhere")])
+        UsdShade.MaterialBindingAPI.Apply(subset.GetPrim()).GetDirectBindingRel().SetTargets([path])
+        for name in draft.rng.permutation([*_SINGLE, *(f"physics:{each}" for each in _PROPOSAL)])[:4]:
+            kind = "float" if draft.chance(0.8) else draft.pick([*VALUES])
+            value = draft.pick([*ODD_FLOATS, 0.5, 1e-4, 100.0]) if kind == "float" else VALUES[kind]
+            times = draft.pick([(), (), (1.0, 2.0)])
+            replace(stage, material.GetPath().AppendProperty(str(name)), kind, value, times=times)
+            draft.said.append(f"{material.GetPath()}.{name} = {value!r} ({kind}) at {times or 'default'}")
+    draft.save(stage, f"{prim.GetPath()}: fabrics of subsets")
+
+
 def _rest(draft: Draft) -> None:
     """Rest shapes that are none, and rest angles of unknown names."""
     stage = draft.open()
@@ -218,6 +241,7 @@ KINDS = (
     Kind("values: painted", _painted, OWN),
     Kind("values: primvars", _primvars, ("dressed", "plain", "skinned")),
     Kind("values: subsets", _subsets, ("dressed", "plain", "still")),
+    Kind("values: fabrics of subsets", _fabrics, OWN),
     Kind("values: rest shape", _rest, OWN),
     Kind("values: extents hint", _hints, ("dressed", "plain")),
     Kind("values: options", _asked, ("plain", "bodies", "several", "instanced", "clips", "layered")),

@@ -389,9 +389,9 @@ def _control_mesh(mesh: UsdGeom.Mesh, polygons: PolygonMesh) -> ControlMesh:
 
 
 def _array(attribute: Usd.Attribute, time: float | None) -> np.ndarray:
-    """An attribute's array at a time code; empty if missing."""
+    """An attribute's array at a time code; empty if missing or a single value."""
     value = value_at(attribute, time)
-    return np.zeros(0, np.int32) if value is None else np.asarray(value)
+    return np.zeros(0, np.int32) if np.ndim(value) == 0 else np.asarray(value)
 
 
 def _measures(prim: Usd.Prim, time: float | None) -> tuple[str, np.ndarray, np.ndarray | None]:

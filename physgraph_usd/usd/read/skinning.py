@@ -17,6 +17,7 @@ from ..lookup import with_ancestors
 from ..stage import TRAVERSAL, Notice, timecode
 from ..times import Motion, merge, motion_by, motion_of
 from .find import instance_roots
+from .instances import instanced_gprims
 
 _ANIMATED = ("rotations", "translations", "scales", "blendShapeWeights")
 """Attributes of an animation. Translations alone, and weights of shapes without in-betweens, move points straight."""
@@ -70,9 +71,12 @@ class Bake:
         return [notice for path in bare for notice in _unskinned(self._stage.GetPrimAtPath(path))]
 
     def motion(self, prim: Usd.Prim) -> Motion:
-        """Motion of a prim; a skinned prim's own points do not count."""
+        """Motion of a prim, an instancer's with its prototypes'; a skinned prim's own points do not count."""
         skinned = self.skinned.get(prim.GetPath())
-        return skinned.motion if skinned else motion_of(prim)
+        if skinned:
+            return skinned.motion
+        prototypes = instanced_gprims(prim) if UsdGeom.PointInstancer(prim) else []
+        return Motion.joined(map(motion_of, [prim, *prototypes]))
 
     def bake(self, times: Sequence[float]) -> None:
         """Bake the skinned prims at the samples of their animation, and at the time codes given.
