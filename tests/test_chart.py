@@ -142,18 +142,6 @@ def test_the_files(made: tuple[Path, Path, Chart]):
 
 
 @pytest.mark.slow
-def test_a_second_run_measures_nothing_again(made: tuple[Path, Path, Chart]):
-    shot, folder, _ = made
-    before = (folder / "chart.rows.jsonl").read_text(encoding="utf-8")
-    chart_shot(shot, folder, QUICK)
-    after = (folder / "chart.rows.jsonl").read_text(encoding="utf-8")
-    assert after.startswith(before)
-    rows = [json.loads(line) for line in after.splitlines()]
-    keys = [tuple(row.get(name) for name in ("row", "method", "steps", "frame", "repeat", "term")) for row in rows]
-    assert len(set(keys)) == len(keys)
-
-
-@pytest.mark.slow
 def test_an_interrupted_run_goes_on(made: tuple[Path, Path, Chart], tmp_path: Path):
     shot, folder, chart = made
     whole = (folder / "chart.rows.jsonl").read_text(encoding="utf-8")

@@ -122,15 +122,6 @@ class TestAgainstEveryPair:
                 count += len(expected)
         assert count > 30
 
-    @pytest.mark.parametrize("far", [0.0, 1e3])
-    def test_far_from_the_origin(self, far: float):
-        """In double precision what crosses does not depend on where it is."""
-        cloth = square(4)
-        level = levels_of(named(cloth), dtype=torch.float64)[-1]
-        x = placed(level, SHAPES["crumpled more"])
-        assert found_at(level, x + far * EDGE) == found_at(level, x)
-        assert len(found_at(level, x)) > 10
-
 
 def slit() -> Cloth:
     """A square sheet cut along the middle from its lower rim to its centre: the points there are there twice."""

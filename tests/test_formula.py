@@ -12,18 +12,14 @@ import pytest
 import scipy.sparse as sp
 import torch
 import warp as wp
-from cloth import finest_system, group_of, sheet, wave
 from torch import Tensor
 
 from physgraph_usd.solver.forces import base, bending, membrane, self_contact, stretch
 from physgraph_usd.solver.integrate.fused import fused_kernel
-from physgraph_usd.solver.integrate.learned import LearnedMetric, placed
 from physgraph_usd.solver.integrate.network import VECTORS, PhysgraphConfig
-from physgraph_usd.solver.integrate.weights import random_network
 from physgraph_usd.solver.mesh import stencil
 from physgraph_usd.solver.mesh import threads as threads_module
 from physgraph_usd.solver.mesh.formula import block_size
-from physgraph_usd.solver.mesh.kernels import KERNELS
 from physgraph_usd.solver.mesh.stencil import Stencil, incidence, vectors
 from physgraph_usd.solver.mesh.threads import Launch
 
@@ -137,34 +133,6 @@ def test_a_stencil_is_its_matrix(dtype: torch.dtype) -> None:
     x = torch.as_tensor(rng.normal(size=(VERTICES, 3))).to(dtype)
     right = torch.as_tensor(matrix @ x.double().numpy()).to(dtype)
     torch.testing.assert_close(Stencil(matrix, dtype=dtype, device="cpu").apply(x), right, rtol=1e-5, atol=1e-6)
-
-
-@pytest.mark.parametrize("count", [3, 8, 21])
-@pytest.mark.parametrize(
-    "config",
-    [
-        PhysgraphConfig(vectors=VECTORS, width=16, depth=3),
-        PhysgraphConfig(vectors=("metric", "move1"), width=5),
-        PhysgraphConfig(vectors=("metric", "secant", "secant.smooth"), width=20),
-    ],
-)
-def test_the_fused_network_is_the_network(config: PhysgraphConfig, count: int) -> None:
-    """Displacements of the kernel and of torch's layers, in single precision, from positions a few steps on."""
-    mesh, rest = sheet(count, 2)
-    system, x = finest_system(group_of(mesh, rest, level=1, dtype=torch.float32), wave(rest))
-    network = placed(random_network(config, seed=3, scale=0.02), system, torch.float32)
-    fused, layers = (LearnedMetric(network, fuse=fuse) for fuse in (True, False))
-    carry = layers.start(system, x)
-    for _ in range(3):
-        carry = layers.step(system, carry)
-    one, other = fused.propose(system, carry), layers.propose(system, carry)
-    assert float((one - other).abs().max()) <= 1e-4 * float(other.abs().max())
-
-
-def test_kernels_have_no_derivatives_and_our_flags() -> None:
-    for kernel in (stretch._KERNELS[torch.float32], stencil._GATHER[torch.float64]):
-        assert kernel.module.options["enable_backward"] is False
-        assert kernel.module.options["cpu_compiler_flags"] == KERNELS["cpu_compiler_flags"]
 
 
 @pytest.mark.slow

@@ -14,7 +14,6 @@ from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 from shots import CLOTH, cloth_shot, faults, refine
 from stages import COLLIDER_API
 
-from physgraph_usd.errors import LayerError
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.solver.colliders.mesh import MeshBody
 from physgraph_usd.solver.colliders.pose import Pose
@@ -75,19 +74,6 @@ class TestLayers:
         primvar = UsdGeom.PrimvarsAPI(stage.GetPrimAtPath(path)).GetPrimvar("physgraph:penetration")
         assert (primvar.GetInterpolation(), primvar.GetTypeName()) == ("vertex", Sdf.ValueTypeNames.FloatArray)
         assert errors(out, shot) == []
-
-    @pytest.mark.parametrize(
-        ("heat", "message"),
-        [
-            ({"penetration": np.zeros(3)}, r"penetration> at time code 1: needs 63 values, got shape \(3,\)"),
-            ({"crossing": np.full(63, np.nan)}, "crossing> at time code 1: value 0 is nan, not finite"),
-            ({"fever": np.zeros(63)}, "no such heat map; known: penetration, crossing"),
-        ],
-    )
-    def test_wrong_maps_leave_nothing(self, shot: Path, tmp_path: Path, heat: dict, message: str):
-        with pytest.raises(LayerError, match=message):
-            write(shot, tmp_path / "out.usdc", {TIMES[0]: heat})
-        assert [file.name for file in tmp_path.iterdir()] == ["shot.usda"]
 
     @pytest.mark.parametrize(
         ("name", "value", "message"),

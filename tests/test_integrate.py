@@ -10,7 +10,7 @@ import scipy.sparse as sp
 import torch
 from cloth import Watched, finest_system, group_of, sheet, wave
 
-from physgraph_usd.errors import SolveError, UsageError
+from physgraph_usd.errors import SolveError
 from physgraph_usd.lab.methods import METHODS
 from physgraph_usd.lab.methods.lbfgs import Lbfgs
 from physgraph_usd.solver.contact.metric import HeldMetric
@@ -144,12 +144,6 @@ class TestWhyItStopped:
         x[2, 1] = bad
         with pytest.raises(SolveError, match=r"level 5: .*not finite"):
             solve_level(system, QuasiNewton(), x, level=5, budget=Budget(3))
-
-
-def test_names():
-    assert all(isinstance(method.build(), Integrator) for method in METHODS.values())
-    with pytest.raises(UsageError, match=r"unknown integrator 'strech'; known integrators: .*quasi-newton"):
-        method_named("strech")
 
 
 def test_a_part_of_the_cloth_is_solved_while_the_rest_is_held():

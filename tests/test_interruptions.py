@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import psutil
 import pytest
-from shots import cloth_shot, command, faults, interrupted, run, sample_times
+from shots import cloth_shot, command, faults, interrupted, run
 
 from physgraph_usd.shot.frames import LOCK, frames_folder
 from physgraph_usd.usd.write.atomic import HOST
@@ -100,21 +100,6 @@ def test_a_killed_run_leaves_nothing_under_the_name_nor_a_process_and_a_rerun_fi
     assert (frames_folder(out) / LOCK).exists()
     assert not out.exists()
     finishes(shot, out, whole, *(() if seed else ("--resume",)))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", range(8))
-def test_killed_at_any_moment_from_start_to_end(shot: Path, tmp_path: Path, seed: int):
-    out = tmp_path / "fine.usdc"
-    process = begun("refine", shot, "-o", out, *LINE)
-    time.sleep(float(np.random.default_rng(seed).uniform(0.0, 6.0)))
-    process.kill()
-    process.wait()
-    if out.exists():
-        assert len(sample_times(out)) == len(TIMES)
-        assert faults(out, shot) == []
-    else:
-        assert command("refine", shot, "-o", out, *LINE, "--resume").returncode == 0
 
 
 def test_a_worker_that_is_killed_is_named_by_its_frame_and_costs_no_finished_one(shot: Path, whole: bytes):
@@ -311,17 +296,6 @@ def test_a_full_disk_is_a_clear_error_and_costs_no_finished_frame(
     assert [file for file in out.parent.iterdir() if file != out] == []
 
 
-def test_pipes_that_nobody_reads_any_more_cost_nothing(shot: Path, tmp_path: Path):
-    read, write = os.pipe()
-    os.close(read)
-    out = tmp_path / "fine.usdc"
-    line = [sys.executable, "-m", "physgraph_usd", "refine", str(shot), "-o", str(out), "--frames", "1:3", "-v", *LINE]
-    done = subprocess.run([*line, "--progress"], stdout=write, stderr=write, check=False, timeout=120)
-    os.close(write)
-    assert done.returncode == 0
-    assert faults(out, shot) == []
-
-
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="a device of Linux")
 def test_a_log_on_a_full_disk_costs_nothing(shot: Path, tmp_path: Path):
     out = tmp_path / "fine.usdc"
@@ -330,14 +304,6 @@ def test_a_log_on_a_full_disk_costs_nothing(shot: Path, tmp_path: Path):
     assert "Traceback" not in done.stderr
     assert done.stderr.count("cannot write /dev/full") == 1
     assert faults(out, shot) == []
-
-
-def test_a_summary_that_cannot_be_written_is_told_before_the_work(shot: Path, tmp_path: Path):
-    (tmp_path / "file").touch()
-    out = tmp_path / "fine.usdc"
-    done = run("refine", shot, "-o", out, "--summary", tmp_path / "file" / "summary.json")
-    assert done.exit_code == 2, done.stderr
-    assert not out.exists()
 
 
 @pytest.mark.slow
@@ -353,13 +319,3 @@ def test_memory_that_runs_out_is_a_clear_error(tmp_path: Path):
     assert (done.returncode, "Traceback" in done.stderr) == (1, False), done.stderr
     assert "memory" in done.stderr.strip().splitlines()[-1], done.stderr
     assert [file.name for file in tmp_path.iterdir()] == ["shot.usdc"]
-
-
-def test_a_folder_that_may_not_be_written(shot: Path, tmp_path: Path):
-    if os.geteuid() == 0:
-        pytest.skip("root may write anywhere")
-    folder = tmp_path / "locked"
-    folder.mkdir(mode=0o500)
-    done = command("refine", shot, "-o", folder / "fine.usdc", *LINE)
-    assert done.returncode == 1
-    assert "Traceback" not in done.stderr

@@ -114,11 +114,6 @@ def test_loop_has_one_frame_per_time_at_the_shots_speed(sample: Callable[[str], 
     assert out.stat().st_size < 100_000
 
 
-def test_same_picture_every_time(sample: Callable[[str], Path], tmp_path: Path) -> None:
-    first, second = (preview(sample("frozen"), tmp_path / f"{i}.png", size=SIZE).read_bytes() for i in range(2))
-    assert first == second
-
-
 def test_wrong_requests_are_named(sample: Callable[[str], Path], tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"cannot draw 'a.tiff'; known suffixes: .png, .gif"):
         preview(sample("swatch"), tmp_path / "a.tiff")

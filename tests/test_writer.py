@@ -23,7 +23,6 @@ from layers import (
 )
 from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 
-from physgraph_usd.errors import LayerError, UsageError
 from physgraph_usd.solver.mesh.subdivide import subdivide_times
 from physgraph_usd.solver.mesh.topology import PolygonMesh
 from physgraph_usd.usd.read.reader import open_shot
@@ -81,35 +80,6 @@ def test_used_values_stay_on_the_prim(dressed: Path, tmp_path: Path) -> None:
     assert prim.GetAttribute("physgraph:material:bendStiffness").Get() == pytest.approx(frame.fabric.bend)
     assert prim.GetAttribute("physgraph:refine:level").Get() == 1
     assert not prim.GetAttribute("physgraph:material:shearStiffness").HasAuthoredValue()
-
-
-def test_wrong_calls_leave_nothing(dressed: Path, tmp_path: Path) -> None:
-    shot = open_shot(str(dressed), level=1)
-    steps = refine_all(shot)
-    points = fine_points(shot, steps, 1.0)
-    broken = [points[0].copy()]
-    broken[0][5] = np.nan
-    cases = [
-        (rf"<{COAT}> at time code 2\.5: points: value 5 is \[nan", [(1.0, points), (2.5, broken)]),
-        (r"points have shape \(3, 3\); the fine mesh has 63", [(1.0, [np.zeros((3, 3))])]),
-        (r"time code 1\.0 does not come after 1", [(1.0, points), (1.0, points)]),
-        (r"0 arrays of points for 1 garments", [(1.0, [])]),
-        (r"no time code was written", []),
-    ]
-    for message, calls in cases:
-        with pytest.raises(LayerError, match=message):
-            _write_calls(LayerWriter(shot, steps, tmp_path / "out.usdc"), calls)
-        assert [item.name for item in tmp_path.iterdir()] == ["shot.usda"]
-    with pytest.raises(UsageError, match="unknown mode 'under'; known modes: over, sibling"):
-        LayerWriter(shot, steps, tmp_path / "out.usdc", mode="under")
-    with pytest.raises(UsageError, match="part of the shot"):
-        LayerWriter(shot, steps, dressed, overwrite=True)
-
-
-def _write_calls(writer: LayerWriter, calls: list[tuple[float, list[np.ndarray]]]) -> None:
-    with writer:
-        for time, points in calls:
-            writer.write(time, points)
 
 
 def test_a_primvar_that_fits_no_mesh_is_hidden_and_named(dressed: Path, tmp_path: Path) -> None:
