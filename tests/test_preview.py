@@ -63,14 +63,6 @@ def test_coarse_stands_beside_fine(sample: Callable[[str], Path], tmp_path: Path
     assert np.nonzero(right)[0].mean() < np.nonzero(left)[0].mean() - 8, "the fine side hangs 5 cm higher"
 
 
-def test_shot_can_be_given(sample: Callable[[str], Path], tmp_path: Path) -> None:
-    layer = refined_layer(sample("swatch"), tmp_path, record=False)
-    assert shot_of(layer) is None
-    picture = pixels(preview(layer, tmp_path / "a.png", shot=sample("swatch"), size=SIZE))
-    assert covered(picture[:, :160]).sum() > 1500
-    assert covered(picture[:, 160:]).sum() > 1500
-
-
 def test_same_picture_in_every_unit_axis_and_winding(sample: Callable[[str], Path], tmp_path: Path) -> None:
     names = ("swatch", "swatch_cm", "swatch_zup", "swatch_lefthanded")
     pictures = [pixels(preview(sample(name), tmp_path / f"{name}.png", size=SIZE)) for name in names]

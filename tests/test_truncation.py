@@ -12,9 +12,8 @@ from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.settled import unsettled
 from physgraph_usd.solver.fabric import Fabric
 from physgraph_usd.solver.frame.refiner import Refiner
-from physgraph_usd.solver.integrate.base import Carry, System
+from physgraph_usd.solver.integrate.base import System
 from physgraph_usd.solver.integrate.descend import solve_level
-from physgraph_usd.solver.integrate.guard import Guard
 from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton, truncated
 from physgraph_usd.solver.integrate.stop import Budget
 from physgraph_usd.usd.read.reader import open_shot
@@ -52,29 +51,6 @@ def test_what_turns_a_triangle_is_cut_there_alone():
     assert float(cut[vertex].norm()) < 0.9 * float(move[vertex].norm())
     kept = (cut == move).all(dim=1)
     assert float(kept.double().mean()) > 0.8
-
-
-class Turning:
-    """Proposes a good step, but for one triangle that it turns over."""
-
-    name = "turning"
-
-    def start(self, system: System, x: torch.Tensor) -> Carry:
-        return Carry(x, *system.energy_and_force(x), mover=self.name)
-
-    def step(self, system: System, carry: Carry) -> Carry:
-        good = system.apply_metric_inverse(carry.force)
-        move, vertex = turning(system, carry.x)
-        good[vertex] = move[vertex]
-        return self.start(system, carry.x + good)
-
-
-def test_the_guard_keeps_the_rest_of_a_step_that_turns_a_triangle():
-    system, x = problem()
-    x = x + 0.12 * system.spacing.mean() * torch.sin(40 * x)
-    carry = Guard(Turning()).step(system, Turning().start(system, x))
-    assert carry.mover == "truncated"
-    assert carry.energy < system.energy_and_force(x)[0]
 
 
 @pytest.mark.real_data

@@ -15,7 +15,7 @@ from shots import CLOTH, cloth_shot, fine, refine, run
 from test_report_format import checked
 
 from physgraph_usd import refine_stage
-from physgraph_usd.errors import At, Place, UnexpectedError, exceptions_named
+from physgraph_usd.errors import At, Place, UnexpectedError
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.processes import result_of, separate_processes
 from physgraph_usd.shot.report import RefineReport
@@ -179,7 +179,3 @@ class TestPlace:
         text = str(UnexpectedError("ValueError", "wrong\n" * 1000, place=place))
         assert text.startswith("</World/coat0>, </World/coat1>, </World/coat2> and 497 more: unexpected")
         assert (len(text) < 700, "\n" in text) == (True, False)
-
-    def test_the_disk_is_no_fault_of_the_program(self):
-        with pytest.raises(Exception, match=r"^there: No space left on device$"), exceptions_named():
-            raise OSError(28, "No space left on device", "there")

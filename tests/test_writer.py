@@ -21,13 +21,13 @@ from layers import (
     write_layer,
     write_shot,
 )
-from pxr import Gf, Sdf, Usd, UsdGeom, Vt
+from pxr import Gf, Sdf, Usd, UsdGeom
 
 from physgraph_usd.solver.mesh.subdivide import subdivide_times
 from physgraph_usd.solver.mesh.topology import PolygonMesh
 from physgraph_usd.usd.read.reader import open_shot
 from physgraph_usd.usd.write.normals import VertexNormals
-from physgraph_usd.usd.write.primvars import FineMap, to_numpy, to_vt
+from physgraph_usd.usd.write.primvars import FineMap
 from physgraph_usd.usd.write.writer import LayerWriter
 
 
@@ -128,43 +128,6 @@ def test_texture_coordinates_follow_the_points(dropped: int | None, indexed: boo
     flat = values if indices is None else values[indices]
     assert (indices is not None) == indexed
     np.testing.assert_allclose(flat, fine.interpolate(POINTS)[fine.fine.indices][:, :2], atol=1e-12)
-
-
-def test_a_partition_of_points_stays_one() -> None:
-    fine = fine_map()
-    halves = [np.arange(5), np.arange(5, len(POINTS))]
-    parts = [fine.subset("point", half, exclusive=True) for half in halves]
-    np.testing.assert_array_equal(np.sort(np.concatenate(parts)), np.arange(fine.fine.vertex_count))
-    inside = fine.subset("point", halves[0])
-    assert set(inside) < set(parts[0])
-
-
-def test_edges_are_split() -> None:
-    fine = fine_map(1)
-    pairs = fine.subset("edge", np.array([1, 0])).reshape(-1, 2)
-    assert pairs[0, 0] == 1
-    assert pairs[1, 1] == 0
-    assert pairs[0, 1] == pairs[1, 0] >= len(POINTS)
-
-
-@pytest.mark.parametrize(
-    "value",
-    [
-        Vt.FloatArray([1, 2]),
-        Vt.HalfArray([1, 2]),
-        Vt.Vec3dArray([(1, 2, 3)]),
-        Vt.Matrix4dArray([Gf.Matrix4d(2)]),
-        Vt.QuatfArray([Gf.Quatf(1, 2, 3, 4)]),
-        Vt.BoolArray([True, False]),
-        Vt.UCharArray([1, 2]),
-        Vt.Int64Array([1, 2]),
-        Vt.TokenArray(["a"]),
-        Vt.StringArray(["a"]),
-        Sdf.AssetPathArray([Sdf.AssetPath("a.png")]),
-    ],
-)
-def test_every_type_comes_back_as_it_was(value: object) -> None:
-    assert to_vt(to_numpy(value)[0], value) == value
 
 
 @pytest.mark.parametrize(("orientation", "matrix"), [("rightHanded", MIRROR), ("leftHanded", Gf.Matrix4d(1.0))])

@@ -47,25 +47,6 @@ def _variants(draft: Draft) -> None:
     draft.save(stage, f"{holder.GetPath()}: variant {chosen or 'none'}")
 
 
-def _large_face(draft: Draft) -> None:
-    """A face of hundreds or thousands of corners, round or crumpled, for cloth or a body."""
-    stage = draft.open()
-    mesh, count = a_mesh(draft, stage), draft.pick([50, 250, 1000, 6000])
-    angle = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)
-    ring = np.stack([np.cos(angle), np.sin(angle), 0.1 * np.sin(3.0 * angle)], axis=1)
-    if draft.chance(0.2):
-        ring += 0.05 * draft.rng.standard_normal(ring.shape)
-    for code in _times(mesh):
-        mesh.GetPointsAttr().Set(vec3(ring), code)
-    mesh.GetFaceVertexCountsAttr().Set(Vt.IntArray([count]))
-    mesh.GetFaceVertexIndicesAttr().Set(Vt.IntArray.FromNumpy(np.arange(count, dtype=np.int32)))
-    twice = draft.chance(0.3)
-    if twice:
-        mesh.GetFaceVertexCountsAttr().Set(Vt.IntArray([count, count]))
-        mesh.GetFaceVertexIndicesAttr().Set(Vt.IntArray.FromNumpy(np.tile(np.arange(count, dtype=np.int32), 2)))
-    draft.save(stage, f"{mesh.GetPath()}: one face of {count} corners" + ", twice" * twice)
-
-
 def _glitch(draft: Draft) -> None:
     """One sample gone wrong: all points equal, a hundred times its size, turned inside out, far away, or torn."""
     stage = draft.open()
@@ -152,7 +133,6 @@ def _other_times(draft: Draft, samples: dict[float, object], how: str) -> dict[f
 
 KINDS = (
     Kind("odd: variants", _variants, OWN),
-    Kind("odd: large faces", _large_face, ("plain", "still", "bodies")),
     Kind("odd: glitch frames", _glitch, ("plain", "bodies", "dressed", "several")),
     Kind("odd: points at one place", _coincident, OWN),
     Kind("odd: times of samples", _retimed, (*TIMED, "bodies", "skinned", "dressed", "layered")),

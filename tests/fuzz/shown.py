@@ -24,19 +24,6 @@ def _set_faces(mesh: UsdGeom.Mesh, faces: list[np.ndarray]) -> None:
     mesh.GetFaceVertexIndicesAttr().Set(Vt.IntArray.FromNumpy(np.concatenate(faces).astype(np.int32)))
 
 
-def _purpose(draft: Draft) -> None:
-    """Purposes and visibility of a mesh, or of what is above it, and bodies that are found or named."""
-    stage = draft.open()
-    prim = a_mesh(draft, stage).GetPrim()
-    prim = draft.pick([prim, prim.GetParent()])
-    purpose = draft.pick(["default", "render", "proxy", "guide"])
-    UsdGeom.Imageable(prim).CreatePurposeAttr(purpose)
-    if draft.chance(0.4):
-        UsdGeom.Imageable(prim).MakeInvisible(draft.pick([Usd.TimeCode.Default(), Usd.TimeCode(2.0)]))
-    draft.options["colliders"] = draft.pick([(), ("auto",), ("/World",)])
-    draft.save(stage, f"{prim.GetPath()}: purpose {purpose}, colliders {draft.options['colliders']}")
-
-
 def _open_bodies(draft: Draft) -> None:
     """Meshes that lack faces: deleted, or in holeIndices, or drawn as a subdivision surface."""
     stage = draft.open()
@@ -99,7 +86,6 @@ def _pieces(draft: Draft) -> None:
 
 
 KINDS = (
-    Kind("shown: purposes", _purpose, OWN),
     Kind("shown: open bodies", _open_bodies, OWN),
     Kind("shown: cut along edges", _cut, OWN),
     Kind("shown: loose pieces", _pieces, OWN),
