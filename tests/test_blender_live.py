@@ -73,6 +73,7 @@ def test_the_process_answers_with_files_and_ends(live: ModuleType, process: Any)
     process.send({"time": 1.0})
 
 
+@pytest.mark.slow
 def test_a_process_that_fails_says_why(live: ModuleType, program: list[str], tmp_path: Path) -> None:
     process = live.LiveProcess([*program[:-1], "/World/nothing"], tmp_path / "log")
     wait_for(process, lambda news: news.ended)

@@ -82,8 +82,7 @@ def run(after: int, *, glitch: str = "", at: int = AT, first: int = 0) -> list[t
     return told
 
 
-FAST = ("ball 10 cm higher", "cage inside out", "cage a hundred times its size")
-"""One glitch of each kind: a body that moves, a cage that turns, one that is blown up."""
+FAST = ("cage inside out",)
 
 
 @pytest.fixture(scope="module")
@@ -104,7 +103,7 @@ def test_cloth_is_back_after_five_frames(clean: list[np.ndarray], name: str):
 @pytest.mark.parametrize(
     ("name", "anew"),
     [
-        ("ball eight times its size", 1),
+        pytest.param("ball eight times its size", 1, marks=pytest.mark.slow),
         pytest.param("ball 10 cm higher", 2, marks=pytest.mark.slow),
         ("cage inside out", 2),
     ],

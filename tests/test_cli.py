@@ -235,6 +235,7 @@ class TestOtherCommands:
         assert (result.exit_code, f"<{CLOTH}>.physgraph:colliders: no prim at </World/gone>" in result.stdout) == (1, 1)
 
 
+@pytest.mark.slow
 def test_a_terminal_has_each_message_on_a_line_of_its_own(tmp_path: Path) -> None:
     """Not behind the progress bar, which a frame before has left in the line."""
     pty = pytest.importorskip("pty", reason="terminals of POSIX")

@@ -48,8 +48,13 @@ MESHES: dict[str, tuple[Soup, float]] = {
 }
 
 
+FAST = ("sphere", "plane", "mixed", "two")
+
+
 class TestRest:
-    @pytest.mark.parametrize("kind", SHAPES)
+    @pytest.mark.parametrize(
+        "kind", [name if name in FAST else pytest.param(name, marks=pytest.mark.slow) for name in SHAPES]
+    )
     def test_on_a_primitive(self, kind: str):
         pose, height = SHAPES[kind]
         state = refiner_with([SHEET], [kind], level=2).solve(frame_with([draped(height)], pose))
@@ -57,7 +62,9 @@ class TestRest:
         assert measured(state)["inside"] == 0
         assert measured(state)["crossings"] <= measured(state, "before")["crossings"]
 
-    @pytest.mark.parametrize("name", MESHES)
+    @pytest.mark.parametrize(
+        "name", [name if name in FAST else pytest.param(name, marks=pytest.mark.slow) for name in MESHES]
+    )
     def test_on_a_mesh(self, name: str):
         soup, height = MESHES[name]
         state = refiner_with([SHEET], ["mesh"], level=2).solve(frame_with([draped(height)], soup))

@@ -22,7 +22,7 @@ from shots import cloth_shot, command, faults, interrupted, run
 from physgraph_usd.shot.frames import LOCK, frames_folder
 from physgraph_usd.usd.write.atomic import HOST
 
-TIMES = tuple(float(t) for t in range(1, 41))
+TIMES = tuple(float(t) for t in range(1, 26))
 LINE = ("--level", "2", "--steps", "4", "--temporal", "off")
 PATIENCE_SECONDS = 180.0
 """How long something must not have happened before a test gives up; nothing else depends on it."""
@@ -30,7 +30,7 @@ PATIENCE_SECONDS = 180.0
 
 @pytest.fixture(scope="module")
 def shot(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Forty frames, some seconds of work."""
+    """Twenty-five frames, some seconds of work."""
     return cloth_shot(tmp_path_factory.mktemp("shot") / "shot.usdc", times=TIMES, size=(10, 8))
 
 
@@ -102,6 +102,7 @@ def test_a_killed_run_leaves_nothing_under_the_name_nor_a_process_and_a_rerun_fi
     finishes(shot, out, whole, *(() if seed else ("--resume",)))
 
 
+@pytest.mark.slow
 def test_a_worker_that_is_killed_is_named_by_its_frame_and_costs_no_finished_one(shot: Path, whole: bytes):
     """The worker may have either half of the shot; frames before its own are finished by the other one."""
     out = shot.parent / "worker" / "fine.usdc"
@@ -136,8 +137,8 @@ def says_interrupted(out: Path, report: Path, summary: Path, *, code: int, of: i
 @pytest.mark.parametrize(
     ("number", "workers"),
     [
-        (signal.SIGTERM, "2"),
         (signal.SIGINT, "1"),
+        pytest.param(signal.SIGTERM, "2", marks=pytest.mark.slow),
         pytest.param(signal.SIGTERM, "1", marks=pytest.mark.slow),
         pytest.param(signal.SIGINT, "2", marks=pytest.mark.slow),
     ],
@@ -221,7 +222,9 @@ def test_finished_frames_are_not_kept_when_not_asked_for(shot: Path, tmp_path: P
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(("number", "workers"), [(signal.SIGTERM, "2"), (signal.SIGINT, "1")])
+@pytest.mark.parametrize(
+    ("number", "workers"), [(signal.SIGTERM, "2"), pytest.param(signal.SIGINT, "1", marks=pytest.mark.slow)]
+)
 def test_a_signal_leaves_no_empty_folder(shot: Path, tmp_path: Path, number: signal.Signals, workers: str):
     """Before the first frame, of several shots, into folders that were not there."""
     other = cloth_shot(tmp_path / "other.usdc")

@@ -73,11 +73,3 @@ def test_a_job_makes_one_layer_and_a_second_run_of_it_solves_nothing_again(tmp_p
     layer = tmp_path / "out" / "fine.usdc"
     assert faults(layer, shot) == []
     assert sample_times(layer) == TIMES
-
-
-@pytest.mark.slow
-def test_a_job_fails_where_a_chunk_is_missing(tmp_path: Path):
-    refine(cloth_shot(tmp_path / "shot.usdc", times=TIMES), tmp_path / "chunk", frames=(1.0, 4.0), preroll=6)
-    done = openjd("run", TEMPLATE, "--step", "Stitch", *parameters(tmp_path, Chunks=str(tmp_path / "chunk")))
-    assert done.returncode != 0
-    assert "frames 5:8 are in no chunk" in done.stdout

@@ -19,7 +19,7 @@ from physgraph_usd.solver.mesh.topology import edges_of
 pytestmark = pytest.mark.real_data
 
 FIRST = {"01_newton_shirt_dab_cm.usdc": "1001:1003", "02_makehuman_usdskel_dm.usdc": "0:2"}
-FAST = ("06", "07", "09")
+FAST = ("09",)
 """Shots of which a few frames are a fast test: by numbers that their names begin with."""
 STAGES = ("stages/float_units", "stages/usd_wg", "stages/usdskel")
 

@@ -92,7 +92,7 @@ def test_the_close_picture_is_of_cloth_in_a_body(tmp_path: Path):
     assert verdict(report).startswith(fault.partition(" edges")[0].partition(" vertices")[0])
 
 
-@pytest.mark.parametrize("seam", [False, True])
+@pytest.mark.parametrize("seam", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_where_nothing_is_wrong_the_close_picture_is_of_the_best_fold(tmp_path: Path, seam: bool):
     """Two strips, one longer than its cage by ease: where it folds is the best fold, not at a crease of the cage."""
     stage = new_stage(tmp_path / "s.usda")

@@ -392,6 +392,7 @@ def test_what_cannot_follow_is_named_before_anything_is_written(
     assert only(tmp_path, "shot.usda")
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_the_sample_keeps_thickness_area_and_buttons(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """The T-shirt's render mesh stands still in the shot; the middle of its faces lies on the refined cloth."""

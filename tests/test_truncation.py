@@ -53,9 +53,10 @@ def test_what_turns_a_triangle_is_cut_there_alone():
     assert float(kept.double().mean()) > 0.8
 
 
+@pytest.mark.slow
 @pytest.mark.real_data
-@pytest.mark.parametrize("steps", [12, pytest.param(24, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("integrator", ["physgraph", pytest.param("quasi-newton", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("steps", [12, 24])
+@pytest.mark.parametrize("integrator", ["physgraph", "quasi-newton"])
 def test_a_squeezed_waistband_does_not_hold_up_the_skirt(real_data: Path, integrator: str, steps: int):
     """Triangles of it shrink to 0.0005 of their area: all line searches of the finest level failed at 3.6 mJ."""
     file = real_data / "shots" / "10_style3d_skirt_twist.usdc"

@@ -157,6 +157,7 @@ def test_values_are_slid_typed_undone_and_saved(shot: Path):
         assert not prim.GetAttribute("physgraph:guide:stiffness").HasAuthoredValue()
 
 
+@pytest.mark.slow
 def test_presets_camera_and_frame_outlive_a_restart(shot: Path):
     with tuned(shot) as (session, artist):
         artist.type("Bending [µN·m]", "80")
@@ -191,6 +192,7 @@ def test_presets_camera_and_frame_outlive_a_restart(shot: Path):
         again.picture(lambda now: np.abs(now - turned).mean() < 3.0)
 
 
+@pytest.mark.slow
 def test_the_picture_wipes_maps_wires_and_compares(shot: Path):
     with tuned(shot) as (session, artist):
         side_by_side = artist.picture()
@@ -217,6 +219,7 @@ def test_the_picture_wipes_maps_wires_and_compares(shot: Path):
         assert session.value(CLOTH, "guide:stiffness") == 2000.0
 
 
+@pytest.mark.slow
 def test_a_map_is_painted_with_the_mouse_and_saved(shot: Path):
     with tuned(shot) as (session, artist):
         artist.tab("Picture")

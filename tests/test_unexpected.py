@@ -87,6 +87,7 @@ def test_one_ends_with_a_line_and_a_report_and_keeps_what_is_finished(tmp_path: 
         assert (fine(shot, tmp_path / "fine.usdc", time) == fine(shot, tmp_path / "whole.usdc", time)).all()
 
 
+@pytest.mark.slow
 def test_one_of_several_shots_leaves_the_others(tmp_path: Path):
     for name, time in (("one", BROKEN), ("two", 1.0)):
         cloth_shot(tmp_path / f"{name}.usda", times=(time,))

@@ -82,6 +82,7 @@ def skirt(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_sample("skirt", tmp_path_factory.mktemp("skirt"))
 
 
+@pytest.mark.slow
 def test_nothing_crosses_in_frames_whose_cages_cross(skirt: Path, tmp_path: Path):
     """Without the earlier frames a contour stays that the cage by itself does not get rid of."""
     options = RefineOptions(frames=(36.0, 37.0), level=1)
