@@ -82,17 +82,13 @@ def run(after: int, *, glitch: str = "", at: int = AT, first: int = 0) -> list[t
     return told
 
 
-FAST = ("cage inside out",)
-
-
 @pytest.fixture(scope="module")
 def clean() -> list[np.ndarray]:
     return [points for points, _ in run(AFTER)]
 
 
-@pytest.mark.parametrize(
-    "name", [name if name in FAST else pytest.param(name, marks=pytest.mark.slow) for name in GLITCHES]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", GLITCHES)
 def test_cloth_is_back_after_five_frames(clean: list[np.ndarray], name: str):
     """RMS: a fold may snap either way. Unmended, cloth that a body swallowed for a frame stayed 34 mm away for good."""
     told = run(AFTER, glitch=name)

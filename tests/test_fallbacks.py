@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 from pxr import Sdf
 from shots import CLOTH, FAST, TIMES, cloth_shot, refine
 
@@ -34,6 +35,7 @@ def without(*words: object) -> str:
     return done.stderr
 
 
+@pytest.mark.slow
 def test_scipy_factorises_and_the_peak_of_memory_is_not_known(tmp_path: Path) -> None:
     shot, out, report = cloth_shot(tmp_path / "shot.usda"), tmp_path / "without.usdc", tmp_path / "report.json"
     assert not any("scipy" in warning for warning in refine(shot, tmp_path / "with.usdc").warnings)

@@ -111,7 +111,7 @@ def body_shot(path: Path, *, frozen: bool = False) -> Path:
 
 
 class TestShots:
-    @pytest.mark.parametrize("contact", ["quadratic", "off"])
+    @pytest.mark.parametrize("contact", [pytest.param("quadratic", marks=pytest.mark.slow), "off"])
     def test_a_layer_tells_how_deep_the_cloth_is(self, tmp_path: Path, contact: str):
         shot, out = body_shot(tmp_path / "shot.usdc"), tmp_path / "fine.usdc"
         report = refine(shot, out, heat_map=True, contact=contact)

@@ -81,7 +81,7 @@ def finishes(shot: Path, out: Path, whole: bytes, *more: str) -> None:
     assert [file.name for file in out.parent.iterdir()] == [out.name]
 
 
-@pytest.mark.parametrize(("seed", "workers"), [pytest.param(0, "1", marks=pytest.mark.slow), (1, "2")])
+@pytest.mark.parametrize(("seed", "workers"), [(0, "1"), pytest.param(1, "2", marks=pytest.mark.slow)])
 def test_a_killed_run_leaves_nothing_under_the_name_nor_a_process_and_a_rerun_finishes(
     shot: Path, whole: bytes, seed: int, workers: str
 ):
@@ -243,7 +243,8 @@ def test_a_signal_leaves_no_empty_folder(shot: Path, tmp_path: Path, number: sig
     assert [row["state"] for row in json.loads(summary.read_text())["shots"]] == ["not done"] * 2
 
 
-@pytest.mark.parametrize(("megabytes", "workers"), [(0.3, "1"), pytest.param(0.005, "2", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize(("megabytes", "workers"), [(0.3, "1"), (0.005, "2")])
 def test_a_full_disk_is_a_clear_error_and_costs_no_finished_frame(
     shot: Path, whole: bytes, tmp_path: Path, megabytes: float, workers: str
 ):

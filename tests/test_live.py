@@ -130,7 +130,8 @@ def test_the_cloth_is_the_sessions(process: Process, session: TuneSession):
     assert not folder.exists()
 
 
-@pytest.mark.parametrize("last", ['{"quit": true}\n', pytest.param("", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("last", ['{"quit": true}\n', ""])
 def test_what_was_asked_before_the_end_is_saved(process: Process, shot: Path, last: str):
     assert process.run.stdin is not None
     process.ask()
@@ -145,7 +146,8 @@ def test_what_was_asked_before_the_end_is_saved(process: Process, shot: Path, la
     assert stage.GetPrimAtPath(CLOTH).GetAttribute("physgraph:material:density").Get() == 0.5
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_ends_it_while_it_waits(process: Process, number: int):
     process.answer()
     process.run.send_signal(number)

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from shots import CLOTH, cloth_shot, faults, refine, run, sample_times
+from shots import CLOTH, cloth_shot, faults, run, sample_times
 
 pytest.importorskip("openjd.cli", reason="needs openjd-cli, which runs the templates")
 TEMPLATE = Path(__file__).resolve().parents[1] / "plugins" / "openjd" / "refine.yaml"

@@ -19,8 +19,8 @@ from physgraph_usd.solver.scene import Frame, Scene
 
 
 def squeezed() -> tuple[Problem, Frame]:
-    """A sheet of 6 by 4 cells that is squeezed by a fifth and buckles."""
-    mesh, rest = sheet(6, 4)
+    """A sheet of 4 by 3 cells that is squeezed by a fifth and buckles."""
+    mesh, rest = sheet(4, 3)
     problem = Problem(Scene((garment_of(mesh, rest),), DOWN, ()), [1], device="cpu", threads=1, dtype=torch.float64)
     return problem, frame_of(wave(rest, squeeze=0.2))
 

@@ -58,7 +58,7 @@ def place_in(report: dict[str, Any]) -> tuple[str, list[str], float]:
     return report["failure"]["kind"], report["failure"]["prims"], report["failure"]["time"]
 
 
-@pytest.mark.parametrize("workers", [pytest.param(1, marks=pytest.mark.slow), 2])
+@pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_one_ends_with_a_line_and_a_report_and_keeps_what_is_finished(tmp_path: Path, workers: int):
     """Two workers have three frames each, so that the fault is in the first frame of the second one.
 
