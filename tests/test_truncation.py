@@ -12,9 +12,9 @@ from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.settled import unsettled
 from physgraph_usd.solver.fabric import Fabric
 from physgraph_usd.solver.frame.refiner import Refiner
-from physgraph_usd.solver.integrate.base import System
+from physgraph_usd.solver.integrate.base import Carry, System
 from physgraph_usd.solver.integrate.descend import solve_level
-from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton, truncated
+from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton, backtrack, dot, truncated
 from physgraph_usd.solver.integrate.stop import Budget
 from physgraph_usd.usd.read.reader import open_shot
 
@@ -50,6 +50,20 @@ def test_what_turns_a_triangle_is_cut_there_alone():
     assert turns(system, x, cut) <= 45.0 + 1e-6
     assert float(cut[vertex].norm()) < 0.9 * float(move[vertex].norm())
     kept = (cut == move).all(dim=1)
+    assert float(kept.double().mean()) > 0.8
+
+
+def test_the_rest_of_a_step_that_turns_a_triangle_is_kept():
+    system, x = problem()
+    x = x + 0.12 * system.spacing.mean() * torch.sin(40 * x)
+    start = Carry(x, *system.energy_and_force(x), mover="")
+    step = system.apply_metric_inverse(start.force)
+    move, vertex = turning(system, x)
+    step[vertex] = move[vertex]
+    found = backtrack(system, start, step, dot(start.force, step))
+    assert found is not None
+    kept = torch.isclose(found[0], x + step).all(dim=1)
+    assert not kept[vertex]
     assert float(kept.double().mean()) > 0.8
 
 
