@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -13,8 +12,7 @@ import pytest
 from layers import vec3
 from pxr import Sdf
 
-from physgraph_usd.errors import LayerError, UsageError
-from physgraph_usd.interrupts import leave_if_asked, signals_noted
+from physgraph_usd.errors import UsageError
 from physgraph_usd.usd.write.atomic import HOST, remove_stale, temporary_path
 from physgraph_usd.usd.write.stream import LayerStream
 
@@ -61,15 +59,6 @@ def test_an_error_keeps_the_file_that_was_there(tmp_path: Path) -> None:
     assert names(tmp_path) == ["out.usdc"]
 
 
-def test_two_writers_of_one_layer_do_not_meet(tmp_path: Path) -> None:
-    with LayerStream(tmp_path / "out.usdc") as stream:
-        with pytest.raises(LayerError, match="being written by this process already"):
-            LayerStream(tmp_path / "out.usdc")
-        fill(stream, 2)
-        stream.commit()
-    assert names(tmp_path) == ["out.usdc"]
-
-
 def test_what_dead_processes_left_is_removed(tmp_path: Path) -> None:
     target = tmp_path / "out.usdc"
     dead = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, check=True)
@@ -82,44 +71,3 @@ def test_what_dead_processes_left_is_removed(tmp_path: Path) -> None:
     assert remove_stale(target) == [stale]
     assert names(tmp_path) == sorted([alive.name, other.name, elsewhere.name])
     assert temporary_path(target).parent == tmp_path
-
-
-def test_hosts_of_one_disk_do_not_meet(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two machines write one layer under the same process number; neither takes the other's file away."""
-    target = tmp_path / "out.usdc"
-    with LayerStream(target) as stream:
-        fill(stream, 1)
-        stream.flush()
-        monkeypatch.setattr("physgraph_usd.usd.write.atomic.HOST", "elsewhere")
-        with LayerStream(target) as second:
-            fill(second, 1)
-            second.flush()
-            assert len(names(tmp_path)) == 2
-        stream.commit()
-    assert names(tmp_path) == ["out.usdc"]
-
-
-class Destroyed:
-    """An object in whose destructor a termination signal comes."""
-
-    def __del__(self) -> None:
-        signal.raise_signal(signal.SIGTERM)
-
-
-def write_on(target: Path, reached: list[str]) -> None:
-    with signals_noted(), LayerStream(target) as stream:
-        Destroyed()
-        fill(stream, 2)
-        reached.append("flush")
-        stream.flush()
-        reached.append("end")
-
-
-def test_a_signal_in_a_destructor_ends_the_next_flush(tmp_path: Path) -> None:
-    reached: list[str] = []
-    with pytest.raises(SystemExit) as caught:
-        write_on(tmp_path / "out.usdc", reached)
-    assert caught.value.code == 128 + signal.SIGTERM
-    assert names(tmp_path) == []
-    assert reached == ["flush"]
-    leave_if_asked()  # The next run of this process is not asked to end.

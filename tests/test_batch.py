@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -117,26 +115,6 @@ class TestSkipExisting:
     def test_it_does_not_go_with_overwrite(self, tmp_path: Path) -> None:
         with pytest.raises(UsageError, match="choose one"):
             refine_shot("s.usda", tmp_path / "o.usdc", RefineOptions(skip_existing=True, overwrite=True))
-
-
-class TestImports:
-    """What is finished is passed over without the solver's libraries, whose import takes seconds."""
-
-    def passed_over(self, *args: object) -> str:
-        """Run the command in a process of its own; what it says last is the solver's libraries that it imported."""
-        program = "import sys; from physgraph_usd.cli import main; main(sys.argv[1:], standalone_mode=False)"
-        program = f"try: exec({program!r})\nexcept SystemExit as end: assert not end.code, end.code\n"
-        program += "import sys; print({'torch', 'warp', 'scipy'} & sys.modules.keys() or 'none')"
-        line = [sys.executable, "-c", program, "refine", *map(str, args)]
-        return subprocess.run(line, capture_output=True, text=True, check=True).stdout.splitlines()[-1]
-
-    def test_of_a_batch_and_of_one(self, tmp_path: Path) -> None:
-        shots = [cloth_shot(tmp_path / f"{name}.usda", times=(1.0,)) for name in "ab"]
-        for shot in shots:
-            assert run("refine", shot, "-o", tmp_path / f"{shot.stem}.refined.usdc", *SMALL).exit_code == 0
-        for option in ("--skip-existing", "--resume"):
-            assert self.passed_over(*shots, "-o", tmp_path, option, *SMALL) == "none"
-            assert self.passed_over(shots[0], "-o", tmp_path / "a.refined.usdc", option, *SMALL) == "none"
 
 
 class TestLogging:

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
-import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -75,6 +73,7 @@ def test_the_process_answers_with_files_and_ends(live: ModuleType, process: Any)
     process.send({"time": 1.0})
 
 
+@pytest.mark.slow
 def test_a_process_that_fails_says_why(live: ModuleType, program: list[str], tmp_path: Path) -> None:
     process = live.LiveProcess([*program[:-1], "/World/nothing"], tmp_path / "log")
     wait_for(process, lambda news: news.ended)
@@ -101,43 +100,6 @@ def test_a_line_that_is_no_json_is_an_error(live: ModuleType, tmp_path: Path) ->
     news = wait_for(process, lambda news: news.errors)
     assert news.errors == ["hello"]
     process.stop().join(PATIENCE_SECONDS)
-
-
-def test_it_does_not_stay_behind_when_its_starter_is_killed(program: list[str], tmp_path: Path) -> None:
-    code = f"""
-import sys, time
-sys.path.insert(0, {str(Path(__file__).parent)!r})
-from pathlib import Path
-from blender import addon_module
-process = addon_module("live").LiveProcess({program!r}, Path({str(tmp_path / "log")!r}))
-while not (news := process.news()).shot:
-    if news.ended:
-        sys.exit(process.last_words())
-    time.sleep(0.01)
-process.send({{}})
-sys.stdout.write(str(process._process.pid) + chr(10))
-sys.stdout.flush()
-time.sleep(60)
-"""
-    starter = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
-    assert starter.stdout is not None
-    number = int(starter.stdout.readline())
-    os.kill(number, 0)
-    starter.kill()
-    starter.communicate()
-    until = time.monotonic() + PATIENCE_SECONDS
-    while is_there(number) and time.monotonic() < until:
-        time.sleep(0.05)
-    assert not is_there(number)
-
-
-def is_there(number: int) -> bool:
-    """Whether a process runs; one that has ended may wait for who starts processes to take note."""
-    status = Path(f"/proc/{number}/stat")
-    try:
-        return status.read_text().rpartition(")")[2].split()[0] != "Z"
-    except FileNotFoundError:
-        return False
 
 
 def test_the_session_then_has_what_the_panel_says(

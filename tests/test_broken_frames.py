@@ -27,7 +27,7 @@ from physgraph_usd.solver.scene import Frame, GarmentFrame, Scene
 
 AT, AFTER = 2, 5
 RADIUS = 0.15
-MESH, FLAT = square(24, edge=0.025, kind="quads")
+MESH, FLAT = square(16, edge=0.0375, kind="quads")
 DRIFT = np.array([1e-6, 0.0, 0.0])
 """Of the held cage, a frame [m]: equal frames would be taken over as they are."""
 
@@ -82,8 +82,7 @@ def run(after: int, *, glitch: str = "", at: int = AT, first: int = 0) -> list[t
     return told
 
 
-FAST = ("ball 10 cm higher", "cage inside out", "cage a hundred times its size")
-"""One glitch of each kind: a body that moves, a cage that turns, one that is blown up."""
+FAST = "cage inside out"
 
 
 @pytest.fixture(scope="module")
@@ -92,7 +91,7 @@ def clean() -> list[np.ndarray]:
 
 
 @pytest.mark.parametrize(
-    "name", [name if name in FAST else pytest.param(name, marks=pytest.mark.slow) for name in GLITCHES]
+    "name", [name if name == FAST else pytest.param(name, marks=pytest.mark.slow) for name in GLITCHES]
 )
 def test_cloth_is_back_after_five_frames(clean: list[np.ndarray], name: str):
     """RMS: a fold may snap either way. Unmended, cloth that a body swallowed for a frame stayed 34 mm away for good."""
@@ -104,7 +103,7 @@ def test_cloth_is_back_after_five_frames(clean: list[np.ndarray], name: str):
 @pytest.mark.parametrize(
     ("name", "anew"),
     [
-        ("ball eight times its size", 1),
+        pytest.param("ball eight times its size", 1, marks=pytest.mark.slow),
         pytest.param("ball 10 cm higher", 2, marks=pytest.mark.slow),
         ("cage inside out", 2),
     ],

@@ -107,16 +107,6 @@ def test_the_default_is_judged_as_refine_reports_it(made: tuple[Path, Path, Char
 
 
 @pytest.mark.slow
-def test_shapes_come_nearer_to_the_reference(made: tuple[Path, Path, Chart], tmp_path: Path):
-    chart = made[2]
-    far, near = chart.curve(UPSAMPLED)[0].apart_mm, chart.curve(DEFAULT)[0].apart_mm
-    assert far is not None
-    assert near is not None
-    assert 0.0 < near < 0.5 * far
-    assert not chart.likeness, "it is drawn where there are solvers outside"
-
-
-@pytest.mark.slow
 def test_terms_tell_what_is_worse_without_them(made: tuple[Path, Path, Chart]):
     rows = {row["term"]: row for row in made[2].terms}
     assert rows["contact"]["without"]["inside"] > rows["contact"]["with"]["inside"]
@@ -139,18 +129,6 @@ def test_the_files(made: tuple[Path, Path, Chart]):
     with Image.open(folder / "chart.png") as picture:
         assert picture.width > 800
     assert (folder / "chart.svg").read_text(encoding="utf-8").count("<text") > 20
-
-
-@pytest.mark.slow
-def test_a_second_run_measures_nothing_again(made: tuple[Path, Path, Chart]):
-    shot, folder, _ = made
-    before = (folder / "chart.rows.jsonl").read_text(encoding="utf-8")
-    chart_shot(shot, folder, QUICK)
-    after = (folder / "chart.rows.jsonl").read_text(encoding="utf-8")
-    assert after.startswith(before)
-    rows = [json.loads(line) for line in after.splitlines()]
-    keys = [tuple(row.get(name) for name in ("row", "method", "steps", "frame", "repeat", "term")) for row in rows]
-    assert len(set(keys)) == len(keys)
 
 
 @pytest.mark.slow

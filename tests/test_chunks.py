@@ -6,7 +6,6 @@ import os
 import pickle
 import threading
 from concurrent.futures import Future
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ from shots import EDGE, cloth_shot, faults, fine, interrupted, refine, run, samp
 
 from physgraph_usd.errors import LayerError, SolveError
 from physgraph_usd.shot.chunks import solve_in_chunks
-from physgraph_usd.shot.frames import FrameFolder, Outcome
+from physgraph_usd.shot.frames import FrameFolder
 from physgraph_usd.shot.processes import cores, memory_is_named, result_of, separate_processes
 from physgraph_usd.solver.mesh.kernels import cards_for
 
@@ -88,15 +87,6 @@ class TestFarmFolder:
                 outlasting.write(0, outcome)
             assert other.read(0, 0.0) is None
 
-    @pytest.mark.parametrize(
-        "points", [np.full((3, 3), np.nan), np.zeros((2, 3)), np.zeros((3, 3), np.int64), np.zeros((3, 2))]
-    )
-    def test_points_that_no_kernel_may_see_are_named(self, tmp_path: Path, points: np.ndarray):
-        with FrameFolder(tmp_path / "f", {}, counts=[3]) as frames:
-            frames.write(0, Outcome(0.0, (points,), (False,), {}))
-            with pytest.raises(LayerError, match=r"0\.npz is damaged \(points of shape"):
-                frames.read(0, 0.0)
-
 
 class TestKeptFrames:
     @pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.slow)])
@@ -148,28 +138,6 @@ class TestLayers:
         assert layers[0].read_bytes() == layers[1].read_bytes()
         assert faults(layers[0], shot) == []
 
-    @pytest.mark.slow
-    def test_s35_equal_frames_give_the_same_bytes_across_a_seam(self, tmp_path: Path):
-        shot = cloth_shot(tmp_path / "shot.usdc", frozen=True)
-        layers = [layer_with(shot, tmp_path / str(n), workers=n, temporal="off") for n in (1, 2)]
-        assert layers[0].read_bytes() == layers[1].read_bytes()
-
     def test_s34_the_same_command_gives_the_same_bytes(self, tmp_path: Path):
         shot = cloth_shot(tmp_path / "shot.usdc")
         assert len({layer_with(shot, tmp_path / str(n)).read_bytes() for n in range(3)}) == 1
-
-    @pytest.mark.slow
-    @pytest.mark.parametrize("temporal", ["tether", "warm"])
-    def test_s34_seams_do_not_show_with_history(self, tmp_path: Path, temporal: str):
-        """Less than a twentieth of a fine edge, RMS, is left at a seam, and it fades; cloth moves far more."""
-        shot = cloth_shot(tmp_path / "shot.usdc", times=LONG)
-        one, two = (layer_with(shot, tmp_path / str(n), workers=n, temporal=temporal) for n in (1, 2))
-        off = {t: fine(shot, two, t) - fine(shot, one, t) for t in LONG}
-        apart = [rms(each) / (EDGE / 2) for each in off.values()]
-        assert max(apart[:6]) == 0.0
-        assert max(apart) < SEAM, apart
-        steps = [rms(off[b] - off[a]) / (EDGE / 2) for a, b in pairwise(LONG)]
-        assert max(steps) < max(apart), steps
-        moves = [rms(fine(shot, one, a) - fine(shot, one, b)) / (EDGE / 2) for a, b in pairwise(LONG)]
-        assert min(moves) > 2 * max(apart)
-        assert sample_times(one) == sample_times(two) == LONG

@@ -130,19 +130,6 @@ class TestSeveralShots:
         monkeypatch.setattr("physgraph_usd.shot.refine.refine_shots", refine_shots)
         return asked
 
-    def test_an_interruption_while_folders_are_made_leaves_none(
-        self, jobs: list[tuple[str, Path, Any]], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-    ) -> None:
-        make = Path.mkdir
-
-        def interrupted(folder: Path) -> None:
-            make(folder)
-            raise KeyboardInterrupt
-
-        monkeypatch.setattr(Path, "mkdir", interrupted)
-        assert run("refine", "a/one.usda", "b/two.usd", "-o", tmp_path / "new" / "out").exit_code != 0
-        assert (jobs, list(tmp_path.iterdir())) == ([], [])
-
     def test_equal_names_are_refused(self, jobs: list[tuple[str, Path, Any]], tmp_path: Path) -> None:
         result = run("refine", "a/shot.usda", "b/shot.usda", "-o", tmp_path / "out")
         assert (result.exit_code, jobs) == (2, [])
@@ -248,6 +235,7 @@ class TestOtherCommands:
         assert (result.exit_code, f"<{CLOTH}>.physgraph:colliders: no prim at </World/gone>" in result.stdout) == (1, 1)
 
 
+@pytest.mark.slow
 def test_a_terminal_has_each_message_on_a_line_of_its_own(tmp_path: Path) -> None:
     """Not behind the progress bar, which a frame before has left in the line."""
     pty = pytest.importorskip("pty", reason="terminals of POSIX")

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 from pxr import Sdf
 from shots import CLOTH, FAST, TIMES, cloth_shot, refine
 
@@ -34,10 +35,10 @@ def without(*words: object) -> str:
     return done.stderr
 
 
+@pytest.mark.slow
 def test_scipy_factorises_and_the_peak_of_memory_is_not_known(tmp_path: Path) -> None:
     shot, out, report = cloth_shot(tmp_path / "shot.usda"), tmp_path / "without.usdc", tmp_path / "report.json"
     assert not any("scipy" in warning for warning in refine(shot, tmp_path / "with.usdc").warnings)
-    without("inspect", shot)
     asked = ("--level", FAST["level"], "--steps", FAST["steps"])
     assert without("refine", shot, "-o", out, *asked, "--report", report).count("scipy") == 1
     told = json.loads(report.read_text(encoding="utf-8"))

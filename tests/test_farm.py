@@ -28,9 +28,9 @@ NOWHERE = "tcp://127.0.0.1:9"
 
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[Any]:
-    """Two worker processes of one thread each."""
+    """A worker process of one thread."""
     with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=":0", host="127.0.0.1"
+        n_workers=1, threads_per_worker=1, processes=True, dashboard_address=":0", host="127.0.0.1"
     ) as started:
         yield started
 
@@ -56,6 +56,8 @@ def layer_of(shot: Path, folder: Path, **options: Any) -> Path:
 @pytest.mark.slow
 def test_h34_a_worker_that_is_killed_changes_no_byte(cluster: Any, shot: Path, tmp_path: Path):
     """A worker dies in the middle of its chunk; another one takes the chunk over."""
+    cluster.scale(2)
+    cluster.wait_for_workers(2)
     local = layer_of(shot, tmp_path / "local", workers=4)
     killed: list[int] = []
     told: list[tuple[int, int]] = []
@@ -74,6 +76,13 @@ def test_h34_a_worker_that_is_killed_changes_no_byte(cluster: Any, shot: Path, t
     assert Sdf.Layer.FindOrOpen(str(farmed)).ListTimeSamplesForPath(f"{BEADS}.points") == list(TIMES)
     assert faults(farmed, shot) == []
     assert [file.name for file in farmed.parent.iterdir()] == ["fine.usdc"]
+
+
+def test_a_layer_is_that_of_a_local_run(cluster: Any, shot: Path, tmp_path: Path):
+    """Of frames that stand alone, so that chunks make no difference."""
+    asked: dict[str, Any] = {"frames": (1.0, 4.0), "temporal": "off"}
+    farmed = layer_of(shot, tmp_path / "farm", workers=2, scheduler=cluster.scheduler_address, **asked)
+    assert farmed.read_bytes() == layer_of(shot, tmp_path / "local", **asked).read_bytes()
 
 
 @pytest.mark.slow

@@ -310,14 +310,3 @@ def test_the_force_is_minus_the_gradient(name: str):
     assert bool(force.any()) == (name not in OPEN)
     difference = difference_force(term, X, 2e-7)
     assert float((force - difference).abs().max()) < 1e-6 * max(float(difference.abs().max()), 1e-3)
-
-
-def test_they_turn_with_the_cloth():
-    turn, shift = torch.as_tensor(rotation(4)), torch.tensor([0.3, -0.2, 5.0], dtype=X.dtype)
-    moved = X @ turn.T + shift
-    gaps = gaps_of(X)
-    energy, force = evaluate(SelfContact(LEVEL, gaps), X)
-    turned = SelfContact(LEVEL, replace(gaps, normal=gaps.normal @ turn.T))
-    energy_there, force_there = evaluate(turned, moved)
-    assert energy_there == pytest.approx(energy, rel=1e-9)
-    assert apart(force_there, force @ turn.T) < 1e-9

@@ -16,9 +16,9 @@ ipctk = pytest.importorskip("ipctk", reason="the IPC toolkit is not installed; i
 scenes = pytest.mark.parametrize("name", SCENES)
 some = pytest.mark.parametrize(
     "name",
-    [name if name in ("layers", "tube", "tangle") else pytest.param(name, marks=pytest.mark.slow) for name in SCENES],
+    [name if name in ("layers", "tube") else pytest.param(name, marks=pytest.mark.slow) for name in SCENES],
 )
-"""Fast: garments over one another on a body, one garment on a body, and cloth that crosses cloth."""
+"""Fast: garments over one another on a body, and one garment on a body."""
 
 
 def crossings(points: Sequence[np.ndarray], faces: Sequence[np.ndarray]) -> int:

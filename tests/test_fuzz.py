@@ -26,6 +26,7 @@ def bases(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", BASES)
 def test_the_shots_that_mutants_are_made_from_are_sound(bases: Path, tmp_path: Path, name: str):
     report = refine(bases / name / "shot.usda", tmp_path / "fine.usdc")

@@ -74,14 +74,6 @@ def test_a_sample_on_a_stage_with_the_other_axis_is_told(sample: Callable[[str],
     assert "give --gravity -Y" in said
 
 
-@pytest.mark.real_data
-def test_a_dress_whose_ruffles_face_up_on_a_stage_with_the_other_axis_is_told(real_data: Path, tmp_path: Path):
-    shot, named = real_data / "shots" / "04_tiered_dress_kick_zup.usdc", {"garments": ("/shot/tiered_dress",)}
-    assert warned(str(shot), **named) == []
-    (said,) = warned(across(shot, tmp_path), **named)
-    assert "give --gravity -Z" in said
-
-
 def test_garments_author_one_gravity_and_options_go_before(tmp_path: Path):
     shot = worn(tmp_path / "s.usda", up="Z", axis="Y")
     root = Sdf.Layer.FindOrOpen(shot)

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 from shots import cloth_shot
 
 from physgraph_usd.shot.chunks import frames_in_order
@@ -52,14 +51,6 @@ def test_cloth_that_would_cross_jumps_and_is_told_of():
     (said,) = joints[0].warnings
     assert "after time code 2" in said
     assert "3 edges through cloth" in said
-
-
-def test_a_frame_that_failed_on_one_side_is_taken_as_it_is():
-    both = [(read(k, None), read(k, 3)) for k in range(3)]
-    both[0] = (both[0][0], Outcome(0.0, (), (), {"error": "no"}))
-    found = list(join(both, Passing()).frames)
-    assert heights(found) == pytest.approx([0.0, 0.5, 0.75])
-    assert [each.reused for each in found] == [(True,), (False,), (False,)]
 
 
 def test_folds_that_change_sides_stop_before_they_cross(tmp_path: Path):

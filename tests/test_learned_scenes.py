@@ -35,7 +35,7 @@ def garments_of(report: RefineReport) -> Iterator[dict[str, Any]]:
     # What crosses is drawn apart by quasi-Newton: half of the crossing sheets' steps.
     # In layers the part is none to most by frame, as four corrections come in a row or do not: the whole shot tells.
     [
-        ("block", (12.0, 13.0), 0.8),
+        pytest.param("block", (12.0, 13.0), 0.8, marks=pytest.mark.slow),
         ("tshirt", (1.0, 2.0), 0.8),
         pytest.param("layers", (1.0, 30.0), 0.1, marks=pytest.mark.slow),
         ("crossing", (1.0, 2.0), 0.3),

@@ -5,32 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from meshes import grid, mesh_of
+from meshes import grid
 from sheets import equilateral, garment_of, level_of
 from test_forces import force_of
 
-from physgraph_usd.solver.level import Level, build_levels, hinge_geometry, refine_garments
-
-
-def two_garments(depths: tuple[int, ...]) -> tuple[Level, ...]:
-    """Levels of two garments, the second of which has paint, pins and a loose point."""
-    first, points = grid(3, 2, "mixed")
-    second = mesh_of([[0, 1, 2], [1, 3, 2], [1, 4, 5, 3]], 7)
-    other = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0], [2, 0, 0.5], [2, 1, 0.5], [9, 9, 9.0]])
-    paint = np.linspace(0.5, 2.0, 7)
-    garments = [
-        garment_of(first, points),
-        garment_of(second, other, stretch_scale=paint, bend_scale=paint, pin=paint / 2),
-    ]
-    return build_levels(garments, refine_garments(garments, depths), dtype=torch.float64)
-
-
-def test_paint_is_the_mean_of_the_vertices():
-    level = two_garments((0, 0))[0]
-    paint = torch.cat([torch.ones(level.spans[0].stop, dtype=torch.float64), torch.linspace(0.5, 2.0, 7).double()])
-    assert torch.allclose(level.spring_scale, paint[level.springs.long()].mean(dim=1))
-    assert torch.allclose(level.membrane_scale, paint[level.membrane.long()].mean(dim=1))
-    assert torch.allclose(level.bend_scale, paint[level.hinges[:, :2].long()].mean(dim=1))
+from physgraph_usd.solver.level import build_levels, hinge_geometry, refine_garments
 
 
 @pytest.mark.parametrize("name", ["stretch", "membrane"])

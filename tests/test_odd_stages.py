@@ -24,9 +24,7 @@ def edit(shot: Path) -> tuple[Usd.Stage, UsdGeom.Mesh]:
     return stage, UsdGeom.Mesh(stage.GetPrimAtPath(CLOTH))
 
 
-@pytest.mark.parametrize(
-    ("how", "bad"), [("one point", 1e24), ("one point", np.nan), ("scale", 1e24), ("place", 3e38), ("place", np.nan)]
-)
+@pytest.mark.parametrize(("how", "bad"), [("one point", 1e24), ("scale", 1e24), ("place", np.nan)])
 def test_a_body_out_of_bounds_is_left_out_there_with_a_word(tmp_path: Path, how: str, bad: float):
     shot = cloth_shot(tmp_path / "shot.usda", times=(1.0, 2.0))
     stage = Usd.Stage.Open(str(shot))

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from shots import CLOTH, cloth_shot, faults, refine, run, sample_times
+from shots import CLOTH, cloth_shot, faults, run, sample_times
 
 pytest.importorskip("openjd.cli", reason="needs openjd-cli, which runs the templates")
 TEMPLATE = Path(__file__).resolve().parents[1] / "plugins" / "openjd" / "refine.yaml"
@@ -73,11 +73,3 @@ def test_a_job_makes_one_layer_and_a_second_run_of_it_solves_nothing_again(tmp_p
     layer = tmp_path / "out" / "fine.usdc"
     assert faults(layer, shot) == []
     assert sample_times(layer) == TIMES
-
-
-@pytest.mark.slow
-def test_a_job_fails_where_a_chunk_is_missing(tmp_path: Path):
-    refine(cloth_shot(tmp_path / "shot.usdc", times=TIMES), tmp_path / "chunk", frames=(1.0, 4.0), preroll=6)
-    done = openjd("run", TEMPLATE, "--step", "Stitch", *parameters(tmp_path, Chunks=str(tmp_path / "chunk")))
-    assert done.returncode != 0
-    assert "frames 5:8 are in no chunk" in done.stdout

@@ -30,10 +30,6 @@ def refiner(**options: Any) -> Solver:
     return refiner_of([garment_of(MESH, REST)], dtype=torch.float32, **options)
 
 
-def pair(first: np.ndarray, second: np.ndarray, time: float | None = None) -> Frame:
-    return Frame(time, (GarmentFrame(first, FABRIC), GarmentFrame(second, FABRIC)))
-
-
 def test_a_budget_of_nothing_makes_one_step_and_says_so():
     state = solved(MESH, REST, wave(REST, height=0.05, squeeze=0), level=1, budget_ms=1e-6)
     assert state.telemetry[0]["levels"][-1]["stopped"] == "budget"
@@ -56,11 +52,6 @@ class TestReuse:
         one.solve(frame_of(wave(REST), 1.0))
         other = Frame(2.0, (replace(frame_of(wave(REST)).garments[0], **change),))
         assert one.solve(other).reused == (False,)
-
-    def test_not_beside_one_that_moves(self):
-        two = refiner_of([garment_of(MESH, REST), garment_of(OTHER, OTHER_REST)])
-        two.solve(pair(wave(REST), wave(OTHER_REST), 1.0))
-        assert two.solve(pair(wave(REST), wave(OTHER_REST, phase=1.0), 2.0)).reused == (False, False)
 
 
 def test_warm_starts_take_fewer_steps():

@@ -63,14 +63,6 @@ def test_coarse_stands_beside_fine(sample: Callable[[str], Path], tmp_path: Path
     assert np.nonzero(right)[0].mean() < np.nonzero(left)[0].mean() - 8, "the fine side hangs 5 cm higher"
 
 
-def test_shot_can_be_given(sample: Callable[[str], Path], tmp_path: Path) -> None:
-    layer = refined_layer(sample("swatch"), tmp_path, record=False)
-    assert shot_of(layer) is None
-    picture = pixels(preview(layer, tmp_path / "a.png", shot=sample("swatch"), size=SIZE))
-    assert covered(picture[:, :160]).sum() > 1500
-    assert covered(picture[:, 160:]).sum() > 1500
-
-
 def test_same_picture_in_every_unit_axis_and_winding(sample: Callable[[str], Path], tmp_path: Path) -> None:
     names = ("swatch", "swatch_cm", "swatch_zup", "swatch_lefthanded")
     pictures = [pixels(preview(sample(name), tmp_path / f"{name}.png", size=SIZE)) for name in names]
@@ -112,11 +104,6 @@ def test_loop_has_one_frame_per_time_at_the_shots_speed(sample: Callable[[str], 
         assert loop.info["loop"] == 0
         assert loop.info["duration"] == pytest.approx(1000 * 8 / 24, abs=10)
     assert out.stat().st_size < 100_000
-
-
-def test_same_picture_every_time(sample: Callable[[str], Path], tmp_path: Path) -> None:
-    first, second = (preview(sample("frozen"), tmp_path / f"{i}.png", size=SIZE).read_bytes() for i in range(2))
-    assert first == second
 
 
 def test_wrong_requests_are_named(sample: Callable[[str], Path], tmp_path: Path) -> None:

@@ -2,28 +2,24 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 from click.testing import Result
-from pxr import Sdf
-from shots import SHOTS, VALID, faults, run
+from shots import VALID, faults, run
 
-from physgraph_usd.errors import StageError
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.solve import open_for
 from physgraph_usd.solver.frame.refiner import Refiner
 from physgraph_usd.solver.level import refine_garments
 from physgraph_usd.solver.mesh.topology import edges_of
-from physgraph_usd.usd.read.reader import Shot, open_shot
 
 pytestmark = pytest.mark.real_data
 
 FIRST = {"01_newton_shirt_dab_cm.usdc": "1001:1003", "02_makehuman_usdskel_dm.usdc": "0:2"}
-FAST = ("06", "07", "09")
+FAST = ("09",)
 """Shots of which a few frames are a fast test: by numbers that their names begin with."""
 STAGES = ("stages/float_units", "stages/usd_wg", "stages/usdskel")
 
@@ -68,17 +64,6 @@ def test_all_frames_of_a_valid_shot(real_data: Path, tmp_path: Path, name: str):
     check(real_data, name, refine(real_data, name, tmp_path))
 
 
-def test_s5_broken_samples_are_repaired_and_told(real_data: Path, tmp_path: Path):
-    out = tmp_path / "fine.usdc"
-    shot = real_data / "shots" / "11b_nan_frame.usda"
-    result = run("refine", shot, "-o", out, "--garment", "/shot/dress", "--level", "1", "--steps", "1")
-    assert result.exit_code == 0, result.output
-    assert faults(out, shot) == []
-    assert len(Sdf.Layer.FindOrOpen(str(out)).ListTimeSamplesForPath("/shot/dress.points")) == 6
-    for time in (4, 5):
-        assert any(f"time code {time}" in line and "repaired" in line for line in result.stderr.splitlines())
-
-
 def stages(data: Path) -> list[Path]:
     return sorted(file for folder in STAGES for file in (data / folder).rglob("*.usd*"))
 
@@ -115,52 +100,6 @@ def test_every_odd_stage_refines_or_says_why_not(real_data: Path, tmp_path: Path
             assert "error: " in result.stderr, path
             assert not list(folder.iterdir()), path
     assert done > 5
-
-
-VARIANTS = [name for name in SHOTS if name.startswith("12_variants/") and "k_static" not in name]
-
-
-def opened(folder: Path, name: str, **options) -> Shot:
-    return open_shot(str(folder / "shots" / name), garments=SHOTS[name][0], **options)
-
-
-@pytest.fixture(scope="module")
-def expected(real_data: Path) -> np.ndarray:
-    """Points of one of them in the first frame [m]."""
-    return opened(real_data, "12_variants/b_winding_flipped_unflagged.usdc").frame(1.0).garments[0].points
-
-
-@pytest.mark.parametrize("name", VARIANTS)
-def test_the_variants_are_one_animation_under_many_conventions(
-    real_data: Path, expected: np.ndarray, name: str
-) -> None:
-    with contextlib.closing(opened(real_data, name)) as shot:
-        points = shot.frame(shot.scene.times[0]).garments[0].points
-        if name.endswith("c_zup_cm.usdc"):
-            points = points @ np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])
-        np.testing.assert_allclose(points, expected, atol=2e-6)
-    assert shot.scene.garments[0].flipped == ("lefthanded" in name)
-
-
-def test_sub_frame_and_sparse_times_are_the_authored_ones(real_data: Path) -> None:
-    sparse = opened(real_data, "12_variants/e_sparse_samples.usdc")
-    assert sparse.scene.times == (1.0, 4.0, 7.0, 10.0)
-    sub = opened(real_data, "12_variants/f_subframe_times_tcps48.usdc").scene.times
-    np.testing.assert_array_equal(np.diff(sub), [2.25, 1.75] * 5 + [2.25])
-
-
-def test_holes_of_a_real_garment_are_left_out(real_data: Path) -> None:
-    shot = opened(real_data, "12_variants/h_holes_creases_normals.usdc")
-    assert len(shot.sources[0].kept_faces) == shot.scene.garments[0].mesh.face_count == 2764
-    assert any("creaseIndices" in notice.message for notice in shot.warnings)
-
-
-def test_a_body_by_path_is_a_collider_with_its_skin_and_payload(real_data: Path) -> None:
-    shot = opened(real_data, "09_cesiumman_kilt/shot.usda", colliders=["/shot/CesiumMan"])
-    assert len(shot.colliders) == 1
-    assert shot.colliders[0].endswith("Cesium_Man_2")
-    with pytest.raises(StageError, match="no prim at </shot/body>"):
-        opened(real_data, "07_flag_quads_nocollider.usda", colliders=["/shot/body"])
 
 
 @pytest.mark.slow

@@ -8,10 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from layers import world_metres
 from pxr import Sdf, Usd, UsdGeom
-from shots import CLOTH, FAST, TIMES, cloth_shot, fine, refine
+from shots import CLOTH, FAST, cloth_shot, fine, refine
 from stages import add_sheet, add_skeleton, author, bind_skin, new_stage, sheet_points, vec3
 
 import physgraph_usd as pg
@@ -55,11 +54,6 @@ def test_five_lines_from_an_open_stage_to_a_layer(tmp_path: Path):
     stage.GetSessionLayer().subLayerPaths.insert(0, layer.identifier)
     assert len(UsdGeom.Mesh(stage.GetPrimAtPath(CLOTH)).GetPointsAttr().Get(1.0)) > 35
     assert [problem for problem in pg.validate_layer(layer) if problem.severity == "error"] == []
-
-
-def test_device_auto_is_the_card_or_the_processor(stage: Usd.Stage):
-    device = "cuda" if torch.cuda.is_available() else "cpu"
-    assert np.array_equal(points(refined(stage, device="auto")), points(refined(stage, device=device)))
 
 
 def test_the_same_cloth_as_from_the_file(stage: Usd.Stage, tmp_path: Path):
@@ -118,11 +112,6 @@ class TestStateOfTheStage:
             UsdGeom.XformCommonAPI(stage.GetPrimAtPath("/World")).SetTranslate((0, 9, 0), 3.0)
         self.as_from_file(stage, tmp_path)
 
-    def test_an_edit_that_is_not_saved(self, stage: Usd.Stage, tmp_path: Path):
-        author(stage.GetPrimAtPath(CLOTH), BEND, 1e-3)
-        assert list(refined(stage).customLayerData["physgraph"]["unsaved"]) == ["shot.usda"]
-        self.as_from_file(stage, tmp_path)
-
     def test_a_muted_layer(self, stage: Usd.Stage, tmp_path: Path):
         stiff = Sdf.Layer.CreateNew(str(tmp_path / "stiff.usda"))
         stage.GetRootLayer().subLayerPaths.append("./stiff.usda")
@@ -178,13 +167,6 @@ class TestReport:
         assert [frame["time"] for frame in written["frames"]] == list(SHORT)
         assert written["out"] is None
 
-    def test_a_frame_that_fails_is_told(self, tmp_path: Path):
-        told: list[RefineReport] = []
-        shot = cloth_shot(tmp_path / "shot.usda", broken={3.0: float("nan")})
-        layer = refine_stage(Usd.Stage.Open(str(shot)), RefineOptions(**FAST), on_report=told.append)
-        assert list(told[0].failed) == list(layer.customLayerData["physgraph"]["failed"]) == ["3"]
-        assert layer.ListTimeSamplesForPath(f"{CLOTH}.points") == [time for time in TIMES if time != 3.0]
-
     def test_a_run_that_fails_is_told(self, stage: Usd.Stage, tmp_path: Path):
         told: list[RefineReport] = []
         options = RefineOptions(**FAST, report=tmp_path / "report.json")
@@ -196,13 +178,6 @@ class TestReport:
         stage.SetTimeCodesPerSecond(24.0)
         refine_stage(stage, RefineOptions(**FAST, report=tmp_path / "report.json"))
         assert json.loads((tmp_path / "report.json").read_text())["exit_code"] == 0
-
-    def test_it_is_never_written_over_the_stage(self, stage: Usd.Stage, tmp_path: Path):
-        (tmp_path / "data.json").write_text("{}")
-        stage.GetPrimAtPath(CLOTH).CreateAttribute("data", Sdf.ValueTypeNames.Asset).Set("./data.json")
-        stage.Save()
-        with pytest.raises(pg.UsageError, match="part of the shot"):
-            refined(stage, report=tmp_path / "data.json", overwrite=True)
 
 
 @pytest.mark.parametrize(

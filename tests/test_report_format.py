@@ -34,7 +34,11 @@ def test_the_command_prints_the_schemas_which_are_schemas(name: str, file: Path)
 
 @pytest.mark.parametrize(
     ("name", "options"),
-    [("torus", {"level": 0, "frames": (1.0, 4.0)}), ("layers", {"level": 0, "frames": (1.0, 3.0)}), ("frozen", {})],
+    [
+        pytest.param("torus", {"level": 0, "frames": (1.0, 4.0)}, marks=pytest.mark.slow),
+        ("layers", {"level": 0, "frames": (1.0, 3.0)}),
+        ("frozen", {}),
+    ],
 )
 def test_reports_of_samples_follow_it(
     sample: Callable[[str], Path], tmp_path: Path, name: str, options: dict[str, Any]

@@ -88,13 +88,6 @@ def test_it_is_not_where_the_shot_was_edited(shot: Path, tmp_path: Path):
         refine(shot, tmp_path / "fine.usdc", resume=True)
 
 
-def test_it_is_not_where_another_checkout_made_it(shot: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    refine(shot, tmp_path / "fine.usdc")
-    monkeypatch.setattr("physgraph_usd.shot.finished.code_digest", lambda: "other")
-    with pytest.raises(UsageError, match=r"fine\.usdc exists"):
-        refine(shot, tmp_path / "fine.usdc", resume=True)
-
-
 def test_it_is_not_where_frames_failed(shot: Path, tmp_path: Path):
     edited(shot, lambda mesh: mesh.GetPointsAttr().Set(mesh.GetPointsAttr().Get(4.0)[:-1], 4.0))
     assert list(refine(shot, tmp_path / "fine.usdc").failed) == ["4"]

@@ -18,6 +18,9 @@ from physgraph_usd.solver.integrate.weights import NETWORKS, shipped_network
 FEW = RoundConfig(scenes=2, reference_steps=15, most_vertices=1)
 
 
+pytestmark = pytest.mark.slow
+
+
 @pytest.fixture(scope="module")
 def rounds() -> list[Round]:
     return make_rounds(FEW, seed=5)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -29,7 +28,6 @@ from folds import (
     view_of,
 )
 from meshes import grid
-from shots import refine
 
 from physgraph_usd.solver.collide.crossings import crossings
 from physgraph_usd.solver.collide.pairs import Reach
@@ -171,7 +169,7 @@ STRAPS = {
 }
 
 
-@pytest.mark.parametrize("level", [0, 1, 2])
+@pytest.mark.parametrize("level", [1, *(pytest.param(level, marks=pytest.mark.slow) for level in (0, 2))])
 @pytest.mark.parametrize("name", STRAPS)
 def test_a_strap_sewn_on_between_two_points_of_a_border_stays_on_it(name: str, level: int):
     """No two vertices of the cage are at one place: each sewn corner lies within an edge of a hem that is bent."""
@@ -266,15 +264,3 @@ class TestCloth:
             x = seam.closed(base + 0.02 * EDGE * noise(base, seed)) @ turn + noise(torch.zeros(3), seed)
             x = seam.closed(x)
             assert view_of(levels, [garment], seam=seam).crossings(x).count == 0
-
-
-@pytest.mark.real_data
-def test_a_skinned_box_cut_at_its_edges(real_data: Path, tmp_path: Path):
-    """The stage that showed it: new crossings and a crease in each frame, where seams were springs."""
-    shot = real_data / "stages" / "usdskel" / "dqs.usda"
-    report = refine(shot, tmp_path / "fine.usdc", level=4, garments=["/Root/Mesh"], frames=(1.0, 10.0))
-    found = [garment for frame in report.frames for garment in frame["garments"]]
-    assert len(found) == 10
-    for each in found:
-        assert each["contact"]["cloth"]["after"]["crossings"] == 0
-        assert each["strain"]["p99"] < 0.06

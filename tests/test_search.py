@@ -7,7 +7,6 @@ says which parts touch, and each of these must be found.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,7 +16,7 @@ from meshes import grid
 
 from physgraph_usd.solver.collide.pairs import Pairs, Reach
 from physgraph_usd.solver.collide.parts import Parts
-from physgraph_usd.solver.collide.search import blocking_and_near, blocking_pairs, near_parts, piercing_edges
+from physgraph_usd.solver.collide.search import blocking_and_near, blocking_pairs, near_parts
 from physgraph_usd.solver.level import Level, build_levels
 from physgraph_usd.solver.mesh.topology import PolygonMesh
 
@@ -172,21 +171,6 @@ def test_few_queried_vertices_give_their_own_pairs(shape: Shape):
         assert cloth.found(x, end, asked) == own
         total += len(own)
     assert total > 20
-
-
-@pytest.mark.parametrize("shape", SHAPES)
-def test_a_search_depends_on_nothing_before_it(shape: Shape):
-    """In the order of pairs too, on several threads."""
-    cloth, others = Cloth(shape), Cloth(shape)
-    others.parts.level = replace(others.level, threads=3)
-    moves = [[torch.as_tensor(each) for each in move] for move in random_moves(cloth, 3, seed=6)]
-    for x, end in moves:
-        piercing_edges(others.parts, end)
-        blocking_pairs(others.parts, end, x, floor=0.1 * EDGE, asked=x[:, 0] > x[:, 0].mean())
-        given = {"floor": 0.0, "asked": torch.ones(len(x), dtype=torch.bool)}
-        first, again = blocking_pairs(cloth.parts, x, end, **given), blocking_pairs(others.parts, x, end, **given)
-        for name in ("corners", "value", "face"):
-            assert torch.equal(getattr(first, name), getattr(again, name))
 
 
 def near_by(cloth: Cloth, rng: np.random.Generator) -> Reach:

@@ -39,13 +39,16 @@ def volume(mesh: PolygonMesh, points: np.ndarray) -> float:
     return float(np.einsum("tx,tx->", a, np.cross(b, c)) / 6.0)
 
 
-@pytest.mark.parametrize("mirrored", [False, True])
-def test_it_is_closed_and_as_thick_as_asked(tmp_path: Path, *, mirrored: bool):
+@pytest.mark.parametrize("how", ["plain", "mirrored", "left-handed"])
+def test_it_is_closed_and_as_thick_as_asked(tmp_path: Path, how: str):
     shot = cloth_shot(tmp_path / "shot.usda")
-    if mirrored:
-        stage = Usd.Stage.Open(str(shot))
-        UsdGeom.Xformable(stage.GetPrimAtPath(CLOTH)).AddTransformOp().Set(Gf.Matrix4d().SetScale(Gf.Vec3d(-1, 1, 1)))
-        stage.Save()
+    stage = Usd.Stage.Open(str(shot))
+    mesh = UsdGeom.Mesh(stage.GetPrimAtPath(CLOTH))
+    if how == "mirrored":
+        mesh.AddTransformOp().Set(Gf.Matrix4d().SetScale(Gf.Vec3d(-1, 1, 1)))
+    elif how == "left-handed":
+        mesh.CreateOrientationAttr("leftHanded")
+    stage.Save()
     refine(shot, tmp_path / "sheet.usda")
     refine(shelled(shot), tmp_path / "shell.usda")
     shell, points = polygons(open_over(shot, tmp_path / "shell.usda"))
@@ -56,7 +59,7 @@ def test_it_is_closed_and_as_thick_as_asked(tmp_path: Path, *, mirrored: bool):
     sides = np.stack([shell.indices, shell.indices[shell.next_corner]], axis=1)
     assert len(np.unique(sides, axis=0)) == len(sides)
     assert {*map(tuple, sides.tolist())} == {*map(tuple, sides[:, ::-1].tolist())}
-    assert volume(shell, points) > 0.0
+    assert (volume(shell, points) > 0.0) == (how != "left-handed")
     assert not errors(tmp_path / "shell.usda", shot)
 
 

@@ -152,17 +152,6 @@ class TestOptions:
         assert out.read_bytes() == b"mine"
         assert refine(shot, out, overwrite=True).exit_code == 0
 
-    @pytest.mark.parametrize("name", ["report", "root"])
-    def test_other_files_that_exist_are_refused_before_the_work(self, shot: Path, tmp_path: Path, name: str):
-        """Not after an hour of frames."""
-        file = tmp_path / {"report": "told.json", "root": "root.usda"}[name]
-        file.write_bytes(b"mine")
-        frames: list[int] = []
-        with pytest.raises(UsageError, match="exists"):
-            refine(shot, tmp_path / "fine.usdc", **{name: file}, progress=lambda done, _: frames.append(done))
-        assert file.read_bytes() == b"mine"
-        assert frames == []
-
     def test_dry_run_writes_nothing_and_knows_everything(self, shot: Path, tmp_path: Path):
         report = refine(
             shot, tmp_path / "fine.usdc", dry_run=True, report=tmp_path / "a.json", root=tmp_path / "a.usda"

@@ -37,15 +37,6 @@ class TestFramesThatFail:
         assert json.loads(told.read_text())["failed"].keys() == {"3"}
         assert faults(out, shot) == []
 
-    def test_the_frame_after_it_starts_from_the_last_good_one(self, tmp_path: Path):
-        shot = cloth_shot(tmp_path / "shot.usdc", broken={3.0: 1e25})
-        report = refine(shot, tmp_path / "fine.usdc")
-        assert report.frames[3]["garments"][0]["start"] == "warm"
-        whole = refine(cloth_shot(tmp_path / "whole.usdc"), tmp_path / "fine_whole.usdc")
-        assert whole.exit_code == 0
-        pairs = [fine(shot, tmp_path / name, 6.0) for name in ("fine.usdc", "fine_whole.usdc")]
-        assert np.abs(pairs[0] - pairs[1]).max() < 1e-3
-
     def test_all_of_them_leave_no_layer(self, tmp_path: Path):
         shot = cloth_shot(tmp_path / "shot.usdc", broken=dict.fromkeys(TIMES, 1e25))
         with pytest.raises(GarmentError, match="at time code 6: point 0 is at"):

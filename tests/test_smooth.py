@@ -2,41 +2,18 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-from pathlib import Path
-
 import igl
 import numpy as np
 import pytest
 import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
-from meshes import any_mesh, cube, faces_of, grid, mesh_of, prism, tetrahedron
-from scipy import sparse
+from meshes import any_mesh, cube, faces_of, grid, mesh_of, tetrahedron
 from scipy.spatial import KDTree
 
 from physgraph_usd.solver.mesh.subdivide import Refinement, compose, smooth, subdivide, subdivide_times
 from physgraph_usd.solver.mesh.topology import PolygonMesh, find_edges
 from physgraph_usd.usd.mesh.attributes import edge_subset
-
-BLENDER = """
-import sys, numpy as np, bpy
-given = np.load(sys.argv[1])
-starts = np.concatenate([[0], np.cumsum(given["counts"])])
-faces = [given["indices"][a:b].tolist() for a, b in zip(starts[:-1], starts[1:])]
-mesh = bpy.data.meshes.new("cage")
-mesh.from_pydata(given["points"].tolist(), [], faces)
-cage = bpy.data.objects.new("cage", mesh)
-bpy.context.scene.collection.objects.link(cage)
-modifier = cage.modifiers.new("subdivision", "SUBSURF")
-modifier.subdivision_type = "CATMULL_CLARK"
-modifier.levels = int(given["levels"])
-modifier.use_limit_surface = False
-modifier.boundary_smooth = "PRESERVE_CORNERS"
-fine = cage.evaluated_get(bpy.context.evaluated_depsgraph_get()).to_mesh()
-np.savez(sys.argv[2], points=[list(v.co) for v in fine.vertices], faces=[list(p.vertices) for p in fine.polygons])
-"""
 
 
 def dense(mesh: PolygonMesh) -> tuple[Refinement, np.ndarray]:
@@ -122,39 +99,6 @@ def test_non_manifold_places_stay():
     cones = mesh_of([[0, 1, 2], [0, 2, 3], [0, 3, 1], [0, 4, 5], [0, 5, 6], [0, 6, 4]], 8)
     _, stencil = dense(cones)
     assert stencil[0, 0] == stencil[7, 7] == 1.0
-
-
-def blender_surface(
-    folder: Path, mesh: PolygonMesh, points: np.ndarray, *, levels: int
-) -> tuple[np.ndarray, list[list[int]]]:
-    """Subdivide with Blender in a process of its own."""
-    python = os.environ.get("PHYSGRAPH_BPY_PYTHON")
-    if not python:
-        pytest.skip("PHYSGRAPH_BPY_PYTHON does not name a Python that has Blender's bpy")
-    cage = {"counts": mesh.counts, "indices": mesh.indices, "points": points, "levels": levels}
-    np.savez(folder / "cage.npz", **cage)
-    (folder / "subdivide.py").write_text(BLENDER)
-    command = [python, "subdivide.py", "cage.npz", "fine.npz"]
-    subprocess.run(command, cwd=folder, check=True, capture_output=True, timeout=300)
-    fine = np.load(folder / "fine.npz")
-    return fine["points"], fine["faces"].tolist()
-
-
-@pytest.mark.slow
-@pytest.mark.blender
-@pytest.mark.parametrize("levels", [1, 2])
-@pytest.mark.parametrize("shape", ["cube", "prism", "grid"])
-def test_catmull_clark_matches_blenders_opensubdiv(tmp_path: Path, shape: str, levels: int):
-    mesh, points = {"cube": cube, "prism": lambda: prism(5)}.get(shape, lambda: grid(5, 4))()
-    points = points + np.random.default_rng(3).normal(scale=0.2, size=points.shape)
-    theirs, faces = blender_surface(tmp_path, mesh, points, levels=levels)
-    fine: sparse.csr_matrix | np.ndarray = points
-    for _ in range(levels):
-        refinement = subdivide(mesh)
-        fine = smooth(mesh, refinement) @ fine
-        mesh = refinement.mesh
-    deviation = same_surface(mesh, fine, theirs, faces)
-    assert deviation < 2e-6, f"Blender computes in float32; found {deviation:.2e}"
 
 
 def oriented(faces: list[list[int]]) -> list[tuple[int, ...]]:

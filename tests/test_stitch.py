@@ -177,16 +177,6 @@ class TestRefused:
         with pytest.raises(UsageError, match=r"were made with other code; refine one anew"):
             stitch([*runs.chunks[:2], other], tmp_path / "joined.usdc")
 
-    def test_another_version_of_the_shot(self, tmp_path: Path):
-        shot = cloth_shot(tmp_path / "shot.usdc")
-        chunks = refine_chunks(shot, tmp_path, [(1.0, 3.0), (4.0, 6.0)])
-        stage = Usd.Stage.Open(str(shot))
-        mesh = UsdGeom.Mesh(stage.GetPrimAtPath(CLOTH))
-        mesh.GetPointsAttr().Set(mesh.GetPointsAttr().Get(2.0), 3.0)
-        stage.Save()
-        with pytest.raises(UsageError, match=r"the shot has changed since .*chunk1 was .*; refine the chunks anew"):
-            stitch(chunks, tmp_path / "joined.usdc")
-
     def test_what_is_no_chunk(self, runs: Runs, tmp_path: Path):
         for place in (runs.one, tmp_path):
             with pytest.raises(

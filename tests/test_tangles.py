@@ -70,7 +70,7 @@ def crossed_strip(name: str) -> tuple[Level, Promise, torch.Tensor]:
 class TestMoves:
     """Whatever is wanted, no more crosses after a move than before, and nothing where nothing did."""
 
-    @pytest.mark.parametrize("seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (2, 3))])
+    @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2, 3))])
     @pytest.mark.parametrize("size", [0.3, 1.0, 3.0])
     @pytest.mark.parametrize("name", ["flat", "folded", "rolled", "crumpled", "rolled through itself"])
     def test_never_more_crossings_than_before(self, name: str, size: float, seed: int):

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from layers import errors, open_over, world_metres
-from meshes import grid
 from numpy.typing import ArrayLike
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
 from shots import CLOTH, EDGE, cloth_shot, only, refine, run
@@ -23,7 +22,7 @@ from physgraph_usd.solver.mesh.subdivide import smooth, subdivide
 from physgraph_usd.solver.mesh.topology import PolygonMesh
 from physgraph_usd.solver.rigid import best_motion
 from physgraph_usd.studio.session import TuneSession
-from physgraph_usd.usd.mesh.bind import Binding, closest
+from physgraph_usd.usd.mesh.bind import closest
 from physgraph_usd.usd.read.reader import open_shot
 from physgraph_usd.usd.read.targets import TARGETS
 from physgraph_usd.usd.write.sample_stage import write_stage
@@ -254,20 +253,6 @@ def test_a_skinned_trim_is_not_skinned_twice(tmp_path: Path):
     assert closest(before, *cloth_at(over, LATE, f"{rig}/cloth")).distance.max() < 0.1 * EDGE
 
 
-def test_the_option_binds_to_the_nearest_garment_as_the_relationship_does(shot: Path, tmp_path: Path):
-    refine(shot, tmp_path / "named.usda")
-    stage = Usd.Stage.Open(str(shot))
-    stage.GetPrimAtPath(CLOTH).RemoveProperty(TARGETS)
-    stage.Save()
-    assert run("refine", shot, "-o", tmp_path / "bind.usda", "--level", 1, "--steps", 6, *[
-        word for path in (BUTTON, PIPING, BEADS) for word in ("--bind", path)
-    ]).exit_code == 0  # fmt: skip
-    for path in (BUTTON, PIPING, BEADS):
-        layers = [Sdf.Layer.FindOrOpen(str(tmp_path / name)) for name in ("named.usda", "bind.usda")]
-        first, second = (layer.QueryTimeSample(Sdf.Path(f"{path}.points"), LATE) for layer in layers)
-        assert first == second
-
-
 def test_chunks_processes_and_a_part_of_the_shot_place_targets_alike(shot: Path, tmp_path: Path):
     spans = (1.0, 3.0), (4.0, 6.0)
     for number, span in enumerate(spans):
@@ -331,21 +316,6 @@ def test_inspect_proposes_what_lies_on_the_cloth_and_moves_with_it(tmp_path: Pat
     stage.Save()
     assert f"--bind {BUTTON} carries it along" in run("inspect", path).output
     assert "carries" not in run("inspect", path, "--bind", BUTTON).output
-
-
-def test_a_held_pose_writes_normals_as_often_as_points(tmp_path: Path):
-    path = cloth_shot(tmp_path / "shot.usda", frozen=True)
-    stage = Usd.Stage.Open(str(path))
-    mesh = beside(stage, BUTTON, on_sheet(3, 2, 0.12))
-    mesh.CreateNormalsAttr([(0.0, 0.0, 1.0)] * len(mesh.GetPointsAttr().Get()))
-    mesh.SetNormalsInterpolation("vertex")
-    bind(stage, BUTTON)
-    stage.Save()
-    refine(path, tmp_path / "out.usda")
-    layer = Sdf.Layer.FindOrOpen(str(tmp_path / "out.usda"))
-    times = [layer.ListTimeSamplesForPath(f"{BUTTON}.{name}") for name in ("points", "normals")]
-    assert times[0] == times[1]
-    assert len(times[0]) < 6
 
 
 def test_the_command_of_inspect_keeps_what_is_bound(shot: Path):
@@ -422,6 +392,7 @@ def test_what_cannot_follow_is_named_before_anything_is_written(
     assert only(tmp_path, "shot.usda")
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_the_sample_keeps_thickness_area_and_buttons(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """The T-shirt's render mesh stands still in the shot; the middle of its faces lies on the refined cloth."""
@@ -454,30 +425,3 @@ def test_the_sample_keeps_thickness_area_and_buttons(tmp_path: Path, monkeypatch
     before, after = (np.split(np.asarray(buttons.Get(code), float), trims.BUTTONS) for code in codes)
     for first, then in zip(before, after, strict=True):
         assert np.linalg.norm(best_motion(first, then)(first) - then, axis=1).max() < 1e-5
-
-
-def sheet(cells: int) -> tuple[np.ndarray, np.ndarray]:
-    """A unit square in triangles: positions [m] and corners."""
-    mesh, points = grid(cells, cells, "triangles")
-    return points / cells, mesh.indices.reshape(-1, 3)
-
-
-def cloud(count: int, depth: float) -> np.ndarray:
-    """Points beside the sheet, away from its border."""
-    return np.random.default_rng(1).uniform([0.1, 0.1, -depth], [0.9, 0.9, depth], (count, 3))
-
-
-def test_what_is_closest_is_found_inside_on_edges_and_beyond_the_border():
-    points, triangles = sheet(4)
-    asked = np.array([[0.3, 0.4, 0.2], [-0.3, 0.5, 0.4], [1.3, 1.4, 0.0], [0.25, 0.25, -0.1]])
-    found = closest(asked, points, triangles)
-    assert found.distance == pytest.approx([0.2, 0.5, 0.5, 0.1])
-    places = np.einsum("nk,nkx->nx", found.weights, points[triangles[found.triangle]])
-    np.testing.assert_allclose(np.linalg.norm(places - asked, axis=1), found.distance, atol=1e-12)
-    assert (found.weights >= 0.0).all()
-
-
-def test_a_stretched_surface_stretches_what_lies_along_it_and_keeps_its_distance():
-    points, triangles = sheet(8)
-    bound = Binding.of(cloud(200, 0.02), points, triangles)
-    np.testing.assert_allclose(bound.at(points * [1.3, 1.0, 1.0]).points, bound.bind * [1.3, 1.0, 1.0], atol=1e-9)

@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from cloth import Answer, frame_of, sheet
+from cloth import Answer, sheet
 from folds import Cloth, curved, flat, folded, frame_with, named, refiner_with, rolled, square, strip
 from pxr import Gf, Usd, UsdGeom
-from sheets import garment_of, rotation
+from sheets import rotation
 from shots import refine
 from stages import add_sheet, new_stage
 
 from physgraph_usd.shot.refine import inspect_shot
-from physgraph_usd.solver.contact.broad_phase import TouchingGroups
 from physgraph_usd.solver.contact.settings import ContactSettings
-from physgraph_usd.solver.scene import Garment, GarmentFrame
 
 OFF = ContactSettings(cloth="off")
 QUIET = {"flat": flat, "curved": curved, "half a turn": lambda points: curved(points, np.pi)}
@@ -115,34 +111,6 @@ def sheets(path: Path, count: int) -> Usd.Stage:
     last.CreateRelationship("physgraph:contact:exclude").AddTarget("/World/g0")
     stage.Save()
     return stage
-
-
-def scattered(count: int, spread: float) -> tuple[list[Garment], list[GarmentFrame]]:
-    places = np.random.default_rng(3).uniform(0.0, spread, (count, 3))
-    garments = [replace(garment_of(MESH, REST), path=f"/World/g{index}") for index in range(count)]
-    return garments, [frame_of(REST + place).garments[0] for place in places]
-
-
-@pytest.mark.parametrize("spread", [0.5, 2.0, 8.0])
-def test_those_that_meet_are_found_as_by_looking_at_every_pair(spread: float):
-    garments, frames = scattered(40, spread)
-    found = TouchingGroups(garments, together=True).of(frames)
-    pairs = [
-        (a, b)
-        for a in range(40)
-        for b in range(a + 1, 40)
-        if len(TouchingGroups([garments[a], garments[b]], together=True).of([frames[a], frames[b]])) == 1
-    ]
-    assert found == joined(40, pairs)
-
-
-def joined(count: int, pairs: Sequence[tuple[int, int]]) -> list[tuple[int, ...]]:
-    """Numbers in groups that pairs join, by their least."""
-    parts = {index: {index} for index in range(count)}
-    for a, b in pairs:
-        both = parts[a] | parts[b]
-        parts |= dict.fromkeys(both, both)
-    return sorted({tuple(sorted(part)) for part in parts.values()})
 
 
 def test_a_warning_of_the_whole_shot_names_all_prims_in_the_report(tmp_path: Path):

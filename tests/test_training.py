@@ -95,7 +95,7 @@ def configured(folder: Path, *, kind: str = "physgraph", iterations: int = 4) ->
     return file
 
 
-@pytest.mark.parametrize("kind", ["physgraph", "physgraph-paper"])
+@pytest.mark.parametrize("kind", ["physgraph", pytest.param("physgraph-paper", marks=pytest.mark.slow)])
 def test_a_run_leaves_weights_a_card_and_a_log(tmp_path: Path, kind: str):
     config = configured(tmp_path, kind=kind)
     result = run("--config", config, "-o", tmp_path / "out")

@@ -83,34 +83,6 @@ def test_a_settled_frame_is_what_refine_gives_from_the_same_state(session: TuneS
     assert np.abs(points(settled) - points(rough)).max() > 1e-7
 
 
-def test_a_rough_solve_shows_each_round_and_ends_near_the_settled_cloth(session: TuneSession):
-    session.set_level(CLOTH, 2)
-    start = points(session.settle())
-    session.set_value(CLOTH, "guide:stiffness", 100.0)
-    seen: list[np.ndarray] = []
-    rough = points(session.solve(lambda found: seen.append(found[CLOTH])))
-    settled = points(session.settle())
-    assert len(seen) >= 1
-    assert np.abs(seen[-1] - rough).max() < 1e-6
-    assert rms(rough - settled) < 0.3 * rms(start - settled)
-
-
-def test_old_materials_are_forgotten(session: TuneSession):
-    """Each one kept a Cholesky factor."""
-    session.settle()
-    (group,) = session.solver.refiner.groups
-    kept: list[weakref.ref[object]] = []
-    for k in range(4):
-        session.set_value(CLOTH, "bendStiffness", STIFF * (k + 1))
-        session.solve()
-        session.settle()
-        ((*_, finest),) = group._forces.values()
-        kept.append(weakref.ref(finest))
-        del finest
-    gc.collect()
-    assert [each() is None for each in kept] == [True, True, True, False]
-
-
 def test_a_settling_that_is_cancelled_goes_on_from_there(session: TuneSession):
     session.settle()
     session.set_value(CLOTH, "bendStiffness", STIFF)

@@ -15,7 +15,7 @@ from shots import CLOTH, cloth_shot, fine, refine, run
 from test_report_format import checked
 
 from physgraph_usd import refine_stage
-from physgraph_usd.errors import At, Place, UnexpectedError, exceptions_named
+from physgraph_usd.errors import At, Place, UnexpectedError
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.processes import result_of, separate_processes
 from physgraph_usd.shot.report import RefineReport
@@ -58,7 +58,7 @@ def place_in(report: dict[str, Any]) -> tuple[str, list[str], float]:
     return report["failure"]["kind"], report["failure"]["prims"], report["failure"]["time"]
 
 
-@pytest.mark.parametrize("workers", [pytest.param(1, marks=pytest.mark.slow), 2])
+@pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_one_ends_with_a_line_and_a_report_and_keeps_what_is_finished(tmp_path: Path, workers: int):
     """Two workers have three frames each, so that the fault is in the first frame of the second one.
 
@@ -87,6 +87,7 @@ def test_one_ends_with_a_line_and_a_report_and_keeps_what_is_finished(tmp_path: 
         assert (fine(shot, tmp_path / "fine.usdc", time) == fine(shot, tmp_path / "whole.usdc", time)).all()
 
 
+@pytest.mark.slow
 def test_one_of_several_shots_leaves_the_others(tmp_path: Path):
     for name, time in (("one", BROKEN), ("two", 1.0)):
         cloth_shot(tmp_path / f"{name}.usda", times=(time,))
@@ -179,7 +180,3 @@ class TestPlace:
         text = str(UnexpectedError("ValueError", "wrong\n" * 1000, place=place))
         assert text.startswith("</World/coat0>, </World/coat1>, </World/coat2> and 497 more: unexpected")
         assert (len(text) < 700, "\n" in text) == (True, False)
-
-    def test_the_disk_is_no_fault_of_the_program(self):
-        with pytest.raises(Exception, match=r"^there: No space left on device$"), exceptions_named():
-            raise OSError(28, "No space left on device", "there")

@@ -9,12 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bodies import box
-from click.testing import CliRunner
 from pxr import Usd, UsdGeom
 from shots import refine
 from stages import COLLIDER_API, GARMENT_API, add_mesh, add_sheet, author, new_stage, save
 
-from physgraph_usd.cli import main
 from physgraph_usd.shot.refine import inspect_shot
 from physgraph_usd.studio.session import TuneSession
 
@@ -58,19 +56,6 @@ def test_animated_cloth_without_a_body_is_a_garment(tmp_path: Path):
     assert shlex.split(found["command"])[-2:] == ["--garment", "/World/cloth"]
     assert "/World/backdrop" not in found["command"]
     assert found["exit_code"] == 0
-
-
-def test_the_command_that_is_printed_runs(stage: Usd.Stage):
-    sheet = UsdGeom.Mesh(stage.GetPrimAtPath("/World/cloth"))
-    sheet.GetPrim().RemoveAppliedSchema(GARMENT_API)
-    add_box(stage)
-    found = inspect_shot(save(stage))
-    assert [mesh["form"] for mesh in found["meshes"]] == ["open", "closed"]
-    words = shlex.split(found["command"])
-    assert words[-4:] == ["--garment", "/World/cloth", "--collider", "/World/body"]
-    done = CliRunner().invoke(main, [*words[1:], "--level", "0", "--frames", "1:1"])
-    assert done.exit_code == 0, done.output
-    assert "does not feel" not in done.output
 
 
 def test_auto_takes_it_and_what_is_marked(stage: Usd.Stage, tmp_path: Path):

@@ -1,65 +1,25 @@
-"""The judge of versions: ripples, figures of a run, the motion that it counts, and its verdicts."""
+"""The judge of versions: figures of a run, and its verdicts."""
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 pytest.importorskip("pxr", reason="the judge reads stages with usd-core")
 
-from click.testing import CliRunner
 from shots import cloth_shot
 
 from benchmarks.judge_shot import Job, judged
 from benchmarks.verdicts import BETTER, EQUAL, FIGURES, UNKNOWN, WORSE, Band, overall, ratio, verdict
-from benchmarks.versions import RIPPLES, bands_of, main, tables
-
-SMALL: dict[str, Any] = {"level": 1, "count": 3}
+from benchmarks.versions import RIPPLES
 
 
-@pytest.fixture(scope="module")
-def figures(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, float | None]]:
-    """Figures of a small waving sheet with each ripple."""
-    shot = cloth_shot(tmp_path_factory.mktemp("judged") / "sheet.usda")
-    return [judged(Job(str(shot), **SMALL, ripple=ripple, seed=seed)) for seed, ripple in enumerate(RIPPLES)]
-
-
-def runs_of(version: str, figures: list[dict[str, float | None]], **changed: float) -> list[dict[str, Any]]:
-    """Finished runs of one shot, as a file of figures has them, with something added to some figures."""
-    job = {"first": 0, "count": 3, "level": 1}
-    return [
-        {
-            "row": "sheet",
-            "version": version,
-            "job": job | {"ripple": ripple},
-            "figures": {name: value and value + changed.get(name, 0.0) for name, value in each.items()},
-        }
-        for ripple, each in zip(RIPPLES, figures, strict=True)
-    ]
-
-
-def test_a_version_beside_itself_is_equal_in_every_figure(figures: list[dict[str, float | None]]):
-    assert set(figures[0]) == set(FIGURES)
-    assert len({each["energy"] for each in figures}) == len(RIPPLES), "a ripple changes the result a little"
-    runs = [*runs_of("old", figures), *runs_of("new", figures)]
-    each = bands_of(runs, "old"), bands_of(runs, "new")
-    found = {name: verdict(each[0][name], each[1][name]) for name in FIGURES}
-    assert found == dict.fromkeys(FIGURES, EQUAL)
-    assert "worse" not in tables(runs).partition("Shot by shot")[2]
-
-
-def test_a_version_that_is_slower_or_higher_is_worse(figures: list[dict[str, float | None]]):
-    runs = [*runs_of("old", figures), *runs_of("new", figures, energy=1.0)]
-    before, after = bands_of(runs, "old"), bands_of(runs, "new")
-    assert verdict(before["energy"], after["energy"]) == WORSE
-    assert verdict(after["energy"], before["energy"]) == BETTER
-    shown = tables(runs)
-    lines = [line for line in shown.splitlines() if line.startswith("| energy")]
-    assert lines[0] == "| energy [mJ] | - | 0 | 1 | 0 | - | sheet |"
-    assert lines[1].endswith("| worse |")
+def test_a_shot_is_judged_in_every_figure_and_a_ripple_changes_it(tmp_path: Path):
+    shot = str(cloth_shot(tmp_path / "sheet.usda"))
+    figures = [judged(Job(shot, level=1, count=3, ripple=ripple, seed=seed)) for seed, ripple in enumerate(RIPPLES)]
+    assert {name for each in figures for name in each} == set(FIGURES)
+    assert len({each["energy"] for each in figures}) == len(RIPPLES)
 
 
 def test_a_verdict_needs_more_than_the_noise_and_more_than_a_hundredth():
@@ -74,14 +34,3 @@ def test_a_verdict_needs_more_than_the_noise_and_more_than_a_hundredth():
     assert ratio(Band(-1.0, 0.0), Band(1.0, 0.0)) is None
     pair = {"warm": Band(100.0, 1.0)}, {"warm": Band(80.0, 1.0)}
     assert "| warm frame [ms] | 0.800 | 1 | 0 | 0 | a | - |" in overall({"a": pair})
-
-
-def test_the_command_prints_a_file_of_figures_again(figures: list[dict[str, float | None]], tmp_path: Path):
-    file, out = tmp_path / "figures.json", tmp_path / "table.md"
-    runs = [*runs_of("old", figures), *runs_of("new", figures, warm=1000.0)]
-    file.write_text(json.dumps({"runs": runs}), "utf-8")
-    done = CliRunner().invoke(main, ["--from-json", str(file), "--out", str(out)])
-    assert done.exit_code == 0, done.output
-    assert out.read_text("utf-8") == done.stdout
-    assert "## new against old, over all shots" in done.stdout
-    assert CliRunner().invoke(main, []).exit_code == 2

@@ -15,13 +15,11 @@ from folds import frame_with, named, refiner_with, square
 from scenes import shot_of
 from shots import refine
 
-from physgraph_usd.errors import StageError
 from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.refine import refine_shot
 from physgraph_usd.solver.contact.settings import ContactSettings
 from physgraph_usd.solver.frame.group import Group
-from physgraph_usd.solver.frame.lead_in import lead_in
 from physgraph_usd.solver.frame.refiner import Refiner
 from physgraph_usd.solver.frame.solve import solve_frame, solve_soundly
 from physgraph_usd.solver.frame.start import STILL, Start, start_of
@@ -29,7 +27,6 @@ from physgraph_usd.solver.frame.values import Cage, FrameInput, FrameState, Solv
 from physgraph_usd.solver.integrate.stop import EARLY, NEAR, ROUND, TOUCHING
 from physgraph_usd.solver.level import refine_garments
 from physgraph_usd.solver.scene import GarmentFrame
-from physgraph_usd.usd.read.reader import open_shot
 
 MESH, REST = sheet(8, 6)
 
@@ -79,23 +76,13 @@ class TestTangledStart:
             assert told["contact"]["cloth"]["after"]["crossings"] == 0
             assert told["start"].startswith("warm") == (time > 0)
 
-    @pytest.mark.slow
-    def test_of_a_shot_crosses_less_than_its_input(self, tmp_path: Path):
-        """Three frames of the T-shirt whose cages cross themselves."""
-        shot = open_shot(str(write_sample("tshirt", tmp_path)))
-        refiner = Refiner(shot.scene, RefineOptions().solve_settings(), levels=[2])
-        told: list[Any] = [refiner.solve(shot.frame(float(time))).telemetry[0] for time in range(7, 10)]
-        for each in told:
-            cloth = each["contact"]["cloth"]
-            assert cloth["after"]["crossings"] <= 0.2 * cloth["before"]["crossings"]
-        assert [each["start"].split(":")[0] for each in told] == ["cold", "warm", "warm"]
-
 
 @pytest.fixture(scope="module")
 def skirt(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_sample("skirt", tmp_path_factory.mktemp("skirt"))
 
 
+@pytest.mark.slow
 def test_nothing_crosses_in_frames_whose_cages_cross(skirt: Path, tmp_path: Path):
     """Without the earlier frames a contour stays that the cage by itself does not get rid of."""
     options = RefineOptions(frames=(36.0, 37.0), level=1)
@@ -115,22 +102,6 @@ def test_one_frame_is_as_low_in_energy_as_in_the_whole_shot(skirt: Path, tmp_pat
         told: Any = refine_shot(skirt, tmp_path / f"{first:g}.usdc", options).frames[-1]["garments"][0]
         energies[first] = sum(told["energy_joules"]["output"].values())
     assert energies[36.0] < energies[26.0] + 1e-2
-
-
-@pytest.mark.parametrize(("broken", "begun"), [(34.0, 32.0), (None, 34.0), (32.0, 34.0)])
-@pytest.mark.slow
-def test_a_frame_that_cannot_be_read_is_passed_over(skirt: Path, broken: float | None, begun: float):
-    shot = open_shot(str(skirt), frames=(36.0, 40.0))
-    cages = Refiner(shot.scene, RefineOptions().solve_settings(), levels=[0])
-
-    def read(time: float | None) -> Any:
-        if time == broken:
-            raise StageError("this time code is broken")
-        return shot.frame(time)
-
-    found = lead_in(cages, read, shot.times_until(36.0))
-    assert found is not None
-    assert found[1] == begun
 
 
 def test_a_warm_frame_is_done_early_only_near_rest():

@@ -21,14 +21,13 @@ from layers import (
     write_layer,
     write_shot,
 )
-from pxr import Gf, Sdf, Usd, UsdGeom, Vt
+from pxr import Gf, Sdf, Usd, UsdGeom
 
-from physgraph_usd.errors import LayerError, UsageError
 from physgraph_usd.solver.mesh.subdivide import subdivide_times
 from physgraph_usd.solver.mesh.topology import PolygonMesh
 from physgraph_usd.usd.read.reader import open_shot
 from physgraph_usd.usd.write.normals import VertexNormals
-from physgraph_usd.usd.write.primvars import FineMap, to_numpy, to_vt
+from physgraph_usd.usd.write.primvars import FineMap
 from physgraph_usd.usd.write.writer import LayerWriter
 
 
@@ -83,35 +82,6 @@ def test_used_values_stay_on_the_prim(dressed: Path, tmp_path: Path) -> None:
     assert not prim.GetAttribute("physgraph:material:shearStiffness").HasAuthoredValue()
 
 
-def test_wrong_calls_leave_nothing(dressed: Path, tmp_path: Path) -> None:
-    shot = open_shot(str(dressed), level=1)
-    steps = refine_all(shot)
-    points = fine_points(shot, steps, 1.0)
-    broken = [points[0].copy()]
-    broken[0][5] = np.nan
-    cases = [
-        (rf"<{COAT}> at time code 2\.5: points: value 5 is \[nan", [(1.0, points), (2.5, broken)]),
-        (r"points have shape \(3, 3\); the fine mesh has 63", [(1.0, [np.zeros((3, 3))])]),
-        (r"time code 1\.0 does not come after 1", [(1.0, points), (1.0, points)]),
-        (r"0 arrays of points for 1 garments", [(1.0, [])]),
-        (r"no time code was written", []),
-    ]
-    for message, calls in cases:
-        with pytest.raises(LayerError, match=message):
-            _write_calls(LayerWriter(shot, steps, tmp_path / "out.usdc"), calls)
-        assert [item.name for item in tmp_path.iterdir()] == ["shot.usda"]
-    with pytest.raises(UsageError, match="unknown mode 'under'; known modes: over, sibling"):
-        LayerWriter(shot, steps, tmp_path / "out.usdc", mode="under")
-    with pytest.raises(UsageError, match="part of the shot"):
-        LayerWriter(shot, steps, dressed, overwrite=True)
-
-
-def _write_calls(writer: LayerWriter, calls: list[tuple[float, list[np.ndarray]]]) -> None:
-    with writer:
-        for time, points in calls:
-            writer.write(time, points)
-
-
 def test_a_primvar_that_fits_no_mesh_is_hidden_and_named(dressed: Path, tmp_path: Path) -> None:
     stage = Usd.Stage.Open(str(dressed))
     UsdGeom.PrimvarsAPI(stage.GetPrimAtPath(COAT)).GetPrimvar("heat").Set([1.0, 2.0])
@@ -158,43 +128,6 @@ def test_texture_coordinates_follow_the_points(dropped: int | None, indexed: boo
     flat = values if indices is None else values[indices]
     assert (indices is not None) == indexed
     np.testing.assert_allclose(flat, fine.interpolate(POINTS)[fine.fine.indices][:, :2], atol=1e-12)
-
-
-def test_a_partition_of_points_stays_one() -> None:
-    fine = fine_map()
-    halves = [np.arange(5), np.arange(5, len(POINTS))]
-    parts = [fine.subset("point", half, exclusive=True) for half in halves]
-    np.testing.assert_array_equal(np.sort(np.concatenate(parts)), np.arange(fine.fine.vertex_count))
-    inside = fine.subset("point", halves[0])
-    assert set(inside) < set(parts[0])
-
-
-def test_edges_are_split() -> None:
-    fine = fine_map(1)
-    pairs = fine.subset("edge", np.array([1, 0])).reshape(-1, 2)
-    assert pairs[0, 0] == 1
-    assert pairs[1, 1] == 0
-    assert pairs[0, 1] == pairs[1, 0] >= len(POINTS)
-
-
-@pytest.mark.parametrize(
-    "value",
-    [
-        Vt.FloatArray([1, 2]),
-        Vt.HalfArray([1, 2]),
-        Vt.Vec3dArray([(1, 2, 3)]),
-        Vt.Matrix4dArray([Gf.Matrix4d(2)]),
-        Vt.QuatfArray([Gf.Quatf(1, 2, 3, 4)]),
-        Vt.BoolArray([True, False]),
-        Vt.UCharArray([1, 2]),
-        Vt.Int64Array([1, 2]),
-        Vt.TokenArray(["a"]),
-        Vt.StringArray(["a"]),
-        Sdf.AssetPathArray([Sdf.AssetPath("a.png")]),
-    ],
-)
-def test_every_type_comes_back_as_it_was(value: object) -> None:
-    assert to_vt(to_numpy(value)[0], value) == value
 
 
 @pytest.mark.parametrize(("orientation", "matrix"), [("rightHanded", MIRROR), ("leftHanded", Gf.Matrix4d(1.0))])

@@ -214,18 +214,6 @@ class TestOpenBodies:
         add(stage, BODY, (points, faces if front == "up" else [face[::-1] for face in faces]))
         assert refined(stage, tmp_path, level=0, time=1.0)[:, 1].min() > 0.01
 
-    def side(self, stage: Usd.Stage) -> str:
-        with closing(open_shot(save(stage), garments=[SKIRT], colliders=[BODY])) as shot:
-            return shot.scene.colliders[0].side
-
-    def test_a_mirrored_floor_is_turned(self, stage: Usd.Stage):
-        mesh = add(stage, BODY, floor(-0.01))
-        assert self.side(stage) == "front"
-        mesh.AddScaleOp().Set((-1.0, 1.0, 1.0))
-        assert self.side(stage) == "front"  # USD turns the faces of a mirrored mesh, too.
-        mesh.CreateOrientationAttr("leftHanded")
-        assert self.side(stage) == "back"
-
 
 class TestAuto:
     """Beside the skirt: its body, its own render mesh, a button on it, a copy of the body, a crate far away."""
@@ -255,10 +243,6 @@ class TestAuto:
             "/World/hidden": "left: invisible",
         }
         assert found["command"].endswith(f"--collider {BODY}")
-
-    def test_auto_takes_the_body_alone(self, stage: Usd.Stage, tmp_path: Path):
-        report = refine(Path(save(stage)), tmp_path / "a.usdc", garments=[SKIRT], colliders=["auto"], dry_run=True)
-        assert report.garments[0]["colliders"] == [BODY]
 
 
 class TestSet:

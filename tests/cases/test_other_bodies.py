@@ -258,13 +258,6 @@ class TestSearch:
         body.CreateExtentAttr(vec3(wrong))
         assert self.taken(stage) == ([BODY] if far == 0.0 else [])
 
-    def test_auto_collides_with_what_it_takes(self, stage: Usd.Stage, tmp_path: Path):
-        stage.DefinePrim(BODY, "Sphere")
-        UsdGeom.XformCommonAPI(stage.GetPrimAtPath(BODY)).SetScale((0.09, 0.09, 0.09))
-        report = refine(Path(save(stage)), tmp_path / "a.usdc", garments=[SKIRT], colliders=["auto"], dry_run=True)
-        assert report.garments[0]["colliders"] == [BODY]
-        assert not any("does not feel" in line for line in report.warnings)
-
 
 def test_cloth_between_two_bodies_that_overlap_is_pinched_as_between_parts_of_one(tmp_path: Path):
     """A trouser leg round a thigh that is 6 mm deep in a seat: what has no room is pinched, and no more than before."""

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from . import files, instances, meshes, odd, records, shown, values, wholes
+from . import attributes, files, meshes, odd, records, shown, wholes
 
 KINDS = (
     *files.KINDS,
+    *attributes.KINDS,
     *meshes.KINDS,
-    *values.KINDS,
     *wholes.KINDS,
-    *instances.KINDS,
     *odd.KINDS,
     *records.KINDS,
     *shown.KINDS,

@@ -3,45 +3,21 @@
 from __future__ import annotations
 
 import numpy as np
-from pxr import Gf, Sdf, Usd, UsdGeom, Vt
+from pxr import Sdf, Usd, UsdGeom, Vt
 from stages import vec3
 
 from physgraph_usd.usd.stage import paths_in
 
 from .bases import garments_of
-from .damage import INF, NAN, numbers
+from .damage import numbers
 from .files import TIMED
 from .meshes import OWN, a_mesh
 from .mutant import Draft, Kind
-
-_PAINTED = ("stretchScale", "bendScale", "guideScale", "detailScale", "pin")
-_EXTREMES = (1e24, 1e38, 3.4e38, NAN, INF, -INF, -1.0, 0.0, 10.0, 1e4)
-_BODIES = ("floor", "sphere", "capsule", "cube", "plane", "cylinder", "cone")
-
-
-def _floats(values: np.ndarray) -> Vt.FloatArray:
-    return Vt.FloatArray.FromNumpy(np.ascontiguousarray(values, np.float32))
 
 
 def _times(mesh: UsdGeom.Mesh) -> list[Usd.TimeCode]:
     """The default and every sample of a mesh's points."""
     return [Usd.TimeCode.Default(), *map(Usd.TimeCode, mesh.GetPointsAttr().GetTimeSamples())]
-
-
-def _paint(draft: Draft) -> None:
-    """Painted maps with extreme values, at one vertex or at all."""
-    stage = draft.open()
-    mesh = UsdGeom.Mesh(draft.pick(garments_of(stage)))
-    count = len(numbers(mesh.GetPointsAttr().Get(Usd.TimeCode.EarliestTime())))
-    for _ in range(draft.pick([1, 1, 2])):
-        name, value = draft.pick(_PAINTED), draft.pick(_EXTREMES)
-        how = draft.pick(["vertex", "vertex", "constant"])
-        values = np.full(count if how == "vertex" else 1, value if draft.chance(0.5) else 1.0)
-        values[int(draft.rng.integers(len(values)))] = value
-        primvar = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar(f"physgraph:{name}", Sdf.ValueTypeNames.FloatArray, how)
-        primvar.Set(_floats(values))
-        draft.said.append(f"{mesh.GetPath()}: {name} {how} {value:g}")
-    draft.save(stage, "saved")
 
 
 def _variants(draft: Draft) -> None:
@@ -69,39 +45,6 @@ def _variants(draft: Draft) -> None:
     else:
         choices.ClearVariantSelection()
     draft.save(stage, f"{holder.GetPath()}: variant {chosen or 'none'}")
-
-
-def _large_face(draft: Draft) -> None:
-    """A face of hundreds or thousands of corners, round or crumpled, for cloth or a body."""
-    stage = draft.open()
-    mesh, count = a_mesh(draft, stage), draft.pick([50, 250, 1000, 6000])
-    angle = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)
-    ring = np.stack([np.cos(angle), np.sin(angle), 0.1 * np.sin(3.0 * angle)], axis=1)
-    if draft.chance(0.2):
-        ring += 0.05 * draft.rng.standard_normal(ring.shape)
-    for code in _times(mesh):
-        mesh.GetPointsAttr().Set(vec3(ring), code)
-    mesh.GetFaceVertexCountsAttr().Set(Vt.IntArray([count]))
-    mesh.GetFaceVertexIndicesAttr().Set(Vt.IntArray.FromNumpy(np.arange(count, dtype=np.int32)))
-    twice = draft.chance(0.3)
-    if twice:
-        mesh.GetFaceVertexCountsAttr().Set(Vt.IntArray([count, count]))
-        mesh.GetFaceVertexIndicesAttr().Set(Vt.IntArray.FromNumpy(np.tile(np.arange(count, dtype=np.int32), 2)))
-    draft.save(stage, f"{mesh.GetPath()}: one face of {count} corners" + ", twice" * twice)
-
-
-def _flat_bodies(draft: Draft) -> None:
-    """Bodies scaled to nothing along one axis or all, at one time or always."""
-    stage = draft.open()
-    prim = stage.GetPrimAtPath(f"/World/{draft.pick(_BODIES)}")
-    scale = draft.pick(
-        [Gf.Vec3f(0, 0, 0), Gf.Vec3f(1, 0, 1), Gf.Vec3f(0, 0, 1), Gf.Vec3f(1e-30), Gf.Vec3f(1, 1, 1e-12)]
-    )
-    code = draft.pick([Usd.TimeCode.Default(), Usd.TimeCode(2.0)])
-    UsdGeom.XformCommonAPI(prim).SetScale(scale, code)
-    if draft.chance(0.3):
-        draft.options["report"] = draft.folder / "report"
-    draft.save(stage, f"{prim.GetPath()}: scaled by {scale} at {code}")
 
 
 def _glitch(draft: Draft) -> None:
@@ -152,14 +95,6 @@ def _coincident(draft: Draft) -> None:
     draft.save(stage, f"{mesh.GetPath()}: {len(pairs)} pairs at one place, {loose} loose points, {len(counts)} faces")
 
 
-def _size(draft: Draft) -> None:
-    """The whole shot a millimetre or kilometres large."""
-    stage = draft.open()
-    metres = draft.pick([1e-6, 1e-5, 3e-4, 1e-3, 1e2, 1e4, 1e6])
-    UsdGeom.SetStageMetersPerUnit(stage, metres)
-    draft.save(stage, f"{metres:g} m per unit")
-
-
 def _retimed(draft: Draft) -> None:
     """Samples of what moves, cloth or body, at other times; at other rates, in a range."""
     stage = draft.open()
@@ -197,12 +132,8 @@ def _other_times(draft: Draft, samples: dict[float, object], how: str) -> dict[f
 
 
 KINDS = (
-    Kind("odd: painted extremes", _paint, OWN),
     Kind("odd: variants", _variants, OWN),
-    Kind("odd: large faces", _large_face, ("plain", "still", "bodies")),
-    Kind("odd: flat bodies", _flat_bodies, ("bodies",)),
     Kind("odd: glitch frames", _glitch, ("plain", "bodies", "dressed", "several")),
     Kind("odd: points at one place", _coincident, OWN),
-    Kind("odd: size of the shot", _size, OWN),
     Kind("odd: times of samples", _retimed, (*TIMED, "bodies", "skinned", "dressed", "layered")),
 )

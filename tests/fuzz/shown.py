@@ -24,53 +24,6 @@ def _set_faces(mesh: UsdGeom.Mesh, faces: list[np.ndarray]) -> None:
     mesh.GetFaceVertexIndicesAttr().Set(Vt.IntArray.FromNumpy(np.concatenate(faces).astype(np.int32)))
 
 
-def _purpose(draft: Draft) -> None:
-    """Purposes and visibility of a mesh, or of what is above it, and bodies that are found or named."""
-    stage = draft.open()
-    prim = a_mesh(draft, stage).GetPrim()
-    prim = draft.pick([prim, prim.GetParent()])
-    purpose = draft.pick(["default", "render", "proxy", "guide"])
-    UsdGeom.Imageable(prim).CreatePurposeAttr(purpose)
-    if draft.chance(0.4):
-        UsdGeom.Imageable(prim).MakeInvisible(draft.pick([Usd.TimeCode.Default(), Usd.TimeCode(2.0)]))
-    draft.options["colliders"] = draft.pick([(), ("auto",), ("/World",)])
-    draft.save(stage, f"{prim.GetPath()}: purpose {purpose}, colliders {draft.options['colliders']}")
-
-
-def _blocks(draft: Draft) -> None:
-    """Samples of points that are blocked, empty, left out, or scaled to nothing."""
-    stage = draft.open()
-    mesh = a_mesh(draft, stage)
-    attribute = mesh.GetPointsAttr()
-    times = attribute.GetTimeSamples() or [1.0, 2.0]
-    some = [time for time in times if draft.chance(0.4)]
-    how = draft.pick(["block", "empty", "gap", "scale"])
-    for time in some:
-        if how == "gap":
-            attribute.ClearAtTime(time)
-        elif how == "scale":
-            UsdGeom.XformCommonAPI(mesh.GetPrim()).SetScale((0.0, 0.0, 0.0), time)
-        else:
-            attribute.Set(Sdf.ValueBlock() if how == "block" else Vt.Vec3fArray(), time)
-    if draft.chance(0.3) and some:
-        draft.options["frames"] = (min(some), max(some))
-    draft.save(stage, f"{attribute.GetPath()}: {how} at {some}")
-
-
-def _rates(draft: Draft) -> None:
-    """Samples at other times than the shot's, and stages of odd rates."""
-    stage = draft.open()
-    attribute = a_mesh(draft, stage).GetPointsAttr()
-    scale, shift = draft.pick([0.04, 0.5, 1.25, 24.0]), draft.pick([0.0, 0.5, 1000.0])
-    samples = {time: attribute.Get(time) for time in attribute.GetTimeSamples()}
-    for time in samples:
-        attribute.ClearAtTime(time)
-    for time, value in samples.items():
-        attribute.Set(value, scale * time + shift)
-    stage.SetTimeCodesPerSecond(draft.pick([1.0, 23.976, 24.0, 960.0]))
-    draft.save(stage, f"{attribute.GetPath()}: times by {scale:g} plus {shift:g}")
-
-
 def _open_bodies(draft: Draft) -> None:
     """Meshes that lack faces: deleted, or in holeIndices, or drawn as a subdivision surface."""
     stage = draft.open()
@@ -158,9 +111,6 @@ def _doubled(draft: Draft) -> None:
 
 
 KINDS = (
-    Kind("shown: purposes", _purpose, OWN),
-    Kind("shown: blocked samples", _blocks, OWN),
-    Kind("shown: other times", _rates, OWN),
     Kind("shown: open bodies", _open_bodies, OWN),
     Kind("shown: cut along edges", _cut, OWN),
     Kind("shown: loose pieces", _pieces, OWN),

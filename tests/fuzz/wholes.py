@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import numpy as np
-from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
+from pxr import Gf, Sdf, Usd, UsdGeom
 
 from .bases import garments_of
-from .damage import INF, NAN, ODD_DOUBLES, ODD_FLOATS, ODD_INTS, VALUES, WORDS, numbers, replace, spoiled
+from .damage import INF, NAN, ODD_DOUBLES, ODD_INTS, WORDS
 from .files import ALL
 from .meshes import OWN
 from .mutant import Draft, Kind
@@ -41,21 +40,6 @@ def _units(draft: Draft) -> None:
             root.SetInfo(how, draft.pick(ODD_DOUBLES))
         draft.said.append(how)
     draft.save(stage, str({key: root.GetInfo(key) for key in root.ListInfoKeys() if key in _UNITS}))
-
-
-def _physics(draft: Draft) -> None:
-    """Gravity without a direction or a size."""
-    stage = draft.open()
-    scene = Sdf.Path("/World/physics")
-    direction = Gf.Vec3f(*(draft.pick(ODD_FLOATS) for _ in range(3)))
-    replace(stage, scene.AppendProperty("physics:gravityDirection"), "vector3f", direction)
-    if draft.chance(0.7):
-        kind = draft.pick(["float", "float", *VALUES])
-        with np.errstate(all="ignore"):
-            value = float(np.float32(draft.pick(ODD_FLOATS))) if kind == "float" else VALUES[kind]
-        replace(stage, scene.AppendProperty("physics:gravityMagnitude"), kind, value)
-    stage.DefinePrim(scene, "PhysicsScene")
-    draft.save(stage, f"gravity along {direction}")
 
 
 def _times(draft: Draft) -> None:
@@ -161,116 +145,9 @@ def _clips(draft: Draft) -> None:
     draft.save(stage, f"clips: {how}")
 
 
-def _bodies(draft: Draft) -> None:
-    """Colliders whose sizes, axes, offsets, switches and placements are none."""
-    stage = draft.open()
-    names = [prim for prim in stage.Traverse() if UsdGeom.Gprim(prim) and not UsdGeom.Mesh(prim)]
-    for _ in range(draft.pick([1, 2, 4])):
-        path = draft.pick(names).GetPath()
-        name = draft.pick(["radius", "height", "size", "axis", "width", "length", "extent", "radiusTop"])
-        name = draft.pick([name, name, "physgraph:collider:offset", "physgraph:collider:enabled"])
-        kind = draft.pick(["double", "double", "token", *VALUES])
-        odd = {"double": draft.pick(ODD_DOUBLES), "token": draft.pick([*WORDS, "Y", "Z"])}
-        value = odd.get(kind, VALUES[kind])
-        replace(stage, path.AppendProperty(name), kind, value, times=draft.pick([(), (), (1.0, 2.0)]))
-        draft.said.append(f"{path}.{name} = {value!r}")
-    prim = draft.pick(names)
-    if draft.chance(0.5):
-        scale = Gf.Vec3f(*(draft.pick([1.0, *ODD_FLOATS]) for _ in range(3)))
-        UsdGeom.XformCommonAPI(prim).SetScale(scale)
-        draft.said.append(f"{prim.GetPath()} scaled by {scale}")
-    draft.save(stage, "saved")
-
-
-def _skin(draft: Draft) -> None:
-    """Skinning that does not fit: influences, joints, bind poses, animations and blend shapes."""
-    stage = draft.open()
-    mesh = stage.GetPrimAtPath("/World/rig/cloth")
-    prims = [mesh, mesh, *(stage.GetPrimAtPath(f"/World/rig/{name}") for name in ("skel", "skel/anim", "cloth/bulge"))]
-    for _ in range(draft.pick([1, 1, 2])):
-        prim = draft.pick(prims)
-        if not (attributes := prim.GetAuthoredAttributes()):
-            continue
-        attribute = draft.pick(attributes)
-        path, value = attribute.GetPath(), attribute.Get(Usd.TimeCode.EarliestTime())
-        how = draft.pick(["retype", "empty", "spoil", "remove", "size"])
-        if how == "remove":
-            prim.RemoveProperty(attribute.GetName())
-        elif how == "size":
-            attribute.SetMetadata("elementSize", draft.pick(ODD_INTS))
-        elif how == "empty" and value is not None:
-            attribute.Set(type(value)(), draft.pick([Usd.TimeCode.Default(), Usd.TimeCode(1.0)]))
-        elif how == "spoil" and getattr(numbers(value), "dtype", np.dtype(object)).kind in "fi" and value is not None:
-            array = numbers(value)
-            odd = ODD_INTS if array.dtype.kind == "i" else ODD_FLOATS
-            attribute.Set(type(value).FromNumpy(np.ascontiguousarray(spoiled(draft, array, odd))))
-        else:
-            kind = draft.pick([*VALUES])
-            replace(stage, path, kind, VALUES[kind], times=draft.pick([(), (1.0, 2.0)]))
-        draft.said.append(f"{path}: {how}")
-    draft.save(stage, "saved")
-
-
-def _skeleton(draft: Draft) -> None:
-    """Skeletons that are not there, are someone else, or whose joints are not a tree."""
-    stage = draft.open()
-    mesh, skel = stage.GetPrimAtPath("/World/rig/cloth"), stage.GetPrimAtPath("/World/rig/skel")
-    targets = draft.pick(
-        [[], ["/Nowhere"], ["/World/rig/cloth"], ["/World/rig/skel/anim"], ["/World", "/World/rig/skel"]]
-    )
-    how = draft.pick(["skeleton", "animation", "joints", "root", "own", "nested", "anim joints", "rate"])
-    if how == "skeleton":
-        mesh.GetRelationship("skel:skeleton").SetTargets([Sdf.Path(each) for each in targets])
-    elif how == "animation":
-        skel.GetRelationship("skel:animationSource").SetTargets([Sdf.Path(each) for each in targets])
-    elif how in {"joints", "anim joints"}:
-        prim = skel if how == "joints" else stage.GetPrimAtPath("/World/rig/skel/anim")
-        joints = draft.pick([["a", "a"], ["a/b", "a"], ["", ""], ["hip"], ["hip", "hip/knee", "hip/knee/x"], []])
-        prim.GetAttribute("joints").Set(Vt.TokenArray(joints))
-    elif how == "root":
-        stage.GetRootLayer().GetPrimAtPath("/World/rig").typeName = draft.pick(["Xform", "Scope", "Mesh", "Skeleton"])
-    elif how == "own":
-        order = Vt.TokenArray(draft.pick([["x", "y"], ["hip"], ["hip/knee", "hip"], []]))
-        replace(stage, mesh.GetPath().AppendProperty("skel:joints"), "token[]", order)
-    elif how == "rate":
-        stage.GetRootLayer().pseudoRoot.SetInfo("timeCodesPerSecond", draft.pick(ODD_DOUBLES))
-    else:
-        UsdSkel.Root.Define(stage, "/World")
-    draft.save(stage, f"skeleton: {how} {targets}")
-
-
-def _relationships(draft: Draft) -> None:
-    """Colliders, materials and proxies that are not there, are themselves, or name each other in a circle."""
-    stage = draft.open()
-    prim = draft.pick(garments_of(stage))
-    name = draft.pick(["physgraph:colliders", "physgraph:colliders", "material:binding", "proxyPrim", "skel:skeleton"])
-    own = str(prim.GetPath())
-    targets = ["/Nowhere", own, f"{own}.{name}", "/World/floor.points", "/World.loop", "/World/physics", "/World"]
-    chosen = [Sdf.Path(draft.pick(targets)) for _ in range(draft.pick([1, 2]))]
-    layer = stage.GetRootLayer()
-    for path, to in (
-        (prim.GetPath().AppendProperty(name), list(dict.fromkeys(chosen))),
-        (Sdf.Path("/World.loop"), [Sdf.Path("/World.loop")]),
-    ):
-        spec = Sdf.CreatePrimInLayer(layer, path.GetPrimPath())
-        known = spec.properties.get(path.name)
-        if known is not None:
-            spec.RemoveProperty(known)
-        if draft.chance(0.1):
-            Sdf.AttributeSpec(spec, path.name, Sdf.ValueTypeNames.Float, Sdf.VariabilityVarying)
-        else:
-            Sdf.RelationshipSpec(spec, path.name, False).targetPathList.explicitItems = to
-    draft.save(stage, f"{prim.GetPath()}.{name} -> {', '.join(map(str, chosen))}")
-
-
 KINDS = (
     Kind("stage: units", _units, ALL),
-    Kind("stage: gravity", _physics, ("bodies", "plain")),
     Kind("stage: time samples", _times, OWN),
     Kind("stage: arcs", _arcs, ("plain", "dressed", "bodies", "skinned", "several")),
     Kind("stage: value clips", _clips, ("clips",)),
-    Kind("bodies: shapes", _bodies, ("bodies",)),
-    Kind("skin: influences", _skin, ("skinned",)),
-    Kind("skin: skeleton", _skeleton, ("skinned",)),
-    Kind("relationships", _relationships, OWN),
 )

@@ -29,7 +29,7 @@ def bodies(answer: Answer, which: str = "after") -> list[dict[str, Any]]:
 class TestPins:
     """S17."""
 
-    @pytest.mark.parametrize("pins", ["none", "some"])
+    @pytest.mark.parametrize("pins", ["some", pytest.param("none", marks=pytest.mark.slow)])
     def test_s17_pins_against_a_body_are_told_and_nothing_trembles(self, pins: str):
         """Six frames of a cage that moves by less than is seen; pinned vertices start 3 cm inside."""
         radius = np.linalg.norm(REST, axis=1)
@@ -63,7 +63,9 @@ KINDS = {"capsules": ["capsule"] * 2, "boxes": ["mesh"] * 2, "one": ["mesh"]}
 class TestNoRoom:
     """S21, S23."""
 
-    @pytest.mark.parametrize("kind", KINDS)
+    @pytest.mark.parametrize(
+        "kind", ["boxes", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("capsules", "one"))]
+    )
     def test_s21_cloth_between_jaws_comes_to_rest(self, kind: str):
         """Half a millimetre apart, a quarter of what both keep together: the cloth lies in the middle."""
         found = [
@@ -91,7 +93,7 @@ def needles() -> Soup:
 class TestJumps:
     """S29."""
 
-    @pytest.mark.parametrize("jump", ["two metres", "half a turn"])
+    @pytest.mark.parametrize("jump", ["half a turn", pytest.param("two metres", marks=pytest.mark.slow)])
     def test_s29_cloth_and_body_jump_together_and_stay_warm(self, jump: str):
         turn = np.diag([-1.0, 1.0, -1.0]) if jump == "half a turn" else np.eye(3)
         shift = np.zeros(3) if jump == "half a turn" else np.array([2.0, 0.0, 0.0])

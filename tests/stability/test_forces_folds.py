@@ -38,14 +38,3 @@ def test_s14_gradient_of_a_fold(angle: float, rest: float, turn: int):
     assert energy == pytest.approx(float(bending.weight[0]) * bent**2 / 2.0, rel=1e-6, abs=1e-18)
     if abs(bent) > 1e-3:
         assert apart(f, difference_force(bending, x, 2e-7)) < 1e-6
-
-
-@pytest.mark.parametrize("angle", [np.pi - 1e-6, -np.pi + 1e-6, np.pi])
-def test_s14_single_precision_folds_are_finite_and_close(angle: float):
-    _, single = resting_at(0.0, torch.float32)
-    _, double = resting_at(0.0)
-    points = hinge(angle, turn=4)
-    energy, f = evaluate(single, torch.as_tensor(points, dtype=torch.float32))
-    expected, g = evaluate(double, torch.as_tensor(points))
-    assert energy == pytest.approx(expected, rel=1e-5)
-    assert min(apart(f.double(), g), apart(-f.double(), g)) < 1e-4
