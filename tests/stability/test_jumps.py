@@ -11,9 +11,11 @@ from cloth import Solver, frame_of, refiner_of, sheet, wave
 from sheets import garment_of
 
 from physgraph_usd.solver.mesh.topology import PolygonMesh
+from physgraph_usd.solver.scene import Frame
 
 EDGE = 0.05
 MESH, REST = sheet(8, 6, EDGE)
+SPIN = np.diag([-1.0, 1.0, -1.0])
 
 
 def refiner(times: tuple[float, ...], **options: Any) -> Solver:
@@ -22,6 +24,17 @@ def refiner(times: tuple[float, ...], **options: Any) -> Solver:
 
 def still(time: float) -> np.ndarray:
     return wave(REST, phase=0.1 * time)
+
+
+JUMPS = {
+    "two metres": lambda points: points + np.array([2.0, 0.0, 0.0]),
+    "half a turn": lambda points: (points - points.mean(axis=0)) @ SPIN + points.mean(axis=0),
+}
+
+
+def jumping(name: str) -> list[Frame]:
+    """Three quiet frames, then the jump, then three quiet ones there."""
+    return [frame_of(still(t) if t < 4 else JUMPS[name](still(t)), float(t)) for t in range(1, 7)]
 
 
 def test_s29_what_moves_smoothly_is_no_teleport():

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from cloth import Answer, frame_of, refiner_of, sheet, solved, total, wave
+from cloth import Answer, finest_system, frame_of, group_of, refiner_of, sheet, solved, total, wave
 from sheets import garment_of, rotation
 
 from physgraph_usd.solver.fabric import Fabric
@@ -58,6 +58,16 @@ def test_s13_a_sheet_that_is_all_but_flat_leaves_it_as_well():
         for h in (1e-4, 0.01)
     ]
     assert outs[0] < 1.1 * outs[1], outs
+
+
+def ball(level: int = 1, dtype: torch.dtype = torch.float64):
+    """A sheet's system and a start that is noise of three edges."""
+    mesh, rest = sheet(6, 6, EDGE)
+    group = group_of(mesh, rest, level=level, dtype=dtype)
+    system, x = finest_system(group, wave(rest))
+    generator = torch.Generator().manual_seed(1)
+    noise = torch.randn(x.shape, generator=generator, dtype=torch.float64).to(dtype)
+    return system, x + 3.0 * system.spacing.unsqueeze(1) * noise
 
 
 def test_s15_a_crumpled_cage_is_solved():
