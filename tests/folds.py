@@ -17,8 +17,7 @@ from physgraph_usd.solver.collide.pairs import NearPairs, Reach
 from physgraph_usd.solver.collide.parts import Parts
 from physgraph_usd.solver.collide.search import near_parts
 from physgraph_usd.solver.colliders.pose import Collider, Pose
-from physgraph_usd.solver.contact.cloth import ClothContact, ClothView
-from physgraph_usd.solver.contact.promise import Promise
+from physgraph_usd.solver.contact.cloth import ClothContact, LevelContact
 from physgraph_usd.solver.contact.settings import ContactSettings
 from physgraph_usd.solver.fabric import Fabric
 from physgraph_usd.solver.forces.seam import Seam
@@ -121,19 +120,14 @@ def view_of(
     stiffness: float = 1e5,
     form: str = "pairs",
     seam: Seam | None = None,
-) -> ClothView:
-    """The finest level's cloth in a frame."""
+) -> LevelContact:
+    """The finest level's contact in a frame."""
     lasting = ClothContact(levels, garments)
     each = torch.full((len(garments),), thickness, dtype=levels[-1].dtype)
     settings = ContactSettings(cloth=form, stiffness=stiffness)
     base = levels[-1].base.apply(levels[0].rest)
     base = base + 1e3 * levels[-1].vertex_garment.unsqueeze(1)  # The input has no two garments near one another.
-    return ClothView(lasting, levels[-1], base=base, thickness=each, settings=settings, seam=seam)
-
-
-def promise_of(levels: Sequence[Level], garments: Sequence[Garment], **given: Any) -> Promise:
-    """What moves the finest level's cloth safely; the rest is as for `view_of`."""
-    return Promise(view_of(levels, garments, **given), 6e-5)
+    return LevelContact(lasting, levels[-1], base=base, thickness=each, settings=settings, seam=seam)
 
 
 def sewn(garments: Sequence[Garment], *cages: np.ndarray) -> list[Garment]:

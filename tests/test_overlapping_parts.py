@@ -16,7 +16,7 @@ from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.solver.colliders.mesh import MeshBody
 from physgraph_usd.solver.colliders.pose import Pose
 from physgraph_usd.solver.contact.bodies import FrameBodies, Touching
-from physgraph_usd.solver.contact.cloth import ClothContact, ClothView
+from physgraph_usd.solver.contact.cloth import ClothContact, LevelContact
 from physgraph_usd.solver.contact.measure import depths, pinched
 from physgraph_usd.solver.contact.settings import ContactSettings
 from physgraph_usd.solver.frame.refiner import Refiner
@@ -29,13 +29,13 @@ OVER, UNDER = (ball(0.15, at=(0.0, side * 0.13, 0.0), level=4) for side in (1.0,
 """Balls that overlap by 4 cm, in a lens of 7.5 cm about the middle of the sheet's plane."""
 
 
-def view_of(levels: tuple[Level, ...], cage: torch.Tensor, *soups: Any) -> ClothView:
+def view_of(levels: tuple[Level, ...], cage: torch.Tensor, *soups: Any) -> LevelContact:
     """The finest level of the sheet among bodies, meshes all."""
     posed = [MeshBody(device="cpu", threads=1).pose(Pose(*soup))[0] for soup in soups]
     touching = [Touching(f"/Body{index}", each, (0.002,)) for index, each in enumerate(posed)]
     bodies = FrameBodies.begin(levels[0], touching, cage, origin=np.zeros(3), settings=SETTINGS)
     base, thickness = levels[-1].base.apply(cage), torch.tensor([0.002])
-    return ClothView(
+    return LevelContact(
         ClothContact(levels, [SHEET]), levels[-1], base=base, thickness=thickness, settings=SETTINGS, bodies=bodies
     )
 
@@ -81,7 +81,7 @@ class TestLost:
     """Which cloth no body sends out, and that it does not."""
 
     @staticmethod
-    def view(*soups: Any, height: float = 0.0) -> tuple[Level, ClothView, torch.Tensor]:
+    def view(*soups: Any, height: float = 0.0) -> tuple[Level, LevelContact, torch.Tensor]:
         """The finest level of a flat sheet [m], and what it sees of bodies."""
         levels = levels_of(SHEET)
         cage = torch.as_tensor(SHEET.rest, dtype=torch.float32) + torch.tensor([0.0, height, 0.0])

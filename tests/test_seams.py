@@ -20,7 +20,6 @@ from folds import (
     levels_of,
     named,
     near_pairs,
-    promise_of,
     refiner_with,
     sewn,
     square,
@@ -234,12 +233,11 @@ class TestCloth:
     def test_whatever_is_wanted_seams_stay_closed_and_nothing_crosses(self, seed: int):
         """Noise that would cross the cloth on both sides of its seam, and open that."""
         garment, levels, seam, base = self.sewn()
-        promise, start = promise_of(levels, [garment], seam=seam), seam.closed(base)
+        view, start = view_of(levels, [garment], seam=seam), seam.closed(base)
         wanted = seam.closed(base + 0.3 * EDGE * noise(base, seed))
-        view = promise.view
-        assert view.crossings(wanted).count > 0
-        x = promise.move(Placed(start), wanted)
-        assert crossings(view.parts, x).count == 0
+        assert view.look(wanted).crossings.count > 0
+        x = view.moved(Placed(start), wanted)
+        assert crossings(view.mesh.parts, x).count == 0
         assert gap_of(x.numpy(), base.numpy()) < 1e-6
         assert torch.equal(seam.closed(x), x)
         assert bool((x != start).any(dim=1)[seam.pairs.reshape(-1)].any())
@@ -263,4 +261,4 @@ class TestCloth:
             turn = torch.linalg.qr(noise(torch.zeros((3, 3)), seed))[0]
             x = seam.closed(base + 0.02 * EDGE * noise(base, seed)) @ turn + noise(torch.zeros(3), seed)
             x = seam.closed(x)
-            assert view_of(levels, [garment], seam=seam).crossings(x).count == 0
+            assert view_of(levels, [garment], seam=seam).look(x).crossings.count == 0

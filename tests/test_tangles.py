@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 import torch
 from brute import Soup, crossings
-from folds import EDGE, SHAPES, curved, folded, levels_of, named, placed, promise_of, square, strip, view_of
+from folds import EDGE, SHAPES, curved, folded, levels_of, named, placed, square, strip, view_of
 from scenes import shot
 
 from physgraph_usd.solver.collide.pairs import Pairs
 from physgraph_usd.solver.contact.along import ApproachLimits, along
-from physgraph_usd.solver.contact.cloth import ClothView
-from physgraph_usd.solver.contact.promise import Promise
+from physgraph_usd.solver.contact.cloth import LevelContact
 from physgraph_usd.solver.forces.self_contact import PairConstraints, SelfContact
 from physgraph_usd.solver.level import Level, Placed
 
@@ -58,13 +57,13 @@ def shifted(points: np.ndarray) -> np.ndarray:
 UPPER = {"dented": dented, "cornered": cornered, "tilted": tilted, "on edge": shifted}
 
 
-def crossed_strip(name: str) -> tuple[Level, Promise, torch.Tensor]:
+def crossed_strip(name: str) -> tuple[Level, LevelContact, torch.Tensor]:
     """A strip pinned at one end in a shape, and what moves it."""
     cloth = strip(8, 3)
     garment = named(cloth, pin=(cloth[1][:, 0] < 0.01) * 1.0)
     levels = levels_of(garment)
     shapes = {"flat": lambda p: p, "curved": curved, "folded": folded, **SHAPES}
-    return levels[-1], promise_of(levels, [garment]), placed(levels[-1], shapes[name])
+    return levels[-1], view_of(levels, [garment]), placed(levels[-1], shapes[name])
 
 
 class TestMoves:
@@ -74,11 +73,11 @@ class TestMoves:
     @pytest.mark.parametrize("size", [0.3, 1.0, 3.0])
     @pytest.mark.parametrize("name", ["flat", "folded", "rolled", "crumpled", "rolled through itself"])
     def test_never_more_crossings_than_before(self, name: str, size: float, seed: int):
-        level, promise, base = crossed_strip(name)
+        level, view, base = crossed_strip(name)
         noise = torch.randn(base.shape, generator=torch.Generator().manual_seed(seed))
-        x = promise.move(Placed(base), base + size * 0.3 * EDGE * noise * level.free)
+        x = view.moved(Placed(base), base + size * 0.3 * EDGE * noise * level.free)
         before, after = (len(crossings(Soup.of(level, at))) for at in (base, x))
-        assert promise.view.crossings(x).count == after
+        assert view.look(x).crossings.count == after
         assert after <= before
         assert (before > 0) == (name in ("crumpled", "rolled through itself"))
         assert torch.equal(x[~level.free[:, 0]], base[~level.free[:, 0]])
@@ -89,17 +88,17 @@ class TestMoves:
         garments = [named(square(4), each) for each in "AB"]
         levels, (level, base) = levels_of(*garments, dtype=torch.float64), pair(name)
         noise = torch.as_tensor(np.random.default_rng(4).normal(size=(len(base), 3)))
-        x = promise_of(levels, garments).move(Placed(base), base + size * EDGE * noise)
+        x = view_of(levels, garments).moved(Placed(base), base + size * EDGE * noise)
         assert 0 <= len(crossings(Soup.of(level, x))) <= len(crossings(Soup.of(level, base)))
 
     def test_only_what_is_near_what_would_cross_is_held_back(self):
         """A smooth wave that pushes the upper half of a fold through the lower one in one corner."""
-        level, promise, base = crossed_strip("folded")
+        level, view, base = crossed_strip("folded")
         upper = (base[:, 1] > 0.009) & (base[:, 2] > 0.03)
         wanted = base.clone()
         wanted[upper, 1] -= 0.014
         assert len(crossings(Soup.of(level, wanted))) > 0
-        x = promise.move(Placed(base), wanted)
+        x = view.moved(Placed(base), wanted)
         assert len(crossings(Soup.of(level, x))) == 0
         moved = (x - wanted).norm(dim=1) > 1e-7
         assert 0 < int(moved.sum()) < 0.6 * level.vertex_count
@@ -112,10 +111,10 @@ class TestMoves:
         half = len(base) // 2
         base[half:] += 0.1 * EDGE * torch.rand_like(base[half:])
         base[half:, 1] += 0.5 * base[half:, 0]
-        x, promise = base.clone(), promise_of(levels, garments)
+        x, view = base.clone(), view_of(levels, garments)
         x[half:, 1] += 0.001
-        assert 0 < promise.view.crossings(x).count <= promise.view.crossings(base).count
-        assert promise.move(Placed(base), x) is x
+        assert 0 < view.look(x).crossings.count <= view.look(base).crossings.count
+        assert view.moved(Placed(base), x) is x
 
     def test_one_tangle_that_would_cross_more_holds_up_no_other(self):
         """Of two pairs of sheets one is pushed deeper, the other drawn out."""
@@ -126,9 +125,9 @@ class TestMoves:
         number, wanted = levels[-1].vertex_garment, base.clone()
         wanted[number == 1, 1] -= 0.004
         wanted[number == 3, 1] += 0.012
-        promise = promise_of(levels, garments)
-        x = promise.move(Placed(base), wanted)
-        before, asked, after = (promise.view.mesh.between(promise.view.crossings(at)) for at in (base, wanted, x))
+        view = view_of(levels, garments)
+        x = view.moved(Placed(base), wanted)
+        before, asked, after = (view.mesh.between(view.look(at).crossings) for at in (base, wanted, x))
         assert asked[0, 1] > before[0, 1] > 0
         assert after[0, 1] <= before[0, 1]
         assert after[2, 3] == asked[2, 3] < before[2, 3]
@@ -170,7 +169,7 @@ class TestGivenUp:
 class TestSides:
     """On which side of one another the parts of two sheets that cross are kept."""
 
-    def gaps(self, x: torch.Tensor) -> tuple[ClothView, PairConstraints]:
+    def gaps(self, x: torch.Tensor) -> tuple[LevelContact, PairConstraints]:
         garments = [named(square(4), name) for name in "AB"]
         view = view_of(levels_of(*garments), garments, thickness=0.4 * EDGE)
         (term,) = view.terms(x)
@@ -181,7 +180,7 @@ class TestSides:
         """It is drawn out instead, by two planes for each edge and face; what is beside it keeps its side."""
         x = pair("cornered")[1].float()
         view, gaps = self.gaps(x)
-        found = view.crossings(x)
+        found = view.look(x).crossings
         out = 2 * found.count
         assert 0 < out < len(gaps.corners)
         crossed = view.mesh.crossed(found)
@@ -210,7 +209,7 @@ class TestLayersThatMoveTogether:
         bump = 0.5 * EDGE * torch.exp(-((x - x[~upper].mean(dim=0)) / (2 * EDGE)).square().sum(dim=1)) * ~upper
         way = torch.zeros_like(x)
         way[:, 1] = 20 * EDGE + bump
-        y = promise_of(levels, garments).move(Placed(x), x + way)
+        y = view_of(levels, garments).moved(Placed(x), x + way)
         assert not crossings(Soup.of(levels[-1], y))
         late = (x + way - y).norm(dim=1)
         assert float(late.max()) < 0.5 * EDGE
@@ -220,7 +219,7 @@ class TestLayersThatMoveTogether:
         (levels, garments), x, _ = two_sheets()
         c, s = np.cos(1.0), np.sin(1.0)
         wanted = x @ torch.tensor([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]], dtype=x.dtype)
-        assert torch.allclose(promise_of(levels, garments).move(Placed(x), wanted), wanted, atol=1e-9)
+        assert torch.allclose(view_of(levels, garments).moved(Placed(x), wanted), wanted, atol=1e-9)
 
 
 class TestAlong:

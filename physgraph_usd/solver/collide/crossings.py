@@ -29,6 +29,10 @@ class Crossings:
         """Number of crossings."""
         return len(self.edge)
 
+    def where(self, kept: Bool[Tensor, " crossings"]) -> Crossings:
+        """The selected crossings."""
+        return Crossings(self.edge[kept], self.face[kept])
+
     @staticmethod
     def none(device: torch.device) -> Crossings:
         """No crossings."""
@@ -45,12 +49,7 @@ def crossings(
         x: Positions [m].
         asked: Mask of vertices; each crossing has one of these among its corners. All vertices when None.
     """
-    found = piercing_edges(parts, x, asked)
-    if asked is not None:
-        level = parts.level
-        corners = torch.cat([level.edges[found[:, 0]], level.triangles[found[:, 1]]], dim=1).long()
-        found = found[asked[corners].any(dim=1)]
-    return Crossings(*found.T)
+    return all_crossings(parts, x, asked)[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,13 +82,16 @@ def all_crossings(
     """As `crossings`, and the crossings of cloth and bodies.
 
     Args:
-        x: Positions of the cloth and of the bodies' corners [m].
-        asked: Mask of vertices; crossings of parts in clusters without any may be missing. All of the cloth when None.
+        x: Positions of the cloth, and of the bodies' corners if bodies are searched too [m].
+        asked: As for `crossings`; crossings with bodies may be missing in clusters without such vertices.
     """
     edge, face = piercing_edges(parts, x, asked).T.contiguous()
-    edges, faces = (torch.tensor(each, device=x.device) for each in parts.starts)
+    edges, faces = (torch.tensor(each, dtype=torch.int64, device=x.device) for each in parts.starts)
     of_edge, of_face = torch.bucketize(edge, edges, right=True), torch.bucketize(face, faces, right=True)
     with_body = (of_edge > 0) | (of_face > 0)
     own, body = (of_edge == 0)[with_body], torch.maximum(of_edge, of_face)[with_body] - 1
-    pierced = Pierced(Crossings(edge[with_body], face[with_body]), body, own)
-    return Crossings(edge[~with_body], face[~with_body]), pierced
+    found, pierced = Crossings(edge, face).where(~with_body), Crossings(edge, face).where(with_body)
+    if asked is not None:
+        corners = torch.cat([parts.level.edges[found.edge], parts.level.triangles[found.face]], dim=1).long()
+        found = found.where(asked[corners].any(dim=1))
+    return found, Pierced(pierced, body, own)

@@ -1,73 +1,87 @@
-"""Contact of a group's cloth with itself and with bodies: near pairs, crossings, and the force that keeps parts apart.
+"""A level's contact in a frame: near pairs, crossings, the forces that keep parts apart, and moves that cross nothing.
 
-Penalty springs carry the load but guarantee nothing; `promise` does. The springs act on all near pairs, not only on the
-nearest: otherwise cloth that pushes at a place and is held at another would stay locked.
+Penalty springs carry the load but guarantee nothing; the safe moves of `promise` do. The springs act on all near pairs,
+not only on the nearest: otherwise cloth that pushes at a place and is held at another would stay locked.
+
+All searches work on the corners of the cloth, then of the bodies, as one array in float64.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
-from typing import cast
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ..collide.crossings import Crossings, Pierced, all_crossings, crossings
-from ..collide.parts import Parts
+from ..collide.crossings import Crossings, Pierced, all_crossings
 from ..colliders.base import Solid
 from ..forces.seam import Seam
-from ..forces.self_contact import PairConstraints, SelfContact
-from ..level import Level
+from ..forces.self_contact import SelfContact
+from ..level import Level, Placed
 from ..scene import Garment
 from .bodies import Chords, FrameBodies, LevelBodies
 from .broad_phase import touch_one_another
 from .cloth_mesh import RINGS, ClothMesh
+from .promise import Promise
 from .settings import ContactSettings
-from .springs import ClothSprings, NearSprings
+from .springs import ClothSprings
 from .tangles import OUT, Tangles, chords_of, gaps_out
+
+KEPT_GAP = 0.06
+"""Gap below which gaps shrink by at most a tenth a move, as a fraction of the thickness."""
+
+_Since = tuple[Tensor, Tensor | None]
+"""Corners in the start frame [m], and a mask of the exempt cloth there, or None."""
 
 
 @dataclass(frozen=True, eq=False)
 class ContactState:
-    """Crossings at positions, with the tensor's version counter when they were found.
+    """Crossings at positions.
 
     Attributes:
-        x: The positions [m].
-        version: The counter.
+        x: Positions of the cloth [m].
+        version: The version counter of x when its crossings were found.
+        corners: Positions of the cloth, then of the bodies' corners [m], float64.
         crossings: Crossings of cloth with cloth, without given-up cloth.
         tangles: These with the cloth around them; None without crossings and given-up cloth.
-        pierced: Crossings of cloth and bodies; None without bodies.
+        pierced: Crossings of cloth and bodies.
         inside: The vertices inside each body, shape (B, V); None if none is.
+        exempt: Mask of the cloth inside or through a body, False for the bodies' corners; None if none is.
     """
 
     x: Tensor
     version: int
+    corners: Float[Tensor, "all 3"]
     crossings: Crossings
     tangles: Tangles | None
-    pierced: Pierced | None = None
-    inside: Tensor | None = None
+    pierced: Pierced
+    inside: Bool[Tensor, "bodies vertices"] | None = None
+    exempt: Bool[Tensor, " all"] | None = None
 
     @staticmethod
-    def clean(x: Tensor) -> ContactState:
-        """Positions at which nothing crosses."""
-        return ContactState(x, x._version, Crossings.none(x.device), None)
+    def clean(x: Tensor, corners: Tensor, given_up: Tangles | None = None) -> ContactState:
+        """Positions at which nothing crosses but given-up cloth."""
+        none = Crossings.none(x.device)
+        return ContactState(x, x._version, corners, none, given_up, Pierced(none, none.edge, none.edge.bool()))
 
     @property
     def in_bodies(self) -> tuple[int, int]:
         """Number of vertices inside bodies, and of crossings with bodies."""
-        inside = 0 if self.inside is None else int(self.inside.sum())
-        return inside, 0 if self.pierced is None else self.pierced.count
+        return 0 if self.inside is None else int(self.inside.sum()), self.pierced.count
 
-    def exempt(self, mesh: ClothMesh) -> Bool[Tensor, " vertices"] | None:
-        """Mask of the cloth inside or through a body; None if none is."""
-        if self.pierced is None or not any(self.in_bodies):
-            return None
-        some = mesh.grown(mesh.crossed(self.pierced.crossings), RINGS)
-        return some if self.inside is None else some | self.inside.any(dim=0)
+    @cached_property
+    def hopeful(self) -> Crossings:
+        """Crossings of cloth with cloth outside hopeless tangles."""
+        return self.crossings if self.tangles is None else self.tangles.hopeful(self.crossings)
+
+    @property
+    def is_clean(self) -> bool:
+        """Whether nothing crosses, neither cloth, but where it is given up, nor bodies."""
+        return self.crossings.count == 0 and self.exempt is None
 
 
 class ClothContact:
@@ -104,21 +118,15 @@ class ClothContact:
         return mesh
 
 
-def _meet(a: Garment, b: Garment) -> bool:
-    """True if two garments are in contact; for a garment with itself, its self-contact setting."""
-    if a is b:
-        return a.self_contact
-    return touch_one_another(a, b)
-
-
-class ClothView:
-    """One level's cloth and the bodies near it in one frame.
+class LevelContact:
+    """One level's contact with bodies and cloth in one frame.
 
     Attributes:
-        mesh: The level's mesh, sewn as in this frame.
+        mesh: The level's cloth and the bodies, sewn as in this frame.
+        seam: Sewn vertices, which stay together; None without seams.
         frame: The bodies of the frame, or None.
-        given_up: Mask of the pieces of cloth that are given up; None for none. Parts whose vertices are all given up
-            are not searched for contact or crossings with one another.
+        given_up: Mask of the pieces of cloth that are given up, False for the bodies' corners; None for none. Parts
+            whose vertices are all given up are not searched for contact or crossings with one another.
         keeps_sides: True if moves are promised to add no crossings of cloth with cloth.
         came_near: True if parts were near one another in any call of `terms`; None before the first call.
     """
@@ -139,168 +147,184 @@ class ClothView:
         """Take the frame.
 
         Args:
-            lasting: Contact data of the shot.
             base: The upsampled cage [m]; distances between parts in the cage are not widened.
             thickness: Thickness of each garment [m].
             settings: Contact settings, in SI.
-            seam: Sewn vertices, which stay together; None without seams.
-            given_up: As the attribute.
             doubtful: Mask of the vertices that the cage places near what crosses in it; None if unknown.
         """
-        self.given_up = given_up
         self.keeps_sides = settings.cloth == "pairs" and bool(lasting.meets.any())
         self.mesh = lasting.mesh(level, seam, bodies, itself=self.keeps_sides)
-        self._level, self._settings, self._thickness = level, settings, thickness
-        self._base, self._seam, self.frame = base, seam, bodies
-        self._doubtful, self._looked = doubtful, cast("ContactState | None", None)
+        self.seam, self.frame = seam, bodies
+        self.given_up, self._doubtful = (
+            None if some is None else self.mesh.padded(some) for some in (given_up, doubtful)
+        )
+        self._asked = None if self.given_up is None else ~self.given_up
+        self._base, self._settings, self._thickness = base, settings, thickness
+        self._all_bodies = None if bodies is None else LevelBodies(level, bodies, self.mesh.pieces)
+        self._looked: ContactState | None = None
         self.came_near: bool | None = None
 
     @cached_property
     def bodies(self) -> LevelBodies | None:
         """The level's view of the bodies; cloth between overlapping parts of a body in the cage stays there."""
-        if self.frame is None:
-            return None
-        bodies = LevelBodies(self._level, self.frame, self.mesh.pieces)
-        inside = self.at_base.inside
-        return bodies if inside is None else bodies.losing(self._base, inside)
+        bodies, inside = self._all_bodies, self.at_base.inside
+        return bodies if bodies is None or inside is None else bodies.losing(self._base, inside)
 
     @cached_property
     def at_base(self) -> ContactState:
-        """Crossings, tangles and vertices inside bodies of the upsampled cage that is followed."""
+        """The state of the upsampled cage that is followed."""
         return self.of_cage(self._base)
+
+    @cached_property
+    def _springs(self) -> ClothSprings:
+        """Finder of near pairs and contact springs in this frame."""
+        return ClothSprings(self.mesh, self._base, self._thickness, self.frame)
+
+    def closed(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
+        """Positions with their seams closed [m]."""
+        return x if self.seam is None else self.seam.closed(x)
 
     def of_cage(self, x: Float[Tensor, "vertices 3"]) -> ContactState:
         """As `look` for an upsampled cage [m], searched only around what crosses in the cage itself."""
         known_clean = self._doubtful is not None and not bool(self._doubtful.any())
-        return ContactState.clean(x) if known_clean else self.found(x, self._doubtful)
+        return ContactState.clean(x, self._corners(x)) if known_clean else self._found(x, self._doubtful)
 
-    @property
-    def parts(self) -> Parts:
-        """Table of vertex, edge and face pairs that may be in contact, sewn as in this frame."""
-        return self.mesh.parts
-
-    def closed(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
-        """Positions with their seams closed [m]."""
-        return x if self._seam is None else self._seam.closed(x)
-
-    @property
-    def gap(self) -> float:
-        """Distance left between cloth and cloth when pieces are moved back [m]."""
-        return float(self._thickness.mean())
-
-    @cached_property
-    def corners(self) -> Float[Tensor, "corners 3"]:
-        """Positions of the bodies' corners in this frame [m], float64."""
-        return self._base.new_zeros((0, 3)).double() if self.frame is None else self.frame.points
-
-    def with_bodies(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "all 3"]:
-        """Positions of the cloth and of the bodies' corners [m], float64."""
-        return torch.cat([x.double(), self.corners])
-
-    @cached_property
-    def springs(self) -> ClothSprings:
-        """Finder of near pairs and contact springs in this frame."""
-        return ClothSprings(self.mesh, self._base, self._thickness, self.frame)
-
-    @cached_property
-    def asked(self) -> Bool[Tensor, " all"] | None:
-        """Mask of the vertices that are not given up, True for the bodies' corners; None for all of the cloth."""
-        count = len(self.corners)
-        return None if self.given_up is None else torch.nn.functional.pad(~self.given_up, (0, count), value=True)
-
-    def crossings(self, x: Float[Tensor, "vertices 3"]) -> Crossings:
-        """Crossings at x [m], without given-up cloth; cached for the same tensor until its version changes."""
-        return self.look(x).crossings
-
-    def look(self, x: Tensor) -> ContactState:
-        """Cached crossings, tangles and vertices inside bodies at x."""
+    def look(self, x: Float[Tensor, "vertices 3"]) -> ContactState:
+        """Crossings at x [m]; cached for the same tensor until its version changes."""
         if self._looked is None or self._looked.x is not x or self._looked.version != x._version:
-            self._looked = self.found(x)
+            self._looked = self._found(x)
         return self._looked
-
-    def found(self, x: Tensor, some: Bool[Tensor, " vertices"] | None = None) -> ContactState:
-        """Crossings, tangles and vertices inside bodies at x, of the given vertices; of all when None."""
-        asked = self.asked if some is None else self.padded(some if self.given_up is None else some & ~self.given_up)
-        bodies = None if self.frame is None else LevelBodies(self._level, self.frame, self.mesh.pieces)
-        pierced = inside = None
-        if bodies is None:
-            found = crossings(self.parts, x, asked)
-        else:
-            found, pierced = all_crossings(self.parts, self.with_bodies(x), asked)
-            inside = bodies.inside(x, pierced)
-            inside = inside if bool(inside.any()) else None
-        lost = torch.zeros_like(self._level.free[:, 0]) if self.given_up is None else self.given_up
-        if self.given_up is not None:
-            kept = ~lost[self.mesh.corners_of(found)].all(dim=1)
-            found = Crossings(found.edge[kept], found.face[kept])
-        tangles = Tangles.find(self.mesh, found, lost) if found.count or self.given_up is not None else None
-        return ContactState(x, x._version, found, tangles, pierced, inside)
-
-    def tangles(self, x: Float[Tensor, "vertices 3"]) -> Tangles | None:
-        """Tangles at x [m]: crossings and the cloth around them; None without crossings and given-up cloth."""
-        return self.look(x).tangles
-
-    def exempt(self, x: Float[Tensor, "vertices 3"]) -> Bool[Tensor, " all"] | None:
-        """Mask of the cloth inside, through or on a body at x [m], False for the bodies' corners; None if none is."""
-        return self.padded(self.look(x).exempt(self.mesh))
-
-    def in_bodies(self, x: Float[Tensor, "vertices 3"]) -> tuple[int, int]:
-        """Number of vertices inside bodies, and of crossings with bodies, at x [m]."""
-        return self.look(x).in_bodies
-
-    def _within(self, x: Tensor) -> tuple[Tensor, Chords | None]:
-        """The vertices inside each body, and the places inside on edges and faces whose corners are outside."""
-        looked, bodies = self.look(x), self.bodies
-        assert bodies is not None
-        none = torch.zeros((len(bodies.frame.touching), len(x)), dtype=torch.bool, device=x.device)
-        inside = none if looked.inside is None else looked.inside
-        return inside, chords_of(self.mesh, looked.pierced, self.with_bodies(x), inside) if looked.pierced else None
-
-    def pushed_out(self, x: Float[Tensor, "vertices 3"], *, vertices: bool = False) -> Float[Tensor, "vertices 3"]:
-        """As `LevelBodies.pushed_out`, or for vertices alone; x [m] itself if no cloth is inside or through a body."""
-        if self.bodies is None or not any(self.in_bodies(x)):
-            return x
-        inside, chords = self._within(x)
-        return self.bodies.pushed_out(x, inside, None if vertices else chords)
-
-    def padded(self, some: Bool[Tensor, " vertices"] | None) -> Bool[Tensor, " all"] | None:
-        """A mask of vertices with False for the bodies' corners."""
-        return None if some is None else torch.nn.functional.pad(some, (0, len(self.corners)))
-
-    def is_clean(self, x: Float[Tensor, "vertices 3"]) -> bool:
-        """Whether nothing crosses at x [m], neither cloth, but where it is given up, nor bodies."""
-        return self.look(x).crossings.count == 0 and self.exempt(x) is None
 
     def remember(self, x: Float[Tensor, "vertices 3"], given_up: Tangles | None = None) -> None:
         """Record that nothing crosses at x [m] but given-up cloth, as after a safe move from such positions."""
-        self._looked = replace(ContactState.clean(x), tangles=given_up)
+        self._looked = ContactState.clean(x, self._corners(x), given_up)
+
+    def _corners(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "all 3"]:
+        """Corners of the cloth, then of the bodies in this frame [m], float64."""
+        return x.double() if self.frame is None else torch.cat([x.double(), self.frame.points])
+
+    def _found(self, x: Tensor, some: Bool[Tensor, " all"] | None = None) -> ContactState:
+        """Crossings, tangles and cloth inside bodies at x, of the given vertices; of all when None."""
+        mesh, corners, lost = self.mesh, self._corners(x), self.given_up
+        asked = self._asked if some is None else some if self._asked is None else some & self._asked
+        found, pierced = all_crossings(mesh.parts, corners, asked)
+        inside = None if self._all_bodies is None else self._all_bodies.inside(x, pierced)
+        inside = inside if inside is not None and bool(inside.any()) else None
+        tangles = None
+        if found.count or lost is not None:
+            lost = mesh.padded(torch.zeros_like(x[:, 0], dtype=torch.bool)) if lost is None else lost
+            found = found.where(~lost[mesh.corners_of(found)].all(dim=1))
+            tangles = Tangles.find(mesh, found, lost)
+        exempt = None
+        if pierced.count or inside is not None:
+            exempt = mesh.grown(mesh.crossed(pierced.crossings), RINGS)
+            exempt = mesh.padded(exempt if inside is None else exempt | inside.any(dim=0))
+        return ContactState(x, x._version, corners, found, tangles, pierced, inside, exempt)
+
+    def tangled_pieces(self, x: Float[Tensor, "vertices 3"]) -> Bool[Tensor, " vertices"] | None:
+        """Mask of the connected pieces of cloth with most of their vertices in tangles at x [m]; None without any."""
+        tangles = self.look(x).tangles
+        return None if tangles is None else self.mesh.pieces_with(tangles.label >= 0, over=0.5)
+
+    def pushed_out(self, x: Float[Tensor, "vertices 3"], *, vertices: bool = False) -> Float[Tensor, "vertices 3"]:
+        """As `LevelBodies.pushed_out`, or for vertices alone; x [m] itself if no cloth is inside or through a body."""
+        state = self.look(x)
+        if self.bodies is None or not any(state.in_bodies):
+            return x
+        inside, chords = _within(self.mesh, self.bodies, state)
+        return self.bodies.pushed_out(x, inside, None if vertices else chords)
 
     def terms(self, x: Float[Tensor, "vertices 3"]) -> tuple[SelfContact, ...]:
         """Contact forces with bodies and between near cloth at x [m], with crossings drawn apart; () without any."""
-        looked, at = self.look(x), self.with_bodies(x)
-        inside = None if looked.inside is None else self.padded(looked.inside.any(dim=0))
-        near = self.springs.find(at, self.springs.near(x, at, asked=self.asked, inside=inside).pairs)
-        near, with_body, touching = self.springs.sided(near, self.exempt(x))
-        pushes = self.springs.constraints(near.where(with_body), at, self._settings.stiffness)
-        if self.bodies is not None and (any(self.in_bodies(x)) or bool(touching.any())):
-            inside, chords = self._within(x)
-            pushes = pushes.with_more(self.bodies.pulls(x, inside | touching, chords))
-        pushes = pushes.sharing_room(x)
-        gaps = self._gaps(x, near.where(~with_body), at)
-        found, tangles = looked.crossings, looked.tangles
-        found = found if tangles is None else tangles.hopeful(found)
-        if found.count:
-            step, stiffness = OUT * float(self._level.spacing.mean()), self._settings.stiffness
-            gaps = gaps.with_more(gaps_out(self.mesh, found, x, step=step, stiffness=stiffness))
-        self.came_near = bool(self.came_near) or len(gaps.corners) > 0
-        named = (("contact", pushes), ("self_contact", gaps))
-        return tuple(SelfContact(self._level, each, name) for name, each in named if len(each.corners))
-
-    def _gaps(self, x: Tensor, near: NearSprings, at: Tensor) -> PairConstraints:
-        """Springs between all near parts of the cloth that do not cross."""
-        tangles = self.tangles(x)
-        if tangles is not None:
+        state, springs, stiffness = self.look(x), self._springs, self._settings.stiffness
+        at, tangles = state.corners, state.tangles
+        inside = None if state.inside is None else self.mesh.padded(state.inside.any(dim=0))
+        near = springs.find(at, springs.near(x, at, asked=self._asked, inside=inside).pairs)
+        near, with_body, touching = springs.sided(near, state.exempt)
+        pushes = springs.constraints(near.where(with_body), at, stiffness)
+        if self.bodies is not None and (any(state.in_bodies) or bool(touching.any())):
+            within, chords = _within(self.mesh, self.bodies, state)
+            pushes = pushes.with_more(self.bodies.pulls(x, within | touching, chords))
+        near = near.where(~with_body)
+        if tangles is not None:  # What crosses has no side to keep.
             corners = near.near.corners.long()
-            kept = ~self.mesh.crossed(self.crossings(x))[corners].any(dim=1)
+            kept = ~self.mesh.crossed(state.crossings)[corners].any(dim=1)
             near = near.where(kept & ~tangles.given_up[corners].all(dim=1))
-        return self.springs.constraints(near, at, self._settings.stiffness)
+        gaps = springs.constraints(near, at, stiffness)
+        if state.hopeful.count:
+            step = OUT * float(self.mesh.level.spacing.mean())
+            gaps = gaps.with_more(gaps_out(self.mesh, state.hopeful, x, step=step, stiffness=stiffness))
+        self.came_near = bool(self.came_near) or len(gaps.corners) > 0
+        named = (("contact", pushes.sharing_room(x)), ("self_contact", gaps))
+        return tuple(SelfContact(self.mesh.level, each, name) for name, each in named if len(each.corners))
+
+    def moved(self, start: Placed, wanted: Float[Tensor, "vertices 3"]) -> Placed:
+        """Positions as close to the wanted as is safe [m], seams closed; without seams ``wanted`` itself if safe.
+
+        In a tangle of the start, cloth may pass through itself as long as the tangle's number of crossings does not
+        grow. Cloth inside a body may pass through bodies.
+        """
+        return self._moved(start, self.closed(wanted), None)
+
+    def carried(
+        self, start: Placed, wanted: Float[Tensor, "vertices 3"], inside: Bool[Tensor, " vertices"] | None
+    ) -> Placed:
+        """As `moved` from the start frame, with bodies that move too, and pass through cloth that cannot give way.
+
+        Args:
+            inside: Mask of the cloth inside a body in the start frame; None for none.
+        """
+        before = None if self.frame is None else self.frame.before
+        exempt = None if inside is None else self.mesh.padded(inside)
+        since = None if before is None else (torch.cat([start.double(), before]), exempt)
+        return self._moved(start, self.closed(wanted), since)
+
+    def drawn(self, start: Placed, wanted: Float[Tensor, "vertices 3"]) -> Placed:
+        """As `moved`, but the number of crossings in a tangle may grow for a while."""
+        tangles = self.look(start).tangles
+        return self._go(start, self.closed(wanted), None if tangles is None else tangles.label, None)[0]
+
+    def _moved(self, start: Placed, wanted: Tensor, since: _Since | None) -> Placed:
+        """As `moved`; ``since`` holds the corners and the exempt cloth in the start frame, or is None."""
+        state = self.look(start)
+        tangles = state.tangles
+        if tangles is None or bool(tangles.hopeless.all()):
+            x, proved = self._go(start, wanted, None if tangles is None else tangles.label, since)
+            if proved and state.is_clean:
+                self.remember(x, tangles)
+            return x
+        free = tangles.label.clone()
+        x, _ = self._go(start, wanted, free, since)
+        for whole in (False, True):  # First the worse tangles alone are held, then all.
+            worse = tangles.worse(self.look(x).crossings)
+            if not bool(worse.any()):
+                break
+            free[~tangles.given_up if whole else worse] = -1
+            x, _ = self._go(start, wanted, free, since)
+        return x
+
+    def _go(self, start: Placed, aim: Tensor, tangle: Tensor | None, since: _Since | None) -> tuple[Placed, bool]:
+        """As `moved`, without a promise for pairs in one tangle; and whether all pairs with bodies are proved apart."""
+        state, end, springs = self.look(start), self._corners(aim), self._springs
+        begin, exempt = since or (state.corners, state.exempt)
+        near = springs.known(start) if since is None else None
+        promise = Promise(self.mesh, self.seam, KEPT_GAP * float(self._thickness.min()), tangle, exempt)
+        if near is None and tangle is None and exempt is None:
+            found = springs.blocking(begin, end, aim, floor=promise.floor, asked=self._asked)
+        else:
+            asked = (end != begin).any(dim=1) if self._asked is None else self._asked
+            found = promise.blocking(begin, end, asked, near=near)
+        x, proved = promise.kept(begin, end, found, halved=since is not None)
+        return Placed(aim if x is end else x[: len(aim)].to(aim)), proved
+
+
+def _within(mesh: ClothMesh, bodies: LevelBodies, state: ContactState) -> tuple[Tensor, Chords]:
+    """The vertices inside each body, and the places inside on edges and faces whose corners are outside."""
+    size = len(bodies.frame.touching), len(state.x)
+    inside = state.x.new_zeros(size, dtype=torch.bool) if state.inside is None else state.inside
+    return inside, chords_of(mesh, state.pierced, state.corners, inside)
+
+
+def _meet(a: Garment, b: Garment) -> bool:
+    """True if two garments are in contact; for a garment with itself, its self-contact setting."""
+    return a.self_contact if a is b else touch_one_another(a, b)

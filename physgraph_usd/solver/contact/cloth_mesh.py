@@ -30,6 +30,7 @@ class ClothMesh:
         triangles: Corners of the faces of the cloth, then of the bodies, int64.
         pieces: Connected piece of each vertex, shape (V,).
         beside: Adjacency of the vertices, also across seams, shape (V, V).
+        free: Mask of the vertices that may move, False for the bodies' corners, shape (V + B, 1).
         opposite: Vertices opposite each of all edges in its first two faces, -1 without a face, shape (E, 2).
     """
 
@@ -54,6 +55,8 @@ class ClothMesh:
                 np.concatenate(each) for each in ((edges, solid.edges + start), (triangles, solid.faces + start))
             )
             start += len(solid.points)
+        self._others = start - count
+        self.free = self.padded(level.free[:, 0]).unsqueeze(1)
         self.edges, self.triangles, self.opposite = (
             torch.as_tensor(each, device=level.device).long()
             for each in (edges, triangles, _opposite(edges, triangles))
@@ -63,17 +66,22 @@ class ClothMesh:
             torch.as_tensor(each.astype(np.int64)).to(level.device) for each in (first, second)
         )
 
-    def grown(self, vertices: Bool[Tensor, " vertices"], rings: int) -> Bool[Tensor, " vertices"]:
-        """The given vertices and all vertices at most `rings` edges away."""
+    def padded(self, vertices: Bool[Tensor, " vertices"]) -> Bool[Tensor, " all"]:
+        """A mask of vertices, with False for the bodies' corners."""
+        return torch.nn.functional.pad(vertices, (0, self._others))
+
+    def grown(self, vertices: Bool[Tensor, " some"], rings: int) -> Bool[Tensor, " some"]:
+        """The given vertices and all vertices of the cloth at most `rings` edges away."""
         for _ in range(rings):
             given, vertices = vertices, vertices.clone()
             vertices[self._second[given[self._first]]] = True
         return vertices
 
-    def pieces_with(self, vertices: Bool[Tensor, " vertices"], *, over: float) -> Bool[Tensor, " vertices"] | None:
+    def pieces_with(self, some: Bool[Tensor, " all"], *, over: float) -> Bool[Tensor, " vertices"] | None:
         """Mask of the connected pieces, also across seams, with over a fraction of the vertices; None for none."""
-        piece = torch.as_tensor(joined_by(self.parts.links.cpu().numpy(), len(vertices)), device=vertices.device).long()
-        share = torch.bincount(piece, vertices.double()) / torch.bincount(piece).clamp_min(1)
+        count = self.level.vertex_count
+        piece = torch.as_tensor(joined_by(self.parts.links.cpu().numpy(), count), device=some.device).long()
+        share = torch.bincount(piece, some[:count].double()) / torch.bincount(piece).clamp_min(1)
         out = (share > over)[piece]
         return out if bool(out.any()) else None
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -15,145 +14,18 @@ from torch import Tensor
 from ..collide.crossings import Crossings, Pierced, all_crossings, crossings
 from ..deadline import is_over
 from ..forces.seam import Seam
-from ..forces.self_contact import SelfContact
-from ..integrate.base import Preconditioner
-from ..integrate.metric import Metric
 from ..level import Level, Placed
 from .apart import drawn_apart
 from .bodies import FrameBodies, LevelBodies
-from .cloth import ClothContact, ClothView
+from .cloth import ClothContact, LevelContact
 from .cloth_mesh import ClothMesh
-from .metric import HeldMetric
-from .promise import Before, Promise
 from .repair import repaired_cage
 from .report import measured, swallowed
 from .settings import ContactSettings
 from .tangles import Tangles
 
-KEPT_GAP = 0.06
-"""Gap below which gaps shrink by at most a tenth a move, as a fraction of the thickness."""
 STALLED = 4
 """Most passes of moving cloth out of bodies without progress, and rounds over which untangling is judged."""
-Touch = SelfContact
-"""A contact force term."""
-
-
-@dataclass(frozen=True, eq=False)
-class LevelContact:
-    """One level's contact with bodies and cloth.
-
-    Attributes:
-        cloth: The level's view of the cloth and the bodies.
-        seam: Sewn vertices, or None without seams.
-        promise: Safe moves of the cloth.
-    """
-
-    cloth: ClothView
-    seam: Seam | None
-    promise: Promise
-
-    def metric(
-        self,
-        plain: Metric,
-        terms: Sequence[Touch],
-        x: Float[Tensor, "vertices 3"],
-        *,
-        known: Preconditioner | None = None,
-    ) -> Metric | HeldMetric:
-        """The level's metric with the contact stiffness at x [m]; the known metric while its stiffness suffices."""
-        plain = plain if self.seam is None else plain.merged(self.seam.label)
-        if not terms:
-            return plain
-        last = known if isinstance(known, HeldMetric) else None
-        stiff = 3.0 * torch.stack([term.diagonal(x) for term in terms]).sum(dim=0)
-        if last is None or self.comes_apart(x):
-            return HeldMetric(plain, stiff) if bool((stiff > 0).any()) else plain  # Things are near, but none pushes.
-        return last if last.serves(stiff) else HeldMetric(plain, torch.maximum(stiff, last.stiff))
-
-    def crosses(self, x: Float[Tensor, "vertices 3"]) -> bool:
-        """True if cloth crosses cloth at positions x [m]."""
-        return self.cloth.crossings(x).count > 0
-
-    def comes_apart(self, x: Float[Tensor, "vertices 3"]) -> bool:
-        """True if x has crossings in hopeful tangles."""
-        return self.hopeful(x) > 0
-
-    def hopeful(self, x: Float[Tensor, "vertices 3"]) -> int:
-        """Number of crossings in hopeful tangles at x [m]."""
-        tangles = self.cloth.tangles(x)
-        return 0 if tangles is None else tangles.hopeful(self.cloth.crossings(x)).count
-
-    def tangled_pieces(self, x: Float[Tensor, "vertices 3"]) -> Bool[Tensor, " vertices"] | None:
-        """Mask of the connected pieces of cloth with most of their vertices in tangles at x [m]; None without any."""
-        tangles = self.cloth.tangles(x)
-        return None if tangles is None else self.cloth.mesh.pieces_with(tangles.label >= 0, over=0.5)
-
-    def begun(self, x: Float[Tensor, "vertices 3"]) -> Placed:
-        """Start positions of a level [m], seams closed. Crossings here come from the input or from the level below."""
-        return Placed(self.closed(x))
-
-    def remember(self, x: Float[Tensor, "vertices 3"]) -> None:
-        """As `ClothView.remember`."""
-        self.cloth.remember(x)
-
-    def terms(self, x: Float[Tensor, "vertices 3"]) -> tuple[Touch, ...]:
-        """As `ClothView.terms`."""
-        return self.cloth.terms(x)
-
-    def closed(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
-        """Positions with their seams closed [m]."""
-        return x if self.seam is None else self.seam.closed(x)
-
-    def moved(self, x: Placed, wanted: Float[Tensor, "vertices 3"], since: Before | None = None) -> Placed:
-        """Positions as close to the wanted positions as is safe [m], seams closed; `since` is as for `Promise.move`."""
-        return self.promise.move(x, self.closed(wanted), since)
-
-    def since(self, inside: Bool[Tensor, " vertices"] | None) -> Before | None:
-        """The bodies in the start frame, with a mask of the cloth inside one there; None if unknown."""
-        frame = self.cloth.frame
-        return None if frame is None or frame.before is None else Before(frame.before, inside)
-
-    def drawn(self, x: Placed, wanted: Float[Tensor, "vertices 3"]) -> Placed:
-        """As `moved`, but the number of crossings in a tangle may grow for a while."""
-        return self.promise.draw(x, self.closed(wanted))
-
-    def out_of_bodies(self, x: Placed) -> tuple[Placed, int]:
-        """Positions moved safely out of bodies [m], x itself if no cloth had to move, and the number of passes.
-
-        First all cloth inside is moved until no fewer vertices and crossings are left, then the vertices inside alone:
-        an edge's way out may put a vertex inside.
-        """
-        whole, passes = self._moved_out(x, vertices=False)
-        out, more = self._moved_out(whole, vertices=True)
-        return out, passes + more
-
-    def _moved_out(self, start: Placed, *, vertices: bool) -> tuple[Placed, int]:
-        """Positions with less cloth in bodies [m], and the number of passes.
-
-        In all passes together, a vertex moves at most the distance of its first push plus a mean edge: cloth pinched
-        between two limbs, pushed out of one into the other in turns, would form spikes. Passes end once `STALLED` of
-        them in a row left as much; the best positions stay.
-
-        Args:
-            start: Positions [m].
-            vertices: Whether only vertices inside are moved and counted, not edges and faces through a body.
-        """
-        view, x, reach = self.cloth, start, None
-
-        def count(x: Placed) -> int:
-            return view.in_bodies(x)[0] if vertices else sum(view.in_bodies(x))
-
-        best, left, passes, stalled = x, count(x), 0, 0
-        while left and stalled < STALLED and not is_over():
-            wanted = view.pushed_out(x, vertices=vertices)
-            shift = wanted - start
-            far = shift.norm(dim=1, keepdim=True)
-            reach = far + view.mesh.level.rest_length.mean() if reach is None else reach
-            x = self.moved(x, torch.where(far > reach, start + shift * (reach / far), wanted))
-            passes, stalled, now = passes + 1, stalled + 1, count(x)
-            if now < left:
-                best, left, stalled = x, now, 0
-        return best, passes
 
 
 class FrameContact:
@@ -201,13 +73,13 @@ class FrameContact:
         return self._aimed[1]
 
     @cached_property
-    def _cage(self) -> tuple[ClothMesh, Crossings, LevelBodies | None, Pierced | None, Tensor | None]:
+    def _cage(self) -> tuple[ClothMesh, Crossings, LevelBodies | None, Pierced, Tensor | None]:
         """The cage's mesh, crossings, view of the bodies, crossings with them, and vertices inside each."""
-        cage, bodies = self._levels[0], self._bodies
+        cage, bodies, x = self._levels[0], self._bodies, self._coarse.double()
         mesh = self._cloth.mesh(cage, self._seam_at(cage), bodies, itself=self._settings.cloth == "pairs")
+        found, pierced = all_crossings(mesh.parts, x if bodies is None else torch.cat([x, bodies.points]))
         if bodies is None:
-            return mesh, crossings(mesh.parts, self._coarse), None, None, None
-        found, pierced = all_crossings(mesh.parts, torch.cat([self._coarse.double(), bodies.points]))
+            return mesh, found, None, pierced, None
         view = LevelBodies(cage, bodies, mesh.pieces)
         inside = view.inside(self._coarse, pierced)
         return mesh, found, view, pierced, inside if bool(inside.any()) else None
@@ -221,8 +93,9 @@ class FrameContact:
         if self._last_given_up is None or not (self._last_given_up.any() and self.crossed):
             return None
         mesh, found, *_ = self._cage
-        tangled = Tangles.find(mesh, found, torch.zeros_like(self._last_given_up)).label >= 0
-        return mesh.pieces_with(self._last_given_up & tangled, over=0.0)
+        lost = mesh.padded(self._last_given_up)
+        tangled = Tangles.find(mesh, found, torch.zeros_like(lost)).label >= 0
+        return mesh.pieces_with(lost & tangled, over=0.0)
 
     def after_cage(self, x: Float[Tensor, "coarse 3"]) -> FrameContact:
         """This contact, where pieces that are mostly tangled in the cage x [m] of a cold frame are given up."""
@@ -249,8 +122,7 @@ class FrameContact:
         found = found if aim is self._coarse else crossings(mesh.parts, aim)
         asked = None if self.given_up is None else ~self.given_up
         if asked is not None:
-            kept = asked[mesh.corners_of(found)].any(dim=1)
-            found = Crossings(found.edge[kept], found.face[kept])
+            found = found.where(asked[mesh.corners_of(found)].any(dim=1))
         apart, left = drawn_apart(mesh, aim, found, gap=float(self._thickness.mean()), asked=asked)
         pair = (aim if left else apart), apart
         aim, apart = (each if seam is None or each is self._coarse else seam.closed(each) for each in pair)
@@ -275,9 +147,7 @@ class FrameContact:
             own = {"base": base, "thickness": self._thickness, "settings": self._settings, "seam": seam}
             own |= {"bodies": self._bodies, "given_up": self._given_up_at(level)}
             own |= {"doubtful": _share_of(level, self._doubtful) > 0.0}
-            cloth = ClothView(self._cloth, level, **own)
-            promise = Promise(cloth, KEPT_GAP * float(self._thickness.min()))
-            self._views[level.index] = LevelContact(cloth, seam, promise)
+            self._views[level.index] = LevelContact(self._cloth, level, **own)
         return self._views[level.index]
 
     def _given_up_at(self, level: Level) -> Bool[Tensor, " vertices"] | None:
@@ -288,8 +158,7 @@ class FrameContact:
     def _doubtful(self) -> Bool[Tensor, " coarse"]:
         """Mask of the cage's vertices around all that crosses in it, or was repaired."""
         mesh, found, _, pierced, inside = self._cage
-        some = mesh.crossed(found) | (self.aim != self._coarse).any(dim=1)
-        some = some if pierced is None else some | mesh.crossed(pierced.crossings)
+        some = mesh.crossed(found) | mesh.crossed(pierced.crossings) | (self.aim != self._coarse).any(dim=1)
         some = some if inside is None else some | inside.any(dim=0)
         return mesh.grown(some, 1)
 
@@ -306,16 +175,19 @@ class FrameContact:
         if self.aim is not self._coarse:
             shift = (self.aim - self._coarse).norm(dim=1)
             moved["repaired"] = {"vertices": int((shift > 0).sum()), "largest_mm": round(1e3 * float(shift.max()), 4)}
-        out, passes = self.at(self._levels[-1]).out_of_bodies(x)
+        # First all cloth inside is moved, then the vertices inside alone: an edge's way out may put a vertex inside.
+        view = self.at(self._levels[-1])
+        whole, passes = _out_of_bodies(view, x, vertices=False)
+        out, more = _out_of_bodies(view, whole, vertices=True)
         if self._bodies is not None:
             shifts = (out - x).norm(dim=1)
             far = round(1e3 * float(shifts.max()), 4) if len(shifts) else 0.0
-            moved["projected"] = {"vertices": int((shifts > 0).sum()), "largest_mm": far, "passes": passes}
+            moved["projected"] = {"vertices": int((shifts > 0).sum()), "largest_mm": far, "passes": passes + more}
         return out, moved
 
     def is_out(self, x: Placed) -> bool:
         """Whether no cloth is inside or through a body at x [m]."""
-        return not any(self.at(self._levels[-1]).cloth.in_bodies(x))
+        return not any(self.at(self._levels[-1]).look(x).in_bodies)
 
     def measure(self, x: Float[Tensor, "vertices 3"]) -> tuple[dict[str, object], Bool[Tensor, " vertices"]]:
         """Penetrations and crossings before and after, as plain values, and a mask of the vertices of crossing cloth.
@@ -324,7 +196,37 @@ class FrameContact:
             x: The result [m].
         """
         view = self.at(self._levels[-1])
-        return measured(view.cloth, view.closed(self._levels[-1].base.apply(self._coarse)), x)
+        return measured(view, view.closed(self._levels[-1].base.apply(self._coarse)), x)
+
+
+def _out_of_bodies(view: LevelContact, start: Placed, *, vertices: bool) -> tuple[Placed, int]:
+    """Positions moved safely out of bodies [m], the start itself if no cloth had to move, and the number of passes.
+
+    In all passes together, a vertex moves at most the distance of its first push plus a mean edge: cloth pinched
+    between two limbs, pushed out of one into the other in turns, would form spikes. Passes end once `STALLED` of them
+    in a row left as much; the best positions stay.
+
+    Args:
+        start: Positions [m].
+        vertices: Whether only vertices inside are moved and counted, not edges and faces through a body.
+    """
+
+    def count(x: Placed) -> int:
+        inside, crossings = view.look(x).in_bodies
+        return inside if vertices else inside + crossings
+
+    x, reach = start, None
+    best, left, passes, stalled = x, count(x), 0, 0
+    while left and stalled < STALLED and not is_over():
+        wanted = view.pushed_out(x, vertices=vertices)
+        shift = wanted - start
+        far = shift.norm(dim=1, keepdim=True)
+        reach = far + view.mesh.level.rest_length.mean() if reach is None else reach
+        x = view.moved(x, torch.where(far > reach, start + shift * (reach / far), wanted))
+        passes, stalled, now = passes + 1, stalled + 1, count(x)
+        if now < left:
+            best, left, stalled = x, now, 0
+    return best, passes
 
 
 def _share_of(level: Level, some: Bool[Tensor, " coarse"]) -> Float[Tensor, " vertices"]:

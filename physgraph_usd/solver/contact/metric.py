@@ -22,7 +22,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..integrate.base import Solver
+from ..integrate.base import Preconditioner, Solver
 from ..integrate.metric import Metric
 from ..mesh.stencil import three_columns
 
@@ -54,6 +54,13 @@ class HeldMetric:
         self._rough = ROUGH / plain.gathered(three_columns(own + stiff)).clamp_min(tiny)
         between, self._cage = plain.coarse.held(plain.gathered(three_columns(stiff))[:, 0])
         self._middle = [three_columns(1.0 / each.clamp_min(tiny)) for each in between]
+
+    @staticmethod
+    def of(plain: Metric, stiff: Float[Tensor, " vertices"], last: Preconditioner | None) -> Metric | HeldMetric:
+        """The metric with a contact stiffness [N/m]; the last metric while its stiffness suffices."""
+        if not isinstance(last, HeldMetric):
+            return HeldMetric(plain, stiff) if bool((stiff > 0).any()) else plain  # Things are near, but none pushes.
+        return last if last.serves(stiff) else HeldMetric(plain, torch.maximum(stiff, last.stiff))
 
     def serves(self, stiff: Float[Tensor, " vertices"]) -> bool:
         """True if K contains enough of the given stiffness [N/m]."""

@@ -13,20 +13,19 @@ rounding cannot be returned, and are not promised.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TypedDict
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ..collide.pairs import Pairs
+from ..collide.pairs import NearAt, Pairs
 from ..collide.parts import Parts
 from ..collide.search import blocking_pairs
 from ..deadline import is_over
+from ..forces.seam import Seam
 from ..level import Placed
 from .along import ApproachLimits, along
-from .cloth import ClothView
-from .cloth_mesh import RINGS
+from .cloth_mesh import RINGS, ClothMesh
 
 ROUNDS = 4
 """Most passes that shorten blocked displacements. Vertices still blocked afterwards stay at the start, so the passes
@@ -38,144 +37,74 @@ is negligible. Without the limit shot 02 needs twice the rounds (53 for 24 in fr
 
 
 @dataclass(frozen=True, eq=False)
-class Before:
-    """Bodies in the start frame.
+class Promise:
+    """The pairs of parts of cloth and bodies that a move keeps apart.
 
     Attributes:
-        corners: Positions of the bodies' corners [m], shape (B, 3), float64.
-        inside: Mask of the cloth inside a body there; None if none is.
+        floor: Gap that pairs keep, as for `safe_move` [m].
+        tangle, inside: As for `safe_move`.
     """
 
-    corners: Float[Tensor, "corners 3"]
-    inside: Bool[Tensor, " vertices"] | None
-
-
-class _Options(TypedDict):
-    """Options of `safe_move`."""
-
+    mesh: ClothMesh
+    seam: Seam | None
     floor: float
     tangle: Int[Tensor, " all"] | None
     inside: Bool[Tensor, " all"] | None
 
+    def blocking(self, begin: Tensor, end: Tensor, asked: Tensor, *, near: NearAt | None = None) -> Pairs:
+        """As `blocking_pairs`."""
+        given = {"floor": self.floor, "tangle": self.tangle, "inside": self.inside}
+        return blocking_pairs(self.mesh.parts, begin, end, **given, asked=asked, near=near)
 
-@dataclass(frozen=True, eq=False)
-class Promise:
-    """Moves of one level's cloth in one frame that add no crossings of cloth with cloth or with bodies.
+    def kept(
+        self, begin: Float[Tensor, "all 3"], end: Float[Tensor, "all 3"], met: Pairs, *, halved: bool
+    ) -> tuple[Float[Tensor, "all 3"], bool]:
+        """Corners after a safe move, the wanted themselves if no pair blocks; and whether pairs with bodies are proved.
 
-    Attributes:
-        view: The level's cloth and the bodies.
-        floor: Gap that pairs keep, as for `safe_move` [m].
-    """
-
-    view: ClothView
-    floor: float
-
-    def move(self, start: Placed, wanted: Float[Tensor, "vertices 3"], since: Before | None = None) -> Placed:
-        """Positions as close to the wanted positions as is safe [m], ``wanted`` itself if no pair blocks the move.
-
-        In a tangle of the start, cloth may pass through itself as long as the tangle's number of crossings does not
-        grow. Cloth inside a body may pass through bodies.
+        Displacements are projected onto the planes of the blocking pairs, and then shortened. Only pairs of vertices
+        with changed ends are checked again.
 
         Args:
-            start: Positions [m].
-            wanted: Wanted positions [m].
-            since: The bodies in the start frame, from which they move; None if they stand. A body passes through cloth
-                that cannot give way.
-        """
-        view, tangles = self.view, self.view.tangles(start)
-        if tangles is None or bool(tangles.hopeless.all()):
-            x, proved = self._go(start, wanted, None if tangles is None else tangles.label, since)
-            if proved and view.is_clean(start):
-                view.remember(x, tangles)
-            return x
-        free = tangles.label.clone()
-        x, _ = self._go(start, wanted, free, since)
-        for whole in (False, True):  # First the worse tangles alone are held, then all.
-            worse = tangles.worse(view.crossings(x))
-            if not bool(worse.any()):
-                break
-            free[~tangles.given_up if whole else worse] = -1
-            x, _ = self._go(start, wanted, free, since)
-        return x
-
-    def draw(self, start: Placed, wanted: Float[Tensor, "vertices 3"]) -> Placed:
-        """As `move`, but the number of crossings in a tangle may grow for a while."""
-        tangles = self.view.tangles(start)
-        return self._go(start, wanted, None if tangles is None else tangles.label, None)[0]
-
-    def _go(
-        self, start: Placed, aim: Tensor, tangle: Int[Tensor, " vertices"] | None, since: Before | None
-    ) -> tuple[Placed, bool]:
-        """As `move`, without a promise for pairs inside one tangle; and whether all pairs with bodies are proved apart.
-
-        Vertices are projected onto the planes of the blocked pairs, and then shortened. Only pairs of vertices with
-        changed ends are checked again.
-        """
-        view, count = self.view, len(aim)
-        begin = view.with_bodies(start) if since is None else torch.cat([start.double(), since.corners])
-        label = None if tangle is None else torch.nn.functional.pad(tangle, (0, len(view.corners)), value=-1)
-        inside = view.exempt(start) if since is None else view.padded(since.inside)
-        options = _Options(floor=self.floor, tangle=label, inside=inside)
-        end = view.with_bodies(aim)
-        near = view.springs.known(start) if since is None else None
-        if near is None and label is None and inside is None:
-            met = view.springs.blocking(begin, end, aim, floor=self.floor, asked=view.asked)
-        else:
-            met = blocking_pairs(view.parts, begin, end, **options, asked=self._moving(begin, end), near=near)
-        x, proved = self._on(begin, end, met, options, dtype=aim.dtype, halved=since is not None)
-        return Placed(aim if x is end else x[:count].to(aim)), proved
-
-    def _moving(self, begin: Tensor, end: Tensor) -> Bool[Tensor, " all"]:
-        """Mask of the vertices that move, or of all that are not given up."""
-        return (end != begin).any(dim=1) if self.view.asked is None else self.view.asked
-
-    def _on(
-        self, begin: Tensor, end: Tensor, met: Pairs, options: _Options, *, dtype: torch.dtype, halved: bool
-    ) -> tuple[Tensor, bool]:
-        """Positions after a move of cloth and bodies, and whether all pairs with bodies are proved apart.
-
-        Args:
-            begin: Positions of cloth and bodies [m], float64.
-            end: Wanted positions [m]; those of bodies are reached.
+            begin: Corners of cloth and bodies [m], float64.
+            end: Wanted corners [m]; those of bodies are reached.
             met: Pairs that block the move.
-            dtype: Type to which positions of the cloth are rounded.
             halved: Whether vertices in or around pairs that stay blocked move in two halves: planes may turn once more.
         """
-        view, parts, count = self.view, self.view.parts, self.view.parts.level.vertex_count
         if not len(met.value):
             return end, True
-        moves = (end != begin).any(dim=1)
-        stand = not bool(moves[count:].any())
-        free = parts.level.free & moves[:count].unsqueeze(1) if stand else parts.level.free
-        free = torch.nn.functional.pad(free, (0, 0, 0, len(end) - count))
+        mesh, moves = self.mesh, (end != begin).any(dim=1)
+        stand = not bool(moves[mesh.level.vertex_count :].any())
+        free = mesh.free & moves.unsqueeze(1) if stand else mesh.free
         ends, wanted = end, end - begin
         planes = ApproachLimits.of(begin, ends, met, self.floor)
         for _ in range(ROUNDS):
-            last, gone = ends, along(wanted, planes, free=free, threads=parts.level.threads)
-            cloth = view.closed((begin + gone)[:count].to(dtype))
-            ends = torch.cat([cloth.double(), end[count:]])
-            met = blocking_pairs(parts, begin, ends, **options, asked=_corners(met, (ends != last).any(dim=1)))
+            last, gone = ends, along(wanted, planes, free=free, threads=mesh.level.threads)
+            ends = self._rounded(begin + gone, end)
+            met = self.blocking(begin, ends, _with_corners(met, (ends != last).any(dim=1)))
             if not len(met.value):
                 return ends, True
             planes = planes.joined(ApproachLimits.of(begin, ends, met, self.floor, corners=True))
+        late = _with_corners(met, torch.zeros_like(moves))
         if halved:  # Pairs of other vertices stay apart on both halves of their straight paths.
-            late, proved = _corners(met, torch.zeros_like(moves)), True
-            late[:count] = view.mesh.grown(late[:count], RINGS)
-            late &= moves
+            late, proved = mesh.grown(late, RINGS) & moves, True
             last = torch.where(late.unsqueeze(1), end, ends)
             for aim in (0.5 * (begin + last), last):
-                met = blocking_pairs(parts, begin, aim, **options, asked=late)
-                begin, one = self._on(begin, aim, met, options, dtype=dtype, halved=False)
+                begin, one = self.kept(begin, aim, self.blocking(begin, aim, late), halved=False)
                 late, proved = late | (begin != aim).any(dim=1), proved and one
             return begin, proved
-        if not stand:  # Cloth that stays behind a body that moves on would be in the body.
-            options = _Options(**options)
-            options["inside"] = torch.arange(len(moves), device=moves.device) < count
-        asked = _corners(met, torch.zeros_like(moves))
-        return safe_move(begin, ends, parts, **options, asked=asked, dtype=dtype), stand
+        # Cloth that stays behind a body that moves on would be in the body.
+        inside = self.inside if stand else torch.arange(len(moves), device=moves.device) < mesh.level.vertex_count
+        given = {"floor": self.floor, "tangle": self.tangle, "inside": inside, "dtype": mesh.level.dtype}
+        return safe_move(begin, ends, mesh.parts, asked=late, **given), stand
+
+    def _rounded(self, points: Tensor, end: Tensor) -> Float[Tensor, "all 3"]:
+        """Corners of the cloth rounded to the type of the solve, seams closed, and corners of bodies at their ends."""
+        cloth = points[: self.mesh.level.vertex_count].to(self.mesh.level.dtype)
+        cloth = cloth if self.seam is None else self.seam.closed(cloth)
+        return torch.cat([cloth.double(), end[len(cloth) :]])
 
 
-def _corners(met: Pairs, others: Bool[Tensor, " vertices"]) -> Bool[Tensor, " vertices"]:
+def _with_corners(met: Pairs, others: Bool[Tensor, " all"]) -> Bool[Tensor, " all"]:
     asked = others.clone()
     asked[met.corners.long().reshape(-1)] = True
     return asked

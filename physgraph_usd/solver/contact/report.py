@@ -15,13 +15,13 @@ from ..collide.crossings import all_crossings, crossings
 from ..colliders.mesh import MeshSurface
 from ..level import Level
 from .bodies import LevelBodies
-from .cloth import ClothView, ContactState
+from .cloth import ContactState, LevelContact
 from .cloth_mesh import ClothMesh
 from .measure import Penetration, depths, penetration
 
 
 def measured(
-    view: ClothView, before: Float[Tensor, "vertices 3"], x: Float[Tensor, "vertices 3"]
+    view: LevelContact, before: Float[Tensor, "vertices 3"], x: Float[Tensor, "vertices 3"]
 ) -> tuple[dict[str, object], Bool[Tensor, " vertices"]]:
     """Penetrations and crossings before and after, and a mask of the vertices of crossing cloth after.
 
@@ -36,15 +36,14 @@ def measured(
     said: dict[str, object] = {}
     if view.bodies is not None:
         said["bodies"] = _of_bodies(view.bodies, before, first, x, last)
-    kept = last.crossings if last.tangles is None else last.tangles.hopeful(last.crossings)
-    found = kept if view.given_up is None else crossings(view.parts, x)
+    found = last.hopeful if view.given_up is None else crossings(view.mesh.parts, x)
     if view.keeps_sides:
-        base = first.crossings if view.given_up is None else crossings(view.parts, before)
+        base = first.crossings if view.given_up is None else crossings(view.mesh.parts, before)
         crossed = {
             name: {"crossings": each.count, "between_garments": int(np.triu(view.mesh.between(each), 1).sum())}
             for name, each in (("before", base), ("after", found))
         }
-        crossed["after"]["given_up"] = found.count - kept.count
+        crossed["after"]["given_up"] = found.count - last.hopeful.count
         near = bool(view.came_near) or any(each["crossings"] for each in crossed.values())
         said["cloth"] = {"near": near, **crossed}
     return said, view.mesh.crossed(found)
@@ -67,8 +66,7 @@ def _of_bodies(
 
 def _penetration(bodies: LevelBodies, index: int, x: Tensor, look: ContactState, *, lost: Tensor | None) -> Penetration:
     inside = torch.zeros_like(bodies.level.free[:, 0]) if look.inside is None else look.inside[index]
-    count = 0 if look.pierced is None else int((look.pierced.body == index).sum())
-    known = {"longest": bodies.frame.longest, "lost": lost, "crossings": count}
+    known = {"longest": bodies.frame.longest, "lost": lost, "crossings": int((look.pierced.body == index).sum())}
     surface, at = bodies.frame.touching[index].surface, x + bodies.frame.shifts[index]
     exits = partial(bodies.frame.exits, index) if surface.closed else None
     return penetration(surface, bodies.level, at, inside, exits=exits, **known)
@@ -130,4 +128,4 @@ def body_crossings(level: Level, surfaces: Sequence[MeshSurface], points: np.nda
     mesh = ClothMesh(level, meets, np.zeros((0, 2), np.int64), solids=tuple(each.solid for each in surfaces))
     x = np.concatenate([points, *(each.world for each in surfaces)]) - points.mean(axis=0)
     pierced = all_crossings(mesh.parts, torch.as_tensor(x, device=level.device))[1]
-    return mesh.crossed(pierced.crossings)[: len(points)].cpu().numpy()
+    return mesh.crossed(pierced.crossings).cpu().numpy()

@@ -44,18 +44,18 @@ class Tangles:
     """The tangles of one level's cloth.
 
     Attributes:
-        label: The tangle of each vertex, -1 outside tangles, shape (V,), int32.
+        label: The tangle of each corner of cloth and bodies, -1 outside tangles, shape (V + B,), int32.
         before: Number of crossings of each tangle, shape (N,).
         hopeless: True for tangles with vertices that are given up, shape (N,), bool.
     """
 
-    label: Int[Tensor, " vertices"]
+    label: Int[Tensor, " all"]
     before: Int[Tensor, " tangles"]
     hopeless: Bool[Tensor, " tangles"]
     _mesh: ClothMesh
 
     @staticmethod
-    def find(mesh: ClothMesh, crossings: Crossings, given_up: Bool[Tensor, " vertices"]) -> Tangles:
+    def find(mesh: ClothMesh, crossings: Crossings, given_up: Bool[Tensor, " all"]) -> Tangles:
         """Tangles: connected components of the crossings and the cloth within `RINGS` rings.
 
         Args:
@@ -69,7 +69,7 @@ class Tangles:
         across = torch.cat([corners[:, [0, place]] for place in range(1, 5)])
         lost = torch.nonzero(given_up).squeeze(1)
         together = torch.stack([lost[:1].expand(len(lost)), lost], dim=1)
-        piece = joined_by(torch.cat([inside, across, together]).cpu().numpy(), mesh.level.vertex_count)
+        piece = joined_by(torch.cat([inside, across, together]).cpu().numpy(), len(region))
         which = region.cpu().numpy()
         label = np.full(len(which), -1, np.int32)
         numbers, label[which] = np.unique(piece[which], return_inverse=True)
@@ -78,23 +78,22 @@ class Tangles:
         hopeless = torch.bincount(labels[lost].long(), minlength=len(numbers)) > 0
         return Tangles(labels, before, hopeless, mesh)
 
-    def worse(self, crossings: Crossings) -> Bool[Tensor, " vertices"]:
+    def worse(self, crossings: Crossings) -> Bool[Tensor, " all"]:
         """Mask of the vertices of hopeful tangles with more crossings than before."""
         of = self.label[self._mesh.corners_of(crossings)].amax(dim=1).long()
         counts = torch.bincount(of.clamp_min(0), minlength=len(self.before))
         return self._of((counts > self.before) & ~self.hopeless)
 
     @property
-    def given_up(self) -> Bool[Tensor, " vertices"]:
+    def given_up(self) -> Bool[Tensor, " all"]:
         """Mask of the vertices of hopeless tangles."""
         return self._of(self.hopeless)
 
     def hopeful(self, crossings: Crossings) -> Crossings:
         """Crossings outside hopeless tangles."""
-        kept = ~self.given_up[self._mesh.corners_of(crossings)].any(dim=1)
-        return Crossings(crossings.edge[kept], crossings.face[kept])
+        return crossings.where(~self.given_up[self._mesh.corners_of(crossings)].any(dim=1))
 
-    def _of(self, some: Bool[Tensor, " tangles"]) -> Bool[Tensor, " vertices"]:
+    def _of(self, some: Bool[Tensor, " tangles"]) -> Bool[Tensor, " all"]:
         return some[self.label.clamp_min(0).long()] & (self.label >= 0)
 
 

@@ -60,15 +60,15 @@ def state_left(problem: Problem, x: Placed) -> FrameState:
     view, cage = problem.view(problem.finest), problem.cage
     fine = x.double() + torch.as_tensor(cage.origin).to(x.device)
     lost = None if problem.contact is None else problem.contact.given_up
-    clean = view is not None and lost is None and view.cloth.is_clean(x)
-    exempt = None if view is None else view.cloth.exempt(x)
+    state = None if view is None else view.look(x)
+    exempt = None if state is None else state.exempt
     return FrameState(
         coarse=torch.as_tensor(cage.world),
         fine=fine,
         inside=torch.zeros_like(x[:, 0], dtype=torch.bool) if exempt is None else exempt[: len(x)],
         given_up=torch.zeros_like(cage.points[:, 0], dtype=torch.bool) if lost is None else lost,
         held=problem.start.held,
-        clean=clean,
+        clean=lost is None and state is not None and state.is_clean,
     )
 
 

@@ -8,12 +8,16 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ..contact.frame import FrameContact, LevelContact, Touch
+from ..contact.cloth import LevelContact
+from ..contact.frame import FrameContact
+from ..contact.metric import HeldMetric
 from ..forces.base import ForceModule
 from ..forces.seam import SewnForces
+from ..forces.self_contact import SelfContact
 from ..integrate.base import Integrator, System
 from ..integrate.metric import Metric
 from ..integrate.stop import Budget
@@ -57,7 +61,7 @@ class LevelProblem:
     def system(
         self,
         view: LevelContact,
-        touched: Sequence[Touch],
+        touched: Sequence[SelfContact],
         x: Float[Tensor, "vertices 3"],
         *,
         last: System | None = None,
@@ -75,7 +79,11 @@ class LevelProblem:
         field, metric = self.alone.field, self.alone.metric
         assert isinstance(field, ForceModule)
         assert isinstance(metric, Metric)
-        held = view.metric(metric, touched, x, known=None if last is None else last.metric)
+        held = metric if view.seam is None else metric.merged(view.seam.label)
+        if touched:
+            stiff = 3.0 * torch.stack([term.diagonal(x) for term in touched]).sum(dim=0)
+            known = None if last is None or view.look(x).hopeful.count else last.metric
+            held = HeldMetric.of(held, stiff, known)
         joined = field.joined_by(touched)
         return self.lasting.system_in(joined if view.seam is None else SewnForces(joined, view.seam), held)
 
@@ -124,7 +132,7 @@ class Problem:
         assert warm is not None
         if view is None or self.before is None:
             return warm
-        return view.moved(self.before, warm, view.since(self.inside))
+        return view.carried(self.before, warm, self.inside)
 
     @property
     def _first_cage(self) -> Float[Tensor, "coarse 3"]:
@@ -191,7 +199,7 @@ class Problem:
             linear, smooth = level.base, level.smooth_base
         x = linear.apply(below)
         smoothing = self.forces[index].without_facets(x, below, smooth)
-        if view is not None and not first and level.flat_from_below is not None and view.crosses(x):
+        if view is not None and not first and level.flat_from_below is not None and view.look(x).crossings.count:
             flat = level.flat_from_below.apply(below)
             x, smoothing = flat, x + smoothing - flat
         return x, smoothing

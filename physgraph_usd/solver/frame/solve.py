@@ -18,7 +18,8 @@ import numpy as np
 from torch import Tensor
 
 from ...errors import SolveError
-from ..contact.frame import STALLED, LevelContact
+from ..contact.cloth import LevelContact
+from ..contact.frame import STALLED
 from ..contact.metric import HELD_TOLERANCE, HeldMetric
 from ..deadline import is_over
 from ..forces.base import ForceModule
@@ -112,7 +113,7 @@ def solve_one_level(
         if problem.show is not None:
             problem.show(x)
         return x, [report], problem.module
-    x, reports = _untangle(problem, view, view.begun(x), view.moved, most=WARM_UNTANGLINGS)
+    x, reports = _untangle(problem, view, Placed(view.closed(x)), view.moved, most=WARM_UNTANGLINGS)
     if smoothing is not None:
         x = view.moved(x, x + smoothing) if level.index else x
         terms = view.terms(x)
@@ -157,7 +158,7 @@ def _with_cage_untangled(problem: Problem, *, since: float) -> tuple[Problem, li
     level = problem.level(0, since=since)
     view, start = level.view, problem.begun(0, None)[0]
     assert view is not None
-    x, reports = _untangle(level, view, view.begun(start), view.drawn, most=UNTANGLINGS)
+    x, reports = _untangle(level, view, Placed(view.closed(start)), view.drawn, most=UNTANGLINGS)
     return replace(problem, contact=contact.after_cage(x), walked=x), reports
 
 
@@ -175,7 +176,7 @@ def _untangle(
     """
     level, budget = problem.level, problem.budget
     reports: list[LevelReport] = []
-    short, counts = budget.for_untangling(), [view.hopeful(x)]
+    short, counts = budget.for_untangling(), [view.look(x).hopeful.count]
     for left in reversed(range(most)):
         if is_over() or not counts[-1]:
             break
@@ -184,7 +185,7 @@ def _untangle(
         wanted, report = solve_level(system, problem.untangler, x, level=level.index, budget=short)
         x = move(x, wanted)
         reports.append(report)
-        counts.append(view.hopeful(x))
+        counts.append(view.look(x).hopeful.count)
         gone = counts[-1 - STALLED] - counts[-1] if len(counts) > STALLED else math.inf
         if counts[-1] * STALLED > gone * left and view.tangled_pieces(x) is not None:
             break
