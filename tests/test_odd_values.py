@@ -68,7 +68,7 @@ def test_a_body_whose_faces_are_a_single_number_is_left_out_by_name(tmp_path: Pa
     add_sheet(stage, CLOTH)
     add_sheet(stage, "/World/floor", tagged=False).GetPrim().AddAppliedSchema(COLLIDER_API)
     retype(stage, "/World/floor.faceVertexIndices", "int", 7)
-    report = refine(save(stage), tmp_path / "fine.usdc", level=1, steps=1)
+    report = refine(Path(save(stage)), tmp_path / "fine.usdc", level=1, steps=1)
     assert any("its points and faces do not fit together" in str(each) for each in report.warnings)
 
 
