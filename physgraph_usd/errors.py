@@ -29,8 +29,9 @@ LONGEST_TEXT = 300
 """Most characters of an unexpected exception's text in a message."""
 MOST_NAMED = 3
 """Most prims named in the message of an unexpected exception."""
-_OF_PACKAGE = re.compile(r'File ".*physgraph_usd[\\/](.+)", line (\d+), in (\S+)')
-"""A line of a traceback in this package."""
+_ROOMS = "cli|lab|shot|solver|studio|usd"
+_OF_PACKAGE = re.compile(rf'File ".*physgraph_usd[\\/]((?:(?:{_ROOMS})[\\/].+|\w+\.py))", line (\d+), in (\S+)')
+"""A line of a traceback in this package, wherever it is installed: a checkout may lie in a folder of its name."""
 
 
 class PhysGraphError(Exception):
@@ -180,7 +181,7 @@ def place_of(error: BaseException, *, time: float | None = None) -> Place:
     if isinstance(error, GarmentError):
         at = at | {"prims": (error.path,)} | ({} if error.time is None else {"time": error.time})
     lines = _OF_PACKAGE.findall("".join(traceback.format_exception(error)))
-    own = [(file.replace("\\", "/"), line, name) for file, line, name in lines if "site-packages" not in file]
+    own = [(file.replace("\\", "/"), line, name) for file, line, name in lines]
     code = "{}, line {}, in {}".format(*own[-1]) if own else ""
     return Place(tuple(at.get("prims", ())), at.get("time", time), code)
 
