@@ -1,4 +1,4 @@
-"""``refine``: one shot in this process, or several, each in a process of its own, with one summary."""
+"""``refine``: one shot in this process, or several shots in a process each, with a summary of all."""
 
 from __future__ import annotations
 
@@ -185,7 +185,7 @@ def _refine_logged(*job: Any, output: Output, alone: bool) -> RefineReport:
 def _refine_shown(
     shot: str | Path, layer: Path, options: RefineOptions, *, output: Output, alone: bool = True
 ) -> RefineReport:
-    """Refine a shot and show how far it is where it is alone at work."""
+    """Refine a shot, with a progress bar if no other shot is refined beside it."""
     with imports_uncollected():
         from ..shot.refine import refine_shot
 

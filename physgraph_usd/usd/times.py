@@ -133,7 +133,7 @@ def found_among(time: float, times: Sequence[float]) -> float | None:
 
 
 def is_among(time: float, times: Sequence[float]) -> bool:
-    """Whether a time code is the same as one of others, ascending."""
+    """Whether a time code equals one of several ascending time codes, within `SAME_TIME`."""
     return found_among(time, times) is not None
 
 

@@ -43,10 +43,10 @@ class Crossings:
 def crossings(
     parts: Parts, x: Float[Tensor, "vertices 3"], asked: Bool[Tensor, " vertices"] | None = None
 ) -> Crossings:
-    """All edges that pass through a face to which they are neither connected nor sewn.
+    """Crossings of cloth with cloth: edges through faces without a common or sewn vertex.
 
     Args:
-        x: Positions [m].
+        x: Positions of the cloth, or of the cloth and the bodies' corners [m].
         asked: Mask of vertices; each crossing has one of these among its corners. All vertices when None.
     """
     return all_crossings(parts, x, asked)[0]

@@ -142,7 +142,7 @@ class GarmentReader:
 
 
 def samples_of(prim: Usd.Prim, own: Sequence[float], times: Sequence[float]) -> Samples:
-    """Time codes at which a garment is solved, given its own and all, without those at which it has no shape.
+    """Time codes of a garment's samples and of its solve, without time codes where the garment has no shape.
 
     Raises:
         GarmentError: When the garment has a shape at none of its own time codes.
