@@ -267,23 +267,22 @@ def _pieces(
 
 def _pressed(prim: Usd.Prim, weld: Weld, animation: Animation) -> dict[str, Any]:
     """Pressed vertices and the pose with the folds as they rest, by field name; empty without pressed folds."""
-    asked = _asked_edges(prim, weld)
-    poses = [weld.joined(pose) for pose in animation.poses().values()] if len(asked) else []
-    found = pressed_folds(weld.mesh, poses, asked)
+    poses = [weld.joined(pose) for pose in animation.poses().values()]
+    found = pressed_folds(weld.mesh, poses, *(_marked_edges(prim, weld, pressed=value) for value in (True, False)))
     return {} if found is None else {"pressed": found[0], "folded": found[1]}
 
 
-def _asked_edges(prim: Usd.Prim, weld: Weld) -> np.ndarray:
-    """Welded vertices of the edges in a mesh's subsets of pressed edges, lower first, ascending, shape (E, 2)."""
-    asked = [np.zeros((0, 2), np.int64)]
+def _marked_edges(prim: Usd.Prim, weld: Weld, *, pressed: bool) -> np.ndarray:
+    """Welded vertices of the edges in a mesh's subsets with that `PRESSED`, lower first, ascending, shape (E, 2)."""
+    marked = [np.zeros((0, 2), np.int64)]
     for subset in UsdGeom.Subset.GetGeomSubsets(UsdGeom.Imageable(prim), UsdGeom.Tokens.edge):
         attribute = subset.GetPrim().GetAttribute(PRESSED)
         ends = subset.GetIndicesAttr().Get(Usd.TimeCode.EarliestTime())
-        if attribute and attribute.Get() and ends is not None:
+        if attribute and attribute.Get() is pressed and ends is not None:
             ends = np.asarray(ends)[: len(ends) // 2 * 2].reshape(-1, 2)
             ends = ends[((ends >= 0) & (ends < len(weld.number))).all(axis=1)]
-            asked.append(np.sort(weld.number[ends], axis=1))
-    return np.unique(np.concatenate(asked), axis=0)
+            marked.append(np.sort(weld.number[ends], axis=1))
+    return np.unique(np.concatenate(marked), axis=0)
 
 
 def _words(prim: Usd.Prim, subsets: Sequence[str]) -> tuple[str, ...]:

@@ -9,6 +9,7 @@ garment at its first time code, or by a skinned garment's bind transform.
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -44,6 +45,9 @@ HOLD = 1e-6
 """Stiffness holding a fitted shape in place, in mean stiffnesses: makes the matrix regular, keeps lengths."""
 SHORTEST = 1e-3
 """Length, in mean edges, below which edges pull no harder."""
+SHARP, KEPT = math.radians(60.0), 0.1
+"""Least angle of a pressed fold that nobody marked, and its most relative change. All 28 edges of a turned collar are
+so, 251 of two skinned garments with modelled hems, 10 of two made samples; none of eight simulated shots."""
 _AUTHORED = ("physics:restShapePoints", "primvars:rest", "primvars:Pref")
 _BENT = ("restShape", "restShapeDefault")
 _PER_CORNER = UsdGeom.Tokens.faceVarying
@@ -321,28 +325,38 @@ def median_shape(mesh: PolygonMesh, poses: Sequence[np.ndarray]) -> tuple[np.nda
 
 
 def pressed_folds(
-    mesh: PolygonMesh, poses: Sequence[np.ndarray], asked: Int[np.ndarray, "edges 2"]
+    mesh: PolygonMesh,
+    poses: Sequence[Float[np.ndarray, "vertices 3"]],
+    asked: Int[np.ndarray, "asked 2"],
+    refused: Int[np.ndarray, "refused 2"],
 ) -> tuple[Bool[np.ndarray, " vertices"], Float[np.ndarray, "vertices 3"]] | None:
     """Vertices at pressed folds, and the pose that has the folds as they rest.
 
+    A fold is pressed where an artist says so, and where the cage keeps it: folded by more than `SHARP`, with an
+    angle within `KEPT` of its median in every pose. Simulated wrinkles form and move.
+
     Args:
         mesh: The welded mesh.
-        poses: Positions of its vertices, each of shape (V, 3).
+        poses: Positions of its vertices.
         asked: Vertices of the edges that are pressed, lower first.
+        refused: Vertices of the edges that are not, lower first.
 
     Returns:
         Whether each vertex is at a pressed edge, and the pose nearest to the median angles; None without pressed edges.
     """
-    if not poses or not len(asked):
+    if not poses:
         return None
     elements = elastic_elements(mesh, mesh.triangulate(poses[0]), poses[0])
     hinges = elements.hinges[~elements.twists]
-    hinges = hinges[find_edges(asked, np.sort(hinges[:, :2], axis=1)) >= 0]
-    if not len(hinges):
-        return None
     angles = np.array([hinge_geometry(pose, hinges)[0] for pose in poses])
-    nearest = np.abs(angles - np.median(angles, axis=0)).sum(axis=1).argmin()
-    return np.isin(np.arange(mesh.vertex_count), hinges[:, :2]), np.asarray(poses[nearest])
+    median = np.median(angles, axis=0)
+    kept = (np.abs(angles - median) <= KEPT * np.abs(median)).all(axis=0) & (np.abs(median) > SHARP)
+    wanted, unwanted = (find_edges(each, np.sort(hinges[:, :2], axis=1)) >= 0 for each in (asked, refused))
+    pressed = wanted | (kept & ~unwanted & (len(poses) > 1))
+    if not pressed.any():
+        return None
+    nearest = np.abs(angles - median)[:, pressed].sum(axis=1).argmin()
+    return np.isin(np.arange(mesh.vertex_count), hinges[pressed, :2]), np.asarray(poses[nearest])
 
 
 def _bent(mesh: PolygonMesh) -> sparse.csr_matrix:
