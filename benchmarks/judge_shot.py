@@ -12,12 +12,13 @@ between ripples are noise.
 
 from __future__ import annotations
 
+import functools
 import json
 import statistics
 import sys
 import tempfile
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,10 +28,12 @@ from pxr import Sdf, Usd, UsdGeom, Vt
 
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.solve import ShotSolver, open_for
-from physgraph_usd.solver.mesh.subdivide import subdivide_times
+from physgraph_usd.solver.mesh.subdivide import smooth, subdivide_times
 
 STILL = 0.01
 """A cage stands where it moves less than this between two samples, in mean cage edges."""
+SHARP, SMOOTH = 60.0, 30.0
+"""Fine cloth folded by more than the first, in degrees, where the smooth cage folds by less than the second."""
 PERCENTILE = 99.0
 """Percentile of the cloth's motion over a standing cage."""
 
@@ -74,25 +77,33 @@ class Job:
 
 
 class Motion:
-    """Motion of the refined cloth relative to the upsampled cage, summed over frames.
+    """Motion and folds of the refined cloth relative to the cage's, summed over frames.
 
     Attributes:
         jumps: Vertices whose motion between two samples differs from the cage's by more than a mean cage edge.
+        sharp: Edges that fold sharply where the smoothly subdivided cage does not.
     """
 
     def __init__(self, garments: Sequence[Any], level: int) -> None:
         """Subdivide the cages of a scene's garments."""
         self._chains = [subdivide_times(garment.mesh, level) for garment in garments]
+        self._sides = [
+            _sides(chain[-1].mesh if chain else g.mesh) for g, chain in zip(garments, self._chains, strict=True)
+        ]
+        self._smooth = [_smoothing(g.mesh, chain) for g, chain in zip(garments, self._chains, strict=True)]
         self._edges = [_mean_rest_edge(garment) for garment in garments]
         self._last: list[tuple[np.ndarray, np.ndarray] | None] = [None] * len(garments)
         self._still: list[np.ndarray] = []
-        self.jumps = 0
+        self.jumps = self.sharp = 0
 
     def add(self, cages: Sequence[np.ndarray], points: Sequence[np.ndarray | None]) -> None:
         """Take the next frame: cage and fine positions of each garment [m]; None for a garment without a sample."""
         for index, (cage, fine) in enumerate(zip(cages, points, strict=True)):
             before, now = self._last[index], None if fine is None else (fine, self._upsampled(index, cage))
             self._last[index] = now
+            if fine is not None:
+                folded, smooth = (self._sides[index](x) for x in (fine, self._smooth[index](cage)))
+                self.sharp += int(((folded > SHARP) & (smooth < SMOOTH)).sum())
             if before is None or now is None:
                 continue
             carried = now[1] - before[1]
@@ -110,6 +121,27 @@ class Motion:
         for refinement in self._chains[index]:
             points = np.asarray(refinement.linear @ points)
         return points
+
+
+def _smoothing(mesh: Any, chain: Sequence[Any]) -> Callable[[np.ndarray], np.ndarray]:
+    """Maps cage positions to the smoothly subdivided cage's."""
+    steps = [smooth(coarse, step) for coarse, step in zip([mesh, *(each.mesh for each in chain)], chain, strict=False)]
+    return lambda x: functools.reduce(lambda points, step: np.asarray(step @ points), steps, x)
+
+
+def _sides(mesh: Any) -> Callable[[np.ndarray], np.ndarray]:
+    """Maps positions to the angle between the two faces at each inner edge, in degrees."""
+    face, order = np.repeat(np.arange(len(mesh.counts)), mesh.counts), np.argsort(mesh.half_edges.edge, kind="stable")
+    first = (np.cumsum(mesh.half_edges.count) - mesh.half_edges.count)[mesh.half_edges.count == 2]
+    pairs, following = face[order][first[:, None] + [0, 1]], mesh.indices[mesh.next_corner]
+
+    def angles(x: np.ndarray) -> np.ndarray:
+        cross = np.cross(x[mesh.indices], x[following])
+        normal = np.stack([np.bincount(face, each, len(mesh.counts)) for each in cross.T], axis=1)
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True).clip(1e-30)
+        return np.degrees(np.arccos((normal[pairs[:, 0]] * normal[pairs[:, 1]]).sum(axis=1).clip(-1.0, 1.0)))
+
+    return angles
 
 
 def _mean_rest_edge(garment: Any) -> float:
@@ -142,7 +174,7 @@ def judged(job: Job) -> dict[str, float | None]:
             frames.append(groups_of(outcome.record))
             spent.append(milliseconds)
         shot.close()
-    return _figures(frames, spent, job) | {"jumps": motion.jumps, "still": motion.still}
+    return _figures(frames, spent, job) | {"jumps": motion.jumps, "still": motion.still, "sharp": motion.sharp}
 
 
 def _timed(outcomes: Iterable[Any]) -> Iterator[tuple[Any, float]]:
