@@ -115,7 +115,7 @@ def add_mesh(
 
 
 def add_subset(stage: Usd.Stage, name: str, faces: np.ndarray, **values: float) -> None:
-    """A subset of the cloth's faces with a material of its own and our schema's values, or UsdPhysics' (physics_...)."""
+    """A subset of the cloth's faces with a material and our schema's values, or UsdPhysics' (physics_...)."""
     indices = Vt.IntArray.FromNumpy(faces.astype(np.int32))
     subset = UsdShade.MaterialBindingAPI.Apply(stage.GetPrimAtPath("/World/cloth")).CreateMaterialBindSubset(
         name, indices
