@@ -251,7 +251,10 @@ class TestPieces:
     def test_a_thick_garment_is_as_thick_as_its_cage(self, tmp_path: Path):
         points, faces = thick_tube()
         shot, count = shot_of(tmp_path, sheet=(points, faces)), len(points) // 2
-        assert "a closed shell, 2 mm thick" in warnings_of(shot)
+        for rest_frame in (None, "auto"):
+            said = warnings_of(shot, rest_frame=rest_frame)
+            assert "a closed shell, 2 mm thick" in said
+            assert "no length" not in said
         refine(shot, tmp_path / "fine.usda", level=LEVEL)
         found = fine(shot, tmp_path / "fine.usda", 1.0, prim="/World/sheet")
         assert len(found) == len(refined((points, faces)))

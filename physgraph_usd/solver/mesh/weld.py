@@ -96,6 +96,13 @@ class Weld:
         return steps, Weld(apart, welded, number, faces, across)
 
     @property
+    def without_rims(self) -> Weld:
+        """The weld without the rims in ``apart``, whose edges have no length where the skins are joined."""
+        rim = _are_rims(_sorted_corners(self.apart, self.number[self.apart.indices]))
+        indices = self.apart.indices[~rim[self.apart.corner_face]]
+        return replace(self, apart=PolygonMesh(self.apart.counts[~rim], indices, self.apart.vertex_count))
+
+    @property
     def sides(self) -> Int[np.ndarray, " vertices"]:
         """A number for each vertex, equal for vertices with a common normal; a doubled sheet has one per side."""
         if self.across is not None:

@@ -308,7 +308,7 @@ def _rest_and_weld(
     """Rest shape as authored or fitted, and the weld of the borders coincident in the rest shape and over the shot."""
     poses = [*animation.poses().values()] or [animation.first]
     if (found := weld_skins(mesh, poses)) is not None:
-        return _rest(prim, found, animation, request, matrix=matrix), found
+        return _rest(prim, found.without_rims, animation, request, matrix=matrix), found
     poses = [*animation.poses(1).values()] or [animation.first]
     within = seam_reach(mesh, poses[0], seam_tolerance(prim, request.overrides))
     found = weld(mesh, poses, within)
