@@ -126,3 +126,12 @@ class TestWritten:
         UsdGeom.Subset.SetFamilyType(UsdGeom.Imageable(mesh), "materialBind", "nonOverlapping")
         shot = Path(save(dressed))
         assert errors(write_layer(shot, tmp_path / "out.usdc", mode=mode), shot) == []
+
+
+def test_a_subset_whose_family_is_no_name_is_of_none(tmp_path: Path):
+    stage = Usd.Stage.Open(sheet_shot(tmp_path / "s.usda"))
+    subset = UsdGeom.Subset.Define(stage, "/World/cloth/trim")
+    subset.CreateIndicesAttr([0])
+    retype(stage, "/World/cloth/trim.familyName", "float", 1.0)
+    refine(Path(save(stage)), tmp_path / "fine.usda")
+    assert not errors(tmp_path / "fine.usda", tmp_path / "s.usda")
