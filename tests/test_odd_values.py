@@ -146,3 +146,11 @@ def test_texture_coordinates_that_are_not_finite_give_no_grain(tmp_path: Path):
     uv.Set(Vt.Vec2fArray([(float("inf"), 0.0)] * 20))
     with closing(open_shot(save(stage))) as shot:
         assert shot.sources[0].sources["grain"] == "the rest shape, downwards"
+
+
+def test_a_reference_to_a_name_with_a_null_byte_is_told(tmp_path: Path):
+    shot = Path(sheet_shot(tmp_path / "s.usda"))
+    text = shot.read_text().replace('def Xform "World"', 'def Xform "World" (prepend references = @./a\0b.usda@)', 1)
+    shot.write_text(text)
+    with pytest.raises(StageError, match="Could not open asset"):
+        refine(shot, tmp_path / "fine.usda")
