@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdSkel, Vt
 
 from physgraph_usd.usd.read.reader import Shot
 from physgraph_usd.usd.write.plain import PlainStage
@@ -112,6 +112,19 @@ def add_mesh(
     if scheme is not None:
         mesh.CreateSubdivisionSchemeAttr(scheme)
     return mesh
+
+
+def add_subset(stage: Usd.Stage, name: str, faces: np.ndarray, **values: float) -> None:
+    """A subset of the cloth's faces with a material and our schema's values, or UsdPhysics' (physics_...)."""
+    indices = Vt.IntArray.FromNumpy(faces.astype(np.int32))
+    subset = UsdShade.MaterialBindingAPI.Apply(stage.GetPrimAtPath("/World/cloth")).CreateMaterialBindSubset(
+        name, indices
+    )
+    material = UsdShade.Material.Define(stage, f"/World/looks/{name}")
+    UsdShade.MaterialBindingAPI.Apply(subset.GetPrim()).Bind(material)
+    for short, value in values.items():
+        full = short.replace("physics_", "physics:") if "physics_" in short else f"physgraph:material:{short}"
+        author(material.GetPrim(), full, value)
 
 
 def said(shot: Shot) -> str:

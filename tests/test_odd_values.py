@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -126,3 +127,30 @@ class TestWritten:
         UsdGeom.Subset.SetFamilyType(UsdGeom.Imageable(mesh), "materialBind", "nonOverlapping")
         shot = Path(save(dressed))
         assert errors(write_layer(shot, tmp_path / "out.usdc", mode=mode), shot) == []
+
+
+def test_a_subset_whose_family_is_no_name_is_of_none(tmp_path: Path):
+    stage = Usd.Stage.Open(sheet_shot(tmp_path / "s.usda"))
+    subset = UsdGeom.Subset.Define(stage, "/World/cloth/trim")
+    subset.CreateIndicesAttr([0])
+    retype(stage, "/World/cloth/trim.familyName", "float", 1.0)
+    refine(Path(save(stage)), tmp_path / "fine.usda")
+    assert not errors(tmp_path / "fine.usda", tmp_path / "s.usda")
+
+
+def test_texture_coordinates_that_are_not_finite_give_no_grain(tmp_path: Path):
+    stage = Usd.Stage.Open(sheet_shot(tmp_path / "s.usda"))
+    uv = UsdGeom.PrimvarsAPI(stage.GetPrimAtPath("/World/cloth")).CreatePrimvar(
+        "st", Sdf.ValueTypeNames.TexCoord2fArray, "vertex"
+    )
+    uv.Set(Vt.Vec2fArray([(float("inf"), 0.0)] * 20))
+    with closing(open_shot(save(stage))) as shot:
+        assert shot.sources[0].sources["grain"] == "the rest shape, downwards"
+
+
+def test_a_reference_to_a_name_with_a_null_byte_is_told(tmp_path: Path):
+    shot = Path(sheet_shot(tmp_path / "s.usda"))
+    text = shot.read_text().replace('def Xform "World"', 'def Xform "World" (prepend references = @./a\0b.usda@)', 1)
+    shot.write_text(text)
+    with pytest.raises(StageError, match="Could not open asset"):
+        refine(shot, tmp_path / "fine.usda")

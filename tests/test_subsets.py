@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pxr import Sdf, Usd, UsdGeom, UsdShade, Vt
+from pxr import Sdf, Usd, UsdGeom
 from shots import fine, refine
-from stages import add_mesh, author, new_stage, said, save, vec3
+from stages import add_mesh, add_subset, author, new_stage, said, save, vec3
 
 from physgraph_usd.shot.refine import inspect_shot
 from physgraph_usd.solver.fabric import Fabric
@@ -38,17 +38,6 @@ def sheet(path: Path, *times: np.ndarray) -> Usd.Stage:
     for time, points in enumerate(times):
         mesh.GetPointsAttr().Set(vec3(points), time + 1.0)
     return stage
-
-
-def add_subset(stage: Usd.Stage, name: str, faces: np.ndarray, **values: float) -> None:
-    """A subset of faces bound to a material of its own, with values of the schema, or of UsdPhysics for physics_..."""
-    indices = Vt.IntArray.FromNumpy(faces.astype(np.int32))
-    subset = UsdShade.MaterialBindingAPI.Apply(stage.GetPrimAtPath(CLOTH)).CreateMaterialBindSubset(name, indices)
-    material = UsdShade.Material.Define(stage, f"/World/looks/{name}")
-    UsdShade.MaterialBindingAPI.Apply(subset.GetPrim()).Bind(material)
-    for short, value in values.items():
-        full = short.replace("physics_", "physics:") if "physics_" in short else f"physgraph:material:{short}"
-        author(material.GetPrim(), full, value)
 
 
 def refined(stage: Usd.Stage, folder: Path, time: float, **options: object) -> np.ndarray:

@@ -19,6 +19,7 @@ from cloth import frame_of, rms, sheet
 from meshes import grid
 from pxr import Usd, UsdGeom
 from shots import CLOTH, EDGE, cloth_shot, run
+from stages import add_subset
 
 from physgraph_usd.errors import PhysGraphError, SchemaError, UsageError
 from physgraph_usd.shot.options import RefineOptions
@@ -31,7 +32,7 @@ from physgraph_usd.studio.notes import Notes
 from physgraph_usd.studio.session import Shown, TuneSession
 from physgraph_usd.studio.setting import History, Setting
 from physgraph_usd.studio.takes import FRESH, MOST_SETTINGS, STALE
-from physgraph_usd.usd.read.reader import open_shot
+from physgraph_usd.usd.read.reader import Shot, open_shot
 from physgraph_usd.usd.write.tag import tag
 
 STIFF = 3e-4
@@ -409,3 +410,23 @@ def test_notes_are_read_again_and_no_other_file_is_taken_for_them(tmp_path: Path
     again.path.write_text("not json")
     with pytest.raises(UsageError, match="cannot be read"):
         Notes(layer)
+
+
+def test_subsets_of_another_fabric_follow_their_garment_and_are_saved_so(tmp_path: Path):
+    stage = Usd.Stage.Open(str(cloth_shot(tmp_path / "sheet.usda", size=(8, 6))))
+    add_subset(stage, "trim", np.arange(8), bendStiffness=1e-4)
+    stage.Save()
+    with closing(TuneSession(tmp_path / "sheet.usda", garments=[CLOTH])) as session:
+        (times,) = {scale for scale in bends(session.shot) if scale != 1.0}
+        session.set_value(CLOTH, "bendStiffness", STIFF)
+        assert bends(session.shot) == {1.0, times}
+        with closing(open_shot(session.save())) as saved:
+            assert saved.frame(1.0).garments[0].fabric.bend == pytest.approx(STIFF)
+            assert sorted(bends(saved)) == pytest.approx(sorted({1.0, times}))
+
+
+def bends(shot: Shot) -> set[float]:
+    """Multiples of the garment's bending on its faces."""
+    scale = shot.scene.garments[0].fabric_scale
+    assert scale is not None
+    return {float(each) for each in scale[:, 1]}

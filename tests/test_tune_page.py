@@ -20,6 +20,7 @@ from browser import PATIENCE_MS, served
 from PIL import Image
 from pxr import Usd
 from shots import CLOTH, cloth_shot
+from stages import add_subset
 
 from physgraph_usd.studio.page import TunePage
 from physgraph_usd.studio.session import TuneSession
@@ -125,7 +126,11 @@ def shot(tmp_path: Path) -> Path:
 
 
 def test_values_are_slid_typed_undone_and_saved(shot: Path):
+    stage = Usd.Stage.Open(str(shot))
+    add_subset(stage, "trim", np.arange(8), bendStiffness=1e-4)
+    stage.Save()
     with tuned(shot) as (session, artist):
+        artist.page.get_by_text(f"<{CLOTH}/trim>: 8 faces of another fabric: bendStiffness times").wait_for()
         before = artist.picture()
         slid = TUNABLES["guide:stiffness"].at(artist.slide("Guide [N/m³]", 0.2))
         assert slid < 300.0

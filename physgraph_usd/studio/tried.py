@@ -11,6 +11,7 @@ import numpy as np
 from ..shot.untagged import AUTO, open_with_colliders
 from ..usd.read.garment import read_painted
 from ..usd.read.reader import Shot, open_shot
+from ..usd.read.subsets import SCALED
 from ..usd.schema import GARMENT
 from ..usd.write.paint import painted_layer
 from ..usd.write.tag import tag
@@ -76,7 +77,8 @@ class TriedShot:
             StageError: A garment lies in an instance.
             LayerError: It cannot be written.
         """
-        given = {"values": setting.values, "painted": self._authored(setting.painted), "overwrite": overwrite}
+        values = {**setting.values, **self._of_subsets(setting.values)}
+        given = {"values": values, "painted": self._authored(setting.painted), "overwrite": overwrite}
         return tag(self.opened.path, out, **self._named, **given)
 
     @property
@@ -84,6 +86,18 @@ class TriedShot:
         """The garments that were found, the colliders and the targets, as options of `open_shot`."""
         _, colliders, bind = self.named
         return {"garments": [str(source.path) for source in self.opened.sources], "colliders": colliders, "bind": bind}
+
+    def _of_subsets(self, values: Mapping[str, Mapping[str, float]]) -> dict[str, dict[str, float]]:
+        """The values of subsets of other fabrics, in proportion to their garments', by prim path."""
+        found = dict[str, dict[str, float]]()
+        for garment, source in zip(self.opened.scene.garments, self.opened.sources, strict=True):
+            tried, scale = values.get(garment.path, {}), garment.fabric_scale
+            if scale is not None:
+                for name in filter(None, source.fabrics):
+                    ratios = dict(zip(SCALED, scale[source.subsets[name][0]].tolist(), strict=True))
+                    path = str(source.path.AppendChild(name))
+                    found[path] = {short: tried[short] * ratios[short] for short in tried.keys() & ratios.keys()}
+        return found
 
     def _authored(self, painted: Mapping[str, Mapping[str, np.ndarray]]) -> dict[str, dict[str, np.ndarray]]:
         """Maps of the cages' vertices on the authored points."""

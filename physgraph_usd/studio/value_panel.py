@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
+from ..shot.notes import of_subsets
 from ..solver.fabric import PRESETS
 from ..usd.schema import CONTACT, FABRIC, GARMENT, REFINEMENT
-from .desk import Desk, put
+from .desk import Desk, put, small
 from .session import TuneSession
 from .values import TUNABLES, Tunable
 
@@ -33,6 +34,7 @@ class ValuePanel:
         gui.add_html(STYLE)
         self._preset = gui.add_dropdown("Preset", self._presets(), initial_value=AS_AUTHORED)
         desk.on(self._preset, self._choose)
+        self._subsets = gui.add_html(self._of_subsets())
         self._reset = desk.on(gui.add_dropdown("Reset", (RESET,), hint="Takes the shot's value again."), self._put_back)
         for group in dict.fromkeys(tunable.group for tunable in TUNABLES.values()):
             with gui.add_folder(group):
@@ -51,6 +53,7 @@ class ValuePanel:
         tried = session.setting.values.get(garment, {})
         put(self._reset, options=(RESET, *(TUNABLES[name].label for name in tried if name in TUNABLES), EVERYTHING))
         put(self._reset, value=RESET)
+        put(self._subsets, content=self._of_subsets())
         put(self._level, value=min(session.setting.levels[self._desk.index], self._level.max))
         put(self._contact, value=session.setting.contact)
 
@@ -100,6 +103,13 @@ class ValuePanel:
             put(number, label=title, precision=decimals, step=10.0**-decimals, value=shown)
         if slider is not None:
             put(slider, value=tunable.place(value if value is not None else tunable.ends[0]))
+
+    def _of_subsets(self) -> str:
+        """The garment's subsets of other fabrics, as HTML."""
+        notes = of_subsets([self._desk.session.shot.sources[self._desk.index]])
+        return "".join(
+            small(f"{note}. These values hold there, and follow the garment's in proportion.") for note in notes
+        )
 
     def _presets(self) -> tuple[str, ...]:
         own = tuple(OWN + name for name in sorted(self._desk.notes.presets))

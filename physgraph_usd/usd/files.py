@@ -99,7 +99,7 @@ def _identity(path: Path) -> object:
     """A key equal for two paths to the same file, whether the file exists or not."""
     try:
         found = os.stat(path)
-    except OSError:
+    except (OSError, ValueError):  # ValueError: a name with a null byte, in a damaged file.
         whole = path.absolute()
         return (_identity(whole.parent), whole.name) if whole.parent != whole else whole
     return found.st_dev, found.st_ino

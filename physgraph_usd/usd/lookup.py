@@ -12,7 +12,7 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from pxr import Sdf, Usd, UsdShade
+from pxr import Sdf, Usd, UsdGeom, UsdShade
 
 from ..errors import SchemaError, UsageError
 from ..solver.fabric import PRESETS
@@ -123,6 +123,12 @@ def check_overrides(
         if not any(path.HasPrefix(override.prim) for path in paths):
             there = ", ".join(map(str, paths)) or "none"
             raise UsageError(f"--set {override.prim}.{override.row.name}: no such {kind}; {kind}s: {there}")
+
+
+def family_of(subset: UsdGeom.Subset) -> str:
+    """Name of a subset's family; "" for none, and for a value of another type."""
+    name = subset.GetFamilyNameAttr().Get()
+    return name if isinstance(name, str) else ""
 
 
 def with_ancestors(prim: Usd.Prim) -> Iterator[Usd.Prim]:

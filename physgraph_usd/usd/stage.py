@@ -192,14 +192,12 @@ def root_metadata(stage: Usd.Stage, key: str) -> object | None:
 
 
 def check_metadata(stage: Usd.Stage) -> None:
-    """Refuse (StageError) invalid units, rates and time range, because the refined layer copies the metadata."""
+    """Refuse (StageError) invalid units and time range, because the refined layer copies the metadata."""
     for key, (what, positive) in _NUMBERS.items():
         value = root_metadata(stage, key)
         number = float(value) if isinstance(value, int | float) else math.nan
         if value is not None and not (1.0 / _HUGE < number < _HUGE if positive else math.isfinite(number)):
             raise StageError(f"{key} of the stage is {in_brief(value)}, which is no {what}, in its root layer")
-    if message := bad_rate(stage):
-        raise StageError(message)
 
 
 def bad_rate(stage: Usd.Stage) -> str:
@@ -382,10 +380,7 @@ def open_stage(shot: str | Usd.Stage) -> tuple[Usd.Stage, list[Notice]]:
         if not stage:
             raise StageError(f"cannot open {path}")
         problems = composition_problems(stage, [item.commentary for item in diagnostics.TakeUncoalescedDiagnostics()])
-        rates = {layer.GetDisplayName(): layer.timeCodesPerSecond for layer in stage.GetUsedLayers()}
-    endless = [name for name, rate in rates.items() if not math.isfinite(rate)]
-    if endless:  # USD would search for samples for ever.
-        message = f"timeCodesPerSecond of @{endless[0]}@ is {rates[endless[0]]}; author the shot's rate, such as 24"
+    if message := bad_rate(stage):
         raise StageError(f"cannot read {path}: {message}")
     broken = [notice.message for notice, missing in problems if not missing]
     if broken:

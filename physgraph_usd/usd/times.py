@@ -8,16 +8,17 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left, bisect_right
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby, pairwise
 from operator import itemgetter
 
 import numpy as np
-from pxr import Usd, UsdGeom
+from pxr import Sdf, Usd, UsdGeom
 
 from ..errors import AbsentError, named_time
 from ..solver.scene import FARTHEST, SAME_TIME
+from .instances import drawn_with
 from .lookup import with_ancestors
 
 _PLACED = ("protoIndices", "ids", "invisibleIds", "positions", "orientations", "orientationsf", "scales")
@@ -85,7 +86,18 @@ class Motion:
         return Motion(merge(*(motion.times for motion in motions)), tuple(arcs))
 
 
-def motion_of(prim: Usd.Prim, *, shape: bool = True) -> Motion:
+def motion_of(prim: Usd.Prim, *, skinned: Mapping[Sdf.Path, Motion] | None = None) -> Motion:
+    """Motion of a prim by its form and its transforms; an instancer's with all that its instances draw.
+
+    Args:
+        prim: The prim.
+        skinned: Motion of skinned prims, in place of that of their own points.
+    """
+    known = skinned or {}
+    return Motion.joined(known.get(each.GetPath()) or motion_alone(each) for each in drawn_with(prim))
+
+
+def motion_alone(prim: Usd.Prim, *, shape: bool = True) -> Motion:
     """Motion of a prim by its transforms and, if ``shape``, by its form, whose time codes come first in `merge`."""
     form = [prim.GetAttribute(name) for name in _SHAPE if shape and prim.HasAttribute(name)]
     ops = [op for transform in transform_chain(prim) for op in transform.GetOrderedXformOps()]

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from cloth import settings_of
-from layers import open_over
+from layers import errors, open_over
 from meshes import mesh_of
 from pxr import Sdf, Usd, UsdGeom, Vt
 from scipy.spatial import cKDTree
@@ -20,7 +20,7 @@ from test_bodies_as_drawn import Faces, tube
 
 from physgraph_usd.solver.frame.refiner import Refiner
 from physgraph_usd.solver.mesh.subdivide import compose, subdivide_times
-from physgraph_usd.solver.mesh.weld import weld
+from physgraph_usd.solver.mesh.weld import weld, weld_skins
 from physgraph_usd.usd.read.reader import Shot, open_shot
 
 FRAMES, LEVEL, SAME = 5, 1, 1e-6
@@ -73,6 +73,21 @@ def shot_of(folder: Path, **shapes: Shape) -> Path:
         for time in range(1, FRAMES + 1):
             mesh.GetPointsAttr().Set(vec3(shortened(points, time)), time)
     return Path(save(stage))
+
+
+def thick_tube(turned: float = 0.0) -> Shape:
+    """A tube 2 mm thick with rims at both ends; its inner skin's vertices lie turned by an angle."""
+    (outer, sides), (inner, _) = tube(0.102, 0.0, 0.2), tube(0.1, 0.0, 0.2)
+    cos, sin = np.cos(turned), np.sin(turned)
+    count, around = len(outer), 16
+    faces = [*sides, *([corner + count for corner in face[::-1]] for face in sides)]
+    for row, turn in ((0, 1), (count - around, -1)):
+        ring = [row + k for k in range(around)]
+        quads = [
+            [ring[k], ring[(k + 1) % around], ring[(k + 1) % around] + count, ring[k] + count] for k in range(around)
+        ]
+        faces += [quad[::turn] for quad in quads]
+    return np.concatenate([outer, inner @ np.array([[cos, 0.0, sin], [0.0, 1.0, 0.0], [-sin, 0.0, cos]])]), faces
 
 
 def widest_gap(shot: Path, layer: Path, shapes: dict[str, Shape], *, within: float = SAME) -> float:
@@ -218,20 +233,10 @@ class TestPieces:
         stage.Save()
         assert "paint bendScale" in warnings_of(shot)
 
-    def test_a_thick_garment_keeps_its_rim(self, tmp_path: Path):
-        (outer, sides), (inner, _) = tube(0.102, 0.0, 0.2), tube(0.1, 0.0, 0.2)
-        count, around = len(outer), 16
-        faces = [*sides, *([corner + count for corner in face[::-1]] for face in sides)]
-        for row, turn in ((0, 1), (count - around, -1)):
-            ring = [row + k for k in range(around)]
-            quads = [
-                [ring[k], ring[(k + 1) % around], ring[(k + 1) % around] + count, ring[k] + count]
-                for k in range(around)
-            ]
-            faces += [quad[::turn] for quad in quads]
-        shape = np.concatenate([outer, inner]), faces
-        shot = shot_of(tmp_path, sheet=shape)
-        assert "closed shell" in warnings_of(shot)
+    def test_a_thick_garment_that_is_no_sheet_keeps_its_rim(self, tmp_path: Path):
+        shape = thick_tube(turned=np.pi / 16)
+        shot, count = shot_of(tmp_path, sheet=shape), len(shape[0]) // 2
+        assert "both skins are refined" in warnings_of(shot)
         with closing(open_shot(str(shot))) as opened:
             garment, frame = opened.scene.garments[0], opened.frame(1.0)
             rims = []
@@ -239,6 +244,35 @@ class TestPieces:
                 scene = replace(opened.scene, garments=(each,))
                 points = Refiner(scene, settings_of(), levels=[LEVEL]).solve(frame).points[0]
                 assert points is not None
-                rims.append(np.linalg.norm(points[:count] - points[count : 2 * count], axis=1)[[*range(around)]])
-        assert rims[0].min() > 1e-3
-        assert rims[0].max() < 5e-3
+                radius = np.linalg.norm(points[: 2 * count, ::2], axis=1).reshape(2, -1)[:, :16]
+                rims.append(float(radius[0].mean() - radius[1].mean()))
+        assert 1e-3 < rims[0] < 5e-3
+
+    def test_a_thick_garment_is_as_thick_as_its_cage(self, tmp_path: Path):
+        points, faces = thick_tube()
+        shot, count = shot_of(tmp_path, sheet=(points, faces)), len(points) // 2
+        for rest_frame in (None, "auto"):
+            said = warnings_of(shot, rest_frame=rest_frame)
+            assert "a closed shell, 2 mm thick" in said
+            assert "no length" not in said
+        refine(shot, tmp_path / "fine.usda", level=LEVEL)
+        found = fine(shot, tmp_path / "fine.usda", 1.0, prim="/World/sheet")
+        assert len(found) == len(refined((points, faces)))
+        assert np.linalg.norm(found[:count] - found[count : 2 * count], axis=1) == pytest.approx(2e-3, rel=0.1)
+        outer, inner = np.linalg.norm(found[: 2 * count, ::2], axis=1).reshape(2, -1)
+        assert (outer > inner).all()
+        assert not errors(tmp_path / "fine.usda", shot)
+
+    def test_a_coat_with_its_lining_and_a_cord_are_no_thick_sheets(self):
+        points, faces = thick_tube()
+        mesh = mesh_of(faces, len(points))
+        assert weld_skins(mesh, [points, points]) is not None
+        apart = points.copy()
+        apart[: len(points) // 2, ::2] *= 1.05  # A coat and its lining, which part.
+        assert weld_skins(mesh, [points, apart]) is None
+        square = np.array([[0.0, 0.0], [0.002, 0.0], [0.002, 0.002], [0.0, 0.002]])
+        cord = np.array([[x, y, 0.05 * z] for z in range(3) for x, y in square])
+        sides = [
+            [4 * z + k, 4 * z + (k + 1) % 4, 4 * z + 4 + (k + 1) % 4, 4 * z + 4 + k] for z in (0, 1) for k in range(4)
+        ]
+        assert weld_skins(mesh_of([*sides, [3, 2, 1, 0], [8, 9, 10, 11]], 12), [cord]) is None

@@ -27,6 +27,7 @@ from stages import (
 from physgraph_usd.errors import AbsentError
 from physgraph_usd.shot.report import RefineReport
 from physgraph_usd.usd.read.reader import open_shot
+from physgraph_usd.usd.times import motion_of
 
 SIZE = (6, 6)
 RADIUS = 1.0
@@ -246,3 +247,23 @@ def test_cloth_that_stands_still_is_solved_where_a_prototype_moves(tmp_path: Pat
     rocks.CreatePositionsAttr([(0.0, 0.0, 0.0)])
     shot = open_shot(save(stage), colliders=("/World/rocks",))
     assert shot.scene.times == (1.0, 2.0, 3.0)
+
+
+@pytest.mark.parametrize("body", ["/World/field", "/World/field/rocks/ball"])
+def test_cloth_that_stands_still_is_solved_where_a_nested_instancer_moves(tmp_path: Path, body: str):
+    """Also where one shape of it is named, and as the pages and the validator see its time codes."""
+    stage = new_stage(tmp_path / "shot.usda")
+    flat(stage)
+    field, rocks = (UsdGeom.PointInstancer.Define(stage, path) for path in ("/World/field", "/World/field/rocks"))
+    add_ball(stage, "/World/field/rocks/ball", {1.0: (0.0, 0.0, 0.0)})
+    for instancer, prototype in ((field, "/World/field/rocks"), (rocks, "/World/field/rocks/ball")):
+        instancer.CreatePrototypesRel().SetTargets([prototype])
+        instancer.CreateProtoIndicesAttr([0])
+        instancer.CreatePositionsAttr([(0.0, 0.0, 0.0)])
+    for time, height in ((1.0, 0.0), (2.0, 0.01), (3.0, 0.0)):
+        rocks.GetPositionsAttr().Set([(0.0, height, 0.0)], time)
+    assert motion_of(field.GetPrim()).times == (1.0, 2.0, 3.0)
+    shot = open_shot(save(stage), colliders=(body,))
+    assert shot.scene.times == (1.0, 2.0, 3.0)
+    poses = [pose for time in shot.scene.times for pose in shot.frame(time).colliders if pose is not None]
+    assert [pose.points[:, 1].mean() for pose in poses] == pytest.approx([0.0, 0.01, 0.0], abs=1e-6)

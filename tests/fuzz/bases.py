@@ -22,6 +22,9 @@ from stages import (
     vec3,
 )
 
+from physgraph_usd.solver.mesh.topology import PolygonMesh
+from physgraph_usd.usd.mesh.shell import Shell
+
 SIZE = (3, 2)
 TIMES = (1.0, 2.0)
 METRES = 0.05
@@ -212,6 +215,22 @@ def _loops(folder: Path) -> None:
     loop_shot(folder, size=SIZE, metres=METRES)
 
 
+def _thick(folder: Path) -> None:
+    """A garment of two skins and a rim."""
+    stage = new_stage(folder / "shot.usda", metres=METRES)
+    mesh = add_sheet(stage, CLOTH, times=TIMES, size=SIZE)
+    counts, indices = mesh.GetFaceVertexCountsAttr(), mesh.GetFaceVertexIndicesAttr()
+    points = sheet_points(None, SIZE)
+    shell = Shell.of(PolygonMesh(np.array(counts.Get()), np.array(indices.Get()), len(points)), np.arange(len(points)))
+    counts.Set(Vt.IntArray.FromNumpy(shell.mesh.counts.astype(np.int32)))
+    indices.Set(Vt.IntArray.FromNumpy(shell.mesh.indices.astype(np.int32)))
+    for time in TIMES:
+        skins = shell.thickened(sheet_points(time, SIZE), np.eye(3)[[2] * len(points)], 0.05)
+        mesh.GetPointsAttr().Set(vec3(skins), time)
+    mesh.GetPointsAttr().ClearDefault()
+    save(stage)
+
+
 BASES: dict[str, Callable[[Path], None]] = {
     "plain": _plain,
     "still": _still,
@@ -227,6 +246,7 @@ BASES: dict[str, Callable[[Path], None]] = {
     "rounded": _rounded,
     "curtain": _curtain,
     "loops": _loops,
+    "thick": _thick,
 }
 """What writes each sound shot, ``shot.usda``, into a folder."""
 

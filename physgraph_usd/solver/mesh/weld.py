@@ -2,7 +2,8 @@
 
 Exporters split a garment at its seams, and draw a sheet twice to show both sides. Bending forces, smooth surfaces and
 normals need a face on each side of an edge. Therefore coincident open edges are joined in pairs, and only the first of
-coincident faces is solved. Edges with more than two coincident copies stay apart: `forces.seam` sews them.
+coincident faces is solved. Edges with more than two coincident copies stay apart: `forces.seam` sews them. A thick
+sheet, two skins and the rims between, is solved as the sheet in its middle.
 """
 
 from __future__ import annotations
@@ -17,13 +18,17 @@ from scipy.spatial import cKDTree
 
 from .borders import open_edges
 from .subdivide import Refinement, face_points, subdivide_times
-from .topology import PolygonMesh, find_edges, joined_by
+from .topology import PolygonMesh, area_vectors, find_edges, joined_by
 
 WELDED = 5e-3
 """Distance below which vertices coincide, in mean edges: 4% of an edge after three subdivisions. With a thousandth, a
 border with a gap of about a thousandth would be sewn at every second vertex, worse than fully sewn or fully open."""
 WIDEST = 0.25
 """Largest seam tolerance, in mean edges."""
+THICKEST = 0.5
+"""Largest thickness of a thick sheet, in distances to the next vertex of the same skin: cords are thicker."""
+UNEVEN = 2.0
+"""Largest ratio between two thicknesses at one place of a thick sheet over the shot; skins that part more are two."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,12 +41,14 @@ class Weld:
             face.
         number: Vertex of the welded mesh for each vertex, shape (V,).
         faces: Faces of ``apart`` kept in the welded mesh, ascending.
+        across: Place of each vertex along the normal of a thick sheet's middle [m], shape (V,); None for sheets.
     """
 
     apart: PolygonMesh
     mesh: PolygonMesh
     number: Int[np.ndarray, " vertices"]
     faces: Int[np.ndarray, " faces"]
+    across: Float[np.ndarray, " vertices"] | None = None
 
     @property
     def is_none(self) -> bool:
@@ -73,21 +80,33 @@ class Weld:
         steps = subdivide_times(self.apart, levels)
         if not steps or self.is_none:
             return steps, unwelded(steps[-1].mesh) if steps else self
-        welded, number, apart, faces = self.mesh, self.number, self.apart, self.faces
+        welded, number, apart, faces, across = self.mesh, self.number, self.apart, self.faces, self.across
         for step, fine in zip(steps, subdivide_times(self.mesh, levels), strict=True):
             # A reversed face has its children in a different order.
             own = _sorted_corners(apart, number[apart.indices])
-            face = _first_like(own, _sorted_corners(welded, welded.indices))
-            of_edges = welded.vertex_count + find_edges(fine.edges, number[step.edges])
-            of_faces = face_points(welded)[face[apart.is_polygon]]
-            number = np.concatenate([number, of_edges, of_faces])
+            rim = _are_rims(own) & (across is not None)
+            of_faces = np.zeros(apart.face_count, np.int64)
+            of_faces[~rim] = face_points(welded)[_first_like(own[~rim], _sorted_corners(welded, welded.indices))]
+            lowest = np.where(own[rim] < 0, own[rim, -1:], own[rim]).min(axis=1, initial=welded.vertex_count)
+            of_faces[rim] = _halfway(fine, np.stack([lowest, own[rim, -1]], axis=1))
+            number = np.concatenate([number, _halfway(fine, number[step.edges]), of_faces[apart.is_polygon]])
             faces = np.flatnonzero(np.isin(step.parent_face, faces))
             apart, welded = step.mesh, fine.mesh
-        return steps, Weld(apart, welded, number, faces)
+            across = None if across is None else step.linear @ across
+        return steps, Weld(apart, welded, number, faces, across)
+
+    @property
+    def without_rims(self) -> Weld:
+        """The weld without the rims in ``apart``, whose edges have no length where the skins are joined."""
+        rim = _are_rims(_sorted_corners(self.apart, self.number[self.apart.indices]))
+        indices = self.apart.indices[~rim[self.apart.corner_face]]
+        return replace(self, apart=PolygonMesh(self.apart.counts[~rim], indices, self.apart.vertex_count))
 
     @property
     def sides(self) -> Int[np.ndarray, " vertices"]:
         """A number for each vertex, equal for vertices with a common normal; a doubled sheet has one per side."""
+        if self.across is not None:
+            return np.arange(len(self.number))
         shown = np.zeros(len(self.number), bool)
         shown[self.apart.indices[np.isin(self.apart.corner_face, self.faces)]] = True
         return np.unique(2 * self.number + ~shown, return_inverse=True)[1].reshape(-1)
@@ -131,6 +150,63 @@ def weld(mesh: PolygonMesh, poses: Sequence[Float[np.ndarray, "vertices 3"]], wi
     whole = replace(mesh, counts=mesh.counts[faces], indices=indices, vertex_count=len(used))
     first = np.unique(number, return_index=True)[1]
     return Weld(mesh, wound_alike(whole, poses[0][first]), number, faces)
+
+
+def weld_skins(mesh: PolygonMesh, poses: Sequence[Float[np.ndarray, "vertices 3"]]) -> Weld | None:
+    """Join the skins of a thick sheet into the sheet in its middle; None unless the whole mesh is one.
+
+    In a thick sheet each vertex has one nearest other vertex, its partner, in the other skin. Each face is
+    a rim, between an edge and the partners' edge, or in a skin, with a face of the partners in the other.
+
+    Args:
+        poses: Positions [m], at least one.
+    """
+    half, used = mesh.half_edges, np.unique(mesh.indices)
+    if len(used) < mesh.vertex_count or (half.count != 2).any() or not np.isfinite(poses).all():
+        return None
+    away, near = map(np.asarray, cKDTree(poses[0]).query(poses[0], 3))
+    itself = np.arange(mesh.vertex_count)
+    partner = np.where(near[:, 0] == itself, near[:, 1], near[:, 0])
+    number = np.unique(np.minimum(itself, partner), return_inverse=True)[1].reshape(-1)
+    thick = np.linalg.norm(np.subtract(poses, np.asarray(poses)[:, partner]), axis=2)
+    if (partner[partner] != itself).any() or not (0.0 < thick[0]).all() or (thick[0] > THICKEST * away[:, 2]).any():
+        return None
+    if (thick > UNEVEN * thick[0]).any() or (thick < thick[0] / UNEVEN).any():
+        return None
+    corners = _sorted_corners(mesh, number[mesh.indices])
+    rim = _are_rims(corners)
+    sheet = np.flatnonzero(~rim)
+    beside = mesh.corner_face[mesh.twin_corners]
+    skin = joined_by(beside[~rim[beside].any(axis=1)], mesh.face_count)
+    like = sheet[_first_like(corners[sheet], corners[sheet])]
+    ones, twos = sheet[like == sheet], sheet[like != sheet]
+    repeated = (np.diff(corners[sheet], axis=1) == 0) & (corners[sheet, 1:] >= 0)
+    of_skins = np.zeros(mesh.vertex_count, np.int64) - 1
+    of_skins[mesh.indices[~rim[mesh.corner_face]]] = skin[mesh.corner_face[~rim[mesh.corner_face]]]
+    twice = np.array_equal(np.sort(like[like != sheet]), ones)
+    if repeated.any() or (of_skins < 0).any() or not twice or (of_skins == of_skins[partner]).any():
+        return None
+    faces = np.sort(np.where(skin[twos] < skin[like[like != sheet]], twos, like[like != sheet]))
+    kept = np.isin(mesh.corner_face, faces)
+    joined = PolygonMesh(mesh.counts[faces], number[mesh.indices[kept]].astype(np.int32), int(number.max()) + 1)
+    middle = 0.5 * (poses[0] + poses[0][partner])
+    first = np.unique(number, return_index=True)[1]
+    joined = wound_alike(joined, middle[first])
+    normals = np.zeros((joined.vertex_count, 3))
+    np.add.at(normals, joined.indices, area_vectors(joined, middle[first])[joined.corner_face])
+    outward = np.bincount(of_skins, ((poses[0] - middle) * normals[number]).sum(axis=1))
+    return Weld(mesh, joined, number, faces, 0.5 * np.sign(outward)[of_skins] * np.median(thick, axis=0))
+
+
+def _are_rims(corners: np.ndarray) -> np.ndarray:
+    """Whether each face, with sorted corners as by `_sorted_corners`, has two different corners at most, shape (F,)."""
+    return ((np.diff(corners, axis=1) != 0) & (corners[:, :-1] >= 0)).sum(axis=1) < 2
+
+
+def _halfway(step: Refinement, ends: np.ndarray) -> np.ndarray:
+    """Child vertices halfway between the ends of edges, or at the ends where both are one vertex, shape (N,)."""
+    halfway = step.parent_vertex_count + find_edges(step.edges, ends)
+    return np.where(ends[:, 0] == ends[:, 1], ends[:, 0], halfway)
 
 
 def wound_alike(mesh: PolygonMesh, points: Float[np.ndarray, "vertices 3"]) -> PolygonMesh:

@@ -13,6 +13,7 @@ import numpy as np
 from pxr import Sdf, Usd, UsdGeom, UsdSkel
 
 from ...solver.mesh.topology import PolygonMesh
+from ..lookup import family_of
 from ..provenance import METADATA, mute_refined, read_record
 from ..read.absence import absence
 from ..read.authored import beyond_limits
@@ -264,7 +265,7 @@ def subsets(fine: Fine) -> Iterator[Problem]:
             yield Problem("error", path, None, f"names {element} {indices.max()} of {sizes[element]}")
         elif len(np.unique(indices)) != len(indices):
             yield Problem("error", path, None, f"names a {element} twice")
-        families.setdefault((element, subset.GetFamilyNameAttr().Get() or ""), []).append(indices)
+        families.setdefault((element, family_of(subset)), []).append(indices)
     for (element, family), parts in families.items():
         kind = UsdGeom.Subset.GetFamilyType(imageable, family)
         named = np.concatenate(parts)

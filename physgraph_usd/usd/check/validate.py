@@ -211,7 +211,11 @@ def _as_problem(module: Any, found: Any) -> Problem:
     if sites and not path and sites[0].IsPrim():
         path = str(sites[0].GetPrim().GetPath())
     severity = "error" if found.GetType() == module.ValidationErrorType.Error else "warning"
-    return Problem(severity, path or "/", None, found.GetMessage(), str(found.GetIdentifier()))
+    try:
+        message = found.GetMessage()
+    except UnicodeDecodeError:
+        message = "a name in the shot is no text; its file is damaged"
+    return Problem(severity, path or "/", None, message, str(found.GetIdentifier()))
 
 
 def _without_names(message: str) -> str:

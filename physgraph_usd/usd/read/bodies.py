@@ -20,13 +20,13 @@ from ...solver.colliders.pose import Collider, Pose
 from ...solver.colliders.primitives import AROUND, KINDS, primitive, segments
 from ...solver.mesh.topology import PolygonMesh
 from ...solver.scene import FARTHEST, out_of_bounds
+from ..instances import instanced_gprims, instancer_above, placements
 from ..lookup import Override, find_token, find_value, is_on
 from ..mesh.drawn import MOST_VERTICES, ControlMesh, DrawnSurface, drawn_surface
 from ..schema import COLLIDER, GARMENT
 from ..stage import Notice, timecode, value_at
 from .absence import missing_value
 from .find import is_drawn
-from .instances import instanced_gprims, instancer_above, placements
 from .placement import is_flipped, place
 
 DRAWN_NEAR = 0.1

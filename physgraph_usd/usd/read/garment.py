@@ -14,7 +14,7 @@ from pxr import Sdf, Usd, UsdGeom
 
 from ...errors import GarmentError, SchemaError, counted
 from ...solver.mesh.topology import PolygonMesh
-from ...solver.mesh.weld import Weld, seam_reach, weld
+from ...solver.mesh.weld import Weld, seam_reach, weld, weld_skins
 from ...solver.scene import Garment, GarmentFrame, mean_edge
 from ..lookup import Found, Override, bound_materials, check_limits, find_value
 from ..mesh.pieces import sort_pieces
@@ -114,7 +114,9 @@ class GarmentReader:
             message = f"contact keeps {1e3 * most:.3g} mm, a {_THICK:g}th of the cloth's size, for a thickness of"
             message += f" {1e3 * thickness:.3g} mm and an offset of {1e3 * offset:.3g} mm; check metersPerUnit"
             notices = (*notices, Notice(self.garment.path, None, message))
-        fabric, offset = replace(fabric, thickness=min(thickness, most)), min(offset, most)
+        half = 0.0 if self.weld.across is None else float(np.abs(self.weld.across).max())
+        thickness, offset = max(min(thickness, most), 2.0 * half), min(offset, most) + half
+        fabric = replace(fabric, thickness=thickness)
         return GarmentFrame(points, fabric, guide, detail, offset), notices
 
     @cached_property
@@ -256,6 +258,12 @@ def _pieces(
     if count := int(found.rigid.max(initial=-1)) + 1:
         message = f"{counted(count, 'piece')} of it moved rigidly with the cloth under, as buttons are"
         notices.append(Notice(path, None, message))
+    if weld.across is not None:
+        thick = 2e3 * float(np.median(np.abs(weld.across)))
+        message = (
+            f"a closed shell, {thick:.2g} mm thick: the sheet in its middle is refined, and given its thickness again"
+        )
+        notices.append(Notice(path, None, message))
     if found.closed.any():
         message = "a closed shell: both skins are refined, and its sharp edges stay sharp; a sheet makes better folds"
         notices.append(Notice(path, None, message))
@@ -297,6 +305,9 @@ def _rest_and_weld(
     prim: Usd.Prim, mesh: PolygonMesh, animation: Animation, request: Request, *, matrix: np.ndarray
 ) -> tuple[Rest, Weld]:
     """Rest shape as authored or fitted, and the weld of the borders coincident in the rest shape and over the shot."""
+    poses = [*animation.poses().values()] or [animation.first]
+    if (found := weld_skins(mesh, poses)) is not None:
+        return _rest(prim, found.without_rims, animation, request, matrix=matrix), found
     poses = [*animation.poses(1).values()] or [animation.first]
     within = seam_reach(mesh, poses[0], seam_tolerance(prim, request.overrides))
     found = weld(mesh, poses, within)

@@ -75,6 +75,8 @@ def _texture_coordinates(prim: Usd.Prim, mesh: PolygonMesh, kept: np.ndarray) ->
         except Tf.ErrorException:  # Indices of a wrong type: the layer writer reports such primvars.
             continue
         values = np.zeros((0, 2)) if flat is None else np.asarray(flat, np.float64)
+        if not np.isfinite(values).all():
+            continue
         if primvar.GetInterpolation() == UsdGeom.Tokens.faceVarying:
             corners = kept_corners(*authored_topology(prim), kept)
             if len(corners) == len(mesh.indices) and corners.max(initial=-1) < len(values):

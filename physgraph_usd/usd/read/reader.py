@@ -25,6 +25,7 @@ from ...errors import AbsentError, SchemaError, StageError, UsageError, named_ti
 from ...interrupts import leave_if_asked
 from ...solver.colliders.orient import choose_side
 from ...solver.scene import Frame, Scene, refuse_falling, refuse_far
+from ..instances import instanced_gprims, instancer_above, mover
 from ..lookup import check_limits, check_overrides, is_on, parse_overrides
 from ..provenance import mute_refined, refuse_refined, selections, unsaved_layers
 from ..schema import GARMENT
@@ -57,7 +58,6 @@ from .find import (
     with_gravity,
 )
 from .garment import GarmentReader, Request, is_visible, read_garment, samples_of, seam_tolerance, worn_notices
-from .instances import instanced_gprims, instancer_above
 from .materials import find_values
 from .placement import place, to_metres
 from .rest import AUTO
@@ -544,7 +544,10 @@ def _times(
     def motion(path: Sdf.Path) -> Motion:
         return bake.motion(stage.GetPrimAtPath(path))
 
-    felt = {path: map(motion, sorted(each.felt & known)) for path, each in contacts.items()}
+    felt = {
+        path: [motion(mover(stage, body, path).GetPath()) for body in sorted(each.felt & known)]
+        for path, each in contacts.items()
+    }
     solved = {path: solve_times(motion(path), bodies, frames) for path, bodies in felt.items()}
     return {path: motion(path).times for path in contacts}, solved
 

@@ -15,9 +15,8 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
 from ...errors import GarmentError
 from ..lookup import with_ancestors
 from ..stage import TRAVERSAL, Notice, timecode
-from ..times import Motion, merge, motion_by, motion_of
+from ..times import Motion, merge, motion_alone, motion_by, motion_of
 from .find import instance_roots
-from .instances import instanced_gprims
 
 _ANIMATED = ("rotations", "translations", "scales", "blendShapeWeights")
 """Attributes of an animation. Translations alone, and weights of shapes without in-betweens, move points straight."""
@@ -71,12 +70,8 @@ class Bake:
         return [notice for path in bare for notice in _unskinned(self._stage.GetPrimAtPath(path))]
 
     def motion(self, prim: Usd.Prim) -> Motion:
-        """Motion of a prim, an instancer's with its prototypes'; a skinned prim's own points do not count."""
-        skinned = self.skinned.get(prim.GetPath())
-        if skinned:
-            return skinned.motion
-        prototypes = instanced_gprims(prim) if UsdGeom.PointInstancer(prim) else []
-        return Motion.joined(map(motion_of, [prim, *prototypes]))
+        """Motion of a prim as by `motion_of`; a skinned prim's own points do not count."""
+        return motion_of(prim, skinned={path: each.motion for path, each in self.skinned.items()})
 
     def bake(self, times: Sequence[float]) -> None:
         """Bake the skinned prims at the samples of their animation, and at the time codes given.
@@ -124,7 +119,7 @@ def _find_skinning(stage: Usd.Stage, path: Sdf.Path) -> Skinned | None:
                 values = [animation.GetAttribute(name) for name in _ANIMATED] if animation else []
                 bent = {"rotations", "scales"} | ({"blendShapeWeights"} if _has_inbetweens(prim) else set())
                 by = [motion_by(each, turns=each.GetName() in bent) for each in values if each]
-                motion = Motion.joined([*by, motion_of(bones), motion_of(prim, shape=False)])
+                motion = Motion.joined([*by, motion_alone(bones), motion_alone(prim, shape=False)])
                 moved_by = animation.GetPath() if animation else None
                 return Skinned(path, root.GetPath(), motion, query, bones.GetPath(), moved_by)
     return None

@@ -16,7 +16,7 @@ from ..schema import GARMENT, every_fabric_value
 from ..stage import Units
 from .materials import Values, find_values, values_by
 
-_SCALED = {"stretchStiffness": "stretch", "bendStiffness": "bend", "density": "density"}
+SCALED = {"stretchStiffness": "stretch", "bendStiffness": "bend", "density": "density"}
 """Values with a multiplier on each face, and their fields in a fabric."""
 _ROUNDING = 1e-6
 """Relative difference up to which two values are equal: attributes are in single precision."""
@@ -71,7 +71,7 @@ def _fabrics(
         asked = [short for short in every_fabric_value(fabric) if found.sources[short] != own.sources[short]]
         if asked and len(faces):
             other = found.fabric(time)
-            scale[faces] = ratios = [_ratio(getattr(other, each), getattr(fabric, each)) for each in _SCALED.values()]
+            scale[faces] = ratios = [_ratio(getattr(other, each), getattr(fabric, each)) for each in SCALED.values()]
             held = [short for short in asked if found.found[short].animated]
             place = "" if name else " of no such subset"
             words[name] = f"{counted(len(faces), 'face')}{place} of another fabric: {_in_words(fabric, other, ratios)}"
@@ -117,7 +117,7 @@ def _in_words(fabric: Fabric, other: Fabric, ratios: list[float]) -> str:
     )
     used, wanted = every_fabric_value(scaled), every_fabric_value(other)
     unused = [name for name in used if not math.isclose(used[name] or 0.0, wanted[name] or 0.0, rel_tol=_ROUNDING)]
-    times = [f"{name} times {ratio:.3g}" for name, ratio in zip(_SCALED, ratios, strict=True) if ratio != 1.0]
+    times = [f"{name} times {ratio:.3g}" for name, ratio in zip(SCALED, ratios, strict=True) if ratio != 1.0]
     return ", ".join(times or ["none of its values differ"]) + (
         f"; not used: its {', '.join(unused)}" if unused else ""
     )

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from pxr import Sdf, Usd, UsdGeom
 
 from ...errors import counted, named_time
+from ..instances import mover
 from ..stage import GarmentSource, Notice
 from ..times import SAME_TIME, is_among, transform_chain
 from .skinning import Bake
@@ -31,7 +32,8 @@ def timing_notices(
 
 def _misses(body: Usd.Prim, garment: GarmentSource, bake: Bake) -> Iterator[str]:
     """Faults of a body's sample times compared with a garment's, in words."""
-    own, cloth, every = bake.motion(body).times, garment.times, tuple(sorted([*garment.times, *garment.left_out]))
+    own = bake.motion(mover(body.GetStage(), body.GetPath(), garment.path)).times
+    cloth, every = garment.times, tuple(sorted([*garment.times, *garment.left_out]))
     if not cloth and UsdGeom.Mesh(body) and UsdGeom.Mesh(body).GetPointsAttr().Get() is None and own:
         yield f"has no points by default, at which still garments are read; its sample at {named_time(own[0])} is used"
     if len(own) < 2 or not cloth:

@@ -12,6 +12,7 @@ from scipy import sparse
 
 from ...solver.mesh.subdivide import Refinement, compose
 from ...solver.mesh.topology import PolygonMesh
+from ..lookup import family_of
 from ..mesh.attributes import (
     corner_values,
     edge_subset,
@@ -146,7 +147,7 @@ def carry_subsets(
         attribute = subset.GetIndicesAttr()
         path = target.AppendChild(subset.GetPrim().GetName()).AppendProperty("indices")
         element = subset.GetElementTypeAttr().Get()
-        family = UsdGeom.Subset.GetFamilyType(imageable, subset.GetFamilyNameAttr().Get() or "")
+        family = UsdGeom.Subset.GetFamilyType(imageable, family_of(subset))
         stream.attribute(path, Sdf.ValueTypeNames.IntArray)
         try:
             for time in (None, *_times(attribute.GetTimeSamples(), span)):

@@ -49,7 +49,8 @@ def tag(
         bind: Meshes, curves or points that follow the nearest of the garments, named likewise.
         preset: Name of a fabric to author on the garments, or None.
         side: Side of the colliders for the cloth, one of `SIDES`, or None.
-        values: Values to author after the preset's, by the garment's prim path and the schema's short names.
+        values: Values to author after the preset's, by the prim path of a garment or of one of its subsets, and by
+            the schema's short names.
         painted: Maps to author, values of each authored point, shape (V,), by the same names.
         asset_paths: "relative" or "absolute": form of the shot's path in the layer.
         overwrite: Whether an existing file may be replaced.
@@ -85,9 +86,9 @@ def tag(
         _check_editable(prim)
     for prim in cloth:
         spec = _applied(root, prim, GARMENT_API)
-        authored = {} if preset is None else every_fabric_value(PRESETS[preset])
-        for name, value in (authored | dict((values or {}).get(str(prim.GetPath()), {}))).items():
-            _author_over(spec, prim, GARMENT[name], value)
+        _author_values(root, prim, {} if preset is None else every_fabric_value(PRESETS[preset]))
+        for each in (prim, *prim.GetChildren()):
+            _author_values(root, each, (values or {}).get(str(each.GetPath()), {}))
         author_painted(spec, prim, (painted or {}).get(str(prim.GetPath()), {}))
         if prim.GetPath() in targets:
             Sdf.RelationshipSpec(spec, TARGETS, False).targetPathList.prependedItems = targets[prim.GetPath()]
@@ -133,6 +134,12 @@ def _applied(layer: Sdf.Layer, prim: Usd.Prim, schema: str) -> Sdf.PrimSpec:
     schemas.prependedItems = [schema]
     spec.SetInfo("apiSchemas", schemas)
     return spec
+
+
+def _author_values(layer: Sdf.Layer, prim: Usd.Prim, values: Mapping[str, float | None]) -> None:
+    """Author values over a prim's opinions, by the schema's short names."""
+    for name, value in values.items():
+        _author_over(Sdf.CreatePrimInLayer(layer, prim.GetPath()), prim, GARMENT[name], value)
 
 
 def _author_over(spec: Sdf.PrimSpec, prim: Usd.Prim, row: Property, value: float | None) -> None:

@@ -9,10 +9,10 @@ from pxr import Sdf, Usd, UsdGeom, Vt
 from scipy.spatial.transform import Rotation
 
 from ...solver.mesh.subdivide import Refinement
+from ..instances import instance_reach
 from ..mesh.bind import Follower
 from ..read.bindings import GarmentBindings, PlacedTarget
 from ..read.find import instance_roots
-from ..read.instances import instance_reach
 from ..read.placement import to_metres
 from ..read.reader import Shot
 from ..read.targets import Target, points_attribute

@@ -241,7 +241,7 @@ class _RefinedMesh:
         counts, indices = authored_topology(prim)
         steps, self._weld = source.weld.subdivided(len(steps))
         sheet, sides = steps[-1].mesh if steps else source.weld.apart, self._weld.sides
-        self._shell = Shell.of(sheet, self._weld.number) if source.shell else None
+        self._shell = Shell.of(sheet, self._weld.number) if source.shell and self._weld.across is None else None
         fine = FineMap(source.weld.apart, steps, counts, source.kept_faces, indices=indices, shell=self._shell)
         self.notices = overs.open_instances(stream, source.path, source.instance_roots)
         self.target = target = overs.make_sibling(stream, prim) if sibling else source.path
@@ -255,7 +255,7 @@ class _RefinedMesh:
         if not (source.still or source.skinned or self._shell):
             rest = fine.vectors(UsdGeom.Mesh(prim).GetPointsAttr().Get(Usd.TimeCode.Default()))
         self._sheet_normals = VertexNormals(sheet, left_handed=left, welded=sides)
-        normals = self._sheet_normals
+        normals, self._middle_normals = self._sheet_normals, VertexNormals(self._weld.mesh)
         if self._shell is not None:
             normals = VertexNormals(fine.fine, left_handed=left, welded=np.concatenate([sides, sides + len(sides)]))
         rate = shot.stage.GetTimeCodesPerSecond() if velocities or source.velocities else None
@@ -271,7 +271,9 @@ class _RefinedMesh:
         self, time: float | None, points: np.ndarray, heat: Mapping[str, np.ndarray], *, changed: bool, cut: bool
     ) -> None:
         """Write one time code; arguments as in `LayerWriter.write`."""
-        points, to_world = self._weld.split(points), self._shot.to_metres(self._index, time)
+        weld, to_world = self._weld, self._shot.to_metres(self._index, time)
+        across = 0.0 if weld.across is None else weld.across[:, None] * weld.split(self._middle_normals(points))
+        points = weld.split(points) + across
         maps = {name: self._weld.split(values) for name, values in heat.items()}
         if self._shell is not None:
             thickness = self._shot.sources[self._index].shell * np.sign(np.linalg.det(to_world[:3, :3]))

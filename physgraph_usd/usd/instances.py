@@ -8,8 +8,8 @@ from itertools import product
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom, Vt
 
-from ..lookup import with_ancestors
-from ..stage import quiet, timecode
+from .lookup import with_ancestors
+from .stage import quiet, timecode
 
 _ATTRIBUTES = ("protoIndices", "ids", "invisibleIds", "positions", "orientations", "orientationsf", "scales")
 _RATES = ("velocities", "accelerations", "angularVelocities")
@@ -28,6 +28,12 @@ def instancer_above(prim: Usd.Prim, beside: Usd.Prim | None = None) -> Usd.Prim 
     return next((each for each in reversed(above) if each.GetPath() not in shared), None)
 
 
+def mover(stage: Usd.Stage, body: Sdf.Path, garment: Sdf.Path) -> Usd.Prim:
+    """The prim whose motion a body has beside a garment: the instancer that draws the body, else the body."""
+    prim = stage.GetPrimAtPath(body)
+    return instancer_above(prim, stage.GetPrimAtPath(garment)) or prim
+
+
 def prototypes_of(instancer: Usd.Prim) -> list[Usd.Prim]:
     """The prototypes by number; an invalid prim for a missing prototype."""
     targets = UsdGeom.PointInstancer(instancer).GetPrototypesRel().GetForwardedTargets()
@@ -36,16 +42,19 @@ def prototypes_of(instancer: Usd.Prim) -> list[Usd.Prim]:
 
 def instanced_gprims(instancer: Usd.Prim) -> list[Usd.Prim]:
     """Gprims below the prototypes of an instancer, and below those of instancers nested there."""
-    return list({prim.GetPath(): prim for prim in _gprims(instancer, ())}.values())
+    return [prim for prim in drawn_with(instancer) if not UsdGeom.PointInstancer(prim)]
 
 
-def _gprims(instancer: Usd.Prim, above: tuple[Sdf.Path, ...]) -> Iterator[Usd.Prim]:
-    for root in prototypes_of(instancer):
-        for prim in _shapes(root):
-            if not UsdGeom.PointInstancer(prim):
-                yield prim
-            elif prim.GetPath() not in (*above, instancer.GetPath()):  # A prototype that contains its instancer.
-                yield from _gprims(prim, (*above, instancer.GetPath()))
+def drawn_with(prim: Usd.Prim) -> list[Usd.Prim]:
+    """A prim and, of an instancer, all gprims and nested instancers below its prototypes."""
+    found, open_prims = dict[Sdf.Path, Usd.Prim](), [prim]
+    while open_prims:
+        each = open_prims.pop()
+        if each.GetPath() not in found:  # Else drawn twice, or a prototype that contains its instancer.
+            found[each.GetPath()] = each
+            roots = prototypes_of(each) if UsdGeom.PointInstancer(each) else []
+            open_prims += [shape for root in reversed(roots) for shape in reversed([*_shapes(root)])]
+    return [*found.values()]
 
 
 def _shapes(root: Usd.Prim) -> Iterator[Usd.Prim]:
