@@ -275,7 +275,7 @@ def _pieces(
 
 def _pressed(prim: Usd.Prim, weld: Weld, animation: Animation) -> dict[str, Any]:
     """Pressed vertices and the pose with the folds as they rest, by field name; empty without pressed folds."""
-    poses = [weld.joined(pose) for pose in animation.poses().values()]
+    poses = [weld.joined(pose) for pose in animation.poses.values()]
     found = pressed_folds(weld.mesh, poses, *(_marked_edges(prim, weld, pressed=value) for value in (True, False)))
     return {} if found is None else {"pressed": found[0], "folded": found[1]}
 
@@ -305,15 +305,11 @@ def _rest_and_weld(
     prim: Usd.Prim, mesh: PolygonMesh, animation: Animation, request: Request, *, matrix: np.ndarray
 ) -> tuple[Rest, Weld]:
     """Rest shape as authored or fitted, and the weld of the borders coincident in the rest shape and over the shot."""
-    poses = [*animation.poses().values()] or [animation.first]
+    poses = [*animation.poses.values()] or [animation.first]
     if (found := weld_skins(mesh, poses)) is not None:
         return _rest(prim, found.without_rims, animation, request, matrix=matrix), found
-    poses = [*animation.poses(1).values()] or [animation.first]
     within = seam_reach(mesh, poses[0], seam_tolerance(prim, request.overrides))
     found = weld(mesh, poses, within)
-    if not found.is_none:
-        poses = [*animation.poses().values()] or poses
-        found = weld(mesh, poses, within)
     rest = _rest(prim, found, animation, request, matrix=matrix)
     return rest, found if found.is_none else weld(mesh, [*poses, rest.points], within)
 

@@ -12,6 +12,7 @@ import contextlib
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -83,13 +84,14 @@ class Animation:
     first: np.ndarray
     read: Callable[[float | None], tuple[np.ndarray, tuple[Notice, ...]]]
 
-    def poses(self, most: int = MOST_FITTED) -> dict[float | None, np.ndarray]:
-        """Positions at up to ``most`` readable time codes spread over the shot, by time code.
+    @cached_property
+    def poses(self) -> dict[float | None, np.ndarray]:
+        """Positions at up to `MOST_FITTED` readable time codes spread over the shot, by time code.
 
         Frames with broken points are skipped; for a shot without readable frames the result is empty.
         """
         poses = dict[float | None, np.ndarray]()
-        picks = np.linspace(0, len(self.times) - 1, min(most, len(self.times))).round().astype(int)
+        picks = np.linspace(0, len(self.times) - 1, min(MOST_FITTED, len(self.times))).round().astype(int)
         for time in [self.times[pick] for pick in picks] or [None]:
             with contextlib.suppress(GarmentError):  # Refining a broken frame names its fault.
                 poses[time] = self.read(time)[0]
@@ -146,7 +148,7 @@ def _from_default(prim: Usd.Prim, edges: np.ndarray, points: np.ndarray, *, firs
 
 def _fitted(weld: Weld, animation: Animation, *, by: str = "") -> Rest:
     """Rest shape fitted to the median lengths of the edges over the whole shot; ``by`` ends its source."""
-    poses = animation.poses()
+    poses = animation.poses
     found = [weld.joined(pose) for pose in poses.values()]
     if len(found) < 2:
         return Rest(weld.split(found[0]) if found else animation.first, f"the only sample of points{by}")
@@ -339,10 +341,14 @@ def pressed_folds(
         return None
     elements = elastic_elements(mesh, mesh.triangulate(poses[0]), poses[0])
     hinges = elements.hinges[~elements.twists]
+    wanted, unwanted = (find_edges(each, np.sort(hinges[:, :2], axis=1)) >= 0 for each in (asked, refused))
+    hinges, wanted, unwanted = (
+        each[wanted | (np.abs(hinge_geometry(poses[0], hinges)[0]) > (1.0 - KEPT) * SHARP)]
+        for each in (hinges, wanted, unwanted)
+    )
     angles = np.array([hinge_geometry(pose, hinges)[0] for pose in poses])
     median = np.median(angles, axis=0)
     kept = (np.abs(angles - median) <= KEPT * np.abs(median)).all(axis=0) & (np.abs(median) > SHARP)
-    wanted, unwanted = (find_edges(each, np.sort(hinges[:, :2], axis=1)) >= 0 for each in (asked, refused))
     pressed = wanted | (kept & ~unwanted & (len(poses) > 1))
     if not pressed.any():
         return None
