@@ -81,7 +81,7 @@ class Motion:
 
     Attributes:
         jumps: Vertices whose motion between two samples differs from the cage's by more than a mean cage edge.
-        sharp: Edges that fold sharply where the smoothly subdivided cage does not.
+        sharp: Number of edges that fold sharply where the smoothly subdivided cage does not, and of all inner edges.
     """
 
     def __init__(self, garments: Sequence[Any], level: int) -> None:
@@ -94,7 +94,7 @@ class Motion:
         self._edges = [_mean_rest_edge(garment) for garment in garments]
         self._last: list[tuple[np.ndarray, np.ndarray] | None] = [None] * len(garments)
         self._still: list[np.ndarray] = []
-        self.jumps = self.sharp = 0
+        self.jumps, self.sharp = 0, (0, 0)
 
     def add(self, cages: Sequence[np.ndarray], points: Sequence[np.ndarray | None]) -> None:
         """Take the next frame: cage and fine positions of each garment [m]; None for a garment without a sample."""
@@ -103,7 +103,8 @@ class Motion:
             self._last[index] = now
             if fine is not None:
                 folded, smooth = (self._sides[index](x) for x in (fine, self._smooth[index](cage)))
-                self.sharp += int(((folded > SHARP) & (smooth < SMOOTH)).sum())
+                found = int(((folded > SHARP) & (smooth < SMOOTH)).sum())
+                self.sharp = self.sharp[0] + found, self.sharp[1] + len(folded)
             if before is None or now is None:
                 continue
             carried = now[1] - before[1]
@@ -174,7 +175,11 @@ def judged(job: Job) -> dict[str, float | None]:
             frames.append(groups_of(outcome.record))
             spent.append(milliseconds)
         shot.close()
-    return _figures(frames, spent, job) | {"jumps": motion.jumps, "still": motion.still, "sharp": motion.sharp}
+    return _figures(frames, spent, job) | {
+        "jumps": motion.jumps,
+        "still": motion.still,
+        "sharp": motion.sharp[0] / max(motion.sharp[1], 1),
+    }
 
 
 def _timed(outcomes: Iterable[Any]) -> Iterator[tuple[Any, float]]:

@@ -47,7 +47,7 @@ FIGURES = {
     "jumps": Figure("jumps"),
     "remaining": Figure("remaining move [1/1000 edge]", 1e3),
     "still": Figure("motion over a still cage [mm]"),
-    "sharp": Figure("sharp folds where the smooth cage has none"),
+    "sharp": Figure("sharp folds where the smooth cage has none [1/10,000 edges]", 1e4),
 }
 """Figures of `judge_shot.judged` by name."""
 

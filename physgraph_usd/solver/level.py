@@ -250,10 +250,13 @@ def build_levels(
 class _GarmentLevel:
     vertex_count: int
     rest: np.ndarray
+    smooth_rest: np.ndarray
+    metric: np.ndarray
     triangles: np.ndarray
     edges: np.ndarray
     elements: ElasticElements
-    rest_angle: np.ndarray
+    bent: np.ndarray
+    pressed: np.ndarray
     vertex_values: dict[str, np.ndarray]
     warp: np.ndarray | None
     fabric: np.ndarray
@@ -268,10 +271,13 @@ def _garment_level(garment: Garment, whole: Sequence[Refinement], index: int) ->
     """Carry one garment to a level, or to the end of a shorter chain of refinements."""
     chain = whole[:index]
     mesh, face, creases, maps = _carried(garment, chain, stays=index > len(chain))
-    linear = maps["linear"]
-    rest = np.asarray(linear @ np.asarray(garment.rest, dtype=np.float64))
+    linear, smoothing = maps["linear"], maps["smooth"]
+    rest, smooth_rest = (np.asarray(each @ np.asarray(garment.rest, dtype=np.float64)) for each in (linear, smoothing))
     split = _sound(mesh.triangulate(rest if not chain else None), rest, rigid=_is_rigid(garment, linear))
     elements = elastic_elements(mesh, split, rest)
+    # Along normals only: what smoothing moves within the surface would strain a flat cage.
+    normal = vertex_normals(smooth_rest, elements.membrane)
+    smooth_rest = rest + ((smooth_rest - rest) * normal).sum(axis=1, keepdims=True) * normal
     painted = {name: getattr(garment, name) for name in ("stretch_scale", "bend_scale", "pin")}
     if garment.grain is not None:
         painted |= {"ease_scale": garment.grain.ease_scale, "gather": garment.grain.gather}
@@ -279,10 +285,13 @@ def _garment_level(garment: Garment, whole: Sequence[Refinement], index: int) ->
     return _GarmentLevel(
         vertex_count=mesh.vertex_count,
         rest=rest,
+        smooth_rest=smooth_rest,
+        metric=_metric_of(linear, elements, rest, smooth_rest),
         triangles=split.triangles,
         edges=edges_of(split.triangles, mesh.vertex_count).vertices,
         elements=elements,
-        rest_angle=_rest_angles(garment, elements.hinges, creases=creases, maps=maps),
+        bent=garment.bent_rest | (find_edges(creases, elements.hinges[:, :2]) >= 0),
+        pressed=_pressed_angles(garment, elements, linear=linear, smoothing=smoothing),
         vertex_values={name: np.asarray(linear @ each.astype(np.float64)) for name, each in painted.items()},
         warp=None if garment.grain is None else garment.grain.warp[face[elements.face]],
         fabric=scale[face[elements.face]],
@@ -290,18 +299,15 @@ def _garment_level(garment: Garment, whole: Sequence[Refinement], index: int) ->
     )
 
 
-def _rest_angles(
-    garment: Garment, hinges: np.ndarray, *, creases: np.ndarray, maps: dict[str, sp.csr_matrix]
+def _pressed_angles(
+    garment: Garment, elements: ElasticElements, *, linear: sp.csr_matrix, smoothing: sp.csr_matrix
 ) -> np.ndarray:
-    """Rest angles of hinges [rad], shape (H,): the smooth rest cage's where cloth rests bent, the smooth folded cage's
-    at pressed folds, fading within a cage edge, else 0.
-    """
-    angle = np.zeros(len(hinges))
-    if garment.pressed is not None and garment.folded is not None:
-        share = np.asarray(maps["linear"] @ garment.pressed.astype(np.float64))[hinges[:, :2]].mean(axis=1)
-        angle = share * hinge_geometry(np.asarray(maps["smooth"] @ garment.folded), hinges)[0]
-    bent = garment.bent_rest | (find_edges(creases, hinges[:, :2]) >= 0)
-    return np.where(bent, hinge_geometry(np.asarray(maps["smooth"] @ garment.rest), hinges)[0], angle)
+    """Rest angles of pressed folds [rad], shape (H,): those of the smooth folded cage, fading within a cage edge."""
+    if garment.pressed is None or garment.folded is None:
+        return np.zeros(len(elements.hinges))
+    angle = hinge_geometry(np.asarray(smoothing @ garment.folded), elements.hinges)[0]
+    share = np.asarray(linear @ garment.pressed.astype(np.float64))
+    return angle * share[elements.hinges[:, :2]].mean(axis=1)
 
 
 def _carried(
@@ -325,6 +331,64 @@ def _carried(
         linear_step = smooth_step = flat_step = sp.identity(mesh.vertex_count, format="csr")
     steps = {"linear_step": linear_step, "smooth_step": smooth_step, "flat_step": flat_step}
     return mesh, face, creases, {"linear": linear, "smooth": smoothing} | steps
+
+
+def _metric_of(
+    linear: sp.csr_matrix, elements: ElasticElements, rest: np.ndarray, smooth_rest: np.ndarray
+) -> np.ndarray:
+    """The metric S of the cloth on the smooth rest surface, shape (V, 3, 3): a vector d is (d.S d)^1/2 long.
+
+    Smooth subdivision shortens a curved cage, across a fold but not along the fold. S gives the cage's lengths,
+    averaged around each cage vertex; along the normal S is 1. With areas kept but not lengths, cloth would be too long
+    along folds, and crumple.
+
+    Args:
+        linear: Linear map from the cage, shape (V, C).
+        elements: Elastic elements.
+        rest: The cage's rest positions on the mesh, linearly [m], shape (V, 3).
+        smooth_rest: The same smoothly [m].
+    """
+    triangles, count = elements.membrane, len(rest)
+    cage, surface = (x[triangles[:, 1:]] - x[triangles[:, :1]] for x in (rest, smooth_rest))  # T 2 3
+    area = triangle_areas(smooth_rest, triangles)
+    known = area > 1e-9 * (surface**2).sum(axis=(1, 2))
+    gram, lengths = (np.einsum("tac,tbc->tab", each, each) for each in (surface, cage))
+    dual = np.linalg.inv(np.where(known[:, None, None], gram, np.eye(2))) @ surface
+    normal = np.cross(surface[:, 0], surface[:, 1]) / np.where(known, 2.0 * area, 1.0)[:, None]
+    tensor = dual.swapaxes(1, 2) @ lengths @ dual + normal[:, :, None] * normal[:, None, :]
+    tensor[~known] = np.eye(3)
+    weight, places = np.repeat(elements.share * area, 3), (triangles.ravel(), np.arange(3 * len(triangles)) // 3)
+    around = linear.T @ sp.csr_matrix((weight, places), shape=(count, len(triangles)))
+    total, mean = np.asarray(around.sum(axis=1)), np.asarray(around @ tensor.reshape(-1, 9))
+    mean = np.where(total > 0, mean / np.where(total > 0, total, 1.0), np.eye(3).ravel())
+    return np.asarray(linear @ mean).reshape(-1, 3, 3)
+
+
+def _in_cloth(vectors: np.ndarray, metric: np.ndarray) -> np.ndarray:
+    """Tangent vectors of the smooth rest surface in the cloth's lengths and angles: S^1/2 times the vectors.
+
+    Args:
+        vectors: Two sides of each triangle [m], and more vectors in the triangle's plane, shape (T, K, 3).
+        metric: S, shape (T, 3, 3).
+    """
+    first, normal = vectors[:, 0], np.cross(vectors[:, 0], vectors[:, 1])
+    second = np.cross(normal, first)
+    tiny = np.finfo(float).tiny
+    axes = np.stack([each / np.linalg.norm(each, axis=1, keepdims=True).clip(tiny) for each in (first, second)], axis=1)
+    plane = axes @ metric @ axes.swapaxes(1, 2)
+    root = np.sqrt((plane[:, 0, 0] * plane[:, 1, 1] - plane[:, 0, 1] ** 2).clip(0.0))
+    trace = (plane[:, 0, 0] + plane[:, 1, 1] + 2.0 * root).clip(tiny)
+    plane += root[:, None, None] * np.eye(2)  # The square root of a 2 x 2 matrix, by Cayley and Hamilton.
+    return np.asarray(vectors @ axes.swapaxes(1, 2) @ plane / np.sqrt(trace)[:, None, None] @ axes)
+
+
+def vertex_normals(x: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Unit normals by the areas of the triangles at each vertex, shape (V, 3); zero where there are none."""
+    corners = x[triangles]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    total = np.zeros_like(x)
+    np.add.at(total, triangles, normal[:, None])
+    return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), np.finfo(float).tiny)
 
 
 def triangle_areas(x: np.ndarray, triangles: np.ndarray) -> np.ndarray:
@@ -420,9 +484,18 @@ def _measured(
 ) -> dict[str, np.ndarray]:
     """The real-valued fields of a level by name."""
     springs, triangles, hinges = (elements[name] for name in ("springs", "membrane", "hinges"))
-    rest, angle = (np.concatenate([getattr(part, name) for part in parts]) for name in ("rest", "rest_angle"))
+    surface, metric = (np.concatenate([getattr(part, name) for part in parts]) for name in ("smooth_rest", "metric"))
     share, twists = (np.concatenate([getattr(part.elements, name) for part in parts]) for name in ("share", "twists"))
-    shape = rest_shape(rest, springs, triangles, share=share, hinges=hinges, twists=twists)
+    bent, pressed = (np.concatenate([getattr(part, name) for part in parts]) for name in ("bent", "pressed"))
+    corners = surface[triangles]
+    vectors = np.concatenate([corners[:, 1:] - corners[:, :1], warp[:, None]], axis=1)
+    vectors = _in_cloth(vectors, metric[triangles].mean(axis=1))
+    corners[:, 0], corners[:, 1:] = 0.0, vectors[:, :2]
+    corners, apart = corners.reshape(-1, 3), np.arange(3 * len(triangles)).reshape(-1, 3)
+    sides = surface[springs[:, 1]] - surface[springs[:, 0]]
+    length = np.sqrt(np.einsum("sa,sab,sb->s", sides, metric[springs].mean(axis=1), sides).clip(0.0))
+    cloth = {"length": length, "area": share * triangle_areas(corners, apart)}
+    shape = rest_shape(surface, springs, triangles, share=share, hinges=hinges, twists=twists, bent=bent, **cloth)
     stretch, bend, pin = (
         np.concatenate([part.vertex_values[name] for part in parts]) for name in ("stretch_scale", "bend_scale", "pin")
     )
@@ -431,13 +504,13 @@ def _measured(
     sides = find_edges(springs, triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2))
     at_hinges = mean_at(sides, of_bend, len(springs))[find_edges(springs, hinges[:, :2])]
     return shape | {
-        "rest_angle": angle,
-        "rest": rest,
-        "membrane_inverse": triangle_inverse(rest, triangles, warp),
+        "rest_angle": np.where(bent, shape["rest_angle"], pressed),
+        "rest": np.concatenate([part.rest for part in parts]),
+        "membrane_inverse": triangle_inverse(corners, apart, vectors[:, 2]),
         "spring_scale": stretch[springs].mean(axis=1) * mean_at(sides, of_stretch, len(springs)),
         "membrane_scale": stretch[triangles].mean(axis=1) * fabric[:, 0],
         "bend_scale": bend[hinges[:, :2]].mean(axis=1) * at_hinges,
-        "density_scale": mean_at(triangles.ravel(), of_density, len(rest), weight=np.repeat(shape["membrane_area"], 3)),
+        "density_scale": mean_at(triangles.ravel(), of_density, len(surface), weight=np.repeat(cloth["area"], 3)),
         "pin": pin,
     }
 
@@ -464,8 +537,11 @@ def rest_shape(
     share: np.ndarray,
     hinges: np.ndarray,
     twists: np.ndarray,
+    bent: np.ndarray,
+    length: np.ndarray,
+    area: np.ndarray,
 ) -> dict[str, np.ndarray]:
-    """Lengths and areas of the rest shape, under the names of `Level`'s fields.
+    """Lengths, areas and angles of the rest shape, under the names of `Level`'s fields.
 
     The bending energy of a sheet is D/2 (k1^2 + k2^2) by its principal curvatures. A hinge at an edge l between
     triangles of areas A1 and A2 bends across l: D l^2 / (A1 + A2) times half its angle squared. On a grid of rectangles
@@ -479,19 +555,21 @@ def rest_shape(
         share: Fraction of the area that a triangle stands for, shape (M,).
         hinges: Shape (H, 6).
         twists: Whether a hinge is a quad's diagonal, shape (H,).
+        bent: True where a hinge rests at the rest shape's angle, shape (H,).
+        length: Length of each spring in the cloth [m], shape (S,).
+        area: Area that each triangle stands for in the cloth [m^2], shape (M,).
 
     Returns:
-        spring_length, spring_area, membrane_area, hinge_shape, vertex_area, spacing.
+        spring_length, spring_area, membrane_area, hinge_shape, rest_angle, vertex_area, spacing.
     """
-    count, area = len(rest), share * triangle_areas(rest, membrane)
-    length = np.linalg.norm(rest[springs[:, 1]] - rest[springs[:, 0]], axis=1)
+    count = len(rest)
     side = find_edges(springs, membrane[:, [[0, 1], [1, 2], [2, 0]]])
     factor = np.where((share < 1.0)[:, None], np.array(QUAD_SPRING)[[0, 0, 1]], 1.0)
     spring_area = np.bincount(side, (factor * area[:, None] / 3.0).ravel(), len(springs)) if len(springs) else length
     degree = np.bincount(springs.ravel(), minlength=count)
     spacing = np.bincount(springs.ravel(), np.repeat(length, 2), count) / np.maximum(degree, 1)
     fallback = float(length.mean()) if len(length) else 1.0
-    _, first, second, hinge_length = hinge_geometry(rest, hinges)
+    angle, first, second, hinge_length = hinge_geometry(rest, hinges)
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = hinge_length**2 / (first + second)
         hinge_shape = np.where(twists, 2.0 / ratio, np.minimum(ratio, HINGE_SHAPE_LIMIT))
@@ -500,6 +578,7 @@ def rest_shape(
         "spring_area": spring_area,
         "membrane_area": area,
         "hinge_shape": np.nan_to_num(hinge_shape, nan=0.0),
+        "rest_angle": np.where(bent, angle, 0.0),
         "vertex_area": np.bincount(membrane.ravel(), np.repeat(area, 3) / 3.0, count),
         "spacing": np.where(spacing > 0, spacing, fallback),
     }

@@ -22,7 +22,7 @@ from scipy.sparse.linalg import splu
 
 from ...errors import GarmentError, named_time
 from ...solver.mesh.elements import elastic_elements, hinge_geometry
-from ...solver.mesh.topology import PolygonMesh, find_edges
+from ...solver.mesh.topology import PolygonMesh, adjacency, find_edges
 from ...solver.mesh.weld import Weld
 from ...solver.scene import out_of_bounds
 from ...solver.strain import COLLAPSED
@@ -39,6 +39,9 @@ MOST_FITTED = 50
 within 0.2 to 1.3% of the medians of all 24 to 60, medians of 9 within 0.6 to 4.3%."""
 STEPS = 100
 """Steps of a fit. On eleven garments lengths are then within 0.1 to 0.8% of their medians (root mean square)."""
+SMOOTHNESS, SMOOTH_STEPS = (1.0, 0.3, 0.1, 0.03, 0.01, 0.003, 0.001), 25
+"""Stiffness of a fit's smoothness, in mean stiffnesses, one after another, and steps of each but the last. Without it,
+1,146 fine edges of a walking shirt rest at lengths over 15% off the cage's, with it 23; of a kilt 2,754 and 76."""
 HOLD = 1e-6
 """Stiffness holding a fitted shape in place, in mean stiffnesses: makes the matrix regular, keeps lengths."""
 SHORTEST = 1e-3
@@ -124,7 +127,9 @@ def read_rest(
         rest = _fitted(weld, animation, by=" (--rest)")
     elif asked is not None:
         points, notices = animation.read(float(asked))
-        rest = Rest(points, f"points at time code {named_time(float(asked))} (--rest)", notices)
+        if not rests_bent(prim)[0]:  # Animated cloth is folded.
+            points = weld.split(median_shape(weld.mesh, [weld.joined(points)])[0])
+        rest = Rest(points, f"edge lengths at time code {named_time(float(asked))} (--rest)", notices)
     elif (authored := _authored(prim, len(first), odd)) is not None:
         rest = Rest(place(authored[0]), authored[1])
     elif (default := _default_points(prim, baked)) is None:
@@ -270,13 +275,17 @@ def _braced(mesh: PolygonMesh) -> np.ndarray:
 
 
 def median_shape(mesh: PolygonMesh, poses: Sequence[np.ndarray]) -> tuple[np.ndarray, int]:
-    """Fit a shape to the median length of each edge.
+    """Fit a smooth shape to the median length of each edge.
 
     A single pose has its own stretch; median lengths may fit no exact shape, yet cloth comes near them almost
-    everywhere. The sum over edges of (l - m)^2 / m is minimised by SMACOF (de Leeuw 1977): each step solves a linear
-    equation with the current edge directions, with the momentum of Nesterov (1983), restarted whenever the sum grows
-    (O'Donoghue and Candes 2015). The shape may be crumpled where the pose is: fine cloth takes its lengths only.
-    Collapsed poses are left out, because garments are hidden by scaling to nothing.
+    everywhere. Where the nearest pose is folded, a shape with the right lengths alone would be crumpled. So the sum
+
+        sum over edges of (l - m)^2 / m + s |x - mean of the neighbours|^2
+
+    is minimised with a stiffness s that falls from `SMOOTHNESS`'s first to its last value. Collapsed poses are left
+    out, because garments are hidden by scaling to nothing. The method is SMACOF (de Leeuw 1977): each step solves a
+    linear equation with the current edge directions, with the momentum of Nesterov (1983), restarted whenever the sum
+    grows (O'Donoghue and Candes 2015).
 
     Args:
         mesh: The welded mesh.
@@ -302,18 +311,20 @@ def median_shape(mesh: PolygonMesh, poses: Sequence[np.ndarray]) -> tuple[np.nda
     pull = sparse.csr_matrix(spans.T @ sparse.diags(weight))
     stiffness = pull @ spans
     mean = float(stiffness.diagonal().mean())
-    hold = HOLD * mean
-    solve = splu(sparse.csc_matrix(stiffness + hold * sparse.identity(len(shape)))).solve
-    ahead, pace, error = shape, 1.0, np.inf
-    for _ in range(STEPS):
-        span = spans @ ahead
-        length = np.linalg.norm(span, axis=1)
-        wanted = span * (median / np.maximum(length, np.finfo(float).tiny))[:, None]
-        last, shape = shape, solve(pull @ wanted + hold * ahead)
-        before, error = error, float((weight * (length - median) ** 2).sum())
-        last_pace = 1.0 if error > before else pace
-        pace = 0.5 + np.sqrt(0.25 + last_pace**2)
-        ahead = shape + (last_pace - 1.0) / pace * (shape - last)
+    hold, bent = HOLD * mean, _bent(mesh)
+    for smoothness in SMOOTHNESS:
+        rough = smoothness * mean * (bent.T @ bent)
+        solve = splu(sparse.csc_matrix(stiffness + rough + hold * sparse.identity(len(shape)))).solve
+        ahead, pace, error = shape, 1.0, np.inf
+        for _ in range(STEPS if smoothness == SMOOTHNESS[-1] else SMOOTH_STEPS):
+            span = spans @ ahead
+            length = np.linalg.norm(span, axis=1)
+            wanted = span * (median / np.maximum(length, np.finfo(float).tiny))[:, None]
+            last, shape = shape, solve(pull @ wanted + hold * ahead)
+            before, error = error, float((weight * (length - median) ** 2).sum() + (ahead * (rough @ ahead)).sum())
+            last_pace = 1.0 if error > before else pace
+            pace = 0.5 + np.sqrt(0.25 + last_pace**2)
+            ahead = shape + (last_pace - 1.0) / pace * (shape - last)
     return shape, nearest
 
 
@@ -354,3 +365,14 @@ def pressed_folds(
         return None
     nearest = np.abs(angles - median)[:, pressed].sum(axis=1).argmin()
     return np.isin(np.arange(mesh.vertex_count), hinges[pressed, :2]), np.asarray(poses[nearest])
+
+
+def _bent(mesh: PolygonMesh) -> sparse.csr_matrix:
+    """Maps positions to each vertex's vector from the mean of its neighbours, shape (V, V); zero on open borders."""
+    ends, count = mesh.half_edges.edges, mesh.vertex_count
+    beside = adjacency(ends, count)
+    degree = np.asarray(beside.sum(axis=1)).ravel()
+    inner = degree > 0
+    inner[ends[mesh.half_edges.count == 1]] = False
+    mean = sparse.diags(1.0 / np.maximum(degree, 1.0)) @ beside
+    return sparse.csr_matrix(sparse.diags(inner.astype(float)) @ (sparse.identity(count) - mean))
