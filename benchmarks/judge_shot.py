@@ -87,10 +87,7 @@ class Motion:
     def __init__(self, garments: Sequence[Any], level: int) -> None:
         """Subdivide the cages of a scene's garments."""
         self._chains = [subdivide_times(garment.mesh, level) for garment in garments]
-        self._sides = [
-            _sides(chain[-1].mesh if chain else g.mesh) for g, chain in zip(garments, self._chains, strict=True)
-        ]
-        self._smooth = [_smoothing(g.mesh, chain) for g, chain in zip(garments, self._chains, strict=True)]
+        self._sharp = [sharp_folds(g.mesh, chain) for g, chain in zip(garments, self._chains, strict=True)]
         self._edges = [_mean_rest_edge(garment) for garment in garments]
         self._last: list[tuple[np.ndarray, np.ndarray] | None] = [None] * len(garments)
         self._still: list[np.ndarray] = []
@@ -102,9 +99,8 @@ class Motion:
             before, now = self._last[index], None if fine is None else (fine, self._upsampled(index, cage))
             self._last[index] = now
             if fine is not None:
-                folded, smooth = (self._sides[index](x) for x in (fine, self._smooth[index](cage)))
-                found = int(((folded > SHARP) & (smooth < SMOOTH)).sum())
-                self.sharp = self.sharp[0] + found, self.sharp[1] + len(folded)
+                found = self._sharp[index](cage, fine)
+                self.sharp = self.sharp[0] + int(found.sum()), self.sharp[1] + len(found)
             if before is None or now is None:
                 continue
             carried = now[1] - before[1]
@@ -122,6 +118,14 @@ class Motion:
         for refinement in self._chains[index]:
             points = np.asarray(refinement.linear @ points)
         return points
+
+
+def sharp_folds(mesh: Any, chain: Sequence[Any]) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    """Maps positions of a cage and of its fine cloth to whether each inner fine edge folds sharply where the smoothly
+    subdivided cage does not.
+    """
+    angles, smoothed = _sides(chain[-1].mesh if chain else mesh), _smoothing(mesh, chain)
+    return lambda cage, fine: (angles(fine) > SHARP) & (angles(smoothed(cage)) < SMOOTH)
 
 
 def _smoothing(mesh: Any, chain: Sequence[Any]) -> Callable[[np.ndarray], np.ndarray]:
