@@ -38,7 +38,7 @@ class PhysGraphError(Exception):
     """Root of all errors raised on purpose; its text is meant for the user.
 
     Attributes:
-        exit_code: What a command that it ends leaves with.
+        exit_code: Exit code of a command that ends with this error.
     """
 
     exit_code = 1
@@ -65,7 +65,7 @@ class StageError(PhysGraphError):
 
 
 class AbsentError(UsageError, StageError):
-    """A file, a prim or a frame that was named is not there."""
+    """A named file, prim or frame does not exist."""
 
 
 class GarmentError(StageError):
@@ -225,12 +225,12 @@ NOTICE = 25
 
 
 def counted(number: int, noun: str, plural: str = "") -> str:
-    """A number of things: "1 frame", "1,024 frames".
+    """A number with its noun: "1 frame", "1,024 frames".
 
     Args:
-        number: How many.
-        noun: One of them.
-        plural: Several; the noun with an "s" where it is left out.
+        number: The number, printed with thousands separators.
+        noun: The noun's singular.
+        plural: The noun's plural; "" for the singular with an "s".
     """
     return f"{number:,} {noun if number == 1 else plural or noun + 's'}"
 

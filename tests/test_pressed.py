@@ -85,7 +85,15 @@ def test_a_fold_that_forms_is_not_pressed():
     folded = np.stack([0.3 * x, flat[:, 1], 0.95 * np.abs(x)], axis=1)
     none = np.zeros((0, 2), np.int64)
     assert pressed_folds(mesh, [flat, folded, folded, folded], none, none) is None
-    found = pressed_folds(mesh, [folded, folded], none, none)
+
+
+def test_a_garment_hidden_by_scale_keeps_its_pressed_folds():
+    """A grid folded along its middle, and collapsed to a point in the first pose."""
+    mesh, flat = grid(4, 4)
+    x = flat[:, 0] - flat[:, 0].mean()
+    folded = np.stack([0.3 * x, flat[:, 1], 0.95 * np.abs(x)], axis=1)
+    none = np.zeros((0, 2), np.int64)
+    found = pressed_folds(mesh, [0.0 * folded, folded, folded], none, none)
     assert found is not None
     assert set(x[found[0]]) == {0.0}
 

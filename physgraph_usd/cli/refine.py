@@ -194,7 +194,7 @@ def _refine_shown(
 
 
 def _one_each(shots: tuple[str, ...], to: Path, option: str, *, suffix: str, accepts: tuple[str, ...]) -> list[Path]:
-    """Name one output per shot: ``to`` itself when it is a file's name, else files in the folder ``to``."""
+    """Output path of each shot: ``to`` if ``to`` names a file, else a file in the folder ``to``."""
     if to.suffix in accepts and not to.is_dir():
         if len(shots) > 1:
             raise UsageError(f"{option} {to} is one file for {len(shots)} shots; give a folder")
@@ -213,9 +213,9 @@ def _one_each(shots: tuple[str, ...], to: Path, option: str, *, suffix: str, acc
 
 @contextmanager
 def _folder_of(layers: Sequence[Path], out: Path, *, dry_run: bool) -> Iterator[None]:
-    """Make the folder that layers go into, unless ``out`` names a layer; it goes again where nothing came into it.
+    """Create the layers' folder unless ``out`` names a layer, and remove the folder if no layer was written.
 
-    Finished frames that an interruption or an error left are named.
+    After an interruption or an error, print where finished frames are kept.
     """
     from ..shot.frames import kept_for
 

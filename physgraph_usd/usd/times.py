@@ -87,18 +87,18 @@ class Motion:
 
 
 def motion_of(prim: Usd.Prim, *, skinned: Mapping[Sdf.Path, Motion] | None = None) -> Motion:
-    """Motion of a prim by its form and its transforms; an instancer's with all that its instances draw.
+    """Motion of a prim's shape and transforms; for an instancer also of its prototypes and nested instancers.
 
     Args:
-        prim: The prim.
-        skinned: Motion of skinned prims, in place of that of their own points.
+        prim: A mesh, shape, instancer or transform.
+        skinned: Motion of skinned prims by path, used instead of the motion of the prims' authored points.
     """
     known = skinned or {}
     return Motion.joined(known.get(each.GetPath()) or motion_alone(each) for each in drawn_with(prim))
 
 
 def motion_alone(prim: Usd.Prim, *, shape: bool = True) -> Motion:
-    """Motion of a prim by its transforms and, if ``shape``, by its form, whose time codes come first in `merge`."""
+    """Motion of a prim's transforms and, if ``shape``, of its shape, whose time codes come first in `merge`."""
     form = [prim.GetAttribute(name) for name in _SHAPE if shape and prim.HasAttribute(name)]
     ops = [op for transform in transform_chain(prim) for op in transform.GetOrderedXformOps()]
     turning = [op.GetOpTypeToken(op.GetOpType()).startswith(_TURNING) for op in ops]
@@ -139,7 +139,7 @@ def solve_times(cloth: Motion, bodies: Iterable[Motion], frames: FrameGrid) -> t
 
 
 def found_among(time: float, times: Sequence[float]) -> float | None:
-    """The time code among others, ascending, that is the same as one, the nearest of two; None without any."""
+    """The nearest of several ascending time codes to a time code, within `SAME_TIME`; None if all are farther."""
     same = times[bisect_left(times, time - SAME_TIME) : bisect_right(times, time + SAME_TIME)]
     return min(same, key=lambda each: abs(each - time), default=None)
 

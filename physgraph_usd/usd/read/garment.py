@@ -281,12 +281,13 @@ def _pressed(prim: Usd.Prim, weld: Weld, animation: Animation) -> dict[str, Any]
 
 
 def _marked_edges(prim: Usd.Prim, weld: Weld, *, pressed: bool) -> np.ndarray:
-    """Welded vertices of the edges in a mesh's subsets with that `PRESSED`, lower first, ascending, shape (E, 2)."""
+    """Welded vertices of the edges in subsets whose `PRESSED` has a value, lower first, ascending, shape (E, 2)."""
     marked = [np.zeros((0, 2), np.int64)]
     for subset in UsdGeom.Subset.GetGeomSubsets(UsdGeom.Imageable(prim), UsdGeom.Tokens.edge):
         attribute = subset.GetPrim().GetAttribute(PRESSED)
+        value = attribute.Get() if attribute else None
         ends = subset.GetIndicesAttr().Get(Usd.TimeCode.EarliestTime())
-        if attribute and attribute.Get() is pressed and ends is not None:
+        if value is not None and bool(value) == pressed and ends is not None:
             ends = np.asarray(ends)[: len(ends) // 2 * 2].reshape(-1, 2)
             ends = ends[((ends >= 0) & (ends < len(weld.number))).all(axis=1)]
             marked.append(np.sort(weld.number[ends], axis=1))

@@ -383,7 +383,7 @@ def _link(
     contacts: Mapping[Sdf.Path, _Contact],
     notices: list[Notice],
 ) -> tuple[list[GarmentReader], list[ColliderReader]]:
-    """Garments with their seams and the numbers of their colliders, and the colliders."""
+    """Readers of the sewn garments, each with the indices of the garment's colliders, and readers of the colliders."""
     readers = _sewn(stage, readers, request, notices)
     cloth = dict.fromkeys(reader.source.path for reader in readers)
     times = [reader.source.times[0] if reader.source.times else None for reader in readers]

@@ -296,8 +296,7 @@ def median_shape(mesh: PolygonMesh, poses: Sequence[np.ndarray]) -> tuple[np.nda
     """
     edges = _braced(mesh)
     lengths = np.array([np.linalg.norm(np.subtract(*pose[edges.T]), axis=1) for pose in poses])
-    total = lengths.sum(axis=1)
-    whole = total > COLLAPSED * np.sort(total)[-2:][0]  # The largest pose may be blown up.
+    whole = _are_whole(lengths)
     median = np.median(lengths[whole] if whole.any() else lengths, axis=0)
     nearest = int(np.abs(lengths - median).sum(axis=1).argmin())
     shape = np.array(poses[nearest], np.float64)
@@ -328,6 +327,12 @@ def median_shape(mesh: PolygonMesh, poses: Sequence[np.ndarray]) -> tuple[np.nda
     return shape, nearest
 
 
+def _are_whole(lengths: Float[np.ndarray, "poses edges"]) -> Bool[np.ndarray, " poses"]:
+    """Whether each pose is not collapsed, by its edges' lengths [m]."""
+    total = lengths.sum(axis=1)
+    return np.asarray(total > COLLAPSED * np.sort(total)[-2:][0])  # The largest pose may be blown up.
+
+
 def pressed_folds(
     mesh: PolygonMesh,
     poses: Sequence[Float[np.ndarray, "vertices 3"]],
@@ -337,7 +342,7 @@ def pressed_folds(
     """Vertices at pressed folds, and the pose that has the folds as they rest.
 
     A fold is pressed where an artist says so, and where the cage keeps it: folded by more than `SHARP`, with an
-    angle within `KEPT` of its median in every pose. Simulated wrinkles form and move.
+    angle within `KEPT` of its median in every pose that is not collapsed. Simulated wrinkles form and move.
 
     Args:
         mesh: The welded mesh.
@@ -348,6 +353,10 @@ def pressed_folds(
     Returns:
         Whether each vertex is at a pressed edge, and the pose nearest to the median angles; None without pressed edges.
     """
+    edges = mesh.half_edges.edges
+    if poses:
+        whole = _are_whole(np.array([np.linalg.norm(np.subtract(*pose[edges.T]), axis=1) for pose in poses]))
+        poses = [pose for pose, is_whole in zip(poses, whole, strict=True) if is_whole]
     if not poses:
         return None
     elements = elastic_elements(mesh, mesh.triangulate(poses[0]), poses[0])
