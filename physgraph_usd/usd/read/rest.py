@@ -3,7 +3,8 @@
 The first available of: the points at the time code of ``--rest``, ``physics:restShapePoints``, ``primvars:rest``,
 ``primvars:Pref``, the points' default value, a shape fitted to the median length of each edge over the shot.
 ``--rest auto`` requests the fitted shape even if a shape is authored. Authored shapes are placed in the world like the
-garment at its first time code, or by a skinned garment's bind transform.
+garment at its first time code, or by a skinned garment's bind transform. Of a frame of the animation, as ``--rest`` or
+as default points, the edge lengths count: its folds do not.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from ...solver.mesh.elements import elastic_elements, hinge_geometry
 from ...solver.mesh.topology import PolygonMesh, adjacency, find_edges
 from ...solver.mesh.weld import Weld
 from ...solver.scene import out_of_bounds
-from ...solver.strain import COLLAPSED
+from ...solver.strain import COLLAPSED, extent
 from ..lookup import nearest, source_name
 from ..stage import Notice, first_value
 from .cage import as_points, repair
@@ -127,9 +128,8 @@ def read_rest(
         rest = _fitted(weld, animation, by=" (--rest)")
     elif asked is not None:
         points, notices = animation.read(float(asked))
-        if not rests_bent(prim)[0]:  # Animated cloth is folded.
-            points = weld.split(median_shape(weld.mesh, [weld.joined(points)])[0])
-        rest = Rest(points, f"edge lengths at time code {named_time(float(asked))} (--rest)", notices)
+        source = f"edge lengths at time code {named_time(float(asked))} (--rest)"
+        rest = Rest(_lengths_of(prim, weld, points), source, notices)
     elif (authored := _authored(prim, len(first), odd)) is not None:
         rest = Rest(place(authored[0]), authored[1])
     elif (default := _default_points(prim, baked)) is None:
@@ -140,7 +140,14 @@ def read_rest(
         rest = replace(rest, notices=(Notice(str(prim.GetPath()), None, message),))
     else:
         rest = _from_default(prim, edges, place(default), first=first)
+        if animation.times and np.allclose(rest.points, first, rtol=0.0, atol=_SAME_PLACE * extent(first).max()):
+            rest = replace(rest, points=_lengths_of(prim, weld, rest.points))
     return _checked(prim, edges, replace(rest, notices=(*odd, *rest.notices)), first=first)
+
+
+def _lengths_of(prim: Usd.Prim, weld: Weld, pose: np.ndarray) -> np.ndarray:
+    """A smooth shape with the edge lengths of an animated pose, which may be folded; the pose itself to rest bent."""
+    return pose if rests_bent(prim)[0] else weld.split(median_shape(weld.mesh, [weld.joined(pose)])[0])
 
 
 def _from_default(prim: Usd.Prim, edges: np.ndarray, points: np.ndarray, *, first: np.ndarray) -> Rest:
