@@ -16,7 +16,9 @@ from typing import Protocol
 
 from ..deadline import is_over
 
-ROUND, FREE_ROUND = 4, 16
+import os
+GROW = int(os.environ.get('GROW','2'))
+ROUND, FREE_ROUND = 4, int(os.environ.get('FREE','16'))
 """Most steps of a round with contact, and without: near pairs are found again after a round."""
 HURRIED = 2
 """Most steps of a first round that somebody waits for."""
@@ -68,16 +70,19 @@ class Budget:
     near: float = 0.0
     hurried: bool = False
 
-    def for_round(self, *, first: bool, touching: bool, shrunk: float) -> Budget:
+    def for_round(self, *, made: int, touching: bool, shrunk: float, free: int = 0) -> Budget:
         """The budget of a round.
 
         Args:
-            first: Whether this is the level's first round.
+            made: Steps of all rounds before; 0 for the level's first round.
             touching: Whether there is contact.
             shrunk: Factor of the tolerance: a metric with contact underestimates moves.
+            free: Steps of the last round if nothing blocked it, else 0: the next round may be twice as long.
         """
-        longest = max(ROUND, math.ceil(EARLY * self.steps)) if first and self.near else ROUND
+        first = not made
+        longest = max(ROUND, math.ceil(EARLY * self.steps)) if first and self.near else max(ROUND, GROW * free)
         steps = min(HURRIED if self.hurried and first else longest if touching else FREE_ROUND, FREE_ROUND, self.steps)
+        steps = min(steps, max(self.steps, self.touching) - made) if touching else steps
         once = {} if first else {"rest": 1.0, "least": 0}
         return replace(self, steps=steps, tolerance=shrunk * self.tolerance, **once)
 
