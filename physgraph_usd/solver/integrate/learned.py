@@ -26,7 +26,7 @@ from ..level import Level
 from .base import Carry, System
 from .fused import FusedPhysgraph, fused_physgraph
 from .network import Physgraph
-from .quasi_newton import Dot, StepHistory, dot, secant_direction
+from .quasi_newton import StepHistory, dot, secant_direction
 from .vertex_frame import VertexFrame
 
 NetworkT = TypeVar("NetworkT", bound=nn.Module)
@@ -77,7 +77,10 @@ class LearnedMetric:
         """The carry at x [m], a displacement away from the previous carry."""
         energy, force = system.energy_and_force(x)
         image = system.apply_short_inverse(force)
-        memory = carry.memory.after(carry, move, force, image, dot=self._dot(system))
+        numbers = self._trained and not system.spacing.is_cuda  # Waiting for numbers costs nothing.
+        spans = system.level.spans if numbers and system.level is not None and len(system.level.spans) > 1 else ()
+        product = dot if numbers else partial(garment_dot, system.level)
+        memory = carry.memory.after(carry, move, force, image, dot=product, spans=spans)
         return Carry(x, energy, force, image, self.name, memory)
 
     def propose(self, system: System, carry: Carry) -> Float[Tensor, "vertices 3"]:
@@ -104,24 +107,13 @@ class LearnedMetric:
         move = (coefficients.unsqueeze(2) * stacked).sum(dim=1)  # V 3
         return limited(move, system.spacing) * system.free
 
-    def _dot(self, system: System) -> Dot:
-        """The scalar product: returns numbers if waiting for numbers costs nothing."""
-        alone = system.level is None or len(system.level.spans) == 1
-        waits = alone and self._trained and not system.spacing.is_cuda
-        return dot if waits else partial(garment_dot, system.level)
-
-
-def _secant_direction(carry: Carry) -> Tensor:
-    """The L-BFGS direction of a carry [m]."""
-    assert carry.preconditioned is not None
-    return secant_direction(carry.force, carry.preconditioned, carry.memory.secants)
-
 
 def _vector(name: str, *, system: System, carry: Carry) -> Tensor:
     """One of `network.WHOLE` [m]; zero if the history is too short."""
     memory: StepHistory = carry.memory
     if name == "secant":
-        return _secant_direction(carry)
+        assert carry.preconditioned is not None
+        return secant_direction(carry.force, carry.preconditioned, memory.secants)
     if name.startswith("diagonal"):
         return (memory.force if name == "diagonal1" else carry.force) / system.rest_diagonal_columns
     if name.startswith("metric"):

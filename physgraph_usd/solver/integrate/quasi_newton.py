@@ -14,8 +14,8 @@ as there are secants, because an opening triangle would otherwise remain slow.
 | rho_i | 1 / ``curvature`` | 1 / s_i.y_i |
 | gamma | s.y / y.z of the newest secant | scales H0^-1 to the latest curvature |
 
-Scalar products are numbers for cloth solved as one problem, or tensors: one per garment, at each vertex of the garment.
-Tensors keep garments independent, avoid waiting for a number, and let gradients flow.
+Scalar products are numbers, of all cloth or of one garment after another, or tensors: one per garment, at each vertex
+of the garment. Tensors avoid waiting for a number, and let gradients flow.
 """
 
 from __future__ import annotations
@@ -237,12 +237,21 @@ def dot(a: Tensor, b: Tensor) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Secant:
-    """Differences of positions, of negative forces, of their images under H0^-1, and the scalar product to use."""
+    """Differences of positions, of negative forces, of their images under H0^-1, and the scalar product to use.
+
+    Garments are treated one after another if ``spans`` has their vertices.
+    """
 
     move: Tensor
     yields: Tensor
     image: Tensor
     dot: Dot = dot
+    spans: tuple[slice, ...] = ()
+
+    @cached_property
+    def parts(self) -> list[Secant]:
+        """The secant of each garment."""
+        return [Secant(self.move[span], self.yields[span], self.image[span], self.dot) for span in self.spans]
 
     @cached_property
     def curvature(self) -> Any:
@@ -271,10 +280,12 @@ class StepHistory:
     secants: tuple[Secant, ...] = ()
     step: int = 0
 
-    def after(self, carry: Carry, move: Tensor, force: Tensor, image: Tensor, *, dot: Dot) -> StepHistory:
+    def after(
+        self, carry: Carry, move: Tensor, force: Tensor, image: Tensor, *, dot: Dot, spans: tuple[slice, ...]
+    ) -> StepHistory:
         """The memory after a displacement [m] from a carry with this memory; force [N] and image [m] are at the end."""
         assert carry.preconditioned is not None
-        newest = Secant(move, carry.force - force, carry.preconditioned - image, dot)
+        newest = Secant(move, carry.force - force, carry.preconditioned - image, dot, spans)
         images = (carry.preconditioned, self.images[0])
         return StepHistory(carry.force, images, (*self.secants, newest)[-SECANTS:], self.step + 1)
 
@@ -293,6 +304,9 @@ def secant_direction(
     """
     if not secants:
         return preconditioned
+    if secants[-1].spans:
+        garments = zip(secants[-1].spans, *(each.parts for each in secants), strict=True)
+        return torch.cat([secant_direction(force[span], preconditioned[span], each) for span, *each in garments])
     weights, residual, image = [], force.clone(), preconditioned.clone()
     for secant in reversed(secants):
         weight = secant.dot(secant.move, residual) / secant.curvature
