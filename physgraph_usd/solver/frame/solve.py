@@ -118,14 +118,14 @@ def solve_one_level(
         x = view.moved(x, x + smoothing) if level.index else x
         terms = view.terms(x)
         x = view.moved(x, leave_saddle(problem.system(view, terms, x), level, x, outward=problem.outward))
-    carry, last, terms, made, free, touched, integrator = None, None, (), 0, 0, False, problem.integrator
+    carry, last, terms, made, blocked, touched, integrator = None, None, (), 0, False, False, problem.integrator
     while True:
         terms = view.terms(x)
         touched = touched or bool(terms)
         system = problem.system(view, terms, x, last=last)
         resume = carry if last is not None and system.has_same_metric(last) else None
         shrunk = HELD_TOLERANCE if isinstance(system.metric, HeldMetric) else 1.0
-        of_round = budget.for_round(made=made, touching=bool(terms), shrunk=shrunk, free=free)
+        of_round = budget.for_round(made=made, touching=bool(terms), blocked=blocked, shrunk=shrunk)
         carry, report = descend(system, integrator, x, level=level.index, budget=of_round, resume=resume)
         report.remaining_move = _smooth_move(system, carry, report)
         reports.append(report)
@@ -133,7 +133,6 @@ def solve_one_level(
         wanted = carry.x
         x, last = view.moved(x, wanted), system
         blocked = x is not wanted
-        free = 0 if blocked else report.steps
         if problem.show is not None:
             problem.show(x)
         if budget.ends(report, made=made, touched=touched, blocked=blocked):

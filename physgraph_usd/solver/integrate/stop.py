@@ -16,10 +16,10 @@ from typing import Protocol
 
 from ..deadline import is_over
 
-import os
-GROW = int(os.environ.get('GROW','2'))
-ROUND, FREE_ROUND = 4, int(os.environ.get('FREE','16'))
-"""Most steps of a round with contact, and without: near pairs are found again after a round."""
+ROUND, CLEAR_ROUND, FREE_ROUND = 4, 8, 16
+"""Most steps of a round with contact, of such a round after one that nothing blocked, and of a round without contact:
+near pairs are found again after a round. With 8 for 4, layers take 0.65 of the time at equal energy; with 16 an
+overcoat's energy rises by 9%."""
 HURRIED = 2
 """Most steps of a first round that somebody waits for."""
 TOUCHING = 3
@@ -70,21 +70,21 @@ class Budget:
     near: float = 0.0
     hurried: bool = False
 
-    def for_round(self, *, made: int, touching: bool, shrunk: float, free: int = 0) -> Budget:
+    def for_round(self, *, made: int, touching: bool, blocked: bool, shrunk: float) -> Budget:
         """The budget of a round.
 
         Args:
-            made: Steps of all rounds before; 0 for the level's first round.
+            made: Steps of all rounds before.
             touching: Whether there is contact.
+            blocked: Whether the last round's move was blocked.
             shrunk: Factor of the tolerance: a metric with contact underestimates moves.
-            free: Steps of the last round if nothing blocked it, else 0: the next round may be twice as long.
         """
-        first = not made
-        longest = max(ROUND, math.ceil(EARLY * self.steps)) if first and self.near else max(ROUND, GROW * free)
-        steps = min(HURRIED if self.hurried and first else longest if touching else FREE_ROUND, FREE_ROUND, self.steps)
-        steps = min(steps, max(self.steps, self.touching) - made) if touching else steps
+        first, left = not made, max(self.steps, self.touching) - made
+        longest = ROUND if blocked or first else CLEAR_ROUND
+        longest = max(longest, math.ceil(EARLY * self.steps)) if first and self.near else longest
+        longest = HURRIED if self.hurried and first else min(longest, left) if touching else FREE_ROUND
         once = {} if first else {"rest": 1.0, "least": 0}
-        return replace(self, steps=steps, tolerance=shrunk * self.tolerance, **once)
+        return replace(self, steps=min(longest, FREE_ROUND, self.steps), tolerance=shrunk * self.tolerance, **once)
 
     def for_untangling(self) -> Budget:
         """The budget of an untangling round, without a tolerance: contours shorten while nothing moves much."""
