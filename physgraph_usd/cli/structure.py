@@ -17,8 +17,14 @@ from ..errors import PhysGraphError, UnexpectedError, exceptions_named
 from ..interrupts import SIGNALLED, importing
 
 DONE, FAILED = 0, 1
-EXTRAS = {"pxr": "usd", "PIL": "preview", "matplotlib": "chart", "plotly": "chart", "viser": "tune"}
-"""Which extra brings a module that only some commands need."""
+PACKAGES = {
+    "pxr": "'usd-core<27'",
+    "PIL": "pillow",
+    "matplotlib": "matplotlib",
+    "plotly": "plotly",
+    "viser": "'viser<2'",
+}
+"""Which package of the extras brings a module that only some commands need."""
 
 
 DEBUG = "physgraph_usd.debug"
@@ -78,10 +84,9 @@ def errors_named() -> Iterator[None]:
             yield
         except ModuleNotFoundError as error:
             missing = (error.name or "").partition(".")[0]
-            if missing not in EXTRAS:
+            if missing not in PACKAGES:
                 raise
-            install = f"{missing} is not installed: pip install 'physgraph-usd[{EXTRAS[missing]}]'"
-            raise PhysGraphError(install) from error
+            raise PhysGraphError(f"{missing} is not installed: pip install {PACKAGES[missing]}") from error
 
 
 def _let_go(error: BaseException | None) -> None:
