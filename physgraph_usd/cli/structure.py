@@ -40,13 +40,11 @@ class Commands(click.Group):
         try:
             with errors_named():
                 return super().invoke(ctx)
-        except KeyboardInterrupt as error:
-            _let_go(error)
+        except KeyboardInterrupt:
             click.echo("interrupted", err=True)
             ctx.exit(SIGNALLED + signal.SIGINT)
         except PhysGraphError as error:
             show_trace(error)
-            _let_go(error)
             _leave(ctx, str(error), error.exit_code)
 
     def add_command(self, cmd: click.Command, name: str | None = None) -> None:
@@ -87,13 +85,6 @@ def errors_named() -> Iterator[None]:
             if missing not in PACKAGES:
                 raise
             raise PhysGraphError(f"{missing} is not installed: pip install {PACKAGES[missing]}") from error
-
-
-def _let_go(error: BaseException | None) -> None:
-    """Free what the frames of tracebacks hold: nanobind complains on stderr of factors that live to the very end."""
-    while error is not None:
-        traceback.clear_frames(error.__traceback__)
-        error = error.__cause__ or error.__context__
 
 
 def show_trace(error: PhysGraphError) -> None:
