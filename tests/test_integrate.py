@@ -247,7 +247,7 @@ made = threading.Event()
 
 def hold():
     solve = Factors(sp.csr_matrix(sp.identity(3)), dtype=torch.float64, device="cpu").of(torch.full((3,), 2.0).double())
-    print(solve(torch.ones(3, 1).double()).sum().item())
+    solve(torch.ones(3, 1).double())
     made.set()
     time.sleep(1000)
 
@@ -255,4 +255,4 @@ threading.Thread(target=hold, daemon=True).start()
 made.wait()
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=120)
-    assert (done.returncode, done.stdout, done.stderr) == (0, "1.5\n", "")
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
