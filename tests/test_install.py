@@ -52,7 +52,7 @@ def test_the_command_works_after_each_way_to_install(checkout: Path, way: str):
     probe = [*last.replace("install", "install --dry-run", 1).split(" '")[:1], "torch hatchling"]
     reached = shell(checkout, *ahead, " ".join(probe))
     if reached.returncode:
-        pytest.skip(f"no index of packages can be reached: {reached.stderr[-200:]}")
+        pytest.skip("no index with these packages can be reached")
     done = shell(checkout, enter, way, USES)
     assert done.returncode == 0, done.stdout + done.stderr
     assert (checkout / "fine.png").is_file()

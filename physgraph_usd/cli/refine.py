@@ -53,8 +53,8 @@ def refine(
         jobs = _jobs(ctx, shots, out)
         layers = [layer for _, layer, _ in jobs]
         verbose, log_file, in_lines = (ctx.params[name] for name in ("verbose", "log_file", "progress"))
-        said = {name: ctx.params[name] for name in ("openjd", "quiet", "as_json")}
-        output = Output(verbose, log_file, in_lines, several=len(jobs) > 1, **said)
+        flags = {name: ctx.params[name] for name in ("openjd", "quiet", "as_json")}
+        output = Output(verbose, log_file, in_lines, several=len(jobs) > 1, **flags)
         also = [(what, file) for what, file in (("the summary", summary), ("the log", log_file)) if file is not None]
         if also:
             check_jobs(jobs, also=also)
