@@ -341,6 +341,8 @@ def test_a_refused_seam_is_mended_by_the_chunk_and_the_preroll_that_the_error_na
     assert seam.rms < 2 / 3 * SEAM_BOUND
     report, _ = stitch([first, second], tmp_path / "joined.usdc")
     assert report.exit_code == 0
+    assert record_of(tmp_path / "joined.usdc")["options"]["preroll"] == preroll
+    assert faults(tmp_path / "joined.usdc", shot) == []
 
 
 class TestSeamsBeforeAllIsThere:

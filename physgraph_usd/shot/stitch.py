@@ -219,6 +219,7 @@ def stitch(
         _check_same_shot(parts[0], made_from(opened, out, options))
         recorded = {name: value for name, value in parts[0].run["options"].items() if name not in _OF_ONE_CHUNK}
         recorded |= {"frames": list(frames)} if frames else {}
+        recorded["preroll"] = max(part.run["options"].get("preroll", 0) for part in parts)
         report.options = dict(recorded)
         joins = _Joins(parts, opened, seam_bound, report.warn)
         record = {"options": recorded, "chunks": [_span(part.times) for part in parts]}
