@@ -17,10 +17,12 @@ from typing import Any
 import pytest
 import torch
 from frame_solvers import as_named
+from jsonschema import Draft202012Validator
 from pxr import Usd
-from shots import CLOTH, cloth_shot, run
+from shots import CLOTH, cloth_shot, command, run
 
 from physgraph_usd import cli, errors
+from physgraph_usd.shot import summary
 from physgraph_usd.shot.report import RefineReport
 
 Sample = Callable[[str], Path]
@@ -117,6 +119,53 @@ class TestRefine:
         assert [file.name for file in tmp_path.iterdir()] == ["file"]
 
 
+class TestStreams:
+    """What a caller of the command reads: stdout and stderr of whole processes, ends included."""
+
+    @pytest.fixture
+    def shot(self, tmp_path: Path) -> Path:
+        """A shot whose second sample fails, with a warning."""
+        return cloth_shot(tmp_path / "part.usda", times=(1.0, 2.0, 3.0, 4.0), broken={2.0: float("nan")})
+
+    @pytest.mark.parametrize("workers", ["1", pytest.param("2", marks=pytest.mark.slow)])
+    def test_quiet_prints_the_path_and_nothing_else(self, shot: Path, tmp_path: Path, workers: str) -> None:
+        out = tmp_path / "fine.usdc"
+        done = command("refine", shot, "-o", out, "--level", "1", "--workers", workers, "--quiet")
+        assert (done.returncode, done.stdout, done.stderr) == (3, f"{out}\n", "")
+        again = command("refine", shot, "-o", out, "--level", "1", "--quiet")
+        assert (again.returncode, again.stdout) == (2, "")
+        assert again.stderr.startswith(f"error: {out} exists")
+
+    def test_without_a_terminal_there_is_no_bar_and_stderr_has_the_warnings(self, shot: Path, tmp_path: Path) -> None:
+        done = command("refine", shot, "-o", tmp_path / "fine.usdc", "--level", "1")
+        assert done.stdout == f"{tmp_path / 'fine.usdc'}\n"
+        assert done.stderr.splitlines()
+        assert all(line.startswith("warning: ") for line in done.stderr.splitlines()), done.stderr
+
+    def test_json_is_a_summary_of_all_shots_by_its_schema(self, shot: Path, tmp_path: Path) -> None:
+        good = cloth_shot(tmp_path / "good.usda", times=(1.0,))
+        done = command("refine", shot, good, "-o", tmp_path / "out", "--level", "0", "--json", "--quiet")
+        plain = json.loads(done.stdout)
+        Draft202012Validator(json.loads(summary.SCHEMA.read_text("utf-8"))).validate(plain)
+        assert done.returncode == plain["exit_code"] == 3
+        assert [(row["state"], Path(row["layer"]).is_file()) for row in plain["shots"]] == [
+            ("in part", True),
+            ("done", True),
+        ]
+
+    def test_json_of_a_failed_shot_has_its_error(self, tmp_path: Path) -> None:
+        shot = cloth_shot(tmp_path / "torn.usda", times=(1.0,), broken={1.0: float("nan")})
+        done = command("refine", shot, "-o", tmp_path / "fine.usdc", "--level", "0", "--json")
+        (row,) = json.loads(done.stdout)["shots"]
+        assert (done.returncode, row["state"]) == (1, "failed")
+        assert done.stderr.splitlines()[-1] == f"error: {row['error']}"
+
+    @pytest.mark.parametrize("more", ["--verbose", "--progress", "--openjd"])
+    def test_quiet_excludes_what_prints_more(self, sample: Sample, tmp_path: Path, more: str) -> None:
+        result = run("refine", sample("swatch"), "-o", tmp_path / "fine.usdc", "--quiet", more)
+        assert (result.exit_code, f"--quiet and {more} exclude each other" in result.stderr) == (2, True)
+
+
 class TestSeveralShots:
     @pytest.fixture
     def jobs(self, monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, Path, Any]]:
@@ -199,12 +248,12 @@ class TestErrors:
         assert result.stderr == f"error: no such file: {tmp_path / 'missing.usda'}\n"
         assert not list(tmp_path.iterdir())
 
-    def test_missing_extra_is_named(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def test_missing_package_is_named(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
         monkeypatch.delitem(sys.modules, "physgraph_usd.shot.page.preview", raising=False)
         monkeypatch.setitem(sys.modules, "PIL", None)
         result = run("preview", "a.usdc", "-o", tmp_path / "x.png")
         assert result.exit_code == 1
-        assert "pip install 'physgraph-usd[preview]'" in result.stderr
+        assert "pip install pillow" in result.stderr
 
 
 class TestOtherCommands:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from itertools import pairwise
 
 import numpy as np
@@ -233,3 +235,24 @@ def test_sewn_vertices_move_together_and_the_solve_is_symmetric(level: int):
         assert torch.equal(move[9], move[3])
     work = [float((forces[:, n] * moves[1 - n]).sum()) for n in range(2)]
     assert abs(work[0] - work[1]) < 1e-9 * float((forces[:, 0] * moves[0]).sum())
+
+
+def test_a_factor_that_something_holds_to_the_end_of_the_process_is_freed_without_a_word():
+    """As the traceback of an error does that a host program keeps, or a thread in the midst of a frame."""
+    code = """
+import threading, time
+import scipy.sparse as sp, torch
+from physgraph_usd.solver.integrate.factors import Factors
+made = threading.Event()
+
+def hold():
+    solve = Factors(sp.csr_matrix(sp.identity(3)), dtype=torch.float64, device="cpu").of(torch.full((3,), 2.0).double())
+    solve(torch.ones(3, 1).double())
+    made.set()
+    time.sleep(1000)
+
+threading.Thread(target=hold, daemon=True).start()
+made.wait()
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=120)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")

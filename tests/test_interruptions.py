@@ -161,6 +161,26 @@ def test_a_polite_signal_keeps_finished_frames_and_says_so(
         finishes(shot, out, whole, "--resume", "--workers", "2", "--report", str(report))
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere workers are no forks of a server")
+def test_ctrl_c_while_the_workers_server_imports_is_one_line(shot: Path, tmp_path: Path):
+    """A terminal sends Ctrl-C to the server too."""
+    line = ("refine", shot, "-o", tmp_path / "fine.usdc", "--workers", "2")
+    with begun(*line, stderr=subprocess.PIPE, start_new_session=True) as process:
+        limit = time.monotonic() + PATIENCE_SECONDS
+        while not (children := _servers(process.pid)) and time.monotonic() < limit:
+            time.sleep(0.002)
+        time.sleep(0.1)  # In the midst of its imports, which take a second.
+        os.killpg(process.pid, signal.SIGINT)
+        error = process.communicate(timeout=PATIENCE_SECONDS)[1]
+    assert children
+    assert (process.returncode, error) == (130, "interrupted\n")
+
+
+def _servers(pid: int) -> list[psutil.Process]:
+    """Servers of workers that a process has started."""
+    return [child for child in psutil.Process(pid).children() if any("forkserver" in word for word in child.cmdline())]
+
+
 @pytest.mark.slow
 def test_every_signal_at_any_moment_of_any_command_ends_it():
     """Must hold 4 in brief; all of it is the program itself."""

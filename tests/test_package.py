@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import re
+import shutil
 import subprocess
 import sys
+import tarfile
+import tomllib
 import zipfile
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
 
 import physgraph_usd
 
@@ -56,10 +60,26 @@ def test_public_names_are_there_and_an_unknown_one_lists_them() -> None:
         _ = physgraph_usd.refine
 
 
-def test_wheel_carries_schemas_weights_and_licence(tmp_path: Path) -> None:
-    subprocess.run([sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", tmp_path], check=True, cwd=ROOT)
-    (wheel,) = tmp_path.glob("*.whl")
-    names = zipfile.ZipFile(wheel).namelist()
+def _build(folder: Path, into: Path) -> None:
+    subprocess.run([sys.executable, "-m", "hatchling", "build", "-d", into], check=True, cwd=folder)
+
+
+def _names(wheel: Path) -> list[str]:
+    return sorted(zipfile.ZipFile(wheel).namelist())
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """The wheel and the source distribution."""
+    folder = tmp_path_factory.mktemp("built")
+    _build(ROOT, folder)
+    (wheel,), (source,) = folder.glob("*.whl"), folder.glob("*.tar.gz")
+    return wheel, source
+
+
+def test_wheel_carries_schemas_weights_and_licence(built: tuple[Path, Path]) -> None:
+    wheel, _ = built
+    names = _names(wheel)
     assert wheel.name.startswith(f"physgraph_usd-{physgraph_usd.__version__}-py3-none-any")
     data = ("schemas/plugInfo.json", "schemas/generatedSchema.usda", "weights/README.md", "shot/report.schema.json")
     for name in (*data, "cli/refine.py"):
@@ -69,6 +89,51 @@ def test_wheel_carries_schemas_weights_and_licence(tmp_path: Path) -> None:
     metadata = zipfile.ZipFile(wheel).read(next(name for name in names if name.endswith("METADATA"))).decode()
     assert "A coarse animated garment" in metadata
     assert not re.findall(r"\]\((?!https?:)", metadata), "links and pictures that lead nowhere on a package index"
+
+
+def test_the_source_distribution_and_an_images_files_make_the_same_wheel(
+    built: tuple[Path, Path], tmp_path: Path
+) -> None:
+    """What `.dockerignore` lets through is enough to build the wheel."""
+    wheel, source = built
+    with tarfile.open(source) as file:
+        file.extractall(tmp_path / "source", filter="data")
+    (unpacked,) = (tmp_path / "source").iterdir()
+    let_through = re.findall(r"^!(.+)$", (ROOT / ".dockerignore").read_text(encoding="utf-8"), re.MULTILINE)
+    context = tmp_path / "context"
+    for name in let_through:
+        copy = shutil.copytree if (ROOT / name).is_dir() else shutil.copy
+        context.mkdir(exist_ok=True)
+        copy(ROOT / name, context / name)
+    for number, folder in enumerate((unpacked, context)):
+        _build(folder, tmp_path / str(number))
+        (again,) = (tmp_path / str(number)).glob("*.whl")
+        assert _names(again) == _names(wheel)
+
+
+def test_package_indexes_take_the_distributions(built: tuple[Path, Path]) -> None:
+    pytest.importorskip("twine", reason="needs twine, which checks what package indexes ask for")
+    done = subprocess.run(
+        [sys.executable, "-m", "twine", "check", "--strict", *built], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert done.stdout.count("PASSED") == 2
+
+
+def test_constraints_are_one_version_of_each_requirement_within_its_bounds() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    extras = project["optional-dependencies"]
+    lines = [
+        *project["dependencies"],
+        *(line for name in ("usd", "preview", "chart", "farm", "tune") for line in extras[name]),
+    ]
+    wanted = {requirement.name: requirement for requirement in map(Requirement, lines)}
+    text = (ROOT / "constraints.txt").read_text(encoding="utf-8")
+    pins = dict(re.findall(r"^([\w-]+)==(\S+)$", text, re.MULTILINE))
+    assert pins.keys() == wanted.keys() | {"dask"}
+    assert all(requirement.specifier.contains(pins[name]) for name, requirement in wanted.items())
+    for name in ("torch", "warp-lang", "usd-core"):
+        assert any(each.operator == "<" for each in wanted[name].specifier)
 
 
 def test_contributing_names_each_module_and_none_that_is_not_there() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -325,6 +325,26 @@ def test_a_root_shows_one_layer_over_the_shot_too_and_replaces_no_file(runs: Run
     assert points_in(shown, CLOTH, TIMES[-1]) == points_in(asked, CLOTH, TIMES[-1])
 
 
+def test_a_refused_seam_is_mended_by_the_chunk_and_the_preroll_that_the_error_names(
+    sample: Callable[[str], Path], tmp_path: Path
+):
+    """Only that chunk is refined anew; the seam then holds with a third of the bound to spare."""
+    shot = sample("swatch")
+    first, second = refine_chunks(shot, tmp_path, [(1.0, 12.0), (13.0, 24.0)], steps=12)
+    with pytest.raises(LayerError, match="refine the chunk from 13 on with --preroll ") as refused:
+        check_seams([first, second])
+    preroll = int(str(refused.value).partition("--preroll ")[2].partition(",")[0])
+    shutil.rmtree(second)
+    assert preroll > 6
+    assert refine(shot, second, frames=(13.0, 24.0), preroll=preroll, steps=12).exit_code == 0
+    (seam,) = check_seams([first, second])
+    assert seam.rms < 2 / 3 * SEAM_BOUND
+    report, _ = stitch([first, second], tmp_path / "joined.usdc")
+    assert report.exit_code == 0
+    assert record_of(tmp_path / "joined.usdc")["options"]["preroll"] == preroll
+    assert faults(tmp_path / "joined.usdc", shot) == []
+
+
 class TestSeamsBeforeAllIsThere:
     """The first two chunks of a job tell how far a seam moves."""
 
@@ -335,7 +355,9 @@ class TestSeamsBeforeAllIsThere:
         assert seam == whole
         line = ["stitch", *runs.chunks[:2], "--check-seams", "--seam-bound", 0.2 * seam.rms]
         done = run(*line)
-        assert (done.exit_code, "is allowed: refine with --preroll" in done.stderr) == (1, True), done.stderr
+        assert (done.exit_code, "is allowed: refine the chunk from 9 on with --preroll" in done.stderr) == (1, True), (
+            done.stderr
+        )
         assert sorted(runs.chunks[0].parent.iterdir()) == there
 
     def test_a_chunk_is_measured_beside_those_of_its_folder(self, runs: Runs, tmp_path: Path):

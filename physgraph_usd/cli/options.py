@@ -107,6 +107,8 @@ run_options = together(
     _farm("--openjd", is_flag=True, help="Print progress in the lines that OpenJD reads."),
     config_option,
     _messages("--progress", is_flag=True, help="Print each frame in a line of its own, into files and pipes too."),
+    _messages("-q", "--quiet", is_flag=True, help="Print errors alone on stderr."),
+    _messages("--json", "as_json", is_flag=True, help="Print the shots' summary as JSON on stdout, not the paths."),
     _messages(
         "-v",
         "--verbose",

@@ -36,6 +36,8 @@ class Output:
         in_lines: Print progress in lines, into files and pipes too.
         several: Name the shot in each line.
         openjd: Print progress in the lines that OpenJD reads.
+        quiet: Print errors alone on stderr.
+        as_json: Print one summary of all shots as JSON on stdout, in place of the layers' paths.
     """
 
     verbose: int = 0
@@ -43,6 +45,14 @@ class Output:
     in_lines: bool = False
     several: bool = False
     openjd: bool = False
+    quiet: bool = False
+    as_json: bool = False
+
+    def __post_init__(self) -> None:
+        """Refuse (UsageError) to print more and less at once."""
+        more = {"--verbose": self.verbose > 0, "--progress": self.in_lines, "--openjd": self.openjd}
+        if self.quiet and any(more.values()):
+            raise UsageError(f"--quiet and {next(name for name in more if more[name])} exclude each other; give one")
 
     @contextmanager
     def logged(self) -> Iterator[None]:
@@ -54,7 +64,8 @@ class Output:
         """
         from ..usd.write.atomic import check_no_link
 
-        logger, on_stderr = logging.getLogger(LOGGER), _OnStderr(_LEVELS[min(self.verbose, 2)], self.several)
+        level = logging.ERROR if self.quiet else _LEVELS[min(self.verbose, 2)]
+        logger, on_stderr = logging.getLogger(LOGGER), _OnStderr(level, self.several)
         handlers: list[logging.Handler] = [on_stderr]
         if self.log_file is not None:
             check_no_link(self.log_file)
@@ -84,7 +95,7 @@ class Output:
     @contextmanager
     def progress(self, label: str) -> Iterator[Callable[[int, int], None]]:
         """A bar of finished frames, on a terminal alone, or lines of them."""
-        hidden = self.in_lines or self.openjd or self.verbose > 0 or not sys.stderr.isatty()
+        hidden = self.quiet or self.in_lines or self.openjd or self.verbose > 0 or not sys.stderr.isatty()
         with click.progressbar(length=1, label=label, file=sys.stderr, hidden=hidden) as bar:
 
             def show(done: int, total: int) -> None:

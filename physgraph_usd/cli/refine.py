@@ -41,7 +41,7 @@ RENAMED = {"run-up": "preroll"}
 def refine(
     ctx: click.Context, shots: tuple[str, ...], out: Path, *, summary: Path | None, dry_run: bool, **options: object
 ) -> None:
-    """Refine the garments of each SHOT into a layer of its own and print the layers' paths.
+    """Refine the garments of each SHOT into a layer of its own and print only the layers' paths on stdout.
 
     Several shots are refined one beside the other, and one that fails leaves the others alone. A table of them all
     comes last, on stderr. Exits with 0 when all is done, 1 when all failed, 2 for wrong usage, 3 when a part failed.
@@ -53,18 +53,19 @@ def refine(
         jobs = _jobs(ctx, shots, out)
         layers = [layer for _, layer, _ in jobs]
         verbose, log_file, in_lines = (ctx.params[name] for name in ("verbose", "log_file", "progress"))
-        output = Output(verbose, log_file, in_lines, several=len(jobs) > 1, openjd=ctx.params["openjd"])
+        flags = {name: ctx.params[name] for name in ("openjd", "quiet", "as_json")}
+        output = Output(verbose, log_file, in_lines, several=len(jobs) > 1, **flags)
         also = [(what, file) for what, file in (("the summary", summary), ("the log", log_file)) if file is not None]
         if also:
             check_jobs(jobs, also=also)
         with _folder_of(layers, out, dry_run=dry_run), output.logged():
             code = _refine_each(jobs, output, summary=None if dry_run else summary)
             if not dry_run:
-                _check_seams(layers, ctx.params["seam_bound"], openjd=output.openjd)
+                _check_seams(layers, ctx.params["seam_bound"], output)
     sys.exit(code)
 
 
-def _check_seams(layers: Sequence[Path], bound: float | None, *, openjd: bool) -> None:
+def _check_seams(layers: Sequence[Path], bound: float | None, output: Output) -> None:
     """Print how far seams between neighbouring chunks move; exit with an error beyond the bound."""
     if bound is None:
         return
@@ -72,7 +73,8 @@ def _check_seams(layers: Sequence[Path], bound: float | None, *, openjd: bool) -
 
     for layer in filter(Path.exists, layers):
         for seam in check_seams([layer.parent], of=layer, seam_bound=bound):
-            say(f"{'openjd_status: ' if openjd else ''}{seam}", err=True)
+            if not output.quiet:
+                say(f"{'openjd_status: ' if output.openjd else ''}{seam}", err=True)
 
 
 def _jobs(ctx: click.Context, shots: tuple[str, ...], out: Path) -> list[Job]:
@@ -121,8 +123,10 @@ def _refine_each(jobs: Sequence[Job], output: Output, *, summary: Path | None) -
                     failed.append(done)
                     if output.several:
                         show_trace(done)
-                else:
-                    say(done.to_json() if done.out is None else str(done.out))
+                elif done.out is None:
+                    say(done.to_json())
+                elif not output.as_json:
+                    say(str(done.out))
     except (KeyboardInterrupt, SystemExit) as error:
         interrupted(signal_code_of(error) or FAILED)
         raise
@@ -135,9 +139,11 @@ def _refine_each(jobs: Sequence[Job], output: Output, *, summary: Path | None) -
 
 def _summarise(rows: Sequence[Row], output: Output, summary: Path | None, *, exit_code: int) -> None:
     """Print and write what became of all shots."""
-    from ..shot.summary import table_of, write_summary
+    from ..shot.summary import json_of, table_of, write_summary
 
-    if output.several:
+    if output.as_json:
+        say(json_of(rows, exit_code=exit_code))
+    if output.several and not output.quiet:
         say("\n".join(table_of(rows)), err=True)
     if summary is not None:
         write_summary(summary, rows, exit_code=exit_code)

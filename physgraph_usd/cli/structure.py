@@ -17,8 +17,14 @@ from ..errors import PhysGraphError, UnexpectedError, exceptions_named
 from ..interrupts import SIGNALLED, importing
 
 DONE, FAILED = 0, 1
-EXTRAS = {"pxr": "usd", "PIL": "preview", "matplotlib": "chart", "plotly": "chart", "viser": "tune"}
-"""Which extra brings a module that only some commands need."""
+PACKAGES = {
+    "pxr": "'usd-core<27'",
+    "PIL": "pillow",
+    "matplotlib": "matplotlib",
+    "plotly": "plotly",
+    "viser": "'viser<2'",
+}
+"""Which package of the extras brings a module that only some commands need."""
 
 
 DEBUG = "physgraph_usd.debug"
@@ -34,13 +40,11 @@ class Commands(click.Group):
         try:
             with errors_named():
                 return super().invoke(ctx)
-        except KeyboardInterrupt as error:
-            _let_go(error)
+        except KeyboardInterrupt:
             click.echo("interrupted", err=True)
             ctx.exit(SIGNALLED + signal.SIGINT)
         except PhysGraphError as error:
             show_trace(error)
-            _let_go(error)
             _leave(ctx, str(error), error.exit_code)
 
     def add_command(self, cmd: click.Command, name: str | None = None) -> None:
@@ -78,17 +82,9 @@ def errors_named() -> Iterator[None]:
             yield
         except ModuleNotFoundError as error:
             missing = (error.name or "").partition(".")[0]
-            if missing not in EXTRAS:
+            if missing not in PACKAGES:
                 raise
-            install = f"{missing} is not installed: pip install 'physgraph-usd[{EXTRAS[missing]}]'"
-            raise PhysGraphError(install) from error
-
-
-def _let_go(error: BaseException | None) -> None:
-    """Free what the frames of tracebacks hold: nanobind complains on stderr of factors that live to the very end."""
-    while error is not None:
-        traceback.clear_frames(error.__traceback__)
-        error = error.__cause__ or error.__context__
+            raise PhysGraphError(f"{missing} is not installed: pip install {PACKAGES[missing]}") from error
 
 
 def show_trace(error: PhysGraphError) -> None:

@@ -75,7 +75,7 @@ def _distributed() -> Any:
     try:
         return import_module("distributed")
     except ModuleNotFoundError as error:
-        raise UsageError("--scheduler needs Dask: pip install 'physgraph-usd[farm]'") from error
+        raise UsageError("--scheduler needs Dask: pip install distributed") from error
 
 
 def _code() -> str:

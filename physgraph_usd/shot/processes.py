@@ -43,19 +43,25 @@ def cores() -> int:
 
 def import_ahead() -> None:
     """Start the server process of `_context`, which imports the solver meanwhile; nothing except on Linux."""
-    if _context().get_start_method() == "forkserver":
-        importlib.import_module("multiprocessing.forkserver").ensure_running()
+    _context()
 
 
 def _context() -> BaseContext:
     """Start method of processes: on Linux, fork of a server process that has imported the solver; else a new process.
 
-    The libraries of macOS may crash in a forked process.
+    The libraries of macOS may crash in a forked process. Ctrl-C in a terminal reaches the server too, which would print
+    a traceback of its imports; the server inherits the blocked signal.
     """
     if sys.platform != "linux":
         return multiprocessing.get_context("spawn")
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload([_PRELOAD])
+    importlib.import_module("multiprocessing.resource_tracker").ensure_running()  # Would unblock the signal.
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        importlib.import_module("multiprocessing.forkserver").ensure_running()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
     return context
 
 

@@ -32,7 +32,9 @@ from .solve import ShotSolver, open_for
 
 SEAM_BOUND = 0.05
 """Largest increase of a frame's move by a seam, RMS over a garment, in mean fine edges; figures in `docs/farm.md`."""
-_OF_ONE_CHUNK = ("frames",)
+SPARE = 1 / 3
+"""Fraction of the bound that a proposed pre-roll leaves: a longer one settles in other folds, nearer or farther."""
+_OF_ONE_CHUNK = ("frames", "preroll")
 """Options allowed to differ between chunks of one shot."""
 
 
@@ -157,9 +159,10 @@ class _Joins:
         """Refuse a seam with too large a move, or an unmeasured seam although frames depend on their predecessors."""
         worst = max(self.seams, key=lambda seam: seam.rms, default=None)
         if worst is not None and worst.rms > self.bound:
-            count = ceil(worst.rms * (worst.frames + 1) / self.bound) if self.bound > 0 else 0
-            longer = f"--preroll {count}" if count else "a longer --preroll"
-            remedy = f"refine with {longer} or with --temporal off, or allow more by --seam-bound"
+            allowed = (1 - SPARE) * self.bound
+            longer = f"--preroll {ceil(worst.rms * (worst.frames + 1) / allowed)}" if allowed else "a longer --preroll"
+            again = f"refine the chunk from {named_time(worst.after)} on with {longer}"
+            remedy = f"{again}, or all with --temporal off, or allow more by --seam-bound"
             raise LayerError(f"{worst}; at most {self.bound:g} RMS is allowed: {remedy}")
         known = {seam.after for seam in self.seams}
         alone = self.run["options"].get("temporal") == "off" or not np.isfinite(self.bound)
@@ -216,6 +219,7 @@ def stitch(
         _check_same_shot(parts[0], made_from(opened, out, options))
         recorded = {name: value for name, value in parts[0].run["options"].items() if name not in _OF_ONE_CHUNK}
         recorded |= {"frames": list(frames)} if frames else {}
+        recorded["preroll"] = max(part.run["options"].get("preroll", 0) for part in parts)
         report.options = dict(recorded)
         joins = _Joins(parts, opened, seam_bound, report.warn)
         record = {"options": recorded, "chunks": [_span(part.times) for part in parts]}

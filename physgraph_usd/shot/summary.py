@@ -81,6 +81,17 @@ def exit_code_of(rows: Sequence[Row]) -> int:
     return FAILED if all(row.state == "failed" for row in rows) else IN_PART
 
 
+def json_of(rows: Sequence[Row], *, exit_code: int) -> str:
+    """Rows as JSON that follows `SCHEMA`.
+
+    Args:
+        rows: A row per shot.
+        exit_code: The exit code of the batch.
+    """
+    plain: dict[str, Any] = {"format": FORMAT, "version": __version__, "exit_code": exit_code}
+    return to_json(plain | {"shots": [asdict(row) for row in rows]})
+
+
 def write_summary(path: Path, rows: Sequence[Row], *, exit_code: int) -> None:
     """Write rows as JSON, whole or not at all.
 
@@ -91,8 +102,7 @@ def write_summary(path: Path, rows: Sequence[Row], *, exit_code: int) -> None:
     Raises:
         LayerError: The file cannot be written.
     """
-    plain: dict[str, Any] = {"format": FORMAT, "version": __version__, "exit_code": exit_code}
-    write_text(path, to_json(plain | {"shots": [asdict(row) for row in rows]}) + "\n")
+    write_text(path, json_of(rows, exit_code=exit_code) + "\n")
 
 
 def check_summary(path: Path, *, overwrite: bool) -> None:

@@ -110,8 +110,8 @@ WARNINGS = {
     ),
     "strained": Kind(
         "in most frames the cage has not its rest shape's size",
-        "`--rest auto`, or `primvars:rest` in the cloth's own size: refined cloth goes to its rest shape's size",
-        "in most frames the cage has not its rest shape's size, to which refined cloth goes: {parts}",
+        "`--rest auto`, or `primvars:rest` in the cloth's own size: refined cloth takes the rest shape's size",
+        "in most frames the cage has not its rest shape's size, which refined cloth takes: {parts}",
         "give --rest auto, or author primvars:rest in the cloth's own size",
         {"rest_frame": "auto"},
     ),

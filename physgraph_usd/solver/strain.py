@@ -1,6 +1,6 @@
 """Which parts of a garment the animation holds at another size than the rest shape's.
 
-Where the rest shape is not the cloth's, refined cloth goes back to its size: a puffed sleeve deflates. Cloth that is
+Where the rest shape is not the cloth's, refined cloth returns to the rest shape's size: a puffed sleeve deflates. Cloth
 pushed together in most frames is reported only, since folding it is what refining is for; the opposite gets a warning.
 """
 

@@ -1,7 +1,7 @@
 """Rez package: `rez-build --install` here, from a checkout; `rez-env physgraph_usd -- physgraph-usd --help`."""
 
 name = "physgraph_usd"
-version = "0.1.0"
+version = "0.2.0"
 description = "Refine coarse animated garments in USD shots into fine cloth with physical wrinkles"
 requires = ["python-3.11+<3.15"]
 tools = ["physgraph-usd"]

@@ -118,7 +118,7 @@ def _pictures(report: RefineReport, shot: Shot) -> str:
     """A close picture of the worst place or the best fold, and coarse beside fine at a few time codes."""
     title = "<h2>Before and after</h2>"
     if find_spec("PIL") is None:
-        return f"{title}<p class='note'>No pictures: PIL is missing; pip install 'physgraph-usd[preview]'</p>"
+        return f"{title}<p class='note'>No pictures: PIL is missing; pip install pillow</p>"
     kind = importlib.import_module(".preview", __package__).Pictures  # Needs an optional extra.
     written = [frame["time"] for frame in report.frames if "garments" in frame]
     times = [written[0], written[-1]][: len(written)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from typing import Any
 
 import numpy as np
@@ -62,13 +63,15 @@ class Factors:
 
 def _of_cholespy(module: Any, values: Tensor, rows: Tensor, columns: Tensor, dtype: torch.dtype) -> Solver:
     kind = module.CholeskySolverD if dtype == torch.float64 else module.CholeskySolverF
-    solver = kind(int(rows.max()) + 1, rows, columns, values, module.MatrixType.COO)
+    factor = [kind(int(rows.max()) + 1, rows, columns, values, module.MatrixType.COO)]
 
     def solve(force: Tensor) -> Tensor:
         out = torch.empty_like(force)
-        solver.solve(force.contiguous(), out)
+        factor[0].solve(force.contiguous(), out)
         return out
 
+    # Also at the end of the process: cholespy complains on stderr of factors that a traceback or a thread still holds.
+    weakref.finalize(solve, factor.clear)
     return solve
 
 
