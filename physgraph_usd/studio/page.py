@@ -14,6 +14,7 @@ import numpy as np
 
 from ..errors import LayerError, PhysGraphError
 from ..interrupts import leave_if_asked
+from .camera import Camera
 from .desk import Desk, in_order, put, small
 from .guard import guarded_server
 from .loop import SolveLoop
@@ -52,7 +53,11 @@ class TunePage:
         self._server, self.url = guarded_server(port=port, label="physgraph-usd tune")
         self.loop, picture = SolveLoop(session, self), Picture(self._server, session)
         self._desk = Desk(self._server.gui, session, loop=self.loop, picture=picture, notes=notes)
-        self._look_as(notes.looked)
+        if notes.looked.get("garment") in session.garments:
+            self._desk.garment = notes.looked["garment"]
+        if notes.looked.get("time") in session.times:
+            session.set_time(notes.looked["time"])
+        self._camera = Camera(self._server, picture, notes.looked.get("camera"))
         self._build()
         self.loop.start()
 
@@ -60,7 +65,7 @@ class TunePage:
         """End the thread and the server, and write the notes."""
         self.loop.close()
         tried = {path: dict(values) for path, values in self._session.setting.values.items()}
-        looked = {"time": self._session.time, "garment": self._desk.garment, "camera": self._camera}
+        looked = {"time": self._session.time, "garment": self._desk.garment, "camera": self._camera.last}
         with suppress(LayerError):  # A folder that cannot be written to; saving the layer has said so.
             self._desk.notes.save(looked | {"view": self._view.looked, "values": tried})
         with redirect_stdout(io.StringIO()):  # The viewer's own words.
@@ -87,6 +92,8 @@ class TunePage:
         put(self._command, content=f"<code>{small(session.command)}</code>")
         words = "playing" if self.loop.playing else "settled: as refine solves it" if shown.settled else "on its way"
         self._state.content = _badge(words, SETTLED if shown.settled else MOVING)
+        if shown.settled and not self.loop.playing:
+            self._desk.picture.shade(self.loop.is_wanted)
 
     def solved(self) -> None:
         """Update the strip of frames, or draw A."""
@@ -98,30 +105,6 @@ class TunePage:
     def fail(self, error: PhysGraphError) -> None:
         """Write an error."""
         self._state.content = _badge(str(error), WRONG)
-
-    def _look_as(self, looked: Mapping[str, Any]) -> None:
-        """Restore garment, frame and camera of the last session."""
-        session = self._session
-        if looked.get("garment") in session.garments:
-            self._desk.garment = looked["garment"]
-        if looked.get("time") in session.times:
-            session.set_time(looked["time"])
-        self._camera: dict[str, list[float]] | None = looked.get("camera")
-        self._server.on_client_connect(in_order(self._welcome))
-
-    def _welcome(self, client: Any) -> None:
-        """Set the camera of a browser that connects, between two of its messages.
-
-        A message in between would undo a part on viser's side, and viser sends no part that it takes for known.
-        """
-        if self._camera:
-            for name, value in self._camera.items():
-                setattr(client.camera, name, value)
-        client.camera.on_update(in_order(self._look_from))
-
-    def _look_from(self, camera: Any) -> None:
-        found = {name: getattr(camera, name) for name in ("position", "look_at", "up_direction")}
-        self._camera = {name: [float(each) for each in value] for name, value in found.items()}
 
     def _build(self) -> None:
         gui, desk = self._server.gui, self._desk
@@ -138,9 +121,9 @@ class TunePage:
         with tabs.add_tab("Values"):
             self._values = ValuePanel(desk)
         with tabs.add_tab("Picture"):
-            self._view = ViewPanel(desk)
+            self._view = ViewPanel(desk, self._camera)
         with tabs.add_tab("Paint"):
-            self._paint = PaintPanel(desk, self._view)
+            self._paint = PaintPanel(desk, self._view, self._camera)
         with tabs.add_tab("Figures"):
             self._figures = gui.add_html("")
             self._command = gui.add_html("")
