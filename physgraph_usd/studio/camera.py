@@ -18,6 +18,8 @@ ROOM = 0.92
 """Part of the picture that framed garments fill, in the direction in which they are larger."""
 ASPECT = 1.17
 """Width of the picture in heights, until the browser has told it."""
+ABOVE = 0.18
+"""Height of the first camera above the garments' middle, in its distance: the ground is seen."""
 DOUBLE_SECONDS = 0.4
 """Longest time between the two clicks of a double click."""
 
@@ -33,8 +35,9 @@ class Camera:
         """Look as ``last``, or at the garments; F and double clicks frame them."""
         self.last = None if last is None else dict(last)
         self._server, self._picture, self._clicked = server, picture, 0.0
-        right, up, front = picture.axes
-        position, middle = self.fit(front + 0.12 * up, ASPECT)
+        _, up, front = picture.axes
+        self._back = front + ABOVE * up
+        position, middle = self.fit(self._back, ASPECT)
         server.scene.set_up_direction(tuple(up.tolist()))
         initial = server.initial_camera
         initial.position, initial.look_at, initial.fov = position, middle, FIELD
@@ -82,14 +85,13 @@ class Camera:
         at = middle @ np.stack([right, np.cross(back, right), back])
         return at + float(reach.max()) * back, at
 
-    def _frame(self, client: Any) -> None:
+    def _frame(self, client: Any, back: np.ndarray | None = None) -> None:
+        """Frame the garments, seen from where the camera is, or from a direction."""
         camera = client.camera
-        back = np.asarray(camera.position) - np.asarray(camera.look_at)
-        self._look(client, *self.fit(back, camera.image_width / max(camera.image_height, 1)))
-
-    def _look(self, client: Any, position: Any, look_at: Any) -> None:
+        back = np.asarray(camera.position) - np.asarray(camera.look_at) if back is None else back
+        position, middle = self.fit(back, camera.image_width / max(camera.image_height, 1))
         with client.atomic():
-            client.camera.position, client.camera.look_at = position, look_at
+            camera.position, camera.look_at = position, middle
 
     def _welcome(self, client: Any) -> None:
         """Set the camera of a browser that connects, between two of its messages.
@@ -99,8 +101,8 @@ class Camera:
         if self.last:
             for name, value in self.last.items():
                 setattr(client.camera, name, value)
-        else:
-            self._frame(client)
+        else:  # The browser tells its own camera before it has ours.
+            self._frame(client, self._back)
         client.camera.on_update(in_order(self._seen))
 
     def _seen(self, camera: Any) -> None:
