@@ -15,6 +15,8 @@ from .session import Shown, TuneSession
 REST_SECONDS = 0.1
 """How long nothing must be asked before the frame is solved as ``refine`` does."""
 
+SOLVING = "solving"
+
 Change = Callable[[TuneSession], None]
 """A change asked of a session."""
 
@@ -117,7 +119,7 @@ class SolveLoop:
 
     def _solve(self) -> float:
         """Solve the frame roughly; returns the time to wait for a change [s]."""
-        self._watcher.busy("solving")
+        self._watcher.busy(SOLVING)
         rounds = list[None]()
 
         def seen(points: Mapping[str, np.ndarray]) -> None:

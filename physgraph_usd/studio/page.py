@@ -7,7 +7,7 @@ import io
 from collections.abc import Callable, Mapping
 from contextlib import redirect_stdout, suppress
 from pathlib import Path
-from time import sleep
+from time import perf_counter, sleep
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from ..interrupts import leave_if_asked
 from .camera import Camera
 from .desk import Desk, in_order, put, small
 from .guard import guarded_server
-from .loop import SolveLoop
+from .loop import SOLVING, SolveLoop
 from .notes import Notes
 from .paint_panel import PaintPanel
 from .picture import Picture
@@ -29,6 +29,12 @@ from .view_panel import ViewPanel
 
 WORKING, MOVING, SETTLED, WRONG = "#b45f06", "#5b6470", "#1a7f37", "#c0392b"
 """Colours of the page's state."""
+FIRST = "the first cloth is being solved, as refine does; this is the cage …"
+WAITS = "first cloth", "settled"
+CROSSINGS = "Crossings of cloth, before and after"
+BESIDE = ("Vertices", "Strain, 99th percentile", CROSSINGS)
+"""Figures that are always seen."""
+STICKY = "<style>div:has(> #state) {position: sticky; top: 0; z-index: 9; background: white}</style>"
 UNDO, REDO = "Undo", "Redo"
 POLL_SECONDS = 0.1
 """How often the main thread asks whether a signal came."""
@@ -58,7 +64,11 @@ class TunePage:
         if notes.looked.get("time") in session.times:
             session.set_time(notes.looked["time"])
         self._camera = Camera(self._server, picture, notes.looked.get("camera"))
+        self._clock, self._waits, self._lines = perf_counter(), ["", ""], dict[str, str]()
         self._build()
+        frame = session.shot.frame(session.time)
+        picture.draw(Shown(frame, (None,) * len(session.garments), (), 0.0, False))
+        self._say(FIRST, WORKING)
         self.loop.start()
 
     def close(self) -> None:
@@ -73,25 +83,32 @@ class TunePage:
 
     def busy(self, what: str) -> None:
         """Say that work has begun."""
-        self._state.content = _badge(f"{what} …", WORKING)
+        if what == SOLVING:
+            self._clock, self._waits = perf_counter(), ["", ""]
+        self._say(f"{what} …" if self._lines else FIRST, WORKING)
 
     def seen(self, points: Mapping[str, np.ndarray]) -> None:
         """Draw garments that are not settled."""
         self._desk.picture.move(points)
+        self._note_wait(0)
 
     def show(self, shown: Shown) -> None:
         """Draw a solved frame and write its figures and values."""
         session = self._session
         self._desk.picture.draw(shown, kept=session.kept_shown)
         self._paint.attach()
-        put(self._figures, content=_table(figures(shown, self._desk.index)))
+        self._lines = figures(shown, self._desk.index)
+        put(self._figures, content=_table(self._lines))
         self._values.update()
         self._view.update()
         self._time.update()
         self._write_history()
         put(self._command, content=f"<code>{small(session.command)}</code>")
         words = "playing" if self.loop.playing else "settled: as refine solves it" if shown.settled else "on its way"
-        self._state.content = _badge(words, SETTLED if shown.settled else MOVING)
+        self._note_wait(0)
+        if shown.settled:
+            self._note_wait(1)
+        self._say(words, SETTLED if shown.settled else MOVING)
         if shown.settled and not self.loop.playing:
             self._desk.picture.shade(self.loop.is_wanted)
 
@@ -104,14 +121,24 @@ class TunePage:
 
     def fail(self, error: PhysGraphError) -> None:
         """Write an error."""
-        self._state.content = _badge(str(error), WRONG)
+        self._say(str(error), WRONG)
+
+    def _note_wait(self, which: int) -> None:
+        """Note the time of the first cloth, 0, or of the settled cloth, 1, after a change."""
+        self._waits[which] = self._waits[which] or f"{perf_counter() - self._clock:.1f} s"
+
+    def _say(self, words: str, color: str) -> None:
+        """Write the state, and the figures that stay beside the sliders while these are scrolled."""
+        waits = [f"{name} {wait}" for name, wait in zip(WAITS, self._waits, strict=True) if wait]
+        lines = [f"{name.partition(',')[0].lower()} {text}" for name, text in self._lines.items() if name in BESIDE]
+        put(self._state, content=STICKY + _badge(words, color) + small("; ".join(waits + lines), "waits"))
 
     def _build(self) -> None:
         gui, desk = self._server.gui, self._desk
         gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
         gui.main_panel.dock_right()
         gui.set_panel_label(f"Tune {Path(self._session.shot.path).name}")
-        self._state = gui.add_html(_badge("opening …", WORKING))
+        self._state = gui.add_html("")
         self._build_history()
         if len(self._session.garments) > 1:
             choice = gui.add_dropdown("Garment", self._session.garments, initial_value=desk.garment)
@@ -179,7 +206,7 @@ def figures(shown: Shown, index: int) -> dict[str, str]:
         lines["Strain, 99th percentile"] = f"{100.0 * entry['strain']['p99']:.2g} %"
     contact = entry.get("contact", {})
     if "cloth" in contact:
-        lines["Crossings of cloth, before and after"] = _both(contact["cloth"], "crossings")
+        lines[CROSSINGS] = _both(contact["cloth"], "crossings")
     if "bodies" in contact:
         for path, body in contact["bodies"].items():
             lines[f"Inside {path.rpartition('/')[2]}, before and after"] = _both(body, "inside")

@@ -133,10 +133,11 @@ class Picture:
         return {k: self._skins.meshes[name] for k, name in names.items() if name in self._skins.meshes}
 
     def draw(self, shown: Shown, *, kept: Shown | None = None) -> None:
-        """Draw a frame; ``kept`` is A's."""
+        """Draw a frame, or its cages where it has no refined cloth yet; ``kept`` is A's."""
         with self._server.atomic():  # Pictures between two states are never drawn.
             self.bar = None
-            columns, garments = self.view.columns, range(len(shown.points))
+            garments = range(len(shown.points))
+            columns = self.view.columns if any(each is not None for each in shown.points) else (CAGE,)
             self._skins.touched = [f"{FINE}/{index}" for index in garments] if self.paintable else []
             self._columns, lines = [], set[str]()
             for place, column in enumerate(columns):
