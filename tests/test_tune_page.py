@@ -24,6 +24,7 @@ from stages import add_subset
 
 from physgraph_usd.studio.page import TunePage
 from physgraph_usd.studio.session import TuneSession
+from physgraph_usd.studio.value_panel import CHANGED
 from physgraph_usd.studio.values import TUNABLES
 from physgraph_usd.usd.read.reader import open_shot
 
@@ -79,7 +80,7 @@ class Artist:
 
     def number(self, title: str) -> Any:
         """The input box behind a label."""
-        found = f"xpath=//label[normalize-space()='{title}']/following::input[not(@type='hidden')][1]"
+        found = f"xpath=//label[normalize-space(translate(., '{CHANGED}', ''))='{title}']/following::input[not(@type='hidden')][1]"
         return self.page.locator(found)
 
     def shows(self, title: str, value: float | None) -> bool:
@@ -169,8 +170,6 @@ def test_presets_camera_and_frame_outlive_a_restart(shot: Path):
         artist.settle("Bending Stiffness")
         artist.type("Name", "stiff")
         artist.page.get_by_role("button", name="Keep as preset").click()
-        artist.tab("Picture")
-        artist.choose("Show", "refined")
         straight = artist.picture()
         mouse = artist.page.mouse
         mouse.move(*EMPTY)
@@ -200,8 +199,9 @@ def test_presets_camera_and_frame_outlive_a_restart(shot: Path):
 @pytest.mark.slow
 def test_the_picture_wipes_maps_wires_and_compares(shot: Path):
     with tuned(shot) as (session, artist):
-        side_by_side = artist.picture()
         artist.tab("Picture")
+        artist.choose("Show", "cage | refined")
+        side_by_side = artist.picture()
         artist.number("Wipe").click()
         wiped = artist.picture(lambda now: np.abs(now - side_by_side).mean() > 1.0)
         artist.press("g")
@@ -227,8 +227,6 @@ def test_the_picture_wipes_maps_wires_and_compares(shot: Path):
 @pytest.mark.slow
 def test_a_map_is_painted_with_the_mouse_and_saved(shot: Path):
     with tuned(shot) as (session, artist):
-        artist.tab("Picture")
-        artist.choose("Show", "refined")
         artist.tab("Paint")
         artist.choose("Paint", "pin")
         artist.page.locator("#bar").wait_for(state="attached")  # The map is drawn, and with it what the brush meets.

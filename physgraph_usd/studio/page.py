@@ -33,8 +33,8 @@ FIRST = "the first cloth is being solved, as refine does; this is the cage …"
 WAITS = "first cloth", "settled"
 CROSSINGS = "Crossings of cloth, before and after"
 BESIDE = ("Vertices", "Strain, 99th percentile", CROSSINGS)
-"""Figures that are always seen."""
-STICKY = "<style>div:has(> #state) {position: sticky; top: 0; z-index: 9; background: white}</style>"
+"""Figures that are seen beside every tab."""
+PANEL_PIXELS = 400
 UNDO, REDO = "Undo", "Redo"
 POLL_SECONDS = 0.1
 """How often the main thread asks whether a signal came."""
@@ -128,16 +128,18 @@ class TunePage:
         self._waits[which] = self._waits[which] or f"{perf_counter() - self._clock:.1f} s"
 
     def _say(self, words: str, color: str) -> None:
-        """Write the state, and the figures that stay beside the sliders while these are scrolled."""
+        """Write the state and figures; in short in the panel's title, which stays when the sliders are scrolled."""
         waits = [f"{name} {wait}" for name, wait in zip(WAITS, self._waits, strict=True) if wait]
         lines = [f"{name.partition(',')[0].lower()} {text}" for name, text in self._lines.items() if name in BESIDE]
-        put(self._state, content=STICKY + _badge(words, color) + small("; ".join(waits + lines), "waits"))
+        put(self._state, content=_badge(words, color) + small("; ".join(waits + lines), "figures"))
+        name = Path(self._session.shot.path).name
+        self._server.gui.set_panel_label(f"{name}: {', '.join(waits) or words.partition(',')[0]}")
 
     def _build(self) -> None:
         gui, desk = self._server.gui, self._desk
         gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
         gui.main_panel.dock_right()
-        gui.set_panel_label(f"Tune {Path(self._session.shot.path).name}")
+        gui.main_panel.set_width(PANEL_PIXELS)
         self._state = gui.add_html("")
         self._build_history()
         if len(self._session.garments) > 1:

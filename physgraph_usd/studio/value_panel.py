@@ -21,7 +21,8 @@ STYLE = """<style>
 div:has(> .value) + div .mantine-NumberInput-root, div:has(> .value) + div .mantine-Slider-markLabel,
 div:has(> .value) + div > .mantine-Flex-root > div:first-child {display: none}
 div:has(> .value) {margin: -0.6em 0 -0.2em 0}
-div:has(> .mantine-Text-root > label) {width: 10em !important; white-space: nowrap}
+div:has(> .mantine-Text-root > label) {width: 11.5em !important; white-space: nowrap}
+.mantine-Text-root > label > wbr {display: none}
 </style>"""
 """Hides the sliders' own numbers, which are places on a logarithmic scale; names stand on one line."""
 
