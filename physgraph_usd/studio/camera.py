@@ -89,7 +89,7 @@ class Camera:
         """Frame the garments, seen from where the camera is, or from a direction."""
         camera = client.camera
         back = np.asarray(camera.position) - np.asarray(camera.look_at) if back is None else back
-        position, middle = self.fit(back, camera.image_width / max(camera.image_height, 1))
+        position, middle = self.fit(back, _aspect(camera))
         with client.atomic():
             camera.position, camera.look_at = position, middle
 
@@ -103,8 +103,19 @@ class Camera:
                 setattr(client.camera, name, value)
         else:  # The browser tells its own camera before it has ours.
             self._frame(client, self._back)
-        client.camera.on_update(in_order(self._seen))
+        framed = {} if self.last else {"at": client.camera.position.copy(), "aspect": _aspect(client.camera)}
 
-    def _seen(self, camera: Any) -> None:
-        found = {name: getattr(camera, name) for name in ("position", "look_at", "up_direction")}
-        self.last = {name: [float(each) for each in value] for name, value in found.items()}
+        def seen(camera: Any) -> None:
+            still = framed and np.allclose(camera.position, framed["at"], rtol=1e-3)
+            if still and framed["aspect"] != _aspect(camera):  # The panel, which docks later, leaves less room.
+                self._frame(client, self._back)
+                framed.update(at=camera.position.copy(), aspect=_aspect(camera))
+            found = {name: getattr(camera, name) for name in ("position", "look_at", "up_direction")}
+            self.last = {name: [float(each) for each in value] for name, value in found.items()}
+
+        client.camera.on_update(in_order(seen))
+
+
+def _aspect(camera: Any) -> float:
+    """Width of a browser's picture over its height."""
+    return camera.image_width / max(camera.image_height, 1)

@@ -22,6 +22,7 @@ from .notes import Notes
 from .paint_panel import PaintPanel
 from .picture import Picture
 from .session import TuneSession
+from .setting import Setting
 from .takes import Shown
 from .time_panel import TimePanel
 from .value_panel import ValuePanel
@@ -65,6 +66,7 @@ class TunePage:
             session.set_time(notes.looked["time"])
         self._camera = Camera(self._server, picture, notes.looked.get("camera"))
         self._clock, self._waits, self._lines = perf_counter(), ["", ""], dict[str, str]()
+        self._solved: tuple[Setting, float | None] | None = None
         self._build()
         frame = session.shot.frame(session.time)
         picture.draw(Shown(frame, (None,) * len(session.garments), (), 0.0, False))
@@ -83,7 +85,8 @@ class TunePage:
 
     def busy(self, what: str) -> None:
         """Say that work has begun."""
-        if what == SOLVING:
+        solved, self._solved = self._solved, (self._session.setting, self._session.time)
+        if what == SOLVING and solved != self._solved:
             self._clock, self._waits = perf_counter(), ["", ""]
         self._say(f"{what} …" if self._lines else FIRST, WORKING)
 

@@ -145,13 +145,13 @@ class Picture:
                 named: list[str] = []
                 for index in garments:
                     named += self._draw_garment(shown, kept, index, column=column, at=at)
-                    lines |= {f"{column}/{index}/wires"} if self.view.wires else set()
+                    lines |= {f"wires/{column}/{index}"} if self.view.wires else set()
                     named += self._draw_trims(shown, index, at=at) if column == FINE else []
                 if not (self.view.wiped and place):
                     named += self._draw_bodies(shown.frame, column, at=at)
                 self._columns += [named] if named else []
             self._skins.keep([name for named in self._columns for name in named])
-            for name in [each for each in self._lines if each.endswith("wires") and each not in lines]:
+            for name in [each for each in self._lines if each.startswith("wires") and each not in lines]:
                 self._lines.pop(name).remove()
             self._cloth = np.concatenate([each.points for each in shown.frame.garments])
 
@@ -209,7 +209,7 @@ class Picture:
         whole, sheet = sheet.triangles, self._wiped(sheet, column, _everything(shown.frame))
         self._place(name := f"{column}/{index}", sheet, color, at=at, whole=whole, flat=column == CAGE, colors=colors)
         if self.view.wires:
-            self._draw_lines(f"{name}/wires", self._placed(sheet.points, at)[sheet.edges], WIRE, WIRE_PIXELS)
+            self._draw_lines(f"wires/{name}", self._placed(sheet.points, at)[sheet.edges], WIRE, WIRE_PIXELS)
         return [name]
 
     def _colored(self, found: Map, values: np.ndarray) -> np.ndarray:
