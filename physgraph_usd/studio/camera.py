@@ -48,14 +48,15 @@ class Camera:
     def on_click(self, clicked: Callable[[Any], None]) -> None:
         """Have a function called with viser's event of each click in the picture that is no double click's second."""
 
-        @self._server.scene.on_click()
-        @in_order
-        def _(event: Any) -> None:
+        def called(event: Any) -> None:
             before, self._clicked = self._clicked, time.monotonic()
             if self._clicked - before < DOUBLE_SECONDS:
                 self._frame(event.client)
             else:
                 clicked(event)
+
+        scene: Any = self._server.scene  # Its stub does not know of coroutines.
+        scene.on_click()(in_order(called))
 
     @property
     def eye(self) -> np.ndarray:

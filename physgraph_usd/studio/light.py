@@ -78,7 +78,7 @@ def light_on(
 
 
 def _fraction(normals: np.ndarray, sky: np.ndarray, key: np.ndarray) -> np.ndarray:
-    """Fraction of viser's light at the vertices of a mesh, shape (V,), on its outer side: the one that sees more sky."""
+    """Fraction of viser's light at a mesh's vertices, shape (V,), on its outer side: the one that sees more sky."""
     outer = int(sky[1].mean() > sky[0].mean())
     facing = normals if outer == 0 else -normals
     direct = KEY_LIGHT * (facing @ (KEY / np.linalg.norm(KEY))).clip(0, 1)
@@ -120,7 +120,7 @@ def as_glb(
     return export_glb(trimesh.Scene(mesh), include_normals=not flat, tree_postprocessor=finish)
 
 
-def to_linear(color: np.ndarray) -> np.ndarray:
+def to_linear(color: np.ndarray | tuple[int, int, int]) -> np.ndarray:
     """Linear colour, 0 to 1, of sRGB bytes."""
     value = np.asarray(color, float) / 255.0
     return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)

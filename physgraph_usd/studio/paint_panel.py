@@ -99,7 +99,7 @@ class PaintPanel:
         stroke = self._stroke
         if stroke is None or (stroke.garment, stroke.name) != (garment, self._name):
             stroke = Stroke(garment, self._name, session.painted(garment, self._name))
-        mode = mode or self._mode.value
+        mode = str(mode or self._mode.value)
         value = float(GARMENT[self._name].fallback or 0.0) if mode == ERASE else self._limited()
         brush = Brush(self._radius.value, value, self._strength.value, mode=mode, mirrored=self._mirror.value)
         where = {"mesh": cage.mesh, "rest": cage.rest, "right": self._desk.picture.axes[0]}

@@ -50,7 +50,7 @@ class Placed:
 
 @dataclass(frozen=True, eq=False)
 class Skin:
-    """A coloured mesh over a plain one: the mesh, the linear colours at its vertices, shape (V, 4), and viser's handle."""
+    """A coloured mesh over a plain one: the mesh, linear colours at its vertices, shape (V, 4), and viser's handle."""
 
     mesh: Placed
     colors: np.ndarray
