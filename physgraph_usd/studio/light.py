@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -69,7 +70,7 @@ def light_on(
         light = soft_light(solid, ground, visible=points, towards=towards, cancelled=cancelled)
         if cancelled():
             return None
-        parts = [slice(*ends) for ends in zip(starts[:-1], starts[1:], strict=True)]
+        parts = [slice(*ends) for ends in pairwise(starts)]
         factors = [_fraction(light.normals[part], light.sky[:, part], light.key[:, part]) for part in parts]
         shadow = np.zeros((len(ground.points), 4))
         shadow[:, 3] = ground_shadow(ground, light)

@@ -200,10 +200,10 @@ class Picture:
         sheet = self._sheet(shown, kept, index, column)
         if sheet is None:
             return []
-        found = None
-        if column == FINE:
-            found = find_map(self._session, shown, index, self.view.map, stroke=self.stroke)
-        colors = None if found is None else self._colored(*found)
+        colors = None
+        if column == FINE and (found := find_map(self._session, shown, index, self.view.map, stroke=self.stroke)):
+            self.bar, values = found
+            colors = self.bar.colors(values)
         own = self._own[self._session.garments[index]]
         color = to_linear(COLORS[column]) if own is None else own
         whole, sheet = sheet.triangles, self._wiped(sheet, column, _everything(shown.frame))
@@ -211,10 +211,6 @@ class Picture:
         if self.view.wires:
             self._draw_lines(f"wires/{name}", self._placed(sheet.points, at)[sheet.edges], WIRE, WIRE_PIXELS)
         return [name]
-
-    def _colored(self, found: Map, values: np.ndarray) -> np.ndarray:
-        self.bar = found
-        return found.colors(values)
 
     def _sheet(self, shown: Shown, kept: Shown | None, index: int, column: str) -> Sheet | None:
         """A garment's mesh in a column, or None."""
@@ -252,16 +248,11 @@ class Picture:
 
     def _draw_lines(self, name: str, segments: np.ndarray, color: tuple[int, int, int], pixels: float) -> None:
         """Draw line segments in the scene [m], shape (S, 2, 3), under a name; none removes them."""
-        handle = self._lines.pop(name, None)
-        if handle is not None and len(handle.points) == len(segments):
-            handle.points = segments.astype(np.float32)
-        else:
-            if handle is not None:
-                handle.remove()
+        if (handle := self._lines.pop(name, None)) is not None:
+            handle.remove()
+        if len(segments):
             look: dict[str, Any] = {"thickness": pixels, "thickness_units": "screen"}
-            handle = self._scene.add_line_segments(name, segments, color, **look) if len(segments) else None
-        if handle is not None:
-            self._lines[name] = handle
+            self._lines[name] = self._scene.add_line_segments(name, segments, color, **look)
 
     def _draw_trims(self, shown: Shown, index: int, *, at: np.ndarray) -> list[str]:
         """Draw the meshes that hang on a refined garment; returns the names of what is drawn."""
