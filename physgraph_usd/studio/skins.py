@@ -2,7 +2,7 @@
 
 viser moves a plain mesh in place but gives it one colour only. A mesh with colours at its vertices is loaded anew with
 each change, and misses a few pictures meanwhile. So each mesh is drawn plain while it moves; at rest a coloured one,
-its skin, is loaded over it, and the plain one is hidden afterwards.
+its skin, is loaded over it, and the plain one is hidden once the skin must be there.
 """
 
 from __future__ import annotations
@@ -19,8 +19,9 @@ import viser
 from ..shot.page.drawing import encode_color
 from .light import as_glb, light_on, to_linear
 
-LOADED_SECONDS = 0.25
-"""How long a browser may take to load a skin; what the skin replaces is drawn meanwhile."""
+LOADED_SECONDS, SURE_SECONDS = 0.25, 3.0
+"""How long a browser takes to load a skin, and how long at most: until then the skin before, and the plain mesh, are
+drawn under it. Where both are as deep the skin is seen, which is drawn last."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,7 +121,7 @@ class Skins:
                     self._dress(name)
                     self.meshes[name].color = encode_color(tuple(self._placed[name].color * factor.mean()))
             for ground in self._grounds:
-                self._later(ground.remove)
+                self._later(ground.remove, LOADED_SECONDS)
             self._grounds = [self._scene.add_glb(f"ground/{next(self._serial)}", each.ground) for each in found]
 
     def _is_lit(self, name: str) -> bool:
@@ -137,14 +138,16 @@ class Skins:
         colors[:, :3] *= 1.0 if mesh.colors is None else to_linear(mesh.colors[:, :3])
         before = self._skins.get(name)
         if before is not None and before.mesh.has_shape_of(mesh) and np.array_equal(before.colors, colors):
-            return self._later(lambda: self._conceal(name, before))
+            return self._later(lambda: self._conceal(name, before), SURE_SECONDS)
         base = mesh.color if mesh.colors is None else np.ones(3)
         data = as_glb(mesh.points, mesh.triangles, colors, base=base, flat=mesh.flat)
         skin = Skin(mesh, colors, self._scene.add_glb(f"skin/{next(self._serial)}/{name}", data))
-        self._skins[name] = skin
+        with self._lock:
+            self._skins[name] = skin
+            self._show(name, opacity=None, visible=True)
         if before is not None:
-            self._later(before.handle.remove)
-        self._later(lambda: self._conceal(name, skin))
+            self._later(before.handle.remove, LOADED_SECONDS)
+        self._later(lambda: self._conceal(name, skin), SURE_SECONDS)
 
     def _undress(self, name: str) -> None:
         """Draw a mesh plain."""
@@ -166,7 +169,7 @@ class Skins:
         if (mesh.opacity, mesh.visible) != (opacity, visible):
             mesh.opacity, mesh.visible = opacity, visible
 
-    def _later(self, call: Callable[[], None]) -> None:
+    def _later(self, call: Callable[[], None], seconds: float) -> None:
         """Have a function called once browsers have loaded what was sent."""
         loop = self._server.get_event_loop()
-        loop.call_soon_threadsafe(loop.call_later, LOADED_SECONDS, call)
+        loop.call_soon_threadsafe(loop.call_later, seconds, call)
