@@ -14,11 +14,13 @@ import numpy as np
 from PIL import Image
 from playwright import sync_api
 
+from physgraph_usd.studio.value_panel import CHANGED
 from physgraph_usd.studio.values import Tunable
 
 NAMES = ("chromium", "chromium-browser", "google-chrome")
 DRAWN = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 """Drawn by the processor: there may be no graphics card."""
+LABEL = f"//label[normalize-space(translate(., '{CHANGED}', ''))='{{}}']"
 SETTLED = "settled: as refine solves it"
 CALM_MS = 1000
 """How long the page is left alone before a move: pictures that are still drawn would hold the mouse up."""
@@ -143,12 +145,12 @@ class Tour:
 
     def _input(self, title: str) -> Any:
         """The input box behind a label."""
-        found = f"xpath=//label[normalize-space()='{title}']/following::input[not(@type='hidden')][1]"
+        found = f"xpath={LABEL.format(title)}/following::input[not(@type='hidden')][1]"
         return self._page.locator(found)
 
     def _slide(self, title: str, place: float) -> None:
         """Press on a slider."""
-        label = self._page.locator(f"xpath=//label[normalize-space()='{title}']")
+        label = self._page.locator(f"xpath={LABEL.format(title)}")
         thumb = label.locator("xpath=following::*[@role='slider'][1]")
         box = thumb.locator("xpath=ancestor::*[contains(@class, 'Slider-track')][1]").bounding_box()
         self._page.mouse.click(box["x"] + place * box["width"], box["y"] + box["height"] / 2)
@@ -190,8 +192,8 @@ class Tour:
 
 def waits(page: Any, tunable: Tunable, place: float) -> tuple[float, float]:
     """Seconds from a press on a slider to the first new cloth at the graphics card, and to the settled cloth."""
-    number = page.get_by_label(tunable.title, exact=True).last
-    thumb = number.locator("xpath=following::*[@role='slider'][1]")
+    label = page.locator(f"xpath={LABEL.format(tunable.title)}")
+    thumb = label.locator("xpath=following::*[@role='slider'][1]")
     track = thumb.locator("xpath=ancestor::*[contains(@class, 'Slider-track')][1]")
     track.scroll_into_view_if_needed()
     box = track.bounding_box()

@@ -25,7 +25,7 @@ from physgraph_usd.errors import PhysGraphError, SchemaError, UsageError
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.solver.frame.refiner import Refiner
 from physgraph_usd.solver.scene import Garment, Scene
-from physgraph_usd.studio.brush import SMOOTH, Brush, Stroke, hit
+from physgraph_usd.studio.brush import SMOOTH, Brush, Stroke, circle, hit
 from physgraph_usd.studio.loop import SolveLoop
 from physgraph_usd.studio.maps import HIGH, LOW, MEASURED, MIDDLE, stretches
 from physgraph_usd.studio.notes import Notes
@@ -430,3 +430,14 @@ def bends(shot: Shot) -> set[float]:
     scale = shot.scene.garments[0].fabric_scale
     assert scale is not None
     return {float(each) for each in scale[:, 1]}
+
+
+def test_the_ring_of_a_brush_is_closed_and_lies_on_the_cloth_at_the_brushs_radius():
+    mesh, points = grid(20, 20)
+    points = points * [1.0, 1.0, 0.0] + np.sin(6.0 * points[:, :1]) * [0.0, 0.0, 0.05]
+    at, radius = points[len(points) // 2], 0.31 * np.ptp(points[:, 0])
+    segments = circle(points, mesh.triangulate(points).triangles, at, radius)
+    assert np.linalg.norm(segments - at, axis=2) == pytest.approx(radius, rel=0.02)
+    _, times = np.unique(segments.reshape(-1, 3).round(9), axis=0, return_counts=True)
+    assert len(segments) > 20
+    assert (times == 2).all()

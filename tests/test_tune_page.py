@@ -24,6 +24,7 @@ from stages import add_subset
 
 from physgraph_usd.studio.page import TunePage
 from physgraph_usd.studio.session import TuneSession
+from physgraph_usd.studio.value_panel import CHANGED
 from physgraph_usd.studio.values import TUNABLES
 from physgraph_usd.usd.read.reader import open_shot
 
@@ -60,15 +61,18 @@ class Artist:
             self.page.get_by_role("button", name=f"Undo {undone}", exact=True).wait_for()
         self.page.get_by_text(SETTLED).wait_for()
 
+    def whole(self) -> np.ndarray:
+        """The picture without the controls, as it is now: sRGB, shape (900, 1000, 3)."""
+        self.page.evaluate(FRAMES)
+        return np.asarray(Image.open(io.BytesIO(self.page.screenshot())).convert("RGB"), float)[:, :1000]
+
     def picture(self, holds: Callable[[np.ndarray], object] = lambda _: True) -> np.ndarray:
-        """The picture, once something holds of it and it stands still: twice the same in a row."""
+        """The lower part of the picture, once something holds of it and it stands still: twice the same in a row."""
         last = np.zeros(0)
 
         def found() -> list[np.ndarray]:
             nonlocal last
-            self.page.evaluate(FRAMES)
-            whole = Image.open(io.BytesIO(self.page.screenshot()))
-            now = np.asarray(whole.convert("RGB"), float)[250:, :1000]
+            now = self.whole()[250:]
             stands, last = np.array_equal(now, last), now
             return [now] if stands and holds(now) else []
 
@@ -79,8 +83,8 @@ class Artist:
 
     def number(self, title: str) -> Any:
         """The input box behind a label."""
-        found = f"xpath=//label[normalize-space()='{title}']/following::input[not(@type='hidden')][1]"
-        return self.page.locator(found)
+        label = f"//label[normalize-space(translate(., '{CHANGED}', ''))='{title}']"
+        return self.page.locator(f"xpath={label}/following::input[not(@type='hidden')][1]")
 
     def shows(self, title: str, value: float | None) -> bool:
         """Whether a number box shows a value."""
@@ -99,6 +103,15 @@ class Artist:
         self.page.mouse.click(*EMPTY)
         self.page.keyboard.press(key)
 
+    def begin_stroke(self, row: float) -> None:
+        """Drag across the middle of the picture, and hold the mouse button."""
+        mouse = self.page.mouse
+        mouse.move(460, row)
+        mouse.down()
+        for step in range(20):
+            mouse.move(460 + 5 * step, row)
+            self.page.evaluate(FRAMES)
+
     def slide(self, title: str, place: float) -> float:
         """Drag a slider to a place, 0 to 1; returns the place where its thumb is let go."""
         thumb = self.number(title).locator("xpath=following::*[@role='slider'][1]")
@@ -110,6 +123,29 @@ class Artist:
         mouse.move(track["x"] + place * track["width"], box["y"] + box["height"] / 2, steps=5)
         mouse.up()
         return float(thumb.get_attribute("aria-valuenow"))
+
+
+def colored(picture: np.ndarray) -> np.ndarray:
+    """Whether each pixel of a picture has more colour than the grey of bodies, ground and background."""
+    return np.ptp(picture[:, 310:], axis=2) > 30.0  # Beside the viewer's notes.
+
+
+def rows_of(pixels: np.ndarray) -> int:
+    """Height of the part of a picture that holds some pixels, shape (H, W), without stray ones."""
+    rows = np.flatnonzero(pixels.sum(axis=1) > 2)
+    return int(np.ptp(rows)) + 1 if len(rows) else 0
+
+
+def assert_no_yellow(picture: np.ndarray) -> None:
+    """Nothing of a picture has the colour of viser's outlines."""
+    red, green, blue = np.moveaxis(picture, 2, 0)
+    assert ((np.minimum(red, green) - blue)[:, 310:] < 60.0).all()
+
+
+def middle_of(picture: np.ndarray) -> np.ndarray:
+    """Column and row of the middle of a picture's black pixels, those of the rings."""
+    rows, columns = np.nonzero(picture[:, 310:].max(axis=2) < 60.0)
+    return 0.5 * np.array([620 + columns.min() + columns.max(), rows.min() + rows.max()]) if len(rows) else np.zeros(2)
 
 
 @contextmanager
@@ -162,6 +198,21 @@ def test_values_are_slid_typed_undone_and_saved(shot: Path):
         assert not prim.GetAttribute("physgraph:guide:stiffness").HasAuthoredValue()
 
 
+def test_the_first_view_is_filled_with_cloth_and_framed_again_by_key_and_double_click(shot: Path):
+    with tuned(shot) as (_, artist):
+        artist.picture()
+        high = rows_of(colored(artist.whole()))
+        assert high >= 0.45 * 900
+        mouse = artist.page.mouse
+        for frame in (lambda: artist.press("f"), lambda: mouse.dblclick(*EMPTY)):
+            mouse.move(500, 450)
+            mouse.wheel(0, 1500)
+            artist.until(lambda: rows_of(colored(artist.whole())) < 0.7 * high, "the cloth is small")
+            artist.page.wait_for_timeout(500)  # Longer than a double click: the next click is no second one.
+            frame()
+            artist.until(lambda: abs(rows_of(colored(artist.whole())) - high) < 0.03 * high, "cloth fills the view")
+
+
 @pytest.mark.slow
 def test_presets_camera_and_frame_outlive_a_restart(shot: Path):
     with tuned(shot) as (session, artist):
@@ -169,8 +220,6 @@ def test_presets_camera_and_frame_outlive_a_restart(shot: Path):
         artist.settle("Bending Stiffness")
         artist.type("Name", "stiff")
         artist.page.get_by_role("button", name="Keep as preset").click()
-        artist.tab("Picture")
-        artist.choose("Show", "refined")
         straight = artist.picture()
         mouse = artist.page.mouse
         mouse.move(*EMPTY)
@@ -200,8 +249,9 @@ def test_presets_camera_and_frame_outlive_a_restart(shot: Path):
 @pytest.mark.slow
 def test_the_picture_wipes_maps_wires_and_compares(shot: Path):
     with tuned(shot) as (session, artist):
-        side_by_side = artist.picture()
         artist.tab("Picture")
+        artist.choose("Show", "cage | refined")
+        side_by_side = artist.picture()
         artist.number("Wipe").click()
         wiped = artist.picture(lambda now: np.abs(now - side_by_side).mean() > 1.0)
         artist.press("g")
@@ -227,20 +277,19 @@ def test_the_picture_wipes_maps_wires_and_compares(shot: Path):
 @pytest.mark.slow
 def test_a_map_is_painted_with_the_mouse_and_saved(shot: Path):
     with tuned(shot) as (session, artist):
-        artist.tab("Picture")
-        artist.choose("Show", "refined")
-        artist.tab("Paint")
+        for tab in ("Picture", "Paint"):
+            artist.tab(tab)
         artist.choose("Paint", "pin")
         artist.page.locator("#bar").wait_for(state="attached")  # The map is drawn, and with it what the brush meets.
-        before = artist.picture()
+        artist.picture()
+        assert abs(middle_of(artist.whole()) - [520, 450]).max() < 30, "the rings wait in the middle of the cloth"
         mouse, up = artist.page.mouse, session.shot.frame(session.time).garments[0].points @ [0.0, 1.0, 0.0]
-        for row in (420, 520):  # The second while the cloth still settles.
-            mouse.move(460, row)
-            mouse.down()
-            for step in range(20):
-                mouse.move(460 + 5 * step, row)
-                artist.page.evaluate(FRAMES)
+        for row in (330, 560):  # The second while the cloth still settles.
+            artist.begin_stroke(row)
+            assert_no_yellow(artist.whole())
+            artist.until(lambda row=row: abs(middle_of(artist.whole()) - [555, row]).max() < 15, "the rings follow")
             mouse.up()
+        assert_no_yellow(artist.whole())
 
         def height() -> float:
             held = session.painted(CLOTH, "pin") > 0.3
@@ -248,15 +297,21 @@ def test_a_map_is_painted_with_the_mouse_and_saved(shot: Path):
 
         artist.until(lambda: height() > 0.25 * np.ptp(up), "both strokes are in the map")
         artist.settle("Pin")
+        was = height()
+        artist.page.keyboard.down("Control")
+        artist.begin_stroke(330)
+        mouse.up()
+        artist.page.keyboard.up("Control")
+        artist.until(lambda: height() < 0.8 * was, "what is dragged over with ctrl is erased")
+        artist.settle("Pin")
         held = session.painted(CLOTH, "pin")
         assert 0 < (held > 0.3).sum() < len(held) // 2
-        artist.picture(lambda now: np.abs(now - before).mean() > 0.1)
         artist.page.get_by_role("button", name="Save layer").click()
         artist.page.get_by_text("saved pin into").wait_for()
         with closing(open_shot(str(session.out))) as saved:
             assert saved.scene.garments[0].pin == pytest.approx(held)
         artist.choose("Paint", "off")
-        artist.press("z")
-        artist.press("z")
+        for _ in range(3):
+            artist.press("z")
         artist.page.get_by_role("button", name="Redo Pin", exact=True).wait_for()
-        artist.until(lambda: session.painted(CLOTH, "pin").max() == 0.0, "both strokes are undone")
+        artist.until(lambda: session.painted(CLOTH, "pin").max() == 0.0, "all strokes are undone")

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from ..solver.mesh.topology import PolygonMesh, adjacency
 
-PAINT, SMOOTH = "paint", "smooth"
+PAINT, ERASE, SMOOTH = "paint", "erase", "smooth"
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,7 @@ class Brush:
         radius: Radius [m].
         value: Painted value.
         strength: Fraction of the way to the value per touch, 0 to 1.
-        mode: `PAINT`, or `SMOOTH`: towards the mean of the neighbours.
+        mode: `PAINT` or `ERASE`: towards the value; or `SMOOTH`: towards the mean of the neighbours.
         mirrored: Whether the other side is painted too, mirrored in the rest shape.
     """
 
@@ -72,7 +72,7 @@ class Stroke:
                 self._mirror = mirrored(rest, right)
             near = np.maximum(near, near[self._mirror])
         weight = brush.strength * near * near * (3.0 - 2.0 * near)
-        towards = brush.value if brush.mode == PAINT else neighbour_mean(mesh, self.values)
+        towards = neighbour_mean(mesh, self.values) if brush.mode == SMOOTH else brush.value
         self.values = self.values + weight * (towards - self.values)
 
 
@@ -111,3 +111,23 @@ def hit(origin: np.ndarray, along: np.ndarray, points: np.ndarray, triangles: np
         distance = (two * turned).sum(axis=1) / volume
     meets = (first >= 0) & (second >= 0) & (first + second <= 1) & (distance > 0)
     return origin + distance[meets].min() * along if meets.any() else None
+
+
+def circle(points: np.ndarray, triangles: np.ndarray, at: np.ndarray, radius: float) -> np.ndarray:
+    """Where a mesh cuts a sphere: line segments [m], shape (S, 2, 3).
+
+    Args:
+        points: Positions [m], shape (V, 3).
+        triangles: Shape (T, 3).
+        at: The sphere's middle [m], shape (3,).
+        radius: Its radius [m].
+    """
+    beyond = np.linalg.norm(points - at, axis=1) - radius
+    count = (beyond[triangles] > 0.0).sum(axis=1)
+    cut = triangles[(count > 0) & (count < 3)]
+    ends = np.stack([cut, np.roll(cut, -1, axis=1)], axis=2)  # Two of the three edges are cut.
+    first, second = beyond[ends[..., 0]], beyond[ends[..., 1]]
+    is_cut = (first > 0.0) != (second > 0.0)
+    part = (first[is_cut] / (first[is_cut] - second[is_cut]))[:, None]
+    start, end = points[ends[is_cut][:, 0]], points[ends[is_cut][:, 1]]
+    return (start + part * (end - start)).reshape(-1, 2, 3)

@@ -15,6 +15,8 @@ from .session import Shown, TuneSession
 REST_SECONDS = 0.1
 """How long nothing must be asked before the frame is solved as ``refine`` does."""
 
+SOLVING = "solving"
+
 Change = Callable[[TuneSession], None]
 """A change asked of a session."""
 
@@ -96,7 +98,7 @@ class SolveLoop:
         patience: float | None = self._rest
         while True:
             with self._changed:
-                self._changed.wait_for(self._is_wanted, patience)
+                self._changed.wait_for(self.is_wanted, patience)
                 if self._closing:
                     return
                 asked, self._asked = self._asked, []
@@ -117,7 +119,7 @@ class SolveLoop:
 
     def _solve(self) -> float:
         """Solve the frame roughly; returns the time to wait for a change [s]."""
-        self._watcher.busy("solving")
+        self._watcher.busy(SOLVING)
         rounds = list[None]()
 
         def seen(points: Mapping[str, np.ndarray]) -> None:
@@ -125,7 +127,7 @@ class SolveLoop:
             self._watcher.seen(points)
 
         # Cancelled after a round at the earliest: cloth moves even while changes keep coming.
-        shown = self._session.solve(seen, lambda: bool(rounds) and self._is_wanted())
+        shown = self._session.solve(seen, lambda: bool(rounds) and self.is_wanted())
         self._watcher.show(shown)
         return 0.0 if shown.settled else self._rest
 
@@ -134,16 +136,16 @@ class SolveLoop:
         shown = self._session.solve()
         if not shown.settled:
             self._watcher.busy("settling")
-            self._watcher.show(self._session.settle(self._watcher.seen, self._is_wanted))
+            self._watcher.show(self._session.settle(self._watcher.seen, self.is_wanted))
             return 0.0
-        if not self._session.go_on(self.span, self._is_wanted):
+        if not self._session.go_on(self.span, self.is_wanted):
             return None
         self._watcher.solved()
         return 0.0
 
     def _play(self) -> float:
         """Show or solve the next frame of the range; returns the time to wait for a change [s]."""
-        shown = self._session.step(self.span, self._is_wanted)
+        shown = self._session.step(self.span, self.is_wanted)
         if shown is None:
             self._watcher.solved()
             return 0.0
@@ -152,6 +154,6 @@ class SolveLoop:
         self._due = max(now, self._due + self._session.shot.scene.seconds)
         return self._due - now
 
-    def _is_wanted(self) -> bool:
+    def is_wanted(self) -> bool:
         """Whether something is to be done at once; read without the lock between steps."""
         return bool(self._asked) or self._closing

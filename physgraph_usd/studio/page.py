@@ -7,20 +7,22 @@ import io
 from collections.abc import Callable, Mapping
 from contextlib import redirect_stdout, suppress
 from pathlib import Path
-from time import sleep
+from time import perf_counter, sleep
 from typing import Any
 
 import numpy as np
 
 from ..errors import LayerError, PhysGraphError
 from ..interrupts import leave_if_asked
+from .camera import Camera
 from .desk import Desk, in_order, put, small
 from .guard import guarded_server
-from .loop import SolveLoop
+from .loop import SOLVING, SolveLoop
 from .notes import Notes
 from .paint_panel import PaintPanel
 from .picture import Picture
 from .session import TuneSession
+from .setting import Setting
 from .takes import Shown
 from .time_panel import TimePanel
 from .value_panel import ValuePanel
@@ -28,6 +30,12 @@ from .view_panel import ViewPanel
 
 WORKING, MOVING, SETTLED, WRONG = "#b45f06", "#5b6470", "#1a7f37", "#c0392b"
 """Colours of the page's state."""
+FIRST = "the first cloth is being solved, as refine does; this is the cage …"
+WAITS = "first cloth", "settled"
+CROSSINGS = "Crossings of cloth, before and after"
+BESIDE = ("Vertices", "Strain, 99th percentile", CROSSINGS)
+"""Figures that are seen beside every tab."""
+PANEL_PIXELS = 400
 UNDO, REDO = "Undo", "Redo"
 POLL_SECONDS = 0.1
 """How often the main thread asks whether a signal came."""
@@ -52,15 +60,24 @@ class TunePage:
         self._server, self.url = guarded_server(port=port, label="physgraph-usd tune")
         self.loop, picture = SolveLoop(session, self), Picture(self._server, session)
         self._desk = Desk(self._server.gui, session, loop=self.loop, picture=picture, notes=notes)
-        self._look_as(notes.looked)
+        if notes.looked.get("garment") in session.garments:
+            self._desk.garment = notes.looked["garment"]
+        if notes.looked.get("time") in session.times:
+            session.set_time(notes.looked["time"])
+        self._camera = Camera(self._server, picture, notes.looked.get("camera"))
+        self._clock, self._waits, self._lines = perf_counter(), ["", ""], dict[str, str]()
+        self._solved: tuple[Setting, float | None] | None = None
         self._build()
+        frame = session.shot.frame(session.time)
+        picture.draw(Shown(frame, (None,) * len(session.garments), (), 0.0, False))
+        self._say(FIRST, WORKING)
         self.loop.start()
 
     def close(self) -> None:
         """End the thread and the server, and write the notes."""
         self.loop.close()
         tried = {path: dict(values) for path, values in self._session.setting.values.items()}
-        looked = {"time": self._session.time, "garment": self._desk.garment, "camera": self._camera}
+        looked = {"time": self._session.time, "garment": self._desk.garment, "camera": self._camera.last}
         with suppress(LayerError):  # A folder that cannot be written to; saving the layer has said so.
             self._desk.notes.save(looked | {"view": self._view.looked, "values": tried})
         with redirect_stdout(io.StringIO()):  # The viewer's own words.
@@ -68,25 +85,35 @@ class TunePage:
 
     def busy(self, what: str) -> None:
         """Say that work has begun."""
-        self._state.content = _badge(f"{what} …", WORKING)
+        solved, self._solved = self._solved, (self._session.setting, self._session.time)
+        if what == SOLVING and solved != self._solved:
+            self._clock, self._waits = perf_counter(), ["", ""]
+        self._say(f"{what} …" if self._lines else FIRST, WORKING)
 
     def seen(self, points: Mapping[str, np.ndarray]) -> None:
         """Draw garments that are not settled."""
         self._desk.picture.move(points)
+        self._note_wait(0)
 
     def show(self, shown: Shown) -> None:
         """Draw a solved frame and write its figures and values."""
         session = self._session
         self._desk.picture.draw(shown, kept=session.kept_shown)
         self._paint.attach()
-        put(self._figures, content=_table(figures(shown, self._desk.index)))
+        self._lines = figures(shown, self._desk.index)
+        put(self._figures, content=_table(self._lines))
         self._values.update()
         self._view.update()
         self._time.update()
         self._write_history()
         put(self._command, content=f"<code>{small(session.command)}</code>")
         words = "playing" if self.loop.playing else "settled: as refine solves it" if shown.settled else "on its way"
-        self._state.content = _badge(words, SETTLED if shown.settled else MOVING)
+        self._note_wait(0)
+        if shown.settled:
+            self._note_wait(1)
+        self._say(words, SETTLED if shown.settled else MOVING)
+        if shown.settled and not self.loop.playing:
+            self._desk.picture.shade(self.loop.is_wanted)
 
     def solved(self) -> None:
         """Update the strip of frames, or draw A."""
@@ -97,38 +124,26 @@ class TunePage:
 
     def fail(self, error: PhysGraphError) -> None:
         """Write an error."""
-        self._state.content = _badge(str(error), WRONG)
+        self._say(str(error), WRONG)
 
-    def _look_as(self, looked: Mapping[str, Any]) -> None:
-        """Restore garment, frame and camera of the last session."""
-        session = self._session
-        if looked.get("garment") in session.garments:
-            self._desk.garment = looked["garment"]
-        if looked.get("time") in session.times:
-            session.set_time(looked["time"])
-        self._camera: dict[str, list[float]] | None = looked.get("camera")
-        self._server.on_client_connect(in_order(self._welcome))
+    def _note_wait(self, which: int) -> None:
+        """Note the time of the first cloth, 0, or of the settled cloth, 1, after a change."""
+        self._waits[which] = self._waits[which] or f"{perf_counter() - self._clock:.1f} s"
 
-    def _welcome(self, client: Any) -> None:
-        """Set the camera of a browser that connects, between two of its messages.
-
-        A message in between would undo a part on viser's side, and viser sends no part that it takes for known.
-        """
-        if self._camera:
-            for name, value in self._camera.items():
-                setattr(client.camera, name, value)
-        client.camera.on_update(in_order(self._look_from))
-
-    def _look_from(self, camera: Any) -> None:
-        found = {name: getattr(camera, name) for name in ("position", "look_at", "up_direction")}
-        self._camera = {name: [float(each) for each in value] for name, value in found.items()}
+    def _say(self, words: str, color: str) -> None:
+        """Write the state and figures; in short in the panel's title, which stays when the sliders are scrolled."""
+        waits = [f"{name} {wait}" for name, wait in zip(WAITS, self._waits, strict=True) if wait]
+        lines = [f"{name.partition(',')[0].lower()} {text}" for name, text in self._lines.items() if name in BESIDE]
+        put(self._state, content=_badge(words, color) + small("; ".join(waits + lines), "figures"))
+        name = Path(self._session.shot.path).name
+        self._server.gui.set_panel_label(f"{name}: {', '.join(waits) or words.partition(',')[0]}")
 
     def _build(self) -> None:
         gui, desk = self._server.gui, self._desk
         gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
         gui.main_panel.dock_right()
-        gui.set_panel_label(f"Tune {Path(self._session.shot.path).name}")
-        self._state = gui.add_html(_badge("opening …", WORKING))
+        gui.main_panel.set_width(PANEL_PIXELS)
+        self._state = gui.add_html("")
         self._build_history()
         if len(self._session.garments) > 1:
             choice = gui.add_dropdown("Garment", self._session.garments, initial_value=desk.garment)
@@ -138,9 +153,9 @@ class TunePage:
         with tabs.add_tab("Values"):
             self._values = ValuePanel(desk)
         with tabs.add_tab("Picture"):
-            self._view = ViewPanel(desk)
+            self._view = ViewPanel(desk, self._camera)
         with tabs.add_tab("Paint"):
-            self._paint = PaintPanel(desk, self._view)
+            self._paint = PaintPanel(desk, self._view, self._camera)
         with tabs.add_tab("Figures"):
             self._figures = gui.add_html("")
             self._command = gui.add_html("")
@@ -196,7 +211,7 @@ def figures(shown: Shown, index: int) -> dict[str, str]:
         lines["Strain, 99th percentile"] = f"{100.0 * entry['strain']['p99']:.2g} %"
     contact = entry.get("contact", {})
     if "cloth" in contact:
-        lines["Crossings of cloth, before and after"] = _both(contact["cloth"], "crossings")
+        lines[CROSSINGS] = _both(contact["cloth"], "crossings")
     if "bodies" in contact:
         for path, body in contact["bodies"].items():
             lines[f"Inside {path.rpartition('/')[2]}, before and after"] = _both(body, "inside")

@@ -7,35 +7,42 @@ from typing import Any
 import numpy as np
 
 from ..usd.schema import GARMENT
-from .brush import PAINT, SMOOTH, Brush, Stroke, hit
+from .brush import ERASE, PAINT, SMOOTH, Brush, Stroke, hit
+from .camera import Camera
 from .desk import Desk, in_order
 from .session import TuneSession
 from .values import MAPS
 from .view_panel import ViewPanel
 
 OFF = "off"
+MODES = {None: None, "shift": SMOOTH, "cmd/ctrl": ERASE}
+"""The brush of a drag by the keys that are held; None is the brush chosen on the page."""
 
 
 class PaintPanel:
     """The controls of the brush."""
 
-    def __init__(self, desk: Desk, view: ViewPanel) -> None:
+    def __init__(self, desk: Desk, view: ViewPanel, camera: Camera) -> None:
         """Add the controls."""
-        self._desk, self._view, gui = desk, view, desk.gui
+        self._desk, self._view, self._camera, gui = desk, view, camera, desk.gui
         self._name, self._stroke = OFF, None
         self._attached: dict[int, Any] = {}  # Handles that have the callbacks.
+        self._at: np.ndarray | None = None  # The middle of the rings, in the scene [m].
         size = desk.picture.size
         choice = gui.add_dropdown(
             "Paint", (OFF, *MAPS), hint="Drag on the refined cloth; drag beside it to turn the view."
         )
         self._choice = desk.on(choice, self.choose)
         self._value = gui.add_number("Value", 0.0, step=0.01)
-        self._radius = gui.add_slider("Radius [m]", 0.005 * size, 0.3 * size, 0.001 * size, 0.05 * size)
+        radius = gui.add_slider("Radius [m]", 0.005 * size, 0.3 * size, 0.001 * size, 0.05 * size)
+        self._radius = desk.on(radius, lambda session, value: self._draw_rings())
         self._strength = gui.add_slider("Strength", 0.05, 1.0, 0.05, 0.5)
-        self._mode = gui.add_dropdown("Brush", (PAINT, SMOOTH))
+        hint = "While dragging, shift smooths, and ctrl erases: paints the value that changes nothing."
+        self._mode = gui.add_dropdown("Brush", (PAINT, ERASE, SMOOTH), hint=hint)
         self._mirror = gui.add_checkbox("Mirror", False, hint="Paints the other side too, mirrored at rest.")
         flood = gui.add_button("Fill", hint="Gives every vertex the value.")
         desk.press(flood, self._fill)
+        camera.on_click(self._clicked)
 
     def choose(self, session: TuneSession, name: str) -> None:
         """Take up the brush for a map of `MAPS`, or put it down."""
@@ -44,53 +51,82 @@ class PaintPanel:
             row = GARMENT[name]
             self._value.value = float((row.soft or (0.0, 1.0))[1])
             self._view.set(map=name)
+            eye, middle = self._camera.eye, self._desk.picture.framed.mean(axis=0)
+            hits = (self._hit(session, k, eye, middle - eye) for k in range(len(session.garments)))
+            self._at = next((at for at in hits if at is not None), None)
+        self._draw_rings()
 
     def attach(self) -> None:
-        """Attach the brush to drags and clicks on the picture's targets."""
-        for index, handle in self._desk.picture.targets.items():
+        """Attach the brush to drags on the picture's targets, and only to them."""
+        targets = self._desk.picture.targets
+        for index, handle in self._attached.items():
+            if targets.get(index) is not handle:
+                handle.remove_drag_callback()
+        for index, handle in targets.items():
             if self._attached.get(index) is not handle:
-                handle.on_drag("left")(in_order(lambda event, index=index: self._dragged(index, event)))
-                handle.on_click(in_order(lambda event, index=index: self._clicked(index, event)))
-        self._attached = dict(self._desk.picture.targets)
+                for modifier, mode in MODES.items():
+                    dragged = in_order(lambda event, index=index, mode=mode: self._dragged(index, event, mode))
+                    handle.on_drag("left", modifier=modifier)(dragged)
+        self._attached = targets
 
-    def _clicked(self, index: int, event: Any) -> None:
+    def _clicked(self, event: Any) -> None:
         origin, along = np.asarray(event.ray_origin), np.asarray(event.ray_direction)
-        self._desk.ask(lambda session: self.touch(session, index, origin, along=along))
-        self._desk.ask(self.lift)
 
-    def _dragged(self, index: int, event: Any) -> None:
+        def touch(session: TuneSession) -> None:
+            for index in range(len(session.garments)):
+                self.touch(session, index, origin, along=along)
+            self.lift(session)
+
+        if self._name != OFF:
+            self._desk.ask(touch)
+
+    def _dragged(self, index: int, event: Any, mode: str | None) -> None:
         origin = np.asarray(event.client.camera.position)
         along = np.asarray(event.end_position) - origin
-        self._desk.ask(lambda session: self.touch(session, index, origin, along=along))
+        self._desk.ask(lambda session: self.touch(session, index, origin, along=along, mode=mode))
         if event.phase == "end":
             self._desk.ask(self.lift)
 
-    def touch(self, session: TuneSession, index: int, origin: np.ndarray, *, along: np.ndarray) -> None:
-        """Paint at the intersection of a ray of the picture and a garment's refined cloth."""
-        garment, points = session.garments[index], session.solve().points[index]
-        chain, cage = session.refinements[index], session.shot.scene.garments[index]
-        if points is None or self._name == OFF:
+    def touch(
+        self, session: TuneSession, index: int, origin: np.ndarray, *, along: np.ndarray, mode: str | None = None
+    ) -> None:
+        """Paint at the intersection of a ray of the picture and a garment's refined cloth; ``mode`` is the brush's."""
+        at = self._hit(session, index, origin, along)
+        if at is None or self._name == OFF:
             return
-        triangles = chain[-1].mesh.triangulate(None).triangles if chain else cage.mesh.triangulate(cage.rest).triangles
-        start = self._desk.picture.world(origin)
-        at = hit(start, along / np.linalg.norm(along), points, triangles)
-        if at is None:
-            return
+        garment, cage = session.garments[index], session.shot.scene.garments[index]
+        points = np.asarray(session.solve().points[index])
         stroke = self._stroke
         if stroke is None or (stroke.garment, stroke.name) != (garment, self._name):
             stroke = Stroke(garment, self._name, session.painted(garment, self._name))
-        controls = self._radius, self._strength, self._mode, self._mirror
-        radius, strength, mode, mirrored = (each.value for each in controls)
-        brush = Brush(radius, self._limited(), strength=strength, mode=mode, mirrored=mirrored)
-        where = {"mesh": cage.mesh, "rest": cage.rest, "right": self._desk.picture.right}
-        stroke.touch(brush, at, points[: cage.mesh.vertex_count], **where)
+        mode = str(mode or self._mode.value)
+        value = float(GARMENT[self._name].fallback or 0.0) if mode == ERASE else self._limited()
+        brush = Brush(self._radius.value, value, self._strength.value, mode=mode, mirrored=self._mirror.value)
+        where = {"mesh": cage.mesh, "rest": cage.rest, "right": self._desk.picture.axes[0]}
+        stroke.touch(brush, self._desk.picture.world(at), points[: cage.mesh.vertex_count], **where)
         self._stroke = self._desk.picture.stroke = stroke
+        self._at = at
+        self._draw_rings()
 
     def lift(self, session: TuneSession) -> None:
         """End a stroke: its map is tried."""
         stroke, self._stroke, self._desk.picture.stroke = self._stroke, None, None
         if stroke is not None:
             session.paint(stroke.garment, stroke.name, stroke.values)
+
+    def _hit(self, session: TuneSession, index: int, origin: np.ndarray, along: np.ndarray) -> np.ndarray | None:
+        """The first intersection of a ray of the scene and a garment's refined cloth, in the scene [m]; or None."""
+        points, picture = session.solve().points[index], self._desk.picture
+        if points is None:
+            return None
+        chain, cage = session.refinements[index], session.shot.scene.garments[index]
+        triangles = chain[-1].mesh.triangulate(None).triangles if chain else cage.mesh.triangulate(cage.rest).triangles
+        at = hit(picture.world(origin), along / np.linalg.norm(along), points, triangles)
+        return None if at is None else at - picture.world(np.zeros(3))
+
+    def _draw_rings(self) -> None:
+        at = None if self._name == OFF else self._at
+        self._desk.picture.draw_rings(at, self._radius.value, eye=self._camera.eye)
 
     def _fill(self, session: TuneSession) -> None:
         if self._name != OFF:

@@ -2,45 +2,46 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import trimesh
 import viser
-from trimesh.exchange.gltf import export_glb
 
 from ..solver.colliders.pose import Pose
 from ..solver.mesh.topology import PolygonMesh
 from ..solver.scene import Frame
 from ..usd.read.bindings import GarmentBindings
-from .brush import Stroke
+from ..usd.read.meshes import color_of
+from .brush import Stroke, circle
+from .light import add_lights, to_linear
 from .maps import PLAIN, Map, find_map
 from .session import TuneSession
+from .skins import Placed, Skins
 from .takes import Shown
 
 CAGE, SUBDIVISION, KEPT, FINE = "cage", "subdivision", "A", "refined"
 SHOWS: dict[str, tuple[str, ...]] = {
-    "cage | refined": (CAGE, FINE),
     "refined": (FINE,),
+    "cage | refined": (CAGE, FINE),
     "cage | subdivision | refined": (CAGE, SUBDIVISION, FINE),
     "subdivision | refined": (SUBDIVISION, FINE),
     "A | refined": (KEPT, FINE),
 }
 """Columns of each choice, from left to right."""
 COLORS = {CAGE: (201, 160, 110), SUBDIVISION: (168, 160, 150), KEPT: (150, 170, 140), FINE: (122, 150, 190)}
-TRIM, BODY, FLOOR, SKY, WIRE = (176, 168, 140), (150, 150, 150), (186, 188, 192), (226, 228, 231), (40, 44, 52)
-"""Colours, sRGB."""
-FLOOR_SIZE = 12.0
-"""Half of the floor's width, in the size of what is drawn."""
-GAP = 0.1
+TRIM, BODY, WIRE, RING = (176, 168, 140), (150, 150, 150), (40, 44, 52), (16, 18, 22)
+"""Colours, sRGB; a garment or body with a colour of its own on the stage has that."""
+GAP = 0.04
 """Space between columns, in the size of what is drawn."""
-AWAY = 3.8
-"""How far off the camera stands, in widths of a column: three are seen."""
 SAMPLED = 6
 """Frames whose widths set the columns apart."""
-WIRE_PIXELS = 0.8
+WIRE_PIXELS, RING_PIXELS = 0.8, 2.5
+LIFT = 0.004
+"""How far before the cloth the brush's rings are drawn, in the garments' size."""
+FALLOFF = (1.0, 0.5)
+"""Radii of the rings, in the brush's: its end, and where it paints half."""
 
 
 @dataclass(frozen=True)
@@ -88,15 +89,15 @@ class Picture:
 
     Attributes:
         view: How cloth is shown.
-        paintable: Whether the refined garments lie under meshes that cannot be seen, for the mouse to meet: those that
-            show a map are made anew with each change of their colours, and miss it meanwhile.
-        targets: Handles of those meshes, by number of the garment.
+        paintable: Whether the mouse meets the refined garments.
         bar: The map that is drawn, or None.
         stroke: The map under the brush, drawn in place of the session's; or None.
+        axes: Rows are right, up and towards the viewer, shape (3, 3).
+        size: Size of the first frame's garments [m].
     """
 
     def __init__(self, server: viser.ViserServer, session: TuneSession) -> None:
-        """Set up floor, light and camera about the session's first frame."""
+        """Set up light, and columns that the session's frames fit into."""
         self.view = View()
         self.bar: Map | None = None
         self.stroke: Stroke | None = None
@@ -106,47 +107,81 @@ class Picture:
         low, high = points.min(axis=0), points.max(axis=0)
         self.centre, self.size = 0.5 * (low + high), float(np.linalg.norm(high - low))
         up = -scene.gravity / np.linalg.norm(scene.gravity)
-        self.right = np.array([0.0, 1.0, 0.0]) if abs(up[0]) > 0.9 else np.array([1.0, 0.0, 0.0])
+        right = np.array([0.0, 1.0, 0.0]) if abs(up[0]) > 0.9 else np.array([1.0, 0.0, 0.0])
+        self.axes = np.stack([right, up, np.cross(right, up)])
         times = session.times[:: max(1, len(session.times) // SAMPLED)]
         drawn = [_everything(session.shot.frame(time)) for time in times]
-        self._across = max(np.ptp(each @ self.right) for each in drawn) + GAP * self.size
-        self._handles: dict[str, tuple[object, Any]] = {}
+        self._across = max(np.ptp(each @ right) for each in drawn) + GAP * self.size
+        self._cloth = points
+        self._lines: dict[str, Any] = {}
         self._bindings: dict[int, tuple[int, GarmentBindings]] = {}
+        self._own = {path: color_of(session.shot.stage, path) for path in (*session.garments, *session.shot.colliders)}
+        self._skins, self._columns = Skins(server, self.axes), list[list[str]]()
         self.paintable = False
-        self.targets: dict[int, Any] = {}
-        server.scene.set_up_direction(up)
-        eye = np.cross(self.right, up) + 0.16 * up
-        server.initial_camera.position = max(1.4 * self.size, AWAY * self._across) * eye / np.linalg.norm(eye)
-        server.initial_camera.look_at = (0.0, 0.0, 0.0)
-        server.initial_camera.fov = np.radians(38.0)
-        light(server.scene, drawn[0] - self.centre, right=self.right, up=up)
+        add_lights(server.scene, self.axes)
+
+    @property
+    def framed(self) -> np.ndarray:
+        """Points of the garments in all columns, in the scene [m], shape (N, 3)."""
+        count = len(self.view.columns)
+        return np.concatenate([self._placed(self._cloth, self._offset(place, count)) for place in range(count)])
+
+    @property
+    def targets(self) -> dict[int, Any]:
+        """Handles of the meshes that the mouse meets, by number of the garment."""
+        names = {k: f"{FINE}/{k}" for k in range(len(self._session.garments))} if self.paintable else {}
+        return {k: self._skins.meshes[name] for k, name in names.items() if name in self._skins.meshes}
 
     def draw(self, shown: Shown, *, kept: Shown | None = None) -> None:
-        """Draw a frame; ``kept`` is A's."""
+        """Draw a frame, or its cages where it has no refined cloth yet; ``kept`` is A's."""
         with self._server.atomic():  # Pictures between two states are never drawn.
             self.bar = None
-            columns = self.view.columns
-            named = set[str]()
+            garments = range(len(shown.points))
+            columns = self.view.columns if any(each is not None for each in shown.points) else (CAGE,)
+            self._skins.touched = [f"{FINE}/{index}" for index in garments] if self.paintable else []
+            self._columns, lines = [], set[str]()
             for place, column in enumerate(columns):
                 at = self._offset(place, len(columns))
-                for index in range(len(shown.points)):
-                    named |= self._draw_garment(shown, kept, index, column=column, at=at)
-                    named |= self._draw_trims(shown, index, at=at) if column == FINE else set()
+                named: list[str] = []
+                for index in garments:
+                    named += self._draw_garment(shown, kept, index, column=column, at=at)
+                    lines |= {f"wires/{column}/{index}"} if self.view.wires else set()
+                    named += self._draw_trims(shown, index, at=at) if column == FINE else []
                 if not (self.view.wiped and place):
-                    named |= self._draw_bodies(shown.frame, column, at=at)
-            for name in self._handles.keys() - named:
-                self._handles.pop(name)[1].remove()
-            found = {index: self._handles.get(f"target/{index}") for index in range(len(shown.points))}
-            self.targets = {index: each[1] for index, each in found.items() if each is not None}
+                    named += self._draw_bodies(shown.frame, column, at=at)
+                self._columns += [named] if named else []
+            self._skins.keep([name for named in self._columns for name in named])
+            for name in [each for each in self._lines if each.startswith("wires") and each not in lines]:
+                self._lines.pop(name).remove()
+            self._cloth = np.concatenate([each.points for each in shown.frame.garments])
+
+    def shade(self, cancelled: Callable[[], bool]) -> None:
+        """Draw the light and the soft shadows of what is drawn, unless ``cancelled`` meanwhile."""
+        self._skins.shade(self._columns, cancelled)
 
     def move(self, points: Mapping[str, np.ndarray]) -> None:
-        """Draw refined garments at new positions [m], by path; a map's colours, wires and a wipe follow in `draw`."""
+        """Draw refined garments at new positions [m], by path; maps, wires and a wipe follow in `draw`."""
         at = self._offset(len(self.view.columns) - 1, len(self.view.columns))
         for path, each in points.items():
-            name = f"{FINE}/{self._session.garments.index(path)}"
-            key, handle = self._handles.get(name, (None, None))
-            if handle is not None and isinstance(key, tuple) and key[0] == "plain" and key[1] == len(each):
-                handle.vertices = self._placed(each, at)
+            handle = self._skins.meshes.get(name := f"{FINE}/{self._session.garments.index(path)}")
+            if handle is not None and self.view.map == PLAIN and len(handle.vertices) == len(each):
+                self._skins.move(name, self._placed(each, at))
+
+    def draw_rings(self, at: np.ndarray | None, radius: float, *, eye: np.ndarray) -> None:
+        """Draw the end of a brush, and where it paints half, on the refined cloth.
+
+        Args:
+            at: The brush's middle in the scene [m], shape (3,); None draws nothing.
+            radius: The brush's radius [m].
+            eye: Position of the camera in the scene [m], shape (3,).
+        """
+        meshes = [self._skins.meshes[name] for named in self._columns for name in named if name.startswith(FINE)]
+        for part in FALLOFF:
+            rings = [circle(each.vertices, each.faces, at, part * radius) for each in meshes if at is not None]
+            segments = np.concatenate([np.zeros((0, 2, 3)), *rings])
+            to_eye = eye - segments
+            lifted = segments + LIFT * self.size * to_eye / np.linalg.norm(to_eye, axis=2, keepdims=True)
+            self._draw_lines(f"ring/{part}", lifted, RING, RING_PIXELS * part)
 
     def world(self, point: np.ndarray) -> np.ndarray:
         """The place [m] in the shot of a point on the refined cloth that is drawn."""
@@ -155,31 +190,27 @@ class Picture:
 
     def _offset(self, place: int, count: int) -> np.ndarray:
         """How far a column stands from the middle [m]."""
-        return np.zeros(3) if self.view.wiped else (place - 0.5 * (count - 1)) * self._across * self.right
+        return np.zeros(3) if self.view.wiped else (place - 0.5 * (count - 1)) * self._across * self.axes[0]
 
     def _placed(self, points: np.ndarray, at: np.ndarray) -> np.ndarray:
         return (points - self.centre + at).astype(np.float32)
 
-    def _draw_garment(self, shown: Shown, kept: Shown | None, index: int, *, column: str, at: np.ndarray) -> set[str]:
+    def _draw_garment(self, shown: Shown, kept: Shown | None, index: int, *, column: str, at: np.ndarray) -> list[str]:
         """Draw a garment in a column; returns the names of what is drawn."""
         sheet = self._sheet(shown, kept, index, column)
         if sheet is None:
-            return set()
-        found = None
-        if column == FINE:
-            found = find_map(self._session, shown, index, self.view.map, stroke=self.stroke)
-        colors = None if found is None else self._colored(*found)
-        sheet = self._wiped(sheet, column, _everything(shown.frame))
-        name = f"{column}/{index}"
-        self._place(name, sheet, COLORS[column], at=at, flat=column == CAGE, colors=colors)
-        if column == FINE and self.paintable:
-            self._place(f"target/{index}", sheet, COLORS[column], at=at, opacity=0.0)
-            return {name, f"target/{index}"}
-        return {name} | (self._draw_wires(name, sheet, at=at) if self.view.wires else set())
-
-    def _colored(self, found: Map, values: np.ndarray) -> np.ndarray:
-        self.bar = found
-        return found.colors(values)
+            return []
+        colors = None
+        if column == FINE and (found := find_map(self._session, shown, index, self.view.map, stroke=self.stroke)):
+            self.bar, values = found
+            colors = self.bar.colors(values)
+        own = self._own[self._session.garments[index]]
+        color = to_linear(COLORS[column]) if own is None else own
+        whole, sheet = sheet.triangles, self._wiped(sheet, column, _everything(shown.frame))
+        self._place(name := f"{column}/{index}", sheet, color, at=at, whole=whole, flat=column == CAGE, colors=colors)
+        if self.view.wires:
+            self._draw_lines(f"wires/{name}", self._placed(sheet.points, at)[sheet.edges], WIRE, WIRE_PIXELS)
+        return [name]
 
     def _sheet(self, shown: Shown, kept: Shown | None, index: int, column: str) -> Sheet | None:
         """A garment's mesh in a column, or None."""
@@ -204,34 +235,28 @@ class Picture:
         """The part of a mesh on one side of the wipe; ``drawn`` [m], shape (N, 3), gives the wipe's ends."""
         if not self.view.wiped or len(self.view.columns) < 2:
             return sheet
-        low, high = (drawn @ self.right).min(), (drawn @ self.right).max()
+        right = self.axes[0]
+        low, high = (drawn @ right).min(), (drawn @ right).max()
         line = low + self.view.wipe * (high - low)
         first = column == self.view.columns[0]
 
         def chosen(corners: np.ndarray) -> np.ndarray:
-            at = (sheet.points @ self.right)[corners].mean(axis=1)
+            at = (sheet.points @ right)[corners].mean(axis=1)
             return corners[(at < line) == first]
 
         return replace(sheet, triangles=chosen(sheet.triangles), edges=chosen(sheet.edges))
 
-    def _draw_wires(self, name: str, sheet: Sheet, *, at: np.ndarray) -> set[str]:
-        name, segments = f"{name}/wires", self._placed(sheet.points, at)[sheet.edges]
-        known, handle = self._handles.pop(name, (None, None))
-        if handle is not None and known == len(segments):
-            handle.points = segments
-        elif len(segments):
-            handle = self._scene.add_line_segments(
-                name, segments, WIRE, thickness=WIRE_PIXELS, thickness_units="screen"
-            )
-        elif handle is not None:
+    def _draw_lines(self, name: str, segments: np.ndarray, color: tuple[int, int, int], pixels: float) -> None:
+        """Draw line segments in the scene [m], shape (S, 2, 3), under a name; none removes them."""
+        if (handle := self._lines.pop(name, None)) is not None:
             handle.remove()
         if len(segments):
-            self._handles[name] = len(segments), handle
-        return {name}
+            look: dict[str, Any] = {"thickness": pixels, "thickness_units": "screen"}
+            self._lines[name] = self._scene.add_line_segments(name, segments, color, **look)
 
-    def _draw_trims(self, shown: Shown, index: int, *, at: np.ndarray) -> set[str]:
+    def _draw_trims(self, shown: Shown, index: int, *, at: np.ndarray) -> list[str]:
         """Draw the meshes that hang on a refined garment; returns the names of what is drawn."""
-        points, steps, named = shown.points[index], self._session.refinements[index], set[str]()
+        points, steps, named = shown.points[index], self._session.refinements[index], list[str]()
         if points is None:
             return named
         if index not in self._bindings or self._bindings[index][0] != len(steps):
@@ -240,70 +265,22 @@ class Picture:
             if placed.target.mesh is not None:
                 name, mesh = f"trim/{index}/{placed.target.path}", placed.target.mesh
                 sheet = Sheet(placed.points, mesh.triangulate(placed.target.points).triangles, np.empty((0, 2), int))
-                self._place(name, self._wiped(sheet, FINE, _everything(shown.frame)), TRIM, at=at)
-                named.add(name)
+                whole, sheet = sheet.triangles, self._wiped(sheet, FINE, _everything(shown.frame))
+                self._place(name, sheet, to_linear(TRIM), at=at, whole=whole)
+                named.append(name)
         return named
 
-    def _draw_bodies(self, frame: Frame, column: str, *, at: np.ndarray) -> set[str]:
-        drawn = {f"body/{column}/{index}": pose for index, pose in _drawn(frame).items()}
-        for name, pose in drawn.items():
-            self._place(name, Sheet(pose.points, pose.triangles, np.empty((0, 2), int)), BODY, at=at)
-        return {*drawn}
+    def _draw_bodies(self, frame: Frame, column: str, *, at: np.ndarray) -> list[str]:
+        drawn = {f"body/{column}/{index}": (index, pose) for index, pose in _drawn(frame).items()}
+        for name, (index, pose) in drawn.items():
+            own = self._own.get(self._session.shot.scene.colliders[index].path)
+            color = to_linear(BODY) if own is None else own
+            sheet = Sheet(pose.points, pose.triangles, np.empty((0, 2), int))
+            self._place(name, sheet, color, at=at, whole=pose.triangles)
+        return [*drawn]
 
-    def _place(
-        self,
-        name: str,
-        sheet: Sheet,
-        color: tuple[int, int, int],
-        *,
-        at: np.ndarray,
-        flat: bool = False,
-        colors: np.ndarray | None = None,
-        opacity: float | None = None,
-    ) -> None:
-        """Show a mesh under a name; of a known mesh only points are sent."""
-        known, handle = self._handles.pop(name, (None, None))
-        points = self._placed(sheet.points, at)
-        kind = "plain" if colors is None else "colored"
-        key = (kind, len(points), len(sheet.triangles), sheet.triangles[:1].tobytes())
-        if handle is not None and known == key and colors is None:
-            if not np.array_equal(handle.vertices, points):
-                handle.vertices = points
-        elif colors is None:
-            look: dict[str, Any] = {"color": color, "flat_shading": flat, "side": "double", "opacity": opacity}
-            handle = self._scene.add_mesh_simple(name, points, sheet.triangles, **look)
-        elif handle is not None and known == key:
-            handle.glb_data = _glb(points, sheet.triangles, colors)
-        else:
-            handle = self._scene.add_glb(name, _glb(points, sheet.triangles, colors))
-        self._handles[name] = key, handle
-
-
-def light(scene: viser.SceneApi, drawn: np.ndarray, *, right: np.ndarray, up: np.ndarray) -> None:
-    """Set up floor, sky, and a key light from the left that rakes over folds; nothing that viser would fetch.
-
-    No shadows: on cloth their bands would look like wrinkles. And no grid: without a graphics card it would take half
-    of the time of a picture.
-
-    Args:
-        scene: The scene.
-        drawn: Points of all that is drawn, about the middle of the cloth [m], shape (N, 3).
-        right: Unit vector, shape (3,).
-        up: Unit vector, shape (3,).
-    """
-    size, front = float(np.linalg.norm(np.ptp(drawn, axis=0))), np.cross(right, up)
-    scene.configure_environment_map(None)
-    scene.configure_default_lights(enabled=False)
-    scene.set_background_image(np.full((2, 2, 3), SKY, np.uint8), format="png")
-    scene.add_light_hemisphere("sky", sky_color=(255, 255, 255), ground_color=(200, 196, 190), intensity=1.6)
-    lights = {"key": (-3.0, 2.0, 1.5, 2.6), "fill": (3.0, 0.5, 1.5, 0.5)}
-    for name, (across, above, before, intensity) in lights.items():
-        at = size * (across * right + above * up + before * front)
-        scene.add_light_directional(name, intensity=intensity, position=tuple(at.tolist()))
-    height, wide = float((drawn @ up).min()) - 0.02 * size, FLOOR_SIZE * size
-    corners = [height * up + x * wide * right + y * wide * front for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
-    look: dict[str, Any] = {"color": FLOOR, "side": "double", "cast_shadow": False, "receive_shadow": False}
-    scene.add_mesh_simple("floor", np.asarray(corners, np.float32), np.array([[0, 1, 2], [0, 2, 3]]), **look)
+    def _place(self, name: str, sheet: Sheet, color: np.ndarray, *, at: np.ndarray, **look: Any) -> None:
+        self._skins.place(name, Placed(self._placed(sheet.points, at), sheet.triangles, color=color, **look))
 
 
 def _everything(frame: Frame) -> np.ndarray:
@@ -320,16 +297,3 @@ def _edges(mesh: PolygonMesh) -> np.ndarray:
     """Each edge of a mesh's faces once, shape (E, 2)."""
     ends = np.sort(np.stack([mesh.indices, mesh.indices[mesh.next_corner]], axis=1), axis=1)
     return np.unique(ends, axis=0)
-
-
-def _glb(points: np.ndarray, triangles: np.ndarray, colors: np.ndarray) -> bytes:
-    """A mesh with a colour at each vertex as GLB: matt, and seen from both sides."""
-
-    def matt(tree: dict[str, Any]) -> None:
-        tree["materials"] = [
-            {"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.9}, "doubleSided": True}
-        ]
-        tree["meshes"][0]["primitives"][0]["material"] = 0
-
-    drawn = trimesh.Scene(trimesh.Trimesh(points, triangles, vertex_colors=colors, process=False))
-    return export_glb(drawn, include_normals=True, tree_postprocessor=matt)

@@ -14,13 +14,17 @@ from .values import TUNABLES, Tunable
 AS_AUTHORED, OWN_VALUES, LAST, OWN = "as authored", "own values", "last session", "own: "
 FINEST = 0.002
 """Step of a slider, in its length."""
+CHANGED = "•"
+"""Beside a value that is tried, and may differ from the shot's."""
 RESET, EVERYTHING = "reset ...", "everything"
 STYLE = """<style>
 div:has(> .value) + div .mantine-NumberInput-root, div:has(> .value) + div .mantine-Slider-markLabel,
 div:has(> .value) + div > .mantine-Flex-root > div:first-child {display: none}
 div:has(> .value) {margin: -0.6em 0 -0.2em 0}
+div:has(> .mantine-Text-root > label) {width: 11.5em !important; white-space: nowrap}
+.mantine-Text-root > label > wbr {display: none}
 </style>"""
-"""Hides the sliders' own numbers, which are places on a logarithmic scale."""
+"""Hides the sliders' own numbers, which are places on a logarithmic scale; names stand on one line."""
 
 
 class ValuePanel:
@@ -73,7 +77,7 @@ class ValuePanel:
         for tunable in (each for each in TUNABLES.values() if each.group == group):
             number = gui.add_number(tunable.title, 0.0, hint=tunable.hint)
             gui.add_html("<div class='value'></div>")
-            slider = gui.add_slider(" ", 0.0, 1.0, FINEST, 0.5)
+            slider = gui.add_slider(" ", 0.0, 1.0, FINEST, 0.5, hint=tunable.hint)
             self._rows[tunable.name] = number, slider
             desk.on(number, lambda session, value, of=tunable: self._typed(session, of, value))
             desk.on(slider, lambda session, place, of=tunable: self._slid(session, of, place))
@@ -95,12 +99,13 @@ class ValuePanel:
             put(self._preset, value=OWN_VALUES)
 
     def _write(self, tunable: Tunable, number: Any | None, slider: Any | None) -> None:
-        """Write a value into a number box and a slider, unless None."""
-        value = self._desk.session.value(self._desk.garment, tunable.name)
+        """Write a value into a number box and a slider, unless None; marked if it is tried."""
+        session, garment = self._desk.session, self._desk.garment
+        value = session.value(garment, tunable.name)
         if number is not None:
             shown, decimals = tunable.shown(0.0 if value is None else value)
-            title = tunable.title if value is not None else f"{tunable.title}, not set"
-            put(number, label=title, precision=decimals, step=10.0**-decimals, value=shown)
+            mark = ", unset" if value is None else f" {CHANGED}" if session.tries(garment, tunable.name) else ""
+            put(number, label=tunable.title + mark, precision=decimals, step=10.0**-decimals, value=shown)
         if slider is not None:
             put(slider, value=tunable.place(value if value is not None else tunable.ends[0]))
 

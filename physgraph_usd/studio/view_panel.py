@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, fields, replace
 from typing import Any
 
+from .camera import Camera
 from .desk import Desk, in_order, put
 from .maps import HIGH, LOW, MIDDLE, NAMES, Map
 from .picture import KEPT, SHOWS, View
@@ -14,9 +15,9 @@ from .session import TuneSession
 class ViewPanel:
     """The controls of the picture."""
 
-    def __init__(self, desk: Desk) -> None:
+    def __init__(self, desk: Desk, camera: Camera) -> None:
         """Add the controls, and look as last time."""
-        self._desk, gui = desk, desk.gui
+        self._desk, self._camera, gui = desk, camera, desk.gui
         known = {each.name for each in fields(View)}
         last = {name: value for name, value in desk.notes.looked.get("view", {}).items() if name in known}
         view = View(**last)
@@ -43,8 +44,11 @@ class ViewPanel:
             gui.add_command(label, hotkey=key).on_trigger(in_order(lambda _, change=change: desk.ask(change)))
 
     def set(self, **changes: Any) -> None:
-        """Change how cloth is looked at, by the names of `View`."""
-        self._desk.picture.view = replace(self._desk.picture.view, **changes)
+        """Change how cloth is looked at, by the names of `View`; other columns are framed."""
+        picture, before = self._desk.picture, self._desk.picture.view
+        picture.view = replace(before, **changes)
+        if (before.columns, before.wiped) != (picture.view.columns, picture.view.wiped):
+            self._camera.frame()
         for name, value in changes.items():
             put(self._controls[name], value=value)
 

@@ -9,7 +9,7 @@ occludes the vertex in the direction's map. Light is interpolated between the ve
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -135,7 +135,7 @@ def draw(surfaces: Sequence[Surface | DrawnMesh], view: View, *, size: tuple[int
     picture = np.tile(BACKGROUND.astype(np.float32), (2 * size[1], 2 * size[0], 1))  # Four samples a pixel.
     if surfaces:
         solid = _joined(surfaces)
-        ground = _ground(solid.points, floor if view.eye[1] > floor > -np.inf else None)
+        ground = ground_below(solid.points, floor if view.eye[1] > floor > -np.inf else None)
         drawn = _joined([solid, ground])
         seen = view.project(drawn.points, (picture.shape[1], picture.shape[0]))
         visible = drawn.points[_in_view(seen, solid.triangles, picture)]
@@ -160,8 +160,8 @@ def _joined(surfaces: Sequence[Surface | DrawnMesh]) -> Surface:
     return Surface(*(np.concatenate(part) for part in parts))
 
 
-def _ground(points: np.ndarray, floor: float | None) -> Surface:
-    """A square of cells below points; without triangles where the floor is None."""
+def ground_below(points: np.ndarray, floor: float | None) -> Surface:
+    """A square of cells at a height below points, shape (N, 3); without triangles where the floor is None."""
     low, high = points.min(axis=0)[[0, 2]], points.max(axis=0)[[0, 2]]
     half = 1.1 * max(float(np.max(high - low)), 0.6 * float(np.linalg.norm(np.ptp(points, axis=0))))
     side = np.linspace(-half, half, GROUND_CELLS + 1)
@@ -184,27 +184,73 @@ def _in_view(seen: np.ndarray, triangles: np.ndarray, picture: np.ndarray) -> np
 
 def _shade(solid: Surface, ground: Surface, view: View, visible: np.ndarray) -> np.ndarray:
     """Shading factors at each vertex of the surfaces and the ground: all fronts, then all backs, shape (2 N, 3)."""
-    points, up = np.concatenate([solid.points, ground.points]), np.tile([0.0, 1.0, 0.0], (len(ground.points), 1))
-    normals = np.concatenate([vertex_normals(solid), up])
-    spots, facing, towards = np.tile(points, (2, 1)), np.concatenate([normals, -normals]), _unit(KEY) @ view.axes
-    sky, key = _light(solid, spots, facing, visible=visible, towards=towards)
-    mean = _mean_of_neighbours(solid, LIGHT_WIDTH * float(np.ptp(visible, axis=0).max()))
-    for side in (slice(0, len(solid.points)), slice(len(points), len(points) + len(solid.points))):
-        for light in (sky, key):
-            for _ in range(LIGHT_BLUR):
-                light[side] = mean @ light[side]
+    towards = _unit(KEY) @ view.axes
+    found = soft_light(solid, ground, visible=visible, towards=towards)
+    facing, sky, key = np.concatenate([found.normals, -found.normals]), found.sky.ravel(), found.key.ravel()
+    spots = np.tile(np.concatenate([solid.points, ground.points]), (2, 1))
     front = np.einsum("vk,vk->v", facing, _unit(view.eye - spots)).clip(0, 1)
     warm, cool = np.array([1.04, 1.0, 0.95]), np.array([0.95, 1.0, 1.06])
     shade = (0.98 * (facing @ towards).clip(0, 1) * key)[:, None] * warm
     shade += (sky * (0.36 * (0.75 + 0.25 * facing[:, 1]) + 0.10 * front))[:, None] * cool
-    shade[len(points) :] *= 0.72
-    below, grid = slice(len(solid.points), len(points)), (GROUND_CELLS + 1, GROUND_CELLS + 1)
+    shade[len(found.normals) :] *= 0.72
+    shade[len(solid.points) : len(found.normals)] = 1.0 - ground_shadow(ground, found)[:, None]
+    return shade
+
+
+@dataclass(frozen=True, eq=False)
+class SoftLight:
+    """Light that arrives at the vertices of surfaces and of the ground below, on their fronts and their backs.
+
+    Attributes:
+        normals: Unit normals of the fronts, shape (N, 3).
+        sky: Visible fraction of the sky on each side, shape (2, N).
+        key: Visible fraction of the key light on each side, shape (2, N), whether the side faces it or not.
+    """
+
+    normals: np.ndarray
+    sky: np.ndarray
+    key: np.ndarray
+
+
+def soft_light(
+    solid: Surface,
+    ground: Surface,
+    *,
+    visible: np.ndarray,
+    towards: np.ndarray,
+    cancelled: Callable[[], bool] = lambda: False,
+) -> SoftLight:
+    """Light at the vertices of surfaces, averaged over neighbours, and of the ground.
+
+    Args:
+        solid: The surfaces, which occlude light.
+        ground: The ground, which occludes none; may be empty.
+        visible: Points that the maps of light cover, shape (M, 3); all beyond is lit.
+        towards: Unit vector towards the key light, shape (3,).
+        cancelled: Asked before each map of light: whether the caller no longer needs the result, which then is wrong.
+    """
+    start_warp()
+    points, up = np.concatenate([solid.points, ground.points]), np.tile([0.0, 1.0, 0.0], (len(ground.points), 1))
+    normals = np.concatenate([vertex_normals(solid), up])
+    spots, facing = np.tile(points, (2, 1)), np.concatenate([normals, -normals])
+    found = _light(solid, spots, facing, visible=visible, towards=towards, cancelled=cancelled)
+    sky, key = (each.reshape(2, -1) for each in found)
+    mean = _mean_of_neighbours(solid, LIGHT_WIDTH * float(np.ptp(visible, axis=0).max()))
+    for light in (sky, key):
+        for _ in range(0 if cancelled() else LIGHT_BLUR):
+            light[:, : len(solid.points)] = (mean @ light[:, : len(solid.points)].T).T
+    return SoftLight(normals, sky, key)
+
+
+def ground_shadow(ground: Surface, light: SoftLight) -> np.ndarray:
+    """Darkness of each node of a ground of `ground_below`, 0 for none, fading towards its edges, shape (G,)."""
+    sky, key = light.sky[0, -len(ground.points) :], light.key[0, -len(ground.points) :]
+    if not len(ground.points):
+        return np.zeros(0)
     away = np.linalg.norm(ground.points - ground.points.mean(axis=0), axis=1) / (0.5 * np.ptp(ground.points[:, 0]))
     fade = np.clip(2.6 * (1.0 - away), 0.0, 1.0)
-    lit = uniform_filter((0.62 * sky[below] + 0.38 * key[below]).reshape(grid), GROUND_BLUR, mode="nearest")
-    dark = 0.70 * (1.0 - lit.ravel())
-    shade[below] = (1.0 - fade * fade * (3 - 2 * fade) * dark)[:, None]
-    return shade
+    lit = uniform_filter((0.62 * sky + 0.38 * key).reshape((GROUND_CELLS + 1,) * 2), GROUND_BLUR, mode="nearest")
+    return 0.70 * fade * fade * (3 - 2 * fade) * (1.0 - lit.ravel())
 
 
 def _mean_of_neighbours(solid: Surface, width: float) -> sparse.csr_matrix:
@@ -217,7 +263,13 @@ def _mean_of_neighbours(solid: Surface, width: float) -> sparse.csr_matrix:
 
 
 def _light(
-    solid: Surface, spots: np.ndarray, facing: np.ndarray, *, visible: np.ndarray, towards: np.ndarray
+    solid: Surface,
+    spots: np.ndarray,
+    facing: np.ndarray,
+    *,
+    visible: np.ndarray,
+    towards: np.ndarray,
+    cancelled: Callable[[], bool],
 ) -> tuple[np.ndarray, np.ndarray]:
     """Fractions of sky light and of key light reaching spots with given normals, shape (N,).
 
@@ -229,6 +281,8 @@ def _light(
     key = [_unit(towards + KEY_WIDTH * offset @ across) for offset in _disk(KEY_MAPS)]
     for is_key, directions, size in ((0, _hemisphere(SKY_MAPS), SKY_SIZE), (1, key, KEY_SIZE)):
         for direction in directions:
+            if cancelled():
+                break
             frame = _frame(direction)
             area = frame[:2] @ visible.T
             pixel = max(float(np.ptp(area, axis=1).max()), 1e-9) / size

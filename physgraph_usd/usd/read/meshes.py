@@ -226,6 +226,16 @@ def _read(
     return DrawnMesh(str(mesh.GetPath()), positions, polygons, colors)
 
 
+def color_of(stage: Usd.Stage, path: str) -> np.ndarray | None:
+    """Mean linear colour of a mesh's faces, shape (3,); None for a mesh without colour and for other prims."""
+    mesh = UsdGeom.Mesh(stage.GetPrimAtPath(path))
+    if not mesh:
+        return None
+    faces = len(mesh.GetFaceVertexCountsAttr().Get(Usd.TimeCode.EarliestTime()) or [])
+    colors = _colors(mesh, Usd.TimeCode.EarliestTime(), faces)
+    return colors.mean(axis=0) if faces and (colors != NEUTRAL).any() else None
+
+
 def _colors(mesh: UsdGeom.Mesh, code: Usd.TimeCode, faces: int) -> np.ndarray:
     """Linear colour of each authored face, shape (F, 3): its subset's or mesh's material, displayColor, or neutral."""
     colors = np.tile(np.array(NEUTRAL), (faces, 1))
