@@ -69,7 +69,7 @@ def crumpled_shot(path: Path, fold: float) -> Path:
     stage = new_stage(path)
     ids = np.arange((CELLS + 1) ** 2).reshape(CELLS + 1, -1)
     quads = np.stack([ids[:-1, :-1], ids[1:, :-1], ids[1:, 1:], ids[:-1, 1:]], axis=-1).reshape(-1, 4)
-    attribute = add_mesh(stage, CLOTH, miura(fold) + (0.0, 0.0, 0.001), quads).GetPointsAttr()
+    attribute = add_mesh(stage, CLOTH, miura(fold) + np.array([0.0, 0.0, 0.001]), quads).GetPointsAttr()
     for time in (1.0, 2.0, 3.0):
         points = miura(fold if time == 1.0 else 0.0)
         points[:, 2] += 0.001 * time
