@@ -3,8 +3,8 @@
 The first available of: the points at the time code of ``--rest``, ``physics:restShapePoints``, ``primvars:rest``,
 ``primvars:Pref``, the points' default value, a shape fitted to the median length of each edge over the shot.
 ``--rest auto`` requests the fitted shape even if a shape is authored. Authored shapes are placed in the world like the
-garment at its first time code, or by a skinned garment's bind transform. Of a frame of the animation, as ``--rest`` or
-as default points, the edge lengths count: its folds do not.
+garment at its first time code, or by a skinned garment's bind transform. Of a frame of animated points, as ``--rest``
+or as default points, only the edge lengths count: its folds are not those at rest.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from ...solver.mesh.elements import elastic_elements, hinge_geometry
 from ...solver.mesh.topology import PolygonMesh, adjacency, find_edges
 from ...solver.mesh.weld import Weld
 from ...solver.scene import out_of_bounds
-from ...solver.strain import COLLAPSED, extent
+from ...solver.strain import COLLAPSED
 from ..lookup import nearest, source_name
 from ..stage import Notice, first_value
 from .cage import as_points, repair
@@ -140,7 +140,8 @@ def read_rest(
         rest = replace(rest, notices=(Notice(str(prim.GetPath()), None, message),))
     else:
         rest = _from_default(prim, edges, place(default), first=first)
-        if animation.times and np.allclose(rest.points, first, rtol=0.0, atol=_SAME_PLACE * extent(first).max()):
+        is_frame = np.allclose(rest.points, first, rtol=_SAME_PLACE, atol=_SAME_PLACE)
+        if is_frame and animation.times and baked.GetPrimAtPath(prim.GetPath()) is None:  # A bind pose is modelled.
             rest = replace(rest, points=_lengths_of(prim, weld, rest.points))
     return _checked(prim, edges, replace(rest, notices=(*odd, *rest.notices)), first=first)
 
