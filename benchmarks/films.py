@@ -3,7 +3,7 @@
     python -m benchmarks.films docs/films [NAME...] [--folder SHOTS]
 
 Refines some frames of a sample, or of a real shot below the folder, at level 2 and writes NAME.mp4, a loop, NAME.jpg,
-the frame in which the two sides differ most, and for README.md NAME.webp, an animated picture. `Figures` go into
+the frame with the most folds that its cage lacks, and for README.md NAME.webp, an animated picture. `Figures` go into
 figures.json, which `python -m docs.tables` shows in the gallery. Takes the program ffmpeg with libx264.
 """
 
@@ -39,8 +39,6 @@ LEVEL, PANEL, QUALITY = 2, (480, 540), "25"
 """Subdivisions, one side's size [pixels], and x264's rate factor."""
 LOOP, QUADS = "Cage, Loop subdivision", "Cage, Catmull-Clark subdivision"
 """Titles of the left side: `solver/mesh/subdivide.py` has one rule of both, the pure one among one kind of face."""
-TITLE = PANEL[1] // 12
-"""Height of the titles [pixels]."""
 
 
 @dataclass(frozen=True)
@@ -177,7 +175,7 @@ def film(shot: Path, shown: Shown, layer: Path, out: Path) -> None:
     seconds = round(spent / len(times), 2)
     record(out, Figures(len(times), len(report.unsettled), cage, vertices, seconds, (before, after)))
     drawn = [Image.fromarray(pixels) for pixels in pictures(sides, shown)]
-    max(drawn, key=difference).save(out.with_suffix(".jpg"), quality=85)
+    max(drawn, key=added_folds).save(out.with_suffix(".jpg"), quality=85)
     encode(drawn, out, rate=shown.rate)
     if out.stem in README:
         moving = {"save_all": True, "append_images": drawn[1:], "duration": 1000 // shown.rate, "loop": 0}
@@ -193,10 +191,11 @@ def record(out: Path, figures: Figures) -> None:
     file.write_text("{\n" + ",\n".join(lines) + "\n}\n", "utf-8")
 
 
-def difference(sheet: Image.Image) -> float:
-    """How much the two sides of a picture differ, below their titles: the sum of the pixels' differences."""
-    pixels = np.asarray(sheet)[TITLE:].astype(float)
-    return float(np.abs(pixels[:, : PANEL[0]] - pixels[:, PANEL[0] :]).sum())
+def added_folds(sheet: Image.Image) -> float:
+    """How much more the shading varies on the right of a picture than on the left: the pixels' steps, summed."""
+    pixels = np.asarray(sheet).astype(float)
+    left, right = (np.abs(np.diff(side, axis=0)).sum() for side in np.split(pixels, 2, axis=1))
+    return float(right - left)
 
 
 def smooth(shot: Path, fine: DrawnStage, times: Sequence[float], garments: Sequence[str]) -> Iterator[Side]:
