@@ -173,6 +173,7 @@ def test_the_first_films_have_the_figures_of_the_record(name: str, page: str):
     assert f"{recorded['cage']:,} vertices to {recorded['fine']:,}" in " ".join(after.split("![")[0].split())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("notebook", sorted((ROOT / "docs" / "notebooks").glob("*.ipynb")), ids=lambda each: each.stem)
 def test_notebooks_run(notebook: Path, monkeypatch: pytest.MonkeyPatch):
     """The cells run in order in one namespace, without a notebook server; their own assertions judge the results."""
