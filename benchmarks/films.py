@@ -2,22 +2,21 @@
 
     python -m benchmarks.films docs/films [NAME...] [--folder SHOTS]
 
-Refines some frames of a sample, or of a real shot below the folder, at level 2 and writes NAME.mp4, a loop, and
-NAME.jpg, one of its frames. Prints how
-many frames did not settle, the median time a frame, and the edges through faces of cloth and of bodies in all frames of
-both sides, counted by `benchmarks.crossing_count`. Takes the program ffmpeg with libx264. The dancer is also written as
-an animated picture, for README.md.
+Refines some frames of a sample, or of a real shot below the folder, at level 2 and writes NAME.mp4, a loop, NAME.jpg,
+the frame with the most folds that its cage lacks, and for README.md NAME.webp, an animated picture. `Figures` go into
+figures.json, which `python -m docs.tables` shows in the gallery. Takes the program ffmpeg with libx264.
 """
 
 from __future__ import annotations
 
+import json
 import shutil
-import statistics
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import click
@@ -47,9 +46,9 @@ class Shown:
     """What of a shot is filmed.
 
     Attributes:
+        caption: What the gallery says of it.
         frames: First and last time code.
         camera: Azimuth and elevation [degrees].
-        still: Time code of the picture that stands for the film.
         title: Of the left side.
         rate: Frames a second; shots have 24.
         source: Path of a real shot below the folder; "" for the sample of the film's name.
@@ -59,9 +58,9 @@ class Shown:
         near: Heights between which the picture is filled, as fractions of the whole's; None for the whole.
     """
 
+    caption: str
     frames: tuple[float, float]
     camera: tuple[float, float]
-    still: float
     title: str = LOOP
     rate: int = 12
     source: str = ""
@@ -72,9 +71,9 @@ class Shown:
 
 
 WALK = Shown(
+    "Trousers, shirt and belt on a walk",
     (1001.0, 1036.0),
     (35.0, 6.0),
-    1018.0,
     QUADS,
     source="20_trousers_belt_shirt_walk_cm.usdc",
     garments=("/char/cloth/shirt", "/char/cloth/trousers", "/char/cloth/belt"),
@@ -84,32 +83,54 @@ WALK = Shown(
     ),
 )
 SHOWN = {
-    "dancer": Shown((1.0, 60.0), (20.0, 7.0), 33.0, QUADS, 24),
-    "tshirt": Shown((1.0, 36.0), (15.0, 8.0), 17.0, QUADS),
-    "layers": Shown((1.0, 30.0), (30.0, 6.0), 20.0, QUADS),
-    "sleeve": Shown((1.0, 24.0), (25.0, 10.0), 22.0),
-    "skirt": Shown((1.0, 32.0), (25.0, 6.0), 24.0),
-    "flag": Shown((1.0, 30.0), (25.0, 10.0), 24.0, QUADS),
-    "block": Shown((1.0, 24.0), (40.0, 22.0), 16.0, QUADS),
     "walk": WALK,
-    "walk_near": replace(WALK, camera=(15.0, 4.0), near=(0.42, 0.72)),
+    "walk_near": replace(WALK, caption="The same walk, near", camera=(15.0, 4.0), near=(0.42, 0.72)),
     "coat": Shown(
+        "An open wool coat",
         (1001.0, 1040.0),
         (30.0, 6.0),
-        1020.0,
         QUADS,
         source="21_open_coat_skinned.usdc",
         garments=("/shot/hero/geo/coat",),
         bodies=("/shot/hero/geo/body",),
         presets=("preset=wool",),
     ),
+    "dancer": Shown("A dancer in a cotton dress", (1.0, 60.0), (20.0, 7.0), QUADS, 24),
+    "tshirt": Shown("A T-shirt", (1.0, 36.0), (15.0, 8.0), QUADS),
+    "layers": Shown("Trousers, shirt and belt", (1.0, 30.0), (30.0, 6.0), QUADS),
+    "sleeve": Shown("A sleeve, pushed together and twisted", (1.0, 24.0), (25.0, 10.0)),
+    "skirt": Shown("A skirt on turning hips", (1.0, 32.0), (25.0, 6.0)),
+    "flag": Shown("A flag in the wind", (1.0, 30.0), (25.0, 10.0), QUADS),
+    "block": Shown("A sheet dropped over a block", (1.0, 24.0), (40.0, 22.0), QUADS),
 }
 """The films by name."""
 
-README = "dancer"
-"""The film that README.md shows: pages of repositories play animated pictures, no films."""
+README = ("walk", "dancer")
+"""The films that README.md shows: pages of repositories play animated pictures, no films."""
 
 Side = list[DrawnMesh]
+
+
+@dataclass(frozen=True)
+class Figures:
+    """What figures.json says of a film.
+
+    Attributes:
+        frames: Number of frames.
+        unsettled: Number of frames that did not settle.
+        cage: Number of vertices of the garments in the shot.
+        fine: Number of vertices of either side.
+        seconds: Processor time a frame [s], with reading, writing and the first frame.
+        crossings: Edges through faces of cloth and of bodies in all frames, subdivided and refined, counted by
+            `benchmarks.crossing_count`.
+    """
+
+    frames: int
+    unsettled: int
+    cage: int
+    fine: int
+    seconds: float
+    crossings: tuple[int, int]
 
 
 @click.command()
@@ -127,11 +148,11 @@ def main(out: Path, names: Sequence[str], folder: Path | None) -> None:
             continue
         with tempfile.TemporaryDirectory() as place:
             shot = (folder or Path()) / shown.source if shown.source else write_sample(name, Path(place))
-            film(name, shot, shown, Path(place) / "refined.usdc", out / f"{name}.mp4")
+            film(shot, shown, Path(place) / "refined.usdc", out / f"{name}.mp4")
 
 
-def film(name: str, shot: Path, shown: Shown, layer: Path, out: Path) -> None:
-    """Refine a shot into a layer, draw each of its frames, and print its figures."""
+def film(shot: Path, shown: Shown, layer: Path, out: Path) -> None:
+    """Refine a shot into a layer, draw each of its frames, and record its figures."""
     options = RefineOptions(
         frames=shown.frames,
         level=LEVEL,
@@ -139,35 +160,52 @@ def film(name: str, shot: Path, shown: Shown, layer: Path, out: Path) -> None:
         colliders=shown.bodies,
         overrides=shown.presets,
     )
+    start = time.process_time()
     report = refine_shot(shot, layer, options)
+    spent = time.process_time() - start
     garments = [each["path"] for each in report.garments]
     fine = DrawnStage(shot, layer)
     times = fine.times(tuple(garments))
     fine.bake(times)
-    refined = (fine.meshes(time, cages=garments) for time in times)
+    refined = (fine.meshes(each, cages=garments) for each in times)
     sides = list(zip(times, smooth(shot, fine, times, garments), refined, strict=True))
     columns = ([left for _, left, _ in sides], [right for _, _, right in sides])
-    counts = [sum(crossings(side, garments) for side in column) for column in columns]
-    seconds = statistics.median(sum(each["garments"][0]["milliseconds"].values()) for each in report.frames) / 1e3
-    said = f"{len(times)} frames, {len(report.unsettled)} not settled, {seconds:.2f} s a frame"
-    say(f"{name}: {said}, crossings {counts[0]:,} -> {counts[1]:,}")
-    drawn = {time: Image.fromarray(pixels) for time, pixels in pictures(sides, shown)}
-    drawn[shown.still].save(out.with_suffix(".jpg"), quality=85)
-    encode(list(drawn.values()), out, rate=shown.rate)
-    if name == README:
-        first, *others = drawn.values()
-        moving = {"save_all": True, "append_images": others, "duration": 1000 // shown.rate, "loop": 0}
-        first.save(out.with_suffix(".webp"), quality=55, method=3, **moving)
+    before, after = (sum(crossings(side, garments) for side in column) for column in columns)
+    cage, vertices = (sum(each[kind] for each in report.garments) for kind in ("points", "fine_points"))
+    seconds = round(spent / len(times), 2)
+    record(out, Figures(len(times), len(report.unsettled), cage, vertices, seconds, (before, after)))
+    drawn = [Image.fromarray(pixels) for pixels in pictures(sides, shown)]
+    max(drawn, key=added_folds).save(out.with_suffix(".jpg"), quality=85)
+    encode(drawn, out, rate=shown.rate)
+    if out.stem in README:
+        moving = {"save_all": True, "append_images": drawn[1:], "duration": 1000 // shown.rate, "loop": 0}
+        drawn[0].save(out.with_suffix(".webp"), quality=55, method=3, **moving)
+
+
+def record(out: Path, figures: Figures) -> None:
+    """Print a film's figures and put them into figures.json."""
+    say(f"{out.stem}: {figures}")
+    file = out.with_name("figures.json")
+    kept = json.loads(file.read_text("utf-8")) if file.exists() else {}
+    lines = (f'"{name}": {json.dumps(each)}' for name, each in sorted({**kept, out.stem: asdict(figures)}.items()))
+    file.write_text("{\n" + ",\n".join(lines) + "\n}\n", "utf-8")
+
+
+def added_folds(sheet: Image.Image) -> float:
+    """How much more the shading varies on the right of a picture than on the left: the pixels' steps, summed."""
+    pixels = np.asarray(sheet).astype(float)
+    left, right = (np.abs(np.diff(side, axis=0)).sum() for side in np.split(pixels, 2, axis=1))
+    return float(right - left)
 
 
 def smooth(shot: Path, fine: DrawnStage, times: Sequence[float], garments: Sequence[str]) -> Iterator[Side]:
     """The fine meshes at the places that the rules of subdivision give them, one side a time."""
     coarse = open_shot(str(shot), level=LEVEL, garments=garments)
     problem = problem_of(coarse)
-    for time in times:
-        places = problem.upsampled(coarse.frame(time), smooth=True)
-        points = {garment.path: each for garment, each in zip(coarse.scene.garments, places, strict=True)}
-        yield [replace(mesh, points=points.get(mesh.path, mesh.points)) for mesh in fine.meshes(time, cages=garments)]
+    for each in times:
+        places = problem.upsampled(coarse.frame(each), smooth=True)
+        points = {garment.path: found for garment, found in zip(coarse.scene.garments, places, strict=True)}
+        yield [replace(mesh, points=points.get(mesh.path, mesh.points)) for mesh in fine.meshes(each, cages=garments)]
 
 
 def crossings(side: Side, garments: Sequence[str]) -> int:
@@ -189,22 +227,22 @@ def edges_of(mesh: DrawnMesh) -> np.ndarray:
     return np.unique(np.sort(pairs, axis=1), axis=0)
 
 
-def pictures(sides: Sequence[tuple[float, Side, Side]], shown: Shown) -> Iterator[tuple[float, np.ndarray]]:
-    """The pixels at each time, both sides from one camera."""
+def pictures(sides: Sequence[tuple[float, Side, Side]], shown: Shown) -> Iterator[np.ndarray]:
+    """The pixels of each frame, both sides from one camera."""
     points = np.concatenate([mesh.points for _, _, side in sides for mesh in side])
     floor = float(points[:, 1].min()) - 0.02
     if shown.near is not None:
         low, high = floor + np.array(shown.near) * np.ptp(points[:, 1])
         points = points[(points[:, 1] > low) & (points[:, 1] < high)]
     view: View = fit_view(points, PANEL[0] / PANEL[1], azimuth=shown.camera[0], elevation=shown.camera[1])
-    for time, *both in sides:
+    for _, *both in sides:
         sheet = Image.new("RGB", (2 * PANEL[0], PANEL[1]))
         pen = ImageDraw.Draw(sheet)
         for place, (title, side) in enumerate(zip((shown.title, "Refined"), both, strict=True)):
             pixels = draw(side, view, size=PANEL, floor=floor)
             sheet.paste(Image.fromarray(pixels), (place * PANEL[0], 0))
             label(pen, (place * PANEL[0], 0), PANEL[1], lines=[title])
-        yield time, np.asarray(sheet)
+        yield np.asarray(sheet)
 
 
 def encode(frames: Sequence[Image.Image], out: Path, *, rate: int) -> None:

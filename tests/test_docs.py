@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shlex
 import shutil
 import subprocess
 import sys
+import threading
+from functools import partial
 from glob import glob
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import NamedTuple
 
 import pytest
+from browser import served
 from shots import run
 from stages import add_mesh, add_sheet, new_stage, save
 
+from benchmarks.films import README as README_FILMS
 from docs import tables
 from physgraph_usd.cli import main
 from physgraph_usd.shot.options import OPTIONS
@@ -143,7 +149,7 @@ def test_advice_names_what_there_is(name: str):
         assert f"| `{attribute}` |" in attributes
 
 
-def test_the_table_of_warnings_is_the_one_of_the_code():
+def test_tables_are_those_of_the_code_and_of_the_films():
     for page in tables.PAGES:
         assert tables.page_with_table(page) == page.read_text("utf-8"), "run python -m docs.tables"
 
@@ -151,18 +157,73 @@ def test_the_table_of_warnings_is_the_one_of_the_code():
 def test_the_gallery_has_its_films_and_they_are_short():
     page = (ROOT / "docs" / "gallery.md").read_text("utf-8")
     films = {ROOT / "docs" / name for name in re.findall(r'(?:src|poster)="([^"]+)"', page)}
-    assert len(films) >= 6
+    assert {each.stem for each in films} == {*json.loads(tables.FIGURES.read_text("utf-8"))}
+    films |= set((ROOT / "docs" / "films").glob("*.webp"))
     sizes = {film: film.stat().st_size for film in films}
     assert max(sizes.values()) <= MOST_BYTES_OF_A_FILM
     assert sum(sizes.values()) <= MOST_BYTES_OF_FILMS
 
 
-def test_the_site_builds_without_a_warning(tmp_path: Path):
-    """Dead links, missing pictures and pages that are in no menu are warnings."""
-    line = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path / "site")]
+@pytest.mark.parametrize("name", README_FILMS)
+@pytest.mark.parametrize("page", ["README.md", "docs/index.md"])
+def test_the_first_films_have_the_figures_of_the_record(name: str, page: str):
+    recorded, text = json.loads(tables.FIGURES.read_text("utf-8"))[name], (ROOT / page).read_text("utf-8")
+    _, shown, after = text.partition(f"films/{name}.webp")
+    assert shown
+    assert f"{recorded['cage']:,} vertices to {recorded['fine']:,}" in " ".join(after.split("![")[0].split())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("notebook", sorted((ROOT / "docs" / "notebooks").glob("*.ipynb")), ids=lambda each: each.stem)
+def test_notebooks_run(notebook: Path, monkeypatch: pytest.MonkeyPatch):
+    """The cells run in order in one namespace, without a notebook server; their own assertions judge the results."""
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    cells = [each for each in json.loads(notebook.read_text("utf-8"))["cells"] if each["cell_type"] == "code"]
+    names: dict[str, object] = {}
+    for cell in cells:
+        exec("".join(cell["source"]), names)
+    assert len(cells) >= 4
+    assert any("image/png" in output.get("data", {}) for cell in cells for output in cell["outputs"])
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The site, built without a warning: dead links, missing pictures and pages that are in no menu are warnings."""
+    place = tmp_path_factory.mktemp("site")
+    line = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(place)]
     done = subprocess.run(line, cwd=ROOT, capture_output=True, text=True, check=False, timeout=240)
     assert done.returncode == 0, done.stderr
     assert "not included in the" not in done.stderr
-    assert (tmp_path / "site" / "index.html").is_file()
-    python = (tmp_path / "site" / "api.html").read_text(encoding="utf-8")
+    return place
+
+
+def test_the_site_has_its_pages(site: Path):
+    assert (site / "index.html").is_file()
+    assert "data:image/png" in (site / "notebooks" / "solver.html").read_text(encoding="utf-8")
+    python = (site / "api.html").read_text(encoding="utf-8")
     assert not [name for name in OPTIONS if f">{name}</span></code></td>" not in python]
+
+
+@pytest.mark.browser
+def test_the_site_searches_and_turns_dark_without_the_network(site: Path):
+    handler = partial(QuietHandler, directory=str(site))
+    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        try:
+            with served(f"http://127.0.0.1:{server.server_port}/") as page:
+                page.get_by_placeholder("Search").click()
+                page.keyboard.type("denim")
+                page.locator(".md-search-result__item", has_text="denim").first.wait_for()
+                page.keyboard.press("Escape")
+                assert page.locator("body").get_attribute("data-md-color-scheme") == "default"
+                page.locator("label[title=Dark]").click()
+                page.locator("body[data-md-color-scheme=slate]").wait_for()
+        finally:
+            server.shutdown()
+
+
+class QuietHandler(SimpleHTTPRequestHandler):
+    """Serves files without a line for each."""
+
+    def log_message(self, format: str, *args: object) -> None:
+        """Write nothing."""
