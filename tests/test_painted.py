@@ -89,7 +89,7 @@ def test_set_gather_refuses_cloth_without_borders(stage: Usd.Stage) -> None:
     cloth.GetPointsAttr().Set([(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)])
     cloth.GetFaceVertexCountsAttr().Set([3, 3, 3, 3])
     cloth.GetFaceVertexIndicesAttr().Set([0, 2, 1, 0, 1, 3, 0, 3, 2, 1, 2, 3])
-    with pytest.raises(GarmentError, match="it has none.*paint primvars:physgraph:gather, or set weftEase"):
+    with pytest.raises(GarmentError, match=r"it has none.*paint primvars:physgraph:gather, or set weftEase"):
         open_shot(save(stage), overrides=["gather=30"])
 
 
