@@ -65,12 +65,11 @@ def test_a_constant_holds_everywhere_and_is_inherited(stage: Usd.Stage, at: str)
 
 def test_set_replaces_a_map_by_one_value_nearest_prim_first(stage: Usd.Stage) -> None:
     paint(stage, "bendScale", RAMP.tolist())
-    paint(stage, "easeScale", RAMP.tolist())
+    paint(stage, "stretchScale", RAMP.tolist())
     texts = ["bendScale=3", "/World/rig/cloth.bendScale=2.5"]
     garment = open_shot(save(stage), overrides=texts).scene.garments[0]
     np.testing.assert_array_equal(garment.bend_scale, np.full(20, 2.5))
-    assert garment.grain is not None
-    np.testing.assert_allclose(garment.grain.ease_scale, RAMP, rtol=1e-6)
+    np.testing.assert_allclose(garment.stretch_scale, RAMP, rtol=1e-6)
 
 
 def test_set_gather_acts_at_open_borders(stage: Usd.Stage) -> None:
