@@ -28,7 +28,7 @@ from physgraph_usd.solver.integrate import method_named
 from physgraph_usd.solver.level import Level, build_levels, refine_garments
 from physgraph_usd.solver.mesh.weld import unwelded
 from physgraph_usd.solver.scene import Frame, GarmentFrame, Grain, Scene
-from physgraph_usd.usd.read.grain import read_grain
+from physgraph_usd.usd.read.grain import read_grain, unevenness
 
 ALONG = np.array([1.0, 0.0, 0.0])
 WOVEN = Fabric(1000.0, 20e-6, 0.3, shear=70.0, weft_stretch=250.0, weft_bend=8e-6)
@@ -169,6 +169,49 @@ def test_ease_folds_cloth_whose_cage_is_at_rest():
     assert bumps[0.0] < 1e-5
     assert bumps[0.04] > 1e-3
     assert slope[along].mean() > 1.5 * slope[~along].mean()
+
+
+def test_folds_are_where_the_uneven_ease_is():
+    """Even ease folds both halves of a sheet alike; uneven ease folds more where there is more of it."""
+    points, triangles = equilateral(0.3, 0.3, 0.02)
+    mesh = triangle_mesh(triangles, len(points))
+    uneven = unevenness(mesh, points)
+    ratio = []
+    for scale in (np.ones(len(points)), uneven):
+        grain = Grain(np.broadcast_to(ALONG, (mesh.face_count, 3)), scale, 0 * scale)
+        garment = replace(garment_of(mesh, points), grain=grain, level=1)
+        refiner = Refiner(Scene((garment,), np.zeros(3)), SolveSettings())
+        fine = refiner.solve(Frame(None, (GarmentFrame(points, Fabric(warp_ease=0.04)),))).points[0]
+        assert fine is not None
+        level = build_levels([garment], refine_garments([garment], [1]), dtype=torch.float64)[-1]
+        ends = level.edges.numpy()
+        slope = (np.diff(fine[:, 2][ends], axis=1)[:, 0] / level.rest_length.numpy()) ** 2
+        much = (level.from_coarse @ uneven)[ends].mean(axis=1) > 1.0
+        ratio.append(slope[much].mean() / slope[~much].mean())
+    assert ratio[1] > 1.5 * ratio[0]
+
+
+def test_uneven_ease_has_mean_one_and_goes_by_the_shape_alone():
+    points, triangles = equilateral(0.6, 0.6, 0.02)
+    mesh = triangle_mesh(triangles, len(points))
+    found = unevenness(mesh, points)
+    assert found.mean() == pytest.approx(1.0)
+    assert found.min() > 0.0
+    assert found.std() > 0.3
+    assert np.corrcoef(found[mesh.half_edges.edges].T)[0, 1] > 0.7  # That of the waves is sin(k) / k, k = 2 pi / 6.
+    assert unevenness(mesh, 100.0 * points + [5.0, -3.0, 2.0]) == pytest.approx(found)
+
+
+def test_cloth_without_ease_is_the_same_whatever_its_uneven_ease():
+    points, triangles = equilateral(0.16, 0.16, 0.02)
+    mesh = triangle_mesh(triangles, len(points))
+    lengths = []
+    for scale in (np.ones(len(points)), unevenness(mesh, points)):
+        grain = Grain(np.broadcast_to(ALONG, (mesh.face_count, 3)), scale, np.full(len(points), 0.3))
+        garment = replace(garment_of(mesh, points), grain=grain)
+        level = build_levels([garment], refine_garments([garment], [1]))[-1]
+        lengths.append(level.eased([Fabric()]).spring_length)
+    assert torch.equal(*lengths)
 
 
 SPRINGS, TRIANGLES = Fabric(30.0), Fabric(30.0, shear=7.0)

@@ -131,7 +131,8 @@ def test_what_is_out_of_limits_is_refused_by_name(stage: Usd.Stage, value: float
         ("bendStiffness=-1", r"must be finite and in \[0, 100000\]"),
         ("level=1.5", "whole number"),
         ("colliders=/World", "not a single number"),
-        ("pin=1", "not a single number"),
+        ("gather=0.3", "it is in percent; write gather=30 for 0.3 times the length"),
+        ("gather=500", r"must be finite and in \[-50, 400\] %"),
         ("</World.bendStiffness=1", "cannot read|unknown|no such garment"),
     ],
 )

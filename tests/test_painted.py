@@ -9,7 +9,7 @@ import pytest
 from pxr import Usd, UsdGeom
 from stages import add_sheet, new_stage, save, value_type
 
-from physgraph_usd.errors import SchemaError
+from physgraph_usd.errors import GarmentError, SchemaError
 from physgraph_usd.usd.read.garment import read_painted
 from physgraph_usd.usd.read.reader import open_shot
 from physgraph_usd.usd.schema import GARMENT, PROPERTIES, Property
@@ -61,6 +61,35 @@ def test_a_constant_holds_everywhere_and_is_inherited(stage: Usd.Stage, at: str)
         stage.DefinePrim(at)
     paint(stage, "bendScale", [2.5], how="constant", at=at)
     np.testing.assert_array_equal(read(stage, "bendScale"), np.full(20, 2.5))
+
+
+def test_set_replaces_a_map_by_one_value_nearest_prim_first(stage: Usd.Stage) -> None:
+    paint(stage, "bendScale", RAMP.tolist())
+    paint(stage, "stretchScale", RAMP.tolist())
+    texts = ["bendScale=3", "/World/rig/cloth.bendScale=2.5"]
+    garment = open_shot(save(stage), overrides=texts).scene.garments[0]
+    np.testing.assert_array_equal(garment.bend_scale, np.full(20, 2.5))
+    np.testing.assert_allclose(garment.stretch_scale, RAMP, rtol=1e-6)
+
+
+def test_set_gather_acts_at_open_borders(stage: Usd.Stage) -> None:
+    """The sheet is a grid of 5 x 4 points, row by row, of which 2 rows of 3 lie inside."""
+    paint(stage, "gather", (100.0 * RAMP).tolist())
+    garment = open_shot(save(stage), overrides=["/World/rig.gather=30"]).scene.garments[0]
+    inside = np.zeros((4, 5), bool)
+    inside[1:3, 1:4] = True
+    assert garment.grain is not None
+    np.testing.assert_allclose(garment.grain.gather, np.where(inside.ravel(), 0.0, 0.3))
+
+
+def test_set_gather_refuses_cloth_without_borders(stage: Usd.Stage) -> None:
+    cloth = UsdGeom.Mesh(stage.GetPrimAtPath("/World/rig/cloth"))
+    cloth.GetPointsAttr().Clear()
+    cloth.GetPointsAttr().Set([(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)])
+    cloth.GetFaceVertexCountsAttr().Set([3, 3, 3, 3])
+    cloth.GetFaceVertexIndicesAttr().Set([0, 2, 1, 0, 1, 3, 0, 3, 2, 1, 2, 3])
+    with pytest.raises(GarmentError, match=r"it has none.*paint primvars:physgraph:gather, or set weftEase"):
+        open_shot(save(stage), overrides=["gather=30"])
 
 
 @pytest.mark.parametrize(

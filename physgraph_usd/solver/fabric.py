@@ -56,7 +56,7 @@ PRESETS: dict[str, Fabric] = {
     "denim": Fabric(1054.0, 41e-6, 0.324, shear=69.0, weft_stretch=226.0, weft_bend=28e-6),
     "jersey": Fabric(30.0, 4.7e-6, 0.187),
     "rib": Fabric(50.0, 9.3e-6, 0.276),
-    "leather": Fabric(640.0, 50e-6, 0.65),
+    "leather": Fabric(640.0, 60e-6, 0.65),
     "worn-denim": Fabric(1054.0, 14e-6, 0.324, shear=69.0, weft_stretch=226.0, weft_ease=0.02),
     "crisp-cotton": Fabric(261.0, 23e-6, 0.150, weft_ease=0.01),
     "soft-jersey": Fabric(30.0, 3.6e-6, 0.187, weft_ease=0.03),

@@ -102,13 +102,15 @@ def _parse_override(text: str) -> list[Override]:
         values = [(GARMENT[name], value) for name, value in every_fabric_value(PRESETS[word]).items()]
         return [Override(prim, row, v) for row, v in values if row.short not in _OWN or v not in (None, row.fallback)]
     row = find_property(match["name"])
-    if row.type == "rel" or row.interpolation or (row.type == "token" and row is not COLLIDER["collider:side"]):
+    if row.type == "rel" or (row.type == "token" and row is not COLLIDER["collider:side"]):
         raise UsageError(f"{row.name} is not a single number; author it on the prim")
     try:
         if row.type == "token":
             return [Override(prim, row, check_token(row, word, text))]
         words = _WORDS | ({"auto": AUTO_LEVEL} if row is GARMENT["refine:level"] else {})
         value = words[word] if word in words else float(word)
+        if row is GARMENT["gather"] and 0.0 < abs(value) < 1.0:
+            raise ValueError(f"it is in percent; write {row.short}={100.0 * value:g} for {value:g} times the length")
         return [Override(prim, row, check_limits(row, value, text))]
     except (ValueError, SchemaError) as error:
         raise UsageError(f"cannot use {text!r}: {error}") from error

@@ -13,6 +13,7 @@ import numpy as np
 from pxr import Sdf, Usd, UsdGeom
 
 from ...errors import GarmentError, SchemaError, counted
+from ...solver.mesh.borders import open_edges
 from ...solver.mesh.topology import PolygonMesh
 from ...solver.mesh.weld import Weld, seam_reach, weld, weld_skins
 from ...solver.scene import Garment, GarmentFrame, mean_edge
@@ -175,7 +176,7 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], samples: Samples, re
     notices = [*samples.notices(str(prim.GetPath()), absent), *cage.notices, *odd, *placement]
     values = find_values(prim, request.units, request.overrides)
     constants, of_constants = _constants(prim, request)
-    painted, cut = _painted(prim, weld, notices, values=values)
+    painted, cut = _painted(prim, weld, notices, values=values, overrides=request.overrides)
     subsets = read_subsets(prim, cage.kept_faces[weld.faces], units=request.units, time=times[0] if times else None)
     pieces = _pieces(prim, weld, rest.points, subsets.faces, notices)
     grain, lies = read_grain(prim, weld, rest.points, kept=cage.kept_faces, up=request.units.up, painted=cut)
@@ -331,7 +332,7 @@ def _rest(prim: Usd.Prim, weld: Weld, animation: Animation, request: Request, *,
 
 
 def _painted(
-    prim: Usd.Prim, weld: Weld, notices: list[Notice], *, values: Values
+    prim: Usd.Prim, weld: Weld, notices: list[Notice], *, values: Values, overrides: Sequence[Override]
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """The painted arrays of a garment by field name, times the relative thickness, and the grain's by schema name.
 
@@ -342,12 +343,23 @@ def _painted(
     cut = ("easeScale", "gather", "grain")
     arrays = {}
     for name, short in (names | dict(zip(cut, cut, strict=True))).items():
-        arrays[name], odd = read_painted(prim, short, weld.apart.vertex_count)
+        arrays[name], odd = read_painted(prim, short, weld.apart.vertex_count, overrides=overrides)
         notices.extend(odd)
+    if find_value(prim, GARMENT["gather"], overrides).source == "--set":
+        arrays["gather"] *= _at_open_borders(prim, weld)
     arrays["stretch_scale"] = arrays["stretch_scale"] * values.thickness_scale("stretchStiffness")
     arrays["bend_scale"] = arrays["bend_scale"] * values.thickness_scale("bendStiffness")
     joined = {name: weld.largest(arrays[name]) if name == "pin" else weld.joined(arrays[name]) for name in names}
     return joined, {name: arrays[name] for name in cut}
+
+
+def _at_open_borders(prim: Usd.Prim, weld: Weld) -> np.ndarray:
+    """True at the authored vertices on borders that are open when sewn; GarmentError without such a border."""
+    ends = open_edges(weld.mesh)
+    if not len(ends):
+        remedy = f"paint {GARMENT['gather'].name}, or set weftEase for all of the cloth"
+        raise GarmentError(str(prim.GetPath()), "--set gather acts at open borders, and it has none", remedy=remedy)
+    return np.isin(weld.number, ends)
 
 
 def _size_notices(prim: Usd.Prim, points: np.ndarray, matrix: np.ndarray, request: Request) -> list[Notice]:
@@ -398,10 +410,12 @@ def is_visible(prim: Usd.Prim, times: Sequence[float]) -> bool:
     return any(imageable.ComputeVisibility(code) != UsdGeom.Tokens.invisible for code in codes)
 
 
-def read_painted(prim: Usd.Prim, short: str, count: int) -> tuple[np.ndarray, tuple[Notice, ...]]:
+def read_painted(
+    prim: Usd.Prim, short: str, count: int, *, overrides: Sequence[Override] = ()
+) -> tuple[np.ndarray, tuple[Notice, ...]]:
     """A painted multiplier or pin of a mesh at each point, shape (count,), float64, and notices.
 
-    Constant primvars are inherited from ancestors, as in USD.
+    Constant primvars are inherited from ancestors, as in USD. A value of ``--set`` holds at every point.
 
     Args:
         short: Short name of the schema's row, such as ``bendScale``.
@@ -411,6 +425,9 @@ def read_painted(prim: Usd.Prim, short: str, count: int) -> tuple[np.ndarray, tu
         SchemaError: When the interpolation, type, number or limits of the values are wrong.
     """
     row = GARMENT[short]
+    found = find_value(prim, row, overrides)
+    if found.source == "--set":
+        return np.full(count, found.constant), ()
     primvar = _primvar(prim, row.name.removeprefix("primvars:"))
     flat = primvar.ComputeFlattened(Usd.TimeCode.EarliestTime()) if primvar else None
     if primvar is None or flat is None:

@@ -22,6 +22,12 @@ PATTERN = 0.8
 """Least fraction of the area with shape-preserving texture coordinates in a pattern."""
 _NAMES = ("st", "uv", "UVMap", "map1")
 _FLAT = 1e-12
+PATCH = 6.0
+"""Wavelength of the ease's variation, in mean cage edges: five folds of the shortest that two subdivisions show, which
+are five fine edges wide. At four edges folds break up into bumps; at twelve half of a skirt has none."""
+UNEVEN = 0.6
+"""Standard deviation of the logarithm of the ease's variation: folds end where there is half the ease."""
+_WAVES = 32
 
 
 def read_grain(
@@ -41,6 +47,9 @@ def read_grain(
         kept: Numbers of the kept faces among the authored faces, shape (F,).
         up: The stage's upward direction, shape (3,).
         painted: Values of ``easeScale``, ``gather`` [%] and ``grain`` [degrees] at each point, each of shape (V,).
+
+    Returns:
+        The grain, with the painted ease times `unevenness`, and where its direction comes from.
     """
     mesh = weld.apart
     coordinates = _texture_coordinates(prim, mesh, kept)
@@ -54,7 +63,28 @@ def read_grain(
     warp = np.cos(turn)[:, None] * warp + np.sin(turn)[:, None] * np.cross(normal, warp)
     if turn.any():
         source += ", turned by primvars:physgraph:grain"
-    return Grain(warp[weld.faces], weld.joined(painted["easeScale"]), weld.joined(painted["gather"] / 100.0)), source
+    ease = weld.joined(painted["easeScale"]) * unevenness(weld.mesh, weld.joined(rest))
+    return Grain(warp[weld.faces], ease, weld.joined(painted["gather"] / 100.0)), source
+
+
+def unevenness(mesh: PolygonMesh, rest: np.ndarray) -> np.ndarray:
+    """Smooth variation of the ease over a cage, of mean one, shape (V,): folds of even ease are parallel ridges.
+
+    The exponential of a sum of plane waves in evenly spread directions, each of `PATCH` mean edges: a function of the
+    rest shape alone, the same wherever it stands and however large it is.
+
+    Args:
+        rest: Rest positions [m], shape (V, 3).
+    """
+    number = np.arange(_WAVES)
+    height, turn = (2.0 * number + 1.0) / _WAVES - 1.0, np.pi * (3.0 - np.sqrt(5.0)) * number
+    across = np.sqrt(1.0 - height**2)
+    directions = np.stack([across * np.cos(turn), across * np.sin(turn), height])
+    length = np.linalg.norm(np.diff(rest[mesh.half_edges.edges], axis=1), axis=2).mean()
+    phase = 2.0 * np.pi / (PATCH * max(length, np.finfo(float).tiny)) * (rest - rest.mean(axis=0)) @ directions
+    waves = np.sqrt(2.0 / _WAVES) * np.sin(phase + turn**2).sum(axis=1)
+    uneven = np.exp(UNEVEN * waves)
+    return uneven / uneven.mean()
 
 
 def _down(normal: np.ndarray, up: np.ndarray) -> np.ndarray:
