@@ -173,7 +173,8 @@ def film(shot: Path, shown: Shown, layer: Path, out: Path) -> None:
     before, after = (sum(crossings(side, garments) for side in column) for column in columns)
     cage, vertices = (sum(each[kind] for each in report.garments) for kind in ("points", "fine_points"))
     seconds = round(spent / len(times), 2)
-    record(out, Figures(len(times), len(report.unsettled), cage, vertices, seconds, (before, after)))
+    unsettled = len({entry["time"] for entry in report.unsettled})
+    record(out, Figures(len(times), unsettled, cage, vertices, seconds, (before, after)))
     drawn = [Image.fromarray(pixels) for pixels in pictures(sides, shown)]
     max(drawn, key=added_folds).save(out.with_suffix(".jpg"), quality=85)
     encode(drawn, out, rate=shown.rate)
