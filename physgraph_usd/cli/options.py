@@ -63,7 +63,7 @@ def of_field(name: str, **settings: Any) -> Decorator:
 
 
 def together(*options: Decorator) -> Decorator:
-    """One decorator that declares several options in order."""
+    """A decorator that declares several options in order."""
 
     def apply(function: Callable[..., None]) -> Callable[..., None]:
         for option in reversed(options):

@@ -24,7 +24,7 @@ PACKAGES = {
     "plotly": "plotly",
     "viser": "'viser<2'",
 }
-"""Which package of the extras brings a module that only some commands need."""
+"""Package to install for each optional module."""
 
 
 DEBUG = "physgraph_usd.debug"
@@ -95,7 +95,7 @@ def show_trace(error: PhysGraphError) -> None:
 
 
 def _open_closed_streams() -> None:
-    """Let output go nowhere where its stream was closed by who started this: a file opened later would get it."""
+    """Discard output to streams closed by the parent process: a file opened later would receive the output."""
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         if getattr(sys, name) is None:
             nowhere = os.open(os.devnull, os.O_RDWR)
@@ -136,7 +136,7 @@ class Option(click.Option):
 
 
 class GroupedCommand(click.Command):
-    """A command whose help shows its options under their headings, in the order in which they are declared."""
+    """A command with help that groups options by heading, in order of declaration."""
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the options into the help."""

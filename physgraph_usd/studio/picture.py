@@ -41,7 +41,7 @@ WIRE_PIXELS, RING_PIXELS = 0.8, 2.5
 LIFT = 0.004
 """How far before the cloth the brush's rings are drawn, in the garments' size."""
 FALLOFF = (1.0, 0.5)
-"""Radii of the rings, in the brush's: its end, and where it paints half."""
+"""Radii of the brush's rings over the brush's radius: full extent, and half strength."""
 
 
 @dataclass(frozen=True)

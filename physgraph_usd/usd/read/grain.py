@@ -71,7 +71,7 @@ def unevenness(mesh: PolygonMesh, rest: np.ndarray) -> np.ndarray:
     """Smooth variation of the ease over a cage, of mean one, shape (V,): folds of even ease are parallel ridges.
 
     The exponential of a sum of plane waves in evenly spread directions, each of `PATCH` mean edges: a function of the
-    rest shape alone, the same wherever it stands and however large it is.
+    rest shape alone, unchanged by moving or scaling the shape.
 
     Args:
         rest: Rest positions [m], shape (V, 3).
