@@ -10,14 +10,18 @@ from functools import cached_property
 import numpy as np
 import torch
 import warp as wp
-from jaxtyping import Int
+from jaxtyping import Float, Int
+from torch import Tensor
 
 from ..colliders.base import Solid
 from ..level import Level
 from ..mesh.kernels import start_warp
+from ..mesh.stencil import incidence
 from .boxes import bound_clusters, boxes_for, query_of
 from .topology import topology_of
 
+ROOM = 32
+"""Pairs of clusters per cluster for which the first search has room."""
 SIZE = {"cpu": 24, "cuda": 8}
 """Most vertices of a cluster: a thread compares two clusters, and CUDA has more threads."""
 
@@ -30,6 +34,7 @@ class Parts:
         links: Connected vertices: edges and sewn pairs, shape (N, 2), int64.
         lengths: Lengths of the links at rest, 0 if sewn [m], shape (N,), float64.
         boxes: Warp struct of boxes, written by each search.
+        room: Most pairs of clusters that a cluster had in any search.
         faces: Number of faces, of the cloth and of bodies.
         starts: Number of the first edge and of the first face of each body, after those of the cloth and the bodies
             before.
@@ -62,7 +67,7 @@ class Parts:
         edges = np.cumsum([len(level.edges), *(len(each.edges) for each in solids)])
         faces = np.cumsum([len(level.triangles), *(len(each.faces) for each in solids)])
         self.faces, self.starts = int(faces[-1]), (edges[:-1].tolist(), faces[:-1].tolist())
-        self.boxes = boxes_for(self.topology, level.device)
+        self.boxes, self.room = boxes_for(self.topology, level.device), ROOM
 
     @cached_property
     def tree(self) -> wp.Bvh:
@@ -71,6 +76,23 @@ class Parts:
         inputs = [0, self.topology, at_rest, self.boxes]
         wp.launch(bound_clusters, dim=self.topology.clusters, inputs=inputs, device=self.level.device)
         return wp.Bvh(self.boxes.low, self.boxes.high)
+
+    @cached_property
+    def _rows(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Start of each vertex's row of links, and the other vertex and length of each entry."""
+        starts, slots = incidence(self.links, len(self.topology.owner))
+        slots = slots.long()
+        return starts.long(), self.links.reshape(-1)[slots ^ 1], self.lengths[slots // 2]
+
+    def links_of(
+        self, vertices: Int[Tensor, " some"]
+    ) -> tuple[Int[Tensor, " links"], Int[Tensor, " links"], Float[Tensor, " links"]]:
+        """The links of some vertices: these vertices, the linked vertices, and lengths at rest [m]."""
+        starts, others, lengths = self._rows
+        count = starts[vertices + 1] - starts[vertices]
+        place = torch.arange(int(count.sum()), device=count.device)
+        place += (starts[vertices] - count.cumsum(dim=0) + count).repeat_interleave(count)
+        return vertices.repeat_interleave(count), others[place], lengths[place]
 
 
 def _sewn(label: np.ndarray) -> np.ndarray:

@@ -26,8 +26,6 @@ from .topology import LANES, Topology
 
 wp.set_module_options(KERNELS)
 
-CLUSTERS = 32
-"""Room for pairs of clusters per cluster before these are counted."""
 PAIRS, TASK_PAIRS = 2**19, 16
 """Room for pairs of parts, of all tasks, and at least of a task. Without enough room a search runs twice."""
 TASKS, THREADS = 4 * PAIR_KINDS, 2**18
@@ -220,10 +218,11 @@ def _blocking_among(pairs: Pairs, parts: Parts, query: Any) -> Pairs:
 
 def _near_clusters(parts: Parts, query: Any, tree: wp.Bvh) -> Int[Tensor, "pairs 2"]:
     """Pairs of clusters not separated by an axis at both ends, sorted, int32; bounds the clusters."""
-    size, room, device = query.clusters, CLUSTERS, parts.level.device
+    size, device = query.clusters, parts.level.device
     _launch(parts, bound_clusters, size, parts.topology, query, parts.boxes)
     tree.refit()
     while True:
+        room = parts.room
         slots = torch.empty(size * room, dtype=torch.int32, device=device)
         count = torch.empty(size, dtype=torch.int32, device=device)
         inputs = [parts.topology, query, parts.boxes, tree.id, room, argument(slots), argument(count)]
@@ -232,7 +231,7 @@ def _near_clusters(parts: Parts, query: Any, tree: wp.Bvh) -> Int[Tensor, "pairs
         total, most = torch.stack([end[-1], count.max()]).tolist()
         if most <= room:
             break
-        room = most
+        parts.room = most
     out = torch.empty((total, 2), dtype=torch.int32, device=device)
     inputs = [argument(slots), argument(count), argument(end), argument(out, wp.vec2i)]
     _launch(parts, list_clusters, size, room, parts.boxes, *inputs)

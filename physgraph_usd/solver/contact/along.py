@@ -129,25 +129,26 @@ def along(
     """
     if not len(planes.may):
         return way
-    places, weight = planes.corners.long(), planes.weight.contiguous()
-    starts, slots = incidence(places, len(way))
-    gives = (weight * free[places].squeeze(2)).contiguous()
+    used, places = torch.unique(planes.corners.long(), return_inverse=True)
+    weight, wanted = planes.weight.contiguous(), way[used]
+    starts, slots = incidence(places, len(used))
+    gives = (weight * free[used][places].squeeze(2)).contiguous()
     count = starts.diff().to(way)
     stiffness = (gives.square() * count[places]).sum(dim=1).clamp_min(1e-300)
-    pairs = [argument(planes.corners.contiguous(), wp.vec4i), *(argument(each, wp.vec4d) for each in (weight, gives))]
+    pairs = [argument(places.to(torch.int32), wp.vec4i), *(argument(each, wp.vec4d) for each in (weight, gives))]
     pairs += [_vectors(planes.normal)]
-    moved = way.clone(memory_format=torch.contiguous_format)
-    push, wanted, out = argument(torch.zeros_like(planes.may)), _vectors(way), _vectors(moved)
+    moved = wanted.clone()
+    push, out = argument(torch.zeros_like(planes.may)), _vectors(moved)
     push_apart = [*pairs[:2], pairs[3], argument(planes.may), argument(stiffness), out, push]
-    add_pushes = [argument(starts), argument(slots), pairs[2], pairs[3], push, wanted, out]
+    add_pushes = [argument(starts), argument(slots), pairs[2], pairs[3], push, _vectors(wanted), out]
     launched = {"device": str(way.device), "threads": threads}
     launches = [
         Launch(_push_apart, len(places), push_apart, **launched),
-        Launch(_add_pushes, len(way), add_pushes, **launched),
+        Launch(_add_pushes, len(used), add_pushes, **launched),
     ]
     for launch in launches * JACOBI_PASSES:
         launch({})
-    return moved
+    return way.index_copy(0, used, moved)
 
 
 def _between(at: Float[Tensor, "pairs 4 3"], face: Tensor) -> tuple[Float[Tensor, "pairs 4"], Float[Tensor, "pairs 3"]]:

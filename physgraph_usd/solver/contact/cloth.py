@@ -314,7 +314,7 @@ class LevelContact:
         else:
             asked = (end != begin).any(dim=1) if self._asked is None else self._asked
             found = promise.blocking(begin, end, asked, near=near)
-        x, proved = promise.kept(begin, end, found, halved=since is not None)
+        x, proved = promise.kept(begin, end, found, halved=since is not None, near=near)
         return Placed(aim if x is end else x[: len(aim)].to(aim)), proved
 
 

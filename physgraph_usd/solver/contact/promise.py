@@ -57,7 +57,13 @@ class Promise:
         return blocking_pairs(self.mesh.parts, begin, end, **given, asked=asked, near=near)
 
     def kept(
-        self, begin: Float[Tensor, "all 3"], end: Float[Tensor, "all 3"], met: Pairs, *, halved: bool
+        self,
+        begin: Float[Tensor, "all 3"],
+        end: Float[Tensor, "all 3"],
+        met: Pairs,
+        *,
+        halved: bool,
+        near: NearAt | None = None,
     ) -> tuple[Float[Tensor, "all 3"], bool]:
         """Corners after a safe move, the wanted themselves if no pair blocks; and whether pairs with bodies are proved.
 
@@ -69,6 +75,7 @@ class Promise:
             end: Wanted corners [m]; those of bodies are reached.
             met: Pairs that block the move.
             halved: Whether vertices in or around pairs that stay blocked move in two halves: planes may turn once more.
+            near: All near pairs at the start; None if unknown.
         """
         if not len(met.value):
             return end, True
@@ -80,7 +87,7 @@ class Promise:
         for _ in range(ROUNDS):
             last, gone = ends, along(wanted, planes, free=free, threads=mesh.level.threads)
             ends = self._rounded(begin + gone, end)
-            met = self.blocking(begin, ends, _with_corners(met, (ends != last).any(dim=1)))
+            met = self.blocking(begin, ends, _with_corners(met, (ends != last).any(dim=1)), near=near)
             if not len(met.value):
                 return ends, True
             planes = planes.joined(ApproachLimits.of(begin, ends, met, self.floor, corners=True))
@@ -88,14 +95,15 @@ class Promise:
         if halved:  # Pairs of other vertices stay apart on both halves of their straight paths.
             late, proved = mesh.grown(late, RINGS) & moves, True
             last = torch.where(late.unsqueeze(1), end, ends)
-            for aim in (0.5 * (begin + last), last):
+            halfway = 0.5 * (begin + last)
+            for aim in (self._rounded(halfway, halfway), last):
                 begin, one = self.kept(begin, aim, self.blocking(begin, aim, late), halved=False)
                 late, proved = late | (begin != aim).any(dim=1), proved and one
             return begin, proved
         # Cloth that stays behind a body that moves on would be in the body.
         inside = self.inside if stand else torch.arange(len(moves), device=moves.device) < mesh.level.vertex_count
         given = {"floor": self.floor, "tangle": self.tangle, "inside": inside, "dtype": mesh.level.dtype}
-        return safe_move(begin, ends, mesh.parts, asked=late, **given), stand
+        return safe_move(begin, ends, mesh.parts, asked=late, near=near if stand else None, **given), stand
 
     def _rounded(self, points: Tensor, end: Tensor) -> Float[Tensor, "all 3"]:
         """Corners of the cloth rounded to the type of the solve, seams closed, and corners of bodies at their ends."""
@@ -119,6 +127,7 @@ def safe_move(
     tangle: Int[Tensor, " vertices"] | None = None,
     inside: Bool[Tensor, " vertices"] | None = None,
     asked: Bool[Tensor, " vertices"] | None = None,
+    near: NearAt | None = None,
     dtype: torch.dtype | None = None,
 ) -> Placed:
     """Move vertices towards wanted positions as far as a plane keeps each pair of parts apart.
@@ -136,6 +145,7 @@ def safe_move(
         inside: Cloth inside a body; its pairs with bodies have no promise. None for none.
         asked: Vertices whose pairs must be checked; pairs without such a vertex are known to be safe. None checks every
             vertex that moves.
+        near: All near pairs at the start; None if unknown.
         dtype: Type to which positions of the cloth are rounded; None for the type of the wanted positions.
 
     Returns:
@@ -148,7 +158,7 @@ def safe_move(
     given = {"floor": floor, "tangle": tangle, "inside": inside}
     cloth, dtype = torch.arange(len(way), device=way.device) < parts.level.vertex_count, dtype or wanted.dtype
     for attempt in range(len(way) + ROUNDS):
-        more = blocking_pairs(parts, start, x, asked=asked, **given)
+        more = blocking_pairs(parts, start, x, asked=asked, near=near, **given)
         if not len(more.value):
             break
         least = torch.ones_like(share)
@@ -168,16 +178,13 @@ def _spread(share: Tensor, way: Tensor, parts: Parts) -> Float[Tensor, " vertice
     """Fractions reduced around shortened vertices, so that no edge is strained by more than `STRAINS`."""
     length = way.norm(dim=1)
     late = length * (1.0 - share)
-    first, second = parts.links.T
-    within = STRAINS * parts.lengths
-    least = NEGLIGIBLE * within.mean()
-    while True:
-        new = late.scatter_reduce(0, second, late[first] - within, "amax")
-        new = new.scatter_reduce(0, first, new[second] - within, "amax")
-        if is_over() or not bool((new > late + least).any()):
-            break
-        late = new
+    least = NEGLIGIBLE * STRAINS * parts.lengths.mean()
+    changed = torch.nonzero(late > least).squeeze(1)
+    while len(changed) and not is_over():
+        vertex, other, rest = parts.links_of(changed)
+        new = late.scatter_reduce(0, other, late[vertex] - STRAINS * rest, "amax")
+        late, changed = new, torch.nonzero(new > late + least).squeeze(1)
     out = torch.minimum(share, (1.0 - late / length.clamp_min(1e-300)).clamp_min(0.0))
-    sewn, partner = parts.links[parts.lengths == 0].T  # Seams stay closed to the last bit.
+    sewn, partner = parts.links[len(parts.level.edges) :].T  # Seams stay closed to the last bit.
     out = out.scatter_reduce(0, partner, out[sewn], "amin")
     return out.scatter_reduce(0, sewn, out[partner], "amin")
