@@ -26,7 +26,7 @@ from .topology import LANES, Topology
 
 wp.set_module_options(KERNELS)
 
-PAIRS, TASK_PAIRS = 2**19, 16
+PAIRS, TASK_PAIRS = 2**21, 16
 """Room for pairs of parts, of all tasks, and at least of a task. Without enough room a search runs twice."""
 TASKS, THREADS = 4 * PAIR_KINDS, 2**18
 """Tasks of a pair of clusters on CUDA, each with one kind of pairs and every fourth part; and threads running at once.
