@@ -22,6 +22,9 @@ from torch import Tensor
 
 LEAST_SECONDS = 5e-4
 """Least work per thread [s]; waking a thread takes some 0.2 ms."""
+MOST_THREADS = 4
+"""Most threads of a launch: without this limit warm frames on 1, 4 and 16 cores took 0.17, 0.12 and 0.19 s (dancer), and
+2.7, 1.6 and 2.7 s (layers)."""
 SLICES, SLICE_SECONDS = 8, 5e-5
 """Slices per thread and their least average work [s]: some items cost a hundred times as much as average, so free
 threads take the next slice, and slices shrink to shorten the wait for the last."""
@@ -49,12 +52,12 @@ class Launch:
             size: Number of items; of elements if a kernel's item is a block of elements.
             inputs: The kernel's arrays; changing arrays are given again at each call.
             device: "cpu" or a CUDA device.
-            threads: Most threads to use on the CPU.
+            threads: Most threads to use on the CPU; at most `MOST_THREADS` are.
             at_once: Number of elements in an item of the kernel.
         """
         self._size, self._name = -(-size // at_once), f"{kernel.module.name}.{kernel.key}"
         self._device = None if device == "cpu" else device
-        self._most = threads if self._device is None else 1
+        self._most = min(threads, MOST_THREADS) if self._device is None else 1
         whole = wp.launch(kernel, dim=self._size, inputs=[0, *inputs], device=device, record_cmd=True)
         self._whole: wp.Launch | None = whole if self._size else None
         self._slices: list[wp.Launch] = []
