@@ -148,7 +148,8 @@ class CurveBench:
                 self.journal.add("failed", error=str(error), **key)
                 continue
             values = {} if repeat else self.judged(frame, solved.points)
-            values |= {"made": solved.steps, "elapsed": solved.elapsed, "waited": solved.waited}
+            values |= {"made": solved.steps, "prepared": solved.prepared}
+            values |= {"elapsed": solved.elapsed, "waited": solved.waited}
             self._add(name, frame, solved.milliseconds, steps=steps, repeat=repeat, **about, **values)
 
     def _is_done(self, name: str, steps: int) -> bool:

@@ -19,9 +19,11 @@ from .words import (
     BASELINE,
     FAR,
     FRONT,
+    PREPARING,
     Style,
     advice,
     changes,
+    contact_words,
     figures,
     percent,
     settings,
@@ -94,6 +96,11 @@ def _figure(chart: Chart) -> go.Figure:
     )
     style = styles(chart)
     _add_front(figure, chart)
+    if chart.prepared:
+        words = {"annotation_text": PREPARING, "annotation_position": "bottom left", "annotation_font_size": 11}
+        figure.add_vrect(
+            x0=1e-2, x1=chart.prepared, fillcolor="#f2f2f2", layer="below", line_width=0, row=1, col=1, **words
+        )
     for place, (field, words) in enumerate(panels.items(), start=1):
         row = place + (warm if place > 1 else 0)
         for name in chart.methods:
@@ -189,7 +196,7 @@ def _looks(chart: Chart, folder: Path) -> str:
 
 
 def _lead(chart: Chart) -> str:
-    sentences = [each for each in (advice(chart), warm_advice(chart)) if each]
+    sentences = [each for each in (advice(chart), warm_advice(chart), contact_words(chart)) if each]
     times = chart.times_to(JUDGED)
     if times:
         order = ", ".join(f"{name} {ms:.0f} ms" for name, ms in list(times.items())[:4])

@@ -15,7 +15,21 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter, Symmetr
 
 from .measure import DEFAULT, JUDGED, SMOOTH, UPSAMPLED
 from .table import Chart, Point
-from .words import ABOVE, BASELINE, FAR, FRONT, Change, Style, advice, changes, percent, styles, title
+from .words import (
+    ABOVE,
+    BASELINE,
+    FAR,
+    FRONT,
+    PREPARING,
+    Change,
+    Style,
+    advice,
+    changes,
+    contact_words,
+    percent,
+    styles,
+    title,
+)
 
 FLOOR = 1e-4
 """Least gap that is drawn: Phi* itself is known no better."""
@@ -49,7 +63,7 @@ def _figure(chart: Chart) -> Figure:
     rows = [each for each in (chart.panels, chart.likeness) if each]
     heights = [4.2, *[2.6] * len(rows), *([0.6 + 0.28 * len(steps)] if steps else [])]
     figure = Figure(figsize=(10.6, sum(heights) + 1.0), layout="constrained")
-    words = textwrap.fill(advice(chart), 120)
+    words = textwrap.fill(f"{advice(chart)} {contact_words(chart)}", 120)
     figure.suptitle(f"{title(chart)}\n{words}", x=0.01, ha="left", fontsize=9.5)
     parts = figure.subfigures(len(heights), 1, height_ratios=heights, squeeze=False)[:, 0]
     style = styles(chart)
@@ -96,7 +110,12 @@ def _curves(axes: Axes, chart: Chart, style: dict[str, Style]) -> None:
         color="#444444",
     )
     least = min((p.gap for p in chart.points), default=FLOOR)
-    axes.set_ylim(max(FLOOR, min(0.5 * least, 0.01)) if least > 0 else FLOOR, CEILING)
+    highest = max((p.gap for each in ONE_POINT for p in chart.curve(each)), default=0.0)
+    axes.set_ylim(max(FLOOR, min(0.5 * least, 0.01)) if least > 0 else FLOOR, max(CEILING, 1.3 * highest))
+    if chart.prepared:
+        left, right = axes.get_xlim()
+        axes.axvspan(left, chart.prepared, color="#f2f2f2", zorder=0, label=PREPARING)
+        axes.set_xlim(left, right)
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: percent(value)))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.axhline(JUDGED, color="#b0b0b0", linewidth=0.8, linestyle=":")

@@ -67,6 +67,7 @@ class Solved:
     Attributes:
         points: Fine world positions [m] of each garment.
         milliseconds: Time of preparing and solving the frame, without reading, writing and telemetry.
+        prepared: The part of it in which the frame was prepared.
         elapsed: Wall time of all of it [ms].
         steps: Steps made at the finest levels.
         waited: Milliseconds that its threads waited for a core that others had, or None where that is not known.
@@ -74,6 +75,7 @@ class Solved:
 
     points: tuple[np.ndarray, ...]
     milliseconds: float
+    prepared: float
     elapsed: float
     steps: int
     waited: float | None
@@ -124,14 +126,17 @@ class Problem:
         state = self.refiner.solve(frame)
         after, elapsed, worked = _waited(), time.perf_counter() - began, time.process_time() - worked
         entries: list[Any] = list({id(entry): entry for entry in state.telemetry}.values())
-        spent = [value for each in entries for name, value in each.get("milliseconds", {}).items() if name != "measure"]
+        spent = {
+            name: sum(each.get("milliseconds", {}).get(name, 0.0) for each in entries) for name in ("prepare", "solve")
+        }
         reports = [each for entry in entries for each in entry.get("levels", [])]
         last = max((each["level"] for each in reports), default=0)
         steps = sum(each["steps"] for each in reports if each["level"] == last)
         waited = None if before is None or after is None else after - before
         busy = worked / elapsed if self._clock == "cpu" else 1.0
         points = tuple(p for p in state.points if p is not None)
-        return Solved(points, busy * sum(spent), 1e3 * elapsed, steps, waited)
+        prepared = busy * spent["prepare"]
+        return Solved(points, prepared + busy * spent["solve"], prepared, 1e3 * elapsed, steps, waited)
 
     def go_on(
         self, frame: Frame, settings: SolveSettings, states: Sequence[FrameState | None]

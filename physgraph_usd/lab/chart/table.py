@@ -49,6 +49,7 @@ class Point:
         ms_median: Milliseconds by the median of all repeats.
         ms_least: Milliseconds of the fastest repeats.
         ms_most: Milliseconds of the slowest repeats.
+        ms_prepared: Milliseconds of preparing the frame, in `ms`; 0 where no solver of ours ran.
         gap: (Phi - Phi*) / (Phi0 - Phi*), both summed over the frames.
         energy: Phi, mean over the frames [J].
         energies: Phi by term [J].
@@ -82,6 +83,7 @@ class Point:
     note: str
     apart_mm: float | None
     ms_most: float
+    ms_prepared: float
 
 
 @dataclass(frozen=True)
@@ -120,9 +122,18 @@ class Chart:
 
     @property
     def panels(self) -> dict[str, str]:
-        """Measures of contact that there are to draw: fields of the points, and their titles."""
-        touches = any("contact" in point.energies for point in self.points)
-        return {name: title for name, title in CONTACT.items() if self._has(name) or (touches and name != "tangles")}
+        """Titles of the measures of contact that are not 0 for every method, by field of `Point`."""
+        return {name: title for name, title in CONTACT.items() if self._has(name)}
+
+    @property
+    def zeros(self) -> tuple[str, ...]:
+        """Titles of the measures of contact that are 0 for every method."""
+        return tuple(title for name, title in CONTACT.items() if not self._has(name))
+
+    @property
+    def prepared(self) -> float:
+        """Milliseconds of a cold frame that refine's default takes to prepare it; 0 if unknown."""
+        return next((point.ms_prepared for point in self.curve(DEFAULT)), 0.0)
 
     @property
     def likeness(self) -> dict[str, str]:
@@ -278,6 +289,7 @@ def _point(rows: Sequence[dict[str, Any]], references: dict[Any, Reference]) -> 
         ms_median=statistics.fmean(statistics.median(each) for each in times),
         ms_least=statistics.fmean(min(each) for each in times),
         ms_most=statistics.fmean(max(each) for each in times),
+        ms_prepared=statistics.fmean(row.get("prepared", 0.0) for row in values),
         gap=(len(values) * energy - least) / max(start - least, TINY),
         energy=energy,
         energies=energies,

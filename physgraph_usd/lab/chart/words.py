@@ -80,6 +80,7 @@ def percent(value: float, *, digits: int = 3) -> str:
     return f"{100.0 * value:.{max(digits, 3) if abs(value) >= 0.995 else digits}g}%"
 
 
+PREPARING = "preparing a cold frame, in all times of ours"
 ABOVE = "energy above the best known, percent of what solving gains"
 """The axis of gaps, in words."""
 
@@ -98,6 +99,11 @@ def advice(chart: Chart) -> str:
         f"Take {place['fastest']}{asked} for single frames like these: refine's default comes to {left}, "
         f"{place['ratio']:.1f} times the {place['fastest_ms']:.0f} ms in which that gets as low."
     )
+
+
+def contact_words(chart: Chart) -> str:
+    """The measures of contact that no method has, which are not drawn; "" for none."""
+    return f"0 for every method: {', '.join(words.split(' [')[0] for words in chart.zeros)}." if chart.zeros else ""
 
 
 def warm_advice(chart: Chart) -> str:
@@ -175,6 +181,8 @@ def _term(row: dict[str, Any], gap: str) -> Change:
         f"{key} {other[key]} ({full[key]})" for key in ("inside", "crossings", "tangles") if full[key] != other[key]
     ]
     cost = full["ms"] - other["ms"]
+    if cost < 0.0:
+        worse.append("and a frame takes longer")
     if row["moved_mm"] > FAR:
         worse = ["the cloth falls away"]
     return Change(name, cost, cost / max(full["ms"], 1e-9), row["moved_mm"], "without it " + ", ".join(worse))
