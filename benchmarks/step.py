@@ -25,7 +25,7 @@ from typing import Any, cast
 import numpy as np
 import torch
 
-from benchmarks.rows import Row, say, under
+from benchmarks.rows import Row, commit, say, under
 from physgraph_usd.lab.methods.paper_network import PaperConfig
 from physgraph_usd.shot.solve import prepare_device
 from physgraph_usd.solver.fabric import PRESETS
@@ -72,7 +72,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         lines.append(line)
     if given.json:
         name = torch.cuda.get_device_name(given.device) if given.device.startswith("cuda") else "CPU"
-        known = {"device": name, "command": f"python -m benchmarks.step --device {given.device}", "rows": lines}
+        known = {"device": name, "command": f"python -m benchmarks.step --device {given.device}", "commit": commit()}
+        known["rows"] = lines
         given.json.write_text(json.dumps(known, indent=1) + "\n", encoding="utf-8")
 
 
