@@ -96,11 +96,6 @@ def _figure(chart: Chart) -> go.Figure:
     )
     style = styles(chart)
     _add_front(figure, chart)
-    if chart.prepared:
-        words = {"annotation_text": PREPARING, "annotation_position": "bottom left", "annotation_font_size": 11}
-        figure.add_vrect(
-            x0=1e-2, x1=chart.prepared, fillcolor="#f2f2f2", layer="below", line_width=0, row=1, col=1, **words
-        )
     for place, (field, words) in enumerate(panels.items(), start=1):
         row = place + (warm if place > 1 else 0)
         for name in chart.methods:
@@ -132,7 +127,7 @@ def _figure(chart: Chart) -> go.Figure:
 
 
 def _add_front(figure: go.Figure, chart: Chart) -> None:
-    """The broad line behind all others: of no point on it another is both faster and lower."""
+    """The broad line behind all others: of no point on it another is both faster and lower; and the time to prepare."""
     front = chart.front
     figure.add_trace(
         go.Scatter(
@@ -146,6 +141,20 @@ def _add_front(figure: go.Figure, chart: Chart) -> None:
         row=1,
         col=1,
     )
+    if chart.prepared:
+        figure.add_shape(
+            type="rect",
+            x0=1e-2,
+            x1=chart.prepared,
+            y0=0.0,
+            y1=1.0,
+            xref="x",
+            yref="y domain",
+            fillcolor="#f2f2f2",
+            line={"width": 0},
+            layer="below",
+            label={"text": PREPARING, "textposition": "bottom left", "font": {"size": 11}},
+        )
 
 
 def _trace(chart: Chart, name: str, style: Style, points: Sequence[Point], *, field: str) -> go.Scatter:

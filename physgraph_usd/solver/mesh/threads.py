@@ -23,8 +23,8 @@ from torch import Tensor
 LEAST_SECONDS = 5e-4
 """Least work per thread [s]; waking a thread takes some 0.2 ms."""
 MOST_THREADS = 4
-"""Most threads of a launch: without this limit warm frames on 1, 4 and 16 cores took 0.17, 0.12 and 0.19 s (dancer), and
-2.7, 1.6 and 2.7 s (layers)."""
+"""Most threads of a launch: warm frames took 0.17, 0.12 and 0.19 s (dancer) and 2.7, 1.6 and 2.7 s (layers) on 1, 4 and
+16 cores without this limit."""
 SLICES, SLICE_SECONDS = 8, 5e-5
 """Slices per thread and their least average work [s]: some items cost a hundred times as much as average, so free
 threads take the next slice, and slices shrink to shorten the wait for the last."""
