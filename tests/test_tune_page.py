@@ -130,6 +130,11 @@ def colored(picture: np.ndarray) -> np.ndarray:
     return np.ptp(picture[:, 310:], axis=2) > 30.0  # Beside the viewer's notes.
 
 
+def labelled(picture: np.ndarray) -> np.ndarray:
+    """Whether each pixel of a picture is white, as the labels' ground alone is."""
+    return (picture > 250.0).all(axis=2)
+
+
 def rows_of(pixels: np.ndarray) -> int:
     """Height of the part of a picture that holds some pixels, shape (H, W), without stray ones."""
     rows = np.flatnonzero(pixels.sum(axis=1) > 2)
@@ -272,6 +277,30 @@ def test_the_picture_wipes_maps_wires_and_compares(shot: Path):
         artist.press("x")
         artist.settle("A and B exchanged")
         assert session.value(CLOTH, "guide:stiffness") == 2000.0
+
+
+def test_a_and_b_stand_side_by_side_under_their_letters(shot: Path):
+    with tuned(shot) as (session, artist):
+        artist.tab("Picture")
+        assert not labelled(artist.picture()).any()
+        artist.choose("Show", "A | B")
+        artist.until(lambda: session.kept is not None, "choosing A | B keeps A")
+        artist.tab("Values")
+        artist.type("Guide [N/m³]", "50")
+        artist.settle("Guide Stiffness")
+        picture = artist.picture()
+        cloth = np.ptp(picture, axis=2) > 12.0
+        across, letters = (np.flatnonzero(each.sum(axis=0) > 2) for each in (cloth, labelled(picture)))
+        (gap,) = np.flatnonzero(np.diff(across) > 8)
+        left, right = across[: gap + 1], across[gap + 1 :]
+        a, b = letters[letters < right[0]], letters[letters > left[-1]]
+        assert left[0] < a[0] < a[-1] < left[-1], "a letter over A"
+        assert right[0] < b[0] < b[-1] < right[-1], "a letter over B"
+        lowest = [np.flatnonzero(cloth[:, side].any(axis=1)).max() for side in (left, right)]
+        assert lowest[1] > lowest[0] + 8, "B hangs lower, A is as it was"
+        artist.tab("Picture")
+        artist.choose("Show", "refined")
+        artist.picture(lambda now: not labelled(now).any())
 
 
 @pytest.mark.slow
