@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import time
+from base64 import b64decode
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -22,9 +23,10 @@ from pxr import Usd
 from shots import CLOTH, cloth_shot
 from stages import add_subset
 
+from physgraph_usd.solver.fabric import PRESETS
 from physgraph_usd.studio.page import TunePage
 from physgraph_usd.studio.session import TuneSession
-from physgraph_usd.studio.value_panel import CHANGED
+from physgraph_usd.studio.value_panel import CHANGED, SWATCHES
 from physgraph_usd.studio.values import TUNABLES
 from physgraph_usd.usd.read.reader import open_shot
 
@@ -277,6 +279,22 @@ def test_the_picture_wipes_maps_wires_and_compares(shot: Path):
         artist.press("x")
         artist.settle("A and B exchanged")
         assert session.value(CLOTH, "guide:stiffness") == 2000.0
+
+
+def test_a_picture_of_each_preset_chooses_it(shot: Path):
+    with tuned(shot) as (session, artist):
+        for name in PRESETS:
+            button = artist.page.get_by_role("button", name=name, exact=True)
+            url = button.evaluate("drawn => getComputedStyle(drawn).backgroundImage")
+            picture = b64decode(url.partition("base64,")[2].partition('"')[0])
+            assert picture == (SWATCHES / f"{name}.webp").read_bytes()
+            box = button.bounding_box()
+            assert 48 < box["width"] < 70
+            assert 48 < box["height"]
+        artist.page.get_by_role("button", name="denim", exact=True).click()
+        artist.settle("denim")
+        assert session.value(CLOTH, "weftStretchStiffness") == 226.0
+        assert artist.number("Preset").input_value() == "denim"
 
 
 def test_a_and_b_stand_side_by_side_under_their_letters(shot: Path):

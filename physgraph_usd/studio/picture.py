@@ -50,6 +50,14 @@ class Sheet:
     triangles: np.ndarray
     edges: np.ndarray
 
+    def beside(self, line: float, right: np.ndarray, *, before: bool) -> Sheet:
+        """The faces and edges whose middle lies ``before`` or after a line [m] along a direction, shape (3,)."""
+
+        def chosen(corners: np.ndarray) -> np.ndarray:
+            return corners[((self.points @ right)[corners].mean(axis=1) < line) == before]
+
+        return replace(self, triangles=chosen(self.triangles), edges=chosen(self.edges))
+
 
 class Picture:
     """The scene of a session; it is drawn by the thread that owns the session.
@@ -163,13 +171,9 @@ class Picture:
 
     def _places(self, columns: Sequence[str]) -> dict[str, np.ndarray]:
         """Where the label of each column stands: over the middle of its garments, or of its side of a wipe [m]."""
-        top = max((self._cloth - self.centre) @ self.axes[1]) * self.axes[1]
-        sides = np.linspace(-0.25, 0.25, len(columns)) * self._across * self.view.wiped
-        offsets = (self._offset(place, len(columns)) for place in range(len(columns)))
-        return {
-            column: top + side * self.axes[0] + offset
-            for column, side, offset in zip(columns, sides, offsets, strict=True)
-        }
+        top = ((self._cloth - self.centre) @ self.axes[1]).max() * self.axes[1]
+        apart = (0.5 if self.view.wiped else 1.0) * self._across * self.axes[0]
+        return {column: top + (place - 0.5 * (len(columns) - 1)) * apart for place, column in enumerate(columns)}
 
     def _placed(self, points: np.ndarray, at: np.ndarray) -> np.ndarray:
         return (points - self.centre + at).astype(np.float32)
@@ -214,16 +218,9 @@ class Picture:
         """The part of a mesh on one side of the wipe; ``drawn`` [m], shape (N, 3), gives the wipe's ends."""
         if not self.view.wiped or len(self.view.columns) < 2:
             return sheet
-        right = self.axes[0]
-        low, high = (drawn @ right).min(), (drawn @ right).max()
+        low, high = (drawn @ self.axes[0]).min(), (drawn @ self.axes[0]).max()
         line = low + self.view.wipe * (high - low)
-        first = column == self.view.columns[0]
-
-        def chosen(corners: np.ndarray) -> np.ndarray:
-            at = (sheet.points @ right)[corners].mean(axis=1)
-            return corners[(at < line) == first]
-
-        return replace(sheet, triangles=chosen(sheet.triangles), edges=chosen(sheet.edges))
+        return sheet.beside(line, self.axes[0], before=column == self.view.columns[0])
 
     def _draw_lines(self, name: str, segments: np.ndarray, color: tuple[int, int, int], pixels: float) -> None:
         """Draw line segments in the scene [m], shape (S, 2, 3), under a name; none removes them."""
