@@ -8,6 +8,7 @@ from base64 import b64decode
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ pytest.importorskip("pxr", reason="shots are read with usd-core")
 pytest.importorskip("viser", reason="the page is served with viser")
 pytest.importorskip("PIL.Image", reason="screenshots are compared with pillow")
 
+import viser
 from browser import PATIENCE_MS, served
 from PIL import Image
 from pxr import Usd
@@ -26,6 +28,7 @@ from stages import add_subset
 from physgraph_usd.solver.fabric import PRESETS
 from physgraph_usd.studio.page import TunePage
 from physgraph_usd.studio.session import TuneSession
+from physgraph_usd.studio.skins import LOADED_SECONDS, Placed, Skins
 from physgraph_usd.studio.value_panel import CHANGED, SWATCHES
 from physgraph_usd.studio.values import TUNABLES
 from physgraph_usd.usd.read.reader import open_shot
@@ -279,6 +282,20 @@ def test_the_picture_wipes_maps_wires_and_compares(shot: Path):
         artist.press("x")
         artist.settle("A and B exchanged")
         assert session.value(CLOTH, "guide:stiffness") == 2000.0
+
+
+def test_cloth_that_moves_and_rests_again_leaves_no_nodes_in_the_scene():
+    points, triangles = np.random.default_rng(1).random((30, 3), np.float32), np.arange(30).reshape(10, 3)
+    server, axes, counts = viser.ViserServer(host="127.0.0.1", port=8300, verbose=False), np.eye(3), list[int]()
+    with closing(SimpleNamespace(close=server.stop)):
+        skins = Skins(server, axes)
+        for step in range(4):
+            moved = points + np.float32(step)
+            skins.place("refined/0", Placed(moved, triangles, whole=triangles, color=np.ones(3)))
+            skins.shade([["refined/0"]], lambda: False)
+            time.sleep(2 * LOADED_SECONDS)
+            counts.append(len(server.scene._handle_from_node_name))
+    assert counts == [counts[0]] * 4
 
 
 def test_a_picture_of_each_preset_chooses_it(shot: Path):
