@@ -93,9 +93,12 @@ class Tour:
         for place in np.linspace(0.1, 0.75, 8):
             self._slide("Weft Ease [%]", float(place))
         self._settle(folder / "tune.png")
+        self._tab("Picture")
+        self._choose("Show", "A | B")
+        self._tab("Values")
         for place in np.linspace(0.5, 0.85, 8):
             self._slide("Bending [µN·m]", float(place))
-        self._settle()
+        self._settle(folder / "tune_ab.png")
         self._tab("Picture")
         self._choose("Show", "subdivision | refined")
         self._input("Wipe").click()
