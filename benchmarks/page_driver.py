@@ -27,6 +27,8 @@ CALM_MS = 1000
 PATIENCE_MS = 120000
 SMALL, RATE, COLORS = (1080, 675), 5, 200
 """A picture's size [pixels], pictures a second of the film, and colours in a picture."""
+PART = 12
+"""Solved frames in the picture of a range."""
 WATCH = """
 window.least = Infinity;
 window.begin = () => { window.pressed = window.drawn = window.settled = null; window.left = false };
@@ -93,9 +95,12 @@ class Tour:
         for place in np.linspace(0.1, 0.75, 8):
             self._slide("Weft Ease [%]", float(place))
         self._settle(folder / "tune.png")
+        self._tab("Picture")
+        self._choose("Show", "A | B")
+        self._tab("Values")
         for place in np.linspace(0.5, 0.85, 8):
             self._slide("Bending [µN·m]", float(place))
-        self._settle()
+        self._settle(folder / "tune_ab.png")
         self._tab("Picture")
         self._choose("Show", "subdivision | refined")
         self._input("Wipe").click()
@@ -180,13 +185,15 @@ class Tour:
             self._page.wait_for_timeout(300)
 
     def _play(self, picture: Path) -> None:
-        """Play a range twice, and write a picture when part of it is solved."""
+        """Play a range, and write a picture once `PART` of its frames are solved."""
         self._page.get_by_role("button", name="Play").click()
-        for step in range(30):
+        waits = True
+        for _ in range(30):
             self._page.wait_for_timeout(100)
             self._snap()
-            if step == 20:
+            if waits and int(self._page.locator("#takes").inner_text().split()[0]) >= PART:
                 self.film[-1].quantize(COLORS).save(picture, optimize=True)
+                waits = False
         self._page.get_by_role("button", name="Pause").click()
 
 

@@ -1,10 +1,12 @@
 """The pictures of docs/swatches.md: every preset draped, gathered and pinched.
 
     python -m benchmarks.swatches docs/pictures [PRESET...]
+    python -m benchmarks.swatches physgraph_usd/studio/swatches --thumbnails
 
 Each is simulated by the potential and inertia of `benchmarks.fidelity` for a second, without contact, in triangles of
 5 mm. Draped: a square of 30 cm over a round support of 18. Gathered: 30 cm hang from 19. Pinched: two points of a
 hanging square, 8 cm apart, are brought together to 3. Printed: the total absolute mean curvature of each.
+With ``--thumbnails`` each draped preset alone, as a small WebP: those that `tune` shows beside its presets.
 """
 
 from __future__ import annotations
@@ -23,11 +25,14 @@ from benchmarks.drawing import Thing, drawn, framing, upright
 from benchmarks.fidelity import Judge, garment_of, level_at, simulated
 from benchmarks.fidelity_stages import Stage, grid
 from benchmarks.rows import say
+from physgraph_usd.shot.page.drawing import draw
 from physgraph_usd.shot.solve import prepare_device
 from physgraph_usd.solver.fabric import PRESETS
 
 SIDE, QUADS, FRAMES = 0.3, 30, 24
 PANEL, COLUMNS = (250, 230), 4
+THUMBNAIL, SHARPER, QUALITY = (192, 144), 3, 82
+"""Size of a thumbnail [pixels], drawn pixels a side for each of its own, and quality of WebP."""
 
 
 def draped() -> Stage:
@@ -101,20 +106,35 @@ def paint(test: str, shapes: dict[str, np.ndarray], out: Path) -> None:
     sheet.quantize(96, kmeans=2, dither=Image.Dither.NONE).save(out, optimize=True)
 
 
+def paint_thumbnails(shapes: dict[str, np.ndarray], out: Path) -> None:
+    """Draw each draped preset into a file of its own, from one camera."""
+    stage, size = TESTS["draped"](), (SHARPER * THUMBNAIL[0], SHARPER * THUMBNAIL[1])
+    triangles = level_at(garment_of(stage, 1), 1).triangles.numpy()
+    things = {name: Thing(upright(x), triangles) for name, x in shapes.items()}
+    view, floor = framing(list(things.values()), size, stage.camera)
+    out.mkdir(parents=True, exist_ok=True)
+    for name, thing in things.items():
+        pixels = Image.fromarray(draw([thing.surface()], view, size=size, floor=floor))
+        pixels.resize(THUMBNAIL, Image.Resampling.LANCZOS).save(out / f"{name}.webp", quality=QUALITY, method=6)
+
+
 def main() -> None:
     """Simulate, print and draw."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path)
     parser.add_argument("presets", nargs="*", default=list(PRESETS))
     parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--thumbnails", action="store_true")
     given = parser.parse_args()
-    names = given.presets
-    say("| preset | " + " | ".join(f"{test}, m" for test in TESTS) + " |\n|---|---|---|---|")
-    found: dict[str, dict[str, np.ndarray]] = {test: {} for test in TESTS}
+    names, tests = given.presets, ["draped"] if given.thumbnails else [*TESTS]
+    found: dict[str, dict[str, np.ndarray]] = {test: {} for test in tests}
     with ProcessPoolExecutor(given.jobs, get_context("spawn")) as pool:
-        tasks = [(test, name) for name in names for test in TESTS]
+        tasks = [(test, name) for name in names for test in tests]
         for (test, name), shape in zip(tasks, pool.map(swatch, tasks), strict=True):
             found[test][name] = shape
+    if given.thumbnails:
+        return paint_thumbnails(found["draped"], given.out)
+    say("| preset | " + " | ".join(f"{test}, m" for test in TESTS) + " |\n|---|---|---|---|")
     for name in names:
         judged = [
             Judge(level_at(garment_of(TESTS[test](), 1), 1), np.zeros((0, 2))).curvature(found[test][name])

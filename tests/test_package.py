@@ -15,6 +15,7 @@ import pytest
 from packaging.requirements import Requirement
 
 import physgraph_usd
+from physgraph_usd.solver.fabric import PRESETS
 
 ROOT = Path(__file__).resolve().parents[1]
 MADE_BY_RUNS = {"build/"}
@@ -82,7 +83,8 @@ def test_wheel_carries_schemas_weights_and_licence(built: tuple[Path, Path]) -> 
     names = _names(wheel)
     assert wheel.name.startswith(f"physgraph_usd-{physgraph_usd.__version__}-py3-none-any")
     data = ("schemas/plugInfo.json", "schemas/generatedSchema.usda", "weights/README.md", "shot/report.schema.json")
-    for name in (*data, "cli/refine.py"):
+    swatches = (f"studio/swatches/{name}.webp" for name in PRESETS)
+    for name in (*data, *swatches, "cli/refine.py"):
         assert f"physgraph_usd/{name}" in names
     assert any(name.endswith("licenses/LICENSE") for name in names)
     assert not [name for name in names if name.startswith(("tests/", "schemas/"))]

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import io
 import time
+from base64 import b64decode
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -16,15 +17,18 @@ pytest.importorskip("pxr", reason="shots are read with usd-core")
 pytest.importorskip("viser", reason="the page is served with viser")
 pytest.importorskip("PIL.Image", reason="screenshots are compared with pillow")
 
+import viser
 from browser import PATIENCE_MS, served
 from PIL import Image
 from pxr import Usd
 from shots import CLOTH, cloth_shot
 from stages import add_subset
 
+from physgraph_usd.solver.fabric import PRESETS
 from physgraph_usd.studio.page import TunePage
 from physgraph_usd.studio.session import TuneSession
-from physgraph_usd.studio.value_panel import CHANGED
+from physgraph_usd.studio.skins import LOADED_SECONDS, Placed, Skins
+from physgraph_usd.studio.value_panel import CHANGED, SWATCHES
 from physgraph_usd.studio.values import TUNABLES
 from physgraph_usd.usd.read.reader import open_shot
 
@@ -128,6 +132,11 @@ class Artist:
 def colored(picture: np.ndarray) -> np.ndarray:
     """Whether each pixel of a picture has more colour than the grey of bodies, ground and background."""
     return np.ptp(picture[:, 310:], axis=2) > 30.0  # Beside the viewer's notes.
+
+
+def labelled(picture: np.ndarray) -> np.ndarray:
+    """Whether each pixel of a picture is white, as the labels' ground alone is."""
+    return picture.min(axis=2) > 250.0
 
 
 def rows_of(pixels: np.ndarray) -> int:
@@ -272,6 +281,61 @@ def test_the_picture_wipes_maps_wires_and_compares(shot: Path):
         artist.press("x")
         artist.settle("A and B exchanged")
         assert session.value(CLOTH, "guide:stiffness") == 2000.0
+
+
+def test_cloth_that_moves_and_rests_again_leaves_no_nodes_in_the_scene():
+    points, triangles = np.random.default_rng(1).random((30, 3), np.float32), np.arange(30).reshape(10, 3)
+    server, axes, counts = viser.ViserServer(host="127.0.0.1", port=8300, verbose=False), np.eye(3), list[int]()
+    with ExitStack() as end:
+        end.callback(server.stop)
+        skins = Skins(server, axes)
+        for step in range(4):
+            moved = points + np.float32(step)
+            skins.place("refined/0", Placed(moved, triangles, whole=triangles, color=np.ones(3)))
+            skins.shade([["refined/0"]], lambda: False)
+            time.sleep(2 * LOADED_SECONDS)
+            counts.append(len(server.scene._handle_from_node_name))
+    assert counts == [counts[0]] * 4
+
+
+def test_a_picture_of_each_preset_chooses_it(shot: Path):
+    with tuned(shot) as (session, artist):
+        for name in PRESETS:
+            button = artist.page.get_by_role("button", name=name, exact=True)
+            url = button.evaluate("drawn => getComputedStyle(drawn).backgroundImage")
+            picture = b64decode(url.partition("base64,")[2].partition('"')[0])
+            assert picture == (SWATCHES / f"{name}.webp").read_bytes()
+            box = button.bounding_box()
+            assert 48 < box["width"] < 70
+            assert 48 < box["height"]
+        artist.page.get_by_role("button", name="denim", exact=True).click()
+        artist.settle("denim")
+        assert session.value(CLOTH, "weftStretchStiffness") == 226.0
+        assert artist.number("Preset").input_value() == "denim"
+
+
+def test_a_and_b_stand_side_by_side_under_their_letters(shot: Path):
+    with tuned(shot) as (session, artist):
+        artist.tab("Picture")
+        assert not labelled(artist.picture()).any()
+        artist.choose("Show", "A | B")
+        artist.until(lambda: session.kept is not None, "choosing A | B keeps A")
+        artist.tab("Values")
+        artist.type("Guide [N/m³]", "50")
+        artist.settle("Guide Stiffness")
+        picture = artist.picture()
+        cloth = np.ptp(picture, axis=2) > 12.0
+        across, letters = (np.flatnonzero(each.sum(axis=0) > 2) for each in (cloth, labelled(picture)))
+        (gap,) = np.flatnonzero(np.diff(across) > 8)
+        left, right = across[: gap + 1], across[gap + 1 :]
+        a, b = letters[letters < right[0]], letters[letters > left[-1]]
+        assert left[0] < a[0] < a[-1] < left[-1], "a letter over A"
+        assert right[0] < b[0] < b[-1] < right[-1], "a letter over B"
+        lowest = [np.flatnonzero(cloth[:, side].any(axis=1)).max() for side in (left, right)]
+        assert lowest[1] > lowest[0] + 8, "B hangs lower, A is as it was"
+        artist.tab("Picture")
+        artist.choose("Show", "refined")
+        artist.picture(lambda now: not labelled(now).any())
 
 
 @pytest.mark.slow

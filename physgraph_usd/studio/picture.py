@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -20,16 +20,8 @@ from .maps import PLAIN, Map, find_map
 from .session import TuneSession
 from .skins import Placed, Skins
 from .takes import Shown
+from .view import CAGE, FINE, KEPT, SUBDIVISION, Labels, View
 
-CAGE, SUBDIVISION, KEPT, FINE = "cage", "subdivision", "A", "refined"
-SHOWS: dict[str, tuple[str, ...]] = {
-    "refined": (FINE,),
-    "cage | refined": (CAGE, FINE),
-    "cage | subdivision | refined": (CAGE, SUBDIVISION, FINE),
-    "subdivision | refined": (SUBDIVISION, FINE),
-    "A | refined": (KEPT, FINE),
-}
-"""Columns of each choice, from left to right."""
 COLORS = {CAGE: (201, 160, 110), SUBDIVISION: (168, 160, 150), KEPT: (150, 170, 140), FINE: (122, 150, 190)}
 TRIM, BODY, WIRE, RING = (176, 168, 140), (150, 150, 150), (40, 44, 52), (16, 18, 22)
 """Colours, sRGB; a garment or body with a colour of its own on the stage has that."""
@@ -42,31 +34,6 @@ LIFT = 0.004
 """How far before the cloth the brush's rings are drawn, in the garments' size."""
 FALLOFF = (1.0, 0.5)
 """Radii of the brush's rings over the brush's radius: full extent, and half strength."""
-
-
-@dataclass(frozen=True)
-class View:
-    """How cloth is shown.
-
-    Attributes:
-        show: A name of `SHOWS`.
-        wiped: Whether the first and the last column stand at one place, the first left of the wipe.
-        wipe: Where the wipe stands, 0 to 1 from left to right.
-        wires: Whether the edges of the meshes are drawn.
-        map: A name of `maps.NAMES`.
-    """
-
-    show: str = next(iter(SHOWS))
-    wiped: bool = False
-    wipe: float = 0.5
-    wires: bool = False
-    map: str = PLAIN
-
-    @property
-    def columns(self) -> tuple[str, ...]:
-        """The columns, from left to right."""
-        found = SHOWS[self.show]
-        return (found[0], found[-1]) if self.wiped and len(found) > 1 else found
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +49,14 @@ class Sheet:
     points: np.ndarray
     triangles: np.ndarray
     edges: np.ndarray
+
+    def beside(self, line: float, right: np.ndarray, *, before: bool) -> Sheet:
+        """The faces and edges whose middle lies ``before`` or after a line [m] along a direction, shape (3,)."""
+
+        def chosen(corners: np.ndarray) -> np.ndarray:
+            return corners[((self.points @ right)[corners].mean(axis=1) < line) == before]
+
+        return replace(self, triangles=chosen(self.triangles), edges=chosen(self.edges))
 
 
 class Picture:
@@ -117,6 +92,7 @@ class Picture:
         self._bindings: dict[int, tuple[int, GarmentBindings]] = {}
         self._own = {path: color_of(session.shot.stage, path) for path in (*session.garments, *session.shot.colliders)}
         self._skins, self._columns = Skins(server, self.axes), list[list[str]]()
+        self._labels = Labels(server.scene)
         self.paintable = False
         add_lights(server.scene, self.axes)
 
@@ -154,6 +130,7 @@ class Picture:
             for name in [each for each in self._lines if each.startswith("wires") and each not in lines]:
                 self._lines.pop(name).remove()
             self._cloth = np.concatenate([each.points for each in shown.frame.garments])
+            self._labels.draw(self._places(columns))
 
     def shade(self, cancelled: Callable[[], bool]) -> None:
         """Draw the light and the soft shadows of what is drawn, unless ``cancelled`` meanwhile."""
@@ -191,6 +168,12 @@ class Picture:
     def _offset(self, place: int, count: int) -> np.ndarray:
         """How far a column stands from the middle [m]."""
         return np.zeros(3) if self.view.wiped else (place - 0.5 * (count - 1)) * self._across * self.axes[0]
+
+    def _places(self, columns: Sequence[str]) -> dict[str, np.ndarray]:
+        """Where the label of each column stands: over the middle of its garments, or of its side of a wipe [m]."""
+        top = ((self._cloth - self.centre) @ self.axes[1]).max() * self.axes[1]
+        apart = (0.5 if self.view.wiped else 1.0) * self._across * self.axes[0]
+        return {column: top + (place - 0.5 * (len(columns) - 1)) * apart for place, column in enumerate(columns)}
 
     def _placed(self, points: np.ndarray, at: np.ndarray) -> np.ndarray:
         return (points - self.centre + at).astype(np.float32)
@@ -235,16 +218,9 @@ class Picture:
         """The part of a mesh on one side of the wipe; ``drawn`` [m], shape (N, 3), gives the wipe's ends."""
         if not self.view.wiped or len(self.view.columns) < 2:
             return sheet
-        right = self.axes[0]
-        low, high = (drawn @ right).min(), (drawn @ right).max()
+        low, high = (drawn @ self.axes[0]).min(), (drawn @ self.axes[0]).max()
         line = low + self.view.wipe * (high - low)
-        first = column == self.view.columns[0]
-
-        def chosen(corners: np.ndarray) -> np.ndarray:
-            at = (sheet.points @ right)[corners].mean(axis=1)
-            return corners[(at < line) == first]
-
-        return replace(sheet, triangles=chosen(sheet.triangles), edges=chosen(sheet.edges))
+        return sheet.beside(line, self.axes[0], before=column == self.view.columns[0])
 
     def _draw_lines(self, name: str, segments: np.ndarray, color: tuple[int, int, int], pixels: float) -> None:
         """Draw line segments in the scene [m], shape (S, 2, 3), under a name; none removes them."""

@@ -122,7 +122,7 @@ class Skins:
                     self.meshes[name].color = encode_color(tuple(self._placed[name].color * factor.mean()))
             for ground in self._grounds:
                 self._later(ground.remove, LOADED_SECONDS)
-            self._grounds = [self._scene.add_glb(f"ground/{next(self._serial)}", each.ground) for each in found]
+            self._grounds = [self._scene.add_glb(f"ground-{next(self._serial)}", each.ground) for each in found]
 
     def _is_lit(self, name: str) -> bool:
         lit = self._light.get(name)
@@ -141,7 +141,7 @@ class Skins:
             return self._later(lambda: self._conceal(name, before), SURE_SECONDS)
         base = mesh.color if mesh.colors is None else np.ones(3)
         data = as_glb(mesh.points, mesh.triangles, colors, base=base, flat=mesh.flat)
-        skin = Skin(mesh, colors, self._scene.add_glb(f"skin/{next(self._serial)}/{name}", data))
+        skin = Skin(mesh, colors, self._scene.add_glb(f"skin-{next(self._serial)}", data))
         with self._lock:
             self._skins[name] = skin
             self._show(name, opacity=None, visible=True)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from base64 import b64encode
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from ..shot.notes import of_subsets
 from ..solver.fabric import PRESETS
 from ..usd.schema import CONTACT, FABRIC, GARMENT, REFINEMENT
-from .desk import Desk, put, small
+from .desk import Desk, in_order, put, small
 from .session import TuneSession
 from .values import TUNABLES, Tunable
 
@@ -25,6 +28,17 @@ div:has(> .mantine-Text-root > label) {width: 11.5em !important; white-space: no
 .mantine-Text-root > label > wbr {display: none}
 </style>"""
 """Hides the sliders' own numbers, which are places on a logarithmic scale; names stand on one line."""
+SWATCHES = Path(__file__).parent / "swatches"
+"""A WebP of each preset, drawn by `benchmarks.swatches`."""
+SWATCH_STYLE = """
+div:has(> .swatches) + div div:has(> p) {display: none}
+div:has(> .swatches) + div button {flex: 0 0 calc(100% / 6 - 6px) !important; min-width: 0 !important; height: 5em;
+padding: 0; overflow: visible; border: 0; background-size: 100% auto; background-repeat: no-repeat}
+div:has(> .swatches) + div button:hover {outline: 2px solid #228be6}
+div:has(> .swatches) + div .mantine-Button-label
+{align-items: flex-end; height: 100%; overflow: visible; font-size: 0.8em; letter-spacing: -0.04em; color: #1f2933}
+"""
+"""Draws buttons as pictures with a name below, six in a row."""
 
 
 class ValuePanel:
@@ -38,6 +52,11 @@ class ValuePanel:
         gui.add_html(STYLE)
         self._preset = gui.add_dropdown("Preset", self._presets(), initial_value=AS_AUTHORED)
         desk.on(self._preset, self._choose)
+        gui.add_html(f"<div class='swatches'><style>{SWATCH_STYLE}{pictures(sorted(PRESETS))}</style></div>")
+        swatches = gui.add_button_group("Swatches", sorted(PRESETS))
+        swatches.on_click(
+            in_order(lambda event: desk.ask(lambda session, name=event.target.value: self._pick(session, name)))
+        )
         self._subsets = gui.add_html(self._of_subsets())
         self._reset = desk.on(gui.add_dropdown("Reset", (RESET,), hint="Takes the shot's value again."), self._put_back)
         for group in dict.fromkeys(tunable.group for tunable in TUNABLES.values()):
@@ -135,6 +154,10 @@ class ValuePanel:
         elif chosen != OWN_VALUES:
             session.set_preset(garment, chosen)
 
+    def _pick(self, session: TuneSession, name: str) -> None:
+        self._choose(session, name)
+        put(self._preset, value=name)
+
     def _keep_preset(self, session: TuneSession) -> None:
         name = self._name.value.strip() or "mine"
         rows = (each for each in TUNABLES.values() if each.group == FABRIC)
@@ -152,3 +175,11 @@ class ValuePanel:
         for tunable in TUNABLES.values():
             if tunable.label == label:
                 session.reset(garment, tunable.name)
+
+
+def pictures(presets: Sequence[str]) -> str:
+    """Rules of style that draw each preset's picture on the button of the same number."""
+    data = (b64encode((SWATCHES / f"{name}.webp").read_bytes()).decode() for name in presets)
+    buttons = (f"div:has(> .swatches) + div button:nth-of-type({number})" for number in range(1, len(presets) + 1))
+    urls = (f"{{background-image: url(data:image/webp;base64,{each})}}" for each in data)
+    return "\n".join(map(" ".join, zip(buttons, urls, strict=True)))

@@ -8,8 +8,10 @@ from typing import Any
 from .camera import Camera
 from .desk import Desk, in_order, put
 from .maps import HIGH, LOW, MIDDLE, NAMES, Map
-from .picture import KEPT, SHOWS, View
 from .session import TuneSession
+from .view import KEPT, SHOWS, View
+
+COMPARED = "A | B keeps the present cloth as A if there is no A yet; B is what is tuned."
 
 
 class ViewPanel:
@@ -18,20 +20,21 @@ class ViewPanel:
     def __init__(self, desk: Desk, camera: Camera) -> None:
         """Add the controls, and look as last time."""
         self._desk, self._camera, gui = desk, camera, desk.gui
-        known = {each.name for each in fields(View)}
-        last = {name: value for name, value in desk.notes.looked.get("view", {}).items() if name in known}
+        names = {each.name for each in fields(View)}
+        last = {name: value for name, value in desk.notes.looked.get("view", {}).items() if name in names}
         view = View(**last)
-        desk.picture.view = view if view.show in SHOWS and view.map in NAMES else View()
+        known = view.show in SHOWS and KEPT not in view.columns and view.map in NAMES
+        desk.picture.view = view if known else View()
         view = desk.picture.view
         self._controls: dict[str, Any] = {
-            "show": gui.add_dropdown("Show", tuple(SHOWS), initial_value=view.show),
+            "show": gui.add_dropdown("Show", tuple(SHOWS), initial_value=view.show, hint=COMPARED),
             "wiped": gui.add_checkbox("Wipe", view.wiped, hint="First and last at one place, split by the slider."),
             "wipe": gui.add_slider("Wipe at", 0.0, 1.0, 0.01, view.wipe),
             "wires": gui.add_checkbox("Wireframe", view.wires, hint="Key: G."),
             "map": gui.add_dropdown("Map", NAMES, initial_value=view.map, hint="Colours of the refined cloth."),
         }
         for name, control in self._controls.items():
-            desk.on(control, lambda session, value, name=name: self.set(**{name: value}))
+            desk.on(control, lambda session, value, name=name: self._choose(session, name, value))
         self._bar = gui.add_html("")
         desk.press(gui.add_button("Keep as A", hint="Keeps values and cloth to compare with. Key: K."), self._keep)
         desk.press(gui.add_button("Exchange A and B", hint="B is what is tuned. Key: X."), TuneSession.swap)
@@ -61,6 +64,11 @@ class ViewPanel:
     def looked(self) -> dict[str, Any]:
         """How cloth is looked at, as plain values."""
         return asdict(self._desk.picture.view)
+
+    def _choose(self, session: TuneSession, name: str, value: Any) -> None:
+        if name == "show" and KEPT in SHOWS[value] and session.kept is None:
+            session.keep()
+        self.set(**{name: value})
 
     def _keep(self, session: TuneSession) -> None:
         session.keep()
