@@ -73,6 +73,37 @@ def test_the_process_answers_with_files_and_ends(live: ModuleType, process: Any)
     process.send({"time": 1.0})
 
 
+def test_a_process_started_ahead_takes_the_next_shot(live: ModuleType, program: list[str], tmp_path: Path) -> None:
+    """It is a command of its own, since the add-on names one by its path."""
+    command = tmp_path / "physgraph-usd"
+    command.write_text(f'#!/bin/sh\nexec {sys.executable} -m physgraph_usd "$@"\n')
+    command.chmod(0o755)
+    ahead, line = live.Ahead(), [str(command), *program[3:]]
+    ahead.start(str(command))
+    waiting = ahead.process
+    ahead.start(str(command))
+    assert ahead.process is waiting
+    process = ahead.take(line, tmp_path / "log")
+    assert process is waiting
+    assert wait_for(process, lambda news: news.shot).shot["garments"] == [CLOTH]
+    process.send({"time": 2.0})
+    assert wait_for(process, lambda news: news.settled).points
+    process.stop().join(PATIENCE_SECONDS)
+    assert not process.log.exists()
+
+
+def test_a_process_started_ahead_ends_with_its_input_and_a_missing_command_is_tried_once(live: ModuleType) -> None:
+    ahead = live.Ahead()
+    ahead.start("no-such-command")
+    assert ahead.process is None
+    ahead.start(sys.executable)  # Python takes "live" for a file that is not there.
+    process = ahead.process
+    process._process.wait(PATIENCE_SECONDS)
+    assert not process.runs
+    ahead.stop()
+    assert ahead.process is None
+
+
 @pytest.mark.slow
 def test_a_process_that_fails_says_why(live: ModuleType, program: list[str], tmp_path: Path) -> None:
     process = live.LiveProcess([*program[:-1], "/World/nothing"], tmp_path / "log")

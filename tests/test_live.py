@@ -179,3 +179,11 @@ def test_a_signal_ends_it_while_it_waits(process: Process, number: int):
 def test_what_is_refused(session: TuneSession, request_: dict[str, Any]):
     with pytest.raises(UsageError):
         changes_in(request_, session, save=lambda _: None)
+
+
+@pytest.mark.parametrize(("words", "code"), [(b"", 0), (b"[1, 2]\n", 2), (b"{\n", 2), (b'["no.usda"]\n', 2)])
+def test_arguments_that_come_with_the_input(words: bytes, code: int):
+    line = [sys.executable, "-m", "physgraph_usd", "live", "-"]
+    run = subprocess.run(line, input=words, capture_output=True, timeout=PATIENCE_SECONDS, check=False)
+    assert run.returncode == code, run.stderr.decode()
+    assert b"Traceback" not in run.stderr

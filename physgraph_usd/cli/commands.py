@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from contextlib import closing
 from dataclasses import asdict
@@ -134,16 +135,35 @@ def live(shot: str, **options: Any) -> None:
     """Solve frames of SHOT for another program, which sends values as lines of JSON on standard input.
 
     Each answer is a line of JSON on standard output; physgraph_usd/studio/live.py describes both. Ends with the input.
+    With - for SHOT the solver is loaded first, and the first line of the input is a list of the arguments.
     """
     with signals_noted():
         with imports_uncollected():
-            from ..studio.live import answers_alone, serve
+            from ..studio.live import answers_alone, lines_of, serve
             from ..studio.session import TuneSession
 
+        lines = lines_of(sys.stdin.fileno())
+        if shot == "-":
+            line = next(lines, None)
+            if line is None:
+                return
+            options = dict(live.make_context("live", _words(line)).params)
+            shot = options.pop("shot")
         with answers_alone() as stream, closing(TuneSession(shot, **options)) as session:
             if session.warning:
                 click.echo(f"warning: {session.warning}", err=True)
-            serve(session, stream)
+            serve(session, stream, lines)
+
+
+def _words(line: bytes) -> list[str]:
+    """Arguments from a line of JSON."""
+    try:
+        words = json.loads(line)
+    except ValueError as error:
+        raise UsageError(f"cannot read the arguments: {error}") from error
+    if not isinstance(words, list) or not all(isinstance(word, str) for word in words):
+        raise UsageError(f"the arguments are {words!r}, not a list of strings")
+    return words
 
 
 @click.command()

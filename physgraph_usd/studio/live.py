@@ -127,8 +127,8 @@ class Answers:
         return str(file)
 
 
-def serve(session: TuneSession, stream: BinaryIO) -> None:
-    """Answer the requests on standard input until the end of the input, or until a request to quit.
+def serve(session: TuneSession, stream: BinaryIO, lines: Iterator[bytes]) -> None:
+    """Answer requests, a line each, until their end or until a request to quit.
 
     Raises:
         SolveError: The thread that solves has ended.
@@ -137,7 +137,7 @@ def serve(session: TuneSession, stream: BinaryIO) -> None:
     with tempfile.TemporaryDirectory(prefix="physgraph-live-") as folder:
         answers = Answers(session, stream, Path(folder))
         try:
-            for line in _lines(sys.stdin.fileno()):
+            for line in lines:
                 try:
                     request = _parsed(line)
                     change = _in_turn(changes_in(request, session, save=answers.save))
@@ -199,7 +199,7 @@ def answers_alone() -> Iterator[BinaryIO]:
             os.dup2(kept, 1)
 
 
-def _lines(descriptor: int) -> Iterator[bytes]:
+def lines_of(descriptor: int) -> Iterator[bytes]:
     """Lines of a stream as they come, until the stream ends; signals are noticed while none comes."""
     rest = b""
     while True:

@@ -9,13 +9,15 @@ import numpy as np
 from bpy.app.handlers import persistent
 
 from .command import Settings, live_line, unsaid_warnings
-from .live import Faces, LiveProcess, faces_in, request_for
+from .live import Ahead, Faces, faces_in, request_for
 from .refine import FAILURES, now_running, objects_of, prepare
 from .shot import author_level, collection_for_cloth, metres_in, refined_of, selected_garments
 
 POLL_SECONDS = 0.05
 HIDDEN = {"coarse": "physgraph_hides_coarse", "refined": "physgraph_hides_refined"}
 """Custom properties of a live object: whether it has hidden another object, and whether that was selected."""
+AHEAD = Ahead()
+"""The process that waits for the next shot while the panel is shown."""
 LIVE = "physgraph_is_live"
 """Custom property of every live object, also after the coarse object was deleted."""
 
@@ -49,7 +51,7 @@ class Live:
         self._times: list[float | None] = []
         self._points: dict[str, np.ndarray] = {}
         self._faces: dict[str, Faces] = {}
-        self._process = LiveProcess(line, self._files.log)
+        self._process = AHEAD.take(line, self._files.log)
 
     def send(self) -> None:
         """Send the changes of the panel, once the process has read the shot."""
@@ -98,9 +100,8 @@ class Live:
         """End the process and remove its files and objects."""
         self._process.stop()
         remove_objects()
-        for file in (self._files.coarse, self._files.log):
-            with suppress(OSError):
-                file.unlink(missing_ok=True)
+        with suppress(OSError):
+            self._files.coarse.unlink(missing_ok=True)
 
     def _begin(self, shot: dict) -> None:
         """Have the present frame solved with the panel's values; show the command's choice of level on the panel."""
@@ -283,6 +284,7 @@ def register() -> None:
 def unregister() -> None:
     """End the live cloth, and follow no more."""
     stop()
+    AHEAD.stop()
     for handlers, function in _handlers():
         if function in handlers:
             handlers.remove(function)

@@ -5,8 +5,8 @@ import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, PointerProperty, StringProperty
 
 from .command import PRESETS, SLIDERS, Settings
-from .live_view import PHYSGRAPH_OT_keep, PHYSGRAPH_OT_live, last_failure, now_live, send
-from .refine import PHYSGRAPH_OT_refine, now_running
+from .live_view import AHEAD, PHYSGRAPH_OT_keep, PHYSGRAPH_OT_live, last_failure, now_live, send
+from .refine import PHYSGRAPH_OT_refine, command_of, now_running
 
 AS_AUTHORED = "AS_AUTHORED"
 FABRICS = [
@@ -126,6 +126,8 @@ class PHYSGRAPH_PT_panel(bpy.types.Panel):
             layout.label(text="Esc cancels")
         else:
             layout.operator(PHYSGRAPH_OT_refine.bl_idname, icon="MOD_CLOTH")
+        if not now_live():
+            AHEAD.start(command_of(context))
         _draw_live(layout.box())
         if settings.last_report:
             layout.operator("wm.path_open", text="Open Report").filepath = settings.last_report

@@ -57,9 +57,13 @@ def prepare(context: bpy.types.Context) -> Prepared:
     files = files_of_run(folder, blend.stem or "untitled", [item.name for item in garments])
     written = export(context, files.coarse, garments, colliders=bodies, frames=settings.frames)
     paths = {item.session_uid: written.garments[item.name] for item in garments}
+    return Prepared(settings, files, written, paths, command_of(context))
+
+
+def command_of(context: bpy.types.Context) -> str:
+    """The command of the preferences."""
     command = context.preferences.addons[__package__].preferences.command
-    command = bpy.path.abspath(command) if command.startswith("//") else command
-    return Prepared(settings, files, written, paths, command)
+    return bpy.path.abspath(command) if command.startswith("//") else command
 
 
 def objects_of(paths: dict[int, str]) -> dict[bpy.types.Object, str]:
