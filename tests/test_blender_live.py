@@ -98,6 +98,7 @@ def test_a_process_started_ahead_ends_with_its_input_and_a_missing_command_is_tr
     assert ahead.process is None
     ahead.start(sys.executable)  # Python takes "live" for a file that is not there.
     process = ahead.process
+    assert process is not None
     process._process.wait(PATIENCE_SECONDS)
     assert not process.runs
     ahead.stop()
