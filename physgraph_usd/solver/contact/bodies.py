@@ -11,7 +11,7 @@ is inside or outside as a whole.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import reduce
 
 import numpy as np
@@ -22,7 +22,6 @@ from torch import Tensor
 from ..collide.crossings import Pierced
 from ..colliders.base import Nearest, Solid
 from ..colliders.mesh import MeshSurface
-from ..colliders.pose import Pose
 from ..forces.self_contact import PairConstraints
 from ..level import Level
 from ..mesh.topology import joined_by, patches_with
@@ -64,7 +63,6 @@ class FrameBodies:
         longest: Longest way out from between overlapping parts of a body [m].
         settings: Contact settings, with the stiffness in SI.
         sides: Allowed side of each open surface for each cage vertex, shape (C,); zeros if undecided or meaningless.
-        unions: Cache of closed surfaces that overlap, as one surface, by their numbers.
     """
 
     touching: tuple[Touching, ...]
@@ -74,7 +72,6 @@ class FrameBodies:
     longest: float
     settings: ContactSettings
     sides: tuple[Float[Tensor, " coarse"], ...]
-    unions: dict[tuple[int, ...], MeshSurface] = field(default_factory=dict)
 
     @staticmethod
     def begin(
@@ -106,31 +103,19 @@ class FrameBodies:
     def exits(self, index: int, at: Float[Tensor, "points 3"]) -> tuple[Nearest, Nearest]:
         """Closest points of a closed surface, and closest points on its exposed faces, for points inside.
 
-        A way out that ends inside other bodies leads to the exposed faces of all of them, as where parts of one body
-        overlap.
+        A way out that ends inside another body is none, and infinitely long: cloth pinched by two bodies stays.
 
         Args:
             at: The points in the surface's coordinates [m].
         """
         surface = self.touching[index].surface
         found = surface.closest(at, torch.full_like(at[:, 0], float("inf")))
-        way, others = surface.exit(at, found), self._beside(index)
-        if not others:
-            return found, way
-        out = way.point + surface.lift * way.normal
-        blocked = torch.zeros_like(found.rim)
-        for other in others:
+        way = surface.exit(at, found)
+        out, blocked = way.point + surface.lift * way.normal, ~way.distance.isfinite()
+        for other in self._beside(index):
             there = self.touching[other].surface
             blocked |= there.inside(out + torch.as_tensor(surface.origin - there.origin).to(out))
-        which = torch.nonzero(blocked & way.distance.isfinite()).squeeze(1)
-        if not len(which):
-            return found, way
-        union = self._union((index, *others))
-        shift = torch.as_tensor(surface.origin - union.origin).to(at)
-        near = union.closest(at[which] + shift, torch.full_like(at[which, 0], float("inf")))
-        both = near, union.exit(at[which] + shift, near)
-        near, beyond = (replace(each, point=each.point - shift) for each in both)
-        return found.with_those(which, near), way.with_those(which, beyond)
+        return found, replace(way, distance=way.distance.masked_fill(blocked, torch.inf))
 
     def parts_around(self, index: int, at: Float[Tensor, "points 3"]) -> Int[Tensor, " points"]:
         """Number of parts around points in a surface's coordinates [m]: up to 2 of the surface, and of those beside."""
@@ -151,19 +136,6 @@ class FrameBodies:
             if [np.isfinite(offset) for offset in each.offset] == [np.isfinite(offset) for offset in own.offset]
             if _meet(each.surface, own.surface)
         )
-
-    def _union(self, numbers: tuple[int, ...]) -> MeshSurface:
-        """Closed surfaces as one."""
-        key = tuple(sorted(numbers))
-        if key not in self.unions:
-            members = [self.touching[number].surface for number in key]
-            firsts = np.cumsum([0, *(len(each.world) for each in members[:-1])])
-            shifted = [each.solid.faces + first for each, first in zip(members, firsts, strict=True)]
-            triangles = np.concatenate(shifted).astype(np.int32)
-            pose = Pose(np.concatenate([each.world for each in members]), triangles)
-            place = {"device": members[0].device, "threads": members[0].threads}
-            self.unions[key] = MeshSurface(pose, triangles, None, **place)
-        return self.unions[key]
 
     @property
     def solids(self) -> tuple[Solid, ...]:

@@ -90,7 +90,7 @@ def depths(
     lost: Bool[Tensor, " vertices"] | None = None,
     exits: Exits | None = None,
 ) -> tuple[Float[Tensor, " vertices"], Bool[Tensor, " vertices"]]:
-    """Length of each vertex's way out of a surface with an inside [m], 0 outside, and a mask of pinched vertices.
+    """Length of each vertex's way out of a surface, or depth without one [m], 0 outside; a mask of pinched vertices.
 
     Args:
         x: Positions in the surface's coordinates [m].
@@ -108,7 +108,8 @@ def depths(
         else:
             found, way = exits(x[within])
         known = None if lost is None else lost[within]
-        depth[within], stays[within] = way.distance, pinched(found, way, longest=longest, lost=known)
+        depth[within] = torch.where(way.distance.isfinite(), way.distance, found.distance)
+        stays[within] = pinched(found, way, longest=longest, lost=known)
     return depth, stays
 
 
