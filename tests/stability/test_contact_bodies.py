@@ -75,6 +75,18 @@ class TestNoRoom:
         assert np.abs(found[1].points[0] - found[0].points[0]).max() < 1e-3
         assert all(body["inside"] + body["crossings"] == 0 for body in bodies(found[1]))
 
+    def test_s21_cloth_stays_between_two_bodies_that_close_and_overlap(self):
+        """A way sideways out of both moved it by 40 mm as they touched, and by up to 13 mm a frame after."""
+        gaps = [*np.linspace(0.02, -0.005, 6), *[-0.005] * 4]
+        one = refiner_with([named(SHEET)], KINDS["boxes"], times=tuple(range(len(gaps))))
+        points = [
+            one.solve(frame_with([REST + 1e-6 * time], *jaws(float(gap), "boxes"), time=float(time))).points[0]
+            for time, gap in enumerate(gaps)
+        ]
+        moves = [float(np.linalg.norm(b - a, axis=1).max()) for a, b in pairwise(points)]
+        assert max(moves) < 5e-3
+        assert max(moves[-3:]) < STILL
+
 
 def needles() -> Soup:
     """Nine thin cones, tips up."""

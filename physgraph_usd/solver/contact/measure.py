@@ -31,9 +31,9 @@ class Penetration:
         percent: Percentage of all free vertices.
         deepest_mm: Depth of the deepest free vertex [mm].
         pinned: Number of pinned vertices deeper than `DEEP`; pinned vertices stay.
-        pinched: Number of free vertices inside whose cloth lies between overlapping parts of the body in the input, or
-            that are between such parts now and farther from any way out than half a cage edge. Pinched vertices stay,
-            out of sight; forced out, they would fold through their neighbours.
+        pinched: Number of free vertices inside whose cloth lies between overlapping parts of the body in the input,
+            that are between such parts now and farther from any way out than half a cage edge, or whose way out ends in
+            another body. Pinched vertices stay, out of sight; forced out, they would fold through their neighbours.
         crossings: Number of cloth edges through faces of the body plus body edges through faces of the cloth.
     """
 
