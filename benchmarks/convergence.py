@@ -34,7 +34,7 @@ from physgraph_usd.solver.integrate.stop import Budget
 from physgraph_usd.solver.integrate.weights import NETWORKS, integrator_of, load_network
 from physgraph_usd.solver.level import refine_garments
 
-from .rows import Row, say
+from .rows import Row, commit, say
 from .unseen import reference_of
 
 STEPS = 30
@@ -47,7 +47,8 @@ SEED = 77
 TEXT = """# Convergence
 
 Gap to the least energy known after each force evaluation, on three patches of another seed than those trained on:
-stretch and bending only, fixed border, two subdivisions, no guard. Written by `python -m benchmarks.convergence`."""
+stretch and bending only, fixed border, two subdivisions, no guard. Written by `python -m benchmarks.convergence` at
+commit {commit}."""
 CONFIG = PatchConfig(count=3, levels=(2, 2), elastic=True, most_vertices=4000, reference_steps=400)
 
 
@@ -60,7 +61,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, default=None)
     given = parser.parse_args(arguments)
     prepare_device(given.device)
-    say(TEXT)
+    say(TEXT.format(commit=commit()))
     for number, patch in enumerate(trained_like(given.device)):
         say(f"\npatch {number}: {patch.words}, {patch.group.levels[-1].vertex_count} vertices, {patch.reference}")
         lines = curves(patch, given.weights, given.physgraph, device=given.device)

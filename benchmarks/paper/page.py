@@ -14,7 +14,7 @@ from typing import Any
 
 import click
 
-from benchmarks.rows import Row
+from benchmarks.rows import Row, commit
 from physgraph_usd import __version__
 from physgraph_usd.solver.integrate.weights import NETWORKS
 
@@ -22,9 +22,9 @@ HEAD = ("| what | the paper | target | ours | |", "|---|---|---|---|---|")
 TEXT = """# The paper's results
 
 Written by `python -m benchmarks.paper{form}` in {minutes:.0f} minutes of processor time ({machine}, version
-{version}). {long} The paper is "PhysGraph: Physics-Based Cloth Enhancement Using Graph Neural Networks". Its shirt, its
-body and its motions are not free: each part says what stands in their place. "-" is where the paper gives no figure, or
-nothing was aimed at.
+{version}, commit {commit}). {long} The paper is "PhysGraph: Physics-Based Cloth Enhancement Using Graph Neural
+Networks". Its shirt, its body and its motions are not free: each part says what stands in their place. "-" is where the
+paper gives no figure, or nothing was aimed at.
 
 **{met} of {counted} figures with a target meet it.** Weights of the learned integrators: {weights}.
 """
@@ -102,6 +102,7 @@ def page(parts: Sequence[Part], known: dict[str, dict[str, Any]], *, short: bool
         long=f"The long form takes about {longer:.0f}, by its steps, frames and levels." if short else "",
         machine=f"{platform.machine()}, CPU",
         version=__version__,
+        commit=commit(),
         met=sum(map(bool, verdicts)),
         counted=len(verdicts),
         weights=", ".join(hashes()) or "none",
