@@ -131,8 +131,7 @@ class LiveProcess:
 
 
 class Ahead:
-    """A process that has loaded the solver before there is a shot: with it, the sample `skirt` shows cloth after 1.4 s
-    for 4.7.
+    """A process that has loaded the solver before there is a shot, so that the first cloth need not wait for it.
 
     Attributes:
         process: The process, or None.

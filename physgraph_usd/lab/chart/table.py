@@ -127,8 +127,9 @@ class Chart:
 
     @property
     def zeros(self) -> tuple[str, ...]:
-        """Titles of the measures of contact that are 0 for every method."""
-        return tuple(title for name, title in CONTACT.items() if not self._has(name))
+        """Titles of the measures of contact that are 0 for every method; without bodies only those of cloth alone."""
+        touches = any("contact" in point.energies for point in self.points)
+        return tuple(title for name, title in CONTACT.items() if not self._has(name) and (touches or name == "tangles"))
 
     @property
     def prepared(self) -> float:

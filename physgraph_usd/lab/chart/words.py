@@ -102,7 +102,7 @@ def advice(chart: Chart) -> str:
 
 
 def contact_words(chart: Chart) -> str:
-    """The measures of contact that no method has, which are not drawn; "" for none."""
+    """A sentence that names the measures of contact that are 0 for every method and not drawn; "" without any."""
     return f"0 for every method: {', '.join(words.split(' [')[0] for words in chart.zeros)}." if chart.zeros else ""
 
 
@@ -181,7 +181,7 @@ def _term(row: dict[str, Any], gap: str) -> Change:
         f"{key} {other[key]} ({full[key]})" for key in ("inside", "crossings", "tangles") if full[key] != other[key]
     ]
     cost = full["ms"] - other["ms"]
-    if cost < 0.0:
+    if other["ms"] > TOLERANCE * full["ms"]:
         worse.append("and a frame takes longer")
     if row["moved_mm"] > FAR:
         worse = ["the cloth falls away"]

@@ -111,7 +111,7 @@ class FrameBodies:
         surface = self.touching[index].surface
         found = surface.closest(at, torch.full_like(at[:, 0], float("inf")))
         way = surface.exit(at, found)
-        out, blocked = way.point + surface.lift * way.normal, ~way.distance.isfinite()
+        out, blocked = way.point + surface.lift * way.normal, torch.zeros_like(found.rim)
         for other in self._beside(index):
             there = self.touching[other].surface
             blocked |= there.inside(out + torch.as_tensor(surface.origin - there.origin).to(out))
@@ -127,7 +127,7 @@ class FrameBodies:
         return count
 
     def _beside(self, index: int) -> tuple[int, ...]:
-        """Other closed surfaces for the same garments with bounds that meet those of a closed surface."""
+        """Numbers of the closed surfaces, felt by the same garments, whose bounds overlap a closed surface's."""
         own = self.touching[index]
         return tuple(
             number

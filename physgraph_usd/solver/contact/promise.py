@@ -103,7 +103,7 @@ class Promise:
         # Cloth that stays behind a body that moves on would be in the body.
         inside = self.inside if stand else torch.arange(len(moves), device=moves.device) < mesh.level.vertex_count
         given = {"floor": self.floor, "tangle": self.tangle, "inside": inside, "dtype": mesh.level.dtype}
-        return safe_move(begin, ends, mesh.parts, asked=late, near=near if stand else None, **given), stand
+        return safe_move(begin, ends, mesh.parts, asked=late, near=near, **given), stand
 
     def _rounded(self, points: Tensor, end: Tensor) -> Float[Tensor, "all 3"]:
         """Corners of the cloth rounded to the type of the solve, seams closed, and corners of bodies at their ends."""
