@@ -18,7 +18,7 @@ from .fabric import Fabric
 from .grain import SHORTEST, LevelGrain, axes, edge_cosines
 from .mesh.defects import NO_AREA
 from .mesh.elements import QUAD_SPRING, ElasticElements, elastic_elements, hinge_geometry
-from .mesh.lengths import LENGTHS, NORMALS, ElementValues
+from .mesh.lengths import FOLDS, LENGTHS, NORMALS, ElementValues
 from .mesh.stencil import Stencil
 from .mesh.subdivide import (
     Refinement,
@@ -185,6 +185,11 @@ class Level:
     def normals(self) -> ElementValues:
         """Gives the triangles' normals at positions [m], twice their areas long [m^2]."""
         return ElementValues(NORMALS, self.triangles, self.rest, shape=(3,), threads=self.threads)
+
+    @cached_property
+    def folds(self) -> ElementValues:
+        """Gives the cosine of each hinge's angle at positions [m]."""
+        return ElementValues(FOLDS, self.hinges, self.rest, shape=(), threads=self.threads)
 
     @cached_property
     def base(self) -> Stencil:

@@ -14,7 +14,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -145,13 +144,7 @@ def _compression(rest: np.ndarray, ends: np.ndarray, frames: list[GarmentFrame])
 
 def sharp_folds(level: Level, x: Float[Tensor, "vertices 3"]) -> float:
     """Fraction of the hinges that fold by more than 45 degrees."""
-    if not len(level.hinges):
-        return 0.0
-    xi, xj, *wings = x[level.hinges.T.long()]
-    axis, ik, il = xj - xi, 0.5 * (wings[0] + wings[1]) - xi, 0.5 * (wings[2] + wings[3]) - xi
-    n1, n2 = torch.linalg.cross(axis, ik), torch.linalg.cross(il, axis)
-    flat = math.cos(SHARP_FOLD) * n1.norm(dim=1) * n2.norm(dim=1)
-    return float(((n1 * n2).sum(dim=1) < flat).double().mean())
+    return float((level.folds(x) < math.cos(SHARP_FOLD)).double().mean()) if len(level.hinges) else 0.0
 
 
 def edge_strain(level: Level, x: Float[Tensor, "vertices 3"]) -> dict[str, float]:

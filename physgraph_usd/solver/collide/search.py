@@ -181,7 +181,9 @@ def blocking_and_near(
     asked = _of_cloth(parts, start) if asked is None else asked
     given = {"radius": reach.radius.double(), "play": reach.play.double(), "half": reach.half, "floor": floor}
     found = _search(parts, query_of(start.double(), end.double(), kind=Ask.MOVE_NEAR, asked=asked, **given))
-    blocking, near = (found.where(mask) for mask in (found.value < 0.0, found.value >= 0.0))
+    blocks = found.value < 0.0
+    blocking = found.where(blocks)
+    near = found.where(~blocks) if len(blocking.face) else found
     return replace(blocking, value=blocking.value + 1.0), NearAt(near, reach)
 
 

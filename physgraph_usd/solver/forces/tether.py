@@ -11,6 +11,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import scipy.sparse as sp
 import torch
 from jaxtyping import Float, Int
@@ -45,11 +47,16 @@ class Tether:
             predicted: Positions [m].
         """
         self._level = level
-        self._density = density.to(level.rest)[level.vertex_garment.long()] * level.density_scale
-        self._area = level.vertex_area
-        self._weight = stiffness * self._density * self._area
+        density = density.to(level.rest)[level.vertex_garment.long()] * level.density_scale
+        self._weight = stiffness * density * level.vertex_area
         self._pull = three_columns(self._weight)
         self.predicted, self.stiffness = predicted, stiffness
+
+    def towards(self, predicted: Float[Tensor, "vertices 3"]) -> Tether:
+        """These springs, to other positions [m]."""
+        tether = copy.copy(self)
+        tether.predicted = predicted
+        return tether
 
     def add_force(self, x: Float[Tensor, "vertices 3"], force: Float[Tensor, "vertices 3"]) -> Float[Tensor, ""]:
         """Add the force [N] in place and return the energy [J]."""

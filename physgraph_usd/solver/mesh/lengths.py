@@ -1,4 +1,4 @@
-"""Lengths of edges and normals of triangles, one kernel each: torch would need many passes."""
+"""Lengths of edges, normals of triangles and folds of hinges, one kernel each: torch would need many passes."""
 
 from __future__ import annotations
 
@@ -41,6 +41,20 @@ def _normals(
     normal[t] = wp.cross(x[triangles[t][1]] - a, x[triangles[t][2]] - a)
 
 
+@wp.kernel
+def _folds(
+    first: wp.int32,
+    hinges: wp.array(dtype=wp.types.vector(length=6, dtype=wp.int32)),
+    x: wp.array(dtype=Any),
+    cosine: wp.array(dtype=Any),
+):
+    h = first + wp.tid()
+    i, c = x[hinges[h][0]], hinges[h]
+    axis = x[c[1]] - i
+    one, two = wp.cross(axis, x[c[2]] - i + x[c[3]] - i), wp.cross(x[c[4]] - i + x[c[5]] - i, axis)
+    cosine[h] = wp.dot(one, two) / (wp.length(one) * wp.length(two))
+
+
 def _for_both(kernel: Any, corners: Any, kinds: Mapping[torch.dtype, Any]) -> dict[torch.dtype, wp.Kernel]:
     """A generic kernel for float32 and float64."""
     kind = {dtype: [corners, VECTOR[dtype], kinds[dtype]] for dtype in VECTOR}
@@ -48,7 +62,9 @@ def _for_both(kernel: Any, corners: Any, kinds: Mapping[torch.dtype, Any]) -> di
 
 
 LENGTHS, NORMALS = _for_both(_lengths, wp.vec2i, SCALAR), _for_both(_normals, wp.vec3i, VECTOR)
-"""Kernels for `ElementValues`: edge lengths [m], and normals of twice the triangle's area [m^2]."""
+FOLDS = _for_both(_folds, wp.types.vector(length=6, dtype=wp.int32), SCALAR)
+"""Kernels for `ElementValues`: edge lengths [m], normals of twice the triangle's area [m^2], and cosines of the angle
+between a hinge's faces; not a number where one has no area."""
 
 
 class ElementValues:
