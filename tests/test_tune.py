@@ -233,7 +233,7 @@ def test_a_drag_is_one_step_of_undo():
     steps = []
     while history.undone_next:
         steps.append(history.undone_next)
-        history.undo()
+        history.go(-1)
     assert steps == ["Pin", "Pin", "Density", "Density"]
 
 

@@ -17,7 +17,7 @@ from ..interrupts import leave_if_asked
 from .camera import Camera
 from .desk import Desk, in_order, put, small
 from .guard import guarded_server
-from .loop import SOLVING, SolveLoop
+from .loop import SOLVING, SolveLoop, Watcher
 from .notes import Notes
 from .paint_panel import PaintPanel
 from .picture import Picture
@@ -41,7 +41,7 @@ POLL_SECONDS = 0.1
 """How often the main thread asks whether a signal came."""
 
 
-class TunePage:
+class TunePage(Watcher):
     """A session in the browser, for this machine only.
 
     Attributes:
