@@ -101,7 +101,8 @@ class TunePage(Watcher):
         self._desk.picture.draw(shown, kept=session.kept_shown)
         self._paint.attach()
         self._lines = figures(shown, self._desk.index)
-        put(self._figures, content=_table(self._lines))
+        rows = [f"| {name} | **{text}** |" for name, text in self._lines.items()]
+        put(self._figures, content="\n".join(["| | |", "|:--|--:|", *rows]))
         self._values.update()
         self._view.update()
         self._time.update()
@@ -157,7 +158,7 @@ class TunePage(Watcher):
         with tabs.add_tab("Paint"):
             self._paint = PaintPanel(desk, self._view, self._camera)
         with tabs.add_tab("Figures"):
-            self._figures = gui.add_html("")
+            self._figures = gui.add_markdown("")
             self._command = gui.add_html("")
 
     def _build_history(self) -> None:
@@ -167,14 +168,10 @@ class TunePage(Watcher):
         self._saved = gui.add_html(small(f"into {self._session.out}", "saved"))
         self._history = gui.add_button_group("History", (UNDO, REDO), hint="Keys: Z, and shift with Z.")
 
-        @self._history.on_click
-        @in_order
-        def _(event: Any) -> None:
-            desk.ask(TuneSession.undo if event.target.value.startswith(UNDO) else TuneSession.redo)
-
-        gui.add_command("Undo", hotkey="Z").on_trigger(in_order(lambda _: desk.ask(TuneSession.undo)))
-        redo = gui.add_command("Redo", hotkey="Z", modifier="shift")
-        redo.on_trigger(in_order(lambda _: desk.ask(TuneSession.redo)))
+        pick = {UNDO: TuneSession.undo, REDO: TuneSession.redo}
+        self._history.on_click(in_order(lambda event: desk.ask(pick[event.target.value.split()[0]])))
+        desk.key("Undo", "Z", TuneSession.undo)
+        desk.key("Redo", "Z", TuneSession.redo, modifier="shift")
 
     def _write_history(self) -> None:
         history = self._session.history
@@ -229,13 +226,3 @@ def _badge(text: str, color: str) -> str:
         f"margin:0.4em 0.8em;padding:0.35em 0.7em;border-radius:0.4em;color:white;background:{color};font-size:0.85em"
     )
     return f"<div id='state' style='{style}'>{html.escape(text)}</div>"
-
-
-def _table(lines: dict[str, str]) -> str:
-    cell = "padding:0.1em 0.2em"
-    rows = (
-        f"<tr><td style='{cell}'>{html.escape(name)}</td>"
-        f"<td style='{cell};text-align:right'><b>{html.escape(value)}</b></td></tr>"
-        for name, value in lines.items()
-    )
-    return f"<table style='width:calc(100% - 1.6em);margin:0 0.8em;font-size:0.8em'>{''.join(rows)}</table>"

@@ -115,14 +115,14 @@ class Skins:
         if found is None:
             return
         with self._server.atomic():
-            for column, lit in zip(columns, found, strict=True):
-                for name, factor in zip(column, lit.factors, strict=True):
+            for column, (factors, _) in zip(columns, found, strict=True):
+                for name, factor in zip(column, factors, strict=True):
                     self._light[name] = self._placed[name].points, factor
                     self._dress(name)
                     self.meshes[name].color = encode_color(tuple(self._placed[name].color * factor.mean()))
             for ground in self._grounds:
                 self._later(ground.remove, LOADED_SECONDS)
-            self._grounds = [self._scene.add_glb(f"ground-{next(self._serial)}", each.ground) for each in found]
+            self._grounds = [self._scene.add_glb(f"ground-{next(self._serial)}", ground) for _, ground in found]
 
     def _is_lit(self, name: str) -> bool:
         lit = self._light.get(name)
@@ -139,8 +139,8 @@ class Skins:
         before = self._skins.get(name)
         if before is not None and before.mesh.has_shape_of(mesh) and np.array_equal(before.colors, colors):
             return self._later(lambda: self._conceal(name, before), SURE_SECONDS)
-        base = mesh.color if mesh.colors is None else np.ones(3)
-        data = as_glb(mesh.points, mesh.triangles, colors, base=base, flat=mesh.flat)
+        base = [*(mesh.color if mesh.colors is None else np.ones(3)), 1.0]
+        data = as_glb(mesh.points, mesh.triangles, colors, flat=mesh.flat, baseColorFactor=base)
         skin = Skin(mesh, colors, self._scene.add_glb(f"skin-{next(self._serial)}", data))
         with self._lock:
             self._skins[name] = skin
