@@ -106,7 +106,8 @@ class TunePage(Watcher):
         self._values.update()
         self._view.update()
         self._time.update()
-        self._write_history()
+        history = session.history
+        put(self._history, options=(f"{UNDO} {history.undone_next}".strip(), f"{REDO} {history.redone_next}".strip()))
         put(self._command, content=f"<code>{small(session.command)}</code>")
         words = "playing" if self.loop.playing else "settled: as refine solves it" if shown.settled else "on its way"
         self._note_wait(0)
@@ -172,11 +173,6 @@ class TunePage(Watcher):
         self._history.on_click(in_order(lambda event: desk.ask(pick[event.target.value.split()[0]])))
         desk.key("Undo", "Z", TuneSession.undo)
         desk.key("Redo", "Z", TuneSession.redo, modifier="shift")
-
-    def _write_history(self) -> None:
-        history = self._session.history
-        options = f"{UNDO} {history.undone_next}".strip(), f"{REDO} {history.redone_next}".strip()
-        put(self._history, options=options)
 
     def _save(self, session: TuneSession) -> None:
         written = session.save()

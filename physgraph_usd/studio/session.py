@@ -186,7 +186,7 @@ class TuneSession(Tuning):
         """The command that refines the whole shot with the saved layer."""
         words = ["physgraph-usd", "refine", str(self.out), "-o", str(self.out.with_suffix(".refined.usdc"))]
         words += [] if self._device == "cpu" else ["--device", self._device]
-        for option, paths in zip(("--garment", "--collider", "--bind"), self._tried.named, strict=True):
+        for option, paths in zip(("--garment", "--collider", "--bind"), self._tried.named.values(), strict=True):
             words += [word for path in paths for word in (option, path)]
         return join(words + ([] if self.setting.contact else ["--contact", "off", "--self-contact", "off"]))
 
