@@ -106,7 +106,7 @@ def waves(test: str, x: np.ndarray) -> int:
     order = np.arctan2(rest[hem, down], rest[hem, 0]) if is_draped else rest[hem, 0]
     height = x[hem[np.argsort(order)], across]
     peaks, _ = find_peaks(np.tile(height, 3 if is_draped else 1), prominence=LEAST_WAVE)
-    return sum(len(height) <= peak < 2 * len(height) for peak in peaks) if is_draped else len(peaks)
+    return int(((peaks >= len(height)) & (peaks < 2 * len(height))).sum()) if is_draped else len(peaks)
 
 
 def alike(a: Sequence[tuple[float, int]], b: Sequence[tuple[float, int]]) -> bool:

@@ -221,14 +221,7 @@ class Picture:
         return [*drawn]
 
     def _place(
-        self,
-        name: str,
-        points: np.ndarray,
-        whole: np.ndarray,
-        *,
-        at: np.ndarray,
-        column: str | None = None,
-        **look: Any,
+        self, name: str, points: np.ndarray, whole: np.ndarray, *, at: np.ndarray, column: str = "", **look: Any
     ) -> None:
         """Draw a mesh, or its column's side of the wipe."""
         triangles = self._side(points, whole, column)
