@@ -63,6 +63,7 @@ class Picture:
         drawn = [_everything(session.shot.frame(time)) for time in times]
         self._across = max(np.ptp(each @ right) for each in drawn) + GAP * self.size
         self._cloth, self._line = points, 0.0  # Where the wipe stands to the right [m].
+        self._labels: dict[str, viser.LabelHandle] = {}
         self._bindings: dict[int, tuple[int, GarmentBindings]] = {}
         self._own = {path: color_of(session.shot.stage, path) for path in (*session.garments, *session.shot.colliders)}
         self._skins, self._columns = Skins(server, self.axes), list[list[str]]()
@@ -87,8 +88,7 @@ class Picture:
             self.bar = None
             garments = range(len(shown.points))
             columns = self.view.columns if any(each is not None for each in shown.points) else (CAGE,)
-            for name in ("wires", "label"):
-                self._scene.remove_by_name(name)
+            self._scene.remove_by_name("wires")
             self._skins.touched = [f"{FINE}/{index}" for index in garments] if self.paintable else []
             self._columns = []
             across = _everything(shown.frame) @ self.axes[0]
@@ -104,8 +104,13 @@ class Picture:
                 self._columns += [named] if named else []
             self._skins.keep([name for named in self._columns for name in named])
             self._cloth = np.concatenate([each.points for each in shown.frame.garments])
-            for text, place in self._places(columns).items() if len(columns) > 1 else ():
-                self._scene.add_label(f"label/{text}", text, position=tuple(place.tolist()), anchor="bottom-center")
+            places = self._places(columns) if len(columns) > 1 else {}
+            for text in self._labels.keys() - places.keys():
+                self._labels.pop(text).remove()
+            for text in places.keys() - self._labels.keys():
+                self._labels[text] = self._scene.add_label(f"label/{text}", text, anchor="bottom-center")
+            for text, place in places.items():  # A label that is added anew is not seen for a moment.
+                self._labels[text].position = tuple(place.tolist())
 
     def shade(self, cancelled: Callable[[], bool]) -> None:
         """Draw the light and the soft shadows of what is drawn, unless ``cancelled`` meanwhile."""
