@@ -19,7 +19,7 @@ They are done in this order, and then the frame is solved. Each round is answere
 
 A file of points holds float32 [m], world space, shape (V, 3), and is replaced two answers later. A file of faces holds
 `counts` and `indices` of the fine mesh, and stays. `{"error": TEXT}` is the answer to a request that cannot be used,
-which changes nothing, and to a frame that cannot be solved.
+which changes nothing (the frame is answered again), and to a frame that cannot be solved.
 """
 
 from __future__ import annotations
