@@ -2,6 +2,7 @@
 # make test       every check, and the fast tests
 # make test-all   every check, and all tests
 # make site       the documentation as a site, in build/site
+# make films      the films of README.md and the gallery and the pictures of tune; SHOTS=folder has the real shots
 # make format     let ruff rewrite what it can
 # PYTHON=python3.12 picks the interpreter of the environment; JOBS=8 the number of test processes.
 # TORCH=auto takes torch's build for this machine's card, TORCH=cu128 the one for that CUDA; else its CPU build.
@@ -16,7 +17,7 @@ DEMO := out/demo
 # A process begins with tests of its own files, so that what a file solves once is solved once, and helps out at the end.
 TESTS := $(BIN)/pytest -n $(JOBS) --dist worksteal
 
-.PHONY: demo site test test-all fast all lint style types format clean
+.PHONY: demo site films test test-all fast all lint style types format clean
 
 demo: $(VENV)/.demo
 	@mkdir -p $(DEMO)
@@ -41,6 +42,12 @@ all: $(VENV)/.dev
 
 site: $(VENV)/.dev
 	$(BIN)/mkdocs build --strict
+
+# Takes the program ffmpeg and a browser.
+films: $(VENV)/.dev
+	$(BIN)/python -m benchmarks.films docs/films $(if $(SHOTS),--folder $(SHOTS))
+	$(BIN)/python -m docs.tables
+	$(BIN)/python -m benchmarks.tune --pictures docs
 
 lint: style types
 

@@ -5,21 +5,24 @@
 
 Each is simulated by the potential and inertia of `benchmarks.fidelity` for a second, without contact, in triangles of
 5 mm. Draped: a square of 30 cm over a round support of 18. Gathered: 30 cm hang from 19. Pinched: two points of a
-hanging square, 8 cm apart, are brought together to 3. Printed: the total absolute mean curvature of each.
+hanging square, 8 cm apart, are brought together to 3. Printed: the total absolute mean curvature of each, the waves of
+its hem, and the pairs of presets that differ in no test by a tenth or more in either.
 With ``--thumbnails`` each draped preset alone, as a small WebP: those that `tune` shows beside its presets.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from itertools import combinations
 from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
 import torch
 from PIL import Image
+from scipy.signal import find_peaks
 
 from benchmarks.drawing import Thing, drawn, framing, upright
 from benchmarks.fidelity import Judge, garment_of, level_at, simulated
@@ -30,6 +33,8 @@ from physgraph_usd.shot.solve import prepare_device
 from physgraph_usd.solver.fabric import PRESETS
 
 SIDE, QUADS, FRAMES = 0.3, 30, 24
+LEAST_WAVE = 2e-3
+"""Least height of a wave of a hem above the higher of its valleys [m]."""
 PANEL, COLUMNS = (250, 230), 4
 THUMBNAIL, SHARPER, QUALITY = (192, 144), 3, 82
 """Size of a thumbnail [pixels], drawn pixels a side for each of its own, and quality of WebP."""
@@ -90,6 +95,29 @@ def swatch(task: tuple[str, str]) -> np.ndarray:
     return last
 
 
+def waves(test: str, x: np.ndarray) -> int:
+    """Waves of a swatch's hem, higher than `LEAST_WAVE`: around the draped square, along the others' lower side."""
+    rest = level_at(garment_of(TESTS[test](), 1), 1).rest.double().numpy()
+    rest = rest - 0.5 * (rest.min(axis=0) + rest.max(axis=0))
+    is_draped = test == "draped"
+    down, across = (1, 2) if is_draped else (2, 1)
+    side = np.abs(rest[:, [0, down]]).max(axis=1) if is_draped else -rest[:, down]
+    hem = np.flatnonzero(side > side.max() - 1e-4 * SIDE)
+    order = np.arctan2(rest[hem, down], rest[hem, 0]) if is_draped else rest[hem, 0]
+    height = x[hem[np.argsort(order)], across]
+    peaks, _ = find_peaks(np.tile(height, 3 if is_draped else 1), prominence=LEAST_WAVE)
+    return int(((peaks >= len(height)) & (peaks < 2 * len(height))).sum()) if is_draped else len(peaks)
+
+
+def alike(a: Sequence[tuple[float, int]], b: Sequence[tuple[float, int]]) -> bool:
+    """Whether two presets differ in no test by a tenth or more of the larger curvature or number of waves."""
+    return all(
+        abs(one - other) < 0.1 * max(one, other, 1e-9)
+        for each in zip(a, b, strict=True)
+        for one, other in zip(*each, strict=True)
+    )
+
+
 def paint(test: str, shapes: dict[str, np.ndarray], out: Path) -> None:
     """Draw a test of each preset from one camera."""
     stage = TESTS[test]()
@@ -134,13 +162,15 @@ def main() -> None:
             found[test][name] = shape
     if given.thumbnails:
         return paint_thumbnails(found["draped"], given.out)
-    say("| preset | " + " | ".join(f"{test}, m" for test in TESTS) + " |\n|---|---|---|---|")
-    for name in names:
-        judged = [
-            Judge(level_at(garment_of(TESTS[test](), 1), 1), np.zeros((0, 2))).curvature(found[test][name])
-            for test in TESTS
-        ]
-        say(f"| {name} | " + " | ".join(f"{each:.2f}" for each in judged) + " |")
+    say("| preset | " + " | ".join(f"{test}, m; waves" for test in TESTS) + " |\n|---|---|---|---|")
+    judges = {test: Judge(level_at(garment_of(TESTS[test](), 1), 1), np.zeros((0, 2))) for test in TESTS}
+    judged = {
+        name: [(judges[test].curvature(x[name]), waves(test, x[name])) for test, x in found.items()] for name in names
+    }
+    for name, each in judged.items():
+        say(f"| {name} | " + " | ".join(f"{curvature:.2f}; {count}" for curvature, count in each) + " |")
+    pairs = [f"{a} and {b}" for a, b in combinations(names, 2) if alike(judged[a], judged[b])]
+    say(f"\nPairs that differ by under a tenth in both: {', '.join(pairs) or 'none'}.")
     for test, shapes in found.items():
         paint(test, shapes, given.out / f"swatches_{test}.png")
 

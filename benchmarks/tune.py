@@ -1,13 +1,14 @@
 """How long an artist waits in `tune`: from a move of a slider to the first new cloth, and to the settled cloth.
 
-    python -m benchmarks.tune [--moves 20] [--shot NAME]... [--folder SHOTS] [--device cuda] [--page]
+    python -m benchmarks.tune [--moves 20] [--shot NAME]... [--folder SHOTS] [--device cuda] [--page | --processor]
     python -m benchmarks.tune --pictures docs
 
 Moves six sliders of a frame in the middle of each shot to random places, one after another, with contact; real shots
 where their folder is given. Prints a row a shot: median and longest wall seconds until the first round is handed over
-and until the frame is settled. With ``--page`` a browser is driven instead, and the time is from the mouse's press to
-the new vertices at the graphics card; without a card the processor draws, on the solver's cores. ``--pictures``
-writes the pictures and the film of docs/tune.md; it takes the program ffmpeg.
+and until the frame is settled; with ``--processor`` seconds of the processor, for a busy machine. With ``--page`` a
+browser is driven instead, and the time is from the mouse's press to the new vertices at the graphics card; without a
+card the processor draws, on the solver's cores. ``--pictures`` writes the pictures and the film of docs/tune.md; it
+takes the program ffmpeg.
 """
 
 from __future__ import annotations
@@ -15,7 +16,8 @@ from __future__ import annotations
 import random
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import chdir
 from pathlib import Path
 from statistics import median
 
@@ -40,9 +42,17 @@ CHOSEN = ("skirt", "dancer", "layers")
 @click.option("--folder", type=click.Path(path_type=Path), help="The real shots, which we may not ship.")
 @click.option("--device", default="cpu", show_default=True, help="Where to solve: cpu, cuda or auto.")
 @click.option("--page", is_flag=True, help="In a browser.")
+@click.option("--processor", is_flag=True, help="Processor seconds instead, without the page.")
 @click.option("--pictures", type=click.Path(path_type=Path), help="Write the pictures and the film into its folders.")
 def main(
-    moves: int, names: Sequence[str], folder: Path | None, *, device: str, page: bool, pictures: Path | None
+    moves: int,
+    names: Sequence[str],
+    folder: Path | None,
+    *,
+    device: str,
+    page: bool,
+    processor: bool,
+    pictures: Path | None,
 ) -> None:
     """Print what each shot takes, or write the pictures."""
     if pictures is not None:
@@ -55,7 +65,9 @@ def main(
             count = sum(len(points) for points in session.settle().points if points is not None)
             chance = random.Random(1)
             tried = [(TUNABLES[MOVED[k % len(MOVED)]], chance.random()) for k in range(moves)]
-            first, settled = zip(*(in_page if page else in_session)(session, tried, count), strict=True)
+            clock = time.process_time if processor else time.perf_counter
+            found = in_page(session, tried, count) if page else in_session(session, tried, clock)
+            first, settled = zip(*found, strict=True)
             cells = [f"{value:.2f}" for each in (first, settled) for value in (median(each), max(each))]
             say(f"| {name} | {count:,} | {' | '.join(cells)} |")
             session.close()
@@ -73,20 +85,22 @@ def sessions(
             yield name, TuneSession(folder / name, garments=garments, colliders=bodies, out=out, device=device)
 
 
-def in_session(session: TuneSession, tried: Sequence[tuple[Tunable, float]], _: int) -> list[tuple[float, float]]:
-    """Seconds of each move to the first new cloth, and to the settled cloth."""
+def in_session(
+    session: TuneSession, tried: Sequence[tuple[Tunable, float]], clock: Callable[[], float]
+) -> list[tuple[float, float]]:
+    """Seconds by a clock of each move to the first new cloth, and to the settled cloth."""
     found = []
     for tunable, place in tried:
-        began, seen = time.perf_counter(), list[float]()
+        began, seen = clock(), list[float]()
         session.set_value(session.garments[0], tunable.name, tunable.at(place))
-        session.solve(lambda _, began=began, seen=seen: seen.append(time.perf_counter() - began))
+        session.solve(lambda _, began=began, seen=seen: seen.append(clock() - began))
         session.settle()
-        found.append((seen[0], time.perf_counter() - began))
+        found.append((seen[0], clock() - began))
     return found
 
 
 def in_page(session: TuneSession, tried: Sequence[tuple[Tunable, float]], count: int) -> list[tuple[float, float]]:
-    """As `in_session`, in a browser."""
+    """As `in_session`, in a browser, from the press; ``count`` is the cloth's number of vertices."""
     page = TunePage(session)
     try:
         least = count // max(len(session.garments), 1) // 2
@@ -97,9 +111,10 @@ def in_page(session: TuneSession, tried: Sequence[tuple[Tunable, float]], count:
 
 
 def draw(folder: Path) -> None:
-    """Write the pictures and the film of the page, with the skirt."""
-    with tempfile.TemporaryDirectory() as made:
-        ((_, session),) = sessions(["skirt"], None, Path(made))
+    """Write the pictures and the film of the page, with the skirt; the page names files without a folder."""
+    folder = folder.resolve()
+    with tempfile.TemporaryDirectory() as made, chdir(made):
+        ((_, session),) = sessions(["skirt"], None, Path())
         session.set_time(session.times[len(session.times) // 2])
         page = TunePage(session)
         try:

@@ -16,7 +16,7 @@ import pytest
 from blender import addon_module
 from shots import CLOTH, cloth_shot
 
-from physgraph_usd.studio.live import changes_in
+from physgraph_usd.studio.live import change, parsed
 from physgraph_usd.studio.session import TuneSession
 from physgraph_usd.studio.values import TUNABLES
 
@@ -150,8 +150,7 @@ def test_the_session_then_has_what_the_panel_says(
     for settings in [*choices, *reversed(choices), choices[3], choices[1], choices[4], choices[2]]:
         request = live.request_for(settings, known, [CLOTH])
         assert bool(request) == (settings != known)
-        for change in changes_in(request, session, save=lambda _: None):
-            change(session)
+        change(session, parsed(json.dumps(request).encode()), save=lambda _: None)
         known, fresh = settings, TuneSession(program[4], garments=[CLOTH], out=tmp_path / "other.usda")
         if settings.preset:
             fresh.set_preset(CLOTH, settings.preset)

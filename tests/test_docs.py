@@ -12,7 +12,9 @@ import threading
 from functools import partial
 from glob import glob
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from importlib.util import find_spec
 from pathlib import Path
+from time import process_time
 from typing import NamedTuple
 
 import pytest
@@ -164,6 +166,14 @@ def test_the_gallery_has_its_films_and_they_are_short():
     assert sum(sizes.values()) <= MOST_BYTES_OF_FILMS
 
 
+def test_make_draws_the_films_with_commands_that_there_are():
+    line = ["make", "--dry-run", "films", "SHOTS=shots"]
+    printed = subprocess.run(line, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    modules = re.findall(r"python -m ((?:benchmarks|docs)\.\w+)", printed)
+    assert modules == ["benchmarks.films", "docs.tables", "benchmarks.tune"]
+    assert all(map(find_spec, modules))
+
+
 @pytest.mark.parametrize("name", README_FILMS)
 @pytest.mark.parametrize("page", ["README.md", "docs/index.md"])
 def test_the_first_films_have_the_figures_of_the_record(name: str, page: str):
@@ -173,15 +183,16 @@ def test_the_first_films_have_the_figures_of_the_record(name: str, page: str):
     assert f"{recorded['cage']:,} vertices to {recorded['fine']:,}" in " ".join(after.split("![")[0].split())
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("notebook", sorted((ROOT / "docs" / "notebooks").glob("*.ipynb")), ids=lambda each: each.stem)
 def test_notebooks_run(notebook: Path, monkeypatch: pytest.MonkeyPatch):
-    """The cells run in order in one namespace, without a notebook server; their own assertions judge the results."""
+    """The cells run in order in one namespace, in under a minute of processor time; their own assertions judge."""
     monkeypatch.setenv("MPLBACKEND", "agg")
     cells = [each for each in json.loads(notebook.read_text("utf-8"))["cells"] if each["cell_type"] == "code"]
     names: dict[str, object] = {}
+    began = process_time()
     for cell in cells:
         exec("".join(cell["source"]), names)
+    assert process_time() - began < 60.0
     assert len(cells) >= 4
     assert any("image/png" in output.get("data", {}) for cell in cells for output in cell["outputs"])
 

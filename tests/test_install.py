@@ -1,8 +1,11 @@
-"""README's commands that install: run as they are printed, in environments that hold nothing."""
+"""README's commands that install, and the image's steps: run as they are printed, in environments that hold nothing."""
 
 from __future__ import annotations
 
+import json
 import os
+import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -61,3 +64,37 @@ def test_the_command_works_after_each_way_to_install(checkout: Path, way: str):
 def test_there_are_two_ways_and_both_install_the_checkout():
     assert len(WAYS) == 2
     assert all("'.[usd,preview]'" in way for way in WAYS)
+
+
+def steps_of_the_image(root: Path) -> list[str]:
+    """The Dockerfile's steps as a shell's lines in a checkout, with the image's folders below a folder."""
+    text = (ROOT / "plugins" / "docker" / "Dockerfile").read_text(encoding="utf-8")
+    lines = re.sub(r"^#.*\n", "", text, flags=re.MULTILINE).replace("\\\n", " ").splitlines()
+    found = list[str]()
+    for word, _, rest in (line.partition(" ") for line in lines if line):
+        here = re.sub(r"(?<![\w/.])/(?=(venv|src|var|shots)\b)", f"{root}/", rest)
+        if word == "COPY":
+            seen = (line[1:] for line in (ROOT / ".dockerignore").read_text().splitlines() if line.startswith("!"))
+            here = f"mkdir {root}/src && cp -r {' '.join(seen)} {root}/src" if rest == ". /src" else "true"
+        elif word == "ENTRYPOINT":
+            here = f'{shlex.join(json.loads(rest))} "$@"'
+        found.append({"FROM": "true", "ARG": f"export {here}", "ENV": f"export {here}"}.get(word, here))
+        found[-1] = f"mkdir -p {here} && cd {here}" if word == "WORKDIR" else found[-1]
+    return found
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(2 * SECONDS)
+@pytest.mark.skipif(sys.platform == "win32", reason="commands for a POSIX shell")
+def test_the_steps_of_the_image_end_in_a_command_that_refines(checkout: Path, tmp_path: Path):
+    """A shell stands in for the builder, and this Python for the image's."""
+    base = [f"python3 -m venv {tmp_path}/base", f"export PATH={tmp_path}/base/bin:$PATH"]
+    *steps, run = steps_of_the_image(tmp_path)
+    assert any("-c" in step and "constraints.txt" in step for step in steps)
+    index = shell(checkout, *base, "pip install uv", "uv pip install --no-cache --dry-run --torch-backend cpu torch")
+    if index.returncode:  # The index of the smaller builds cannot be reached: the package index has others.
+        steps = [step.replace('--torch-backend "$TORCH"', "") for step in steps]
+    words = ["sample swatch -o .", "refine swatch.usdc -o fine.usdc --level 1 --frames 1:2"]
+    done = shell(checkout, *base, *steps, *(line for each in words for line in (f"set -- {each}", run)))
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert (tmp_path / "shots" / "fine.usdc").is_file()

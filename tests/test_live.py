@@ -18,7 +18,7 @@ from pxr import Usd
 from shots import CLOTH, cloth_shot
 
 from physgraph_usd.errors import UsageError
-from physgraph_usd.studio.live import changes_in
+from physgraph_usd.studio.live import change, parsed
 from physgraph_usd.studio.session import TuneSession
 from physgraph_usd.studio.takes import Shown
 
@@ -177,8 +177,11 @@ def test_a_signal_ends_it_while_it_waits(process: Process, number: int):
     ],
 )
 def test_what_is_refused(session: TuneSession, request_: dict[str, Any]):
+    """A request that begins with a value that can be used changes nothing either."""
+    before = session.setting, session.time
     with pytest.raises(UsageError):
-        changes_in(request_, session, save=lambda _: None)
+        change(session, parsed(json.dumps({"preset": {CLOTH: "silk"}} | request_).encode()), save=lambda _: None)
+    assert (session.setting, session.time) == before
 
 
 @pytest.mark.parametrize(("words", "code"), [(b"", 0), (b"[1, 2]\n", 2), (b"{\n", 2), (b'["no.usda"]\n', 2)])

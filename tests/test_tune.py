@@ -26,7 +26,7 @@ from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.solver.frame.refiner import Refiner
 from physgraph_usd.solver.scene import Garment, Scene
 from physgraph_usd.studio.brush import SMOOTH, Brush, Stroke, circle, hit
-from physgraph_usd.studio.loop import SolveLoop
+from physgraph_usd.studio.loop import SolveLoop, Watcher
 from physgraph_usd.studio.maps import HIGH, LOW, MEASURED, MIDDLE, stretches
 from physgraph_usd.studio.notes import Notes
 from physgraph_usd.studio.session import Shown, TuneSession
@@ -154,7 +154,7 @@ def test_what_cannot_be_used_changes_nothing(session: TuneSession, change, said:
     assert session.solve() is shown
 
 
-class Log:
+class Log(Watcher):
     """What a loop tells; the first solve waits until it is let go."""
 
     def __init__(self) -> None:
@@ -233,7 +233,7 @@ def test_a_drag_is_one_step_of_undo():
     steps = []
     while history.undone_next:
         steps.append(history.undone_next)
-        history.undo()
+        history.go(-1)
     assert steps == ["Pin", "Pin", "Density", "Density"]
 
 

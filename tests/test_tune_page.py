@@ -126,6 +126,7 @@ class Artist:
         mouse.down()
         mouse.move(track["x"] + place * track["width"], box["y"] + box["height"] / 2, steps=5)
         mouse.up()
+        self.page.evaluate(FRAMES)  # The thumb is drawn at its last place a little later.
         return float(thumb.get_attribute("aria-valuenow"))
 
 

@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.spatial import cKDTree
+from trimesh.intersections import planes_lines
+from trimesh.triangles import points_to_barycentric
 
 from ..solver.mesh.topology import PolygonMesh, adjacency
 
@@ -85,8 +87,7 @@ def mirrored(rest: np.ndarray, right: np.ndarray) -> np.ndarray:
 
 def neighbour_mean(mesh: PolygonMesh, values: np.ndarray) -> np.ndarray:
     """Mean over each vertex's neighbours, or the vertex's value without neighbours, shape (V,)."""
-    ends = np.stack([mesh.indices, mesh.indices[mesh.next_corner]], axis=1)
-    near = adjacency(ends, mesh.vertex_count)
+    near = adjacency(mesh.half_edges.edges, mesh.vertex_count)
     count = np.asarray(near.sum(axis=1)).ravel()
     return np.where(count > 0, near @ values / np.maximum(count, 1.0), values)
 
@@ -100,17 +101,13 @@ def hit(origin: np.ndarray, along: np.ndarray, points: np.ndarray, triangles: np
         points: Positions [m], shape (V, 3).
         triangles: Shape (T, 3).
     """
-    a, b, c = (points[triangles[:, corner]] for corner in range(3))
-    one, two, start = b - a, c - a, origin - a
-    across = np.cross(along, two)
-    volume = (one * across).sum(axis=1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        first = (start * across).sum(axis=1) / volume
-        turned = np.cross(start, one)
-        second = (turned @ along) / volume
-        distance = (two * turned).sum(axis=1) / volume
-    meets = (first >= 0) & (second >= 0) & (first + second <= 1) & (distance > 0)
-    return origin + distance[meets].min() * along if meets.any() else None
+    corners = points[triangles]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True).clip(1e-30)
+    rays = np.broadcast_to(origin, normals.shape), np.broadcast_to(along, normals.shape)
+    at, meets, distance = planes_lines(corners[:, 0], normals, *rays, return_distance=True)
+    inside = (points_to_barycentric(corners[meets], at) >= 0.0).all(axis=1) & (distance > 0.0)
+    return origin + distance[inside].min() * along if inside.any() else None
 
 
 def circle(points: np.ndarray, triangles: np.ndarray, at: np.ndarray, radius: float) -> np.ndarray:

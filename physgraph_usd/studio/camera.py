@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import viser
 
+from ..shot.page.drawing import framed
 from .desk import in_order
 from .picture import Picture
 
@@ -78,13 +79,9 @@ class Camera:
         back = back / np.linalg.norm(back)
         right = np.cross(self._picture.axes[1], back)
         right = right / np.linalg.norm(right)
-        seen = self._picture.framed @ np.stack([right, np.cross(back, right), back]).T
-        middle = 0.5 * (seen.min(axis=0) + seen.max(axis=0))
-        seen = seen - middle
-        room = ROOM * np.tan(0.5 * FIELD)
-        reach = np.maximum(np.abs(seen[:, 0]) / (room * aspect), np.abs(seen[:, 1]) / room) + seen[:, 2]
-        at = middle @ np.stack([right, np.cross(back, right), back])
-        return at + float(reach.max()) * back, at
+        axes = np.stack([right, np.cross(back, right), back])
+        middle, distance = framed(self._picture.framed @ axes.T, aspect, room=ROOM * np.tan(0.5 * FIELD))
+        return middle @ axes + distance * back, middle @ axes
 
     def _frame(self, client: Any, back: np.ndarray | None = None) -> None:
         """Frame the garments, seen from where the camera is, or from a direction."""

@@ -60,6 +60,10 @@ class Desk:
         button.on_click(in_order(lambda _: self.ask(change)))
         return button
 
+    def key(self, label: str, key: str, change: Change, **options: Any) -> None:
+        """Have the session changed by a key; ``options`` are those of viser's commands."""
+        self.gui.add_command(label, hotkey=key, **options).on_trigger(in_order(lambda _: self.ask(change)))
+
 
 def in_order(call: Callable[[Any], None]) -> Callable[[Any], Coroutine[Any, Any, None]]:
     """A callback that viser calls in the order of the browser's events.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
@@ -11,6 +10,8 @@ import numpy as np
 import trimesh
 import viser
 from trimesh.exchange.gltf import export_glb
+from trimesh.visual.material import PBRMaterial
+from trimesh.visual.texture import TextureVisuals
 
 from ..shot.page.drawing import BACKGROUND, KEY, Surface, encode_color, ground_below, ground_shadow, soft_light
 
@@ -19,18 +20,8 @@ SKY, KEY_LIGHT, FILL = 1.5, 2.6, 0.3
 GROUND_DROP = 0.02
 """How far the ground lies below all points, in their size: cloth does not dip into the ground."""
 
-
-@dataclass(frozen=True, eq=False)
-class Lit:
-    """Soft light on meshes and on the ground below them.
-
-    Attributes:
-        factors: For each mesh the fraction of viser's light that arrives at each vertex, each of shape (V,).
-        ground: GLB of the ground, which is seen by its shadows alone.
-    """
-
-    factors: list[np.ndarray]
-    ground: bytes
+BLACK: dict[str, Any] = {"baseColorFactor": [0, 0, 0, 255], "metallicFactor": 1.0, "alphaMode": "BLEND"}
+"""A material that reflects nothing, for the ground's shadow: the vertices' alpha."""
 
 
 def add_lights(scene: viser.SceneApi, axes: np.ndarray) -> None:
@@ -51,8 +42,11 @@ def add_lights(scene: viser.SceneApi, axes: np.ndarray) -> None:
 
 def light_on(
     columns: Sequence[Sequence[tuple[np.ndarray, np.ndarray]]], axes: np.ndarray, cancelled: Callable[[], bool]
-) -> list[Lit] | None:
+) -> list[tuple[list[np.ndarray], bytes]] | None:
     """Soft light on columns of meshes, none of which shades another column's meshes; None if ``cancelled``.
+
+    For each column the fractions of viser's light that arrive at its meshes' vertices, each of shape (V,), and the
+    GLB of the ground below them, which is seen by its shadows alone.
 
     Args:
         columns: For each column its meshes: positions [m], shape (V, 3), and triangles, shape (T, 3).
@@ -74,7 +68,7 @@ def light_on(
         factors = [_fraction(light.normals[part], light.sky[:, part], light.key[:, part]) for part in parts]
         shadow = np.zeros((len(ground.points), 4))
         shadow[:, 3] = ground_shadow(ground, light)
-        found.append(Lit(factors, as_glb(ground.points @ axes, ground.triangles, shadow, is_shadow=True)))
+        found.append((factors, as_glb(ground.points @ axes, ground.triangles, shadow, **BLACK)))
     return found
 
 
@@ -87,38 +81,23 @@ def _fraction(normals: np.ndarray, sky: np.ndarray, key: np.ndarray) -> np.ndarr
 
 
 def as_glb(
-    points: np.ndarray,
-    triangles: np.ndarray,
-    colors: np.ndarray,
-    *,
-    base: np.ndarray | None = None,
-    flat: bool = False,
-    is_shadow: bool = False,
+    points: np.ndarray, triangles: np.ndarray, colors: np.ndarray, *, flat: bool = False, **material: Any
 ) -> bytes:
     """A mesh with a colour at each vertex as GLB: matt, and seen from both sides.
 
     Args:
         points: Positions, shape (V, 3).
         triangles: Shape (T, 3).
-        colors: Linear RGBA, 0 to 1, shape (V, 4).
-        base: Linear RGB that multiplies the colours, shape (3,); white if None.
+        colors: Linear RGBA, 0 to 1, shape (V, 4); they multiply the material's ``baseColorFactor``.
         flat: Whether faces are shaded flat.
-        is_shadow: Whether the mesh is drawn without light and shows what is behind it, by the colours' alpha.
+        material: Of trimesh's `PBRMaterial`.
     """
-    color = [*(np.ones(3) if base is None else base).tolist(), 1.0]
-    matt: dict[str, Any] = {"metallicFactor": 0.0, "roughnessFactor": 0.9, "baseColorFactor": color}
-    material: dict[str, Any] = {"pbrMetallicRoughness": matt, "doubleSided": True}
-    if is_shadow:
-        material |= {"alphaMode": "BLEND", "extensions": {"KHR_materials_unlit": {}}}
-
-    def finish(tree: dict[str, Any]) -> None:
-        tree["materials"], tree["extensionsUsed"] = [material], ["KHR_materials_unlit"]
-        tree["meshes"][0]["primitives"][0]["material"] = 0
-
-    shown = np.round(255.0 * colors.clip(0.0, 1.0)).astype(np.uint8)
+    matt = {"metallicFactor": 0.0, "roughnessFactor": 0.9, "doubleSided": True}
+    visual = TextureVisuals(material=PBRMaterial(**matt | material))
+    visual.vertex_attributes["color"] = np.round(255.0 * colors.clip(0.0, 1.0)).astype(np.uint8)
     up = np.tile(np.array([0.0, 0.0, 1.0]), (len(points), 1))  # The page computes normals itself.
-    mesh = trimesh.Trimesh(points, triangles, vertex_normals=up, vertex_colors=shown, process=False, validate=False)
-    return export_glb(trimesh.Scene(mesh), include_normals=not flat, tree_postprocessor=finish)
+    mesh = trimesh.Trimesh(points, triangles, vertex_normals=up, visual=visual, process=False, validate=False)
+    return export_glb(trimesh.Scene(mesh), include_normals=not flat)
 
 
 def to_linear(color: np.ndarray | tuple[int, int, int]) -> np.ndarray:

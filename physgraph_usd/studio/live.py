@@ -19,7 +19,7 @@ They are done in this order, and then the frame is solved. Each round is answere
 
 A file of points holds float32 [m], world space, shape (V, 3), and is replaced two answers later. A file of faces holds
 `counts` and `indices` of the fine mesh, and stays. `{"error": TEXT}` is the answer to a request that cannot be used,
-which changes nothing, and to a frame that cannot be solved.
+which changes nothing (the frame is answered again), and to a frame that cannot be solved.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ import tempfile
 import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
-from operator import methodcaller
+from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -40,20 +40,21 @@ import numpy as np
 
 from ..errors import PhysGraphError, SolveError, UsageError
 from ..interrupts import leave_if_asked
-from ..solver.fabric import PRESETS
-from ..usd.lookup import check_known, parse_overrides
-from ..usd.schema import GARMENT
-from .loop import Change, SolveLoop
+from ..usd.lookup import check_known
+from .loop import Change, SolveLoop, Watcher
 from .session import TuneSession
 from .takes import Shown
-from .values import TUNABLES
 
 POLL_SECONDS = 0.1
 """Time between two questions whether a signal came [s]."""
-LEVEL = "refine:level"
+FORMS: dict[str, Any] = {
+    "authored": ["/World/Coat"], "preset": {"/World/Coat": "denim"}, "values": {"/World/Coat": {"density": 0.2}},
+    "level": {"/World/Coat": 2.0}, "time": 12.0, "contact": True, "save": True, "quit": True,
+}  # fmt: skip
+"""An example of each part of a request."""
 
 
-class Answers:
+class Answers(Watcher):
     """The writer of answers; a watcher of the loop.
 
     Attributes:
@@ -72,12 +73,6 @@ class Answers:
         line = json.dumps(answer).encode() + b"\n"
         with self._lock, suppress(BrokenPipeError):
             self.stream.write(line)
-
-    def busy(self, what: str) -> None:
-        """Work has begun, which is no answer."""
-
-    def solved(self) -> None:
-        """Ignore a solved frame of the range."""
 
     def seen(self, points: Mapping[str, np.ndarray]) -> None:
         """Answer with a round."""
@@ -139,14 +134,13 @@ def serve(session: TuneSession, stream: BinaryIO, lines: Iterator[bytes]) -> Non
         try:
             for line in lines:
                 try:
-                    request = _parsed(line)
-                    change = _in_turn(changes_in(request, session, save=answers.save))
+                    asked = partial(change, request=(request := parsed(line)), save=answers.save)
                     if loop is None:
-                        change(session)
+                        asked(session)
                         loop = SolveLoop(session, answers)
                         loop.start()
                     else:
-                        loop.ask(change)
+                        loop.ask(asked)
                 except PhysGraphError as error:
                     answers.fail(error)
                 else:
@@ -169,20 +163,64 @@ def _finish(loop: SolveLoop) -> None:
             raise SolveError("the thread that solves has ended; standard error has its last words")
 
 
-def changes_in(request: Mapping[str, Any], session: TuneSession, *, save: Change) -> list[Change]:
-    """Changes of a session, from a request.
+def change(session: TuneSession, request: Mapping[str, Any], *, save: Change) -> None:
+    """Do what a request of the form `FORMS` asks; ``save`` writes the layer.
 
     Raises:
-        UsageError: A key, a garment, a name or a value cannot be used.
+        UsageError: A garment, a name or a value cannot be used; nothing is changed then.
+        StageError, LayerError: The layer cannot be written.
     """
-    known = {
-        "authored": _of_authored, "preset": _of_presets, "values": _of_values, "level": _of_levels,
-        "time": _of_time, "contact": _of_contact, "save": lambda given, _: [save] if given else [],
-        "quit": lambda *_: [],
-    }  # fmt: skip
-    for key in request:
-        check_known("request", key, known)
-    return [change for key, read in known.items() if key in request for change in read(request[key], session)]
+    before, time = session.setting, session.time
+    wanted = session.sampled(request["time"]) if "time" in request else time
+    try:
+        for garment in request.get("authored", ()):
+            session.set_as_authored(garment)
+        for garment, preset in request.get("preset", {}).items():
+            session.set_preset(garment, preset)
+        for garment, values in request.get("values", {}).items():
+            for name, value in values.items():
+                session.set_value(garment, name, value)
+        for garment, level in request.get("level", {}).items():
+            session.set_level(garment, level)
+    except UsageError:
+        session.put(before, "refused")
+        raise
+    if wanted != time:
+        session.set_time(wanted)
+    if "contact" in request:
+        session.set_contact(request["contact"])
+    if request.get("save"):
+        save(session)
+
+
+def parsed(line: bytes) -> Mapping[str, Any]:
+    """A request from a line of JSON.
+
+    Raises:
+        UsageError: It is not of the form `FORMS`.
+    """
+    try:
+        request = json.loads(line)
+        if not isinstance(request, dict):
+            raise ValueError(f"{json.dumps(request)} is no object")
+    except ValueError as error:
+        raise UsageError(f"cannot read a request: {error}") from error
+    for key, given in request.items():
+        check_known("request", key, FORMS)
+        if not _is_like(given, FORMS[key]):
+            raise UsageError(f"{key} is {json.dumps(given)}; it must be like {json.dumps(FORMS[key])}")
+    return request
+
+
+def _is_like(given: Any, form: Any) -> bool:
+    """Whether JSON has the form of an example, whose first part stands for all parts."""
+    if isinstance(form, float):
+        is_number = isinstance(given, int | float) and not isinstance(given, bool)
+        return is_number and abs(given) <= float(np.finfo(np.float32).max)
+    if not isinstance(given, type(form)) or not isinstance(form, dict | list):
+        return isinstance(given, type(form))
+    parts, forms = (each.values() if isinstance(each, dict) else each for each in (given, form))
+    return all(_is_like(part, next(iter(forms))) for part in parts)
 
 
 @contextmanager
@@ -211,84 +249,3 @@ def lines_of(descriptor: int) -> Iterator[bytes]:
         yield from filter(bytes.strip, whole)
         if not read:
             return
-
-
-def _parsed(line: bytes) -> Mapping[str, Any]:
-    try:
-        return _table(json.loads(line), "a request")
-    except ValueError as error:
-        raise UsageError(f"cannot read a request: {error}") from error
-
-
-def _in_turn(changes: list[Change]) -> Change:
-    def change(session: TuneSession) -> None:
-        for each in changes:
-            each(session)
-
-    return change
-
-
-def _table(given: Any, what: str) -> Mapping[str, Any]:
-    if not isinstance(given, dict):
-        raise UsageError(f"{what} must be an object, not {json.dumps(given)}")
-    return given
-
-
-def _number(given: Any, what: str) -> float:
-    if isinstance(given, bool) or not isinstance(given, int | float) or not abs(given) <= sys.float_info.max:
-        raise UsageError(f"{what} must be a number, not {json.dumps(given)}")
-    return float(given)
-
-
-def _checked(garment: Any, session: TuneSession) -> str:
-    if garment not in session.garments:
-        raise UsageError(f"no garment <{garment}>; garments: {', '.join(session.garments)}")
-    return garment
-
-
-def _check_limits(garment: str, name: str, value: float) -> None:
-    """Refuse (UsageError) a value outside the schema's limits."""
-    parse_overrides([f"{garment}.{GARMENT[name].name}={value!r}"])
-
-
-def _of_authored(given: Any, session: TuneSession) -> list[Change]:
-    if not isinstance(given, list):
-        raise UsageError(f"authored must be a list of garments, not {json.dumps(given)}")
-    return [methodcaller("set_as_authored", _checked(garment, session)) for garment in given]
-
-
-def _of_presets(given: Any, session: TuneSession) -> list[Change]:
-    for preset in _table(given, "preset").values():
-        check_known("preset", preset, sorted(PRESETS))
-    return [methodcaller("set_preset", _checked(garment, session), preset) for garment, preset in given.items()]
-
-
-def _of_values(given: Any, session: TuneSession) -> list[Change]:
-    found = list[Change]()
-    for garment, values in _table(given, "values").items():
-        for name, value in _table(values, f"values of <{_checked(garment, session)}>").items():
-            check_known("value", name, TUNABLES)
-            number = _number(value, name)
-            _check_limits(garment, name, number)
-            found.append(methodcaller("set_value", garment, name, number))
-    return found
-
-
-def _of_levels(given: Any, session: TuneSession) -> list[Change]:
-    levels = {_checked(garment, session): _number(level, LEVEL) for garment, level in _table(given, "level").items()}
-    for garment, level in levels.items():
-        if level < 0:
-            raise UsageError(f"level {level:g}: give 0 or more")
-        _check_limits(garment, LEVEL, level)
-    return [methodcaller("set_level", garment, int(level)) for garment, level in levels.items()]
-
-
-def _of_time(given: Any, session: TuneSession) -> list[Change]:
-    time = session.sampled(None if given is None else _number(given, "time"))
-    return [methodcaller("set_time", time)]
-
-
-def _of_contact(given: Any, _: TuneSession) -> list[Change]:
-    if not isinstance(given, bool):
-        raise UsageError(f"contact must be true or false, not {json.dumps(given)}")
-    return [methodcaller("set_contact", given)]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 import time as clock
 from collections.abc import Callable, Mapping
-from typing import Protocol
 
 import numpy as np
 
@@ -21,28 +20,23 @@ Change = Callable[[TuneSession], None]
 """A change asked of a session."""
 
 
-class Watcher(Protocol):
-    """Receiver of results; called from the loop's thread."""
+class Watcher:
+    """Receiver of results, which does nothing with them; called from the loop's thread."""
 
     def busy(self, what: str) -> None:
         """Work has begun."""
-        ...
 
     def seen(self, points: Mapping[str, np.ndarray]) -> None:
         """Positions of some garments before they are settled [m], world space, by path."""
-        ...
 
     def show(self, shown: Shown) -> None:
         """A frame is solved, or played."""
-        ...
 
     def solved(self) -> None:
         """A frame of the range, or A, is solved."""
-        ...
 
     def fail(self, error: PhysGraphError) -> None:
         """A change cannot be made, or the frame cannot be solved."""
-        ...
 
 
 class SolveLoop:

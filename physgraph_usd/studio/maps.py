@@ -39,14 +39,17 @@ class Map:
     ends: tuple[float, float]
     middle: float
 
-    def colors(self, values: np.ndarray) -> np.ndarray:
-        """Colours of values, shape (V,): bytes, shape (V, 4)."""
-        low, high = (abs(end - self.middle) for end in self.ends)
-        away = np.nan_to_num(values) - self.middle
-        rates = [1.0 / side if side > 0 else 0.0 for side in (low, high)]
-        amount = np.clip(away * np.where(away > 0, rates[1], rates[0]), -1.0, 1.0)[:, None]
-        colors = MIDDLE + np.where(amount > 0, amount * (HIGH - MIDDLE), -amount * (LOW - MIDDLE))
-        return np.concatenate([colors, np.full_like(amount, 255.0)], axis=1).round().astype(np.uint8)
+    @property
+    def stops(self) -> list[float]:
+        """The values with a colour of their own, ascending; those between have colours between."""
+        return sorted({*self.ends, self.middle})
+
+    def colors(self, values: np.ndarray | None = None) -> np.ndarray:
+        """Colours of values, shape (V,), or of the stops: bytes, shape (V, 4)."""
+        own = [LOW if at < self.middle else HIGH if at > self.middle else MIDDLE for at in self.stops]
+        at = np.nan_to_num(self.stops if values is None else values)
+        rgb = [np.interp(at, self.stops, channel) for channel in np.transpose(own)]
+        return np.stack([*rgb, np.full(len(at), 255.0)], axis=1).round().astype(np.uint8)
 
 
 def stretches(refiner: Refiner, frame: Frame, index: int, points: np.ndarray) -> np.ndarray:
@@ -63,12 +66,10 @@ def stretches(refiner: Refiner, frame: Frame, index: int, points: np.ndarray) ->
     warp, weft, cross = gram[:, 0, 0], gram[:, 1, 1], gram[:, 0, 1]
     least = 0.5 * (warp + weft) - ((0.5 * (warp - weft)) ** 2 + cross**2).sqrt()
     strains = 100.0 * (torch.stack([warp, weft, least.clamp_min(0.0)], dim=1).sqrt() - 1.0)
-    area = level.membrane_area.cpu()
-    total, weight = torch.zeros(len(points), 3), torch.zeros(len(points), 1)
-    for corner in level.membrane.long().cpu().T:
-        total.index_add_(0, corner, (area[:, None] * strains).to(total))
-        weight.index_add_(0, corner, area[:, None].to(weight))
-    return (total / weight.clamp_min(1e-30)).numpy()
+    weighted = level.membrane_area.cpu()[:, None] * torch.cat([strains, torch.ones_like(strains[:, :1])], dim=1)
+    total = torch.zeros(len(points), 4, dtype=weighted.dtype)
+    total.index_add_(0, level.membrane.long().cpu().reshape(-1), weighted.repeat_interleave(3, dim=0))
+    return (total[:, :3] / total[:, 3:].clamp_min(1e-30)).numpy()
 
 
 def distances(refiner: Refiner, frame: Frame, index: int, points: np.ndarray) -> np.ndarray:

@@ -29,29 +29,21 @@ class Notes:
             UsageError: The file there is not a session's.
         """
         self.path = layer.with_suffix(".json")
-        self.presets: dict[str, dict[str, float]] = {}
-        self.looked: dict[str, Any] = {}
-        if self.path.exists():
-            self._read()
-
-    def _read(self) -> None:
         remedy = "move it away, or choose another layer with -o"
         try:
-            found = json.loads(self.path.read_text())
-            if not isinstance(found, dict) or found.get("kind") != KIND:
+            found: Any = json.loads(self.path.read_text()) if self.path.exists() else {"kind": KIND}
+            if found["kind"] != KIND:
                 raise UsageError(f"{self.path} holds no notes of a tuning session; {remedy}")
-            self.presets = {
-                str(name): {str(key): float(value) for key, value in values.items()}
+            self.presets: dict[str, dict[str, float]] = {
+                name: {key: float(value) for key, value in values.items()}
                 for name, values in found.get("presets", {}).items()
             }
-            self.looked = dict(found.get("looked", {}))
-        except (OSError, ValueError, AttributeError, TypeError) as error:
+            self.looked: dict[str, Any] = dict(found.get("looked", {}))
+        except (OSError, ValueError, AttributeError, TypeError, LookupError) as error:
             raise UsageError(f"{self.path} cannot be read: {error}; {remedy}") from error
 
     def save(self, looked: Mapping[str, Any]) -> None:
         """Write the presets, and how the session is looked at."""
         self.looked = dict(looked)
-        write_text(
-            self.path,
-            json.dumps({"kind": KIND, "presets": self.presets, "looked": self.looked}, indent=1) + "\n",
-        )
+        notes = {"kind": KIND, "presets": self.presets, "looked": self.looked}
+        write_text(self.path, json.dumps(notes, indent=1) + "\n")

@@ -17,7 +17,7 @@ from ..interrupts import leave_if_asked
 from .camera import Camera
 from .desk import Desk, in_order, put, small
 from .guard import guarded_server
-from .loop import SOLVING, SolveLoop
+from .loop import SOLVING, SolveLoop, Watcher
 from .notes import Notes
 from .paint_panel import PaintPanel
 from .picture import Picture
@@ -41,7 +41,7 @@ POLL_SECONDS = 0.1
 """How often the main thread asks whether a signal came."""
 
 
-class TunePage:
+class TunePage(Watcher):
     """A session in the browser, for this machine only.
 
     Attributes:
@@ -101,11 +101,13 @@ class TunePage:
         self._desk.picture.draw(shown, kept=session.kept_shown)
         self._paint.attach()
         self._lines = figures(shown, self._desk.index)
-        put(self._figures, content=_table(self._lines))
+        rows = [f"| {name} | **{text}** |" for name, text in self._lines.items()]
+        put(self._figures, content="\n".join(["| | |", "|:--|--:|", *rows]))
         self._values.update()
         self._view.update()
         self._time.update()
-        self._write_history()
+        history = session.history
+        put(self._history, options=(f"{UNDO} {history.undone_next}".strip(), f"{REDO} {history.redone_next}".strip()))
         put(self._command, content=f"<code>{small(session.command)}</code>")
         words = "playing" if self.loop.playing else "settled: as refine solves it" if shown.settled else "on its way"
         self._note_wait(0)
@@ -157,7 +159,7 @@ class TunePage:
         with tabs.add_tab("Paint"):
             self._paint = PaintPanel(desk, self._view, self._camera)
         with tabs.add_tab("Figures"):
-            self._figures = gui.add_html("")
+            self._figures = gui.add_markdown("")
             self._command = gui.add_html("")
 
     def _build_history(self) -> None:
@@ -167,19 +169,10 @@ class TunePage:
         self._saved = gui.add_html(small(f"into {self._session.out}", "saved"))
         self._history = gui.add_button_group("History", (UNDO, REDO), hint="Keys: Z, and shift with Z.")
 
-        @self._history.on_click
-        @in_order
-        def _(event: Any) -> None:
-            desk.ask(TuneSession.undo if event.target.value.startswith(UNDO) else TuneSession.redo)
-
-        gui.add_command("Undo", hotkey="Z").on_trigger(in_order(lambda _: desk.ask(TuneSession.undo)))
-        redo = gui.add_command("Redo", hotkey="Z", modifier="shift")
-        redo.on_trigger(in_order(lambda _: desk.ask(TuneSession.redo)))
-
-    def _write_history(self) -> None:
-        history = self._session.history
-        options = f"{UNDO} {history.undone_next}".strip(), f"{REDO} {history.redone_next}".strip()
-        put(self._history, options=options)
+        pick = {UNDO: TuneSession.undo, REDO: TuneSession.redo}
+        self._history.on_click(in_order(lambda event: desk.ask(pick[event.target.value.split()[0]])))
+        desk.key("Undo", "Z", TuneSession.undo)
+        desk.key("Redo", "Z", TuneSession.redo, modifier="shift")
 
     def _save(self, session: TuneSession) -> None:
         written = session.save()
@@ -229,13 +222,3 @@ def _badge(text: str, color: str) -> str:
         f"margin:0.4em 0.8em;padding:0.35em 0.7em;border-radius:0.4em;color:white;background:{color};font-size:0.85em"
     )
     return f"<div id='state' style='{style}'>{html.escape(text)}</div>"
-
-
-def _table(lines: dict[str, str]) -> str:
-    cell = "padding:0.1em 0.2em"
-    rows = (
-        f"<tr><td style='{cell}'>{html.escape(name)}</td>"
-        f"<td style='{cell};text-align:right'><b>{html.escape(value)}</b></td></tr>"
-        for name, value in lines.items()
-    )
-    return f"<table style='width:calc(100% - 1.6em);margin:0 0.8em;font-size:0.8em'>{''.join(rows)}</table>"

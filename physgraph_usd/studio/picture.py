@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import viser
 
 from ..solver.colliders.pose import Pose
-from ..solver.mesh.topology import PolygonMesh
 from ..solver.scene import Frame
 from ..usd.read.bindings import GarmentBindings
 from ..usd.read.meshes import color_of
@@ -20,7 +18,7 @@ from .maps import PLAIN, Map, find_map
 from .session import TuneSession
 from .skins import Placed, Skins
 from .takes import Shown
-from .view import CAGE, FINE, KEPT, SUBDIVISION, Labels, View
+from .view import BESIDE_A, CAGE, FINE, KEPT, SUBDIVISION, View
 
 COLORS = {CAGE: (201, 160, 110), SUBDIVISION: (168, 160, 150), KEPT: (150, 170, 140), FINE: (122, 150, 190)}
 TRIM, BODY, WIRE, RING = (176, 168, 140), (150, 150, 150), (40, 44, 52), (16, 18, 22)
@@ -34,29 +32,6 @@ LIFT = 0.004
 """How far before the cloth the brush's rings are drawn, in the garments' size."""
 FALLOFF = (1.0, 0.5)
 """Radii of the brush's rings over the brush's radius: full extent, and half strength."""
-
-
-@dataclass(frozen=True, eq=False)
-class Sheet:
-    """A mesh to be drawn.
-
-    Attributes:
-        points: Positions [m], world space, shape (V, 3).
-        triangles: Shape (T, 3).
-        edges: Edges of its faces, shape (E, 2).
-    """
-
-    points: np.ndarray
-    triangles: np.ndarray
-    edges: np.ndarray
-
-    def beside(self, line: float, right: np.ndarray, *, before: bool) -> Sheet:
-        """The faces and edges whose middle lies ``before`` or after a line [m] along a direction, shape (3,)."""
-
-        def chosen(corners: np.ndarray) -> np.ndarray:
-            return corners[((self.points @ right)[corners].mean(axis=1) < line) == before]
-
-        return replace(self, triangles=chosen(self.triangles), edges=chosen(self.edges))
 
 
 class Picture:
@@ -87,12 +62,11 @@ class Picture:
         times = session.times[:: max(1, len(session.times) // SAMPLED)]
         drawn = [_everything(session.shot.frame(time)) for time in times]
         self._across = max(np.ptp(each @ right) for each in drawn) + GAP * self.size
-        self._cloth = points
-        self._lines: dict[str, Any] = {}
+        self._cloth, self._line = points, 0.0  # Where the wipe stands to the right [m].
+        self._labels: dict[str, viser.LabelHandle] = {}
         self._bindings: dict[int, tuple[int, GarmentBindings]] = {}
         self._own = {path: color_of(session.shot.stage, path) for path in (*session.garments, *session.shot.colliders)}
         self._skins, self._columns = Skins(server, self.axes), list[list[str]]()
-        self._labels = Labels(server.scene)
         self.paintable = False
         add_lights(server.scene, self.axes)
 
@@ -114,23 +88,29 @@ class Picture:
             self.bar = None
             garments = range(len(shown.points))
             columns = self.view.columns if any(each is not None for each in shown.points) else (CAGE,)
+            self._scene.remove_by_name("wires")
             self._skins.touched = [f"{FINE}/{index}" for index in garments] if self.paintable else []
-            self._columns, lines = [], set[str]()
+            self._columns = []
+            across = _everything(shown.frame) @ self.axes[0]
+            self._line = float(across.min() + self.view.wipe * np.ptp(across))
             for place, column in enumerate(columns):
                 at = self._offset(place, len(columns))
                 named: list[str] = []
                 for index in garments:
                     named += self._draw_garment(shown, kept, index, column=column, at=at)
-                    lines |= {f"wires/{column}/{index}"} if self.view.wires else set()
                     named += self._draw_trims(shown, index, at=at) if column == FINE else []
                 if not (self.view.wiped and place):
                     named += self._draw_bodies(shown.frame, column, at=at)
                 self._columns += [named] if named else []
             self._skins.keep([name for named in self._columns for name in named])
-            for name in [each for each in self._lines if each.startswith("wires") and each not in lines]:
-                self._lines.pop(name).remove()
             self._cloth = np.concatenate([each.points for each in shown.frame.garments])
-            self._labels.draw(self._places(columns))
+            places = self._places(columns) if len(columns) > 1 else {}
+            for text in self._labels.keys() - places.keys():
+                self._labels.pop(text).remove()
+            for text in places.keys() - self._labels.keys():
+                self._labels[text] = self._scene.add_label(f"label/{text}", text, anchor="bottom-center")
+            for text, place in places.items():  # A label that is added anew is not seen for a moment.
+                self._labels[text].position = tuple(place.tolist())
 
     def shade(self, cancelled: Callable[[], bool]) -> None:
         """Draw the light and the soft shadows of what is drawn, unless ``cancelled`` meanwhile."""
@@ -170,65 +150,59 @@ class Picture:
         return np.zeros(3) if self.view.wiped else (place - 0.5 * (count - 1)) * self._across * self.axes[0]
 
     def _places(self, columns: Sequence[str]) -> dict[str, np.ndarray]:
-        """Where the label of each column stands: over the middle of its garments, or of its side of a wipe [m]."""
+        """Where the label of each column stands, by its text: over its garments, or its side of a wipe [m]."""
         top = ((self._cloth - self.centre) @ self.axes[1]).max() * self.axes[1]
         apart = (0.5 if self.view.wiped else 1.0) * self._across * self.axes[0]
-        return {column: top + (place - 0.5 * (len(columns) - 1)) * apart for place, column in enumerate(columns)}
+        texts = [BESIDE_A if name == FINE and KEPT in columns else name for name in columns]
+        return {text: top + (place - 0.5 * (len(columns) - 1)) * apart for place, text in enumerate(texts)}
 
     def _placed(self, points: np.ndarray, at: np.ndarray) -> np.ndarray:
         return (points - self.centre + at).astype(np.float32)
 
     def _draw_garment(self, shown: Shown, kept: Shown | None, index: int, *, column: str, at: np.ndarray) -> list[str]:
         """Draw a garment in a column; returns the names of what is drawn."""
-        sheet = self._sheet(shown, kept, index, column)
-        if sheet is None:
+        cage, chain = self._session.shot.scene.garments[index], self._session.refinements[index]
+        mesh = cage.mesh if column == CAGE or not chain else chain[-1].mesh
+        points = self._points(shown, kept, index, column)
+        if points is None or len(points) != mesh.vertex_count:
             return []
-        colors = None
+        look: dict[str, Any] = {"flat": column == CAGE, "color": self._color(cage.path, COLORS[column])}
         if column == FINE and (found := find_map(self._session, shown, index, self.view.map, stroke=self.stroke)):
             self.bar, values = found
-            colors = self.bar.colors(values)
-        own = self._own[self._session.garments[index]]
-        color = to_linear(COLORS[column]) if own is None else own
-        whole, sheet = sheet.triangles, self._wiped(sheet, column, _everything(shown.frame))
-        self._place(name := f"{column}/{index}", sheet, color, at=at, whole=whole, flat=column == CAGE, colors=colors)
+            look["colors"] = self.bar.colors(values)
+        triangles = mesh.triangulate(cage.rest if mesh is cage.mesh else None).triangles
+        self._place(name := f"{column}/{index}", points, triangles, at=at, column=column, **look)
         if self.view.wires:
-            self._draw_lines(f"wires/{name}", self._placed(sheet.points, at)[sheet.edges], WIRE, WIRE_PIXELS)
+            edges = self._side(points, mesh.half_edges.edges, column)
+            self._draw_lines(f"wires/{name}", self._placed(points, at)[edges], WIRE, WIRE_PIXELS)
         return [name]
 
-    def _sheet(self, shown: Shown, kept: Shown | None, index: int, column: str) -> Sheet | None:
-        """A garment's mesh in a column, or None."""
-        cage, chain = self._session.shot.scene.garments[index], self._session.refinements[index]
-        points = shown.points[index]
-        if column == CAGE or not chain:
-            found = shown.frame.garments[index].points if column == CAGE else points
-            count, split = cage.mesh.vertex_count, cage.mesh.triangulate(cage.rest).triangles
-            edges = _edges(cage.mesh)
-        else:
-            mesh = chain[-1].mesh
-            count, split, edges = mesh.vertex_count, mesh.triangulate(None).triangles, _edges(mesh)
-            if column == SUBDIVISION:
-                finest = self._session.solver.refiner.group_of((index,)).levels[-1]
-                points = finest.smooth_from_coarse @ shown.frame.garments[index].points
-            elif column == KEPT:
-                points = None if kept is None else kept.points[index]
-            found = points
-        return None if found is None or len(found) != count else Sheet(found, split, edges)
+    def _points(self, shown: Shown, kept: Shown | None, index: int, column: str) -> np.ndarray | None:
+        """A garment's positions in a column [m], shape (V, 3), or None."""
+        given = shown.frame.garments[index].points
+        if column == SUBDIVISION and self._session.refinements[index]:
+            return self._session.solver.refiner.group_of((index,)).levels[-1].smooth_from_coarse @ given
+        solved = {FINE: shown, KEPT: kept}.get(column)
+        return given if column in (CAGE, SUBDIVISION) else None if solved is None else solved.points[index]
 
-    def _wiped(self, sheet: Sheet, column: str, drawn: np.ndarray) -> Sheet:
-        """The part of a mesh on one side of the wipe; ``drawn`` [m], shape (N, 3), gives the wipe's ends."""
-        if not self.view.wiped or len(self.view.columns) < 2:
-            return sheet
-        low, high = (drawn @ self.axes[0]).min(), (drawn @ self.axes[0]).max()
-        line = low + self.view.wipe * (high - low)
-        return sheet.beside(line, self.axes[0], before=column == self.view.columns[0])
+    def _side(self, points: np.ndarray, corners: np.ndarray, column: str) -> np.ndarray:
+        """The faces or edges, shape (N, k), whose middle is on a column's side of the wipe, if there is one."""
+        if not column or not self.view.wiped or len(self.view.columns) < 2:
+            return corners
+        is_left = (points @ self.axes[0])[corners].mean(axis=1) < self._line
+        return corners[is_left == (column == self.view.columns[0])]
+
+    def _color(self, path: str, usual: tuple[int, int, int]) -> np.ndarray:
+        """A prim's own colour, or the usual one, sRGB: linear RGB, shape (3,)."""
+        own = self._own.get(path)
+        return to_linear(usual) if own is None else own
 
     def _draw_lines(self, name: str, segments: np.ndarray, color: tuple[int, int, int], pixels: float) -> None:
-        """Draw line segments in the scene [m], shape (S, 2, 3), under a name; none removes them."""
-        if (handle := self._lines.pop(name, None)) is not None:
-            handle.remove()
+        """Draw line segments in the scene [m], shape (S, 2, 3), under a name, in place of those before."""
+        look: dict[str, Any] = {"thickness": pixels, "thickness_units": "screen"}
+        self._scene.remove_by_name(name)
         if len(segments):
-            look: dict[str, Any] = {"thickness": pixels, "thickness_units": "screen"}
-            self._lines[name] = self._scene.add_line_segments(name, segments, color, **look)
+            self._scene.add_line_segments(name, segments, color, **look)
 
     def _draw_trims(self, shown: Shown, index: int, *, at: np.ndarray) -> list[str]:
         """Draw the meshes that hang on a refined garment; returns the names of what is drawn."""
@@ -239,24 +213,24 @@ class Picture:
             self._bindings[index] = len(steps), GarmentBindings(self._session.shot, index, steps)
         for placed in self._bindings[index][1].at(shown.frame.time, points):
             if placed.target.mesh is not None:
-                name, mesh = f"trim/{index}/{placed.target.path}", placed.target.mesh
-                sheet = Sheet(placed.points, mesh.triangulate(placed.target.points).triangles, np.empty((0, 2), int))
-                whole, sheet = sheet.triangles, self._wiped(sheet, FINE, _everything(shown.frame))
-                self._place(name, sheet, to_linear(TRIM), at=at, whole=whole)
-                named.append(name)
+                triangles = placed.target.mesh.triangulate(placed.target.points).triangles
+                named.append(name := f"trim/{index}/{placed.target.path}")
+                self._place(name, placed.points, triangles, at=at, column=FINE, color=to_linear(TRIM))
         return named
 
     def _draw_bodies(self, frame: Frame, column: str, *, at: np.ndarray) -> list[str]:
         drawn = {f"body/{column}/{index}": (index, pose) for index, pose in _drawn(frame).items()}
         for name, (index, pose) in drawn.items():
-            own = self._own.get(self._session.shot.scene.colliders[index].path)
-            color = to_linear(BODY) if own is None else own
-            sheet = Sheet(pose.points, pose.triangles, np.empty((0, 2), int))
-            self._place(name, sheet, color, at=at, whole=pose.triangles)
+            color = self._color(self._session.shot.scene.colliders[index].path, BODY)
+            self._place(name, pose.points, pose.triangles, at=at, color=color)
         return [*drawn]
 
-    def _place(self, name: str, sheet: Sheet, color: np.ndarray, *, at: np.ndarray, **look: Any) -> None:
-        self._skins.place(name, Placed(self._placed(sheet.points, at), sheet.triangles, color=color, **look))
+    def _place(
+        self, name: str, points: np.ndarray, whole: np.ndarray, *, at: np.ndarray, column: str = "", **look: Any
+    ) -> None:
+        """Draw a mesh, or its column's side of the wipe."""
+        triangles = self._side(points, whole, column)
+        self._skins.place(name, Placed(self._placed(points, at), triangles, whole=whole, **look))
 
 
 def _everything(frame: Frame) -> np.ndarray:
@@ -267,9 +241,3 @@ def _everything(frame: Frame) -> np.ndarray:
 def _drawn(frame: Frame) -> dict[int, Pose]:
     """Poses of the bodies by number, without planes, which have no end."""
     return {index: pose for index, pose in enumerate(frame.colliders) if pose and not pose.endless}
-
-
-def _edges(mesh: PolygonMesh) -> np.ndarray:
-    """Each edge of a mesh's faces once, shape (E, 2)."""
-    ends = np.sort(np.stack([mesh.indices, mesh.indices[mesh.next_corner]], axis=1), axis=1)
-    return np.unique(ends, axis=0)

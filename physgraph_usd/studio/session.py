@@ -23,6 +23,7 @@ from ..solver.mesh.subdivide import Refinement
 from .setting import Setting
 from .solver import FrameSolver, Seen
 from .takes import Shown, Start, Take, Takes
+from .tried import TriedShot
 from .tuning import Tuning
 
 
@@ -67,7 +68,7 @@ class TuneSession(Tuning):
         self.out = Path(out) if out is not None else Path(shot).with_suffix(".tuned.usda")
         if self.out.exists() and not overwrite:
             raise UsageError(f"{self.out} exists; choose another name with -o, or replace it by --overwrite")
-        super().__init__(shot, garments=garments, colliders=colliders, bind=bind)
+        super().__init__(TriedShot(shot, garments=garments, colliders=colliders, bind=bind))
         self.warning = "".join(of_unfelt([each for each in find_candidates(self.shot) if each.is_taken]))
         self.solver = FrameSolver(self.shot, self.setting.levels, contact=True, device=self._device)
         self._solves = self.setting  # What the solver was made for, or solved last.
@@ -106,7 +107,7 @@ class TuneSession(Tuning):
         """Go to A's setting, from A's cloth, and keep the present one as A; does nothing without A."""
         if (kept := self.kept) is not None:
             self.keep()
-            self._put(kept.setting, "A and B exchanged")
+            self.put(kept.setting, "A and B exchanged")
             self.solver, self._solves = copy(kept.start.solver), kept.setting
 
     def solve(self, seen: Seen = lambda _: None, cancelled: Callable[[], bool] = lambda: False) -> Shown:
@@ -185,7 +186,7 @@ class TuneSession(Tuning):
         """The command that refines the whole shot with the saved layer."""
         words = ["physgraph-usd", "refine", str(self.out), "-o", str(self.out.with_suffix(".refined.usdc"))]
         words += [] if self._device == "cpu" else ["--device", self._device]
-        for option, paths in zip(("--garment", "--collider", "--bind"), self._tried.named, strict=True):
+        for option, paths in zip(("--garment", "--collider", "--bind"), self._tried.named.values(), strict=True):
             words += [word for path in paths for word in (option, path)]
         return join(words + ([] if self.setting.contact else ["--contact", "off", "--self-contact", "off"]))
 

@@ -42,19 +42,18 @@ class History:
         self._steps = [(first, "")]  # Each setting with the change that led to it.
         self._at, self._seconds, self._last = 0, seconds, -np.inf
 
-    @property
-    def now(self) -> Setting:
-        """The present setting."""
-        return self._steps[self._at][0]
+    def at(self, way: int = 0) -> Setting:
+        """The present setting, or the one as many steps forward as there are; backward if negative."""
+        return self._steps[self._place(way)][0]
 
     @property
     def undone_next(self) -> str:
-        """The change that `undo` takes back, or ""."""
+        """The change that led to the present setting, or ""."""
         return self._steps[self._at][1]
 
     @property
     def redone_next(self) -> str:
-        """The change that `redo` makes again, or ""."""
+        """The change that leads to the next setting, or ""."""
         return self._steps[self._at + 1][1] if self._at + 1 < len(self._steps) else ""
 
     def put(self, setting: Setting, change: str, *, joins: bool = False) -> None:
@@ -65,18 +64,9 @@ class History:
         self._steps[self._at :] = [(setting, change)]
         self._last = now
 
-    def after_undo(self) -> Setting:
-        """The setting after `undo`; the present one without an earlier step."""
-        return self._steps[max(self._at - 1, 0)][0]
+    def go(self, way: int) -> None:
+        """Go to the setting of `at`."""
+        self._at, self._last = self._place(way), -np.inf
 
-    def after_redo(self) -> Setting:
-        """The setting after `redo`; the present one without a next step."""
-        return self._steps[min(self._at + 1, len(self._steps) - 1)][0]
-
-    def undo(self) -> None:
-        """Go back by a step."""
-        self._at, self._last = max(self._at - 1, 0), -np.inf
-
-    def redo(self) -> None:
-        """Go forward by a step."""
-        self._at, self._last = min(self._at + 1, len(self._steps) - 1), -np.inf
+    def _place(self, way: int) -> int:
+        return min(max(self._at + way, 0), len(self._steps) - 1)

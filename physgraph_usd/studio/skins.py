@@ -44,18 +44,9 @@ class Placed:
     colors: np.ndarray | None = None
     flat: bool = False
 
-    def has_shape_of(self, other: Placed) -> bool:
-        """Whether another mesh has the same positions and triangles."""
-        return np.array_equal(self.points, other.points) and np.array_equal(self.triangles, other.triangles)
 
-
-@dataclass(frozen=True, eq=False)
-class Skin:
-    """A coloured mesh over a plain one: the mesh, linear colours at its vertices, shape (V, 4), and viser's handle."""
-
-    mesh: Placed
-    colors: np.ndarray
-    handle: viser.GlbHandle
+Skin = tuple[viser.GlbHandle, tuple[np.ndarray, ...]]
+"""viser's handle of a coloured mesh over a plain one, and its positions, triangles and linear colours, shape (V, 4)."""
 
 
 class Skins:
@@ -115,14 +106,14 @@ class Skins:
         if found is None:
             return
         with self._server.atomic():
-            for column, lit in zip(columns, found, strict=True):
-                for name, factor in zip(column, lit.factors, strict=True):
+            for column, (factors, _) in zip(columns, found, strict=True):
+                for name, factor in zip(column, factors, strict=True):
                     self._light[name] = self._placed[name].points, factor
                     self._dress(name)
                     self.meshes[name].color = encode_color(tuple(self._placed[name].color * factor.mean()))
             for ground in self._grounds:
                 self._later(ground.remove, LOADED_SECONDS)
-            self._grounds = [self._scene.add_glb(f"ground-{next(self._serial)}", each.ground) for each in found]
+            self._grounds = [self._scene.add_glb(f"ground-{next(self._serial)}", ground) for _, ground in found]
 
     def _is_lit(self, name: str) -> bool:
         lit = self._light.get(name)
@@ -136,24 +127,24 @@ class Skins:
         colors = np.ones((len(mesh.points), 4))
         colors[:, :3] *= factor[:, None] if len(factor) == len(mesh.points) else 1.0
         colors[:, :3] *= 1.0 if mesh.colors is None else to_linear(mesh.colors[:, :3])
-        before = self._skins.get(name)
-        if before is not None and before.mesh.has_shape_of(mesh) and np.array_equal(before.colors, colors):
+        before, drawn = self._skins.get(name), (mesh.points, mesh.triangles, colors)
+        if before is not None and all(map(np.array_equal, before[1], drawn)):
             return self._later(lambda: self._conceal(name, before), SURE_SECONDS)
-        base = mesh.color if mesh.colors is None else np.ones(3)
-        data = as_glb(mesh.points, mesh.triangles, colors, base=base, flat=mesh.flat)
-        skin = Skin(mesh, colors, self._scene.add_glb(f"skin-{next(self._serial)}", data))
+        base = [*(mesh.color if mesh.colors is None else np.ones(3)), 1.0]
+        data = as_glb(mesh.points, mesh.triangles, colors, flat=mesh.flat, baseColorFactor=base)
+        skin = self._scene.add_glb(f"skin-{next(self._serial)}", data), drawn
         with self._lock:
             self._skins[name] = skin
             self._show(name, opacity=None, visible=True)
         if before is not None:
-            self._later(before.handle.remove, LOADED_SECONDS)
+            self._later(before[0].remove, LOADED_SECONDS)
         self._later(lambda: self._conceal(name, skin), SURE_SECONDS)
 
     def _undress(self, name: str) -> None:
         """Draw a mesh plain."""
         with self._lock:
             if (skin := self._skins.pop(name, None)) is not None:
-                skin.handle.remove()
+                skin[0].remove()
             if name in self.meshes:
                 self._show(name, opacity=None, visible=True)
 

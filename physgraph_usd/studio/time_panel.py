@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from itertools import pairwise
 
-from .desk import Desk, in_order, put
+from ..usd.times import snap
+from .desk import Desk, put
 from .session import TuneSession
 from .takes import FRESH, MISSING, STALE
 
@@ -27,7 +28,7 @@ class TimePanel:
         self._frame = gui.add_slider(
             "Frame", first, last, step, desk.session.time or first, hint="A sample's time code."
         )
-        desk.on(self._frame, lambda session, value: session.set_time(nearest(self._times, value)))
+        desk.on(self._frame, lambda session, value: session.set_time(*snap([value], self._times)))
         self._bar = gui.add_html("")
         self._range = gui.add_multi_slider("Range", first, last, step, (first, last), hint="What is solved and played.")
         desk.on(self._range, lambda session, value: self._set_span())
@@ -37,10 +38,9 @@ class TimePanel:
         )
         self._play = gui.add_button(PLAY, hint="Each frame of the range once it is solved. Key: space.")
         desk.press(self._play, self.play)
-        for label, key, way in (("Frame before", "J", -1), ("Next frame", "L", 1)):
-            command = gui.add_command(label, hotkey=key)
-            command.on_trigger(in_order(lambda _, way=way: desk.ask(lambda session: self._step(session, way))))
-        gui.add_command("Play or pause", hotkey="space").on_trigger(in_order(lambda _: desk.ask(self.play)))
+        desk.key("Frame before", "J", lambda session: self._step(session, -1))
+        desk.key("Next frame", "L", lambda session: self._step(session, 1))
+        desk.key("Play or pause", "space", self.play)
         self.update()
 
     def update(self) -> None:
@@ -60,17 +60,12 @@ class TimePanel:
 
     def _step(self, session: TuneSession, way: int) -> None:
         self._desk.loop.playing = False
-        at = self._times.index(nearest(self._times, session.time or self._times[0])) + way
+        at = self._times.index(self._times[0] if session.time is None else session.time) + way
         session.set_time(self._times[at % len(self._times)])
 
     def _set_span(self) -> None:
         loop, (first, last) = self._desk.loop, self._range.value
         loop.span = (first, last) if self._solving.value or loop.playing else None
-
-
-def nearest(times: Sequence[float], time: float) -> float:
-    """The sample nearest to a time code."""
-    return min(times, key=lambda each: abs(each - time))
 
 
 def bar_of(times: Sequence[float], states: Sequence[str], *, at: float | None) -> str:

@@ -23,7 +23,7 @@ class TriedShot:
 
     Attributes:
         opened: The shot as authored.
-        named: Garments, colliders and targets as commands take them.
+        named: Garments, colliders and targets as commands take them, by the names of `open_shot`'s options.
     """
 
     def __init__(
@@ -37,7 +37,7 @@ class TriedShot:
         self.opened = open_with_colliders(shot, garments=garments, colliders=colliders, bind=bind)
         _ = self.opened.targets  # Refused here, not while a picture is drawn.
         named = self.opened.colliders if AUTO in colliders else tuple(colliders)
-        self.named = tuple(garments), tuple(named), tuple(bind)
+        self.named: dict[str, Any] = {"garments": tuple(garments), "colliders": named, "bind": tuple(bind)}
         # Maps, the shot read with them, and their layer, which the stage does not keep.
         self._painted: tuple[object, Shot, object] = ({}, self.opened, None)
 
@@ -79,13 +79,12 @@ class TriedShot:
         """
         values = {**setting.values, **self._of_subsets(setting.values)}
         given = {"values": values, "painted": self._authored(setting.painted), "overwrite": overwrite}
-        return tag(self.opened.path, out, **self._named, **given)
+        return tag(self.opened.path, out, **self._found, **given)
 
     @property
-    def _named(self) -> dict[str, Any]:
-        """The garments that were found, the colliders and the targets, as options of `open_shot`."""
-        _, colliders, bind = self.named
-        return {"garments": [str(source.path) for source in self.opened.sources], "colliders": colliders, "bind": bind}
+    def _found(self) -> dict[str, Any]:
+        """`named` with the garments that were found."""
+        return self.named | {"garments": [str(source.path) for source in self.opened.sources]}
 
     def _of_subsets(self, values: Mapping[str, Mapping[str, float]]) -> dict[str, dict[str, float]]:
         """The values of subsets of other fabrics, in proportion to their garments', by prim path."""
@@ -111,6 +110,6 @@ class TriedShot:
             return self.opened
         if self._painted[0] is not painted:
             layer = painted_layer(self.opened.stage, self._authored(painted))
-            shot = open_shot(self.opened.view.open(over=[layer]), **self._named)
+            shot = open_shot(self.opened.view.open(over=[layer]), **self._found)
             self._painted = painted, shot, layer
         return self._painted[1]

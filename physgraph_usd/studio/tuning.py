@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
@@ -12,7 +11,6 @@ from ..errors import UsageError, named_time
 from ..solver.fabric import PRESETS
 from ..solver.resolution import choose_levels, sample_frames
 from ..usd.lookup import check_known
-from ..usd.read.reader import Shot
 from ..usd.schema import AUTO_LEVEL, FABRIC, GARMENT, fabric_values
 from ..usd.times import found_among, within
 from .setting import History, Setting
@@ -31,16 +29,9 @@ class Tuning:
         history: The settings so far.
     """
 
-    def __init__(
-        self, shot: str | Path, *, garments: Sequence[str], colliders: Sequence[str], bind: Sequence[str]
-    ) -> None:
-        """Open a shot at its first frame; arguments are those of `TuneSession`.
-
-        Raises:
-            StageError: The shot cannot be read.
-        """
-        self._tried = TriedShot(shot, garments=garments, colliders=colliders, bind=bind)
-        self.shot: Shot = self._tried.opened
+    def __init__(self, tried: TriedShot) -> None:
+        """Begin at a shot's first frame."""
+        self._tried, self.shot = tried, tried.opened
         scene = self.shot.scene
         self.garments = tuple(garment.path for garment in scene.garments)
         self.times: tuple[float | None, ...] = scene.times or (None,)
@@ -55,7 +46,7 @@ class Tuning:
     @property
     def setting(self) -> Setting:
         """The present setting."""
-        return self.history.now
+        return self.history.at()
 
     @property
     def codes(self) -> tuple[float, ...]:
@@ -151,7 +142,7 @@ class Tuning:
         painted = {**self.setting.painted, garment: maps}
         self._try(garment, self._values(garment), GARMENT[name].label, painted=painted)
 
-    def set_level(self, garment: str, level: int) -> None:
+    def set_level(self, garment: str, level: float) -> None:
         """Set the number of subdivisions.
 
         Raises:
@@ -159,24 +150,31 @@ class Tuning:
         """
         index = self._index(garment)
         if level < 0:
-            raise UsageError(f"level {level}: give 0 or more")
-        levels = tuple(level if k == index else each for k, each in enumerate(self.setting.levels))
+            raise UsageError(f"level {level:g}: give 0 or more")
+        levels = tuple(int(level) if k == index else each for k, each in enumerate(self.setting.levels))
         values = {**self._values(garment), "refine:level": float(level)}
         self._try(garment, values, GARMENT["refine:level"].label, levels=levels)
 
     def set_contact(self, on: bool) -> None:
         """Let cloth feel bodies and cloth, or nothing."""
-        self._put(replace(self.setting, contact=on), "contact on" if on else "contact off")
+        self.put(replace(self.setting, contact=on), "contact on" if on else "contact off")
+
+    def put(self, setting: Setting, change: str, *, joins: bool = False) -> None:
+        """Make a setting the present one by a change, in words; an invalid setting changes nothing."""
+        self.shot = self._tried.read(setting)
+        self.history.put(setting, change, joins=joins)
 
     def undo(self) -> None:
         """Undo the last change."""
-        self.shot = self._tried.read(self.history.after_undo())
-        self.history.undo()
+        self._go(-1)
 
     def redo(self) -> None:
         """Redo the last undone change."""
-        self.shot = self._tried.read(self.history.after_redo())
-        self.history.redo()
+        self._go(1)
+
+    def _go(self, way: int) -> None:
+        self.shot = self._tried.read(self.history.at(way))
+        self.history.go(way)
 
     def _index(self, garment: str) -> int:
         if garment not in self.garments:
@@ -192,12 +190,7 @@ class Tuning:
     ) -> None:
         """Go on to a garment's values, and ``others`` of the setting."""
         setting = replace(self.setting, values={**self.setting.values, garment: values}, **others)
-        self._put(setting, change, joins=joins)
-
-    def _put(self, setting: Setting, change: str, *, joins: bool = False) -> None:
-        """Make a setting the present one; an invalid setting changes nothing."""
-        self.shot = self._tried.read(setting)
-        self.history.put(setting, change, joins=joins)
+        self.put(setting, change, joins=joins)
 
 
 def _rounded(values: Mapping[str, float]) -> dict[str, float]:

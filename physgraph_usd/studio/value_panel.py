@@ -98,24 +98,17 @@ class ValuePanel:
             gui.add_html("<div class='value'></div>")
             slider = gui.add_slider(" ", 0.0, 1.0, FINEST, 0.5, hint=tunable.hint)
             self._rows[tunable.name] = number, slider
-            desk.on(number, lambda session, value, of=tunable: self._typed(session, of, value))
-            desk.on(slider, lambda session, place, of=tunable: self._slid(session, of, place))
+            desk.on(number, lambda session, value, of=tunable: self._try(session, of, value / of.factor))
+            desk.on(slider, lambda session, place, of=tunable: self._try(session, of, of.at(place), is_slid=True))
             self._write(tunable, number, slider)
 
-    def _slid(self, session: TuneSession, tunable: Tunable, place: float) -> None:
-        self._try(session, tunable, tunable.at(place))
-        self._moved = tunable.name
-        self._write(tunable, self._rows[tunable.name][0], None)
-
-    def _typed(self, session: TuneSession, tunable: Tunable, number: float) -> None:
-        self._try(session, tunable, number / tunable.factor)
-        self._moved = tunable.name
-        self._write(tunable, None, self._rows[tunable.name][1])
-
-    def _try(self, session: TuneSession, tunable: Tunable, value: float) -> None:
+    def _try(self, session: TuneSession, tunable: Tunable, value: float, *, is_slid: bool = False) -> None:
+        """Try a value [SI], and write it into the control that was not moved."""
         session.set_value(self._desk.garment, tunable.name, value)
-        if GARMENT[tunable.name].group == FABRIC:
+        if tunable.group == FABRIC:
             put(self._preset, value=OWN_VALUES)
+        self._moved, (number, slider) = tunable.name, self._rows[tunable.name]
+        self._write(tunable, number if is_slid else None, None if is_slid else slider)
 
     def _write(self, tunable: Tunable, number: Any | None, slider: Any | None) -> None:
         """Write a value into a number box and a slider, unless None; marked if it is tried."""
@@ -172,9 +165,8 @@ class ValuePanel:
         if label == EVERYTHING:
             session.set_as_authored(garment)
             self._preset.value = AS_AUTHORED
-        for tunable in TUNABLES.values():
-            if tunable.label == label:
-                session.reset(garment, tunable.name)
+        for tunable in (each for each in TUNABLES.values() if each.label == label):
+            session.reset(garment, tunable.name)
 
 
 def pictures(presets: Sequence[str]) -> str:

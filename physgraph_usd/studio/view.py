@@ -2,12 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
-
-import numpy as np
-import viser
 
 from .maps import PLAIN
 
@@ -47,29 +42,3 @@ class View:
         """The columns, from left to right."""
         found = SHOWS[self.show]
         return (found[0], found[-1]) if self.wiped and len(found) > 1 else found
-
-
-class Labels:
-    """Names over the columns of a scene."""
-
-    def __init__(self, scene: viser.SceneApi) -> None:
-        """Draw no label."""
-        self._scene = scene
-        self._drawn: dict[str, viser.LabelHandle] = {}
-
-    def draw(self, places: Mapping[str, np.ndarray]) -> None:
-        """Label columns, unless there is only one; the present refined cloth beside A is `BESIDE_A`.
-
-        Args:
-            places: Middle of the lower edge of each column's label in the scene [m], shape (3,).
-        """
-        texts = {name: BESIDE_A if name == FINE and KEPT in places else name for name in places if len(places) > 1}
-        wanted = {text: tuple(places[name].tolist()) for name, text in texts.items()}
-        for text in self._drawn.keys() - wanted.keys():
-            self._drawn.pop(text).remove()
-        for text, place in wanted.items():
-            if text not in self._drawn:
-                look: dict[str, Any] = {"position": place, "anchor": "bottom-center"}
-                self._drawn[text] = self._scene.add_label(f"label/{text}", text, **look)
-            elif tuple(self._drawn[text].position) != place:
-                self._drawn[text].position = place

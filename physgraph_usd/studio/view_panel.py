@@ -6,8 +6,8 @@ from dataclasses import asdict, fields, replace
 from typing import Any
 
 from .camera import Camera
-from .desk import Desk, in_order, put
-from .maps import HIGH, LOW, MIDDLE, NAMES, Map
+from .desk import Desk, put
+from .maps import NAMES, Map
 from .session import TuneSession
 from .view import KEPT, SHOWS, View
 
@@ -38,13 +38,9 @@ class ViewPanel:
         self._bar = gui.add_html("")
         desk.press(gui.add_button("Keep as A", hint="Keeps values and cloth to compare with. Key: K."), self._keep)
         desk.press(gui.add_button("Exchange A and B", hint="B is what is tuned. Key: X."), TuneSession.swap)
-        keys = {
-            "Wireframe": ("G", lambda session: self.set(wires=not desk.picture.view.wires)),
-            "Keep as A": ("K", self._keep),
-            "Exchange A and B": ("X", TuneSession.swap),
-        }
-        for label, (key, change) in keys.items():
-            gui.add_command(label, hotkey=key).on_trigger(in_order(lambda _, change=change: desk.ask(change)))
+        desk.key("Wireframe", "G", lambda session: self.set(wires=not desk.picture.view.wires))
+        desk.key("Keep as A", "K", self._keep)
+        desk.key("Exchange A and B", "X", TuneSession.swap)
 
     def set(self, **changes: Any) -> None:
         """Change how cloth is looked at, by the names of `View`; other columns are framed."""
@@ -78,15 +74,10 @@ class ViewPanel:
 
 def bar_of(drawn: Map) -> str:
     """The colours of a map with the values at their ends, as HTML."""
-    (low, high), middle = drawn.ends, drawn.middle
-    stops = [(low, LOW)] if low < middle else []
-    stops += [(middle, MIDDLE)] + ([(high, HIGH)] if high > middle else [])
-    span = max(high - low, 1e-12)
-    colors = ",".join(
-        f"rgb({','.join(f'{c:.0f}' for c in color)}) {100 * (at - low) / span:.0f}%" for at, color in stops
-    )
+    span = [100.0 * (at - drawn.ends[0]) / (drawn.ends[1] - drawn.ends[0]) for at in drawn.stops]
+    colors = ",".join(f"rgb({r}, {g}, {b}) {at:.0f}%" for (r, g, b, _), at in zip(drawn.colors(), span, strict=True))
     strip = f"<div id='bar' style='height:9px;margin:0 1em;background:linear-gradient(to right,{colors})'></div>"
-    ends = "".join(f"<span>{at:g} {drawn.unit}</span>" for at, _ in stops)
+    ends = "".join(f"<span>{at:g} {drawn.unit}</span>" for at in drawn.stops)
     return (
         strip + f"<div style='display:flex;justify-content:space-between;margin:0 1.4em;font-size:0.75em'>{ends}</div>"
     )

@@ -109,13 +109,22 @@ def fit_view(points: np.ndarray, aspect: float, *, azimuth: float = 25.0, elevat
     right = np.array([np.cos(a), 0.0, -np.sin(a)])
     axes = np.stack([right, np.cross(back, right), back])
     tangent = np.tan(np.radians(11.0))
-    room = 0.86 * tangent
-    seen = points @ axes.T
+    middle, distance = framed(points @ axes.T, aspect, room=0.86 * tangent)
+    return View(middle @ axes + distance * back, axes, float(tangent))
+
+
+def framed(seen: np.ndarray, aspect: float, *, room: float) -> tuple[np.ndarray, float]:
+    """The middle of points, shape (3,), and the distance from there at which a camera sees them all.
+
+    Args:
+        seen: Points along the picture's right and up and towards the camera, shape (N, 3).
+        aspect: Width over height of the picture.
+        room: Half height of the points' part of the picture at distance 1.
+    """
     middle = 0.5 * (seen.min(axis=0) + seen.max(axis=0))
     seen = seen - middle
     reach = np.maximum(np.abs(seen[:, 0]) / (room * aspect), np.abs(seen[:, 1]) / room) + seen[:, 2]
-    distance = max(float(reach.max()), 1e-6)
-    return View(middle @ axes + distance * back, axes, float(tangent))
+    return middle, max(float(reach.max()), 1e-6)
 
 
 def draw(surfaces: Sequence[Surface | DrawnMesh], view: View, *, size: tuple[int, int], floor: float) -> np.ndarray:
