@@ -256,7 +256,7 @@ class Judge:
         return float(0.5 * (np.abs(angle) * length).sum())
 
     def amplitudes(self, x: np.ndarray) -> np.ndarray:
-        """RMS of each band of wavelengths of positions or another field, shape (V, C); the last has all that is less."""
+        """RMS of each band of wavelengths of a field, shape (V, C), such as positions; the last has all the rest."""
         area = vertex_area(self.level)
         smooth = [each(x) for each in self.smooth] + [x]
         parts = [short - long for long, short in pairwise(smooth)]
