@@ -18,7 +18,7 @@ import os
 import time as clock
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed, wait
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
 from multiprocessing import get_context
@@ -226,10 +226,7 @@ def inside(stage: Stage, x: np.ndarray, time: float) -> int:
             along = local[:, 2] - np.clip(local[:, 2], -body.half, body.half)
             deep |= np.linalg.norm(np.column_stack([local[:, :2], along]), axis=1) < body.radius
         else:
-            points, corners = (
-                wp.array(body.points(time), dtype=wp.vec3),
-                wp.array(body.triangles.ravel(), dtype=wp.int32),
-            )
+            points, corners = wp.array(body.points(time), dtype=wp.vec3), wp.array(body.triangles.ravel(), dtype=int)
             mesh, found = wp.Mesh(points, corners, support_winding_number=True), wp.zeros(len(x), dtype=wp.bool)
             wp.launch(inward, len(x), inputs=[mesh.id, wp.array(x, dtype=wp.vec3), found])
             deep |= found.numpy()
@@ -242,24 +239,24 @@ Row = dict[str, Any]
 
 def made(task: Task) -> Row:
     """Measure and judge."""
-    device = prepare_device(task.device)
+    task = replace(task, device=prepare_device(task.device))
     x, spent, version = task.measured()
     level, late = task.level(task.subdivisions), task.frames // 2
     edges, triangles = level.springs.numpy(), level.triangles.numpy()
     row = {
         "scene": task.scene,
         "vertices": level.vertex_count,
-        "on": "one core" if device == "cpu" else wp.get_device(device).name,
+        "on": "one core" if task.device == "cpu" else wp.get_device(task.device).name,
         "method": task.method.name,
         "settings": task.method.settings,
         "frames": task.frames,
         "newton": version,
         "ms": float(np.median(spent[WARM:])),
         "cage ms": float(np.median(task.cage()["milliseconds"][WARM:])),
-        "stretch": max(stretch(level, each) for each in x),
+        "stretch": float(np.max([stretch(level, each) for each in x])),
     }
     if not row["stretch"] < FLOWN:
-        return row | {"bands": None, "curvature": None, "crossings": None, "inside": None}
+        return row | {"stretch": None, "bands": None, "curvature": None, "crossings": None, "inside": None}
     judge = Judge(level, level.from_coarse @ task.stage.flat)
     with wp.ScopedDevice("cpu"):
         deep = sum(inside(task.stage, each, (n + 1) / RATE) for n, each in enumerate(x))
