@@ -1,116 +1,212 @@
-"""Cost of refined cloth beside Newton's VBD and Style3D, which simulate it on the same mesh and card.
+"""Speed against accuracy with bodies: refined cloth beside subdivision and Newton's Style3D, VBD and XPBD.
 
-    python -m benchmarks.beside_newton --newton PYTHON [--device cuda] [--level 2]... [--frames 24]
-        [-o benchmarks/results/newton.md]
+    python -m benchmarks.beside_newton --newton PYTHON [--shot FILE GARMENT BODY] [--scene NAME]... [--method NAME]...
+    python -m benchmarks.beside_newton [--rows FILE]...
 
-Scenes and fabrics are those of `benchmarks.fidelity` that touch bodies or fold over themselves. The cage that is
-refined is simulated by Style3D, at the cage's resolution, as it is there.
+The first measures, on the card and on a core, adds rows to ``--rows`` and writes page and picture; the second writes
+them anew from rows that are there. Scenes and fabric are those of `benchmarks.fidelity` that touch bodies or fold over
+themselves, and a shot's garment, whose highest border is held, on its body. The cage that is refined is simulated by
+Style3D, at the cage's resolution, as it is there.
 """
 
 from __future__ import annotations
 
 import argparse
-import subprocess
-import tempfile
+import fcntl
+import json
+import os
+import time as clock
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, field
-from functools import partial
+from concurrent.futures import ProcessPoolExecutor, as_completed, wait
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import product
 from multiprocessing import get_context
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+import torch
 import warp as wp
 
 from benchmarks.crossing_count import crossing_count
-from benchmarks.fidelity import RATE, garment_of, level_at, problem_of, timed
-from benchmarks.fidelity_stages import SCENES, Stage
+from benchmarks.fidelity import RATE, Judge, garment_of, level_at, newton_result, problem_of, timed
+from benchmarks.fidelity_stages import SCENES, Body, Stage, dressed
 from benchmarks.rows import say, table
 from physgraph_usd.shot.solve import prepare_device
 from physgraph_usd.solver.fabric import PRESETS
-from physgraph_usd.solver.level import Level
+from physgraph_usd.solver.frame.settings import SolveSettings
+from physgraph_usd.solver.level import Level, build_levels, refine_garments
 
 CHOSEN = ("curtain", "ball", "elbow")
 """Scenes: gathered cloth without a body, cloth over a ball, a sleeve on an arm that bends."""
 FABRIC = "jersey"
-SIMULATED: dict[str, dict[str, Any]] = {
-    "vbd": {"substeps": 10, "iterations": (10, 0)},
-    "style3d": {"substeps": 10, "iterations": (4, 10)},
-}
-"""Steps of a frame of 1/24 s and iterations in each, as in Newton's own examples (VBD: ten, not four)."""
 APART = 0.25
 """Contact distance of cloth in Newton's solvers, relative to the mesh's spacing."""
 WARM, COUNTED = 2, 4
 """Untimed frames at the start; stride of the frames in which crossings are counted."""
-PAGE = Path("benchmarks/results/newton.md")
-TEXT = """# Beside Newton's solvers on one mesh
+FLOWN = 1000.0
+"""Stretch from which a sheet has flown apart [%]: nothing else of it is measured."""
+ROWS, PAGE = Path("benchmarks/results/newton.json"), Path("benchmarks/results/newton.md")
+PICTURE = Path("docs/pictures/chart_bodies.webp")
+TEXT = """# Speed against accuracy with bodies
 
-Written by `python -m benchmarks.beside_newton --newton PYTHON`, on {device}, Newton {newton}; fabric {fabric}, {frames}
-frames at 24 a second. VBD: 10 steps of 10 iterations a frame. Style3D: 10 steps of 4 iterations of 10 conjugate
-gradients. Both simulate the fine sheet, self-contact on, their steps recorded as graphs; `refined` refines a cage of
-the same sheet that Style3D simulates (20 steps, 4 iterations of 40). So they answer unlike questions: theirs has a
-history.
+Written by `python -m benchmarks.beside_newton --newton PYTHON`; fabric {fabric}, {frames} frames at 24 a second, Newton
+{newton}. Its solvers simulate the fine sheet, self-contact on, their steps recorded as graphs on the card; `refined`
+refines a cage of the same sheet that Style3D simulates (20 steps, 4 iterations of 40). So they answer unlike questions:
+theirs has a history, ours and subdivision have the cage's. The reference is Style3D with {reference}: what is Style3D's
+own comes near it by construction. One level coarser: so solved, then subdivided by Loop.
 
-- **Warm frame**: median of the milliseconds of a frame, after the first two; simulating the cage is not in it, its
-  cost and the cage's stretch are in brackets.
+- **Settings**: steps of ours at the finest level, 12 by default, the tolerance in inverse proportion; of Newton, steps
+  of a frame x iterations (x conjugate gradients).
+- **Warm frame**: median after the first two; the cage's simulation is not in it ({cages}). On a core: one thread, rows
+  run beside each other.
+- **Away**: over the bands of wavelengths of [fidelity.md](fidelity.md) the mean factor between the RMS of the mean
+  curvature and the reference's, larger or smaller, less one; last half of the frames. **Curvature**: total absolute
+  mean curvature over the reference's.
 - **Stretch**: 99th percentile over edges of their length over the rest length, less one; largest over frames.
 - **Cloth through cloth**: edges that pass through triangles, sum over every fourth frame. **In bodies**: vertices, sum
   over frames.
+- **Front**: none on that device is both faster and nearer.
+
+![Distance from the fine simulation against time]({picture})
 """
+HEAD = ("scene", "vertices", "on", "method", "warm frame, ms", "away, %", "curvature", "stretch, %")
+HEAD += ("cloth through cloth", "in bodies", "front")
 
 
-@dataclass(eq=False)
-class Run:
-    """What a method made of a scene.
+@dataclass(frozen=True)
+class Method:
+    """A method and its settings.
 
     Attributes:
-        method: Its name.
-        frames: Positions of each frame [m], shape (F, V, 3).
-        milliseconds: Of each frame.
-        version: Newton's, "" of ours.
+        name: Of what solves.
+        steps: Of ours at the finest level, or of Newton in a frame, which are even.
+        iterations: Newton's in a step, and of the conjugate gradients in each.
+        below: Levels by which its mesh is coarser; the result is subdivided by Loop.
+        core: Whether it is measured on a core too.
     """
 
-    method: str
-    frames: list[np.ndarray] = field(default_factory=list)
-    milliseconds: list[float] = field(default_factory=list)
-    version: str = ""
+    name: str
+    steps: int = 0
+    iterations: tuple[int, int] = (0, 0)
+    below: int = 0
+    core: bool = False
 
     @property
-    def warm(self) -> float:
-        """Median of a warm frame [ms]."""
-        return float(np.median(self.milliseconds[WARM:]))
+    def settings(self) -> str:
+        """In a few words."""
+        numbers = [str(each) for each in (self.steps, *self.iterations) if each]
+        return ", ".join([*filter(None, [" x ".join(numbers)]), *["one level coarser"] * self.below])
 
 
-def by_newton(
-    python: str, stage: Stage, subdivisions: int, *, solver: str, frames: int, device: str, **options: Any
-) -> Run:
-    """The sheet simulated by one of Newton's solvers; options replace parts of the problem."""
-    substeps = {key: options.pop(key) for key in ("substeps",) if key in options}
-    problem = problem_of(stage, PRESETS[FABRIC], subdivisions, frames=frames, **substeps) | options
-    with tempfile.TemporaryDirectory() as folder:
-        given, result = Path(folder) / "problem.npz", Path(folder) / "result.npz"
-        np.savez(given, allow_pickle=False, **{name: np.asarray(value) for name, value in problem.items()})
-        script = Path(__file__).with_name("newton_cloth.py")
-        command = [python, str(script), str(given), str(result), "--solver", solver, "--device", device]
-        subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
-        found = np.load(result)
-        return Run(solver, [*found["frames"].astype(float)], [*found["milliseconds"]], str(found["newton"]))
+CAGE, REFERENCE = Method("cage", 20, (4, 40)), Method("reference", 40, (8, 80))
+METHODS = (
+    Method("style3d", 10, (4, 10), core=True),
+    Method("vbd", 10, (10, 0), core=True),
+    Method("loop", core=True),
+    *(Method("refined", steps, core=True) for steps in (4, 12, 48)),
+    Method("refined", 12, below=1, core=True),
+    *(Method("style3d", *each) for each in ((4, (2, 10)), (10, (4, 40)), (20, (4, 40)))),
+    Method("style3d", 10, (4, 10), below=1),
+    *(Method("vbd", *each) for each in ((4, (10, 0)), (10, (40, 0)), (20, (80, 0)))),
+    *(Method("xpbd", steps, (1, 0)) for steps in (640, 1280)),
+)
+"""Newton's own examples have 10 steps a frame, of VBD with 4 iterations, of Style3D with 4 of 10. Its XPBD moves a
+vertex by the sum of what its springs ask for: the elbow's cage hung with 160 steps a frame of one iteration and flew
+apart with 4 of 10; at half the spacing twice as many are needed. They would take a core about a minute a frame."""
 
 
-def runs(python: str, stage: Stage, subdivisions: int, *, frames: int, device: str) -> Iterator[Run]:
-    """Each method on a scene; before ours the cage, simulated."""
-    level = level_at(garment_of(stage, subdivisions), subdivisions)
-    apart = APART * float(level.spacing.min())
-    for solver, options in SIMULATED.items():
-        yield by_newton(
-            python, stage, subdivisions, solver=solver, frames=frames, device=device, apart=apart, **options
-        )
-    cage = by_newton(python, stage, 0, solver="style3d", frames=frames, device=device)
-    found = [*timed(stage, PRESETS[FABRIC], cage.frames, subdivisions, touches=True, device=device)]
-    points, spent = zip(*found, strict=True)
-    drawn = max(stretch(level_at(garment_of(stage, 0), 0), x) for x in cage.frames)
-    yield Run(f"refined (cage: {cage.warm:.0f} ms, {drawn:.1f}%)", [*points], [*spent])
+@wp.kernel
+def inward(mesh: wp.uint64, points: wp.array(dtype=wp.vec3), found: wp.array(dtype=wp.bool)):  # pyright: ignore
+    """Which points are inside a closed mesh, by the winding number."""
+    near = wp.mesh_query_point_sign_winding_number(mesh, points[wp.tid()], 1e6)
+    found[wp.tid()] = near.result and near.sign < 0.0  # pyright: ignore[reportAttributeAccessIssue]
+
+
+@dataclass(frozen=True)
+class Task:
+    """A row that is to be made.
+
+    Attributes:
+        scene: Name of the scene.
+        subdivisions: Of the fine mesh.
+        method: What is measured.
+        device: Where.
+        frames: How many.
+        python: One that has Newton.
+        folder: For the cages' positions; has a file "lock".
+        shot: File, garment and body of the scene that is a shot's.
+    """
+
+    scene: str
+    subdivisions: int
+    method: Method
+    device: str
+    frames: int
+    python: str
+    folder: Path
+    shot: tuple[str, ...] = ()
+
+    @cached_property
+    def stage(self) -> Stage:
+        """The scene."""
+        return dressed(*self.shot) if self.scene == "body" else SCENES[self.scene]()
+
+    def level(self, subdivisions: int) -> Level:
+        """The sheet at a number of subdivisions."""
+        return level_at(garment_of(self.stage, subdivisions), subdivisions)
+
+    def newton(self, solver: str, subdivisions: int, method: Method) -> dict[str, np.ndarray]:
+        """What one of Newton's solvers makes of the sheet: frames, milliseconds and its version."""
+        problem = problem_of(self.stage, PRESETS[FABRIC], subdivisions, frames=self.frames, substeps=method.steps)
+        problem["iterations"] = np.array(method.iterations)
+        if method is not CAGE:
+            problem["apart"] = np.array(APART * float(self.level(subdivisions).spacing.min()))
+        name = f"{self.scene} {method.name} {method.settings} {subdivisions} {'' if method is CAGE else self.device}"
+        card = ("--lock", str(self.folder / "lock")) if self.device != "cpu" else ()
+        options = ("--solver", solver, "--device", self.device, *card)
+        return newton_result(self.python, problem, self.folder / f"{name}.npz", *options)
+
+    def cage(self) -> dict[str, np.ndarray]:
+        """The simulation that is refined."""
+        return self.newton("style3d", 0, CAGE)
+
+    def ours(self, subdivisions: int) -> Iterator[tuple[np.ndarray, float]]:
+        """Positions of each frame [m] by subdivision or refined, shape (V, 3), and milliseconds of each."""
+        cages = [*self.cage()["frames"].astype(float)]
+        if self.method.name == "refined":
+            settings: dict[str, Any] = {"touches": True, "device": self.device, "steps": self.method.steps}
+            settings["tolerance"] = SolveSettings.tolerance * SolveSettings.steps / self.method.steps
+            yield from timed(self.stage, PRESETS[FABRIC], cages, subdivisions, **settings)
+            return
+        garment = garment_of(self.stage, subdivisions)
+        loop = build_levels([garment], refine_garments([garment], [subdivisions]), device=self.device)[-1].smooth_base
+        for cage in cages:
+            began = clock.perf_counter()
+            x = loop.apply(torch.as_tensor(cage, dtype=torch.float32, device=self.device)).double().cpu().numpy()
+            yield x, 1e3 * (clock.perf_counter() - began)
+
+    def measured(self) -> tuple[np.ndarray, np.ndarray, str]:
+        """Positions of each frame on the fine mesh [m], shape (F, V, 3), milliseconds of each, and Newton's version."""
+        name, subdivisions = self.method.name, self.subdivisions - self.method.below
+        if name in {"loop", "refined"}:
+            self.cage()
+            with (self.folder / "lock").open("rb") as lock:
+                if self.device != "cpu":
+                    fcntl.flock(lock, fcntl.LOCK_EX)
+                found, spent = zip(*self.ours(subdivisions), strict=True)
+            x, version = np.array(found), ""
+        else:
+            solver = "style3d" if name == "reference" else name
+            results = self.newton(solver, subdivisions, self.method)
+            x, spent, version = results["frames"].astype(float), results["milliseconds"], str(results["newton"])
+        for finer in range(subdivisions + 1, self.subdivisions + 1):
+            up = self.level(finer).smooth_from_below
+            assert up is not None  # Only the cage has none.
+            x = np.array([up.apply(torch.as_tensor(each, dtype=torch.float32)).double().numpy() for each in x])
+        return x, np.array(spent), version
 
 
 def stretch(level: Level, x: np.ndarray) -> float:
@@ -124,47 +220,213 @@ def inside(stage: Stage, x: np.ndarray, time: float) -> int:
     """Vertices inside bodies at a time [s]."""
     deep = np.zeros(len(x), dtype=bool)
     for body in stage.bodies:
-        pose = body.pose(time)
-        local = (x - pose.centre) @ pose.turn
-        along = local[:, 2] - np.clip(local[:, 2], -body.half, body.half)
-        deep |= np.linalg.norm(np.column_stack([local[:, :2], along]), axis=1) < body.radius
+        if isinstance(body, Body):
+            middle, turn = body.place(time)
+            local = (x - middle) @ turn
+            along = local[:, 2] - np.clip(local[:, 2], -body.half, body.half)
+            deep |= np.linalg.norm(np.column_stack([local[:, :2], along]), axis=1) < body.radius
+        else:
+            points, corners = wp.array(body.points(time), dtype=wp.vec3), wp.array(body.triangles.ravel(), dtype=int)
+            mesh, found = wp.Mesh(points, corners, support_winding_number=True), wp.zeros(len(x), dtype=wp.bool)
+            wp.launch(inward, len(x), inputs=[mesh.id, wp.array(x, dtype=wp.vec3), found])
+            deep |= found.numpy()
     return int(deep.sum())
 
 
-def row_of(name: str, stage: Stage, level: Level, run: Run) -> list[str]:
-    """A row of the table."""
+Row = dict[str, Any]
+"""A row's names and figures, as they stand in JSON."""
+
+
+def made(task: Task) -> Row:
+    """Measure and judge."""
+    task = replace(task, device=prepare_device(task.device))
+    x, spent, version = task.measured()
+    level, late = task.level(task.subdivisions), task.frames // 2
     edges, triangles = level.springs.numpy(), level.triangles.numpy()
-    count = partial(crossing_count, edges=edges, triangles=triangles)
-    with ProcessPoolExecutor(mp_context=get_context("spawn")) as pool:
-        crossed = sum(pool.map(count, run.frames[COUNTED - 1 :: COUNTED]))
-    deep = sum(inside(stage, x, (n + 1) / RATE) for n, x in enumerate(run.frames))
-    most = max(stretch(level, x) for x in run.frames)
-    return [name, f"{level.vertex_count:,}", run.method, f"{run.warm:.0f}", f"{most:.1f}", f"{crossed:,}", f"{deep:,}"]
+    row = {
+        "scene": task.scene,
+        "vertices": level.vertex_count,
+        "on": "one core" if task.device == "cpu" else wp.get_device(task.device).name,
+        "method": task.method.name,
+        "settings": task.method.settings,
+        "frames": task.frames,
+        "newton": version,
+        "ms": float(np.median(spent[WARM:])),
+        "cage ms": float(np.median(task.cage()["milliseconds"][WARM:])),
+        "stretch": float(np.max([stretch(level, each) for each in x])),
+    }
+    if not row["stretch"] < FLOWN:
+        return row | {"stretch": None, "bands": None, "curvature": None, "crossings": None, "inside": None}
+    judge = Judge(level, level.from_coarse @ task.stage.flat)
+    with wp.ScopedDevice("cpu"):
+        deep = sum(inside(task.stage, each, (n + 1) / RATE) for n, each in enumerate(x))
+    return row | {
+        "bands": np.mean([judge.amplitudes(judge.bending(each)) for each in x[late:]], axis=0).tolist(),
+        "curvature": float(np.mean([judge.curvature(each) for each in x[late:]])),
+        "crossings": sum(crossing_count(each, edges, triangles) for each in x[COUNTED - 1 :: COUNTED]),
+        "inside": deep,
+    }
 
 
-HEAD = ("scene", "vertices", "method", "warm frame, ms", "stretch, %", "cloth through cloth", "in bodies")
+def key(row: Row) -> tuple[Any, ...]:
+    """What tells a row from others."""
+    return tuple(row[name] for name in ("scene", "vertices", "on", "method", "settings"))
+
+
+def measure(tasks: Sequence[Task], file: Path, jobs: int) -> None:
+    """Make rows, many at once but one at a time on the card, and add each to a file; one that fails is left out."""
+    rows = {key(row): row for row in read([file])}
+    context = get_context("spawn")
+    with ProcessPoolExecutor(jobs, context) as card, ProcessPoolExecutor(jobs, context) as core:
+        wait([card.submit(task.cage) for task in {task.scene: task for task in tasks[::-1]}.values()])
+        begun = {(core if task.device == "cpu" else card).submit(made, task): task for task in tasks}
+        for done in as_completed(begun):
+            task = begun[done]
+            if problem := done.exception():
+                say(f"{task.scene}, {task.method.name} {task.method.settings}, {task.device}: {problem}")
+                continue
+            row = done.result()
+            rows[key(row)] = row
+            file.write_text(json.dumps([*rows.values()], indent=1) + "\n", encoding="utf-8")
+            say(" ".join(f"{row[name]}" for name in ("scene", "on", "method", "settings", "ms", "crossings", "inside")))
+
+
+def read(files: Sequence[Path]) -> list[Row]:
+    """The rows of files that are there."""
+    return [row for file in files if file.exists() for row in json.loads(file.read_text(encoding="utf-8"))]
+
+
+Marks = dict[tuple[Any, ...], list[Row]]
+"""The rows of each scene, number of vertices and device, by time."""
+
+
+def marked(rows: Sequence[Row]) -> Marks:
+    """The rows beside their references: "away", NaN where a sheet flew apart, curvature as a ratio, and "front"."""
+    truth = {key(row)[:2]: row for row in rows if row["method"] == "reference"}
+    found: Marks = {}
+    for row in sorted(rows, key=lambda row: (*key(row)[:3], row["ms"])):
+        fine = truth.get(key(row)[:2], row)
+        if row is fine:
+            continue
+        ratio = np.divide(row["bands"] or np.nan, fine["bands"])
+        away = 100.0 * float(np.expm1(np.abs(np.log(ratio)).mean()))
+        faster = found.setdefault(key(row)[:3], [])
+        front = away < min((each["away"] for each in faster if each["front"]), default=np.inf)
+        faster.append(
+            row | {"away": away, "front": front, "curvature": (row["curvature"] or np.nan) / fine["curvature"]}
+        )
+    return found
+
+
+def cells(row: Row) -> list[str]:
+    """A row of the page's table."""
+    name = ", ".join(filter(None, [row["method"], row["settings"]]))
+    said = [row["scene"], f"{row['vertices']:,}", row["on"], name, f"{row['ms']:.3g}"]
+    if row["bands"] is None:
+        return [*said, "flew apart", *"-----"]
+    said += [f"{row['away']:.1f}", f"{row['curvature']:.2f}", f"{row['stretch']:.1f}"]
+    return [*said, f"{row['crossings']:,}", f"{row['inside']:,}", "yes" * row["front"]]
+
+
+BESIDE = "settings: edges through cloth / vertices in bodies / stretch; hollow: one level coarser, then Loop"
+COLOURS = {"loop": "#7f7f7f", "refined": "#d62728", "style3d": "#1f77b4", "vbd": "#2ca02c", "xpbd": "#9467bd"}
+
+
+def draw(marks: Marks, out: Path) -> None:
+    """Distance against time, a column a scene, a row a device; beside each mark crossings, in bodies and stretch."""
+    import matplotlib as mpl  # noqa: PLC0415
+    from matplotlib.figure import Figure  # noqa: PLC0415
+    from matplotlib.lines import Line2D  # noqa: PLC0415
+
+    scenes = {scene: min(count for name, count, _ in marks if name == scene) for scene, _, _ in marks}
+    devices = sorted({device for _, _, device in marks}, key=lambda device: device == "one core")
+    with mpl.rc_context({"font.size": 8.0, "axes.spines.top": False, "axes.spines.right": False}):
+        figure = Figure(figsize=(4.2 * len(scenes), 3.8 * len(devices)), layout="constrained")
+        panels = figure.subplots(len(devices), len(scenes), squeeze=False, sharey="col")
+        for (device, (scene, count)), axes in zip(product(devices, scenes.items()), panels.flat, strict=True):
+            axes.set(title=f"{scene}, {count:,} vertices, {device}", xscale="log", yscale="log")
+            axes.set(xlabel="warm frame, ms", ylabel="away from the fine simulation, %")
+            axes.margins(x=0.25)
+            for axis in (axes.xaxis, axes.yaxis):
+                axis.set_major_formatter("{x:g}")
+            axes.yaxis.set_minor_formatter("{x:g}")
+            axes.grid(color="#e4e4e4", linewidth=0.6)
+            some = [row for row in marks.get((scene, count, device), []) if row["bands"]]
+            for method, coarse in product(COLOURS, (False, True)):
+                curve(
+                    axes, [r for r in some if r["method"] == method and ("coarser" in r["settings"]) == coarse], coarse
+                )
+        keys = [Line2D([], [], color=colour, marker="o") for colour in COLOURS.values()]
+        figure.legend(keys, COLOURS, loc="outside lower center", ncols=len(keys), frameon=False)
+        figure.suptitle(BESIDE, fontsize=9.0)
+        figure.savefig(out, dpi=130, pil_kwargs={"quality": 80, "method": 6})
+
+
+def curve(axes: Any, rows: Sequence[Row], coarse: bool) -> None:
+    """Marks of a method with their words, and a line through them."""
+    for row in rows:
+        short = row["settings"].partition(",")[0] or "Loop"
+        words = f"{short}: {row['crossings']:,} / {row['inside']:,} / {row['stretch']:.0f}%"
+        place, colour = (row["ms"], row["away"]), COLOURS[row["method"]]
+        axes.annotate(words, place, (3, 3), textcoords="offset points", fontsize=5.5, color=colour)
+        axes.plot(*place, color=colour, marker="o", markersize=4, fillstyle="none" if coarse else "full")
+    if rows:
+        axes.plot([r["ms"] for r in rows], [r["away"] for r in rows], color=COLOURS[rows[0]["method"]], linewidth=1.0)
+
+
+def write(rows: Sequence[Row], page: Path, picture: Path) -> None:
+    """Write the page and the picture."""
+    marks, cages = marked(rows), {row["scene"]: f"{row['scene']} {row['cage ms']:.0f} ms" for row in rows}
+    if not marks:
+        say("no scene has its reference yet: no page is written")
+        return
+    draw(marks, picture)
+    newton = max(row["newton"] for row in rows)
+    place = os.path.relpath(picture, page.parent)
+    text = TEXT.format(
+        fabric=FABRIC,
+        frames=rows[0]["frames"],
+        newton=newton,
+        reference=REFERENCE.settings,
+        cages=", ".join(cages.values()),
+        picture=place,
+    )
+    lines = [cells(row) for some in marks.values() for row in some]
+    page.write_text("\n".join([text, table(HEAD, lines)]) + "\n", encoding="utf-8")
+
+
+def tasks_of(given: argparse.Namespace, folder: Path) -> Iterator[Task]:
+    """The rows that are asked for: those on the first device first, which has all methods and the references."""
+    scenes = [*CHOSEN, *["body"] * bool(given.shot)]
+    devices = given.device or ["cuda", "cpu"]
+    for device, level, scene in product(devices, given.level or [2], given.scene or scenes):
+        for method in (REFERENCE, *METHODS):
+            asked = not given.method or method.name in given.method
+            if asked and (method.core or device == devices[0]):
+                yield Task(scene, level, method, device, given.frames, given.newton, folder, tuple(given.shot))
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Write the page."""
+    """Measure, and write the page and the picture."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", "--out", type=Path, default=PAGE)
-    parser.add_argument("--newton", required=True, metavar="PYTHON", help="A Python that has newton.")
-    parser.add_argument("--device", default="cuda")
-    parser.add_argument("--level", type=int, action="append", help="Subdivisions; may be repeated.")
-    parser.add_argument("--scene", choices=CHOSEN, action="append")
+    parser.add_argument("--picture", type=Path, default=PICTURE)
+    parser.add_argument("--rows", type=Path, action="append", help="Of the first, those that are measured are added.")
+    parser.add_argument("--newton", metavar="PYTHON", help="A Python that has newton; nothing is measured without.")
+    parser.add_argument("--device", action="append", help="May be repeated; else cuda and cpu.")
+    parser.add_argument("--level", type=int, action="append", help="Subdivisions, 2; may be repeated.")
+    parser.add_argument("--shot", nargs=3, metavar=("FILE", "GARMENT", "BODY"), default=())
+    parser.add_argument("--scene", action="append", help="May be repeated; else all.")
+    parser.add_argument("--method", action="append", choices=[*COLOURS, "reference"], help="May be repeated; else all.")
     parser.add_argument("--frames", type=int, default=24)
+    parser.add_argument("--jobs", type=int, default=2, help="Processes on the card, which wait for it, and on cores.")
     given = parser.parse_args(arguments)
-    device, rows, versions = prepare_device(given.device), [], {""}
-    for level, name in ((level, name) for level in given.level or (2, 3) for name in given.scene or CHOSEN):
-        stage = SCENES[name]()
-        mesh = level_at(garment_of(stage, level), level)
-        for run in runs(given.newton, stage, level, frames=given.frames, device=device):
-            rows.append(row_of(name, stage, mesh, run))
-            versions.add(run.version)
-            say(" ".join(rows[-1]))
-    text = TEXT.format(device=wp.get_device(device).name, newton=max(versions), fabric=FABRIC, frames=given.frames)
-    given.out.write_text("\n".join([text, table(HEAD, rows)]) + "\n", encoding="utf-8")
+    files = given.rows or [ROWS]
+    if given.newton:
+        with TemporaryDirectory() as folder:
+            (Path(folder) / "lock").touch()
+            measure([*tasks_of(given, Path(folder))], files[0], given.jobs)
+    write(read(files), given.out, given.picture)
 
 
 if __name__ == "__main__":

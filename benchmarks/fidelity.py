@@ -16,19 +16,21 @@ import argparse
 import subprocess
 import tempfile
 import time as clock
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise, product
 from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 import trimesh
 
 from benchmarks.drawing import Thing, drawn, framing, upright
-from benchmarks.fidelity_stages import SCENES, Body, Stage
+from benchmarks.fidelity_stages import SCENES, Body, Skin, Stage
 from benchmarks.rows import say, table
 from benchmarks.waves import lowpass, vertex_area
 from physgraph_usd.shot.solve import prepare_device
@@ -102,10 +104,8 @@ def garment_of(stage: Stage, level: int, *, touches: bool = False) -> Garment:
     """The stage's sheet as a garment, its warp along its second material coordinate; whether it touches anything."""
     feels = tuple(range(len(stage.bodies))) if touches else ()
     garment = Garment.of("/Sheet", stage.faces, stage.rest, level=level, colliders=feels)
-    corners = stage.rest[stage.faces]
-    down = corners[:, 3] - corners[:, 0]
-    warp, one = down / np.linalg.norm(down, axis=1, keepdims=True), np.ones(len(stage.rest))
-    return replace(garment, pin=stage.held.astype(float), grain=Grain(warp, one, 0.0 * one), self_contact=touches)
+    one = np.ones(len(stage.rest))
+    return replace(garment, pin=stage.held.astype(float), grain=Grain(stage.warp, one, 0.0 * one), self_contact=touches)
 
 
 def level_at(garment: Garment, subdivisions: int) -> Level:
@@ -144,9 +144,7 @@ def area_of(level: Level) -> float:
 def panel_of(stage: Stage, level: Level) -> np.ndarray:
     """Each triangle laid flat with its weft along x and its warp along y [m], shape (T, 3, 2)."""
     rest, triangles = level.rest.double().numpy(), level.triangles.numpy()
-    corners = stage.rest[stage.faces[0]]
-    down = np.broadcast_to(corners[3] - corners[0], (len(triangles), 3))
-    warp, across = axes(rest, triangles, down / np.linalg.norm(down[0]))
+    warp, across = axes(rest, triangles, np.broadcast_to(stage.warp[0], (len(triangles), 3)))
     spans = rest[triangles] - rest[triangles][:, :1]
     return np.stack([-np.einsum("tcx,tx->tc", spans, across), np.einsum("tcx,tx->tc", spans, warp)], axis=2)
 
@@ -157,12 +155,14 @@ def problem_of(
     """What `benchmarks/newton_cloth.py` is given: stiffnesses that correspond, and where held vertices and bodies are.
 
     Its membrane has the fabric's along weft, warp and in shear, no contraction across; its bending, alike in all
-    directions, has the warp's.
+    directions, has the warp's. A stage may have one body that bends.
     """
     level, step = level_at(garment_of(stage, subdivisions), subdivisions), 1.0 / (RATE * substeps)
     held = np.flatnonzero(level.from_coarse @ stage.held.astype(float) > 1.0 - 1e-6)
-    times = step * np.arange(1, frames * substeps + 1)
-    poses = [[body.pose(time) for body in stage.bodies] for time in times]
+    follows, times = level.from_coarse[held], step * np.arange(1, frames * substeps + 1)
+    rigid = [body for body in stage.bodies if isinstance(body, Body)]
+    places = [[body.place(time) for body in rigid] for time in times]
+    skins = [body.pose(n / RATE) for body in stage.bodies if isinstance(body, Skin) for n in range(frames + 1)]
     weft = fabric.stretch if fabric.weft_stretch is None else fabric.weft_stretch
     return {
         "points": level.from_coarse @ stage.rest,
@@ -172,16 +172,35 @@ def problem_of(
         "bend": np.array(fabric.bend),
         "density": np.array(fabric.density),
         "held": held,
-        "targets": np.array([(level.from_coarse @ stage.motion(time))[held] for time in times]),
+        "targets": np.array([follows @ stage.motion(time) for time in times], np.float32),
         "substeps": np.array(substeps),
         "step": np.array(step),
         "iterations": np.array(ITERATIONS),
         "apart": np.array(APART),
         "spacing": np.array(np.sqrt(2.0 * area_of(level) / len(level.triangles))),
-        "capsules": np.array([(body.radius, body.half) for body in stage.bodies]).reshape(-1, 2),
-        "middles": np.array([[pose.centre for pose in each] for each in poses]).reshape(len(times), -1, 3),
-        "turns": np.array([[pose.turn for pose in each] for each in poses]).reshape(len(times), -1, 3, 3),
+        "capsules": np.array([(body.radius, body.half) for body in rigid]).reshape(-1, 2),
+        "middles": np.array([[middle for middle, _ in each] for each in places]).reshape(len(times), -1, 3),
+        "turns": np.array([[turn for _, turn in each] for each in places]).reshape(len(times), -1, 3, 3),
+        "skin": np.array([pose.points for pose in skins] or np.zeros((0, 0, 3))),
+        "faces": skins[0].triangles if skins else np.zeros((0, 3), np.int32),
     }
+
+
+def newton_result(python: str, problem: dict[str, np.ndarray], result: Path, *options: str) -> dict[str, np.ndarray]:
+    """What `benchmarks/newton_cloth.py` writes; a result that is there is not simulated again.
+
+    Args:
+        python: One that has Newton.
+        problem: As `problem_of` gives it.
+        result: Where it is written.
+        options: Of that program.
+    """
+    if not result.exists():
+        given = result.with_suffix(".problem.npz")
+        np.savez_compressed(given, allow_pickle=False, **problem)
+        script = Path(__file__).with_name("newton_cloth.py")
+        subprocess.run([python, "-P", script, given, result, *options], check=True, stdout=subprocess.DEVNULL)
+    return dict(np.load(result))
 
 
 def refined(
@@ -192,13 +211,20 @@ def refined(
 
 
 def timed(
-    stage: Stage, fabric: Fabric, cages: Sequence[np.ndarray], subdivisions: int, *, touches: bool, device: str = "cpu"
+    stage: Stage,
+    fabric: Fabric,
+    cages: Sequence[np.ndarray],
+    subdivisions: int,
+    *,
+    touches: bool,
+    device: str = "cpu",
+    **settings: Any,
 ) -> Iterator[tuple[np.ndarray, float]]:
     """Positions of each frame [m], shape (V, 3), of the cages refined as a shot is, and milliseconds of each."""
     bodies = enumerate(stage.bodies) if touches else ()
     colliders = tuple(Collider(f"/Body{number}", body.kind) for number, body in bodies)
     garment = garment_of(stage, subdivisions, touches=touches)
-    refiner = Refiner(Scene((garment,), GRAVITY, (), colliders), SolveSettings(), device=device)
+    refiner = Refiner(Scene((garment,), GRAVITY, (), colliders), SolveSettings(**settings), device=device)
     for n, cage in enumerate(cages):
         poses: tuple[Pose, ...] = tuple(body.pose((n + 1) / RATE) for body in stage.bodies) if touches else ()
         began = clock.perf_counter()
@@ -219,17 +245,29 @@ class Judge:
     level: Level
     flat: np.ndarray
 
+    @cached_property
+    def smooth(self) -> list[Callable[[np.ndarray], np.ndarray]]:
+        """Filters that leave out what is shorter than each end of the bands."""
+        return lowpass(self.level, BANDS)
+
     def curvature(self, x: np.ndarray) -> float:
         """Total absolute mean curvature [m]: half the sum of the hinges' angles times their lengths."""
         angle, _, _, length = hinge_geometry(x, hinges_of(self.level.triangles.numpy()))
         return float(0.5 * (np.abs(angle) * length).sum())
 
     def amplitudes(self, x: np.ndarray) -> np.ndarray:
-        """RMS of the positions' part of each band of wavelengths [m]; the last has all that is shorter."""
+        """RMS of each band of wavelengths of a field, shape (V, C), such as positions; the last has all the rest."""
         area = vertex_area(self.level)
-        smooth = [each(x) for each in lowpass(self.level, BANDS)] + [x]
+        smooth = [each(x) for each in self.smooth] + [x]
         parts = [short - long for long, short in pairwise(smooth)]
         return np.array([np.sqrt((area[:, None] * part**2).sum() / area.sum()) for part in parts])
+
+    def bending(self, x: np.ndarray) -> np.ndarray:
+        """Mean curvature at each vertex [1/m], shape (V, 1): half of what its hinges turn, 0 on a flat sheet."""
+        hinges = hinges_of(self.level.triangles.numpy())
+        angle, _, _, length = hinge_geometry(x, hinges)
+        turned = np.bincount(hinges[:, :2].ravel(), np.repeat(0.25 * angle * length, 2), self.level.vertex_count)
+        return (turned / vertex_area(self.level))[:, None]
 
     def folds(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Density of folds [1/m] and the angle [rad] of the direction in which they bend, at each vertex."""
@@ -287,15 +325,10 @@ class Task:
 
     def by_newton(self, subdivisions: int) -> list[np.ndarray]:
         """Positions of each frame [m], shape (V, 3), by Newton's Style3D solver."""
+        problem = problem_of(SCENES[self.scene](), PRESETS[self.fabric], subdivisions, frames=self.frames)
         with tempfile.TemporaryDirectory() as folder:
-            place, name = self.kept or Path(folder), f"{self.scene}_{self.fabric}_{subdivisions}"
-            problem, result = place / f"{name}.problem.npz", place / f"{name}.result.npz"
-            if not result.exists():
-                given = problem_of(SCENES[self.scene](), PRESETS[self.fabric], subdivisions, frames=self.frames)
-                np.savez_compressed(problem, allow_pickle=False, **given)
-                script = Path(__file__).with_name("newton_cloth.py")
-                subprocess.run([self.python, script, problem, result], check=True, stdout=subprocess.DEVNULL)
-            return list(np.load(result)["frames"].astype(float))
+            result = (self.kept or Path(folder)) / f"{self.scene}_{self.fabric}_{subdivisions}.npz"
+            return list(newton_result(self.python, problem, result)["frames"].astype(float))
 
 
 Sides = dict[str, np.ndarray]
@@ -347,15 +380,17 @@ def heading() -> list[str]:
     return [*names, f"under {1e3 * BANDS[-1]:g} mm", "angle, degrees", "where", "motion"]
 
 
-def body_at(body: Body, time: float) -> Thing:
+def body_at(body: Body | Skin, time: float) -> Thing:
     """A body's surface at a time [s]."""
+    if isinstance(body, Skin):
+        return Thing(upright(body.points(time)), body.triangles, cloth=False)
     if body.half:
         mesh = trimesh.creation.capsule(height=2.0 * body.half, radius=0.97 * body.radius)
     else:
         mesh = trimesh.creation.icosphere(subdivisions=4, radius=0.99 * body.radius)
-    pose, points = body.pose(time), np.asarray(mesh.vertices)
+    (middle, turn), points = body.place(time), np.asarray(mesh.vertices)
     points = points - 0.5 * (points.min(axis=0) + points.max(axis=0))
-    return Thing(upright(points @ pose.turn.T + pose.centre), np.asarray(mesh.faces, np.int32), cloth=False)
+    return Thing(upright(points @ turn.T + middle), np.asarray(mesh.faces, np.int32), cloth=False)
 
 
 def triangles_of(stage: Stage, subdivisions: int) -> np.ndarray:

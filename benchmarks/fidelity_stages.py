@@ -6,9 +6,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.sparse as sp
+from scipy.sparse.csgraph import connected_components
 
 from physgraph_usd.solver.colliders.pose import Pose
 from physgraph_usd.solver.colliders.primitives import primitive
+from physgraph_usd.usd.read.reader import open_shot
 
 Motion = Callable[[float], np.ndarray]
 
@@ -32,13 +35,35 @@ class Body:
         """The collider's kind."""
         return "capsule" if self.half else "sphere"
 
-    def pose(self, time: float) -> Pose:
-        """Where it is at a time [s]."""
+    def place(self, time: float) -> tuple[np.ndarray, np.ndarray]:
+        """Its middle [m] and the matrix whose columns are its axes at a time [s], the third of them its own."""
         middle, axis = self.ends(time)
         side = np.cross([0.0, 1.0, 0.0], axis)
         side = side / np.linalg.norm(side)
-        turn = np.stack([side, np.cross(axis, side), axis], axis=1)
+        return middle, np.stack([side, np.cross(axis, side), axis], axis=1)
+
+    def pose(self, time: float) -> Pose:
+        """Its triangles at a time [s]."""
+        middle, turn = self.place(time)
         return primitive(self.kind, np.array([self.radius, self.radius, self.half]), turn=turn, centre=middle)
+
+
+@dataclass(frozen=True, eq=False)
+class Skin:
+    """A body that bends.
+
+    Attributes:
+        triangles: Shape (T, 3), int32.
+        points: Positions of its vertices at a time [s].
+    """
+
+    triangles: np.ndarray
+    points: Motion
+    kind = "mesh"
+
+    def pose(self, time: float) -> Pose:
+        """Its triangles at a time [s]."""
+        return Pose(self.points(time), self.triangles)
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +71,8 @@ class Stage:
     """A sheet that hangs from what moves.
 
     Attributes:
-        faces: Quads, shape (F, 4), whose second and third corners lie along the warp from the first and the fourth.
+        faces: Quads, shape (F, 4), whose fourth corner lies along the warp from the first; or triangles, shape (F, 3),
+            whose warp hangs down.
         flat: Its material coordinates [m], shape (V, 2).
         rest: Rest positions [m], shape (V, 3).
         held: Which vertices are moved, shape (V,), bool.
@@ -60,8 +86,16 @@ class Stage:
     rest: np.ndarray
     held: np.ndarray
     motion: Motion
-    bodies: tuple[Body, ...] = ()
+    bodies: tuple[Body | Skin, ...] = ()
     camera: tuple[float, float] = (25.0, 8.0)
+
+    @property
+    def warp(self) -> np.ndarray:
+        """Unit direction of the warp on each face, shape (F, 3); it need not lie in a triangle."""
+        if self.faces.shape[1] == 3:
+            return np.tile([0.0, 0.0, -1.0], (len(self.faces), 1))
+        down = self.rest[self.faces[:, 3]] - self.rest[self.faces[:, 0]]
+        return down / np.linalg.norm(down, axis=1, keepdims=True)
 
 
 def grid(columns: int, rows: int, *, closed: bool = False) -> tuple[np.ndarray, np.ndarray]:
@@ -157,6 +191,38 @@ def elbow(degrees: float = 100.0) -> Stage:
 
     arm = tuple(Body(0.042, 0.15, each) for each in (upper, lower))
     return Stage(faces, uv * [0.346, 0.4], rest, uv[:, 1] == 0.0, lambda _: rest, arm, (10.0, 12.0))
+
+
+def dressed(file: str, garment: str, body: str) -> Stage:
+    """A shot's garment on its body: it begins at rest as in the first frame, and its highest border is held as there.
+
+    Args:
+        file: The shot, with Y up.
+        garment: Prim path of the garment.
+        body: Prim path of the body.
+    """
+    shot = open_shot(file, garments=(garment,), colliders=(body,))
+    frames = [shot.frame(time) for time in shot.scene.times]
+    shot.close()
+    mesh, seconds, upright = shot.scene.garments[0].mesh, shot.scene.seconds, ([0, 2, 1], [1.0, -1.0, 1.0])
+    cloth = np.array([each.garments[0].points for each in frames])[..., upright[0]] * upright[1]
+    poses = [pose for each in frames for pose in each.colliders if pose is not None]
+    skin = np.array([pose.points for pose in poses])[..., upright[0]] * upright[1]
+    i, j = mesh.half_edges.edges[mesh.half_edges.count == 1].T
+    count = cloth.shape[1]
+    _, part = connected_components(sp.coo_matrix((0.0 * i + 1.0, (i, j)), (count, count)), directed=False)
+    height = [np.mean(cloth[0, part == part[each], 2]) for each in i]
+    held = part == part[i[np.argmax(height)]]
+
+    def at(points: np.ndarray) -> Motion:
+        def motion(time: float) -> np.ndarray:
+            n, part = divmod(min(time / seconds, len(points) - 1.001), 1.0)
+            return (1.0 - part) * points[int(n)] + part * points[int(n) + 1]
+
+        return motion
+
+    faces = np.asarray(mesh.indices).reshape(mesh.face_count, -1)
+    return Stage(faces, cloth[0, :, :2], cloth[0], held, at(cloth), (Skin(poses[0].triangles, at(skin)),))
 
 
 SCENES: dict[str, Callable[[], Stage]] = {

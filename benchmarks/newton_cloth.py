@@ -1,10 +1,10 @@
-"""A sheet simulated by Newton's Style3D or VBD solver: run by a Python that has ``newton``.
+"""A sheet simulated by Newton's Style3D, VBD or XPBD solver: run by a Python that has ``newton``.
 
-    python benchmarks/newton_cloth.py problem.npz result.npz [--solver vbd]
+    python benchmarks/newton_cloth.py problem.npz result.npz [--solver vbd] [--lock FILE]
 
 The solver, its membrane, its bending, its contact and friction are Newton's; of ours are the mesh, the numbers of the
-fabric, and where held vertices and bodies are. On CUDA two steps are recorded once and replayed. Imports nothing of
-this package.
+fabric, and where held vertices and bodies are. On CUDA two steps are recorded once and replayed. With a lock, only one
+such program simulates at a time. Imports nothing of this package.
 
 What the problem holds, with V vertices, T triangles, H held vertices and S steps: ``points`` [m], shape (V, 3);
 ``triangles``, (T, 3); ``panel``, material coordinates [m] of the triangles' corners, (T, 3, 2); ``stretch``, stiffness
@@ -12,7 +12,8 @@ along weft and warp and in shear [N/m], (3,); ``bend`` [N m] and ``density`` [kg
 ``targets`` [m], (S, H, 3); ``substeps`` and ``step`` [s]; ``iterations`` of a step, and of the conjugate gradients in
 each, (2,); ``apart``, the distance [m] that cloth keeps to itself; ``spacing``, between parallel edges [m];
 ``capsules``, (C, 2), radius and half length [m], and ``middles`` [m], (S, C, 3), and ``turns``, (S, C, 3, 3), of them,
-the capsule's axis along its z. A capsule of no length is a ball. S is even.
+the capsule's axis along its z; a capsule of no length is a ball; ``skin``, a body that bends, at the start and in
+each frame [m], (F + 1, B, 3), and ``faces``, its triangles; (0, 0, 3) without one. S is even.
 """
 
 # Warp's kernels are typed by values that only Warp reads.
@@ -20,6 +21,7 @@ the capsule's axis along its z. A capsule of no length is a ball. S is even.
 from __future__ import annotations
 
 import argparse
+import fcntl
 import time
 from typing import Any
 
@@ -54,6 +56,20 @@ def place(
 
 
 @wp.kernel
+def bend(
+    step: wp.array(dtype=wp.int32),
+    substeps: wp.int32,
+    frames: wp.array2d(dtype=wp.vec3),
+    points: wp.array(dtype=wp.vec3),
+):
+    """Vertices of a body that bends to where a step has them: linear between frames."""
+    i = wp.tid()
+    n = (step[0] + 1) // substeps
+    part = float((step[0] + 1) % substeps) / float(substeps)
+    points[i] = wp.lerp(frames[n, i], frames[wp.min(n + 1, frames.shape[0] - 1), i], part)
+
+
+@wp.kernel
 def count(step: wp.array(dtype=wp.int32)):
     """On to the next step."""
     step[0] = step[0] + 1
@@ -75,38 +91,60 @@ def add_style3d(builder: Any, problem: Any) -> None:
     )
 
 
-def add_vbd(builder: Any, problem: Any) -> None:
-    """The sheet with VBD's neo-Hookean membrane, as stiff as weft and warp on average, and bending by angles."""
+def add_plain(builder: Any, problem: Any, *, springs: bool) -> None:
+    """The sheet with bending by angles, its membrane as stiff as weft and warp on average.
+
+    VBD's is neo-Hookean. XPBD's is springs along the edges, of which those of the squares' diagonals add half again.
+    """
+    weft, warp = problem["stretch"][:2].tolist()
     builder.add_cloth_mesh(
         **STILL,
         scale=1.0,
         vertices=problem["points"].tolist(),
         indices=problem["triangles"].ravel().tolist(),
         density=float(problem["density"]),
-        tri_ke=0.25 * float(problem["stretch"][:2].sum()),
+        tri_ke=0.25 * (weft + warp),
         tri_ka=0.0,
         tri_kd=0.0,
         edge_ke=float(problem["bend"]) / float(problem["spacing"]),
         edge_kd=0.0,
+        add_springs=springs,
+        spring_ke=(weft + warp) / 3.0,
+        spring_kd=0.0,
     )
 
 
-def build(problem: Any, solver: str, device: str) -> Any:
-    """The problem's sheet and bodies as a model."""
+def build(problem: Any, solver: str, device: str) -> tuple[Any, Any]:
+    """The problem's sheet and bodies as a model, and the mesh of the body that bends or None."""
     builder = newton.ModelBuilder(up_axis=newton.Axis.Z)
-    {"style3d": add_style3d, "vbd": add_vbd}[solver](builder, problem)
+    if solver == "style3d":
+        add_style3d(builder, problem)
+    else:
+        add_plain(builder, problem, springs=solver == "xpbd")
     for (radius, half), at in zip(problem["capsules"], poses(problem)[0], strict=True):
         body = builder.add_body(xform=wp.transform(*at), is_kinematic=True)
         builder.add_shape_capsule(body, radius=float(radius), half_height=float(half))
+    skin = newton.Mesh(problem["skin"][0], problem["faces"].ravel()) if len(problem["skin"]) else None
+    if skin is not None:
+        builder.add_shape_mesh(-1, mesh=skin)
     if solver == "vbd":
         builder.color(include_bending=True)
     model = builder.finalize(device=device)
+    if skin is not None:  # Cloth out of a body's box is not looked at: it holds the body in all frames.
+        model.shape_collision_aabb_lower.assign(problem["skin"].min(axis=(0, 1)).reshape(1, 3))
+        model.shape_collision_aabb_upper.assign(problem["skin"].max(axis=(0, 1)).reshape(1, 3))
+    if solver == "xpbd":  # Its cloth touches itself as balls do, and it takes held vertices for those without mass.
+        model.particle_radius.fill_(0.5 * float(problem["apart"]))
+        model.particle_max_radius = 0.5 * float(problem["apart"])
+        mass = model.particle_inv_mass.numpy()
+        mass[problem["held"]] = 0.0
+        model.particle_inv_mass.assign(mass)
     flags = model.particle_flags.numpy()
     flags[problem["held"]] &= ~int(newton.ParticleFlags.ACTIVE)
     model.particle_flags.assign(flags)
     model.soft_contact_ke, model.soft_contact_kd, model.soft_contact_mu = CONTACT, 1e-5, FRICTION
     model.set_gravity((0.0, 0.0, -9.81))
-    return model
+    return model, skin
 
 
 def solver_of(model: Any, problem: Any, solver: str) -> Any:
@@ -118,6 +156,8 @@ def solver_of(model: Any, problem: Any, solver: str) -> Any:
         made = newton.solvers.SolverStyle3D(model, config=config)
         made.collision.radius = apart
         return made
+    if solver == "xpbd":
+        return newton.solvers.SolverXPBD(model, iterations=iterations)
     return newton.solvers.SolverVBD(
         model,
         iterations=iterations,
@@ -142,7 +182,7 @@ class Simulation:
 
     def __init__(self, problem: Any, solver: str, device: str) -> None:
         """Build it."""
-        self.model = build(problem, solver, device)
+        self.model, self.skin = build(problem, solver, device)
         self.solver, self.seconds = solver_of(self.model, problem, solver), float(problem["step"])
         self.states = (self.model.state(), self.model.state())
         self.control, self.pipeline = self.model.control(), newton.CollisionPipeline(self.model)
@@ -152,7 +192,8 @@ class Simulation:
         self.targets = wp.array(problem["targets"], dtype=wp.vec3, ndim=2, device=device)
         self.poses = wp.array(poses(problem), dtype=wp.transform, ndim=2, device=device)
         self.bodies = wp.array(np.arange(len(problem["capsules"])), dtype=wp.int32, device=device)
-        self.graph: Any = None
+        self.skins = wp.array(problem["skin"], dtype=wp.vec3, ndim=2, device=device)
+        self.substeps, self.graph = int(problem["substeps"]), None
 
     def step(self, here: Any, there: Any) -> None:
         """One step from a state into another."""
@@ -161,6 +202,10 @@ class Simulation:
         moved += [(self.bodies, self.poses, here.body_q, there.body_q)] if len(self.bodies) else []
         for which, *arrays in moved:
             wp.launch(place, dim=len(which), inputs=[self.number, which, *arrays], device=device)
+        if self.skin is not None:
+            inputs = [self.number, self.substeps, self.skins, self.skin.mesh.points]
+            wp.launch(bend, dim=self.skins.shape[1], inputs=inputs, device=device)
+            self.skin.mesh.refit()
         wp.launch(count, dim=1, inputs=[self.number], device=device)
         self.pipeline.collide(here, self.contacts)
         here.clear_forces()
@@ -171,9 +216,9 @@ class Simulation:
         self.step(*self.states)
         self.step(*self.states[::-1])
 
-    def frame(self, steps: int) -> np.ndarray:
-        """Positions [m] after an even number of steps, shape (V, 3)."""
-        for _ in range(steps // 2):
+    def frame(self) -> np.ndarray:
+        """Positions [m] after a frame's steps, shape (V, 3)."""
+        for _ in range(self.substeps // 2):
             if self.graph is not None:
                 wp.capture_launch(self.graph)
                 continue
@@ -190,15 +235,18 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("problem")
     parser.add_argument("result")
-    parser.add_argument("--solver", choices=["style3d", "vbd"], default="style3d")
+    parser.add_argument("--solver", choices=["style3d", "vbd", "xpbd"], default="style3d")
     parser.add_argument("--device", default="cuda" if wp.is_cuda_available() else "cpu")
+    parser.add_argument("--lock", default="")
     given = parser.parse_args()
     problem = dict(np.load(given.problem))
     simulation = Simulation(problem, given.solver, given.device)
+    lock = open(given.lock or given.problem, "rb")  # Until the program ends.
+    fcntl.flock(lock, fcntl.LOCK_EX)
     frames, spent = [], []
-    for _ in range(len(problem["targets"]) // int(problem["substeps"])):
+    for _ in range(len(problem["targets"]) // simulation.substeps):
         began = time.perf_counter()
-        frames.append(simulation.frame(int(problem["substeps"])))
+        frames.append(simulation.frame())
         spent.append(1e3 * (time.perf_counter() - began))
     np.savez(given.result, frames=frames, milliseconds=spent, newton=newton.__version__)
 
