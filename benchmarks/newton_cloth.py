@@ -1,4 +1,4 @@
-"""A sheet simulated by Newton's Style3D, VBD or XPBD solver: run by a Python that has ``newton``.
+"""A sheet simulated by Newton's Style3D or VBD solver: run by a Python that has ``newton``.
 
     python benchmarks/newton_cloth.py problem.npz result.npz [--solver vbd] [--lock FILE]
 
@@ -91,11 +91,8 @@ def add_style3d(builder: Any, problem: Any) -> None:
     )
 
 
-def add_plain(builder: Any, problem: Any, *, springs: bool) -> None:
-    """The sheet with bending by angles, its membrane as stiff as weft and warp on average.
-
-    VBD's is neo-Hookean. XPBD's is springs along the edges, of which those of the squares' diagonals add half again.
-    """
+def add_plain(builder: Any, problem: Any) -> None:
+    """The sheet with bending by angles, its membrane neo-Hookean, as stiff as weft and warp on average."""
     weft, warp = problem["stretch"][:2].tolist()
     builder.add_cloth_mesh(
         **STILL,
@@ -108,9 +105,6 @@ def add_plain(builder: Any, problem: Any, *, springs: bool) -> None:
         tri_kd=0.0,
         edge_ke=float(problem["bend"]) / float(problem["spacing"]),
         edge_kd=0.0,
-        add_springs=springs,
-        spring_ke=(weft + warp) / 3.0,
-        spring_kd=0.0,
     )
 
 
@@ -120,7 +114,7 @@ def build(problem: Any, solver: str, device: str) -> tuple[Any, Any]:
     if solver == "style3d":
         add_style3d(builder, problem)
     else:
-        add_plain(builder, problem, springs=solver == "xpbd")
+        add_plain(builder, problem)
     for (radius, half), at in zip(problem["capsules"], poses(problem)[0], strict=True):
         body = builder.add_body(xform=wp.transform(*at), is_kinematic=True)
         builder.add_shape_capsule(body, radius=float(radius), half_height=float(half))
@@ -133,12 +127,6 @@ def build(problem: Any, solver: str, device: str) -> tuple[Any, Any]:
     if skin is not None:  # Cloth out of a body's box is not looked at: it holds the body in all frames.
         model.shape_collision_aabb_lower.assign(problem["skin"].min(axis=(0, 1)).reshape(1, 3))
         model.shape_collision_aabb_upper.assign(problem["skin"].max(axis=(0, 1)).reshape(1, 3))
-    if solver == "xpbd":  # Its cloth touches itself as balls do, and it takes held vertices for those without mass.
-        model.particle_radius.fill_(0.5 * float(problem["apart"]))
-        model.particle_max_radius = 0.5 * float(problem["apart"])
-        mass = model.particle_inv_mass.numpy()
-        mass[problem["held"]] = 0.0
-        model.particle_inv_mass.assign(mass)
     flags = model.particle_flags.numpy()
     flags[problem["held"]] &= ~int(newton.ParticleFlags.ACTIVE)
     model.particle_flags.assign(flags)
@@ -156,8 +144,6 @@ def solver_of(model: Any, problem: Any, solver: str) -> Any:
         made = newton.solvers.SolverStyle3D(model, config=config)
         made.collision.radius = apart
         return made
-    if solver == "xpbd":
-        return newton.solvers.SolverXPBD(model, iterations=iterations)
     return newton.solvers.SolverVBD(
         model,
         iterations=iterations,
@@ -235,7 +221,7 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("problem")
     parser.add_argument("result")
-    parser.add_argument("--solver", choices=["style3d", "vbd", "xpbd"], default="style3d")
+    parser.add_argument("--solver", choices=["style3d", "vbd"], default="style3d")
     parser.add_argument("--device", default="cuda" if wp.is_cuda_available() else "cpu")
     parser.add_argument("--lock", default="")
     given = parser.parse_args()
