@@ -2,7 +2,8 @@
 
 In overlaps of a skinned body the cage goes deep through both parts, and cloth pushed out of the parts tears. Only there
 the solve follows a repaired cage: cloth between overlapping parts is drawn taut from entry to exit. The report's
-figures are still measured from the input.
+figures are still measured from the input. Without it the T-shirt ends with 2.4 times the remaining move and standing
+cloth moves by 0.77 for 0.47 mm; shots 02 and 09 end equal (whole shots, three ripples each).
 """
 
 from __future__ import annotations

@@ -169,23 +169,42 @@ def _broken(
 ) -> float | None:
     """Time code of the last frame, if only the last frame's input left its place."""
     pairs = [(each.last, each.before) for each in memories if each.last is not None and each.before is not None]
-    if len(pairs) == len(part):
-        for index, (last, before) in zip(part, pairs, strict=True):
-            if came_back(last, before, frame.garments[index], frame.colliders, near=near, edge=edge):
-                return last.time
-    return None
+    return _elsewhere(part, frame, pairs, near=near, edge=edge) if len(pairs) == len(part) else None
 
 
 def jumped_from(
     part: tuple[int, ...], frame: Frame, memories: Sequence[GarmentHistory], *, near: Sequence[int], edge: float
 ) -> float | None:
     """Time code of the first frame, if garments' input jumped from the first frame to the second and stays there."""
-    for index, each in zip(part, memories, strict=True):
-        first, second = each.before, each.last
-        if first is None or second is None or not first.first:
-            return None
-        if jumped_in(first, second, frame.garments[index], frame.colliders, near=near, edge=edge):
-            return first.time
+    pairs = [(each.before, each.last) for each in memories if each.last is not None and each.before is not None]
+    begun = len(pairs) == len(part) and all(first.first for first, _ in pairs)
+    return _elsewhere(part, frame, pairs, near=near, edge=edge) if begun else None
+
+
+def _elsewhere(
+    part: tuple[int, ...],
+    frame: Frame,
+    pairs: Sequence[tuple[SolvedFrame, SolvedFrame]],
+    *,
+    near: Sequence[int],
+    edge: float,
+) -> float | None:
+    """Time code of the first of two earlier frames, if the input was in another place in that frame only.
+
+    Args:
+        pairs: The two frames of each garment.
+        near: Numbers of the bodies within reach.
+        edge: Mean edge of the cages [m]; a smaller move is no break: the cloth follows the move.
+    """
+
+    def moved(known: SolvedFrame, now: GarmentFrame, some: Sequence[int]) -> float:
+        return max(cage_moved(known, now), bodies_moved(known, frame.colliders, some))
+
+    for index, (odd, other) in zip(part, pairs, strict=True):
+        now, some = frame.garments[index], sorted({*near, *odd.near, *other.near})
+        away = moved(odd, now, some)
+        if away > edge and moved(other, now, some) < RETURNED * away:
+            return odd.time
     return None
 
 
@@ -225,49 +244,3 @@ def bodies_moved(
         before, after = known.colliders[body], colliders[body]
         farthest = max(farthest, np.inf if before is None or after is None else after.moved(before, along))
     return farthest
-
-
-def came_back(
-    last: SolvedFrame,
-    before: SolvedFrame,
-    now: GarmentFrame,
-    colliders: Sequence[Pose | None],
-    *,
-    near: Sequence[int],
-    edge: float,
-) -> bool:
-    """Whether the input left its place in the last frame only.
-
-    Args:
-        last: The last frame.
-        before: The start frame of ``last``.
-        colliders: Poses of all bodies in this frame.
-        near: Numbers of the bodies within the garment's reach.
-        edge: Mean edge of the cage [m]; a smaller move is no break: the cloth follows the move.
-    """
-    near = sorted({*near, *before.near})
-    away = max(cage_moved(last, now), bodies_moved(last, colliders, near))
-    return away > edge and max(cage_moved(before, now), bodies_moved(before, colliders, near)) < RETURNED * away
-
-
-def jumped_in(
-    first: SolvedFrame,
-    second: SolvedFrame,
-    now: GarmentFrame,
-    colliders: Sequence[Pose | None],
-    *,
-    near: Sequence[int],
-    edge: float,
-) -> bool:
-    """Whether the input left its place in the first of three frames only.
-
-    Args:
-        first: The first frame.
-        now: The garment in this frame, the third.
-        colliders: Poses of all bodies in this frame.
-        near: Numbers of the bodies within the garment's reach.
-        edge: As for `came_back`.
-    """
-    near = sorted({*near, *first.near, *second.near})
-    away = max(cage_moved(first, second.frame), bodies_moved(first, second.colliders, near))
-    return away > edge and max(cage_moved(second, now), bodies_moved(second, colliders, near)) < RETURNED * away
