@@ -27,6 +27,7 @@ import torch
 
 from benchmarks.rows import Row, commit, say, under
 from physgraph_usd.lab.methods.paper_network import PaperConfig
+from physgraph_usd.lab.methods.random_networks import random_network
 from physgraph_usd.shot.solve import prepare_device
 from physgraph_usd.solver.fabric import PRESETS
 from physgraph_usd.solver.frame.group import Group
@@ -35,7 +36,7 @@ from physgraph_usd.solver.integrate import METHODS
 from physgraph_usd.solver.integrate.base import Integrator, System
 from physgraph_usd.solver.integrate.network import PhysgraphConfig
 from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton
-from physgraph_usd.solver.integrate.weights import integrator_of, random_network, shipped_network
+from physgraph_usd.solver.integrate.weights import integrator_of, shipped_network
 from physgraph_usd.solver.mesh.topology import PolygonMesh
 from physgraph_usd.solver.scene import Garment, GarmentFrame
 

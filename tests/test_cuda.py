@@ -17,11 +17,12 @@ from sheets import garment_of
 from physgraph_usd.cli import main
 from physgraph_usd.lab.methods.paper_network import PaperConfig, has_triton
 from physgraph_usd.lab.methods.paper_steps import LearnedPaper
+from physgraph_usd.lab.methods.random_networks import random_network
 from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.solver.frame.group import Group
 from physgraph_usd.solver.frame.solve import solve_frame
 from physgraph_usd.solver.frame.values import FrameInput
-from physgraph_usd.solver.integrate.weights import random_network, shipped_network
+from physgraph_usd.solver.integrate.weights import shipped_network
 from physgraph_usd.solver.level import refine_garments
 from physgraph_usd.solver.mesh.topology import PolygonMesh
 from physgraph_usd.solver.scene import GarmentFrame

@@ -18,19 +18,14 @@ from physgraph_usd.cli import main
 from physgraph_usd.errors import WeightsError
 from physgraph_usd.lab.methods import METHODS
 from physgraph_usd.lab.methods.paper_network import PaperConfig
+from physgraph_usd.lab.methods.random_networks import random_network
 from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.solver.integrate.base import Carry, Integrator, System
 from physgraph_usd.solver.integrate.descend import solve_level
 from physgraph_usd.solver.integrate.learned import LearnedMetric
 from physgraph_usd.solver.integrate.network import VECTORS, Physgraph, PhysgraphConfig
 from physgraph_usd.solver.integrate.stop import Budget
-from physgraph_usd.solver.integrate.weights import (
-    NETWORKS,
-    load_network,
-    make_network,
-    random_network,
-    save_network,
-)
+from physgraph_usd.solver.integrate.weights import NETWORKS, load_network, make_network, save_network
 
 ALL = PhysgraphConfig(vectors=VECTORS, width=16, depth=3)
 PLAIN = PhysgraphConfig(width=16)

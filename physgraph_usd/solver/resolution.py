@@ -28,8 +28,6 @@ AUTO = -1
 MOST = 4
 SAMPLED_FRAMES = 5
 LEAST_STRAIN = 0.01
-HIGHEST_LEVEL = 5
-"""The most that the schema allows."""
 SHARP_FOLD = math.radians(45.0)
 SHARP_FRACTION = 0.01
 """Fraction of sharp folds from which the mesh shows: 0.1% on the T-shirt at level 3, 1.1% at level 2, where it does."""

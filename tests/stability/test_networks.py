@@ -10,13 +10,14 @@ import torch
 from cloth import FABRIC, GUIDE, Watched, finest_system, group_of, sheet, wave
 
 from physgraph_usd.lab.methods.paper_network import PaperConfig
+from physgraph_usd.lab.methods.random_networks import random_network
 from physgraph_usd.solver.fabric import Fabric
 from physgraph_usd.solver.integrate.base import Carry, System
 from physgraph_usd.solver.integrate.descend import solve_level
 from physgraph_usd.solver.integrate.guard import Guard
 from physgraph_usd.solver.integrate.network import VECTORS, PhysgraphConfig
 from physgraph_usd.solver.integrate.stop import Budget
-from physgraph_usd.solver.integrate.weights import integrator_of, random_network, shipped_network
+from physgraph_usd.solver.integrate.weights import integrator_of, shipped_network
 from physgraph_usd.solver.scene import GarmentFrame
 
 RANDOM = {

@@ -14,7 +14,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Protocol, cast
 
-import torch
 from jaxtyping import Float
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
@@ -179,14 +178,3 @@ def _config(kind: str, values: dict[str, Any]) -> Any:
     if unknown:
         raise ValueError(f"unknown vectors {unknown}")
     return made
-
-
-def random_network(config: Any, *, seed: int, scale: float = 1.0) -> Any:
-    """A network with random weights, including the last layer: a stress test for the guard."""
-    generator = torch.Generator().manual_seed(seed)
-    network = make_network(config)
-    with torch.no_grad():
-        for parameter in network.parameters():
-            fan = parameter.shape[-1] if parameter.dim() > 1 else 1
-            parameter.copy_(scale * torch.randn(parameter.shape, generator=generator) / fan**0.5)
-    return network.requires_grad_(False).eval()
