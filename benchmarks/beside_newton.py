@@ -40,7 +40,8 @@ from physgraph_usd.solver.frame.settings import SolveSettings
 from physgraph_usd.solver.level import Level, build_levels, refine_garments
 
 CHOSEN = ("curtain", "ball", "elbow", "body")
-"""Scenes: gathered cloth without a body, cloth over a ball, a sleeve on an arm that bends."""
+"""Scenes: gathered cloth without a body, cloth over a ball, a sleeve on an arm that bends, and a
+shot's garment on its body."""
 FABRIC = "jersey"
 APART = 0.25
 """Contact distance of cloth in Newton's solvers, relative to the mesh's spacing."""
@@ -128,13 +129,13 @@ class Task:
 
     Attributes:
         scene: Name of the scene.
-        subdivisions: Of the fine mesh.
-        method: What is measured.
-        device: Where.
-        frames: How many.
-        python: One that has Newton.
-        folder: For the cages' positions; has a file "lock".
-        shot: File, garment and body of the scene that is a shot's.
+        subdivisions: Subdivisions of the fine mesh.
+        method: Method that is measured.
+        device: "cuda" or "cpu".
+        frames: Number of frames.
+        python: Path of a Python with Newton.
+        folder: Folder of the cages' positions and of the file "lock", which rows on a card hold in turns.
+        shot: File, garment and body of the scene "body"; empty for other scenes.
     """
 
     scene: str

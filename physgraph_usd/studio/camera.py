@@ -16,7 +16,7 @@ from .picture import Picture
 FIELD = np.radians(30.0)
 """Field of view across the picture's height [rad]: a long lens, as for garments in a catalogue."""
 ROOM = 0.92
-"""Part of the picture that framed garments fill, in the direction in which they are larger."""
+"""Fraction of the picture's width or height, whichever is fuller, filled by framed garments."""
 ASPECT = 1.17
 """Width of the picture in heights, until the browser has told it."""
 ABOVE = 0.18

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import http
 import io
+import re
 import secrets
 from collections.abc import Callable
 from contextlib import redirect_stdout
@@ -18,13 +19,13 @@ from ..errors import UsageError
 
 ADDRESS = "127.0.0.1"
 """Where the page is served: on this machine alone."""
-_NAMES = (ADDRESS, "localhost")
+_HOST = re.compile(rf"({re.escape(ADDRESS)}|localhost)(:\d+)?")
 
 
 def _refusal(request: Request, token: str) -> str | None:
     """The reason to refuse a request whose path must begin with a secret; None to accept."""
     hosts, origins = (request.headers.get_all(name) for name in ("Host", "Origin"))
-    if len(hosts) != 1 or hosts[0].partition(":")[0] not in _NAMES:
+    if len(hosts) != 1 or not _HOST.fullmatch(hosts[0]):
         return "another host"
     if any(origin != f"http://{hosts[0]}" for origin in origins):
         return "a page of another site"
@@ -35,9 +36,9 @@ def _refusal(request: Request, token: str) -> str | None:
 
 
 def guarded_server(*, port: int, label: str) -> tuple[viser.ViserServer, str]:
-    """A viewer on this machine, at this port or the next free one, and its address, which alone opens it.
+    """A viewer on this machine, at a port or the next free one, and the only URL that opens the viewer.
 
-    Every request and websocket handshake is checked before the viewer sees it, which has no hook of its own for that.
+    viser has no hook to check requests, so its websocket server is replaced: every request and handshake is checked.
 
     Raises:
         UsageError: The viewer is of a version that cannot be guarded.

@@ -83,7 +83,7 @@ class Picture:
         return {k: self._skins.meshes[name] for k, name in names.items() if name in self._skins.meshes}
 
     def draw(self, shown: Shown, *, kept: Shown | None = None) -> None:
-        """Draw a frame, or its cages where it has no refined cloth yet; ``kept`` is A's."""
+        """Draw a frame, or cages if no refined cloth exists; ``kept`` is the frame kept as A."""
         with self._server.atomic():  # Pictures between two states are never drawn.
             self.bar = None
             garments = range(len(shown.points))
@@ -150,7 +150,7 @@ class Picture:
         return np.zeros(3) if self.view.wiped else (place - 0.5 * (count - 1)) * self._across * self.axes[0]
 
     def _places(self, columns: Sequence[str]) -> dict[str, np.ndarray]:
-        """Where the label of each column stands, by its text: over its garments, or its side of a wipe [m]."""
+        """Positions of labels [m], shape (3,), by text: above the garments of each column or side of a wipe."""
         top = ((self._cloth - self.centre) @ self.axes[1]).max() * self.axes[1]
         apart = (0.5 if self.view.wiped else 1.0) * self._across * self.axes[0]
         texts = [BESIDE_A if name == FINE and KEPT in columns else name for name in columns]

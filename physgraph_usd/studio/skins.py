@@ -149,7 +149,7 @@ class Skins:
                 self._show(name, opacity=None, visible=True)
 
     def _conceal(self, name: str, skin: Skin) -> None:
-        """Hide a plain mesh under its skin; a mesh in `touched` becomes transparent, so that the mouse meets it."""
+        """Hide a plain mesh; meshes in `touched` become transparent instead, and the mouse still hits them."""
         with self._lock:
             if self._skins.get(name) is skin:
                 touched = name in self.touched

@@ -205,12 +205,13 @@ class LevelForces:
     def tether(self, stiffness: float, predicted: Float[Tensor, "vertices 3"]) -> Tether:
         """The tie to predicted positions [m], of stiffness [1/s^2]."""
         if stiffness not in self._tethers:
+            self._tethers.clear()
             self._tethers[stiffness] = Tether(self.level, self.density, stiffness, predicted)
         return self._tethers[stiffness].towards(predicted)
 
     @cached_property
     def _tethers(self) -> dict[float, Tether]:
-        """The tethers of past frames by stiffness [1/s^2], for their weights."""
+        """The last frame's tether by stiffness [1/s^2], whose weights are used again."""
         return {}
 
 
