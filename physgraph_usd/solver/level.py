@@ -19,6 +19,7 @@ from .grain import SHORTEST, LevelGrain, axes, edge_cosines
 from .mesh.defects import NO_AREA
 from .mesh.elements import QUAD_SPRING, ElasticElements, elastic_elements, hinge_geometry
 from .mesh.lengths import FOLDS, LENGTHS, NORMALS, ElementValues
+from .mesh.recorded import Recordings
 from .mesh.stencil import Stencil
 from .mesh.subdivide import (
     Refinement,
@@ -155,6 +156,16 @@ class Level:
     def dtype(self) -> torch.dtype:
         """Scalar type of the tensors."""
         return self.rest.dtype
+
+    @cached_property
+    def all_free(self) -> bool:
+        """Whether no vertex is fixed."""
+        return bool(self.free.all())
+
+    @cached_property
+    def recordings(self) -> Recordings:
+        """Functions of the level's vertices, recorded on a card."""
+        return Recordings()
 
     @property
     def device(self) -> str:

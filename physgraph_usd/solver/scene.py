@@ -5,6 +5,7 @@ Everything here is SI, in world space, without USD. Only ``usd/`` converts.
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -204,19 +205,35 @@ def recentred(garment: Garment) -> Garment:
     return replace(garment, rest=garment.rest - garment.rest.mean(axis=0))
 
 
+@functools.lru_cache(maxsize=64)
 def mean_edge(garment: Garment) -> float:
-    """Mean edge of the cage [m], 0 without edges."""
+    """Mean edge of the cage at rest [m], 0 without edges."""
+    lengths = _rest_edges(garment)
+    return float(lengths.mean()) if len(lengths) else 0.0
+
+
+@functools.lru_cache(maxsize=64)
+def _median_edge(garment: Garment) -> float:
+    """Median edge of a cage with edges at rest [m]."""
+    return float(np.median(_rest_edges(garment)))
+
+
+def _rest_edges(garment: Garment) -> np.ndarray:
+    """Length of each edge of the cage at rest [m]."""
     ends = garment.mesh.half_edges.edges
-    lengths = np.linalg.norm(garment.rest[ends[:, 1]] - garment.rest[ends[:, 0]], axis=1)
-    return float(lengths.mean()) if len(ends) else 0.0
+    return np.linalg.norm(garment.rest[ends[:, 1]] - garment.rest[ends[:, 0]], axis=1)
+
+
+def extent(points: np.ndarray) -> np.ndarray:
+    """How large points, shape (N, 3), are along each axis, shape (3,): axis by axis, for rows of three are slow."""
+    return np.array([np.ptp(points[:, axis]) for axis in range(3)])
 
 
 def out_of_bounds(points: np.ndarray) -> str:
     """Which of positions [m], shape (V, 3), no kernel may see, not finite or beyond `FARTHEST`, in words; or ""."""
-    beyond = ~(np.abs(points) <= FARTHEST).all(axis=1)
-    if not beyond.any():
+    if (np.abs(points) <= FARTHEST).all():
         return ""
-    index = int(beyond.argmax())
+    index = int((~(np.abs(points) <= FARTHEST).all(axis=1)).argmax())
     at = ", ".join(f"{value:g}" for value in points[index])
     return f"point {index} is at ({at}) m; it must be finite and at most {FARTHEST:g} m from the origin"
 
@@ -232,7 +249,8 @@ def refuse_far(scene: Scene, frame: Frame) -> None:
             raise GarmentError(garment.path, problem, time=frame.time, remedy=_REMEDY)
     for collider, pose in zip(scene.colliders, frame.colliders, strict=False):
         corners = np.zeros((0, 3)) if pose is None else pose.corners()
-        if problem := out_of_bounds(corners[~np.isnan(corners).any(axis=1)]):
+        corners = corners[~np.isnan(corners).any(axis=1)] if np.isnan(corners).any() else corners
+        if problem := out_of_bounds(corners):
             raise GarmentError(collider.path, problem, time=frame.time, remedy=_REMEDY)
 
 
@@ -244,9 +262,10 @@ def _unsolvable(garment: Garment, points: np.ndarray) -> str:
     ends = garment.mesh.half_edges.edges
     if not len(ends) or len(points) != len(garment.rest):
         return ""
-    now, rest = (
-        float(np.median(np.linalg.norm(x[ends[:, 1]] - x[ends[:, 0]], axis=1))) for x in (points, garment.rest)
-    )
+    rest, size = _median_edge(garment), float(np.linalg.norm(extent(points)))
+    if size <= OUTGROWN * rest and np.finfo(np.float32).eps * size <= RESOLVED * rest:
+        return ""
+    now = float(np.median(np.linalg.norm(points[ends[:, 1]] - points[ends[:, 0]], axis=1)))
     if now > OUTGROWN * rest > 0:
         return f"the cage's edges are of {now:.3g} m, those of its rest shape, to which cloth shrinks, of {rest:.3g} m"
     edge = max(now, rest)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .mesh.topology import joined_by
-from .scene import Garment
+from .scene import Garment, extent
 
 STRAINED = 1.1
 """Area over rest area, or its inverse, from which a face is strained."""
@@ -84,11 +84,6 @@ def strained_parts(
                 where = _where(garment, faces, subsets, up)
                 parts.append(StrainedPart(where, len(faces), round(size, 3), round(share, 4)))
     return sorted(parts, key=lambda part: -part.share)
-
-
-def extent(points: np.ndarray) -> np.ndarray:
-    """How large points, shape (N, 3), are along each axis, shape (3,): axis by axis, for rows of three are slow."""
-    return np.array([np.ptp(points[:, axis]) for axis in range(3)])
 
 
 def size_left(garment: Garment, points: np.ndarray) -> float:

@@ -59,7 +59,7 @@ class LearnedPaper:
     def propose(self, system: System, carry: Carry) -> Float[Tensor, "vertices 3"]:
         """The displacement of the next step [m]."""
         memory: _History = carry.memory
-        config, level = self._network.config, level_of(system)
+        config, level = self._network.config, level_of(system.level)
         if level not in _EDGES:
             _EDGES[level] = DirectedEdges.of(level.edges, len(level.rest))
         edges = _EDGES[level]

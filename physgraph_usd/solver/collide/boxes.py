@@ -12,6 +12,7 @@ each part.
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from enum import IntEnum
 from typing import Any
 
@@ -257,37 +258,37 @@ def boxes_for(topology: Any, device: str) -> Any:
 
 
 @functools.lru_cache(maxsize=16)
-def _filled(value: float, count: int, device: torch.device, dtype: torch.dtype) -> wp.array:
+def _filled(value: float, count: int, device: torch.device, dtype: torch.dtype) -> Tensor:
     """A constant for each vertex, which kernels only read."""
-    return wp.from_torch(torch.full((count,), value, dtype=dtype, device=device))
+    return torch.full((count,), value, dtype=dtype, device=device)
 
 
-def query_of(
+def arrays_of(
     start: Tensor,
     end: Tensor | None = None,
     *,
-    kind: Ask = Ask.MOVE,
-    floor: float = 0.0,
     asked: Tensor | None = None,
     tangle: Tensor | None = None,
     inside: Tensor | None = None,
     radius: Tensor | None = None,
     play: Tensor | None = None,
-    half: float = 0.0,
-) -> Any:
-    """A query as a Warp struct; its arguments are described there. Positions are float64 of shape (V, 3)."""
+) -> list[Tensor]:
+    """The arrays of a query, in order, with constants for those that are None; float64 positions of shape (V, 3)."""
+    given = (
+        (asked, 1.0, torch.bool),
+        (tangle, -1.0, torch.int32),
+        (inside, 0.0, torch.bool),
+        (radius, 0.0, torch.float64),
+        (play, 0.0, torch.float64),
+    )
+    masks = [_filled(fill, len(start), start.device, kind) if each is None else each for each, fill, kind in given]
+    return [each.contiguous() for each in (start, start if end is None else end, *masks)]
+
+
+def query_of(arrays: Sequence[Tensor], *, kind: Ask = Ask.MOVE, floor: float = 0.0, half: float = 0.0) -> Any:
+    """A query as a Warp struct, given its `arrays_of`; the numbers are described there."""
     query = Query()
     query.kind, query.floor, query.half = int(kind), floor, half
-    query.start = wp.from_torch(start.contiguous(), dtype=wp.vec3d)
-    query.end = query.start if end is None else wp.from_torch(end.contiguous(), dtype=wp.vec3d)
-    given = (
-        ("asked", asked, 1.0, torch.bool),
-        ("tangle", tangle, -1.0, torch.int32),
-        ("inside", inside, 0.0, torch.bool),
-        ("radius", radius, 0.0, torch.float64),
-        ("play", play, 0.0, torch.float64),
-    )
-    for name, values, default, dtype in given:
-        array = _filled(default, len(start), start.device, dtype) if values is None else values.contiguous()
-        setattr(query, name, array if values is None else wp.from_torch(array))
+    for name, values in zip(("start", "end", "asked", "tangle", "inside", "radius", "play"), arrays, strict=True):
+        setattr(query, name, wp.from_torch(values, dtype=wp.vec3d if values.ndim == 2 else None))
     return query

@@ -86,7 +86,7 @@ def all_crossings(
         asked: As for `crossings`; crossings with bodies may be missing in clusters without such vertices.
     """
     edge, face = piercing_edges(parts, x, asked).T.contiguous()
-    edges, faces = (torch.tensor(each, dtype=torch.int64, device=x.device) for each in parts.starts)
+    edges, faces = parts.starts
     of_edge, of_face = torch.bucketize(edge, edges, right=True), torch.bucketize(face, faces, right=True)
     with_body = (of_edge > 0) | (of_face > 0)
     own, body = (of_edge == 0)[with_body], torch.maximum(of_edge, of_face)[with_body] - 1

@@ -203,12 +203,15 @@ def find_pairs(
     found: Found,
 ):
     """Pairs of parts of each two clusters, counted even without room, in one task or in a task for each kind and share.
+    Clusters of negative numbers have none.
 
     With several tasks for two clusters, their number is a power of two times `PAIR_KINDS`.
     """
     task = start + wp.tid()
     n, own = task // tasks, task % tasks
     i, j = clusters[n][0], clusters[n][1]
+    if i < 0:
+        return
     share, bits = own // PAIR_KINDS, wp.max(tasks // PAIR_KINDS, 1) - 1
     kind = wp.where(tasks == 1, -1, own % PAIR_KINDS)
     one, other, count = wp.where(query.kind == Ask.CROSSING, Part.EDGE, Part.VERTEX), Part.FACE, wp.int32(0)

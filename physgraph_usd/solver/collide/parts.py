@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -16,14 +17,40 @@ from torch import Tensor
 from ..colliders.base import Solid
 from ..level import Level
 from ..mesh.kernels import start_warp
+from ..mesh.recorded import Recordings
 from ..mesh.stencil import incidence
-from .boxes import bound_clusters, boxes_for, query_of
+from .boxes import arrays_of, bound_clusters, boxes_for, query_of
 from .topology import topology_of
 
-ROOM = 32
-"""Pairs of clusters per cluster for which the first search has room."""
+FIRST_ROOM = 2**14
+"""Room of the first search on a card."""
+TASKS = 12
+"""Tasks of a pair of clusters on a card, each with one of the three kinds of pairs and every fourth part."""
 SIZE = {"cpu": 24, "cuda": 8}
 """Most vertices of a cluster: a thread compares two clusters, and CUDA has more threads."""
+
+
+@dataclass
+class Room:
+    """Room of a level's searches, enlarged when a search needs more; changes no result.
+
+    Attributes:
+        of_each: Pairs of clusters for each cluster.
+        clusters, pairs: Pairs of clusters and of parts; 0 where a search reads how many there are, without a card.
+    """
+
+    of_each: int = 32
+    clusters: int = 0
+    pairs: int = 0
+
+    def lacks(self, of_each: int, clusters: int, pairs: int) -> bool:
+        """Whether a search needed more; from now on there is room for twice as much."""
+        needed = (of_each, clusters if self.clusters else 0, pairs if self.pairs else 0)
+        rooms = (self.of_each, self.clusters, self.pairs)
+        self.of_each, self.clusters, self.pairs = (
+            room if count <= room else 2 * count for count, room in zip(needed, rooms, strict=True)
+        )
+        return rooms != (self.of_each, self.clusters, self.pairs)
 
 
 class Parts:
@@ -34,7 +61,9 @@ class Parts:
         links: Connected vertices: edges and sewn pairs, shape (N, 2), int64.
         lengths: Lengths of the links at rest, 0 if sewn [m], shape (N,), float64.
         boxes: Warp struct of boxes, written by each search.
-        room: Most pairs of clusters that a cluster had in any search, raised by each search; changes no result.
+        room: Room of the searches.
+        tasks: Tasks of a pair of clusters in a search.
+        recordings: The searches, recorded on a card.
         faces: Number of faces, of the cloth and of bodies.
         starts: Number of the first edge and of the first face of each body, after those of the cloth and the bodies
             before.
@@ -66,13 +95,16 @@ class Parts:
         self.topology = topology_of(level, meets, label, size=size, solids=solids)
         edges = np.cumsum([len(level.edges), *(len(each.edges) for each in solids)])
         faces = np.cumsum([len(level.triangles), *(len(each.faces) for each in solids)])
-        self.faces, self.starts = int(faces[-1]), (edges[:-1].tolist(), faces[:-1].tolist())
-        self.boxes, self.room = boxes_for(self.topology, level.device), ROOM
+        self.faces = int(faces[-1])
+        self.starts = tuple(torch.as_tensor(each[:-1].astype(np.int64), device=level.device) for each in (edges, faces))
+        self.boxes, self.recordings = boxes_for(self.topology, level.device), Recordings()
+        self.tasks = 1 if level.device == "cpu" else TASKS
+        self.room = Room() if level.device == "cpu" else Room(clusters=FIRST_ROOM, pairs=FIRST_ROOM)
 
     @cached_property
     def tree(self) -> wp.Bvh:
         """Hierarchy of the clusters' boxes, built at rest."""
-        at_rest = query_of(wp.to_torch(self.topology.rest))
+        at_rest = query_of(arrays_of(wp.to_torch(self.topology.rest)))
         inputs = [0, self.topology, at_rest, self.boxes]
         wp.launch(bound_clusters, dim=self.topology.clusters, inputs=inputs, device=self.level.device)
         return wp.Bvh(self.boxes.low, self.boxes.high)

@@ -8,6 +8,7 @@ not separated by an axis at both ends, and treats the parts of these clusters in
 # pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportIndexIssue=false, reportCallIssue=false, reportGeneralTypeIssues=false
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -17,9 +18,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ..mesh.kernels import KERNELS
-from ..mesh.threads import argument, run
-from .boxes import Ask, Boxes, Query, bound_clusters, bound_parts, boxes_near, query_of
-from .narrow_phase import PAIR_KINDS, Found, check_pairs, find_pairs
+from ..mesh.threads import argument, refit, run
+from .boxes import Ask, Boxes, Query, arrays_of, bound_clusters, bound_parts, boxes_near, query_of
+from .narrow_phase import Found, check_pairs, find_pairs
 from .pairs import NearAt, Pairs, Reach
 from .parts import Parts
 from .topology import LANES, Topology
@@ -29,9 +30,6 @@ wp.set_module_options(KERNELS)
 PAIRS, TASK_PAIRS = 2**21, 16
 """Room for pairs of parts, of all tasks, and at least of a task. Without enough room a search runs twice: with 2**19
 frames of the sample `layers` take 1.15 times as long."""
-TASKS, THREADS = 4 * PAIR_KINDS, 2**18
-"""Tasks of a pair of clusters on CUDA, each with one kind of pairs and every fourth part; and threads running at once.
-With more tasks than threads, a single task per pair is faster: tasks repeat box tests."""
 
 
 @wp.kernel
@@ -74,11 +72,13 @@ def list_clusters(
     end: wp.array(dtype=wp.int32),
     pairs: wp.array(dtype=wp.vec2i),
 ):
-    """Write the pairs of each cluster up to `end`, sorted: the order in the tree depends on the pose at its making."""
+    """Write the pairs of each cluster up to `end`, sorted: the order in the tree depends on the pose at its making.
+
+    Pairs without room are left out, as in `gather_pairs`."""
     i = first + wp.tid()
     if count[i] > 0:
         boxes.met[i] = True
-    for n in range(count[i]):
+    for n in range(wp.min(count[i], room)):
         j = found[i * room + n]
         k = wp.int32(n)
         boxes.met[j] = True
@@ -86,7 +86,7 @@ def list_clusters(
             found[i * room + k] = found[i * room + k - 1]
             k -= 1
         found[i * room + k] = j
-    for n in range(count[i]):
+    for n in range(wp.min(wp.min(count[i], room), pairs.shape[0] - end[i] + count[i])):
         pairs[end[i] - count[i] + n] = wp.vec2i(i, found[i * room + n])
 
 
@@ -102,12 +102,15 @@ def gather_pairs(
     out_value: wp.array(dtype=wp.float64),
     out_face: wp.array(dtype=wp.bool),
 ):
-    """Write the pairs of each task, from the end of the previous task on."""
+    """Write the pairs of each task that had room for them, from the end of the previous task on."""
     i = first + wp.tid()
     begin = wp.int32(0)
     if i > 0:
         begin = end[i - 1]
-    for n in range(end[i] - begin):
+    count = end[i] - begin
+    if count > room:
+        return
+    for n in range(wp.min(count, out_face.shape[0] - begin)):
         out_corners[begin + n] = corners[i * room + n]
         out_value[begin + n] = value[i * room + n]
         out_face[begin + n] = face[i * room + n]
@@ -126,8 +129,8 @@ def near_parts(
     Arguments are as for `blocking_pairs`. Positions of the cloth alone give pairs of the cloth alone, in all searches.
     """
     asked = _of_cloth(parts, x) if asked is None else asked
-    given = {"radius": reach.radius.double(), "play": reach.play.double(), "half": reach.half}
-    return NearAt(_search(parts, query_of(x.double(), kind=Ask.NEAR, asked=asked, inside=inside, **given)), reach)
+    arrays = arrays_of(x.double(), asked=asked, inside=inside, radius=reach.radius.double(), play=reach.play.double())
+    return NearAt(_search(parts, arrays, kind=Ask.NEAR, half=reach.half), reach)
 
 
 def blocking_pairs(
@@ -154,15 +157,16 @@ def blocking_pairs(
         inside: Cloth vertices inside a body, without pairs with bodies; or None.
         near: All near pairs with cloth at the start; None if unknown.
     """
-    given = {"kind": Ask.MOVE, "floor": floor, "asked": asked, "tangle": tangle, "inside": inside}
-    start, end = start.double(), end.double()
+    given = {"asked": asked, "tangle": tangle, "inside": inside}
+    start, end, kept = start.double(), end.double(), {"kind": Ask.MOVE, "floor": floor}
     if near is None:
-        return _search(parts, query_of(start, end, **given)) if bool(asked.any()) else Pairs.empty(0, asked.device)
-    found = _blocking_among(near.pairs, parts, query_of(start, end, **given))
+        none = not bool(asked.any())
+        return Pairs.empty(0, asked.device) if none else _search(parts, arrays_of(start, end, **given), **kept)
+    found = _blocking_among(near.pairs, parts, query_of(arrays_of(start, end, **given), **kept))
     given["asked"] = asked & near.leaving(end - start, floor)
     if not bool(given["asked"].any()):
         return found
-    return found.joined(_search(parts, query_of(start, end, **given)))
+    return found.joined(_search(parts, arrays_of(start, end, **given), **kept))
 
 
 def blocking_and_near(
@@ -179,8 +183,9 @@ def blocking_and_near(
     Arguments are as for `blocking_pairs`; ``asked`` contains all vertices able to move, and is all cloth when None.
     """
     asked = _of_cloth(parts, start) if asked is None else asked
-    given = {"radius": reach.radius.double(), "play": reach.play.double(), "half": reach.half, "floor": floor}
-    found = _search(parts, query_of(start.double(), end.double(), kind=Ask.MOVE_NEAR, asked=asked, **given))
+    given = {"asked": asked, "radius": reach.radius.double(), "play": reach.play.double()}
+    arrays = arrays_of(start.double(), end.double(), **given)
+    found = _search(parts, arrays, kind=Ask.MOVE_NEAR, floor=floor, half=reach.half)
     blocks = found.value < 0.0
     blocking = found.where(blocks)
     near = found.where(~blocks) if len(blocking.face) else found
@@ -192,7 +197,7 @@ def piercing_edges(
 ) -> Int[Tensor, "crossings 2"]:
     """Indices of each crossing edge and face at x [m], sorted; clusters without a queried vertex may be left out."""
     asked = _of_cloth(parts, x) if asked is None else asked
-    found = _search(parts, query_of(x.double(), kind=Ask.CROSSING, asked=asked)).corners[:, :2].long()
+    found = _search(parts, arrays_of(x.double(), asked=asked), kind=Ask.CROSSING).corners[:, :2].long()
     return found[torch.argsort(found[:, 0] * max(parts.faces, 1) + found[:, 1])]
 
 
@@ -200,16 +205,70 @@ def _of_cloth(parts: Parts, x: Tensor) -> Bool[Tensor, " vertices"]:
     return torch.arange(len(x), device=x.device) < parts.level.vertex_count
 
 
-def _search(parts: Parts, query: Any) -> Pairs:
-    table = parts.topology
-    query.clusters = table.clusters if len(query.start) > parts.level.vertex_count else table.cloth_clusters
-    if not query.clusters:
-        return Pairs.empty(0, parts.level.device)
-    clusters = _near_clusters(parts, query, parts.tree)
-    if not len(clusters):
-        return Pairs.empty(0, clusters.device)
-    _launch(parts, bound_parts, query.clusters, parts.topology, query, parts.boxes)
-    return _pairs_of(parts, clusters, query)
+def _search(parts: Parts, arrays: Sequence[Tensor], *, kind: Ask, floor: float = 0.0, half: float = 0.0) -> Pairs:
+    """All pairs of a query, ordered by their clusters, given its `arrays_of`."""
+    table, device = parts.topology, parts.level.device
+    clusters = table.clusters if len(arrays[0]) > parts.level.vertex_count else table.cloth_clusters
+    if not clusters:
+        return Pairs.empty(0, device)
+
+    def query(*arrays: Tensor) -> Any:
+        asked = query_of(arrays, kind=kind, floor=floor, half=half)
+        asked.clusters = clusters
+        return asked
+
+    while True:
+        look = parts.recordings.of((kind, floor, half, clusters), lambda *arrays: _looked(parts, query(*arrays)))
+        counts, near, end, *found = look(*arrays)
+        most, total, over, count = counts.tolist()
+        if not parts.room.lacks(most, total, count):
+            break
+        parts.recordings.clear()
+    out = Pairs(*(each[:count] for each in found))
+    if over:  # Tasks without room are repeated.
+        _again(parts, query(*arrays), near, end, out)
+    return out
+
+
+def _looked(parts: Parts, query: Any) -> tuple[Tensor, ...]:
+    """One pass of a search in the room there is.
+
+    Returns:
+        Most pairs of clusters of a cluster, number of them, of tasks without room, and of pairs of parts; the pairs of
+        clusters; the number of pairs up to each task's end; and the fields of `Pairs`.
+    """
+    room, size, device, tree = parts.room, query.clusters, parts.level.device, parts.tree
+    _launch(parts, bound_clusters, size, parts.topology, query, parts.boxes)
+    refit(tree, device)
+    slots = torch.empty(size * room.of_each, dtype=torch.int32, device=device)
+    own = torch.empty(size, dtype=torch.int32, device=device)
+    inputs = [parts.topology, query, parts.boxes, tree.id, room.of_each, argument(slots), argument(own)]
+    _launch(parts, find_clusters, size, *inputs)
+    last = own.cumsum(dim=0, dtype=torch.int32)
+    near = torch.full((room.clusters or max(int(last[-1]), 1), 2), -1, dtype=torch.int32, device=device)
+    inputs = [argument(slots), argument(own), argument(last), argument(near, wp.vec2i)]
+    _launch(parts, list_clusters, size, room.of_each, parts.boxes, *inputs)
+    _launch(parts, bound_parts, size, parts.topology, query, parts.boxes)
+    tasks = parts.tasks * len(near)
+    each = max(PAIRS // tasks, TASK_PAIRS)
+    begin = torch.arange(0, (tasks + 1) * each, each, dtype=torch.int32, device=device)
+    found, count = Pairs.empty(tasks * each, device), torch.zeros(tasks, dtype=torch.int32, device=device)
+    _find(parts, query, near, begin, count, found)
+    end = count.cumsum(dim=0, dtype=torch.int32)
+    out = Pairs.empty(room.pairs or max(int(end[-1]), 1), device)
+    _launch(parts, gather_pairs, tasks, each, *_arguments(found), argument(end), *_arguments(out))
+    counts = (own.max(), last[-1], (count > each).sum(), count.sum())
+    return torch.stack([value.long() for value in counts]), near, end, out.corners, out.value, out.face
+
+
+def _again(parts: Parts, query: Any, near: Int[Tensor, "clusters 2"], end: Int[Tensor, " tasks"], out: Pairs) -> None:
+    """Write all pairs of the pairs of clusters with a task without room to their places."""
+    begin = torch.nn.functional.pad(end, (1, 0))
+    each = max(PAIRS // len(end), TASK_PAIRS)
+    over = torch.nonzero((begin.diff() > each).reshape(-1, parts.tasks).any(dim=1)).squeeze(1)
+    places = begin[:-1].reshape(-1, parts.tasks)[over].reshape(-1)
+    places = torch.cat([places, end[-1:]])  # Each task has its room.
+    _find(parts, query, near[over], places, torch.zeros_like(places[1:]), out)
 
 
 def _blocking_among(pairs: Pairs, parts: Parts, query: Any) -> Pairs:
@@ -219,71 +278,14 @@ def _blocking_among(pairs: Pairs, parts: Parts, query: Any) -> Pairs:
     return Pairs(pairs.corners, value, pairs.face).where(value < 1.0)
 
 
-def _near_clusters(parts: Parts, query: Any, tree: wp.Bvh) -> Int[Tensor, "pairs 2"]:
-    """Pairs of clusters not separated by an axis at both ends, sorted, int32; bounds the clusters."""
-    size, device = query.clusters, parts.level.device
-    _launch(parts, bound_clusters, size, parts.topology, query, parts.boxes)
-    tree.refit()
-    while True:
-        room = parts.room
-        slots = torch.empty(size * room, dtype=torch.int32, device=device)
-        count = torch.empty(size, dtype=torch.int32, device=device)
-        inputs = [parts.topology, query, parts.boxes, tree.id, room, argument(slots), argument(count)]
-        _launch(parts, find_clusters, size, *inputs)
-        end = count.cumsum(dim=0, dtype=torch.int32)
-        total, most = torch.stack([end[-1], count.max()]).tolist()
-        if most <= room:
-            break
-        parts.room = most
-    out = torch.empty((total, 2), dtype=torch.int32, device=device)
-    inputs = [argument(slots), argument(count), argument(end), argument(out, wp.vec2i)]
-    _launch(parts, list_clusters, size, room, parts.boxes, *inputs)
-    return out
-
-
-def _pairs_of(parts: Parts, clusters: Int[Tensor, "clusters 2"], query: Any) -> Pairs:
-    """The pairs of parts in pairs of clusters; pairs of clusters without enough room are searched again."""
-    size = len(clusters)
-    tasks = _tasks(size, cuda=clusters.is_cuda)
-    room = max(PAIRS // (size * tasks), TASK_PAIRS)
-    begin = torch.arange(0, (size * tasks + 1) * room, room, dtype=torch.int32, device=clusters.device)
-    found, count = _write(parts, clusters, query, begin, size * tasks * room, tasks=tasks)
-    count = count.reshape(size, tasks)
-    fits = (count <= room).all(dim=1)
-    end = torch.where(fits.unsqueeze(1), count, 0).reshape(-1).cumsum(dim=0, dtype=torch.int32)
-    total, fitting = torch.stack([end[-1].long(), fits.sum()]).tolist()
-    out = Pairs.empty(total, clusters.device)
-    _launch(parts, gather_pairs, size * tasks, room, *_arguments(found), argument(end), *_arguments(out))
-    if fitting == size:
-        return out
-    over = torch.nonzero(~fits).squeeze(1)
-    begin = torch.nn.functional.pad(count[over].reshape(-1).cumsum(dim=0, dtype=torch.int32), (1, 0))
-    return out.joined(_write(parts, clusters[over], query, begin, int(begin[-1]), tasks=tasks)[0])
-
-
-def _tasks(size: int, *, cuda: bool) -> int:
-    """Number of tasks of each of some pairs of clusters."""
-    return TASKS if cuda and TASKS * size <= THREADS else 1
-
-
-def _write(
-    parts: Parts,
-    clusters: Int[Tensor, "clusters 2"],
-    query: Any,
-    begin: Int[Tensor, " bounds"],
-    room: int,
-    *,
-    tasks: int,
-) -> tuple[Pairs, Int[Tensor, " tasks"]]:
-    """The pairs of parts of each task from given places on, and the number of pairs of each task."""
-    out, found = Pairs.empty(room, clusters.device), Found()
-    count = torch.zeros(len(clusters) * tasks, dtype=torch.int32, device=clusters.device)
+def _find(parts: Parts, query: Any, near: Tensor, begin: Tensor, count: Tensor, out: Pairs) -> None:
+    """The pairs of parts of pairs of clusters, written from given places on; and the number of pairs of each task."""
+    found = Found()
     found.begin, found.count = wp.from_torch(begin), wp.from_torch(count)
     found.corners = wp.from_torch(out.corners, dtype=wp.vec4i)
     found.value, found.face = wp.from_torch(out.value), wp.from_torch(out.face)
-    inputs = [parts.topology, argument(clusters, wp.vec2i), tasks, query, parts.boxes, found]
-    _launch(parts, find_pairs, len(clusters) * tasks, *inputs)
-    return out, count
+    inputs = [parts.topology, argument(near, wp.vec2i), parts.tasks, query, parts.boxes, found]
+    _launch(parts, find_pairs, len(count), *inputs)
 
 
 def _arguments(pairs: Pairs) -> list[Any]:

@@ -54,16 +54,17 @@ class Pose:
 
     def moved(self, since: Pose, along: Rigid = AT_REST) -> float:
         """Largest distance of a corner from its image of another pose under a motion [m]; infinite for unlike poses."""
-        if not np.array_equal(self.triangles, since.triangles):
+        if self.triangles is not since.triangles and not np.array_equal(self.triangles, since.triangles):
             return np.inf
-        return _farthest(self.corners(), along(since.corners()))
+        return _farthest(self.corners(), since.corners() if along is AT_REST else along(since.corners()))
 
 
 def _farthest(points: np.ndarray, others: np.ndarray) -> float:
     """Largest distance of corresponding points [m], 0 without points; infinite for non-finite points."""
     if points.shape != others.shape:
         return np.inf
-    far = float(np.linalg.norm(points - others, axis=1).max(initial=0.0))
+    way = points - others
+    far = float(np.sqrt(np.einsum("vc,vc->v", way, way).max(initial=0.0)))
     return far if np.isfinite(far) else np.inf
 
 

@@ -7,7 +7,7 @@
 | H | metric of the level that is solved, D its diagonal |
 | Z_l | linear map from level l; l = 0 is the cage, the sum has the levels between |
 | K | stiffness of what touches, a diagonal: three times its mean over directions, since a plane holds in one of them |
-| c, r | `COARSE`, `ROUGH`: about so much that a first step needs no shortening |
+| c, r | `coarse.COARSE`, `ROUGH`: about so much that a first step needs no shortening |
 
 What touches is far stiffer than cloth, so the metric of free cloth misjudges both a patch that is held and the rough
 errors beside planes that turn from vertex to vertex. Here each level sees the contact at its own size (after Bramble,
@@ -26,8 +26,8 @@ from ..integrate.base import Preconditioner, Solver
 from ..integrate.metric import Metric
 from ..mesh.stencil import three_columns
 
-COARSE, ROUGH = 0.7, 2.0
-"""Weights of the parts of P."""
+ROUGH = 2.0
+"""Weight of the finest level's part of P."""
 SHORT = 0.5
 """Fraction of P used by steps without a line search."""
 HELD_TOLERANCE = 0.1
@@ -73,11 +73,8 @@ class HeldMetric:
 
     def solve(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
         """P F [m]; zero at fixed vertices, provided that the force is zero there."""
-        *finer, cage = self._plain.coarse.forces(self._plain.gathered(force))
-        move, ups = self._cage(cage).mul_(COARSE), self._plain.coarse.ups
-        for up, part, factor in zip(ups[::-1], finer[::-1], [self._rough, *self._middle][::-1], strict=True):
-            move = up.apply(move).addcmul_(part, factor)
-        return self._plain.spread(move)
+        force = self._plain.gathered(force)
+        return self._plain.spread(*self._plain.coarse.recorded_move(force, self._cage, self._rough, *self._middle))
 
     def stiffened(self, stiffness: Float[Tensor, " vertices"]) -> Solver:
         """P with max(K, stiffness - D) in place of K: the solve for cloth with at least the given stiffness [N/m]."""

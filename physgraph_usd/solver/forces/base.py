@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from itertools import islice
 from typing import Any, Protocol, runtime_checkable
 
 import scipy.sparse as sp
@@ -39,6 +40,27 @@ class Force(Protocol):
         ...
 
 
+def total_of(terms: Sequence[Force]) -> Callable[..., tuple[Tensor, Tensor, Tensor]]:
+    """A function of positions [m] and all `_aims_of` the terms: their energy [J], force [N], and each energy."""
+
+    def total(x: Tensor, *aims: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        left, now = iter(aims), list[Any]()
+        for each in terms:
+            now.append(each.aimed(*islice(left, count)) if (count := len(_aims_of(each))) else each)
+        force, energy = torch.zeros_like(x), torch.zeros((), dtype=torch.float64, device=x.device)
+        energies = [each.add_force(x, force) for each in now]
+        for each in energies:
+            energy = energy + each
+        return energy, force, torch.stack(energies) if energies else energy.reshape(1)[:0]
+
+    return total
+
+
+def _aims_of(term: Any) -> tuple[Tensor, ...]:
+    """A term's tensors that change from frame to frame, if any; ``term.aimed`` takes others."""
+    return getattr(term, "aims", ())
+
+
 class _Last:
     """The last result of constant terms."""
 
@@ -65,27 +87,36 @@ class ForceModule:
         forces: The terms, in order.
     """
 
-    def __init__(self, forces: Sequence[Force], *, remembers: bool = False) -> None:
+    def __init__(
+        self,
+        forces: Sequence[Force],
+        *,
+        remembers: bool = False,
+        total: Callable[..., Sequence[Tensor]] | None = None,
+    ) -> None:
         """Keep the terms in order; the order fixes the rounding of the sum.
 
         Args:
             remembers: Whether the last result is reused at the same positions: for constant terms.
+            total: As `total_of` terms of this kind; None for `total_of` these.
         """
         self.forces = tuple(forces)
         self._lasting, self._last = self.forces, _Last() if remembers else None
+        self._total = total_of(self.forces) if total is None else total
+        self._aims = [aim for each in self.forces for aim in _aims_of(each)]
 
     def joined_by(self, more: Sequence[Force]) -> ForceModule:
         """This module's terms and more; this module's remembered result is still used at the same positions."""
         joined = ForceModule((*self.forces, *more))
-        joined._lasting, joined._last = self._lasting, self._last
+        joined._lasting, joined._last, joined._total, joined._aims = self._lasting, self._last, self._total, self._aims
         return joined
 
     def energy_and_force(self, x: Float[Tensor, "vertices 3"]) -> tuple[Float[Tensor, ""], Float[Tensor, "vertices 3"]]:
         """Total energy [J], float64 scalar, and force [N] at positions x [m]."""
         total = None if self._last is None else self._last.recall(x)
         if total is None:
-            nothing = torch.zeros((), dtype=torch.float64, device=x.device)
-            total = self._sum(self._lasting, x, (nothing, torch.zeros_like(x)))
+            energy, force, _ = self._total(x, *self._aims)
+            total = energy, force
             if self._last is not None:
                 self._last.keep(x, *total)
         return self._sum(self.forces[len(self._lasting) :], x, total)
@@ -112,7 +143,9 @@ class ForceModule:
 
     def energies(self, x: Float[Tensor, "vertices 3"]) -> dict[str, float]:
         """Energy of each term [J] by name."""
-        return {term.name: float(term.add_force(x, torch.zeros_like(x))) for term in self.forces}
+        others = [term.add_force(x, torch.zeros_like(x)) for term in self.forces[len(self._lasting) :]]
+        values = torch.cat([self._total(x, *self._aims)[2], *(each.reshape(1) for each in others)])
+        return dict(zip((term.name for term in self.forces), values.tolist(), strict=True))
 
     def diagonal(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " vertices"]:
         """Sum of the terms' Hessian diagonals [N/m]."""

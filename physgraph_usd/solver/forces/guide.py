@@ -92,9 +92,20 @@ class Guide:
 
     def retarget(self, coarse: Float[Tensor, "coarse 3"]) -> Guide:
         """These ties, with the coarse positions of one frame as target [m]."""
+        base = self._level.base.apply(coarse)
+        guide = self.aimed(self._map.average.apply(base), base)
+        guide.coarse = coarse
+        return guide
+
+    @property
+    def aims(self) -> tuple[Tensor, ...]:
+        """The averages to reach, and the upsampled cage [m]."""
+        return self._target, self._base
+
+    def aimed(self, *aims: Tensor) -> Guide:
+        """These ties, with other `aims` [m]."""
         guide = copy.copy(self)
-        guide.coarse, guide._base = coarse, self._level.base.apply(coarse)
-        guide._target = self._map.average.apply(guide._base)
+        guide._target, guide._base = aims
         return guide
 
     def add_force(self, x: Float[Tensor, "vertices 3"], force: Float[Tensor, "vertices 3"]) -> Float[Tensor, ""]:

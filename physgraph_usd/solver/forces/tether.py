@@ -54,8 +54,17 @@ class Tether:
 
     def towards(self, predicted: Float[Tensor, "vertices 3"]) -> Tether:
         """These springs, to other positions [m]."""
+        return self.aimed(self._pull, predicted)
+
+    @property
+    def aims(self) -> tuple[Tensor, ...]:
+        """The stiffness of each coordinate [N/m], and the positions [m]."""
+        return self._pull, self.predicted
+
+    def aimed(self, *aims: Tensor) -> Tether:
+        """Springs with other `aims`."""
         tether = copy.copy(self)
-        tether.predicted = predicted
+        tether._pull, tether.predicted = aims
         return tether
 
     def add_force(self, x: Float[Tensor, "vertices 3"], force: Float[Tensor, "vertices 3"]) -> Float[Tensor, ""]:

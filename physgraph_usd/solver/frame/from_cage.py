@@ -22,6 +22,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from ..level import PIN_MARGIN, Level, Placed
+from ..mesh.recorded import Recorded
 from ..mesh.stencil import Stencil, add_at
 from ..mesh.topology import PolygonMesh
 from ..rigid import best_motion
@@ -45,7 +46,7 @@ class MovingFrames:
         self._level, self._triangles = finest, cage.triangles.long()
         triangles, rest = cage.triangles.cpu().numpy(), cage.rest.double().cpu().numpy()
         self._tangent = Stencil(tangent_operator(triangles, rest), dtype=finest.dtype, device=finest.device)
-        self.edge = mean_edge(triangles, rest)
+        self.edge, self._predicted = mean_edge(triangles, rest), Recorded(self._predict)
 
     def frames(self, coarse: Float[Tensor, "coarse 3"]) -> Float[Tensor, "coarse 3 3"]:
         """Orthonormal frames at the cage vertices; columns are tangent, bitangent, normal."""
@@ -67,12 +68,18 @@ class MovingFrames:
         Returns:
             Predicted fine positions [m], the RMS motion of the cage in mean cage edges, and its RMS turn [rad].
         """
+        placed, far = self._predicted(before, fine, coarse)
+        motion, turn = far.tolist()
+        return placed, motion / self.edge, turn
+
+    def _predict(self, before: Tensor, fine: Tensor, coarse: Tensor) -> tuple[Tensor, Tensor]:
+        """As `predict`, with the motion in metres."""
         detail, last, frames = fine - self._level.smooth_base.apply(before), self.frames(before), self.frames(coarse)
         moved = torch.einsum("vij,vj->vi", self._turned(last, frames), detail)
-        motion = float((coarse - before).square().sum(dim=1).mean().sqrt()) / self.edge
+        motion = (coarse - before).square().sum(dim=1).mean().sqrt()
         cosine = (torch.einsum("cij,cij->c", frames, last) - 1.0) / 2.0
-        turn = float(torch.arccos(cosine.clamp(-1.0, 1.0)).square().mean().sqrt())
-        return self._level.smooth_base.apply(coarse) + moved, motion, turn
+        turn = torch.arccos(cosine.clamp(-1.0, 1.0)).square().mean().sqrt()
+        return self._level.smooth_base.apply(coarse) + moved, torch.stack([motion, turn])
 
     def scaled(
         self, coarse: Float[Tensor, "coarse 3"], fine: Float[Tensor, "vertices 3"], gain: np.ndarray
@@ -89,7 +96,8 @@ class MovingFrames:
     ) -> Float[Tensor, "vertices 3 3"]:
         """Rotation of the cage frames, interpolated to the fine vertices; identity if either frame is degenerate."""
         turned = torch.einsum("cij,ckj->cik", after, before)
-        whole = (torch.linalg.det(turned) > 0.5).unsqueeze(1).unsqueeze(2)
+        volume = (torch.linalg.cross(turned[:, 0], turned[:, 1]) * turned[:, 2]).sum(dim=1)
+        whole = (volume > 0.5).unsqueeze(1).unsqueeze(2)
         turned = torch.where(whole, turned, torch.eye(3, dtype=turned.dtype, device=turned.device))
         first, last = (self._level.base.apply(turned[:, :, column].contiguous()) for column in (0, 2))
         return orthonormal(last, first)

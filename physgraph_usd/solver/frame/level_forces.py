@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ..fabric import Fabric
 from ..forces import bending_term, body_terms
-from ..forces.base import Force, ForceModule
+from ..forces.base import Force, ForceModule, total_of
 from ..forces.guide import Guide, GuideMap
 from ..forces.membrane import in_plane_terms
 from ..forces.tether import Tether
@@ -21,6 +21,7 @@ from ..integrate.base import ForceField, Preconditioner, System
 from ..integrate.metric import Metric, on_edges
 from ..integrate.saddle import facets
 from ..level import Level
+from ..mesh.recorded import Recordings
 from ..mesh.stencil import Stencil
 from ..scene import Garment, GarmentFrame
 
@@ -178,7 +179,11 @@ class LevelForces:
 
     def module(self, coarse: Float[Tensor, "coarse 3"]) -> ForceModule:
         """All terms of one frame, given the recentred coarse positions [m]."""
-        return ForceModule((*self.terms, self.guide.retarget(coarse)))
+        return self._joined((*self.terms, self.guide.retarget(coarse)))
+
+    def _joined(self, terms: Sequence[Force], *, remembers: bool = False) -> ForceModule:
+        """The terms as one, recorded together."""
+        return ForceModule(terms, remembers=remembers, total=self._totals.of(len(terms), total_of(terms)))
 
     def system(
         self,
@@ -195,7 +200,12 @@ class LevelForces:
         """
         forces = module.forces if tie is None else (*module.forces, self.tether(*tie))
         metric = self.rough_metric if rough else self.metric
-        return self.system_in(ForceModule(forces, remembers=True), metric)
+        return self.system_in(self._joined(forces, remembers=True), metric)
+
+    @cached_property
+    def _totals(self) -> Recordings:
+        """`total_of` the terms by their number: with a tether or without."""
+        return Recordings()
 
     def system_in(self, field: ForceField, metric: Preconditioner | None = None) -> System:
         """The system of the level in any field, with the level's metric by default."""

@@ -141,7 +141,7 @@ def solve_one_level(
             integrator, carry = problem.untangler, None
         elif blocked:  # The guard's corrections do not apply to the blocked positions.
             carry = None if carry.setbacks else replace(carry, x=x)
-    return x, reports, ForceModule((*problem.module.forces, *terms))
+    return x, reports, problem.module.joined_by(terms)
 
 
 def _with_cage_untangled(problem: Problem, *, since: float) -> tuple[Problem, list[LevelReport]]:

@@ -83,9 +83,13 @@ class System:
         """Combine a force field with its metric and mask."""
         self.field, self.metric = field, metric
         self.free, self.spacing, self.level = free, spacing, level
-        self._all_free = bool(free.all())
-        self._mask = three_columns(free.squeeze(1).to(spacing.dtype))
+        self._all_free = level.all_free if level is not None and free is level.free else bool(free.all())
         self.evaluations = self.metric_solves = self.failed = 0
+
+    @cached_property
+    def _mask(self) -> Float[Tensor, "vertices 3"]:
+        """1 at free vertices, 0 at fixed ones."""
+        return three_columns(self.free.squeeze(1).to(self.spacing.dtype))
 
     @property
     def counted(self) -> tuple[int, int, int]:

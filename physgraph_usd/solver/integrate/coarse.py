@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -24,29 +24,17 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ..mesh.recorded import Recorded
 from ..mesh.stencil import Stencil, three_columns
 from .base import Solver
 from .factors import Factors
 
+COARSE = 0.7
+"""Weight of the cage's part of P."""
+MOST_DENSE = 6000
+"""Most vertices of a cage that is solved by its inverse matrix, on a card: a dense factor needs no host."""
 REGULARISATION = 1e-7
 """Regularisation of a factorised diagonal, relative to its mean: keeps loose parts without a guide definite."""
-
-
-@dataclass(eq=False)
-class CageSolve:
-    """The solve of A_0.
-
-    Attributes:
-        solver: The solve of the scaled matrix.
-        scale: Scaled matrix over A_0 [m/N], a scalar.
-    """
-
-    solver: Solver
-    scale: Float[Tensor, ""]
-
-    def __call__(self, force: Float[Tensor, "cage 3"]) -> Float[Tensor, "cage 3"]:
-        """A_0^-1 F [m]."""
-        return self.solver(force * self.scale)
 
 
 class CoarseLevels:
@@ -54,6 +42,8 @@ class CoarseLevels:
 
     Attributes:
         ups: Linear map to each level from the next coarser one, finest first; at the cage, from itself.
+        dense: Whether the cage is solved by its inverse matrix.
+        recorded_move: `move`, recorded.
     """
 
     def __init__(
@@ -90,16 +80,41 @@ class CoarseLevels:
         self._sizes = [len(each) for each in known]
         self._known = torch.as_tensor(np.concatenate(known), device=device)
         self._weights = Stencil(sp.csr_matrix(sp.vstack(weights)), dtype=torch.float64, device=device)
-        self._dtype = dtype
+        self._dtype, self.dense = dtype, device != "cpu" and 0 < basis.shape[1] <= MOST_DENSE
+        self.recorded_move = Recorded(self.move)
 
-    def held(self, stiff: Float[Tensor, " vertices"]) -> tuple[list[Tensor], CageSolve]:
-        """Diagonals of the levels between [N/m], finest first, and the solve of the cage, given K [N/m]."""
+    def held(self, stiff: Float[Tensor, " vertices"]) -> tuple[list[Tensor], Solver | Float[Tensor, "cage cage"]]:
+        """Diagonals of the levels between [N/m], finest first, and the solve of the cage, given K [N/m].
+
+        The solve is the inverse matrix if `dense`, else a function.
+        """
         entries = self._known + self._weights.apply(three_columns(stiff.double()))[:, 0]
         *between, cage = entries.split(self._sizes)
         scale = cage[self._factors.diagonal].mean().reciprocal()
         cage = cage * scale
         cage[self._factors.diagonal] += REGULARISATION
-        return [each.to(stiff) for each in between], CageSolve(self._factors.of(cage), scale.to(stiff))
+        scale, between = scale.to(stiff), [each.to(stiff) for each in between]
+        if self.dense:
+            return between, self._factors.inverse(cage).mul_(scale)
+        solver = self._factors.of(cage)
+        return between, lambda force: solver(force * scale)
+
+    def move(
+        self, force: Float[Tensor, "vertices 3"], cage: Any, rough: Float[Tensor, "vertices 3"], *middle: Tensor
+    ) -> tuple[Float[Tensor, "vertices 3"]]:
+        """P F [m], as in `contact.metric`.
+
+        Args:
+            force: F [N].
+            cage: The solve of the cage.
+            rough: Factor of the finest level's part [m/N].
+            middle: Factors of the levels' between, finest first.
+        """
+        *finer, low = self.forces(force)
+        move = (cage @ low if isinstance(cage, Tensor) else cage(low)).mul_(COARSE)
+        for up, part, factor in zip(self.ups[::-1], finer[::-1], [rough, *middle][::-1], strict=True):
+            move = up.apply(move).addcmul_(part, factor)
+        return (move,)
 
     def forces(self, force: Float[Tensor, "vertices 3"]) -> list[Float[Tensor, "_ 3"]]:
         """Z_l^T F of all levels, finest first [N]."""

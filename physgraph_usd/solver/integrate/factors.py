@@ -60,6 +60,12 @@ class Factors:
             return _of_scipy(sp.coo_matrix((values.cpu().numpy(), place), shape=shape))
         return _of_cholespy(cholespy, values, self.rows.int(), self.columns.int(), self._dtype)
 
+    def inverse(self, values: Float[Tensor, " entries"]) -> Float[Tensor, "V V"]:
+        """The inverse of a matrix with these entries, as a dense matrix."""
+        matrix = torch.zeros((self._count, self._count), dtype=self._dtype, device=values.device)
+        matrix[self.rows, self.columns] = values.to(self._dtype)
+        return torch.cholesky_inverse(torch.linalg.cholesky_ex(matrix)[0]).contiguous()
+
 
 def _of_cholespy(module: Any, values: Tensor, rows: Tensor, columns: Tensor, dtype: torch.dtype) -> Solver:
     kind = module.CholeskySolverD if dtype == torch.float64 else module.CholeskySolverF

@@ -113,6 +113,7 @@ class FusedPhysgraph:
         bias = torch.cat([_padded(layer.bias, to) for layer, to in zip(layers, widths, strict=True)])
         bias[-widths[-1]] += 1.0
         self._bias, self._clock = bias, _padded(network.encode_means.weight[:, 0], len(bias))
+        self._biases: dict[int, Tensor] = {}
         inputs = (layers[0].in_features, *widths[:-1])
         sizes = zip(layers, inputs, widths, strict=True)
         self._weights = torch.cat([_padded(layer.weight.T, from_, to).reshape(-1) for layer, from_, to in sizes])
@@ -128,7 +129,7 @@ class FusedPhysgraph:
         bases: Sequence[Float[Tensor, "vertices 3"]],
         spacing: Float[Tensor, " vertices"],
         reach: Float[Tensor, " vertices"],
-        step: int,
+        bias: Float[Tensor, " outputs"],
         *,
         frame: Callable[[], VertexFrame],
     ) -> Float[Tensor, "vertices 3"]:
@@ -138,17 +139,22 @@ class FusedPhysgraph:
             bases: The vectors named by `bases` [m].
             spacing: Mean rest edge at each vertex [m].
             reach: The spacing, and 0 at fixed vertices [m].
-            step: Number of previous steps.
+            bias: As `bias_at` a number of previous steps.
             frame: Gives the surroundings of the vertices; called only if parts need them.
         """
         torch.stack(list(bases), out=self._rows)
-        bias = self._bias + self._clock * clock_of(step)
         changed = {2: argument(spacing), 3: argument(reach), 10: argument(bias)}
         if self._frames:
             surface = frame()
             changed |= {4: surface.positions} | dict(enumerate(surface.mesh, start=5))
         self._launch(changed)
         return self._out.clone()
+
+    def bias_at(self, step: int) -> Float[Tensor, " outputs"]:
+        """The layers' biases after a number of previous steps."""
+        if step not in self._biases:
+            self._biases[step] = self._bias + self._clock * clock_of(step)
+        return self._biases[step]
 
 
 def _padded(values: Tensor, *shape: int) -> Tensor:

@@ -15,7 +15,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Sequence
 from functools import cache, partial
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Float
@@ -26,7 +26,7 @@ from ..level import Level
 from .base import Carry, System
 from .fused import FusedPhysgraph, fused_physgraph
 from .network import Physgraph
-from .quasi_newton import StepHistory, dot, secant_direction
+from .quasi_newton import Secant, StepHistory, dot, secant_direction
 from .vertex_frame import VertexFrame
 
 NetworkT = TypeVar("NetworkT", bound=nn.Module)
@@ -77,15 +77,48 @@ class LearnedMetric:
         """The carry at x [m], a displacement away from the previous carry."""
         energy, force = system.energy_and_force(x)
         image = system.apply_short_inverse(force)
-        numbers = self._trained and not system.spacing.is_cuda  # Waiting for numbers costs nothing.
-        spans = system.level.spans if numbers and system.level is not None and len(system.level.spans) > 1 else ()
-        product = dot if numbers else partial(garment_dot, system.level)
-        memory = carry.memory.after(carry, move, force, image, dot=product, spans=spans)
-        return Carry(x, energy, force, image, self.name, memory)
+        newest = self._secant(system, (carry.force, force, carry.preconditioned, image, move))
+        return Carry(x, energy, force, image, self.name, carry.memory.after(carry, newest))
+
+    def _secant(self, system: System, ends: tuple[Any, ...]) -> Secant:
+        """The secant of a step, given F and H0^-1 F before and after, and the displacement."""
+        before, force, image_before, image, move = ends
+        level = system.level
+        if self._trained and not move.is_cuda:  # Waiting for numbers costs nothing.
+            spans = level.spans if level is not None and len(level.spans) > 1 else ()
+            return Secant(move, before - force, image_before - image, dot, spans)
+        product = partial(garment_dot, level)
+        if not self._trained or level is None:
+            return Secant(move, before - force, image_before - image, product)
+
+        def parts(before: Tensor, force: Tensor, image_before: Tensor, image: Tensor, move: Tensor) -> Sequence[Tensor]:
+            made = Secant(move, before - force, image_before - image, product)
+            return made.yields, made.image, made.curvature
+
+        yields, change, curvature = level.recordings.of("secant", parts)(*ends)
+        return Secant(move, yields, change, product, known=curvature)
 
     def propose(self, system: System, carry: Carry) -> Float[Tensor, "vertices 3"]:
         """The displacement of the next step [m]."""
-        return self._combined(carry, system=system, fused=self._fused(system))
+        fused, memory, level = self._fused(system), carry.memory, system.level
+        if fused is None:
+            return self._combined(system, carry)
+        bias, stiffness = fused.bias_at(memory.step), system.rest_diagonal_columns
+        place = (fused, level, system.spacing, system.reach)
+        if level is None or not carry.x.is_cuda:
+            return _of_kernel(carry, stiffness, bias, *place)
+        product = partial(garment_dot, level)
+
+        def move(
+            x: Tensor, force: Tensor, image: Tensor, stiffness: Tensor, bias: Tensor, *past: Tensor
+        ) -> list[Tensor]:
+            ends = [Secant(*past[at : at + 3], product, known=past[at + 3]) for at in range(3, len(past), 4)]
+            there = Carry(x, 0.0, force, image, memory=StepHistory(past[0], past[1:3], tuple(ends)))
+            return [_of_kernel(there, stiffness, bias, *place)]
+
+        past = [part for each in memory.secants for part in (each.move, each.yields, each.image, each.curvature)]
+        now = (carry.x, carry.force, carry.preconditioned, stiffness, bias)
+        return level.recordings.of(fused, move)(*now, memory.force, *memory.images, *past)[0]
 
     def _fused(self, system: System) -> FusedPhysgraph | None:
         """The network as kernels, or None if not fused."""
@@ -95,27 +128,36 @@ class LearnedMetric:
         spacing = system.spacing
         return fused_physgraph(self._network, len(spacing), LONGEST_STEP, device=str(spacing.device), threads=threads)
 
-    def _combined(self, carry: Carry, *, system: System, fused: FusedPhysgraph | None) -> Tensor:
+    def _combined(self, system: System, carry: Carry) -> Tensor:
         """The network's combination of vectors [m]."""
-        names, step = self._network.config.vectors, carry.memory.step
-        frame = cache(lambda: VertexFrame(level_of(system), carry.x))
-        whole = partial(_vector, system=system, carry=carry)
-        if fused is not None:
-            return fused(vectors_of(fused.bases, whole, frame=frame), system.spacing, system.reach, step, frame=frame)
-        stacked = torch.stack(vectors_of(names, whole, frame=frame), dim=1)  # V N 3
-        coefficients = self._network(stacked / system.spacing.reshape(-1, 1, 1), step)  # V N
+        frame = cache(lambda: VertexFrame(level_of(system.level), carry.x))
+        whole = partial(_vector, carry=carry, stiffness=system.rest_diagonal_columns)
+        stacked = torch.stack(vectors_of(self._network.config.vectors, whole, frame=frame), dim=1)  # V N 3
+        coefficients = self._network(stacked / system.spacing.reshape(-1, 1, 1), carry.memory.step)  # V N
         move = (coefficients.unsqueeze(2) * stacked).sum(dim=1)  # V 3
         return limited(move, system.spacing) * system.free
 
 
-def _vector(name: str, *, system: System, carry: Carry) -> Tensor:
+def _of_kernel(
+    carry: Carry, stiffness: Tensor, bias: Tensor, fused: FusedPhysgraph, level: Level | None, *sizes: Tensor
+) -> Tensor:
+    """As `LearnedMetric.propose`, by the network as a kernel."""
+
+    def frame() -> VertexFrame:
+        return VertexFrame(level_of(level), carry.x)
+
+    whole = partial(_vector, carry=carry, stiffness=stiffness)
+    return fused(vectors_of(fused.bases, whole, frame=frame), *sizes, bias, frame=frame)
+
+
+def _vector(name: str, *, carry: Carry, stiffness: Tensor) -> Tensor:
     """One of `network.WHOLE` [m]; zero if the history is too short."""
     memory: StepHistory = carry.memory
     if name == "secant":
         assert carry.preconditioned is not None
         return secant_direction(carry.force, carry.preconditioned, memory.secants)
     if name.startswith("diagonal"):
-        return (memory.force if name == "diagonal1" else carry.force) / system.rest_diagonal_columns
+        return (memory.force if name == "diagonal1" else carry.force) / stiffness
     if name.startswith("metric"):
         image = (carry.preconditioned, *memory.images)[int(name.removeprefix("metric") or 0)]
         assert image is not None
@@ -167,12 +209,12 @@ def garment_dot(level: Level | None, a: Tensor, b: Tensor) -> Tensor:
     return each.new_zeros(len(level.spans), 1).index_add_(0, owner, each)[owner]
 
 
-def level_of(system: System) -> Level:
+def level_of(level: Level | None) -> Level:
     """The level of a system.
 
     Raises:
         SolveError: The system has no level.
     """
-    if system.level is None:
+    if level is None:
         raise SolveError("this network needs a mesh, and the system has none")
-    return system.level
+    return level

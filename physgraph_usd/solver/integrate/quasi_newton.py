@@ -240,6 +240,9 @@ class Secant:
     """Differences of positions, of negative forces, of their images under H0^-1, and the scalar product to use.
 
     Garments are treated one after another if ``spans`` has their vertices.
+
+    Attributes:
+        known: The `curvature`, if known.
     """
 
     move: Tensor
@@ -247,6 +250,7 @@ class Secant:
     image: Tensor
     dot: Dot = dot
     spans: tuple[slice, ...] = ()
+    known: Tensor | None = None
 
     @cached_property
     def parts(self) -> list[Secant]:
@@ -256,6 +260,8 @@ class Secant:
     @cached_property
     def curvature(self) -> Any:
         """s.y, infinite if not safely positive: the secant then has no effect."""
+        if self.known is not None:
+            return self.known
         dot = self.dot
         curvature, size = dot(self.move, self.yields), dot(self.yields, self.image)
         floor = 1e-8 * (dot(self.move, self.move) * dot(self.yields, self.yields)) ** 0.5
@@ -280,12 +286,9 @@ class StepHistory:
     secants: tuple[Secant, ...] = ()
     step: int = 0
 
-    def after(
-        self, carry: Carry, move: Tensor, force: Tensor, image: Tensor, *, dot: Dot, spans: tuple[slice, ...]
-    ) -> StepHistory:
-        """The memory after a displacement [m] from a carry with this memory; force [N] and image [m] are at the end."""
+    def after(self, carry: Carry, newest: Secant) -> StepHistory:
+        """The memory after a step from a carry with this memory."""
         assert carry.preconditioned is not None
-        newest = Secant(move, carry.force - force, carry.preconditioned - image, dot, spans)
         images = (carry.preconditioned, self.images[0])
         return StepHistory(carry.force, images, (*self.secants, newest)[-SECANTS:], self.step + 1)
 

@@ -13,6 +13,7 @@ import time
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
+from contextlib import nullcontext
 from itertools import pairwise
 from typing import Any
 
@@ -112,6 +113,12 @@ def run(
         Launch(kernel, size, inputs, device=device, threads=threads)({})
     elif size:
         wp.launch(kernel, dim=size, inputs=[0, *inputs], device=device, stream=current_stream(device))
+
+
+def refit(tree: wp.Bvh | wp.Mesh, device: str) -> None:
+    """Refit a hierarchy to its changed boxes or points, on the stream of the kernels."""
+    with nullcontext() if device == "cpu" else wp.ScopedStream(current_stream(device), sync_enter=False):
+        tree.refit()
 
 
 def argument(tensor: Tensor, dtype: type | None = None) -> Any:
