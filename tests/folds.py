@@ -127,7 +127,8 @@ def view_of(
     settings = ContactSettings(cloth=form, stiffness=stiffness)
     base = levels[-1].base.apply(levels[0].rest)
     base = base + 1e3 * levels[-1].vertex_garment.unsqueeze(1)  # The input has no two garments near one another.
-    return LevelContact(lasting, levels[-1], base=base, thickness=each, settings=settings, seam=seam)
+    given = {"base": base, "thickness": each, "settings": settings, "seam": seam}
+    return LevelContact(lasting, levels[-1], **given, doubtful=levels[-1].free[:, 0] | True)
 
 
 def sewn(garments: Sequence[Garment], *cages: np.ndarray) -> list[Garment]:

@@ -35,9 +35,8 @@ def view_of(levels: tuple[Level, ...], cage: torch.Tensor, *soups: Any) -> Level
     touching = [Touching(f"/Body{index}", each, (0.002,)) for index, each in enumerate(posed)]
     bodies = FrameBodies.begin(levels[0], touching, cage, origin=np.zeros(3), settings=SETTINGS)
     base, thickness = levels[-1].base.apply(cage), torch.tensor([0.002])
-    return LevelContact(
-        ClothContact(levels, [SHEET]), levels[-1], base=base, thickness=thickness, settings=SETTINGS, bodies=bodies
-    )
+    given = {"base": base, "thickness": thickness, "settings": SETTINGS, "bodies": bodies}
+    return LevelContact(ClothContact(levels, [SHEET]), levels[-1], **given, doubtful=levels[-1].free[:, 0] | True)
 
 
 def lens_of(level: Level, *, wider: float = 0.0) -> torch.Tensor:

@@ -71,6 +71,12 @@ class Pierced:
         """Number of crossings."""
         return self.crossings.count
 
+    @staticmethod
+    def none(device: torch.device) -> Pierced:
+        """No crossings."""
+        none = Crossings.none(device)
+        return Pierced(none, none.edge, none.edge.bool())
+
     def cut(self, body: int) -> Int[Tensor, " cut"]:
         """Indices of the cloth's edges that pass through a body, once for each face met."""
         return self.crossings.edge[self.own & (self.body == body)]
@@ -86,6 +92,8 @@ def all_crossings(
         asked: As for `crossings`; crossings with bodies may be missing in clusters without such vertices.
     """
     edge, face = piercing_edges(parts, x, asked).T.contiguous()
+    if not len(edge):
+        return Crossings(edge, face), Pierced.none(x.device)
     edges, faces = parts.starts
     of_edge, of_face = torch.bucketize(edge, edges, right=True), torch.bucketize(face, faces, right=True)
     with_body = (of_edge > 0) | (of_face > 0)

@@ -4,9 +4,11 @@
 # pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportIndexIssue=false, reportCallIssue=false, reportGeneralTypeIssues=false
 from __future__ import annotations
 
+from typing import Any, cast
+
 import warp as wp
 
-from ..mesh.kernels import KERNELS
+from ..mesh.kernels import ALONE, KERNELS
 from ..mesh.piercing import passes_through
 from .boxes import Ask, Boxes, Query, boxes_near, lowest_bit, without_lowest
 from .separation import distance_of, gap_along, safe_fraction
@@ -24,13 +26,27 @@ PAIR_KINDS = wp.constant(3)
 
 @wp.struct
 class Found:
-    """Output of a search: start and count of each task's pairs of parts, and the fields of `Pairs`."""
+    """Output of a search: where the pairs of parts of each task begin, and the fields of `Pairs`."""
 
     begin: wp.array(dtype=wp.int32)
-    count: wp.array(dtype=wp.int32)
     corners: wp.array(dtype=wp.vec4i)
     value: wp.array(dtype=wp.float64)
     face: wp.array(dtype=wp.bool)
+
+
+@wp.struct
+class Candidates:
+    """Pairs of parts whose boxes meet, in any order, counted even without room.
+
+    Attributes:
+        count: Number of pairs, shape (1,).
+        key: The place of each in the right order.
+        parts: Kind of the first part, and numbers of both.
+    """
+
+    count: wp.array(dtype=wp.int32)
+    key: wp.array(dtype=wp.int64)
+    parts: wp.array(dtype=wp.vec3i)
 
 
 @wp.func
@@ -120,6 +136,26 @@ def blocks_left(parts: Topology, kind: wp.int32, i: wp.int32, block: wp.int32):
 
 
 @wp.func
+def corners_of(parts: Topology, query: Query, first: wp.int32, k: wp.int32, m: wp.int32):
+    """Corners of two parts; for a search of crossings the numbers of an edge and a face."""
+    p, q = parts.parts[k], parts.parts[m]
+    c = wp.vec4i(p[0], q[0], q[1], q[2])
+    if first == Part.EDGE:
+        c = wp.vec4i(p[0], p[1], q[0], q[1])
+    if query.kind == Ask.CROSSING:
+        c = wp.vec4i(parts.number[k], parts.number[m], 0, 0)
+    return c
+
+
+@wp.func
+def judged(parts: Topology, query: Query, c: wp.vec4i, first: wp.int32, k: wp.int32, m: wp.int32):
+    """Value of two parts, as `value_of`; for a search of crossings 0 if they cross."""
+    if query.kind != Ask.CROSSING:
+        return value_of(first == Part.VERTEX, c, parts, query)
+    return wp.where(is_pierced(query, parts.parts[k], parts.parts[m]), wp.float64(0.0), wp.float64(1.0))
+
+
+@wp.func
 def write(
     parts: Topology,
     query: Query,
@@ -131,17 +167,8 @@ def write(
     m: wp.int32,
 ):
     """Write two parts if they are a result, and there is room; returns the number of pairs so far."""
-    p, q = parts.parts[k], parts.parts[m]
-    c = wp.vec4i(p[0], q[0], q[1], q[2])
-    if first == Part.EDGE:
-        c = wp.vec4i(p[0], p[1], q[0], q[1])
-    value = wp.float64(0.0)
-    if query.kind != Ask.CROSSING:
-        value = value_of(first == Part.VERTEX, c, parts, query)
-    elif is_pierced(query, p, q):
-        c = wp.vec4i(parts.number[k], parts.number[m], 0, 0)
-    else:
-        value = wp.float64(1.0)
+    c = corners_of(parts, query, first, k, m)
+    value = judged(parts, query, c, first, k, m)
     if value >= wp.float64(1.0):
         return count
     place = found.begin[owner] + count
@@ -153,75 +180,137 @@ def write(
 
 
 @wp.func
-def search_kind(
+def note(
     parts: Topology,
     query: Query,
-    boxes: Boxes,
-    found: Found,
+    found: Candidates,
     owner: wp.int32,
-    first: wp.int32,
-    second: wp.int32,
-    i: wp.int32,
-    j: wp.int32,
     count: wp.int32,
-    share: wp.int32,
-    bits: wp.int32,
+    first: wp.int32,
+    k: wp.int32,
+    m: wp.int32,
 ):
-    """Write pairs of a cluster's parts of one kind and another's of a second; returns the number of pairs so far.
+    """Note two parts as candidates, if there is room; returns the number of the task's candidates so far."""
+    place = wp.atomic_add(found.count, 0, 1)
+    if place < found.key.shape[0]:
+        found.key[place] = (wp.int64(owner) << wp.int64(20)) + wp.int64(count)
+        found.parts[place] = wp.vec3i(first, k, m)
+    return count + 1
 
-    The first cluster's parts are shared between tasks by the last bits of their numbers.
-    """
-    room, size = boxes.radius[i] + boxes.radius[j], parts.clusters + 1
-    for b in range(parts.first[first * size + i], parts.first[first * size + i + 1], ALL):
-        near = boxes_near(boxes.clusters, j, boxes.parts, b, blocks_left(parts, first, i, b), room)
-        while near != wp.uint64(0):
-            k = LANES * b + lowest_bit(near)
-            near = without_lowest(near)
-            if k & bits != share:
-                continue
-            p = parts.parts[k]
-            if not (boxes.asked[j] or query.asked[p[0]] or query.asked[p[1]] or query.asked[p[2]]):
-                continue
-            for c in range(parts.first[second * size + j], parts.first[second * size + j + 1], ALL):
-                others = boxes_near(boxes.parts, k, boxes.parts, c, blocks_left(parts, second, j, c), room)
-                while others != wp.uint64(0):
-                    m = LANES * c + lowest_bit(others)
-                    others = without_lowest(others)
-                    if (first != second or i != j or k < m) and not shares(parts.labels[k], parts.labels[m]):
-                        count = write(parts, query, found, owner, count, first, k, m)
-    return count
+
+def _search(put: Any, output: Any) -> Any:
+    """The function that gives pairs of parts whose boxes meet to one like `write`, with an output of its type."""
+
+    def search_kind(
+        parts: Topology,
+        query: Query,
+        boxes: Boxes,
+        found: Any,
+        owner: wp.int32,
+        first: wp.int32,
+        second: wp.int32,
+        i: wp.int32,
+        j: wp.int32,
+        count: wp.int32,
+        share: wp.int32,
+        bits: wp.int32,
+    ):
+        """Put pairs of a cluster's parts of one kind and another's of a second; returns the number of pairs so far.
+
+        The first cluster's parts are shared between tasks by the last bits of their numbers.
+        """
+        room, size = boxes.radius[i] + boxes.radius[j], parts.clusters + 1
+        for b in range(parts.first[first * size + i], parts.first[first * size + i + 1], ALL):
+            near = boxes_near(boxes.clusters, j, boxes.parts, b, blocks_left(parts, first, i, b), room)
+            while near != wp.uint64(0):
+                k = LANES * b + lowest_bit(near)
+                near = without_lowest(near)
+                if k & bits != share:
+                    continue
+                p = parts.parts[k]
+                if not (boxes.asked[j] or query.asked[p[0]] or query.asked[p[1]] or query.asked[p[2]]):
+                    continue
+                for c in range(parts.first[second * size + j], parts.first[second * size + j + 1], ALL):
+                    others = boxes_near(boxes.parts, k, boxes.parts, c, blocks_left(parts, second, j, c), room)
+                    while others != wp.uint64(0):
+                        m = LANES * c + lowest_bit(others)
+                        others = without_lowest(others)
+                        if (first != second or i != j or k < m) and not shares(parts.labels[k], parts.labels[m]):
+                            count = put(parts, query, found, owner, count, first, k, m)
+        return count
+
+    search_kind.__annotations__["found"] = output
+    return wp.func(search_kind)
+
+
+def _finder(search_kind: Any, output: Any, name: str) -> wp.Kernel:
+    """The kernel of a `_search`."""
+
+    def find(
+        start: wp.int32,
+        parts: Topology,
+        clusters: wp.array(dtype=wp.vec2i),
+        tasks: wp.int32,
+        query: Query,
+        boxes: Boxes,
+        found: Any,
+        counts: wp.array(dtype=wp.int32),
+    ):
+        """Pairs of each two clusters, in one task or in a task for each kind and share, and the number of each task's.
+
+        Clusters of negative numbers have none. With several tasks, their number is a power of two times `PAIR_KINDS`.
+        """
+        task = start + wp.tid()
+        n, own = task // tasks, task % tasks
+        i, j = clusters[n][0], clusters[n][1]
+        if i < 0:
+            return
+        share, bits = own // PAIR_KINDS, wp.max(tasks // PAIR_KINDS, 1) - 1
+        kind = wp.where(tasks == 1, -1, own % PAIR_KINDS)
+        one, other, count = wp.where(query.kind == Ask.CROSSING, Part.EDGE, Part.VERTEX), Part.FACE, wp.int32(0)
+        if kind <= 0:
+            count = search_kind(parts, query, boxes, found, task, one, other, i, j, count, share, bits)
+        if i != j and (kind < 0 or kind == 1):
+            count = search_kind(parts, query, boxes, found, task, one, other, j, i, count, share, bits)
+        if query.kind != Ask.CROSSING and (kind < 0 or kind == 2):
+            count = search_kind(parts, query, boxes, found, task, Part.EDGE, Part.EDGE, i, j, count, share, bits)
+        counts[task] = count
+
+    find.__annotations__["found"] = output
+    return cast(wp.Kernel, wp.kernel(find, name=name, **ALONE))
+
+
+find_pairs = _finder(_search(write, Found), Found, "find_pairs")
+find_candidates = _finder(_search(note, Candidates), Candidates, "find_candidates")
 
 
 @wp.kernel
-def find_pairs(
+def judge_candidates(
     start: wp.int32,
     parts: Topology,
-    clusters: wp.array(dtype=wp.vec2i),
-    tasks: wp.int32,
     query: Query,
-    boxes: Boxes,
-    found: Found,
+    given: Candidates,
+    count: wp.array(dtype=wp.int32),
+    key: wp.array(dtype=wp.int64),
+    corners: wp.array(dtype=wp.vec4i),
+    value: wp.array(dtype=wp.float64),
+    face: wp.array(dtype=wp.bool),
 ):
-    """Pairs of parts of each two clusters, counted even without room, in one task or in a task for each kind and share.
-    Clusters of negative numbers have none.
-
-    With several tasks for two clusters, their number is a power of two times `PAIR_KINDS`.
-    """
-    task = start + wp.tid()
-    n, own = task // tasks, task % tasks
-    i, j = clusters[n][0], clusters[n][1]
-    if i < 0:
+    """Candidates that are results, in any order, with their keys, counted even without room."""
+    i = start + wp.tid()
+    if i >= given.count[0]:
         return
-    share, bits = own // PAIR_KINDS, wp.max(tasks // PAIR_KINDS, 1) - 1
-    kind = wp.where(tasks == 1, -1, own % PAIR_KINDS)
-    one, other, count = wp.where(query.kind == Ask.CROSSING, Part.EDGE, Part.VERTEX), Part.FACE, wp.int32(0)
-    if kind <= 0:
-        count = search_kind(parts, query, boxes, found, task, one, other, i, j, count, share, bits)
-    if i != j and (kind < 0 or kind == 1):
-        count = search_kind(parts, query, boxes, found, task, one, other, j, i, count, share, bits)
-    if query.kind != Ask.CROSSING and (kind < 0 or kind == 2):
-        count = search_kind(parts, query, boxes, found, task, Part.EDGE, Part.EDGE, i, j, count, share, bits)
-    found.count[task] = count
+    first, k, m = given.parts[i][0], given.parts[i][1], given.parts[i][2]
+    c = corners_of(parts, query, first, k, m)
+    own = judged(parts, query, c, first, k, m)
+    if own >= wp.float64(1.0):
+        return
+    place = wp.atomic_add(count, 0, 1)
+    if place < key.shape[0]:
+        key[place] = given.key[i]
+        corners[place] = c
+        value[place] = own
+        face[place] = first == Part.VERTEX
 
 
 @wp.kernel

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -36,21 +36,22 @@ class Room:
 
     Attributes:
         of_each: Pairs of clusters for each cluster.
-        clusters, pairs: Pairs of clusters and of parts; 0 where a search reads how many there are, without a card.
+        clusters, candidates, pairs: Pairs of clusters, of parts whose boxes meet, and of parts; 0 where a search reads
+            how many there are, without a card.
     """
 
     of_each: int = 32
     clusters: int = 0
+    candidates: int = 0
     pairs: int = 0
 
-    def lacks(self, of_each: int, clusters: int, pairs: int) -> bool:
-        """Whether a search needed more; from now on there is room for twice as much."""
-        needed = (of_each, clusters if self.clusters else 0, pairs if self.pairs else 0)
-        rooms = (self.of_each, self.clusters, self.pairs)
-        self.of_each, self.clusters, self.pairs = (
-            room if count <= room else 2 * count for count, room in zip(needed, rooms, strict=True)
-        )
-        return rooms != (self.of_each, self.clusters, self.pairs)
+    def lacks(self, *needed: int) -> bool:
+        """Whether a search needed more, in this order; from now on there is room for twice as much."""
+        before = replace(self)
+        for name, count in zip(("of_each", "clusters", "candidates", "pairs"), needed, strict=True):
+            if 0 < getattr(self, name) < count:
+                setattr(self, name, 2 * count)
+        return self != before
 
 
 class Parts:
@@ -99,7 +100,7 @@ class Parts:
         self.starts = tuple(torch.as_tensor(each[:-1].astype(np.int64), device=level.device) for each in (edges, faces))
         self.boxes, self.recordings = boxes_for(self.topology, level.device), Recordings()
         self.tasks = 1 if level.device == "cpu" else TASKS
-        self.room = Room() if level.device == "cpu" else Room(clusters=FIRST_ROOM, pairs=FIRST_ROOM)
+        self.room = Room() if level.device == "cpu" else Room(Room.of_each, *[FIRST_ROOM] * 3)
 
     @cached_property
     def tree(self) -> wp.Bvh:

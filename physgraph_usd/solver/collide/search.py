@@ -20,7 +20,7 @@ from torch import Tensor
 from ..mesh.kernels import KERNELS
 from ..mesh.threads import argument, refit, run
 from .boxes import Ask, Boxes, Query, arrays_of, bound_clusters, bound_parts, boxes_near, query_of
-from .narrow_phase import Found, check_pairs, find_pairs
+from .narrow_phase import Candidates, Found, check_pairs, find_candidates, find_pairs, judge_candidates
 from .pairs import NearAt, Pairs, Reach
 from .parts import Parts
 from .topology import LANES, Topology
@@ -220,11 +220,11 @@ def _search(parts: Parts, arrays: Sequence[Tensor], *, kind: Ask, floor: float =
     while True:
         look = parts.recordings.of((kind, floor, half, clusters), lambda *arrays: _looked(parts, query(*arrays)))
         counts, near, end, *found = look(*arrays)
-        most, total, over, count = counts.tolist()
-        if not parts.room.lacks(most, total, count):
+        *needed, over = counts.tolist()
+        if not parts.room.lacks(*needed):
             break
         parts.recordings.clear()
-    out = Pairs(*(each[:count] for each in found))
+    out = Pairs(*(each[: needed[-1]] for each in found))
     if over:  # Tasks without room are repeated.
         _again(parts, query(*arrays), near, end, out)
     return out
@@ -234,8 +234,8 @@ def _looked(parts: Parts, query: Any) -> tuple[Tensor, ...]:
     """One pass of a search in the room there is.
 
     Returns:
-        Most pairs of clusters of a cluster, number of them, of tasks without room, and of pairs of parts; the pairs of
-        clusters; the number of pairs up to each task's end; and the fields of `Pairs`.
+        Most pairs of clusters of a cluster, number of them, of candidates, of pairs of parts, and of tasks without
+        room; the pairs of clusters; the number of pairs up to each task's end; and the fields of `Pairs`.
     """
     room, size, device, tree = parts.room, query.clusters, parts.level.device, parts.tree
     _launch(parts, bound_clusters, size, parts.topology, query, parts.boxes)
@@ -249,16 +249,39 @@ def _looked(parts: Parts, query: Any) -> tuple[Tensor, ...]:
     inputs = [argument(slots), argument(own), argument(last), argument(near, wp.vec2i)]
     _launch(parts, list_clusters, size, room.of_each, parts.boxes, *inputs)
     _launch(parts, bound_parts, size, parts.topology, query, parts.boxes)
+    if room.pairs:  # On a card.
+        counts, out = _candidates(parts, query, near)
+        counts = torch.stack([own.max(), last[-1], *counts, counts[0].new_zeros(())])
+        return counts, near[:0], last, out.corners, out.value, out.face
     tasks = parts.tasks * len(near)
     each = max(PAIRS // tasks, TASK_PAIRS)
     begin = torch.arange(0, (tasks + 1) * each, each, dtype=torch.int32, device=device)
     found, count = Pairs.empty(tasks * each, device), torch.zeros(tasks, dtype=torch.int32, device=device)
     _find(parts, query, near, begin, count, found)
     end = count.cumsum(dim=0, dtype=torch.int32)
-    out = Pairs.empty(room.pairs or max(int(end[-1]), 1), device)
+    out = Pairs.empty(max(int(end[-1]), 1), device)
     _launch(parts, gather_pairs, tasks, each, *_arguments(found), argument(end), *_arguments(out))
-    counts = (own.max(), last[-1], (count > each).sum(), count.sum())
+    counts = (own.max(), last[-1], count.sum(), count.sum(), (count > each).sum())
     return torch.stack([value.long() for value in counts]), near, end, out.corners, out.value, out.face
+
+
+def _candidates(parts: Parts, query: Any, near: Int[Tensor, "clusters 2"]) -> tuple[list[Tensor], Pairs]:
+    """Numbers of candidates and of results among the pairs of parts of pairs of clusters, and the results in order.
+
+    A thread judges one candidate: judging in the threads that find them leaves most threads waiting for a few.
+    """
+    room, device = parts.room, near.device
+    number, kept = torch.zeros((2, 1), dtype=torch.int32, device=device)
+    counts = torch.empty(len(near) * parts.tasks, dtype=torch.int32, device=device)
+    keys, own = (torch.full((size,), 2**62, device=device) for size in (room.candidates, room.pairs))
+    which = torch.empty((room.candidates, 3), dtype=torch.int32, device=device)
+    given, out = Candidates(), Pairs.empty(room.pairs, device)
+    given.count, given.key, given.parts = (wp.from_torch(number), wp.from_torch(keys), wp.from_torch(which, wp.vec3i))
+    inputs = [parts.topology, argument(near, wp.vec2i), parts.tasks, query, parts.boxes, given, argument(counts)]
+    _launch(parts, find_candidates, len(counts), *inputs)
+    results = [argument(kept), argument(own), *_arguments(out)]
+    _launch(parts, judge_candidates, room.candidates, parts.topology, query, given, *results)
+    return [number[0], kept[0]], out.where(own.argsort())
 
 
 def _again(parts: Parts, query: Any, near: Int[Tensor, "clusters 2"], end: Int[Tensor, " tasks"], out: Pairs) -> None:
@@ -281,10 +304,10 @@ def _blocking_among(pairs: Pairs, parts: Parts, query: Any) -> Pairs:
 def _find(parts: Parts, query: Any, near: Tensor, begin: Tensor, count: Tensor, out: Pairs) -> None:
     """The pairs of parts of pairs of clusters, written from given places on; and the number of pairs of each task."""
     found = Found()
-    found.begin, found.count = wp.from_torch(begin), wp.from_torch(count)
+    found.begin = wp.from_torch(begin)
     found.corners = wp.from_torch(out.corners, dtype=wp.vec4i)
     found.value, found.face = wp.from_torch(out.value), wp.from_torch(out.face)
-    inputs = [parts.topology, argument(near, wp.vec2i), parts.tasks, query, parts.boxes, found]
+    inputs = [parts.topology, argument(near, wp.vec2i), parts.tasks, query, parts.boxes, found, argument(count)]
     _launch(parts, find_pairs, len(count), *inputs)
 
 

@@ -65,8 +65,7 @@ class ContactState:
     @staticmethod
     def clean(x: Tensor, corners: Tensor, given_up: Tangles | None = None) -> ContactState:
         """Positions at which nothing crosses but given-up cloth."""
-        none = Crossings.none(x.device)
-        return ContactState(x, x._version, corners, none, given_up, Pierced(none, none.edge, none.edge.bool()))
+        return ContactState(x, x._version, corners, Crossings.none(x.device), given_up, Pierced.none(x.device))
 
     @property
     def in_bodies(self) -> tuple[int, int]:
@@ -142,7 +141,7 @@ class LevelContact:
         bodies: FrameBodies | None = None,
         seam: Seam | None = None,
         given_up: Bool[Tensor, " vertices"] | None = None,
-        doubtful: Bool[Tensor, " vertices"] | None = None,
+        doubtful: Bool[Tensor, " vertices"] | None,
     ) -> None:
         """Take the frame.
 
@@ -150,7 +149,7 @@ class LevelContact:
             base: The upsampled cage [m]; distances between parts in the cage are not widened.
             thickness: Thickness of each garment [m].
             settings: Contact settings, in SI.
-            doubtful: Mask of the vertices that the cage places near what crosses in it; None if unknown.
+            doubtful: Mask of the vertices that the cage places near what crosses in it; None if nothing does.
         """
         self.keeps_sides = settings.cloth == "pairs" and bool(lasting.meets.any())
         self.mesh = lasting.mesh(level, seam, bodies, itself=self.keeps_sides)
@@ -186,8 +185,8 @@ class LevelContact:
 
     def of_cage(self, x: Float[Tensor, "vertices 3"]) -> ContactState:
         """As `look` for an upsampled cage [m], searched only around what crosses in the cage itself."""
-        known_clean = self._doubtful is not None and not bool(self._doubtful.any())
-        return ContactState.clean(x, self._corners(x)) if known_clean else self._found(x, self._doubtful)
+        none = self._doubtful is None
+        return ContactState.clean(x, self._corners(x)) if none else self._found(x, self._doubtful)
 
     def look(self, x: Float[Tensor, "vertices 3"]) -> ContactState:
         """Crossings at x [m]; cached for the same tensor until its version changes."""

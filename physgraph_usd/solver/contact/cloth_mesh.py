@@ -91,8 +91,10 @@ class ClothMesh:
 
     def crossed(self, crossings: Crossings) -> Bool[Tensor, " vertices"]:
         """Mask of the vertices of the cloth's crossing edges and faces."""
-        out, corners = torch.zeros_like(self.level.free[:, 0]), self.corners_of(crossings).reshape(-1)
-        out[corners[corners < len(out)]] = True
+        out = torch.zeros_like(self.level.free[:, 0])
+        if crossings.count:
+            corners = self.corners_of(crossings).reshape(-1)
+            out[corners[corners < len(out)]] = True
         return out
 
     def anchored(
@@ -116,8 +118,10 @@ class ClothMesh:
 
     def between(self, crossings: Crossings) -> np.ndarray:
         """Number of crossings between garments, the lower number first, shape (G, G)."""
-        ends = self.level.vertex_garment[self.corners_of(crossings)[:, [0, 2]]].cpu().numpy()
         table = np.zeros((self._garments, self._garments), np.int64)
+        if not crossings.count:
+            return table
+        ends = self.level.vertex_garment[self.corners_of(crossings)[:, [0, 2]]].cpu().numpy()
         np.add.at(table, (ends.min(axis=1), ends.max(axis=1)), 1)
         return table
 

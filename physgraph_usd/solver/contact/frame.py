@@ -146,7 +146,7 @@ class FrameContact:
             seam, base = self._seam_at(level), level.base.apply(self.aim)
             own = {"base": base, "thickness": self._thickness, "settings": self._settings, "seam": seam}
             own |= {"bodies": self._bodies, "given_up": self._given_up_at(level)}
-            own |= {"doubtful": _share_of(level, self._doubtful) > 0.0}
+            own |= {"doubtful": None if self._doubtful is None else _share_of(level, self._doubtful) > 0.0}
             self._views[level.index] = LevelContact(self._cloth, level, **own)
         return self._views[level.index]
 
@@ -155,12 +155,14 @@ class FrameContact:
         return None if self.given_up is None else _share_of(level, ~self.given_up) == 0.0
 
     @cached_property
-    def _doubtful(self) -> Bool[Tensor, " coarse"]:
-        """Mask of the cage's vertices around all that crosses in it, or was repaired."""
+    def _doubtful(self) -> Bool[Tensor, " coarse"] | None:
+        """Mask of the cage's vertices around all that crosses in it, or was repaired; None for none."""
         mesh, found, _, pierced, inside = self._cage
+        if not found.count and not pierced.count and inside is None and self.aim is self._coarse:
+            return None
         some = mesh.crossed(found) | mesh.crossed(pierced.crossings) | (self.aim != self._coarse).any(dim=1)
         some = some if inside is None else some | inside.any(dim=0)
-        return mesh.grown(some, 1)
+        return mesh.grown(some, 1) if bool(some.any()) else None
 
     def _seam_at(self, level: Level) -> Seam | None:
         return self._seams[level.index] if self._seams else None

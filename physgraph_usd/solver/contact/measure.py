@@ -37,12 +37,12 @@ class Penetration:
         crossings: Number of cloth edges through faces of the body plus body edges through faces of the cloth.
     """
 
-    inside: int
-    percent: float
-    deepest_mm: float
-    pinned: int
-    pinched: int
-    crossings: int
+    inside: int = 0
+    percent: float = 0.0
+    deepest_mm: float = 0.0
+    pinned: int = 0
+    pinched: int = 0
+    crossings: int = 0
 
 
 def penetration(

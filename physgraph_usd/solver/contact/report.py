@@ -65,8 +65,10 @@ def _of_bodies(
 
 
 def _penetration(bodies: LevelBodies, index: int, x: Tensor, look: ContactState, *, lost: Tensor | None) -> Penetration:
-    inside = torch.zeros_like(bodies.level.free[:, 0]) if look.inside is None else look.inside[index]
-    known = {"longest": bodies.frame.longest, "lost": lost, "crossings": int((look.pierced.body == index).sum())}
+    crossings = int((look.pierced.body == index).sum()) if look.pierced.count else 0
+    if look.inside is None:
+        return Penetration(crossings=crossings)
+    inside, known = look.inside[index], {"longest": bodies.frame.longest, "lost": lost, "crossings": crossings}
     surface, at = bodies.frame.touching[index].surface, x + bodies.frame.shifts[index]
     exits = partial(bodies.frame.exits, index) if surface.closed else None
     return penetration(surface, bodies.level, at, inside, exits=exits, **known)
