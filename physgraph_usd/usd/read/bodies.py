@@ -223,7 +223,7 @@ class ColliderReader:
     def _faces_of(self, points: np.ndarray, authored: tuple[np.ndarray, ...]) -> _Faces:
         """The drawn faces; cached while the topology stays the same.
 
-        Subdivision and splitting of quads use the collider's first sample, whichever frame is read first.
+        Subdivision uses the collider's first sample, whichever frame is read first; polygons are fans, as drawn.
         """
         if self._faces is None or not all(map(np.array_equal, self._faces.authored, authored)):
             counts, indices, holes = authored
@@ -232,7 +232,7 @@ class ColliderReader:
             first = np.nan_to_num(first if first.shape == points.shape else points).astype(np.float64)
             polygons, within = PolygonMesh(counts, indices, len(points)), self.within / self._scale()
             drawn = surface_of(mesh, polygons, first, holes=holes, within=within)
-            triangles = drawn.mesh.triangulate(drawn.place(first)).triangles
+            triangles = drawn.mesh.triangulate().triangles
             self._faces = _Faces(authored, drawn, (triangles, np.ascontiguousarray(triangles[:, ::-1])))
         return self._faces
 
