@@ -196,6 +196,9 @@ def elbow(degrees: float = 100.0) -> Stage:
 def dressed(file: str, garment: str, body: str) -> Stage:
     """A shot's garment on its body: it begins at rest as in the first frame, and its highest border is held as there.
 
+    It is cut below that border: a waistband that is turned in rests flat and begins folded onto itself, so it springs
+    open and tangles, each solver in its own way.
+
     Args:
         file: The shot, with Y up.
         garment: Prim path of the garment.
@@ -208,11 +211,10 @@ def dressed(file: str, garment: str, body: str) -> Stage:
     cloth = np.array([each.garments[0].points for each in frames])[..., upright[0]] * upright[1]
     poses = [pose for each in frames for pose in each.colliders if pose is not None]
     skin = np.array([pose.points for pose in poses])[..., upright[0]] * upright[1]
-    i, j = mesh.half_edges.edges[mesh.half_edges.count == 1].T
-    count = cloth.shape[1]
-    _, part = connected_components(sp.coo_matrix((0.0 * i + 1.0, (i, j)), (count, count)), directed=False)
-    height = [np.mean(cloth[0, part == part[each], 2]) for each in i]
-    held = part == part[i[np.argmax(height)]]
+    faces, height = np.asarray(mesh.indices).reshape(mesh.face_count, -1), cloth[0, :, 2]
+    below = height < height[highest_border(faces, height)].min()
+    kept, corners = np.unique(faces[below[faces].all(axis=1)], return_inverse=True)
+    faces, cloth = corners.reshape(-1, faces.shape[1]), cloth[:, kept]
 
     def at(points: np.ndarray) -> Motion:
         def motion(time: float) -> np.ndarray:
@@ -221,8 +223,19 @@ def dressed(file: str, garment: str, body: str) -> Stage:
 
         return motion
 
-    faces = np.asarray(mesh.indices).reshape(mesh.face_count, -1)
+    held = highest_border(faces, cloth[0, :, 2])
     return Stage(faces, cloth[0, :, :2], cloth[0], held, at(cloth), (Skin(poses[0].triangles, at(skin)),))
+
+
+def highest_border(faces: np.ndarray, height: np.ndarray) -> np.ndarray:
+    """Which vertices are on the border that is highest on average, shape (V,), bool."""
+    sides = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2), axis=1)
+    found, uses = np.unique(sides, axis=0, return_counts=True)
+    i, j = found[uses == 1].T
+    count = len(height)
+    _, part = connected_components(sp.coo_matrix((0.0 * i + 1.0, (i, j)), (count, count)), directed=False)
+    mean = [height[part == part[each]].mean() for each in i]
+    return part == part[i[np.argmax(mean)]]
 
 
 SCENES: dict[str, Callable[[], Stage]] = {
