@@ -53,11 +53,12 @@ TEXT = """# Speed against accuracy with bodies
 
 Written by `python -m benchmarks.beside_newton --newton PYTHON`; fabric {fabric}, {frames} frames at 24 a second, Newton
 {newton}, ours at commit {commit}. Newton's solvers simulate the fine sheet, self-contact on, their steps recorded as
-graphs on the card; `refined` refines a cage of the same sheet that Style3D simulates (20 steps, 4 iterations of 40). So
-they answer unlike questions: theirs has a history, ours and subdivision have the cage's. The reference is Style3D with
-{reference}: what is Style3D's own comes near it by construction. One level coarser: so solved, then subdivided by Loop.
-XPBD is not here: with steps short enough for it, 640 a frame, no sheet was done in 150 s. Nor is Blender's cloth, whose
-energy is another; see docs/chart.md.
+graphs on the card; `refined` refines a cage of the same sheet that Style3D simulates (40 steps, 4 iterations of 40;
+with fewer steps than the reference, which damp more, it lacks folds). So they answer unlike questions: theirs has a
+history, ours and subdivision have the cage's. The reference is Style3D with {reference}: what is Style3D's own comes
+near it by construction. One level coarser: so solved, then subdivided by Loop. XPBD is not here: with steps short
+enough for it, 640 a frame, no sheet was done in 150 s. Nor is Blender's cloth, whose energy is another; see
+docs/chart.md.
 
 - **Settings**: steps of ours at the finest level, 12 by default, the tolerance in inverse proportion; of Newton, steps
   of a frame x iterations (x conjugate gradients).
@@ -104,7 +105,8 @@ class Method:
         return ", ".join([*filter(None, [" x ".join(numbers)]), *["one level coarser"] * self.below])
 
 
-CAGE, REFERENCE = Method("cage", 20, (4, 40)), Method("reference", 40, (8, 80))
+CAGE, REFERENCE = Method("cage", 40, (4, 40)), Method("reference", 40, (8, 80))
+"""Of as many steps in a frame: implicit steps damp folds the more the longer they are."""
 METHODS = (
     Method("style3d", 10, (4, 10), core=True),
     Method("vbd", 10, (10, 0), core=True),
