@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import gc
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -55,12 +56,16 @@ class _Recording:
         self._inputs = [each.clone(memory_format=torch.contiguous_format) for each in given]
         self._graph, before, stream = torch.cuda.CUDAGraph(), torch.cuda.current_stream(), torch.cuda.Stream()
         stream.wait_stream(before)
+        collects = gc.isenabled()
+        gc.disable()  # Memory that is freed meanwhile would end the recording.
         with torch.cuda.stream(stream):
             self._graph.capture_begin(pool=_pool(before.device_index), capture_error_mode="thread_local")
             try:
                 self._outputs = list(function(*self._inputs))
             finally:
                 self._graph.capture_end()
+                if collects:
+                    gc.enable()
         before.wait_stream(stream)
 
     def __call__(self, given: Sequence[Tensor]) -> list[Tensor]:
