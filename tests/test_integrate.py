@@ -237,6 +237,8 @@ def test_sewn_vertices_move_together_and_the_solve_is_symmetric(level: int):
         assert torch.equal(move[9], move[3])
     work = [float((forces[:, n] * moves[1 - n]).sum()) for n in range(2)]
     assert abs(work[0] - work[1]) < 1e-9 * float((forces[:, 0] * moves[0]).sum())
+    metric.merged(label).coarse.dense = True  # As on a card.
+    torch.testing.assert_close(HeldMetric(metric.merged(label), touched).solve(forces[:, 0].contiguous()), moves[0])
 
 
 def test_a_factor_that_something_holds_to_the_end_of_the_process_is_freed_without_a_word():

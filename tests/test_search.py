@@ -15,7 +15,7 @@ from folds import named
 from meshes import grid
 
 from physgraph_usd.solver.collide.pairs import Pairs, Reach
-from physgraph_usd.solver.collide.parts import Parts
+from physgraph_usd.solver.collide.parts import TASKS, Parts, Room
 from physgraph_usd.solver.collide.search import blocking_and_near, blocking_pairs, near_parts
 from physgraph_usd.solver.level import Level, build_levels
 from physgraph_usd.solver.mesh.topology import PolygonMesh
@@ -86,12 +86,15 @@ class Cloth:
 
     def found(self, x: np.ndarray, end: np.ndarray, asked: np.ndarray | None = None) -> set[Pair]:
         """Pairs of parts that the search finds on a move, of queried vertices alone where these are given."""
-        some = np.ones(len(x), bool) if asked is None else asked
-        given = [torch.as_tensor(each) for each in (x, end)]
-        pairs = blocking_pairs(self.parts, *given, floor=0.0, asked=torch.as_tensor(some))
-        listed = named_pairs(pairs)
+        listed = self.listed(x, end, asked)
         assert len(set(listed)) == len(listed)
         return set(listed)
+
+    def listed(self, x: np.ndarray, end: np.ndarray, asked: np.ndarray | None = None) -> list[Pair]:
+        """Pairs that are found, in order."""
+        some = np.ones(len(x), bool) if asked is None else asked
+        given = [torch.as_tensor(each) for each in (x, end)]
+        return named_pairs(blocking_pairs(self.parts, *given, floor=0.0, asked=torch.as_tensor(some)))
 
     def missed(self, x: np.ndarray, end: np.ndarray, found: set[Pair]) -> set[Pair]:
         """Pairs of parts that touch on a move according to the toolkit, and are not found."""
@@ -152,6 +155,17 @@ def judged(shape: Shape, moves: int, seed: int) -> tuple[int, int]:
         found = cloth.found(x, end)
         total, lost = total + len(found), lost + len(cloth.missed(x, end, found))
     return total, lost
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_a_card_finds_the_same_in_the_same_order(shape: Shape):
+    """Its kernels on one thread of the CPU, with little room at first: pairs are found by their boxes, then judged."""
+    cloth, other = Cloth(shape), Cloth(shape)
+    other.parts.tasks, other.parts.room = TASKS, Room(2, 2, 2, 2)
+    for x, end in random_moves(cloth, 4, seed=4):
+        assert other.found(x, end) == cloth.found(x, end)
+        both = [other.listed(x, end) for _ in range(2)]
+        assert both[0] == both[1]
 
 
 @pytest.mark.parametrize(("moves", "seed"), [(5, 4), pytest.param(100, 2, marks=pytest.mark.slow)])

@@ -199,7 +199,7 @@ def note(
 
 
 def _search(put: Any, output: Any) -> Any:
-    """The function that gives pairs of parts whose boxes meet to one like `write`, with an output of its type."""
+    """Function that gives the pairs of parts whose boxes meet to one like `write`, with an output of its type."""
 
     def search_kind(
         parts: Topology,
@@ -215,10 +215,7 @@ def _search(put: Any, output: Any) -> Any:
         share: wp.int32,
         bits: wp.int32,
     ):
-        """Put pairs of a cluster's parts of one kind and another's of a second; returns the number of pairs so far.
-
-        The first cluster's parts are shared between tasks by the last bits of their numbers.
-        """
+        """Put pairs of a cluster's parts of one kind, shared by the last bits of their numbers, and another's."""
         room, size = boxes.radius[i] + boxes.radius[j], parts.clusters + 1
         for b in range(parts.first[first * size + i], parts.first[first * size + i + 1], ALL):
             near = boxes_near(boxes.clusters, j, boxes.parts, b, blocks_left(parts, first, i, b), room)

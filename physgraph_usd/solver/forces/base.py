@@ -46,7 +46,7 @@ def total_of(terms: Sequence[Force]) -> Callable[..., tuple[Tensor, Tensor, Tens
     def total(x: Tensor, *aims: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         left, now = iter(aims), list[Any]()
         for each in terms:
-            now.append(each.aimed(*islice(left, count)) if (count := len(_aims_of(each))) else each)
+            now.append(_aimed(each, tuple(islice(left, len(_aims_of(each))))))
         force, energy = torch.zeros_like(x), torch.zeros((), dtype=torch.float64, device=x.device)
         energies = [each.add_force(x, force) for each in now]
         for each in energies:
@@ -59,6 +59,11 @@ def total_of(terms: Sequence[Force]) -> Callable[..., tuple[Tensor, Tensor, Tens
 def _aims_of(term: Any) -> tuple[Tensor, ...]:
     """A term's tensors that change from frame to frame, if any; ``term.aimed`` takes others."""
     return getattr(term, "aims", ())
+
+
+def _aimed(term: Any, aims: tuple[Tensor, ...]) -> Any:
+    """A term with other `_aims_of`."""
+    return term.aimed(*aims) if aims else term
 
 
 class _Last:

@@ -73,7 +73,7 @@ class MovingFrames:
         return placed, motion / self.edge, turn
 
     def _predict(self, before: Tensor, fine: Tensor, coarse: Tensor) -> tuple[Tensor, Tensor]:
-        """As `predict`, with the motion in metres."""
+        """Predicted fine positions [m], and the RMS motion [m] and turn [rad] of the cage."""
         detail, last, frames = fine - self._level.smooth_base.apply(before), self.frames(before), self.frames(coarse)
         moved = torch.einsum("vij,vj->vi", self._turned(last, frames), detail)
         motion = (coarse - before).square().sum(dim=1).mean().sqrt()

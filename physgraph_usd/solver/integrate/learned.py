@@ -104,17 +104,17 @@ class LearnedMetric:
         if fused is None:
             return self._combined(system, carry)
         bias, stiffness = fused.bias_at(memory.step), system.rest_diagonal_columns
-        place = (fused, level, system.spacing, system.reach)
+        place = fused, level, (system.spacing, system.reach)
         if level is None or not carry.x.is_cuda:
-            return _of_kernel(carry, stiffness, bias, *place)
+            return _by_kernel(carry, stiffness, bias, *place)
         product = partial(garment_dot, level)
 
-        def move(
-            x: Tensor, force: Tensor, image: Tensor, stiffness: Tensor, bias: Tensor, *past: Tensor
-        ) -> list[Tensor]:
-            ends = [Secant(*past[at : at + 3], product, known=past[at + 3]) for at in range(3, len(past), 4)]
-            there = Carry(x, 0.0, force, image, memory=StepHistory(past[0], past[1:3], tuple(ends)))
-            return [_of_kernel(there, stiffness, bias, *place)]
+        def move(x: Tensor, force: Tensor, image: Tensor, *more: Tensor) -> list[Tensor]:
+            stiffness, bias, before, first, second, *parts = more
+            secants = zip(*[iter(parts)] * 4, strict=True)
+            known = tuple(Secant(*fields, dot=product, known=curvature) for *fields, curvature in secants)
+            there = Carry(x, 0.0, force, image, memory=StepHistory(before, (first, second), known))
+            return [_by_kernel(there, stiffness, bias, *place)]
 
         past = [part for each in memory.secants for part in (each.move, each.yields, each.image, each.curvature)]
         now = (carry.x, carry.force, carry.preconditioned, stiffness, bias)
@@ -138,10 +138,24 @@ class LearnedMetric:
         return limited(move, system.spacing) * system.free
 
 
-def _of_kernel(
-    carry: Carry, stiffness: Tensor, bias: Tensor, fused: FusedPhysgraph, level: Level | None, *sizes: Tensor
+def _by_kernel(
+    carry: Carry,
+    stiffness: Tensor,
+    bias: Tensor,
+    fused: FusedPhysgraph,
+    level: Level | None,
+    sizes: tuple[Tensor, Tensor],
 ) -> Tensor:
-    """As `LearnedMetric.propose`, by the network as a kernel."""
+    """Displacement of the next step [m], by the network as a kernel.
+
+    Args:
+        carry: The state.
+        stiffness: Diagonal of H0 [N/m], in three columns.
+        bias: As `FusedPhysgraph.bias_at`.
+        fused: The network.
+        level: The mesh.
+        sizes: The spacing, and 0 at fixed vertices [m].
+    """
 
     def frame() -> VertexFrame:
         return VertexFrame(level_of(level), carry.x)

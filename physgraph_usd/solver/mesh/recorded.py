@@ -54,7 +54,8 @@ class _Recording:
     def __init__(self, function: Callable[..., Sequence[Tensor]], given: Sequence[Tensor]) -> None:
         """Record the function, without running it."""
         self._inputs = [each.clone(memory_format=torch.contiguous_format) for each in given]
-        self._graph, before, stream = torch.cuda.CUDAGraph(), torch.cuda.current_stream(), torch.cuda.Stream()
+        card = given[0].device
+        self._graph, before, stream = torch.cuda.CUDAGraph(), torch.cuda.current_stream(card), torch.cuda.Stream(card)
         stream.wait_stream(before)
         collects = gc.isenabled()
         gc.disable()  # Memory that is freed meanwhile would end the recording.
@@ -70,7 +71,7 @@ class _Recording:
 
     def __call__(self, given: Sequence[Tensor]) -> list[Tensor]:
         """Replay with other inputs."""
-        torch._foreach_copy_(self._inputs, list(given))
+        torch._foreach_copy_(self._inputs, list(given))  # pyright: ignore[reportPrivateImportUsage]
         self._graph.replay()
         return [each.clone() for each in self._outputs]
 
