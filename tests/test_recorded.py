@@ -16,7 +16,7 @@ from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.solve import ShotSolver, open_for
 from physgraph_usd.solver.integrate.coarse import CoarseLevels
-from physgraph_usd.solver.mesh.recorded import Recorded
+from physgraph_usd.solver.mesh.recorded import CALLS, Recorded
 
 READS = {"_local_scalar_dense", "nonzero", "masked_select", "_unique2", "is_nonzero"}
 """Operations that wait for a card."""
@@ -25,7 +25,9 @@ READS = {"_local_scalar_dense", "nonzero", "masked_select", "_unique2", "is_nonz
 class Reading(TorchDispatchMode):
     """Refuses what a recording cannot hold: values read back, and shapes that depend on values."""
 
-    def __torch_dispatch__(self, func: Any, types: Any, args: Sequence[Any], kwargs: Mapping[str, Any] | None) -> Any:
+    def __torch_dispatch__(  # pyright: ignore[reportIncompatibleMethodOverride]
+        self, func: Any, types: Any, args: Sequence[Any], kwargs: Mapping[str, Any] | None
+    ) -> Any:
         name = func.overloadpacket.__name__
         places = args[1] if name in {"index", "index_put"} else ()
         if name in READS or any(each is not None and each.dtype == torch.bool for each in places):
@@ -57,3 +59,25 @@ def test_what_is_recorded_reads_nothing_back(tmp_path: Path, monkeypatch: pytest
     shot.close()
     assert all("error" not in each.record for each in outcomes)
     assert {name.split(".")[0] for name in called} == {"total_of", "MovingFrames", "CoarseLevels"}
+
+
+def test_what_a_card_cannot_record_is_called_as_it_is(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+):
+    """Also later: a second try would fail as well."""
+    tried = list[int]()
+
+    def fail(*given: Any, **more: Any) -> None:
+        tried.append(1)
+        raise RuntimeError("out of memory")
+
+    class OnCard(Tensor):
+        is_cuda = True
+
+    monkeypatch.setattr("physgraph_usd.solver.mesh.recorded._captured", fail)
+    twice = Recorded(lambda x: [2.0 * x])
+    with caplog.at_level("INFO", logger="physgraph_usd"):
+        found = [float(twice(torch.full((1,), float(n)).as_subclass(OnCard))[0]) for n in range(3 * CALLS)]
+    assert found == [2.0 * n for n in range(3 * CALLS)]
+    assert len(tried) == 1
+    assert "is not recorded: out of memory" in caplog.text

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import gc
+import logging
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -12,13 +13,16 @@ from torch import Tensor
 
 CALLS = 12
 """Calls with equal shapes before a recording: recording takes as long as some calls, and a changed material ends it."""
+NEVER = -(2**62)
+"""Count of calls of what a card could not record."""
+_logger = logging.getLogger(__name__)
 
 
 class Recorded:
     """A function of tensors, recorded for each combination of shapes.
 
     The function reads nothing back from the card, and all that changes from call to call is an input. Without a card,
-    or with an input that is no tensor there, it is called as it is.
+    with an input that is no tensor there, or where recording fails, the function is called as it is.
     """
 
     def __init__(self, function: Callable[..., Sequence[Tensor]]) -> None:
@@ -32,10 +36,17 @@ class Recorded:
             return self._function(*given)
         key = tuple((each.shape, each.dtype) for each in given)
         known = self._known.get(key, 0)
-        if not isinstance(known, _Recording):
-            self._known[key] = known + 1 if known < CALLS else _Recording(self._function, given)
-            return self._function(*given)
-        return known(given)
+        if isinstance(known, _Recording):
+            return known(given)
+        self._known[key] = known + 1 if known < CALLS else self._recording(given)
+        return self._function(*given)
+
+    def _recording(self, given: Sequence[Tensor]) -> _Recording | int:
+        try:
+            return _Recording(self._function, given)
+        except RuntimeError as error:
+            _logger.info("%s is not recorded: %s", self._function.__qualname__, error)
+            return NEVER
 
 
 class Recordings(dict[Any, Recorded]):
@@ -55,19 +66,7 @@ class _Recording:
         """Record the function, without running it."""
         self._inputs = [each.clone(memory_format=torch.contiguous_format) for each in given]
         card = given[0].device
-        self._graph, before, stream = torch.cuda.CUDAGraph(), torch.cuda.current_stream(card), torch.cuda.Stream(card)
-        stream.wait_stream(before)
-        collects = gc.isenabled()
-        gc.disable()  # Memory that is freed meanwhile would end the recording.
-        with torch.cuda.stream(stream):
-            self._graph.capture_begin(pool=_pool(before.device_index), capture_error_mode="thread_local")
-            try:
-                self._outputs = list(function(*self._inputs))
-            finally:
-                self._graph.capture_end()
-                if collects:
-                    gc.enable()
-        before.wait_stream(stream)
+        self._graph, self._outputs = _captured(lambda: function(*self._inputs), card, pool=_shared(card).pool())
 
     def __call__(self, given: Sequence[Tensor]) -> list[Tensor]:
         """Replay with other inputs."""
@@ -76,7 +75,32 @@ class _Recording:
         return [each.clone() for each in self._outputs]
 
 
+def _captured(
+    function: Callable[[], Sequence[Tensor]], card: torch.device, *, pool: Any = None
+) -> tuple[torch.cuda.CUDAGraph, Sequence[Tensor]]:
+    """A CUDA graph of what a function does on a card, and the tensors that it makes; its memory is a pool's."""
+    graph, before, stream = torch.cuda.CUDAGraph(), torch.cuda.current_stream(card), torch.cuda.Stream(card)
+    stream.wait_stream(before)
+    collects = gc.isenabled()
+    gc.disable()  # Memory that is freed meanwhile would end the recording.
+    try:
+        with torch.cuda.stream(stream):
+            graph.capture_begin(pool=pool, capture_error_mode="thread_local")
+            try:
+                made = function()
+            finally:
+                graph.capture_end()
+    finally:
+        if collects:
+            gc.enable()
+    before.wait_stream(stream)
+    return graph, made
+
+
 @functools.cache
-def _pool(card: int) -> Any:
-    """Memory shared by the recordings of a card: none runs while another does."""
-    return torch.cuda.graph_pool_handle()
+def _shared(card: torch.device) -> torch.cuda.CUDAGraph:
+    """A graph that keeps the memory which all graphs of a card share: none runs while another does.
+
+    Torch refuses a pool that no graph holds any more.
+    """
+    return _captured(lambda: [torch.zeros(1, device=card)], card)[0]
