@@ -198,8 +198,13 @@ def note(
     return count + 1
 
 
-def _search(put: Any, output: Any) -> Any:
-    """Function that gives the pairs of parts whose boxes meet to one like `write`, with an output of its type."""
+def _kind_search(put: Any, output: Any) -> Any:
+    """Warp function: calls `write` or `note` with each pair of parts of two clusters whose boxes meet.
+
+    Args:
+        put: `write` or `note`.
+        output: Type of the output: `Found` or `Candidates`.
+    """
 
     def search_kind(
         parts: Topology,
@@ -241,7 +246,7 @@ def _search(put: Any, output: Any) -> Any:
 
 
 def _finder(search_kind: Any, output: Any, name: str) -> wp.Kernel:
-    """The kernel of a `_search`."""
+    """Kernel over pairs of clusters, given a `_kind_search` and the type of its output."""
 
     def find(
         start: wp.int32,
@@ -277,8 +282,8 @@ def _finder(search_kind: Any, output: Any, name: str) -> wp.Kernel:
     return cast(wp.Kernel, wp.kernel(find, name=name, **ALONE))
 
 
-find_pairs = _finder(_search(write, Found), Found, "find_pairs")
-find_candidates = _finder(_search(note, Candidates), Candidates, "find_candidates")
+find_pairs = _finder(_kind_search(write, Found), Found, "find_pairs")
+find_candidates = _finder(_kind_search(note, Candidates), Candidates, "find_candidates")
 
 
 @wp.kernel

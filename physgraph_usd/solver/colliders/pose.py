@@ -1,4 +1,4 @@
-"""Colliders and their poses at one time code; numpy only."""
+"""Colliders, and poses of colliders at a time code."""
 
 from __future__ import annotations
 

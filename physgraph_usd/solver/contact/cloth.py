@@ -185,8 +185,9 @@ class LevelContact:
 
     def of_cage(self, x: Float[Tensor, "vertices 3"]) -> ContactState:
         """As `look` for an upsampled cage [m], searched only around what crosses in the cage itself."""
-        none = self._doubtful is None
-        return ContactState.clean(x, self._corners(x)) if none else self._found(x, self._doubtful)
+        if self._doubtful is None:
+            return ContactState.clean(x, self._corners(x))
+        return self._found(x, self._doubtful)
 
     def look(self, x: Float[Tensor, "vertices 3"]) -> ContactState:
         """Crossings at x [m]; cached for the same tensor until its version changes."""

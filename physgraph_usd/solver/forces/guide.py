@@ -91,7 +91,7 @@ class Guide:
         self.coarse = torch.zeros_like(self._target)
 
     def retarget(self, coarse: Float[Tensor, "coarse 3"]) -> Guide:
-        """These ties, with the coarse positions of one frame as target [m]."""
+        """The guide of a frame, given the cage's positions [m], shape (C, 3)."""
         base = self._level.base.apply(coarse)
         guide = self.aimed(self._map.average.apply(base), base)
         guide.coarse = coarse
@@ -99,11 +99,11 @@ class Guide:
 
     @property
     def aims(self) -> tuple[Tensor, ...]:
-        """The averages to reach, and the upsampled cage [m]."""
+        """Target averages, shape (C, 3), and the upsampled cage, shape (V, 3) [m]."""
         return self._target, self._base
 
     def aimed(self, *aims: Tensor) -> Guide:
-        """These ties, with other `aims` [m]."""
+        """The guide with other `aims` [m]."""
         guide = copy.copy(self)
         guide._target, guide._base = aims
         return guide

@@ -14,7 +14,7 @@ from torch import Tensor
 CALLS = 12
 """Calls with equal shapes before a recording: recording takes as long as some calls, and a changed material ends it."""
 NEVER = -(2**62)
-"""Count of calls of what a card could not record."""
+"""Number of calls noted for a function after a failed recording."""
 _logger = logging.getLogger(__name__)
 
 
@@ -78,7 +78,13 @@ class _Recording:
 def _captured(
     function: Callable[[], Sequence[Tensor]], card: torch.device, *, pool: Any = None
 ) -> tuple[torch.cuda.CUDAGraph, Sequence[Tensor]]:
-    """A CUDA graph of what a function does on a card, and the tensors that it makes; its memory is a pool's."""
+    """CUDA graph of a function's kernels, not run, and the function's tensors.
+
+    Args:
+        function: A function without inputs.
+        card: The function's device.
+        pool: Memory pool of the graph; None for a new one.
+    """
     graph, before, stream = torch.cuda.CUDAGraph(), torch.cuda.current_stream(card), torch.cuda.Stream(card)
     stream.wait_stream(before)
     collects = gc.isenabled()
@@ -99,8 +105,8 @@ def _captured(
 
 @functools.cache
 def _shared(card: torch.device) -> torch.cuda.CUDAGraph:
-    """A graph that keeps the memory which all graphs of a card share: none runs while another does.
+    """An unused graph, to keep alive the memory pool of all graphs of a card; torch refuses a pool without a graph.
 
-    Torch refuses a pool that no graph holds any more.
+    Graphs can share memory because they run one after another.
     """
     return _captured(lambda: [torch.zeros(1, device=card)], card)[0]
