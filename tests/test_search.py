@@ -11,13 +11,16 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import torch
+import warp as wp
 from folds import named
 from meshes import grid
 
+from physgraph_usd.solver.collide.narrow_phase import next_place
 from physgraph_usd.solver.collide.pairs import Pairs, Reach
 from physgraph_usd.solver.collide.parts import TASKS, Parts, Room
 from physgraph_usd.solver.collide.search import blocking_and_near, blocking_pairs, near_parts
 from physgraph_usd.solver.level import Level, build_levels
+from physgraph_usd.solver.mesh import threads
 from physgraph_usd.solver.mesh.topology import PolygonMesh
 
 ipctk = pytest.importorskip("ipctk", reason="the IPC toolkit is not installed; it is in the extra `dev`")
@@ -76,10 +79,11 @@ def named_pairs(pairs: Pairs) -> list[Pair]:
 class Cloth:
     """A mesh, its parts, and the toolkit's view of it."""
 
-    def __init__(self, shape: Shape) -> None:
+    def __init__(self, shape: Shape, *, threads: int = 1) -> None:
         self.rest, faces = shape()
         mesh = PolygonMesh(np.full(len(faces), 3, np.int32), faces.ravel().astype(np.int32), len(self.rest))
-        self.level: Level = build_levels([named((mesh, self.rest), "Sheet")], [[]], dtype=torch.float64)[0]
+        garments = [named((mesh, self.rest), "Sheet")]
+        self.level: Level = build_levels(garments, [[]], dtype=torch.float64, threads=threads)[0]
         self.parts = Parts(self.level, np.ones((1, 1), bool))
         edges, triangles = (each.numpy().astype(np.int32) for each in (self.level.edges, self.level.triangles))
         self.oracle = ipctk.CollisionMesh(np.asfortranarray(self.rest), edges, triangles)
@@ -157,15 +161,37 @@ def judged(shape: Shape, moves: int, seed: int) -> tuple[int, int]:
     return total, lost
 
 
+@wp.kernel
+def list_items(first: wp.int32, count: wp.array(dtype=wp.int32), out: wp.array(dtype=wp.int32)):  # pyright: ignore[reportArgumentType]
+    """Write the number of each item of a launch to a place of its own."""
+    out[next_place(count)] = first + wp.tid()
+
+
+def test_threads_that_count_at_once_share_no_place():
+    size, count = 2**22, torch.zeros(1, dtype=torch.int32)
+    for _ in range(3):  # The first launch tells how long an item takes.
+        out = torch.full((size,), -1, dtype=torch.int32)
+        threads.run(list_items, size, [wp.from_torch(count.zero_()), wp.from_torch(out)], device="cpu", threads=4)
+        assert torch.equal(out.sort().values, torch.arange(size, dtype=torch.int32))
+
+
+@pytest.mark.parametrize("tasks", [1, TASKS])
 @pytest.mark.parametrize("shape", SHAPES)
-def test_a_card_finds_the_same_in_the_same_order(shape: Shape):
-    """Its kernels on one thread of the CPU, with little room at first: pairs are found by their boxes, then judged."""
-    cloth, other = Cloth(shape), Cloth(shape)
-    other.parts.tasks, other.parts.room = TASKS, Room(2, 2, 2, 2)
+def test_room_threads_and_a_cards_kernels_change_neither_pairs_nor_their_order(
+    shape: Shape, tasks: int, monkeypatch: pytest.MonkeyPatch
+):
+    """With little room at first, on four threads that share each launch; a card finds pairs by boxes, then judges."""
+    cloth, other = Cloth(shape), Cloth(shape, threads=4)
+    other.parts.tasks, other.parts.room = tasks, Room(2, 2, 2, 2)
     for x, end in random_moves(cloth, 4, seed=4):
-        assert other.found(x, end) == cloth.found(x, end)
-        both = [other.listed(x, end) for _ in range(2)]
+        expected = cloth.listed(x, end)
+        with monkeypatch.context() as shared:
+            shared.setattr(threads, "LEAST_SECONDS", 1e-9)
+            shared.setattr(threads, "SLICE_SECONDS", 1e-9)
+            both = [other.listed(x, end) for _ in range(2)]
         assert both[0] == both[1]
+        assert set(both[0]) == set(expected)
+        assert both[0] == expected or tasks > 1
 
 
 @pytest.mark.parametrize(("moves", "seed"), [(5, 4), pytest.param(100, 2, marks=pytest.mark.slow)])

@@ -26,27 +26,25 @@ PAIR_KINDS = wp.constant(3)
 
 @wp.struct
 class Found:
-    """Output of a search: where the pairs of parts of each task begin, and the fields of `Pairs`."""
+    """Output of a search, in any order, counted even without room.
 
-    begin: wp.array(dtype=wp.int32)
+    Attributes:
+        candidates: Number of pairs of parts whose boxes meet, where they are noted, shape (1,).
+        candidate_key: The place of each of them in the right order.
+        parts: Kind of the first part of each, and numbers of both.
+        count: Number of pairs that are results, shape (1,).
+        key: The place of each result in the right order.
+        corners, value, face: The fields of `Pairs`.
+    """
+
+    candidates: wp.array(dtype=wp.int32)
+    candidate_key: wp.array(dtype=wp.int64)
+    parts: wp.array(dtype=wp.vec3i)
+    count: wp.array(dtype=wp.int32)
+    key: wp.array(dtype=wp.int64)
     corners: wp.array(dtype=wp.vec4i)
     value: wp.array(dtype=wp.float64)
     face: wp.array(dtype=wp.bool)
-
-
-@wp.struct
-class Candidates:
-    """Pairs of parts whose boxes meet, in any order, counted even without room.
-
-    Attributes:
-        count: Number of pairs, shape (1,).
-        key: The place of each in the right order.
-        parts: Kind of the first part, and numbers of both.
-    """
-
-    count: wp.array(dtype=wp.int32)
-    key: wp.array(dtype=wp.int64)
-    parts: wp.array(dtype=wp.vec3i)
 
 
 @wp.func
@@ -155,72 +153,63 @@ def judged(parts: Topology, query: Query, c: wp.vec4i, first: wp.int32, k: wp.in
     return wp.where(is_pierced(query, parts.parts[k], parts.parts[m]), wp.float64(0.0), wp.float64(1.0))
 
 
+@wp.func_native(
+    """
+#if defined(__CUDA_ARCH__)
+    return atomicAdd(count.data, 1);
+#else
+    return __atomic_fetch_add(count.data, 1, __ATOMIC_RELAXED);
+#endif
+"""
+)
+def next_place(count: wp.array(dtype=wp.int32)) -> wp.int32:
+    """The count, which is then one more, also where several threads count; Warp's own sum counts alone on the CPU."""
+    ...
+
+
 @wp.func
-def write(
-    parts: Topology,
-    query: Query,
-    found: Found,
-    owner: wp.int32,
-    count: wp.int32,
-    first: wp.int32,
-    k: wp.int32,
-    m: wp.int32,
-):
-    """Write two parts if they are a result, and there is room; returns the number of pairs so far."""
+def write(parts: Topology, query: Query, found: Found, key: wp.int64, first: wp.int32, k: wp.int32, m: wp.int32):
+    """Write two parts if they are a result."""
     c = corners_of(parts, query, first, k, m)
     value = judged(parts, query, c, first, k, m)
     if value >= wp.float64(1.0):
-        return count
-    place = found.begin[owner] + count
-    if place < found.begin[owner + 1]:
+        return
+    place = next_place(found.count)
+    if place < found.key.shape[0]:
+        found.key[place] = key
         found.corners[place] = c
         found.value[place] = value
         found.face[place] = first == Part.VERTEX
-    return count + 1
 
 
 @wp.func
-def note(
-    parts: Topology,
-    query: Query,
-    found: Candidates,
-    owner: wp.int32,
-    count: wp.int32,
-    first: wp.int32,
-    k: wp.int32,
-    m: wp.int32,
-):
-    """Note two parts as candidates, if there is room; returns the number of the task's candidates so far."""
-    place = wp.atomic_add(found.count, 0, 1)
-    if place < found.key.shape[0]:
-        found.key[place] = (wp.int64(owner) << wp.int64(20)) + wp.int64(count)
+def note(parts: Topology, query: Query, found: Found, key: wp.int64, first: wp.int32, k: wp.int32, m: wp.int32):
+    """Note two parts as candidates."""
+    place = next_place(found.candidates)
+    if place < found.candidate_key.shape[0]:
+        found.candidate_key[place] = key
         found.parts[place] = wp.vec3i(first, k, m)
-    return count + 1
 
 
-def _kind_search(put: Any, output: Any) -> Any:
-    """Warp function: calls `write` or `note` with each pair of parts of two clusters whose boxes meet.
+def _kind_search(put: Any) -> Any:
+    """Warp function: calls `write` or `note` with each pair of parts of two clusters whose boxes meet."""
 
-    Args:
-        put: `write` or `note`.
-        output: Type of the output: `Found` or `Candidates`.
-    """
-
+    @wp.func
     def search_kind(
         parts: Topology,
         query: Query,
         boxes: Boxes,
-        found: Any,
-        owner: wp.int32,
+        found: Found,
         first: wp.int32,
         second: wp.int32,
         i: wp.int32,
         j: wp.int32,
-        count: wp.int32,
+        key: wp.int64,
         share: wp.int32,
         bits: wp.int32,
     ):
-        """Put pairs of a cluster's parts of one kind, shared by the last bits of their numbers, and another's."""
+        """Put pairs of a cluster's parts of one kind, shared by the last bits of their numbers, and another's; returns
+        the next key."""
         room, size = boxes.radius[i] + boxes.radius[j], parts.clusters + 1
         for b in range(parts.first[first * size + i], parts.first[first * size + i + 1], ALL):
             near = boxes_near(boxes.clusters, j, boxes.parts, b, blocks_left(parts, first, i, b), room)
@@ -238,15 +227,16 @@ def _kind_search(put: Any, output: Any) -> Any:
                         m = LANES * c + lowest_bit(others)
                         others = without_lowest(others)
                         if (first != second or i != j or k < m) and not shares(parts.labels[k], parts.labels[m]):
-                            count = put(parts, query, found, owner, count, first, k, m)
-        return count
+                            put(parts, query, found, key, first, k, m)
+                            key += wp.int64(1)
+        return key
 
-    search_kind.__annotations__["found"] = output
-    return wp.func(search_kind)
+    return search_kind
 
 
-def _finder(search_kind: Any, output: Any, name: str) -> wp.Kernel:
-    """Kernel over pairs of clusters, given a `_kind_search` and the type of its output."""
+def _finder(put: Any, name: str) -> wp.Kernel:
+    """Kernel over pairs of clusters that calls `write` or `note` with each pair of parts whose boxes meet."""
+    search_kind = _kind_search(put)
 
     def find(
         start: wp.int32,
@@ -255,10 +245,9 @@ def _finder(search_kind: Any, output: Any, name: str) -> wp.Kernel:
         tasks: wp.int32,
         query: Query,
         boxes: Boxes,
-        found: Any,
-        counts: wp.array(dtype=wp.int32),
+        found: Found,
     ):
-        """Pairs of each two clusters, in one task or in a task for each kind and share, and the number of each task's.
+        """Pairs of each two clusters, in one task or in a task for each kind and share.
 
         Clusters of negative numbers have none. With several tasks, their number is a power of two times `PAIR_KINDS`.
         """
@@ -268,51 +257,28 @@ def _finder(search_kind: Any, output: Any, name: str) -> wp.Kernel:
         if i < 0:
             return
         share, bits = own // PAIR_KINDS, wp.max(tasks // PAIR_KINDS, 1) - 1
-        kind = wp.where(tasks == 1, -1, own % PAIR_KINDS)
-        one, other, count = wp.where(query.kind == Ask.CROSSING, Part.EDGE, Part.VERTEX), Part.FACE, wp.int32(0)
+        kind, key = wp.where(tasks == 1, -1, own % PAIR_KINDS), wp.int64(task) << wp.int64(20)
+        one, other = wp.where(query.kind == Ask.CROSSING, Part.EDGE, Part.VERTEX), Part.FACE
         if kind <= 0:
-            count = search_kind(parts, query, boxes, found, task, one, other, i, j, count, share, bits)
+            key = search_kind(parts, query, boxes, found, one, other, i, j, key, share, bits)
         if i != j and (kind < 0 or kind == 1):
-            count = search_kind(parts, query, boxes, found, task, one, other, j, i, count, share, bits)
+            key = search_kind(parts, query, boxes, found, one, other, j, i, key, share, bits)
         if query.kind != Ask.CROSSING and (kind < 0 or kind == 2):
-            count = search_kind(parts, query, boxes, found, task, Part.EDGE, Part.EDGE, i, j, count, share, bits)
-        counts[task] = count
+            key = search_kind(parts, query, boxes, found, Part.EDGE, Part.EDGE, i, j, key, share, bits)
 
-    find.__annotations__["found"] = output
     return cast(wp.Kernel, wp.kernel(find, name=name, **ALONE))
 
 
-find_pairs = _finder(_kind_search(write, Found), Found, "find_pairs")
-find_candidates = _finder(_kind_search(note, Candidates), Candidates, "find_candidates")
+find_pairs, find_candidates = _finder(write, "find_pairs"), _finder(note, "find_candidates")
 
 
 @wp.kernel
-def judge_candidates(
-    start: wp.int32,
-    parts: Topology,
-    query: Query,
-    given: Candidates,
-    count: wp.array(dtype=wp.int32),
-    key: wp.array(dtype=wp.int64),
-    corners: wp.array(dtype=wp.vec4i),
-    value: wp.array(dtype=wp.float64),
-    face: wp.array(dtype=wp.bool),
-):
-    """Candidates that are results, in any order, with their keys, counted even without room."""
+def judge_candidates(start: wp.int32, parts: Topology, query: Query, found: Found):
+    """Write the candidates that are results."""
     i = start + wp.tid()
-    if i >= given.count[0]:
-        return
-    first, k, m = given.parts[i][0], given.parts[i][1], given.parts[i][2]
-    c = corners_of(parts, query, first, k, m)
-    own = judged(parts, query, c, first, k, m)
-    if own >= wp.float64(1.0):
-        return
-    place = wp.atomic_add(count, 0, 1)
-    if place < key.shape[0]:
-        key[place] = given.key[i]
-        corners[place] = c
-        value[place] = own
-        face[place] = first == Part.VERTEX
+    if i < found.candidates[0]:
+        which = found.parts[i]
+        write(parts, query, found, found.candidate_key[i], which[0], which[1], which[2])
 
 
 @wp.kernel

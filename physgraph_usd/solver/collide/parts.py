@@ -23,7 +23,7 @@ from .boxes import arrays_of, bound_clusters, boxes_for, query_of
 from .topology import topology_of
 
 FIRST_ROOM = 2**14
-"""Room of the first search on a card."""
+"""Room of the first search."""
 TASKS = 12
 """Tasks of a pair of clusters on a card, each with one of the three kinds of pairs and every fourth part."""
 SIZE = {"cpu": 24, "cuda": 8}
@@ -36,20 +36,19 @@ class Room:
 
     Attributes:
         of_each: Pairs of clusters for each cluster.
-        clusters, candidates, pairs: Pairs of clusters, of parts whose boxes meet, and of parts; 0 where a search reads
-            how many there are, without a card.
+        clusters, candidates, pairs: Pairs of clusters, of parts whose boxes meet, and of parts.
     """
 
     of_each: int = 32
-    clusters: int = 0
-    candidates: int = 0
-    pairs: int = 0
+    clusters: int = FIRST_ROOM
+    candidates: int = FIRST_ROOM
+    pairs: int = FIRST_ROOM
 
     def lacks(self, *needed: int) -> bool:
         """Whether a search needed more, in this order; from now on there is room for twice as much."""
         before = replace(self)
         for name, count in zip(("of_each", "clusters", "candidates", "pairs"), needed, strict=True):
-            if 0 < getattr(self, name) < count:
+            if getattr(self, name) < count:
                 setattr(self, name, 2 * count)
         return self != before
 
@@ -99,8 +98,7 @@ class Parts:
         self.faces = int(faces[-1])
         self.starts = tuple(torch.as_tensor(each[:-1].astype(np.int64), device=level.device) for each in (edges, faces))
         self.boxes, self.recordings = boxes_for(self.topology, level.device), Recordings()
-        self.tasks = 1 if level.device == "cpu" else TASKS
-        self.room = Room() if level.device == "cpu" else Room(Room.of_each, *[FIRST_ROOM] * 3)
+        self.room, self.tasks = Room(), 1 if level.device == "cpu" else TASKS
 
     @cached_property
     def tree(self) -> wp.Bvh:

@@ -20,16 +20,12 @@ from torch import Tensor
 from ..mesh.kernels import KERNELS
 from ..mesh.threads import argument, refit, run
 from .boxes import Ask, Boxes, Query, arrays_of, bound_clusters, bound_parts, boxes_near, query_of
-from .narrow_phase import Candidates, Found, check_pairs, find_candidates, find_pairs, judge_candidates
+from .narrow_phase import Found, check_pairs, find_candidates, find_pairs, judge_candidates
 from .pairs import NearAt, Pairs, Reach
 from .parts import Parts
 from .topology import LANES, Topology
 
 wp.set_module_options(KERNELS)
-
-PAIRS, TASK_PAIRS = 2**21, 16
-"""Room for pairs of parts, of all tasks, and at least of a task. Without enough room a search runs twice: with 2**19
-frames of the sample `layers` take 1.15 times as long."""
 
 
 @wp.kernel
@@ -74,7 +70,7 @@ def list_clusters(
 ):
     """Write the pairs of each cluster up to `end`, sorted: the order in the tree depends on the pose at its making.
 
-    Pairs without room are left out, as in `gather_pairs`."""
+    Pairs without room are left out."""
     i = first + wp.tid()
     if count[i] > 0:
         boxes.met[i] = True
@@ -88,32 +84,6 @@ def list_clusters(
         found[i * room + k] = j
     for n in range(wp.min(wp.min(count[i], room), pairs.shape[0] - end[i] + count[i])):
         pairs[end[i] - count[i] + n] = wp.vec2i(i, found[i * room + n])
-
-
-@wp.kernel
-def gather_pairs(
-    first: wp.int32,
-    room: wp.int32,
-    corners: wp.array(dtype=wp.vec4i),
-    value: wp.array(dtype=wp.float64),
-    face: wp.array(dtype=wp.bool),
-    end: wp.array(dtype=wp.int32),
-    out_corners: wp.array(dtype=wp.vec4i),
-    out_value: wp.array(dtype=wp.float64),
-    out_face: wp.array(dtype=wp.bool),
-):
-    """Write the pairs of each task that had room for them, from the end of the previous task on."""
-    i = first + wp.tid()
-    begin = wp.int32(0)
-    if i > 0:
-        begin = end[i - 1]
-    count = end[i] - begin
-    if count > room:
-        return
-    for n in range(wp.min(count, out_face.shape[0] - begin)):
-        out_corners[begin + n] = corners[i * room + n]
-        out_value[begin + n] = value[i * room + n]
-        out_face[begin + n] = face[i * room + n]
 
 
 def near_parts(
@@ -219,23 +189,23 @@ def _search(parts: Parts, arrays: Sequence[Tensor], *, kind: Ask, floor: float =
 
     while True:
         look = parts.recordings.of((kind, floor, half, clusters), lambda *arrays: _looked(parts, query(*arrays)))
-        counts, near, end, *found = look(*arrays)
-        *needed, over = counts.tolist()
+        counts, key, *found = look(*arrays)
+        needed = counts.tolist()
         if not parts.room.lacks(*needed):
             break
         parts.recordings.clear()
-    out = Pairs(*(each[: needed[-1]] for each in found))
-    if over:  # Tasks without room are repeated.
-        _again(parts, query(*arrays), near, end, out)
-    return out
+    count = needed[-1]
+    return Pairs(*(each[:count] for each in found)).where(key[:count].argsort())
 
 
 def _looked(parts: Parts, query: Any) -> tuple[Tensor, ...]:
     """One pass of a search in the room there is.
 
+    On a card a thread judges one candidate: threads that judged what they find would wait for a few of them.
+
     Returns:
-        Most pairs of clusters of a cluster, number of them, of candidates, of pairs of parts, and of tasks without
-        room; the pairs of clusters; the number of pairs up to each task's end; and the fields of `Pairs`.
+        Most pairs of clusters of a cluster, number of them, of candidates, and of pairs of parts; the place of each
+        pair of parts in the right order; and the fields of `Pairs`.
     """
     room, size, device, tree = parts.room, query.clusters, parts.level.device, parts.tree
     _launch(parts, bound_clusters, size, parts.topology, query, parts.boxes)
@@ -245,53 +215,25 @@ def _looked(parts: Parts, query: Any) -> tuple[Tensor, ...]:
     inputs = [parts.topology, query, parts.boxes, tree.id, room.of_each, argument(slots), argument(own)]
     _launch(parts, find_clusters, size, *inputs)
     last = own.cumsum(dim=0, dtype=torch.int32)
-    near = torch.full((room.clusters or max(int(last[-1]), 1), 2), -1, dtype=torch.int32, device=device)
+    near = torch.full((room.clusters, 2), -1, dtype=torch.int32, device=device)
     inputs = [argument(slots), argument(own), argument(last), argument(near, wp.vec2i)]
     _launch(parts, list_clusters, size, room.of_each, parts.boxes, *inputs)
     _launch(parts, bound_parts, size, parts.topology, query, parts.boxes)
-    if room.pairs:  # On a card.
-        counts, out = _candidates(parts, query, near)
-        counts = torch.stack([own.max(), last[-1], *counts, counts[0].new_zeros(())])
-        return counts, near[:0], last, out.corners, out.value, out.face
-    tasks = parts.tasks * len(near)
-    each = max(PAIRS // tasks, TASK_PAIRS)
-    begin = torch.arange(0, (tasks + 1) * each, each, dtype=torch.int32, device=device)
-    found, count = Pairs.empty(tasks * each, device), torch.zeros(tasks, dtype=torch.int32, device=device)
-    _find(parts, query, near, begin, count, found)
-    end = count.cumsum(dim=0, dtype=torch.int32)
-    out = Pairs.empty(max(int(end[-1]), 1), device)
-    _launch(parts, gather_pairs, tasks, each, *_arguments(found), argument(end), *_arguments(out))
-    counts = (own.max(), last[-1], count.sum(), count.sum(), (count > each).sum())
-    return torch.stack([value.long() for value in counts]), near, end, out.corners, out.value, out.face
-
-
-def _candidates(parts: Parts, query: Any, near: Int[Tensor, "clusters 2"]) -> tuple[list[Tensor], Pairs]:
-    """Numbers of candidates and of results among the pairs of parts of pairs of clusters, and the results in order.
-
-    A thread judges one candidate: judging in the threads that find them leaves most threads waiting for a few.
-    """
-    room, device = parts.room, near.device
-    number, kept = torch.zeros((2, 1), dtype=torch.int32, device=device)
-    counts = torch.empty(len(near) * parts.tasks, dtype=torch.int32, device=device)
-    keys, own = (torch.full((size,), 2**62, device=device) for size in (room.candidates, room.pairs))
-    which = torch.empty((room.candidates, 3), dtype=torch.int32, device=device)
-    given, out = Candidates(), Pairs.empty(room.pairs, device)
-    given.count, given.key, given.parts = (wp.from_torch(number), wp.from_torch(keys), wp.from_torch(which, wp.vec3i))
-    inputs = [parts.topology, argument(near, wp.vec2i), parts.tasks, query, parts.boxes, given, argument(counts)]
-    _launch(parts, find_candidates, len(counts), *inputs)
-    results = [argument(kept), argument(own), *_arguments(out)]
-    _launch(parts, judge_candidates, room.candidates, parts.topology, query, given, *results)
-    return [number[0], kept[0]], out.where(own.argsort())
-
-
-def _again(parts: Parts, query: Any, near: Int[Tensor, "clusters 2"], end: Int[Tensor, " tasks"], out: Pairs) -> None:
-    """Write all pairs of the pairs of clusters with a task without room to their places."""
-    begin = torch.nn.functional.pad(end, (1, 0))
-    each = max(PAIRS // len(end), TASK_PAIRS)
-    over = torch.nonzero((begin.diff() > each).reshape(-1, parts.tasks).any(dim=1)).squeeze(1)
-    places = begin[:-1].reshape(-1, parts.tasks)[over].reshape(-1)
-    places = torch.cat([places, end[-1:]])  # Each task has its room.
-    _find(parts, query, near[over], places, torch.zeros_like(places[1:]), out)
+    candidates, count = torch.zeros((2, 1), dtype=torch.int32, device=device)
+    keys = [torch.empty(each, dtype=torch.int64, device=device) for each in (room.candidates, room.pairs)]
+    which, out = torch.empty((room.candidates, 3), dtype=torch.int32, device=device), Pairs.empty(room.pairs, device)
+    found = Found()
+    found.candidates, found.count = wp.from_torch(candidates), wp.from_torch(count)
+    found.candidate_key, found.key = (wp.from_torch(each) for each in keys)
+    found.parts, found.corners = wp.from_torch(which, wp.vec3i), wp.from_torch(out.corners, wp.vec4i)
+    found.value, found.face = wp.from_torch(out.value), wp.from_torch(out.face)
+    find = find_pairs if parts.tasks == 1 else find_candidates
+    inputs = [parts.topology, argument(near, wp.vec2i), parts.tasks, query, parts.boxes, found]
+    _launch(parts, find, len(near) * parts.tasks, *inputs)
+    if find is find_candidates:
+        _launch(parts, judge_candidates, room.candidates, parts.topology, query, found)
+    counts = torch.stack([own.max(), last[-1], candidates[0], count[0]])
+    return counts, keys[1], out.corners, out.value, out.face
 
 
 def _blocking_among(pairs: Pairs, parts: Parts, query: Any) -> Pairs:
@@ -299,20 +241,6 @@ def _blocking_among(pairs: Pairs, parts: Parts, query: Any) -> Pairs:
     inputs = [parts.topology, query, argument(pairs.corners, wp.vec4i), argument(pairs.face), argument(value)]
     _launch(parts, check_pairs, len(value), *inputs)
     return Pairs(pairs.corners, value, pairs.face).where(value < 1.0)
-
-
-def _find(parts: Parts, query: Any, near: Tensor, begin: Tensor, count: Tensor, out: Pairs) -> None:
-    """The pairs of parts of pairs of clusters, written from given places on; and the number of pairs of each task."""
-    found = Found()
-    found.begin = wp.from_torch(begin)
-    found.corners = wp.from_torch(out.corners, dtype=wp.vec4i)
-    found.value, found.face = wp.from_torch(out.value), wp.from_torch(out.face)
-    inputs = [parts.topology, argument(near, wp.vec2i), parts.tasks, query, parts.boxes, found, argument(count)]
-    _launch(parts, find_pairs, len(count), *inputs)
-
-
-def _arguments(pairs: Pairs) -> list[Any]:
-    return [argument(pairs.corners, wp.vec4i), argument(pairs.value), argument(pairs.face)]
 
 
 def _launch(parts: Parts, kernel: wp.Kernel, size: int, *inputs: object) -> None:
