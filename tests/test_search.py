@@ -162,7 +162,7 @@ def judged(shape: Shape, moves: int, seed: int) -> tuple[int, int]:
 
 
 @wp.kernel
-def list_items(first: wp.int32, count: wp.array(dtype=wp.int32), out: wp.array(dtype=wp.int32)):  # pyright: ignore[reportArgumentType]
+def list_items(first: wp.int32, count: wp.array(dtype=wp.int32), out: wp.array(dtype=wp.int32)):  # pyright: ignore
     """Write the number of each item of a launch to a place of its own."""
     out[next_place(count)] = first + wp.tid()
 
@@ -171,7 +171,8 @@ def test_threads_that_count_at_once_share_no_place():
     size, count = 2**22, torch.zeros(1, dtype=torch.int32)
     for _ in range(3):  # The first launch tells how long an item takes.
         out = torch.full((size,), -1, dtype=torch.int32)
-        threads.run(list_items, size, [wp.from_torch(count.zero_()), wp.from_torch(out)], device="cpu", threads=4)
+        given = [wp.from_torch(count.zero_()), wp.from_torch(out)]
+        threads.run(list_items, size, given, device="cpu", threads=4)  # pyright: ignore[reportArgumentType]
         assert torch.equal(out.sort().values, torch.arange(size, dtype=torch.int32))
 
 
