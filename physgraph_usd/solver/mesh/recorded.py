@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 CALLS = 2
-"""Calls with equal shapes before a recording, which takes as long as some calls. First frames take 3.2 and 7.6 s with 2,
-4.1 and 8.3 with 4, and 4.5 and 8.4 with 12 (H200, dancer at two subdivisions and shot 10 at three)."""
+"""Calls with equal shapes before a recording, which takes as long as some calls. First frames take 3.2 and 7.6 s with
+2, 4.1 and 8.3 with 4, and 4.5 and 8.4 with 12 (H200, dancer at two subdivisions and shot 10 at three)."""
 NEVER = -(2**62)
 """Number of calls noted for a function after a failed recording."""
 _logger = logging.getLogger(__name__)
