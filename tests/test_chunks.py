@@ -68,12 +68,12 @@ class TestFarmFolder:
         times = [float(time) for time in range(8)]
         with FrameFolder(tmp_path / "f", {}) as frames:
             outcomes = list(
-                solve_in_chunks(counting, times, frames, workers=2, preroll=3, start=start, mover=None, warn=print)
+                solve_in_chunks(counting, times, frames, workers=2, preroll=3, start=start, movers=None, warn=print)
             )
         assert [int(np.asarray(outcome.points[0])[0, 0]) for outcome in outcomes] == [0, 1, 2, 3, 3, 4, 5, 6]
         monkeypatch.setattr("physgraph_usd.shot.chunks.LATE_SECONDS", 0.1)
         with FrameFolder(tmp_path / "f", {}) as frames, pytest.raises(SolveError, match="the result of time code 0"):
-            next(solve_in_chunks(counting, times, frames, workers=1, start=start, mover=None, warn=print))
+            next(solve_in_chunks(counting, times, frames, workers=1, start=start, movers=None, warn=print))
         timers[-1].cancel()
 
     def test_a_task_that_outlasts_its_run_writes_nothing_into_another(self, tmp_path: Path):

@@ -44,7 +44,9 @@ def heights(found: list[Outcome]) -> list[float]:
 
 
 def test_cloth_that_would_cross_jumps_and_is_told_of():
-    joints = [join([(read(k, None), read(k, 3)) for k in range(3)], Passing("</a> would have 3 edges through cloth"))]
+    joints = [
+        join([(read(k, None), read(k, 3)) for k in range(3)], lambda: Passing("</a> would have 3 edges through cloth"))
+    ]
     found = list(frames_in_order(read, range(5), {3: 0}, join=lambda *_: joints[0].frames))
     assert [each.reused for each in found] == [(True,), (True,), (True,), (False,), (True,)]
     assert heights(found) == [0.0, 0.0, 0.0, 1.0, 1.0]
@@ -56,7 +58,7 @@ def test_cloth_that_would_cross_jumps_and_is_told_of():
 def test_folds_that_change_sides_stop_before_they_cross(tmp_path: Path):
     """Half way between a half that lies over the other one, and under it, they would pass through each other."""
     with closing(open_shot(str(cloth_shot(tmp_path / "shot.usdc", times=(1.0,), size=(4, 3))))) as opened:
-        move = ShotSolver(opened.path, [0], RefineOptions(), opened=opened).move_safely
+        move = ShotSolver(opened.path, [0], RefineOptions(), opened=opened).mover()
         flat = opened.frame(1.0).garments[0].points * [1.0, 1.0, 0.0]
         middle = flat.mean(axis=0)
         turned = np.flatnonzero(flat[:, 0] > middle[0] + 0.01)

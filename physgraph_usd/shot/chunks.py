@@ -23,7 +23,7 @@ import numpy as np
 from ..errors import SolveError
 from ..interrupts import leave_if_asked
 from .frames import FrameFolder, Outcome
-from .joined import Both, Joint, Mover, join
+from .joined import Both, Joint, Movers, join
 from .processes import POLL_SECONDS, Start, memory_is_named, result_of
 
 PREROLL = 6
@@ -94,7 +94,7 @@ def solve_in_chunks(
     frames: FrameFolder,
     *,
     workers: int,
-    mover: Mover | None,
+    movers: Movers | None,
     warn: Callable[..., object],
     only: range | None = None,
     preroll: int = PREROLL,
@@ -106,7 +106,7 @@ def solve_in_chunks(
         solver: Solves time codes in order.
         frames: Folder of the results; frames in ``frames.kept`` are read from the folder.
         workers: Number of chunks.
-        mover: Moves cloth safely, to join the frames before each seam; picklable. None leaves them unjoined.
+        movers: Give a mover of cloth, to join the frames before each seam; picklable. None leaves them unjoined.
         warn: Called with the warnings of a seam.
         only: Numbers of the time codes to solve; None for all.
         preroll: Frames solved before each chunk except the shot's first.
@@ -127,20 +127,20 @@ def solve_in_chunks(
     if start is None:
         solved = _solve(solver, list(times), parts, frames, preroll)
     else:
-        called = [start(_work, (solver, list(times), chunk, frames, preroll), seams, mover) for chunk in chunks]
+        called = [start(_work, (solver, list(times), chunk, frames, preroll), seams, movers) for chunk in chunks]
         calls = {k: call for chunk, call in zip(chunks, called, strict=True) for part in chunk for k in part}
 
     def read(index: int, seam: int | None) -> Outcome:
         stored = partial(frames.read, index, times[index], seam=seam)
         return _await(stored, times[index], call=calls.get(index if seam is None else seam), solved=solved)
 
-    def joined(move: Mover, seam: int, both: Both) -> Sequence[Outcome]:
+    def joined(own: Movers, seam: int, both: Both) -> Sequence[Outcome]:
         known = result_of(calls[seam - 1]).get(seam) if seam - 1 in calls else None
-        joint = known or join(both, move)
+        joint = known or join(both, own)
         warn(*joint.warnings)
         return joint.frames
 
-    yield from frames_in_order(read, wanted, seams, join=partial(joined, mover) if mover else None)
+    yield from frames_in_order(read, wanted, seams, join=partial(joined, movers) if movers else None)
 
 
 def _solve(
@@ -155,20 +155,20 @@ def _solve(
                 yield index
 
 
-def _work(job: tuple[Any, ...], seams: Mapping[int, int], mover: Mover | None) -> dict[int, Joint]:
+def _work(job: tuple[Any, ...], seams: Mapping[int, int], movers: Movers | None) -> dict[int, Joint]:
     """Solve a chunk in a worker process, and join its frames before each seam if the next chunk's are there."""
     deque(_solve(*job), maxlen=0)
     joints: dict[int, Joint] = {}
-    if mover is None:
+    if movers is None:
         return joints
     _, times, chunk, frames, _ = job
-    own, move = {index for part in chunk for index in part}, mover
+    own, given = {index for part in chunk for index in part}, movers
 
     def read(index: int, seam: int | None) -> Any:
         return frames.read(index, times[index], seam=seam)
 
     def joined(seam: int, both: Both) -> Sequence[Outcome]:
-        joints[seam] = join(both, move)
+        joints[seam] = join(both, given)
         return joints[seam].frames
 
     before = [

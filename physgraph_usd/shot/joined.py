@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -29,7 +30,11 @@ Positions = Sequence[np.ndarray | None]
 """Points of each garment, shape (V, 3), None for a garment without a sample."""
 Mover = Callable[[float | None, Positions, Positions, Positions], tuple[Positions, str]]
 """Moves cloth safely at a time code from the nearer solution towards wanted positions; the farther solution is the
-third argument. Also returns a description of new intersections, "" for none."""
+third argument. Also returns a description of new intersections, "" for none. The frames of a seam are moved in order by
+one mover, without any history of frames before."""
+
+Movers = Callable[[], Mover]
+"""Gives a mover for a seam."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,14 +57,14 @@ class Joint:
         return [f"{jump}: {self.why}"] if self.why else []
 
 
-def join(both: Both, move: Mover) -> Joint:
+def join(both: Both, movers: Movers) -> Joint:
     """Join the frames of one seam.
 
     Args:
         both: The frames before the seam, each with the solution of the process behind the seam.
-        move: Moves cloth safely.
+        movers: Asked for a mover if any frame differs.
     """
-    frames = list[Outcome]()
+    frames, mover = list[Outcome](), cache(movers)
     for k, (own, after) in enumerate(both, start=1):
         pairs, weight = list(zip(own.points, after.points, strict=False)), k / (len(both) + 1)
         if all(a is None or b is None or np.array_equal(a, b) for a, b in pairs):
@@ -67,7 +72,7 @@ def join(both: Both, move: Mover) -> Joint:
             continue
         wanted = [a if a is None or b is None else between(a, b, weight) for a, b in pairs]
         near, far = [a for a, _ in pairs], [b for _, b in pairs]
-        points, why = move(own.time, *((near, far) if weight < 0.5 else (far, near)), wanted)
+        points, why = mover()(own.time, *((near, far) if weight < 0.5 else (far, near)), wanted)
         leave_if_asked()  # A signal may have cut the move short.
         if why:
             return Joint([own for own, _ in both], why)

@@ -180,8 +180,8 @@ class Run:
         self._warn_of_finished(frames, len(self._numbers))
         with self._processes() as start:
             how = {"workers": self.options.workers, "only": self._numbers, "preroll": self._preroll, "start": start}
-            mover = None if self._is_chunk else self.solver.move_safely
-            how |= {"mover": mover, "warn": self.report.warn}
+            movers = None if self._is_chunk else self.solver.mover
+            how |= {"movers": movers, "warn": self.report.warn}
             with closing(solve_in_chunks(self.solver, self._times, frames, **how)) as solved:
                 yield from solved
 

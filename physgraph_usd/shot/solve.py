@@ -6,6 +6,7 @@ import dataclasses
 import os
 import time as clock
 from collections.abc import Generator, Sequence
+from functools import partial
 from statistics import mean
 from typing import Any
 
@@ -19,7 +20,7 @@ from ..solver.mesh.kernels import device_of, start_warp
 from ..usd.read.reader import Shot
 from ..usd.view import Stage
 from .frames import Outcome
-from .joined import Positions, counts, worse
+from .joined import Mover, Positions, counts, worse
 from .options import RefineOptions
 from .processes import cores
 from .untagged import open_with_colliders
@@ -93,21 +94,24 @@ class ShotSolver:
             yield outcome
         self._refiner = refiner
 
-    def move_safely(
-        self, time: float | None, near: Positions, far: Positions, wanted: Positions
+    def mover(self) -> Mover:
+        """A mover for the frames of one seam; the levels are those of the last solved range, if any."""
+        if self._refiner is None or self._opened is None:
+            self._opened, self._refiner = self._built()
+        self._refiner.forget()
+        return partial(self._move_safely, self._opened, self._refiner)
+
+    @staticmethod
+    def _move_safely(
+        shot: Shot, refiner: Refiner, time: float | None, near: Positions, far: Positions, wanted: Positions
     ) -> tuple[Positions, str]:
         """Move cloth without new intersections or vertices in bodies, as `Mover` requires.
 
-        The two solutions are measured only if the result crosses something. The levels are those of the last solved
-        range, if any.
+        The two solutions are measured only if the result crosses something.
         """
-        if self._refiner is None or self._opened is None:
-            self._opened, self._refiner = self._built()
-        shot, refiner = self._opened, self._refiner
         frame = shot.frame(time)
 
         def moved(start: Positions, end: Positions) -> tuple[Positions, list[dict[str, Any]]]:
-            refiner.forget()
             found = refiner.moved_safely(frame, start, end)
             return [points for points, _ in found], [contact for _, contact in found]
 

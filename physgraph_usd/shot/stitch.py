@@ -132,7 +132,7 @@ class _Joins:
         solver = ShotSolver(self.shot.path, self.run["levels"], self.parts[0].options(), opened=self.shot)
 
         def joined(seam: int, both: Both) -> Sequence[Outcome]:
-            joint = join(both, solver.move_safely)
+            joint = join(both, solver.mover)
             self.warn(*joint.warnings)
             self._measure(seam, both, joint)
             return joint.frames
