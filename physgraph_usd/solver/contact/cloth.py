@@ -241,16 +241,15 @@ class LevelContact:
         inside = None if state.inside is None else self.mesh.padded(state.inside.any(dim=0))
         near = springs.find(at, springs.near(x, at, asked=self._asked, inside=inside).pairs)
         near, with_body, touching = springs.sided(near, state.exempt)
-        pushes = springs.constraints(near.where(with_body), at, stiffness)
+        every = springs.constraints(near, at, stiffness)
+        pushes, gaps = every.where(with_body), every.where(~with_body)
         if self.bodies is not None and (any(state.in_bodies) or bool(touching.any())):
             within, chords = _within(self.mesh, self.bodies, state)
             pushes = pushes.with_more(self.bodies.pulls(x, within | touching, chords))
-        near = near.where(~with_body)
         if tangles is not None:  # What crosses has no side to keep.
-            corners = near.near.corners.long()
+            corners = gaps.corners.long()
             kept = ~self.mesh.crossed(state.crossings)[corners].any(dim=1)
-            near = near.where(kept & ~tangles.given_up[corners].all(dim=1))
-        gaps = springs.constraints(near, at, stiffness)
+            gaps = gaps.where(kept & ~tangles.given_up[corners].all(dim=1))
         if state.hopeful.count:
             step = OUT * float(self.mesh.level.spacing.mean())
             gaps = gaps.with_more(gaps_out(self.mesh, state.hopeful, x, step=step, stiffness=stiffness))

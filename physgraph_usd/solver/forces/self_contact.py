@@ -18,7 +18,7 @@ from functools import cached_property
 
 import scipy.sparse as sp
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ..level import Level
@@ -43,6 +43,11 @@ class PairConstraints:
     normal: Float[Tensor, "gaps 3"]
     offset: Float[Tensor, " gaps"]
     stiffness: Float[Tensor, " gaps"]
+
+    def where(self, kept: Bool[Tensor, " gaps"]) -> PairConstraints:
+        """The selected pairs."""
+        some = torch.nonzero(kept).squeeze(1)
+        return PairConstraints(*(getattr(self, each.name)[some] for each in fields(self)))
 
     def with_more(self, other: PairConstraints) -> PairConstraints:
         """Both sets of pairs combined."""

@@ -102,9 +102,14 @@ class System:
 
     def energy_and_force(self, x: Float[Tensor, "vertices 3"]) -> tuple[float, Float[Tensor, "vertices 3"]]:
         """Energy [J] and force [N]; the force on fixed vertices is zero."""
+        energy, force = self.evaluated(x)
+        return float(energy), force
+
+    def evaluated(self, x: Float[Tensor, "vertices 3"]) -> tuple[Float[Tensor, ""], Float[Tensor, "vertices 3"]]:
+        """`energy_and_force` without waiting for the energy, a float64 scalar on the device."""
         self.evaluations += 1
         energy, force = self.field.energy_and_force(x)
-        return float(energy), force if self._all_free else force * self._mask
+        return energy, force if self._all_free else force * self._mask
 
     def apply_metric_inverse(
         self, force: Float[Tensor, "vertices 3"], solver: Solver | None = None
@@ -148,7 +153,7 @@ class System:
         return three_columns(self.rest_diagonal)
 
     @cached_property
-    def _per_edge(self) -> Float[Tensor, "vertices 3"]:
+    def per_edge(self) -> Float[Tensor, "vertices 3"]:
         """Factor from a move to its share of `relative_move` [1/m]."""
         return three_columns(1.0 / (self.spacing * self.free.sum().clamp_min(1).sqrt()))
 
@@ -163,8 +168,12 @@ class System:
 
     def relative_move(self, preconditioned: Float[Tensor, "vertices 3"]) -> Float[Tensor, ""]:
         """`remaining_move` as a tensor on the device, float64."""
-        relative = preconditioned * self._per_edge
-        return relative.square().sum(dtype=torch.float64).sqrt()
+        return root_sum(preconditioned * self.per_edge)
+
+
+def root_sum(values: Tensor) -> Float[Tensor, ""]:
+    """Root of the sum of squares, float64."""
+    return values.square().sum(dtype=torch.float64).sqrt()
 
 
 @dataclass(frozen=True, eq=False)

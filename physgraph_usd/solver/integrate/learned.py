@@ -23,7 +23,7 @@ from torch import Tensor, nn
 
 from ...errors import SolveError
 from ..level import Level
-from .base import Carry, System
+from .base import Carry, System, root_sum
 from .fused import FusedPhysgraph, fused_physgraph
 from .network import Physgraph
 from .quasi_newton import Secant, StepHistory, dot, secant_direction
@@ -55,14 +55,19 @@ class LearnedMetric:
     def start(self, system: System, x: Float[Tensor, "vertices 3"]) -> Carry:
         """Evaluate x with an empty memory; the network runs in the system's precision."""
         self._network = placed(self._network, system, x.dtype)
-        energy, force = system.energy_and_force(x)
         none = torch.zeros_like(x)
-        return Carry(x, energy, force, system.apply_short_inverse(force), self.name, StepHistory(none, (none, none)))
+        return self._evaluated(system, x, StepHistory(none, (none, none)))
 
     def resume(self, system: System, carry: Carry) -> Carry:
         """Evaluate the carry's positions after a small change of the forces; the memory is kept."""
-        energy, force = system.energy_and_force(carry.x)
-        return Carry(carry.x, energy, force, system.apply_short_inverse(force), self.name, carry.memory)
+        return self._evaluated(system, carry.x, carry.memory)
+
+    def _evaluated(self, system: System, x: Tensor, memory: StepHistory) -> Carry:
+        """The carry at x [m] with a given memory."""
+        energy, force = system.evaluated(x)
+        image = system.apply_short_inverse(force)
+        energy, remaining = torch.stack([energy, system.relative_move(image)]).tolist()
+        return Carry(x, energy, force, image, self.name, memory, remaining=remaining)
 
     def step(self, system: System, carry: Carry) -> Carry:
         """One step along the network's combination."""
@@ -75,28 +80,31 @@ class LearnedMetric:
 
     def _reached(self, system: System, carry: Carry, x: Tensor, move: Tensor) -> Carry:
         """The carry at x [m], a displacement away from the previous carry."""
-        energy, force = system.energy_and_force(x)
+        energy, force = system.evaluated(x)
         image = system.apply_short_inverse(force)
-        newest = self._secant(system, (carry.force, force, carry.preconditioned, image, move))
-        return Carry(x, energy, force, image, self.name, carry.memory.after(carry, newest))
+        newest, remaining = self._secant(system, (carry.force, force, carry.preconditioned, image, move))
+        energy, remaining = torch.stack([energy, remaining]).tolist()  # On a card one wait for both.
+        return Carry(x, energy, force, image, self.name, carry.memory.after(carry, newest), remaining=remaining)
 
-    def _secant(self, system: System, ends: tuple[Any, ...]) -> Secant:
-        """The secant of a step, given F and H0^-1 F before and after, and the displacement."""
+    def _secant(self, system: System, ends: tuple[Any, ...]) -> tuple[Secant, Tensor]:
+        """The secant of a step, given F and H0^-1 F before and after, and the displacement; and the remaining move."""
         before, force, image_before, image, move = ends
         level = system.level
         if self._trained and not move.is_cuda:  # Waiting for numbers costs nothing.
             spans = level.spans if level is not None and len(level.spans) > 1 else ()
-            return Secant(move, before - force, image_before - image, dot, spans)
+            return Secant(move, before - force, image_before - image, dot, spans), system.relative_move(image)
         product = partial(garment_dot, level)
         if not self._trained or level is None:
-            return Secant(move, before - force, image_before - image, product)
+            return Secant(move, before - force, image_before - image, product), system.relative_move(image)
 
-        def parts(before: Tensor, force: Tensor, image_before: Tensor, image: Tensor, move: Tensor) -> Sequence[Tensor]:
+        def parts(
+            before: Tensor, force: Tensor, image_before: Tensor, image: Tensor, move: Tensor, per_edge: Tensor
+        ) -> Sequence[Tensor]:
             made = Secant(move, before - force, image_before - image, product)
-            return made.yields, made.image, made.curvature
+            return made.yields, made.image, made.curvature, root_sum(image * per_edge)
 
-        yields, change, curvature = level.recordings.of("secant", parts)(*ends)
-        return Secant(move, yields, change, product, known=curvature)
+        yields, change, curvature, remaining = level.recordings.of("secant", parts)(*ends, system.per_edge)
+        return Secant(move, yields, change, product, known=curvature), remaining
 
     def propose(self, system: System, carry: Carry) -> Float[Tensor, "vertices 3"]:
         """The displacement of the next step [m]."""
