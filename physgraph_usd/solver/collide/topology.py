@@ -75,16 +75,14 @@ def topology_of(
     cluster[used] = halved(rest[used], garment[used], size)
     count = int(cluster[used].max(initial=-1)) + 1
     sides = find_edges(edges, faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2))
-    of_face, of_edge = cluster[faces[:, 0]], np.zeros(len(edges) + 1, np.int64)  # The last is of sides without an edge.
-    of_edge[sides[::-1]] = np.repeat(of_face, 3)[::-1]
-    of_edge = of_edge[:-1]
+    of_face, of_edge = cluster[faces[:, 0]], np.zeros(len(edges), np.int64)
+    of_edge[sides[::-1]] = np.repeat(of_face, 3)[::-1]  # What is written last stays.
     kinds = ((cluster[used], np.stack([used] * 3, axis=1)), (of_edge, edges[:, [0, 1, 1]]), (of_face, faces))
-    if not count:
-        kinds = tuple((of[:0], corners[:0]) for of, corners in kinds)
     first, parts, number = zip(*(_blocks(of, corners, count) for of, corners in kinds), strict=True)
     begin = np.cumsum([0, *(each[-1] for each in first)])
-    corners = [np.concatenate(each) for each in zip(*((np.repeat(of, 3), c.ravel()) for of, c in kinds), strict=True)]
-    inside = sp.csr_matrix((np.ones(len(corners[0]), bool), tuple(corners)), shape=(count, vertices))
+    of = np.concatenate([np.repeat(of, 3) for of, _ in kinds])
+    corners = np.concatenate([corners.ravel() for _, corners in kinds])
+    inside = sp.csr_matrix((np.ones(len(of), bool), (of, corners)), shape=(count, vertices))
     table, device = Topology(), level.device
 
     def array(values: np.ndarray, dtype: type = wp.int32) -> wp.array:

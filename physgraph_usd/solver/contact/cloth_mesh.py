@@ -137,14 +137,8 @@ def _across(beside: sp.csr_matrix, label: np.ndarray | None) -> sp.csr_matrix:
 
 
 def _opposite(triangles: np.ndarray, sides: np.ndarray, count: int) -> np.ndarray:
-    """Vertices opposite each edge in its first and last face, shape (E, 2), -1 without a face.
-
-    Args:
-        triangles: Corners, shape (T, 3).
-        sides: The edge along each side, shape (3 T,).
-        count: Number of edges E.
-    """
-    third, out = triangles[:, [2, 0, 1]].reshape(-1), np.full((count + 1, 2), -1)
-    out[sides[::-1], 0], out[sides, 1] = third[::-1], third  # The last face that is written stays.
+    """Vertices opposite each of E edges in its first and last face, shape (E, 2), -1 without; sides in shape (3 T,)."""
+    third, out = triangles[:, [2, 0, 1]].reshape(-1), np.full((count, 2), -1)
+    out[sides[::-1], 0], out[sides, 1] = third[::-1], third  # What is written last stays.
     out[out[:, 0] == out[:, 1], 1] = -1
-    return out[:-1]
+    return out

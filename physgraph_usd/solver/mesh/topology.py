@@ -142,14 +142,14 @@ class PolygonMesh:
     def half_edges(self) -> HalfEdges:
         """Edges of the faces, and the edge of each half-edge."""
         here, there = self.indices, self.indices[self.next_corner]
-        edges, edge = _paired(here, there, self.vertex_count)
+        edges, edge = paired(here, there, self.vertex_count)
         return HalfEdges(edges, edge, here <= there, np.bincount(edge, minlength=len(edges)).astype(np.int32))
 
     @cached_property
     def twin_corners(self) -> np.ndarray:
         """For each edge with two half-edges, the two corners of the half-edges, shape (N, 2), in the edges' order."""
         half = self.half_edges
-        order, starts = np.argsort(half.edge, kind="stable"), np.cumsum(half.count) - half.count
+        order, starts = sorted_rows(half.edge, count=len(half.count)), np.cumsum(half.count) - half.count
         double = starts[(half.count == 2) & (half.edges[:, 0] != half.edges[:, 1])]
         return np.stack([order[double], order[double + 1]], axis=1)
 
@@ -173,7 +173,7 @@ class PolygonMesh:
         The number is 1 at manifold vertices, 2 or more if a surface touches itself in a point, 0 at isolated vertices.
         """
         half = self.half_edges
-        order = np.argsort(half.edge, kind="stable")
+        order = sorted_rows(half.edge, count=len(half.count))
         same = np.flatnonzero(half.edge[order[1:]] == half.edge[order[:-1]])
         ends = np.stack([np.arange(len(self.indices)), self.next_corner], axis=1)
         ends = np.where(half.forward[:, None], ends, ends[:, ::-1])
@@ -253,19 +253,14 @@ def _fan_corner(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def sorted_rows(*columns: np.ndarray, count: int) -> np.ndarray:
-    """The order that sorts rows of numbers from 0 to count - 1, shape (K,), int32: by counting, in O(K + count).
-
-    Args:
-        columns: Columns of the rows, that which counts most first, each of shape (K,). Equal rows stay in order.
-        count: Bound of the numbers.
-    """
+    """The order that sorts rows of numbers under a count, by columns, shape (K,), int32; equal rows stay in order."""
     order, starts = np.arange(len(columns[0]), dtype=np.int32), np.arange(len(columns[0]) + 1, dtype=np.int32)
     for column in reversed(columns):
         order = sparse.csr_matrix((order, column[order], starts), shape=(len(order), count)).tocsc().data
     return order
 
 
-def _paired(here: np.ndarray, there: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+def paired(here: np.ndarray, there: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Different pairs of vertices, the lower first, in order, shape (E, 2), and which each pair is, shape (K,)."""
     ends = np.stack([np.minimum(here, there), np.maximum(here, there)])
     order = sorted_rows(*ends, count=count)
@@ -297,20 +292,12 @@ def find_edges(edges: np.ndarray, pairs: np.ndarray) -> np.ndarray:
 
 
 def edges_of(triangles: np.ndarray, vertex_count: int) -> Edges:
-    """Find the undirected edges of triangles.
-
-    Args:
-        triangles: Vertices, shape (T, 3).
-        vertex_count: Number of vertices V.
-
-    Returns:
-        Unique edges, without loops from a vertex to itself.
-    """
+    """The undirected edges of triangles of numbered vertices, shape (T, 3), without loops from a vertex to itself."""
     a, b, c = triangles.T
     here, there = triangles.reshape(-1), triangles[:, [1, 2, 0]].reshape(-1)
     kept, proper = np.flatnonzero(here != there), (a != b) & (b != c) & (c != a)
     sides = np.full(len(here), -1, np.int32)
-    vertices, sides[kept] = _paired(here[kept], there[kept], vertex_count)
+    vertices, sides[kept] = paired(here[kept], there[kept], vertex_count)
     count = np.bincount(sides[np.repeat(proper, 3)], minlength=len(vertices))
     return Edges(vertices, count.astype(np.int32), sides.reshape(-1, 3))
 
