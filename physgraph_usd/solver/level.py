@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, reduce
 from itertools import pairwise
@@ -252,8 +252,9 @@ def build_levels(
     """
     depth = max((len(chain) for chain in refinements), default=0)
     levels: list[Level] = []
+    carried = [_carried(g, chain) for g, chain in zip(garments, refinements, strict=True)]
     for index in range(depth + 1):
-        parts = [_garment_level(g, chain, index) for g, chain in zip(garments, refinements, strict=True)]
+        parts = [_garment_level(g, *next(each)) for g, each in zip(garments, carried, strict=True)]
         below: list[Stencil | None] = [None, None]
         ups = tuple[Stencil, ...]()
         if index:
@@ -286,13 +287,13 @@ class _GarmentLevel:
     flat_step: sp.csr_matrix
 
 
-def _garment_level(garment: Garment, whole: Sequence[Refinement], index: int) -> _GarmentLevel:
-    """Carry one garment to a level, or to the end of a shorter chain of refinements."""
-    chain = whole[:index]
-    mesh, face, creases, maps = _carried(garment, chain, stays=index > len(chain))
+def _garment_level(
+    garment: Garment, mesh: PolygonMesh, face: np.ndarray, creases: np.ndarray, maps: dict[str, sp.csr_matrix]
+) -> _GarmentLevel:
+    """One garment at a level, by what `_carried` yields."""
     linear, smoothing = maps["linear"], maps["smooth"]
     rest, smooth_rest = (np.asarray(each @ np.asarray(garment.rest, dtype=np.float64)) for each in (linear, smoothing))
-    split = _sound(mesh.triangulate(rest if not chain else None), rest, rigid=_is_rigid(garment, linear))
+    split = _sound(mesh.triangulate(rest if mesh is garment.mesh else None), rest, rigid=_is_rigid(garment, linear))
     elements = elastic_elements(mesh, split, rest)
     # Along normals only: what smoothing moves within the surface would strain a flat cage.
     normal = vertex_normals(smooth_rest, elements.membrane)
@@ -329,26 +330,27 @@ def _pressed_angles(
 
 
 def _carried(
-    garment: Garment, chain: Sequence[Refinement], *, stays: bool
-) -> tuple[PolygonMesh, np.ndarray, np.ndarray, dict[str, sp.csr_matrix]]:
-    """A garment's mesh after subdivisions, the cage's face of each face, its creases, and its maps by name.
+    garment: Garment, chain: Sequence[Refinement]
+) -> Iterator[tuple[PolygonMesh, np.ndarray, np.ndarray, dict[str, sp.csr_matrix]]]:
+    """A garment's mesh at each level, the cage's face of each face, its creases, and its maps by name.
 
     Maps from the level below are the identity where the garment stays at the end of its chain.
     """
     mesh, face = garment.mesh, np.arange(garment.mesh.face_count)
-    linear = smoothing = linear_step = smooth_step = flat_step = sp.identity(mesh.vertex_count, format="csr")
+    linear = smoothing = sp.identity(mesh.vertex_count, format="csr")
     creases = creases_of(mesh, garment.rest, garment.closed)
+    steps = dict.fromkeys(("linear_step", "smooth_step", "flat_step"), linear)
     for number, refinement in enumerate(chain):
-        flat_step = on_triangles(mesh, refinement, mesh.triangulate(None if number else garment.rest))
-        linear_step = refinement.linear
+        yield mesh, face, creases, {"linear": linear, "smooth": smoothing} | steps
         smooth_step = sp.csr_matrix(smooth(mesh, refinement, creased=crease_mask(mesh, creases)))
-        smoothing, linear = sp.csr_matrix(smooth_step @ smoothing), sp.csr_matrix(linear_step @ linear)
+        flat_step = on_triangles(mesh, refinement, mesh.triangulate(None if number else garment.rest))
+        steps = {"linear_step": refinement.linear, "smooth_step": smooth_step, "flat_step": flat_step}
+        smoothing, linear = sp.csr_matrix(smooth_step @ smoothing), sp.csr_matrix(refinement.linear @ linear)
         creases = halves_of(creases, mesh.vertex_count + find_edges(refinement.edges, creases))
         mesh, face = refinement.mesh, face[refinement.parent_face]
-    if stays:
-        linear_step = smooth_step = flat_step = sp.identity(mesh.vertex_count, format="csr")
-    steps = {"linear_step": linear_step, "smooth_step": smooth_step, "flat_step": flat_step}
-    return mesh, face, creases, {"linear": linear, "smooth": smoothing} | steps
+    while True:
+        yield mesh, face, creases, {"linear": linear, "smooth": smoothing} | steps
+        steps = dict.fromkeys(steps, sp.identity(mesh.vertex_count, format="csr"))
 
 
 def _metric_of(
@@ -366,7 +368,7 @@ def _metric_of(
         rest: The cage's rest positions on the mesh, linearly [m], shape (V, 3).
         smooth_rest: The same smoothly [m].
     """
-    triangles, count = elements.membrane, len(rest)
+    triangles = elements.membrane
     cage, surface = (x[1:] - x[0] for x in (at_corners(rest, triangles), at_corners(smooth_rest, triangles)))
     normal = cross(*surface)
     double = norm(normal)
@@ -378,7 +380,7 @@ def _metric_of(
     tensor[:, :, ~known] = np.eye(3)[:, :, None]
     weight, starts = np.repeat(elements.share * (0.5 * double), 3), np.arange(0, 3 * len(triangles) + 1, 3)
     places = np.sort(triangles, axis=1).ravel()
-    around = linear.T @ sp.csc_matrix((weight, places, starts), shape=(count, len(triangles)))
+    around = linear.T @ sp.csc_matrix((weight, places, starts), shape=(len(rest), len(triangles)))
     total, mean = np.asarray(around.sum(axis=1)), np.asarray(around @ tensor.reshape(9, -1).T)
     mean = np.where(total > 0, mean / np.where(total > 0, total, 1.0), np.eye(3).ravel())
     return np.asarray(linear @ mean)

@@ -133,9 +133,7 @@ def halved(points: np.ndarray, group: np.ndarray, size: int) -> np.ndarray:
         Clusters from 0 in the order of the halves, so that neighbouring numbers are near one another, shape (N,).
     """
     order, count = sorted_rows(group, count=int(group.max(initial=0)) + 1), np.bincount(group)
-    ranks = np.empty(points.T.shape, np.int64)
-    for rank, along in zip(ranks, points.T, strict=True):
-        rank[np.argsort(along, kind="stable")] = np.arange(len(points))
+    ranks = np.stack([sorted_rows(np.argsort(each, kind="stable"), count=len(points)) for each in points.T])
     while (count := count[count > 0]).max(initial=0) > size:
         first, placed = np.cumsum(count) - count, points[order]
         spread = np.maximum.reduceat(placed, first) - np.minimum.reduceat(placed, first)
@@ -143,9 +141,7 @@ def halved(points: np.ndarray, group: np.ndarray, size: int) -> np.ndarray:
         order = order[np.argsort(cluster * len(points) + ranks[axis, order])]
         later = np.where(count > size, count // 2, 0)
         count = np.stack([count - later, later], axis=1).ravel()
-    cluster = np.empty(len(points), np.int64)
-    cluster[order] = np.repeat(np.arange(len(count)), count)
-    return cluster
+    return np.repeat(np.arange(len(count)), count)[sorted_rows(order, count=len(order))]
 
 
 def _blocks(cluster: np.ndarray, corners: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

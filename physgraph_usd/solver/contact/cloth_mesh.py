@@ -43,12 +43,11 @@ class ClothMesh:
             meets: True for pairs in contact of garments, then bodies, symmetric, shape (G + B, G + B), bool.
             sewn: Pairs of vertices merged by a seam.
         """
-        count = level.vertex_count
+        cloth, count = level.edges.cpu().numpy(), level.vertex_count
         label = joined_by(sewn, count) if len(sewn) else None
         self.level, self._garments = level, len(level.spans)
         self.parts = Parts(level, meets, label, solids=solids)
         edges, triangles, sides = self.parts.surface
-        cloth = edges[: len(level.edges)]
         self.pieces = joined_by(cloth, count)
         self.beside = _across(adjacency(cloth, count), label)
         self._others = sum(len(each.points) for each in solids)
