@@ -50,6 +50,7 @@ from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton
 from physgraph_usd.solver.integrate.stop import Budget
 from physgraph_usd.solver.level import Level, build_levels, hinge_geometry, refine_garments
 from physgraph_usd.solver.mesh.elements import hinges_of
+from physgraph_usd.solver.mesh.vectors import at_corners, dot
 from physgraph_usd.solver.scene import Frame, Garment, GarmentFrame, Grain, Scene
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
@@ -143,10 +144,10 @@ def area_of(level: Level) -> float:
 
 def panel_of(stage: Stage, level: Level) -> np.ndarray:
     """Each triangle laid flat with its weft along x and its warp along y [m], shape (T, 3, 2)."""
-    rest, triangles = level.rest.double().numpy(), level.triangles.numpy()
-    warp, across = axes(rest, triangles, np.broadcast_to(stage.warp[0], (len(triangles), 3)))
-    spans = rest[triangles] - rest[triangles][:, :1]
-    return np.stack([-np.einsum("tcx,tx->tc", spans, across), np.einsum("tcx,tx->tc", spans, warp)], axis=2)
+    corners = at_corners(level.rest.double().numpy(), level.triangles.numpy())
+    spans = corners - corners[0]
+    warp, across = axes(spans[1:], np.broadcast_to(stage.warp[0][:, None], spans[0].shape))
+    return np.stack([-dot(spans, across), dot(spans, warp)]).T
 
 
 def problem_of(

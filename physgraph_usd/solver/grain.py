@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
-from .mesh.topology import find_edges
+from .mesh.vectors import at_corners, cross, dot, norm
 
 SHORTEST = 0.25
 """Least length of cloth over its rest shape's: ease, its painted multiplier and gathers may be negative together."""
@@ -46,42 +46,40 @@ class LevelGrain:
         return bool((self.membrane_gather != 0).any())
 
 
-def axes(rest: np.ndarray, triangles: np.ndarray, warp: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Unit warp and weft of each triangle in its plane.
+def axes(sides: np.ndarray, warp: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Unit warp and weft of each triangle in its plane, shapes (3, T).
 
     Where no warp is known, or it stands across the triangle, the rest frame's axis that lies most nearly in the plane
     stands for it: a membrane of equal stiffness both ways is the same after a quarter turn, so wherever the cloth is
     tangent to an axis, neighbours agree whichever they take.
 
     Args:
-        rest: Rest positions [m], shape (V, 3), float64.
-        triangles: Shape (T, 3).
-        warp: Direction on each triangle, shape (T, 3); 0 where none is known.
+        sides: Two sides from the first corner of each triangle [m], shape (2, 3, T), float64.
+        warp: Direction on each triangle, shape (3, T); 0 where none is known.
     """
-    corners = rest[triangles]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normal = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), np.finfo(float).tiny)
-    nearest = np.eye(3)[np.abs(normal).argmin(axis=1)]
-    inside = [each - normal * np.einsum("tc,tc->t", each, normal)[:, None] for each in (warp, nearest)]
-    lengths = [np.linalg.norm(each, axis=1, keepdims=True) for each in inside]
-    chosen = np.where(lengths[0] > 1e-3, inside[0], inside[1])
-    along = chosen / np.where(lengths[0] > 1e-3, lengths[0], lengths[1])
-    return along, np.cross(normal, along)
+    normal = cross(*sides)
+    normal /= np.maximum(norm(normal), np.finfo(float).tiny)
+    nearest = np.eye(3).take(np.abs(normal).argmin(axis=0), axis=1)
+    inside = [each - normal * dot(each, normal) for each in (warp, nearest)]
+    lengths = [norm(each) for each in inside]
+    along = np.where(lengths[0] > 1e-3, *inside) / np.where(lengths[0] > 1e-3, *lengths)
+    return along, cross(normal, along)
 
 
-def edge_cosines(rest: np.ndarray, triangles: np.ndarray, edges: np.ndarray, *, warp: np.ndarray) -> np.ndarray:
-    """Squared cosines of each edge with warp and weft, mean over its triangles, shape (E, 2); see `axes`."""
-    both = axes(rest, triangles, warp)
-    total, count = np.zeros((len(edges), 2)), np.zeros(len(edges))
-    for corner in range(3):
-        ends = triangles[:, [corner, (corner + 1) % 3]]
-        span = rest[ends[:, 1]] - rest[ends[:, 0]]
-        square = np.maximum((span**2).sum(axis=1), np.finfo(float).tiny)
-        which = find_edges(edges, ends)
-        for axis in range(2):
-            np.add.at(total[:, axis], which, np.einsum("tc,tc->t", span, both[axis]) ** 2 / square)
-        np.add.at(count, which, 1.0)
-    return np.where(count[:, None] > 0, total / np.maximum(count, 1.0)[:, None], 0.5)
+def edge_cosines(
+    rest: np.ndarray, triangles: np.ndarray, sides: np.ndarray, *, count: int, warp: np.ndarray
+) -> np.ndarray:
+    """Squared cosines of each edge with warp and weft, mean over its triangles, shape (E, 2); see `axes`.
+
+    The edges along the sides of the triangles have the shape of the triangles, (T, 3); the number of all is given.
+    """
+    corners, which = at_corners(rest, triangles), sides.T.ravel()
+    spans = np.roll(corners, -1, axis=0) - corners
+    square = np.maximum((spans**2).sum(axis=1), np.finfo(float).tiny)
+    both = axes(corners[1:] - corners[0], warp)
+    total = [np.bincount(which, (dot(spans, axis) ** 2 / square).ravel(), count) for axis in both]
+    number = np.bincount(which, minlength=count)
+    return np.where(number > 0, total / np.maximum(number, 1.0), 0.5).T
 
 
 def bending_factor(hinge: Tensor, warp: Sequence[float], weft: Sequence[float], owner: Tensor) -> Tensor:

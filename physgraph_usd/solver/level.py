@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, reduce
 from itertools import pairwise
 from typing import NewType
 
@@ -30,14 +30,18 @@ from .mesh.subdivide import (
     smooth,
     subdivide_times,
 )
-from .mesh.topology import PolygonMesh, TriangleSplit, edges_of, find_edges
+from .mesh.topology import PolygonMesh, TriangleSplit, edges_of, find_edges, sorted_rows
+from .mesh.vectors import at_corners, cross, dot, inverse, mean_of, norm, product
 from .scene import Garment
 
 HINGE_SHAPE_LIMIT = 10.0
 """Cap of l0^2 / (A1 + A2): 1.15 on equilateral triangles, unbounded on slivers."""
 
-OWNED = {"spring": "springs", "membrane": "membrane", "hinge": "hinges"}
-"""Names of elements in the level's fields, and the arrays of `ElasticElements` that hold them."""
+OF_VERTICES = ("triangles", "edges", "springs", "membrane", "hinges")
+"""Arrays of vertex numbers of a garment, and of the level."""
+
+OWNED = {"vertex": "rest", "spring": "springs", "membrane": "membrane", "hinge": "hinges"}
+"""Names of elements in the level's fields, and the arrays of a garment that hold them."""
 
 PIN_MARGIN = 1e-6
 """A pin within this of 1 is exact."""
@@ -248,8 +252,9 @@ def build_levels(
     """
     depth = max((len(chain) for chain in refinements), default=0)
     levels: list[Level] = []
+    carried = [_carried(g, chain) for g, chain in zip(garments, refinements, strict=True)]
     for index in range(depth + 1):
-        parts = [_garment_level(g, chain, index) for g, chain in zip(garments, refinements, strict=True)]
+        parts = [_garment_level(g, *next(each)) for g, each in zip(garments, carried, strict=True)]
         below: list[Stencil | None] = [None, None]
         ups = tuple[Stencil, ...]()
         if index:
@@ -264,7 +269,6 @@ def build_levels(
 
 @dataclass(frozen=True, eq=False)
 class _GarmentLevel:
-    vertex_count: int
     rest: np.ndarray
     smooth_rest: np.ndarray
     metric: np.ndarray
@@ -283,13 +287,13 @@ class _GarmentLevel:
     flat_step: sp.csr_matrix
 
 
-def _garment_level(garment: Garment, whole: Sequence[Refinement], index: int) -> _GarmentLevel:
-    """Carry one garment to a level, or to the end of a shorter chain of refinements."""
-    chain = whole[:index]
-    mesh, face, creases, maps = _carried(garment, chain, stays=index > len(chain))
+def _garment_level(
+    garment: Garment, mesh: PolygonMesh, face: np.ndarray, creases: np.ndarray, maps: dict[str, sp.csr_matrix]
+) -> _GarmentLevel:
+    """One garment at a level, by what `_carried` yields."""
     linear, smoothing = maps["linear"], maps["smooth"]
     rest, smooth_rest = (np.asarray(each @ np.asarray(garment.rest, dtype=np.float64)) for each in (linear, smoothing))
-    split = _sound(mesh.triangulate(rest if not chain else None), rest, rigid=_is_rigid(garment, linear))
+    split = _sound(mesh.triangulate(rest if mesh is garment.mesh else None), rest, rigid=_is_rigid(garment, linear))
     elements = elastic_elements(mesh, split, rest)
     # Along normals only: what smoothing moves within the surface would strain a flat cage.
     normal = vertex_normals(smooth_rest, elements.membrane)
@@ -299,7 +303,6 @@ def _garment_level(garment: Garment, whole: Sequence[Refinement], index: int) ->
         painted |= {"ease_scale": garment.grain.ease_scale, "gather": garment.grain.gather}
     scale = np.ones((garment.mesh.face_count, 3)) if garment.fabric_scale is None else garment.fabric_scale
     return _GarmentLevel(
-        vertex_count=mesh.vertex_count,
         rest=rest,
         smooth_rest=smooth_rest,
         metric=_metric_of(linear, elements, rest, smooth_rest),
@@ -323,36 +326,37 @@ def _pressed_angles(
         return np.zeros(len(elements.hinges))
     angle = hinge_geometry(np.asarray(smoothing @ garment.folded), elements.hinges)[0]
     share = np.asarray(linear @ garment.pressed.astype(np.float64))
-    return angle * share[elements.hinges[:, :2]].mean(axis=1)
+    return angle * mean_of(share, elements.hinges[:, :2])
 
 
 def _carried(
-    garment: Garment, chain: Sequence[Refinement], *, stays: bool
-) -> tuple[PolygonMesh, np.ndarray, np.ndarray, dict[str, sp.csr_matrix]]:
-    """A garment's mesh after subdivisions, the cage's face of each face, its creases, and its maps by name.
+    garment: Garment, chain: Sequence[Refinement]
+) -> Iterator[tuple[PolygonMesh, np.ndarray, np.ndarray, dict[str, sp.csr_matrix]]]:
+    """A garment's mesh at each level, the cage's face of each face, its creases, and its maps by name.
 
     Maps from the level below are the identity where the garment stays at the end of its chain.
     """
     mesh, face = garment.mesh, np.arange(garment.mesh.face_count)
-    linear = smoothing = linear_step = smooth_step = flat_step = sp.identity(mesh.vertex_count, format="csr")
+    linear = smoothing = sp.identity(mesh.vertex_count, format="csr")
     creases = creases_of(mesh, garment.rest, garment.closed)
+    steps = dict.fromkeys(("linear_step", "smooth_step", "flat_step"), linear)
     for number, refinement in enumerate(chain):
-        flat_step = on_triangles(mesh, refinement, mesh.triangulate(None if number else garment.rest))
-        linear_step = refinement.linear
+        yield mesh, face, creases, {"linear": linear, "smooth": smoothing} | steps
         smooth_step = sp.csr_matrix(smooth(mesh, refinement, creased=crease_mask(mesh, creases)))
-        smoothing, linear = sp.csr_matrix(smooth_step @ smoothing), sp.csr_matrix(linear_step @ linear)
+        flat_step = on_triangles(mesh, refinement, mesh.triangulate(None if number else garment.rest))
+        steps = {"linear_step": refinement.linear, "smooth_step": smooth_step, "flat_step": flat_step}
+        smoothing, linear = sp.csr_matrix(smooth_step @ smoothing), sp.csr_matrix(refinement.linear @ linear)
         creases = halves_of(creases, mesh.vertex_count + find_edges(refinement.edges, creases))
         mesh, face = refinement.mesh, face[refinement.parent_face]
-    if stays:
-        linear_step = smooth_step = flat_step = sp.identity(mesh.vertex_count, format="csr")
-    steps = {"linear_step": linear_step, "smooth_step": smooth_step, "flat_step": flat_step}
-    return mesh, face, creases, {"linear": linear, "smooth": smoothing} | steps
+    while True:
+        yield mesh, face, creases, {"linear": linear, "smooth": smoothing} | steps
+        steps = dict.fromkeys(steps, sp.identity(mesh.vertex_count, format="csr"))
 
 
 def _metric_of(
     linear: sp.csr_matrix, elements: ElasticElements, rest: np.ndarray, smooth_rest: np.ndarray
 ) -> np.ndarray:
-    """The metric S of the cloth on the smooth rest surface, shape (V, 3, 3): a vector d is (d.S d)^1/2 long.
+    """The metric S of the cloth on the smooth rest surface, shape (V, 9), by rows: a vector d is (d.S d)^1/2 long.
 
     Smooth subdivision shortens a curved cage, across a fold but not along the fold. S gives the cage's lengths,
     averaged around each cage vertex; along the normal S is 1. With areas kept but not lengths, cloth would be too long
@@ -364,53 +368,46 @@ def _metric_of(
         rest: The cage's rest positions on the mesh, linearly [m], shape (V, 3).
         smooth_rest: The same smoothly [m].
     """
-    triangles, count = elements.membrane, len(rest)
-    cage, surface = (x[triangles[:, 1:]] - x[triangles[:, :1]] for x in (rest, smooth_rest))  # T 2 3
-    area = triangle_areas(smooth_rest, triangles)
-    known = area > 1e-9 * (surface**2).sum(axis=(1, 2))
-    gram, lengths = (np.einsum("tac,tbc->tab", each, each) for each in (surface, cage))
-    dual = np.linalg.inv(np.where(known[:, None, None], gram, np.eye(2))) @ surface
-    normal = np.cross(surface[:, 0], surface[:, 1]) / np.where(known, 2.0 * area, 1.0)[:, None]
-    tensor = dual.swapaxes(1, 2) @ lengths @ dual + normal[:, :, None] * normal[:, None, :]
-    tensor[~known] = np.eye(3)
-    weight, places = np.repeat(elements.share * area, 3), (triangles.ravel(), np.arange(3 * len(triangles)) // 3)
-    around = linear.T @ sp.csr_matrix((weight, places), shape=(count, len(triangles)))
-    total, mean = np.asarray(around.sum(axis=1)), np.asarray(around @ tensor.reshape(-1, 9))
+    triangles = elements.membrane
+    cage, surface = (x[1:] - x[0] for x in (at_corners(rest, triangles), at_corners(smooth_rest, triangles)))
+    normal = cross(*surface)
+    double = norm(normal)
+    known = 0.5 * double > 1e-9 * (surface**2).reshape(6, -1).sum(axis=0)
+    gram, lengths = (np.stack([[dot(a, b) for b in each] for a in each]) for each in (surface, cage))
+    dual = product(inverse(np.where(known, gram, np.eye(2)[:, :, None])), surface)
+    normal /= np.where(known, double, 1.0)
+    tensor = product(product(dual.swapaxes(0, 1), lengths), dual) + normal[:, None] * normal
+    tensor[:, :, ~known] = np.eye(3)[:, :, None]
+    weight, starts = np.repeat(elements.share * (0.5 * double), 3), np.arange(0, 3 * len(triangles) + 1, 3)
+    places = np.sort(triangles, axis=1).ravel()
+    around = linear.T @ sp.csc_matrix((weight, places, starts), shape=(len(rest), len(triangles)))
+    total, mean = np.asarray(around.sum(axis=1)), np.asarray(around @ tensor.reshape(9, -1).T)
     mean = np.where(total > 0, mean / np.where(total > 0, total, 1.0), np.eye(3).ravel())
-    return np.asarray(linear @ mean).reshape(-1, 3, 3)
+    return np.asarray(linear @ mean)
 
 
 def _in_cloth(vectors: np.ndarray, metric: np.ndarray) -> np.ndarray:
     """Tangent vectors of the smooth rest surface in the cloth's lengths and angles: S^1/2 times the vectors.
 
     Args:
-        vectors: Two sides of each triangle [m], and more vectors in the triangle's plane, shape (T, K, 3).
-        metric: S, shape (T, 3, 3).
+        vectors: Two sides of each triangle [m], and more vectors in the triangle's plane, shape (K, 3, T).
+        metric: S, shape (3, 3, T).
     """
-    first, normal = vectors[:, 0], np.cross(vectors[:, 0], vectors[:, 1])
-    second = np.cross(normal, first)
-    tiny = np.finfo(float).tiny
-    axes = np.stack([each / np.linalg.norm(each, axis=1, keepdims=True).clip(tiny) for each in (first, second)], axis=1)
-    plane = axes @ metric @ axes.swapaxes(1, 2)
-    root = np.sqrt((plane[:, 0, 0] * plane[:, 1, 1] - plane[:, 0, 1] ** 2).clip(0.0))
-    trace = (plane[:, 0, 0] + plane[:, 1, 1] + 2.0 * root).clip(tiny)
-    plane += root[:, None, None] * np.eye(2)  # The square root of a 2 x 2 matrix, by Cayley and Hamilton.
-    return np.asarray(vectors @ axes.swapaxes(1, 2) @ plane / np.sqrt(trace)[:, None, None] @ axes)
+    second = cross(cross(vectors[0], vectors[1]), vectors[0])
+    axes = np.stack([each / norm(each).clip(np.finfo(float).tiny) for each in (vectors[0], second)])
+    plane = product(product(axes, metric), axes.swapaxes(0, 1))
+    root = np.sqrt((plane[0, 0] * plane[1, 1] - plane[0, 1] ** 2).clip(0.0))
+    trace = (plane[0, 0] + plane[1, 1] + 2.0 * root).clip(np.finfo(float).tiny)
+    plane += root * np.eye(2)[:, :, None]  # The square root of a 2 x 2 matrix, by Cayley and Hamilton.
+    return product(product(product(vectors, axes.swapaxes(0, 1)), plane) / np.sqrt(trace), axes)
 
 
 def vertex_normals(x: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """Unit normals by the areas of the triangles at each vertex, shape (V, 3); zero where there are none."""
-    corners = x[triangles]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    total = np.zeros_like(x)
-    np.add.at(total, triangles, normal[:, None])
-    return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), np.finfo(float).tiny)
-
-
-def triangle_areas(x: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Area of each triangle [m^2], shape (T,)."""
-    corners = x[triangles]
-    return 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    a, b, c = at_corners(x, triangles)
+    places = triangles.ravel()
+    total = np.stack([np.bincount(places, np.repeat(each, 3), len(x)) for each in cross(b - a, c - a)])
+    return (total / np.maximum(norm(total), np.finfo(float).tiny)).T
 
 
 def _is_rigid(garment: Garment, linear: sp.csr_matrix) -> np.ndarray:
@@ -421,12 +418,13 @@ def _is_rigid(garment: Garment, linear: sp.csr_matrix) -> np.ndarray:
 
 def _sound(split: TriangleSplit, rest: np.ndarray, *, rigid: np.ndarray) -> TriangleSplit:
     """The triangles that are cloth: not rigid, not without rest area, and none twice."""
-    corners = rest[split.triangles]
-    sides = corners - np.roll(corners, 1, axis=1)
-    area = 0.5 * np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
-    valid = np.zeros(len(area), bool)
-    valid[np.unique(np.sort(split.triangles, axis=1), axis=0, return_index=True)[1]] = True
-    valid &= (area > NO_AREA * (sides**2).sum(axis=2).max(axis=1)) & ~rigid[split.triangles[:, 0]]
+    corners = at_corners(rest, split.triangles)
+    sides = corners - np.roll(corners, 1, axis=0)
+    area = 0.5 * norm(cross(sides[0], sides[1]))
+    valid = (area > NO_AREA * (sides**2).sum(axis=1).max(axis=0)) & ~rigid[split.triangles[:, 0]]
+    rows = np.sort(split.triangles, axis=1).T
+    order = sorted_rows(*rows, count=len(rest))
+    valid[order[1:][(rows[:, order[1:]] == rows[:, order[:-1]]).all(axis=0)]] = False
     return split if valid.all() else TriangleSplit(split.triangles[valid], split.face[valid])
 
 
@@ -441,21 +439,10 @@ def _join(
     threads: int,
 ) -> Level:
     """Concatenate garments into one level, with lengths, areas and angles at rest."""
-    counts = [part.vertex_count for part in parts]
-    starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-    elements = {
-        name: np.concatenate([each + start for each, start in zip(found, starts, strict=False)])
-        for name, found in (
-            *((name, [getattr(part, name) for part in parts]) for name in ("triangles", "edges")),
-            *((name, [getattr(part.elements, name) for part in parts]) for name in ("springs", "membrane", "hinges")),
-        )
-    }
-    owners = {"vertex_garment": counts}
-    owners |= {f"{name}_garment": [len(getattr(p.elements, f)) for p in parts] for name, f in OWNED.items()}
-    whole = elements | {name: np.repeat(np.arange(len(parts)), sizes) for name, sizes in owners.items()}
-    whole["edge_spring"] = find_edges(elements["springs"], elements["edges"])
-    warp, grain = _grain(parts, elements)
-    real = _measured(parts, elements, warp=warp)
+    joined, starts = _joined(parts), np.cumsum([0, *(len(part.rest) for part in parts)])
+    whole = {name: joined[name] for name in (*OF_VERTICES, "edge_spring", *(f"{each}_garment" for each in OWNED))}
+    warp, grain = _grain(parts, joined)
+    real = _measured(joined, warp=warp)
     tensors = {n: torch.as_tensor(np.ascontiguousarray(a), dtype=dtype, device=device) for n, a in grain.items()}
     return Level(
         index=index,
@@ -472,62 +459,66 @@ def _join(
     )
 
 
-def _grain(parts: Sequence[_GarmentLevel], elements: dict[str, np.ndarray]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """The warp's direction on each membrane triangle, shape (M, 3), 0 where unknown, and `LevelGrain`'s fields."""
-    triangles, springs, hinges = (elements[name] for name in ("membrane", "springs", "hinges"))
+def _joined(parts: Sequence[_GarmentLevel]) -> dict[str, np.ndarray]:
+    """The arrays of the garments by name, one after another, their garments, and the spring along edges and hinges."""
+    tables = [vars(part) | vars(part.elements) | part.vertex_values for part in parts]
+    names = "rest smooth_rest metric share twists bent pressed fabric stretch_scale bend_scale pin".split()
+    joined = {name: np.concatenate([each[name] for each in tables]) for name in names}
+    for names, counted in ((OF_VERTICES, "rest"), (("sides",), "springs")):
+        starts = np.cumsum([0, *(len(each[counted]) for each in tables)])
+        for name in names:
+            joined[name] = np.concatenate([each[name] + start for each, start in zip(tables, starts, strict=False)])
+    for name, owned in OWNED.items():
+        joined[f"{name}_garment"] = np.repeat(np.arange(len(tables)), [len(each[owned]) for each in tables])
+    for name, ends in (("edge_spring", joined["edges"]), ("hinge_spring", joined["hinges"][:, :2])):
+        joined[name] = find_edges(joined["springs"], ends)
+    return joined
+
+
+def _grain(
+    parts: Sequence[_GarmentLevel], joined: dict[str, np.ndarray]
+) -> tuple[np.ndarray | None, dict[str, np.ndarray]]:
+    """The warp's direction on each membrane triangle, shape (3, M), 0 where unknown, and `LevelGrain`'s fields."""
+    triangles, springs = joined["membrane"], joined["springs"]
     if all(part.warp is None for part in parts):
-        return np.zeros((len(triangles), 3)), {}
-    rest = np.concatenate([part.rest for part in parts])
-    warp = np.concatenate([np.zeros((len(p.elements.membrane), 3)) if p.warp is None else p.warp for p in parts])
-    cosines = edge_cosines(rest, triangles, springs, warp=warp)
+        return None, {}
+    warp = np.concatenate([np.zeros((len(p.elements.membrane), 3)) if p.warp is None else p.warp for p in parts]).T
+    cosines = edge_cosines(joined["rest"], triangles, joined["sides"], count=len(springs), warp=warp)
     scale, gather = (
-        np.concatenate([part.vertex_values.get(name, np.full(part.vertex_count, none)) for part in parts])
+        np.concatenate([part.vertex_values.get(name, np.full(len(part.rest), none)) for part in parts])
         for name, none in (("ease_scale", 1.0), ("gather", 0.0))
     )
-    along, twists = cosines[find_edges(springs, hinges[:, :2])], np.concatenate([p.elements.twists for p in parts])
+    along, across = cosines[joined["hinge_spring"]].T
     return warp, {
         "spring": cosines,
-        "hinge": np.where(twists, 0.0, along[:, 1] - along[:, 0]),  # A hinge bends across its edge; a twist is both.
-        "spring_scale": scale[springs].mean(axis=1),
-        "membrane_scale": scale[triangles].mean(axis=1),
-        "spring_gather": gather[springs].mean(axis=1),
-        "membrane_gather": gather[triangles].mean(axis=1),
+        "hinge": np.where(joined["twists"], 0.0, across - along),  # A hinge bends across its edge; a twist is both.
+        "spring_scale": mean_of(scale, springs),
+        "membrane_scale": mean_of(scale, triangles),
+        "spring_gather": mean_of(gather, springs),
+        "membrane_gather": mean_of(gather, triangles),
     }
 
 
-def _measured(
-    parts: Sequence[_GarmentLevel], elements: dict[str, np.ndarray], *, warp: np.ndarray
-) -> dict[str, np.ndarray]:
+def _measured(joined: dict[str, np.ndarray], *, warp: np.ndarray | None) -> dict[str, np.ndarray]:
     """The real-valued fields of a level by name."""
-    springs, triangles, hinges = (elements[name] for name in ("springs", "membrane", "hinges"))
-    surface, metric = (np.concatenate([getattr(part, name) for part in parts]) for name in ("smooth_rest", "metric"))
-    share, twists = (np.concatenate([getattr(part.elements, name) for part in parts]) for name in ("share", "twists"))
-    bent, pressed = (np.concatenate([getattr(part, name) for part in parts]) for name in ("bent", "pressed"))
-    corners = surface[triangles]
-    vectors = np.concatenate([corners[:, 1:] - corners[:, :1], warp[:, None]], axis=1)
-    vectors = _in_cloth(vectors, metric[triangles].mean(axis=1))
-    corners[:, 0], corners[:, 1:] = 0.0, vectors[:, :2]
-    corners, apart = corners.reshape(-1, 3), np.arange(3 * len(triangles)).reshape(-1, 3)
-    sides = surface[springs[:, 1]] - surface[springs[:, 0]]
-    length = np.sqrt(np.einsum("sa,sab,sb->s", sides, metric[springs].mean(axis=1), sides).clip(0.0))
-    cloth = {"length": length, "area": share * triangle_areas(corners, apart)}
-    shape = rest_shape(surface, springs, triangles, share=share, hinges=hinges, twists=twists, bent=bent, **cloth)
-    stretch, bend, pin = (
-        np.concatenate([part.vertex_values[name] for part in parts]) for name in ("stretch_scale", "bend_scale", "pin")
-    )
-    fabric = np.concatenate([part.fabric for part in parts])
+    springs, triangles, surface, fabric = (joined[name] for name in ("springs", "membrane", "smooth_rest", "fabric"))
+    corners, metric = at_corners(surface, triangles), joined["metric"].T.reshape(3, 3, -1)
+    vectors = np.concatenate([corners[1:] - corners[:1], *([] if warp is None else [warp[None]])])
+    vectors = _in_cloth(vectors, mean_of(metric, triangles))
+    span, around = np.subtract(*at_corners(surface, springs)[::-1]), mean_of(metric, springs)
+    square = reduce(np.add, (span[i] * around[i, j] * span[j] for i in range(3) for j in range(3)))
+    area = joined["share"] * (0.5 * norm(cross(vectors[0], vectors[1])))
     of_stretch, of_bend, of_density = np.repeat(fabric, 3, axis=0).T
-    sides = find_edges(springs, triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2))
-    at_hinges = mean_at(sides, of_bend, len(springs))[find_edges(springs, hinges[:, :2])]
-    return shape | {
-        "rest_angle": np.where(bent, shape["rest_angle"], pressed),
-        "rest": np.concatenate([part.rest for part in parts]),
-        "membrane_inverse": triangle_inverse(corners, apart, vectors[:, 2]),
-        "spring_scale": stretch[springs].mean(axis=1) * mean_at(sides, of_stretch, len(springs)),
-        "membrane_scale": stretch[triangles].mean(axis=1) * fabric[:, 0],
-        "bend_scale": bend[hinges[:, :2]].mean(axis=1) * at_hinges,
-        "density_scale": mean_at(triangles.ravel(), of_density, len(surface), weight=np.repeat(cloth["area"], 3)),
-        "pin": pin,
+    sides = joined["sides"].ravel()
+    at_hinges = mean_at(sides, of_bend, len(springs))[joined["hinge_spring"]]
+    return rest_shape(joined, length=np.sqrt(square.clip(0.0)), area=area) | {
+        "rest": joined["rest"],
+        "membrane_inverse": triangle_inverse(vectors[:2], None if warp is None else vectors[2]),
+        "spring_scale": mean_of(joined["stretch_scale"], springs) * mean_at(sides, of_stretch, len(springs)),
+        "membrane_scale": mean_of(joined["stretch_scale"], triangles) * fabric[:, 0],
+        "bend_scale": mean_of(joined["bend_scale"], joined["hinges"][:, :2]) * at_hinges,
+        "density_scale": mean_at(triangles.ravel(), of_density, len(surface), weight=np.repeat(area, 3)),
+        "pin": joined["pin"],
     }
 
 
@@ -545,18 +536,7 @@ def mean_at(which: np.ndarray, values: np.ndarray, count: int, *, weight: np.nda
     return np.divide(np.bincount(which, weight * values, count), total, out=np.ones(count), where=total > 0)
 
 
-def rest_shape(
-    rest: np.ndarray,
-    springs: np.ndarray,
-    membrane: np.ndarray,
-    *,
-    share: np.ndarray,
-    hinges: np.ndarray,
-    twists: np.ndarray,
-    bent: np.ndarray,
-    length: np.ndarray,
-    area: np.ndarray,
-) -> dict[str, np.ndarray]:
+def rest_shape(joined: dict[str, np.ndarray], *, length: np.ndarray, area: np.ndarray) -> dict[str, np.ndarray]:
     """Lengths, areas and angles of the rest shape, under the names of `Level`'s fields.
 
     The bending energy of a sheet is D/2 (k1^2 + k2^2) by its principal curvatures. A hinge at an edge l between
@@ -565,27 +545,20 @@ def rest_shape(
     k12 l, so that hinge has 2 D A / l^2.
 
     Args:
-        rest: Positions [m], shape (V, 3), float64.
-        springs: Shape (S, 2).
-        membrane: Shape (M, 3).
-        share: Fraction of the area that a triangle stands for, shape (M,).
-        hinges: Shape (H, 6).
-        twists: Whether a hinge is a quad's diagonal, shape (H,).
-        bent: True where a hinge rests at the rest shape's angle, shape (H,).
+        joined: Arrays of all garments, as `_joined` gives them.
         length: Length of each spring in the cloth [m], shape (S,).
         area: Area that each triangle stands for in the cloth [m^2], shape (M,).
 
     Returns:
         spring_length, spring_area, membrane_area, hinge_shape, rest_angle, vertex_area, spacing.
     """
-    count = len(rest)
-    side = find_edges(springs, membrane[:, [[0, 1], [1, 2], [2, 0]]])
-    factor = np.where((share < 1.0)[:, None], np.array(QUAD_SPRING)[[0, 0, 1]], 1.0)
-    spring_area = np.bincount(side, (factor * area[:, None] / 3.0).ravel(), len(springs)) if len(springs) else length
+    count, springs, twists = len(joined["rest"]), joined["springs"], joined["twists"]
+    factor = np.where((joined["share"] < 1.0)[:, None], np.array(QUAD_SPRING)[[0, 0, 1]], 1.0)
+    spring_area = np.bincount(joined["sides"].ravel(), (factor * area[:, None] / 3.0).ravel(), len(springs))
     degree = np.bincount(springs.ravel(), minlength=count)
     spacing = np.bincount(springs.ravel(), np.repeat(length, 2), count) / np.maximum(degree, 1)
     fallback = float(length.mean()) if len(length) else 1.0
-    angle, first, second, hinge_length = hinge_geometry(rest, hinges)
+    angle, first, second, hinge_length = hinge_geometry(joined["smooth_rest"], joined["hinges"])
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = hinge_length**2 / (first + second)
         hinge_shape = np.where(twists, 2.0 / ratio, np.minimum(ratio, HINGE_SHAPE_LIMIT))
@@ -594,29 +567,25 @@ def rest_shape(
         "spring_area": spring_area,
         "membrane_area": area,
         "hinge_shape": np.nan_to_num(hinge_shape, nan=0.0),
-        "rest_angle": np.where(bent, angle, 0.0),
-        "vertex_area": np.bincount(membrane.ravel(), np.repeat(area, 3) / 3.0, count),
+        "rest_angle": np.where(joined["bent"], angle, joined["pressed"]),
+        "vertex_area": np.bincount(joined["membrane"].ravel(), np.repeat(area, 3) / 3.0, count),
         "spacing": np.where(spacing > 0, spacing, fallback),
     }
 
 
-def triangle_inverse(rest: np.ndarray, triangles: np.ndarray, warp: np.ndarray | None = None) -> np.ndarray:
+def triangle_inverse(sides: np.ndarray, warp: np.ndarray | None = None) -> np.ndarray:
     """Inverse of each triangle's sides in the material's axes, which are warp and weft (`axes`).
 
     Args:
-        rest: Rest positions [m], shape (V, 3), float64.
-        triangles: Shape (T, 3).
-        warp: Direction of the warp on each triangle, shape (T, 3), 0 where unknown; None where it is on all.
+        sides: Two sides from the first corner of each triangle [m], shape (2, 3, T), float64.
+        warp: Direction of the warp on each triangle, shape (3, T), 0 where unknown; None where it is on all.
 
     Returns:
         Rows of the inverse [1/m], shape (T, 4), zero where there is no area.
     """
-    corners = rest[triangles]
-    first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    double = np.linalg.norm(np.cross(first, second), axis=1, keepdims=True)
-    along, across = axes(rest, triangles, np.zeros((len(triangles), 3)) if warp is None else warp)
-    a, b, c, d = (np.einsum("tc,tc->t", s, axis) for axis in (along, across) for s in (first, second))
-    sides = (first**2).sum(axis=1, keepdims=True) + (second**2).sum(axis=1, keepdims=True)
-    whole = double > 1e-12 * sides
-    adjugate = np.stack([d, -b, -c, a], axis=1)
-    return np.where(whole, adjugate / np.where(whole, double, 1.0), 0.0)
+    double = norm(cross(*sides))
+    along, across = axes(sides, np.zeros_like(sides[0]) if warp is None else warp)
+    a, b, c, d = (dot(side, axis) for axis in (along, across) for side in sides)
+    squares = (sides**2).sum(axis=1)
+    whole = double > 1e-12 * (squares[0] + squares[1])
+    return np.where(whole, np.stack([d, -b, -c, a]) / np.where(whole, double, 1.0), 0.0).T

@@ -58,6 +58,7 @@ class Parts:
 
     Attributes:
         topology: Warp struct of the parts by cluster.
+        surface: Edges, faces, and the edge along each side of these, of the cloth and then of the bodies, int64.
         links: Connected vertices: edges and sewn pairs, shape (N, 2), int64.
         lengths: Lengths of the links at rest, 0 if sewn [m], shape (N,), float64.
         boxes: Warp struct of boxes, written by each search.
@@ -92,7 +93,7 @@ class Parts:
         self.lengths = torch.cat([level.rest_length.double(), level.rest.new_zeros(len(sewn)).double()])
         label = np.arange(level.vertex_count) if label is None else label
         size = SIZE[torch.device(level.device).type]
-        self.topology = topology_of(level, meets, label, size=size, solids=solids)
+        self.topology, self.surface = topology_of(level, meets, label, size=size, solids=solids)
         edges = np.cumsum([len(level.edges), *(len(each.edges) for each in solids)])
         faces = np.cumsum([len(level.triangles), *(len(each.faces) for each in solids)])
         self.faces = int(faces[-1])

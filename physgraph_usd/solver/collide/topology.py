@@ -9,11 +9,12 @@ from enum import IntEnum
 from typing import Any
 
 import numpy as np
+import scipy.sparse as sp
 import warp as wp
 
 from ..colliders.base import Solid
 from ..level import Level
-from ..mesh.topology import owned_sides
+from ..mesh.topology import find_edges, sorted_rows
 
 LANES = 8
 """Parts in a block, compared at a time; native code in `boxes` is written for eight."""
@@ -55,10 +56,12 @@ class Topology:
     rest: wp.array(dtype=wp.vec3d)
 
 
-def topology_of(level: Level, meets: np.ndarray, label: np.ndarray, *, size: int, solids: Sequence[Solid] = ()) -> Any:
-    """The parts of a level and of bodies in clusters.
+def topology_of(
+    level: Level, meets: np.ndarray, label: np.ndarray, *, size: int, solids: Sequence[Solid] = ()
+) -> tuple[Any, tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """The parts of a level and of bodies in clusters; and their edges, faces, and the edge along each side of these.
 
-    A face belongs to the cluster of its first corner, an edge to that of one of its faces.
+    A face belongs to the cluster of its first corner, an edge to that of its first face.
 
     Args:
         meets: True for pairs in contact of garments, then bodies, symmetric, shape (G + B, G + B), bool.
@@ -67,18 +70,19 @@ def topology_of(level: Level, meets: np.ndarray, label: np.ndarray, *, size: int
     """
     rest, edges, faces, garment, label = _with_solids(level, label, solids)
     cloths = len(level.spans)
-    vertices, used = len(rest), np.unique(faces)  # A vertex of no face is no cloth.
+    vertices, used = len(rest), np.flatnonzero(np.bincount(faces.ravel()))  # A vertex of no face is no cloth.
     cluster = np.zeros(vertices, np.int64)
     cluster[used] = halved(rest[used], garment[used], size)
     count = int(cluster[used].max(initial=-1)) + 1
-    of_face, of_edge, sides = cluster[faces[:, 0]], np.zeros(len(edges), np.int64), owned_sides(edges, faces)
-    of_edge[sides[sides >= 0]] = np.repeat(of_face, 3)[(sides >= 0).ravel()]
+    sides = find_edges(edges, faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2))
+    of_face, of_edge = cluster[faces[:, 0]], np.zeros(len(edges), np.int64)
+    of_edge[sides[::-1]] = np.repeat(of_face, 3)[::-1]  # What is written last stays.
     kinds = ((cluster[used], np.stack([used] * 3, axis=1)), (of_edge, edges[:, [0, 1, 1]]), (of_face, faces))
-    if not count:
-        kinds = tuple((of[:0], corners[:0]) for of, corners in kinds)
     first, parts, number = zip(*(_blocks(of, corners, count) for of, corners in kinds), strict=True)
     begin = np.cumsum([0, *(each[-1] for each in first)])
-    pairs = np.unique(np.concatenate([np.repeat(of, 3) * vertices + c.ravel() for of, c in kinds]))
+    of = np.concatenate([np.repeat(of, 3) for of, _ in kinds])
+    corners = np.concatenate([corners.ravel() for _, corners in kinds])
+    inside = sp.csr_matrix((np.ones(len(of), bool), (of, corners)), shape=(count, vertices))
     table, device = Topology(), level.device
 
     def array(values: np.ndarray, dtype: type = wp.int32) -> wp.array:
@@ -90,14 +94,13 @@ def topology_of(level: Level, meets: np.ndarray, label: np.ndarray, *, size: int
     corners = np.concatenate(parts)
     table.parts, table.number = array(corners, wp.vec3i), array(np.concatenate(number))
     table.labels = array(np.where(corners < 0, -1, label[corners]), wp.vec3i)
-    table.first_corner = array(np.searchsorted(pairs, np.arange(count + 1) * vertices))
-    table.corners = array(pairs % max(vertices, 1))
+    table.first_corner, table.corners = array(inside.indptr), array(inside.indices)
     by_cluster = np.zeros(count, np.int32)
     by_cluster[cluster[used]] = garment[used]
     table.garment, table.owner = array(by_cluster), array(garment)
     table.meets = array(np.asarray(meets).ravel())
     table.rest = wp.array(rest, dtype=wp.vec3d, device=device)
-    return table
+    return table, (edges, faces, sides)
 
 
 def _with_solids(
@@ -129,25 +132,23 @@ def halved(points: np.ndarray, group: np.ndarray, size: int) -> np.ndarray:
     Returns:
         Clusters from 0 in the order of the halves, so that neighbouring numbers are near one another, shape (N,).
     """
-    cluster = group.astype(np.int64)
-    while len(points):
-        cluster, count = np.unique(cluster, return_inverse=True, return_counts=True)[1:]
-        if count.max() <= size:
-            break
-        order, first = np.argsort(cluster, kind="stable"), np.cumsum(count) - count
-        spread = np.maximum.reduceat(points[order], first) - np.minimum.reduceat(points[order], first)
-        order = np.lexsort((points[np.arange(len(points)), spread.argmax(axis=1)[cluster]], cluster))
-        later = np.zeros(len(points), bool)
-        later[order] = np.arange(len(points)) - first[cluster[order]] >= ((count + 1) // 2)[cluster[order]]
-        cluster = 2 * cluster + (later & (count > size)[cluster])
-    return cluster
+    order, count = sorted_rows(group, count=int(group.max(initial=0)) + 1), np.bincount(group)
+    ranks = np.stack([sorted_rows(np.argsort(each, kind="stable"), count=len(points)) for each in points.T])
+    while (count := count[count > 0]).max(initial=0) > size:
+        first, placed = np.cumsum(count) - count, points[order]
+        spread = np.maximum.reduceat(placed, first) - np.minimum.reduceat(placed, first)
+        cluster, axis = np.repeat(np.arange(len(count)), count), np.repeat(spread.argmax(axis=1), count)
+        order = order[np.argsort(cluster * len(points) + ranks[axis, order])]
+        later = np.where(count > size, count // 2, 0)
+        count = np.stack([count - later, later], axis=1).ravel()
+    return np.repeat(np.arange(len(count)), count)[sorted_rows(order, count=len(order))]
 
 
 def _blocks(cluster: np.ndarray, corners: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """First block of each cluster, corners of the parts in blocks, and the parts' numbers; -1 fills the blocks."""
     size = np.bincount(cluster, minlength=count)
     first = np.concatenate([[0], np.cumsum((size + LANES - 1) // LANES)])
-    order = np.argsort(cluster, kind="stable")
+    order = sorted_rows(cluster, count=count)
     owner = cluster[order]
     place = LANES * first[owner] + np.arange(len(order)) - (np.cumsum(size) - size)[owner]
     parts, number = np.full((LANES * first[-1], 3), -1), np.full(LANES * first[-1], -1)

@@ -8,6 +8,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from ..mesh.topology import paired
+
 
 @dataclass(frozen=True, eq=False)
 class Solid:
@@ -27,8 +29,8 @@ class Solid:
     def of(points: np.ndarray, faces: np.ndarray) -> Solid:
         """Triangles with their sides."""
         faces = faces.astype(np.int64)
-        sides = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-        return Solid(points, np.unique(sides, axis=0), faces)
+        edges = paired(faces.ravel(), faces[:, [1, 2, 0]].ravel(), len(points))[0]
+        return Solid(points, edges.astype(np.int64), faces)
 
 
 @dataclass(frozen=True, eq=False)

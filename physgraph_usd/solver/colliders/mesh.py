@@ -20,6 +20,7 @@ from torch import Tensor
 from ..mesh.kernels import KERNELS
 from ..mesh.piercing import passes_through, wide
 from ..mesh.threads import argument, run
+from ..mesh.topology import paired
 from .base import Nearest, Solid
 from .orient import FIXED, Pieces, pieces_of
 from .pose import Pose, moved_rigidly
@@ -123,15 +124,15 @@ class MeshSurface:
         self.closed = rim is None
         self.fixed_side = None if self.closed else FIXED.get(side)
         self.triangles = triangles
-        sides = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-        self.edges, shared = np.unique(sides, axis=0, return_counts=True)
+        count = int(triangles.max(initial=-1)) + 1
+        self.edges, edge = paired(triangles.ravel(), triangles[:, [1, 2, 0]].ravel(), count)
         self.device, self.threads = device, threads
         self._used, compact = np.unique(triangles, return_inverse=True)
         self.solid = Solid.of(pose.points[self._used], compact.reshape(-1, 3))
         self._rim = None if rim is None else [torch.as_tensor(each, device=device) for each in rim]
         self.corners = torch.as_tensor(triangles, device=device).long()
         # At a hole or where more than two faces meet, the other side of a face need not be inside.
-        ragged = np.isin(triangles, self.edges[shared != 2]).any(axis=1)
+        ragged = np.isin(triangles, self.edges[np.bincount(edge) != 2]).any(axis=1)
         self.ragged, self.has_holes = torch.as_tensor(ragged, device=device), bool(ragged.any())
         self.origin, self.bounds = np.zeros(3), np.zeros((2, 3))
         self._judged = pose.points[self._used]

@@ -15,7 +15,7 @@ from ..collide.parts import Parts
 from ..colliders.base import Solid
 from ..forces.self_contact import PairConstraints
 from ..level import Level
-from ..mesh.topology import adjacency, find_edges, joined_by
+from ..mesh.topology import adjacency, joined_by
 
 RINGS = 2
 """Rings of vertices around a crossing, or around a piece of cloth, that belong to it."""
@@ -43,23 +43,18 @@ class ClothMesh:
             meets: True for pairs in contact of garments, then bodies, symmetric, shape (G + B, G + B), bool.
             sewn: Pairs of vertices merged by a seam.
         """
-        edges, triangles, count = level.edges.cpu().numpy(), level.triangles.cpu().numpy(), level.vertex_count
+        cloth, count = level.edges.cpu().numpy(), level.vertex_count
         label = joined_by(sewn, count) if len(sewn) else None
         self.level, self._garments = level, len(level.spans)
         self.parts = Parts(level, meets, label, solids=solids)
-        self.pieces = joined_by(edges, count)
-        self.beside = _across(adjacency(edges, count), label)
-        start = count
-        for solid in solids:
-            edges, triangles = (
-                np.concatenate(each) for each in ((edges, solid.edges + start), (triangles, solid.faces + start))
-            )
-            start += len(solid.points)
-        self._others = start - count
+        edges, triangles, sides = self.parts.surface
+        self.pieces = joined_by(cloth, count)
+        self.beside = _across(adjacency(cloth, count), label)
+        self._others = sum(len(each.points) for each in solids)
         self.free = self.padded(level.free[:, 0]).unsqueeze(1)
         self.edges, self.triangles, self.opposite = (
-            torch.as_tensor(each, device=level.device).long()
-            for each in (edges, triangles, _opposite(edges, triangles))
+            torch.as_tensor(each, device=level.device)
+            for each in (edges, triangles, _opposite(triangles, sides, len(edges)))
         )
         first, second = self.beside.nonzero()
         self._first, self._second = (
@@ -140,13 +135,9 @@ def _across(beside: sp.csr_matrix, label: np.ndarray | None) -> sp.csr_matrix:
     return out
 
 
-def _opposite(edges: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Vertices opposite each edge in its first two faces, shape (E, 2), -1 without a face."""
-    edge = find_edges(edges, triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2))
-    third = triangles[:, [2, 0, 1]].reshape(-1).astype(np.int64)
-    out = np.full((len(edges), 2), -1, np.int64)
-    for place in (1, 0):  # The first face is written last: an edge of one face has it in the first place.
-        kept = np.unique(edge[:: 1 - 2 * place], return_index=True)
-        out[kept[0], place] = third[:: 1 - 2 * place][kept[1]]
+def _opposite(triangles: np.ndarray, sides: np.ndarray, count: int) -> np.ndarray:
+    """Vertices opposite each of E edges in its first and last face, shape (E, 2), -1 without; sides in shape (3 T,)."""
+    third, out = triangles[:, [2, 0, 1]].reshape(-1), np.full((count, 2), -1)
+    out[sides[::-1], 0], out[sides, 1] = third[::-1], third  # What is written last stays.
     out[out[:, 0] == out[:, 1], 1] = -1
     return out

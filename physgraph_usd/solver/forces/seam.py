@@ -24,7 +24,7 @@ from torch import Tensor
 from ..level import Level
 from ..mesh.borders import OnEdge, finer_side, nearest_edges
 from ..mesh.stencil import Stencil
-from ..mesh.topology import find_edges, joined_by
+from ..mesh.topology import edges_of, joined_by
 from ..mesh.weld import WELDED, pairs_within
 from ..scene import Garment
 from .base import ForceModule
@@ -166,8 +166,7 @@ def _seam(level: Level, sewn_at: Float[np.ndarray, "coarse 3"]) -> Seam | None:
 
 def _between(level: Level, points: np.ndarray, on_seam: np.ndarray, alone: np.ndarray, within: float) -> OnEdge:
     """Border vertices between the vertices of another border, with the edge under each."""
-    edges, triangles = (each.cpu().numpy().astype(np.int64) for each in (level.edges, level.triangles))
-    sides = find_edges(edges, triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2))
-    border = edges[np.bincount(sides, minlength=len(edges)) == 1]
+    found = edges_of(level.triangles.cpu().numpy(), level.vertex_count)
+    border = found.vertices[found.face_count == 1].astype(np.int64)
     border = border[on_seam[border].all(axis=1)]
     return finer_side(points, border, nearest_edges(points, alone, border, np.full(len(alone), within)))

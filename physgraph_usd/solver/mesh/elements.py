@@ -13,7 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .topology import PolygonMesh, TriangleSplit, edges_of
+from .topology import PolygonMesh, TriangleSplit, edges_of, paired, sorted_rows
+from .vectors import at_corners, cross, dot, norm
 
 QUAD_SPRING = (0.75, 1.5)
 """Factors of the springs along a quad's sides and diagonals. A grid of squares of Young's modulus Y then has
@@ -26,6 +27,7 @@ class ElasticElements:
 
     Attributes:
         springs: End vertices, lexicographic, shape (S, 2).
+        sides: The spring along each side of the triangles, shape (M, 3).
         membrane: Corner vertices of triangles; the third side of a quad's triangle is a diagonal, shape (M, 3).
         share: Fraction of the area represented by a triangle: a half for a quad's triangle, shape (M,).
         face: The face of each triangle, shape (M,).
@@ -35,6 +37,7 @@ class ElasticElements:
     """
 
     springs: np.ndarray
+    sides: np.ndarray
     membrane: np.ndarray
     share: np.ndarray
     face: np.ndarray
@@ -63,8 +66,10 @@ def elastic_elements(mesh: PolygonMesh, split: TriangleSplit, rest: np.ndarray) 
     (i, other, j), k = split.triangles[first].T, split.triangles[first + 1, 2]
     twist = np.stack([i, j, k, k, other, other], axis=1)
     sides = hinges_of(split.triangles[alone], np.stack([a, b, c, d], axis=1))
+    springs = edges_of(membrane, mesh.vertex_count)
     return ElasticElements(
-        springs=edges_of(membrane, mesh.vertex_count).vertices,
+        springs=springs.vertices,
+        sides=springs.sides,
         membrane=membrane,
         share=share,
         face=face,
@@ -75,12 +80,12 @@ def elastic_elements(mesh: PolygonMesh, split: TriangleSplit, rest: np.ndarray) 
 
 def _convex_quads(mesh: PolygonMesh, split: TriangleSplit, rest: np.ndarray) -> np.ndarray:
     """Numbers of the quads with two consistently facing triangles in both splits."""
-    faces, count = np.unique(split.face, return_counts=True)
-    faces = faces[(count == 2) & (mesh.counts[faces] == 4)]
-    corners = rest[mesh.indices[mesh.starts[faces, None] + np.arange(4)]]
-    sides = np.roll(corners, -1, axis=1) - corners
-    normals = np.cross(sides, np.roll(sides, -1, axis=1))
-    return faces[(np.einsum("fic,fjc->fij", normals, normals) > 0).all(axis=(1, 2))]
+    count = np.bincount(split.face, minlength=mesh.face_count)
+    faces = np.flatnonzero((count == 2) & (mesh.counts == 4))
+    corners = at_corners(rest, mesh.indices[mesh.starts[faces, None] + np.arange(4)])
+    sides = np.roll(corners, -1, axis=0) - corners
+    normals = [cross(each, after) for each, after in zip(sides, np.roll(sides, -1, axis=0), strict=True)]
+    return faces[np.all([dot(one, two) > 0 for n, one in enumerate(normals) for two in normals[n:]], axis=0)]
 
 
 def hinges_of(triangles: np.ndarray, quads: np.ndarray | None = None) -> np.ndarray:
@@ -99,36 +104,27 @@ def hinges_of(triangles: np.ndarray, quads: np.ndarray | None = None) -> np.ndar
         face; a triangle's corner is repeated. Pairs of a face and its own reverse are left out.
     """
     triangles = np.asarray(triangles, np.int64).reshape(-1, 3)
-    triangles = triangles[(triangles != np.roll(triangles, 1, axis=1)).all(axis=1)]
-    faces = [triangles, np.empty((0, 4), np.int64) if quads is None else np.asarray(quads, np.int64)]
+    a, b, c = triangles.T
+    faces = [triangles[(a != b) & (b != c) & (c != a)], np.empty((0, 4), np.int64) if quads is None else quads]
     table = np.concatenate(
         [np.roll(each, -side, axis=1)[:, [0, 1, 2, -1]] for each in faces for side in range(each.shape[1])]
     )
     if not len(table):
         return np.empty((0, 6), np.int32)
-    low, high = table[:, :2].min(axis=1), table[:, :2].max(axis=1)
-    keys = low * (int(high.max()) + 1) + high
-    order = np.argsort(keys, kind="stable")
-    ordered = keys[order]
-    first = np.flatnonzero(np.concatenate([[True], ordered[1:] != ordered[:-1]]))
-    first = first[np.diff(np.append(first, len(ordered))) == 2]
+    edge = paired(table[:, 0], table[:, 1], int(table.max()) + 1)[1]
+    order, count = sorted_rows(edge, count=len(edge)), np.bincount(edge)
+    first = (np.cumsum(count) - count)[count == 2]
     one, two = table[order[first]], table[order[first + 1]]
     hinges = np.concatenate([one, two[:, 2:]], axis=1).astype(np.int32)
-    return hinges[(np.sort(hinges[:, 2:4], axis=1) != np.sort(hinges[:, 4:], axis=1)).any(axis=1)]
-
-
-def hinge_corners(x: np.ndarray, hinges: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Positions of each hinge's edge, i and j, and of the middles k and l of what is opposite to it, shapes (H, 3)."""
-    i, j, k, other_k, ell, other_l = (x[hinges[:, corner]] for corner in range(6))
-    return i, j, 0.5 * (k + other_k), 0.5 * (ell + other_l)
+    k, other_k, ell, other_l = hinges[:, 2:].T
+    return hinges[((k != ell) | (other_k != other_l)) & ((k != other_l) | (other_k != ell))]
 
 
 def hinge_geometry(x: np.ndarray, hinges: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Signed angle [rad], both triangle areas [m^2] and edge length [m] of each hinge."""
-    i, j, k, ell = hinge_corners(x, hinges)
+    i, j, k, other_k, ell, other_l = at_corners(x, hinges)
     axis = j - i
-    n1, n2 = np.cross(axis, k - i), np.cross(ell - i, axis)
-    length = np.linalg.norm(axis, axis=1)
-    sine = np.einsum("hc,hc->h", np.cross(n1, n2), axis) / np.maximum(length, np.finfo(float).tiny)
-    angle = np.arctan2(sine, np.einsum("hc,hc->h", n1, n2))
-    return angle, 0.5 * np.linalg.norm(n1, axis=1), 0.5 * np.linalg.norm(n2, axis=1), length
+    n1, n2 = cross(axis, 0.5 * (k + other_k) - i), cross(0.5 * (ell + other_l) - i, axis)
+    length = norm(axis)
+    sine = dot(cross(n1, n2), axis) / np.maximum(length, np.finfo(float).tiny)
+    return np.arctan2(sine, dot(n1, n2)), 0.5 * norm(n1), 0.5 * norm(n2), length

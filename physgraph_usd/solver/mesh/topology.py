@@ -25,10 +25,12 @@ class Edges:
     Attributes:
         vertices: Edges with the lower vertex first, in lexicographic order, shape (E, 2), int32.
         face_count: Number of triangles at each edge, shape (E,), int32; triangles with a repeated vertex do not count.
+        sides: The edge along each side of the triangles, shape (T, 3), int32; -1 for a loop.
     """
 
     vertices: np.ndarray
     face_count: np.ndarray
+    sides: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,18 +141,15 @@ class PolygonMesh:
     @cached_property
     def half_edges(self) -> HalfEdges:
         """Edges of the faces, and the edge of each half-edge."""
-        here, there = self.indices.astype(np.int64), self.indices[self.next_corner].astype(np.int64)
-        stride = max(self.vertex_count, 1)
-        keys = np.minimum(here, there) * stride + np.maximum(here, there)
-        unique, edge, count = np.unique(keys, return_inverse=True, return_counts=True)
-        edges = np.stack([unique // stride, unique % stride], axis=1).astype(np.int32)
-        return HalfEdges(edges, edge.reshape(-1).astype(np.int32), here <= there, count.astype(np.int32))
+        here, there = self.indices, self.indices[self.next_corner]
+        edges, edge = paired(here, there, self.vertex_count)
+        return HalfEdges(edges, edge, here <= there, np.bincount(edge, minlength=len(edges)).astype(np.int32))
 
     @cached_property
     def twin_corners(self) -> np.ndarray:
         """For each edge with two half-edges, the two corners of the half-edges, shape (N, 2), in the edges' order."""
         half = self.half_edges
-        order, starts = np.argsort(half.edge, kind="stable"), np.cumsum(half.count) - half.count
+        order, starts = sorted_rows(half.edge, count=len(half.count)), np.cumsum(half.count) - half.count
         double = starts[(half.count == 2) & (half.edges[:, 0] != half.edges[:, 1])]
         return np.stack([order[double], order[double + 1]], axis=1)
 
@@ -174,7 +173,7 @@ class PolygonMesh:
         The number is 1 at manifold vertices, 2 or more if a surface touches itself in a point, 0 at isolated vertices.
         """
         half = self.half_edges
-        order = np.argsort(half.edge, kind="stable")
+        order = sorted_rows(half.edge, count=len(half.count))
         same = np.flatnonzero(half.edge[order[1:]] == half.edge[order[:-1]])
         ends = np.stack([np.arange(len(self.indices)), self.next_corner], axis=1)
         ends = np.where(half.forward[:, None], ends, ends[:, ::-1])
@@ -253,14 +252,22 @@ def _fan_corner(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
     return np.where(inside[:, 0] != inside[:, 1], inside[:, 1], shorter).astype(np.int64)
 
 
-def _triangle_sides(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Directed sides of all triangles: from, to, opposite corner (3 T each), and whether the triangle is proper."""
-    triangles = np.asarray(triangles, np.int64).reshape(-1, 3)
-    here = triangles.reshape(-1)
-    there = np.roll(triangles, -1, axis=1).reshape(-1)
-    opposite = np.roll(triangles, -2, axis=1).reshape(-1)
-    proper = (here != there) & (there != opposite) & (opposite != here)
-    return here, there, opposite, proper
+def sorted_rows(*columns: np.ndarray, count: int) -> np.ndarray:
+    """The order that sorts rows of numbers under a count, by columns, shape (K,), int32; equal rows stay in order."""
+    order, starts = np.arange(len(columns[0]), dtype=np.int32), np.arange(len(columns[0]) + 1, dtype=np.int32)
+    for column in reversed(columns):
+        order = sparse.csr_matrix((order, column[order], starts), shape=(len(order), count)).tocsc().data
+    return order
+
+
+def paired(here: np.ndarray, there: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Different pairs of vertices, the lower first, in order, shape (E, 2), and which each pair is, shape (K,)."""
+    ends = np.stack([np.minimum(here, there), np.maximum(here, there)])
+    order = sorted_rows(*ends, count=count)
+    ends, pair = ends[:, order], np.empty(len(order), np.int32)
+    first = np.append(True, (ends[:, 1:] != ends[:, :-1]).any(axis=0))[: len(order)]
+    pair[order] = np.cumsum(first) - 1
+    return np.ascontiguousarray(ends[:, first].T, np.int32), pair
 
 
 def find_edges(edges: np.ndarray, pairs: np.ndarray) -> np.ndarray:
@@ -278,30 +285,21 @@ def find_edges(edges: np.ndarray, pairs: np.ndarray) -> np.ndarray:
         return np.full(len(pairs), -1)
     stride = int(edges.max()) + 1
     keys = edges[:, 0] * stride + edges[:, 1]
-    inside = (pairs >= 0).all(axis=1) & (pairs < stride).all(axis=1)
-    wanted = np.where(inside, pairs.min(axis=1) * stride + pairs.max(axis=1), -1)
+    low, high = np.minimum(pairs[:, 0], pairs[:, 1]), np.maximum(pairs[:, 0], pairs[:, 1])
+    wanted = np.where((low >= 0) & (high < stride), low * stride + high, -1)
     found = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
     return np.where(keys[found] == wanted, found, -1)
 
 
 def edges_of(triangles: np.ndarray, vertex_count: int) -> Edges:
-    """Find the undirected edges of triangles.
-
-    Args:
-        triangles: Vertices, shape (T, 3).
-        vertex_count: Number of vertices V.
-
-    Returns:
-        Unique edges, without loops from a vertex to itself.
-    """
-    here, there, _, proper = _triangle_sides(triangles)
-    kept = here != there
-    stride = max(vertex_count, 1)
-    keys = (np.minimum(here, there) * stride + np.maximum(here, there))[kept]
-    unique, inverse = np.unique(keys, return_inverse=True)
-    count = np.bincount(inverse.reshape(-1), weights=proper[kept], minlength=len(unique))
-    vertices = np.stack([unique // stride, unique % stride], axis=1).astype(np.int32)
-    return Edges(vertices, count.astype(np.int32))
+    """The undirected edges of triangles of numbered vertices, shape (T, 3), without loops from a vertex to itself."""
+    a, b, c = triangles.T
+    here, there = triangles.reshape(-1), triangles[:, [1, 2, 0]].reshape(-1)
+    kept, proper = np.flatnonzero(here != there), (a != b) & (b != c) & (c != a)
+    sides = np.full(len(here), -1, np.int32)
+    vertices, sides[kept] = paired(here[kept], there[kept], vertex_count)
+    count = np.bincount(sides[np.repeat(proper, 3)], minlength=len(vertices))
+    return Edges(vertices, count.astype(np.int32), sides.reshape(-1, 3))
 
 
 def joined_by(edges: np.ndarray, count: int) -> np.ndarray:
@@ -320,13 +318,3 @@ def adjacency(edges: np.ndarray, count: int) -> sparse.csr_matrix:
     """Adjacency matrix of vertices joined by edges."""
     both = np.concatenate([edges, edges[:, ::-1]])
     return sparse.csr_matrix((np.ones(len(both), np.float32), (both[:, 0], both[:, 1])), shape=(count, count))
-
-
-def owned_sides(edges: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """The edges owned by each face, shape (T, 3): each edge exactly once, -1 elsewhere."""
-    sides = triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
-    edge = find_edges(edges, sides)
-    owned = np.full(len(sides), -1, np.int32)
-    kept = np.unique(edge, return_index=True)[1]
-    owned[kept] = edge[kept]
-    return owned.reshape(-1, 3)
