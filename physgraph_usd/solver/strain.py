@@ -11,8 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .colliders.pose import extent
 from .mesh.topology import joined_by
-from .scene import Garment, extent
+from .scene import Garment
 
 STRAINED = 1.1
 """Area over rest area, or its inverse, from which a face is strained."""

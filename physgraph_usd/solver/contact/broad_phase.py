@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from ..colliders.mesh import MeshBody, MeshSurface
 from ..colliders.orient import FIXED
-from ..colliders.pose import Collider, Pose
+from ..colliders.pose import Collider, Pose, bounds_of
 from ..rigid import AT_REST, Rigid
 from ..scene import Garment, GarmentFrame, mean_edge
 from ..strain import has_collapsed
@@ -142,7 +142,8 @@ class Bodies:
         if pose is None:
             return False
         if index not in self._bounds:
-            points = pose.points[np.isfinite(pose.points).all(axis=1)]
+            finite = np.isfinite(pose.points)
+            points = pose.points if finite.all() else pose.points[finite.all(axis=1)]
             if pose.endless:  # Cloth at any depth behind a plane is near the plane.
                 a, b, c = pose.points[:3]
                 away = FIXED.get(self.colliders[index].side, 1.0) * np.cross(b - a, c - a)
@@ -190,11 +191,3 @@ class Bodies:
 def reach_of(garment: Garment, frame: GarmentFrame) -> float:
     """Distance from the cage's bounds within which a body is near [m]: offset plus expected move of the cloth."""
     return frame.offset + REACH * mean_edge(garment)
-
-
-def bounds_of(points: np.ndarray) -> np.ndarray:
-    """Least and greatest corner, shape (2, 3); without points an empty box that meets nothing."""
-    if not len(points):
-        return np.stack([np.full(3, np.inf), np.full(3, -np.inf)])
-    columns = np.ascontiguousarray(points.T)  # Over rows of three numpy is slow.
-    return np.stack([columns.min(axis=1), columns.max(axis=1)])

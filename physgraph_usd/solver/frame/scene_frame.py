@@ -10,8 +10,9 @@ import numpy as np
 import torch
 
 from ...errors import At, GarmentError, SolveError, named_time
+from ..colliders.pose import bounds_of
 from ..contact.bodies import Touching
-from ..contact.broad_phase import Bodies, TouchingGroups, bounds_of, reach_of
+from ..contact.broad_phase import Bodies, TouchingGroups, reach_of
 from ..contact.report import body_crossings, penetration_map
 from ..deadline import is_over
 from ..level import refine_garments
