@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import Any
 
 import numpy as np
-from scipy import sparse
-from scipy.sparse import csgraph
 from scipy.spatial import cKDTree
 
 from ..colliders.mesh import MeshBody, MeshSurface
@@ -44,7 +41,6 @@ class TouchingGroups:
         Two cages are near if two of their vertices are closer than the expected distance of the cloth from its cage
         plus an edge, because a vertex may be near the middle of an edge. A collapsed cage is near no cage.
         """
-        count = len(frames)
         whole = [not has_collapsed(garment, own.points) for garment, own in zip(self._garments, frames, strict=True)]
         trees: dict[int, cKDTree] = {}
         near = [
@@ -53,12 +49,12 @@ class TouchingGroups:
             if whole[a] and whole[b] and touch_one_another(self._garments[a], self._garments[b])
             if self._close(a, b, frames, trees)
         ]
-        ends = np.array(near, np.int64).reshape(-1, 2)
-        graph: Any = sparse.coo_matrix((np.ones(len(ends), bool), (ends[:, 0], ends[:, 1])), shape=(count, count))
-        parts: dict[int, list[int]] = {}
-        for index, label in enumerate(csgraph.connected_components(graph, directed=False)[1].tolist()):
-            parts.setdefault(label, []).append(index)
-        return [tuple(part) for part in parts.values()]
+        parts = [(index,) for index in range(len(frames))]
+        for a, b in near:
+            joined = tuple(sorted({*parts[a], *parts[b]}))
+            for index in joined if parts[a] != parts[b] else ():
+                parts[index] = joined
+        return list(dict.fromkeys(parts))
 
     def _reach(self, index: int, frame: GarmentFrame) -> float:
         """A garment's share of the distance at which two garments are near [m]."""
