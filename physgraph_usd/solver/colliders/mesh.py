@@ -149,7 +149,7 @@ class MeshSurface:
         return LIFT * float(np.ptp(self.bounds, axis=0).max())
 
     def repose(self, pose: Pose) -> None:
-        """Move the surface to another finite pose of its topology; a rigid motion keeps the known self-intersections."""
+        """Move the surface to another finite pose of its topology; a rigid motion keeps known self-intersections."""
         self.mesh.points.assign(self._place(pose))
         self.mesh.refit()
         rigid = moved_rigidly(self._judged, self.world)

@@ -258,7 +258,7 @@ class SceneFrame:
 
     def _edge(self, part: tuple[int, ...]) -> float:
         """Mean edge of the cages of garments [m]."""
-        return float(self.cloth.group(part, self.settings).levels[0].spacing.mean())
+        return self.cloth.group(part, self.settings).spacings[0]
 
     def _surroundings(self, part: tuple[int, ...], near: Sequence[int]) -> dict[str, object]:
         """Telemetry: paths of the bodies near garments, and of garments solved together."""
