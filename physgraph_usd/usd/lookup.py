@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Collection, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom, UsdShade
@@ -63,6 +63,7 @@ class Found:
     scale: float = 1.0
     compute: Callable[[float | None], float] | None = None
     varies: bool = False
+    _known: dict[float | None, float] = field(default_factory=dict, init=False)
 
     @property
     def animated(self) -> bool:
@@ -70,12 +71,17 @@ class Found:
         return self.varies or (self.attribute is not None and self.attribute.ValueMightBeTimeVarying())
 
     def at(self, time: float | None) -> float | None:
-        """Value in SI at a time code, None without a value; SchemaError for a wrong type or a value beyond limits."""
-        if self.compute is not None:
-            return check_limits(self.row, self.compute(time), self.source)
-        if self.attribute is None:
+        """Value in SI at a time code, None without a value; SchemaError for a wrong type or a value beyond limits.
+
+        A value that is the same at all time codes is read once.
+        """
+        if self.compute is None and self.attribute is None:
             return self.constant
-        return check_limits(self.row, read_number(self.attribute, time) * self.scale, self.source)
+        when = time if time is None or self.animated else 0.0
+        if when not in self._known:
+            value = read_number(self.attribute, time) * self.scale if self.compute is None else self.compute(time)
+            self._known[when] = check_limits(self.row, value, self.source)
+        return self._known[when]
 
 
 def check_known(what: str, word: object, known: Collection[object]) -> None:
