@@ -155,12 +155,7 @@ def edge_strain(level: Level, x: Float[Tensor, "vertices 3"]) -> dict[str, float
 
 
 def _percentile(values: np.ndarray, share: float) -> float:
-    """The value with a share of the values below, as `np.percentile` and faster; brings the values into another order.
-
-    Args:
-        values: At least one, shape (N,).
-        share: From 0 to 1.
-    """
+    """The value with a share of the values, shape (N,), below: `np.percentile`, but faster; it reorders the values."""
     at = share * (len(values) - 1)
     below = int(at)
     values.partition(below)

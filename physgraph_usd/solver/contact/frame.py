@@ -90,7 +90,7 @@ class FrameContact:
 
         What the last frame solved is never given up because the cage crosses there.
         """
-        if self._last_given_up is None or not (self._last_given_up.any() and self.crossed):
+        if self._last_given_up is None or not (self.crossed and self._last_given_up.any()):
             return None
         mesh, found, *_ = self._cage
         lost = mesh.padded(self._last_given_up)
