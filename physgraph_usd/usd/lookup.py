@@ -75,13 +75,12 @@ class Found:
 
         A value that is the same at all time codes is read once.
         """
-        if self.compute is None and self.attribute is None:
-            return self.constant
         when = time if time is None or self.animated else 0.0
-        if when not in self._known:
-            value = read_number(self.attribute, time) * self.scale if self.compute is None else self.compute(time)
-            self._known[when] = check_limits(self.row, value, self.source)
-        return self._known[when]
+        if when not in self._known and self.compute is not None:
+            self._known[when] = check_limits(self.row, self.compute(time), self.source)
+        if when not in self._known and self.attribute is not None:
+            self._known[when] = check_limits(self.row, read_number(self.attribute, time) * self.scale, self.source)
+        return self._known.get(when, self.constant)
 
 
 def check_known(what: str, word: object, known: Collection[object]) -> None:

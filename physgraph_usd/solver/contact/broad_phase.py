@@ -49,7 +49,7 @@ class TouchingGroups:
             if whole[a] and whole[b] and touch_one_another(self._garments[a], self._garments[b])
             if self._close(a, b, frames, trees)
         ]
-        parts = [(index,) for index in range(len(frames))]
+        parts: list[tuple[int, ...]] = [(index,) for index in range(len(frames))]
         for a, b in near:
             joined = tuple(sorted({*parts[a], *parts[b]}))
             for index in joined if parts[a] != parts[b] else ():
