@@ -32,7 +32,7 @@ def test_rigid_motion_carries_detail_exactly(seed: int):
     coarse = tensor(wave(REST, height=0.02))
     turn, shift = tensor(rotation(seed)), tensor(np.array([0.3, -2.0, 5.0]))
     x = fine(coarse)
-    predicted, _, _ = FRAMES.predict(coarse, x, coarse @ turn.T + shift)
+    predicted, *_ = FRAMES.predict(coarse, x, coarse @ turn.T + shift)
     assert torch.allclose(predicted, x @ turn.T + shift, rtol=0, atol=1e-12)
 
 
@@ -44,7 +44,7 @@ def test_bending_turns_detail_with_the_place_it_is_at():
     bumped = x.clone()
     bumped[far, 2] += 0.01
     folded = np.where(REST[:, :1] > 0.11, np.stack([0 * REST[:, 0] + 0.1, REST[:, 1], REST[:, 0] - 0.1], axis=1), REST)
-    predicted, _, _ = FRAMES.predict(coarse, bumped, tensor(folded))
+    predicted, *_ = FRAMES.predict(coarse, bumped, tensor(folded))
     bump = predicted - FINEST.smooth_base.apply(tensor(folded))
     assert torch.allclose(bump[far], tensor(np.array([-0.01, 0.0, 0.0])), rtol=0, atol=1e-4)
 

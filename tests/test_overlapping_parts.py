@@ -33,7 +33,8 @@ def view_of(levels: tuple[Level, ...], cage: torch.Tensor, *soups: Any) -> Level
     """The finest level of the sheet among bodies, meshes all."""
     posed = [MeshBody(device="cpu", threads=1).pose(Pose(*soup))[0] for soup in soups]
     touching = [Touching(f"/Body{index}", each, (0.002,)) for index, each in enumerate(posed)]
-    bodies = FrameBodies.begin(levels[0], touching, cage, origin=np.zeros(3), settings=SETTINGS)
+    place = {"edge": float(levels[0].spacing.mean()), "origin": np.zeros(3), "settings": SETTINGS}
+    bodies = FrameBodies.begin(touching, cage, **place)
     base, thickness = levels[-1].base.apply(cage), torch.tensor([0.002])
     given = {"base": base, "thickness": thickness, "settings": SETTINGS, "bodies": bodies}
     return LevelContact(ClothContact(levels, [SHEET]), levels[-1], **given, doubtful=levels[-1].free[:, 0] | True)

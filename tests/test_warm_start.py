@@ -33,8 +33,8 @@ MESH, REST = sheet(8, 6)
 
 def begun(group: Group, state: FrameState, cage: Cage) -> Start:
     """Where a frame starts, with no body that has moved."""
-    given = {"frames": group.moving_frames, "finest": group.levels[-1], "reset": group.settings.reset}
-    return start_of(state, cage, **given, moved=0.0)
+    given = {"frames": group.moving_frames, "reset": group.settings.reset}
+    return start_of(state.about(cage.origin), state.held, cage, **given, moved=0.0)
 
 
 @pytest.mark.parametrize(("moved", "still"), [(0.9, True), (1.1, False)])

@@ -14,8 +14,7 @@ from scipy.spatial import cKDTree
 
 from ..errors import StageError, counted
 from ..solver.colliders.mesh import MeshBody
-from ..solver.colliders.pose import Pose
-from ..solver.contact.broad_phase import bounds_of
+from ..solver.colliders.pose import Pose, bounds_of
 from ..solver.mesh.kernels import start_warp
 from ..solver.resolution import sample_frames
 from ..solver.scene import Garment

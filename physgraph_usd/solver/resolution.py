@@ -150,5 +150,15 @@ def edge_strain(level: Level, x: Float[Tensor, "vertices 3"]) -> dict[str, float
     if not len(level.edges):
         return {"p50": 0.0, "p99": 0.0, "max": 0.0}
     strain = (level.lengths(x) / level.rest_length - 1.0).abs().cpu().numpy()
-    p50, p99 = np.percentile(strain, [50, 99])
-    return {"p50": float(p50), "p99": float(p99), "max": float(strain.max())}
+    p99, p50 = (_percentile(strain, share) for share in (0.99, 0.5))
+    return {"p50": p50, "p99": p99, "max": float(strain.max())}
+
+
+def _percentile(values: np.ndarray, share: float) -> float:
+    """The value with a share of the values, shape (N,), below: `np.percentile`, but faster; it reorders the values."""
+    at = share * (len(values) - 1)
+    below = int(at)
+    values.partition(below)
+    low, high = values[below], values[below + 1 :].min(initial=values.max())
+    apart, part = float(high - low), at - below
+    return float(low) + apart * part if part < 0.5 else float(high) - apart * (1.0 - part)

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from ..errors import GarmentError
-from .colliders.pose import Collider, Pose
+from .colliders.pose import Collider, Pose, extent
 from .fabric import Fabric
 from .mesh.topology import PolygonMesh
 
@@ -224,11 +224,6 @@ def _rest_edges(garment: Garment) -> np.ndarray:
     return np.linalg.norm(garment.rest[ends[:, 1]] - garment.rest[ends[:, 0]], axis=1)
 
 
-def extent(points: np.ndarray) -> np.ndarray:
-    """How large points, shape (N, 3), are along each axis, shape (3,): axis by axis, for rows of three are slow."""
-    return np.array([np.ptp(points[:, axis]) for axis in range(3)])
-
-
 def out_of_bounds(points: np.ndarray) -> str:
     """Which of positions [m], shape (V, 3), no kernel may see, not finite or beyond `FARTHEST`, in words; or ""."""
     if (np.abs(points) <= FARTHEST).all():
@@ -238,8 +233,9 @@ def out_of_bounds(points: np.ndarray) -> str:
     return f"point {index} is at ({at}) m; it must be finite and at most {FARTHEST:g} m from the origin"
 
 
+@functools.lru_cache(maxsize=1)
 def refuse_far(scene: Scene, frame: Frame) -> None:
-    """Refuse a frame with garments or bodies out of bounds; faces of bodies with NaN are left out later.
+    """Refuse a frame with garments or bodies out of bounds, once; faces of bodies with NaN are left out later.
 
     Raises:
         GarmentError: With the prim, the time code and the point.
@@ -290,7 +286,7 @@ def refuse_falling(scene: Scene, frame: Frame) -> None:
     for garment, garment_frame in zip(scene.garments, frame.garments, strict=True):
         weight = garment_frame.fabric.density * float(np.linalg.norm(scene.gravity))
         held = garment.colliders or (garment.pin > 0).any() or len(scene.garments) > 1
-        size = max(SPECK, *(float(np.ptp(x, axis=0).max(initial=0.0)) for x in (garment_frame.points, garment.rest)))
+        size = max(SPECK, *(float(extent(x).max()) for x in (garment_frame.points, garment.rest)))
         guide, stretch = garment_frame.guide * float(garment.guide_scale.mean()), garment_frame.fabric.stretch
         if (garment.pin >= 1.0).all() or weight <= FALLS * size * guide:
             continue

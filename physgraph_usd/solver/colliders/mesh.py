@@ -23,7 +23,7 @@ from ..mesh.threads import argument, run
 from ..mesh.topology import paired
 from .base import Nearest, Solid
 from .orient import FIXED, Pieces, pieces_of
-from .pose import Pose, moved_rigidly
+from .pose import Pose, bounds_of, moved_rigidly
 
 wp.set_module_options(KERNELS)
 
@@ -135,8 +135,8 @@ class MeshSurface:
         ragged = np.isin(triangles, self.edges[np.bincount(edge) != 2]).any(axis=1)
         self.ragged, self.has_holes = torch.as_tensor(ragged, device=device), bool(ragged.any())
         self.origin, self.bounds = np.zeros(3), np.zeros((2, 3))
-        self._judged = pose.points[self._used]
         self.mesh = _hierarchy(wp.array(self._place(pose), dtype=wp.vec3f, device=device), triangles, self.closed)
+        self._judged = self.world
         self._faces = Faces(self)
 
     @property
@@ -150,29 +150,29 @@ class MeshSurface:
         return LIFT * float(np.ptp(self.bounds, axis=0).max())
 
     def repose(self, pose: Pose) -> None:
-        """Move the surface to another pose of equal topology; a rigid motion keeps the known self-intersections."""
-        wp.copy(self.mesh.points, wp.array(self._place(pose), dtype=wp.vec3f, device=self.device))
+        """Move the surface to another finite pose of its topology; a rigid motion keeps known self-intersections."""
+        self.mesh.points.assign(self._place(pose))
         self.mesh.refit()
-        posed = pose.points[self._used]
-        rigid = moved_rigidly(self._judged, posed)
-        self._judged = self._judged if rigid else posed
+        rigid = moved_rigidly(self._judged, self.world)
+        self._judged = self._judged if rigid else self.world
         self._faces = self._faces.turned() if rigid else Faces(self)
 
     def _place(self, pose: Pose) -> np.ndarray:
         """Recentre a pose; vertices without a face are moved to the origin."""
-        used = pose.points[self._used]
+        used = pose.points.take(self._used, axis=0)
         used = self.world = np.where(np.isfinite(used), used, 0.0)
-        self.origin = 0.5 * (used.min(axis=0) + used.max(axis=0))
+        low, high = bounds_of(used)
+        self.origin = 0.5 * (low + high)
         local = np.zeros((len(pose.points), 3), np.float32)
         local[self._used] = used - self.origin
-        self.bounds = np.stack([used.min(axis=0), used.max(axis=0)]) - self.origin
+        self.bounds = np.stack([low, high]) - self.origin
         return local
 
     def placed(self, pose: Pose) -> np.ndarray | None:
         """World positions of the corners in another pose [m]; None if the pose is of another shape."""
         if len(pose.points) != len(self.mesh.points):
             return None
-        points = pose.points[self._used]
+        points = pose.points.take(self._used, axis=0)
         return points if np.isfinite(points).all() else None
 
     def closest(self, x: Float[Tensor, "points 3"], reach: Float[Tensor, " points"]) -> Nearest:

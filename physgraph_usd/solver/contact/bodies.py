@@ -75,10 +75,10 @@ class FrameBodies:
 
     @staticmethod
     def begin(
-        cage: Level,
         touching: Sequence[Touching],
         coarse: Float[Tensor, "coarse 3"],
         *,
+        edge: float,
         origin: np.ndarray,
         settings: ContactSettings,
     ) -> FrameBodies:
@@ -86,6 +86,7 @@ class FrameBodies:
 
         Args:
             coarse: Cage positions [m], recentred.
+            edge: Mean edge of the cage [m].
             origin: World position of the group's origin [m], shape (3,).
             settings: Contact settings, with the stiffness in SI.
         """
@@ -96,7 +97,7 @@ class FrameBodies:
             for each in ([each.surface.world for each in touching], known or [np.zeros((0, 3))])
         )
         sides = tuple(_start_sides(each.surface, coarse + shift) for each, shift in zip(touching, shifts, strict=True))
-        longest = settings.way_out * float(cage.spacing.mean())
+        longest = settings.way_out * edge
         whole = len(known) == len(touching)
         return FrameBodies(tuple(touching), shifts, points, before if whole else None, longest, settings, sides)
 
@@ -174,8 +175,7 @@ class LevelBodies:
 
     def _inside(self, index: int, x: Tensor, cut: Tensor) -> Bool[Tensor, " vertices"]:
         surface, out = self.frame.touching[index].surface, torch.zeros_like(self.level.free[:, 0])
-        feels = self._feels(index)
-        if not bool(feels.any()) or not (surface.has_inside or len(cut)):
+        if not np.isfinite(self.frame.touching[index].offset).any() or not (surface.has_inside or len(cut)):
             return out
         piece = self.pieces
         if len(cut):
@@ -186,12 +186,12 @@ class LevelBodies:
         which = torch.as_tensor(asked, device=x.device)
         wrong = self._behind(index, x[which], which).cpu().numpy()
         votes = np.bincount(owner, np.where(wrong, 1.0, -1.0), int(piece.max()) + 1)
-        return torch.as_tensor(votes[piece] > 0, device=x.device) & feels
+        return torch.as_tensor(votes[piece] > 0, device=x.device) & self._feels(index)
 
     def _feels(self, index: int) -> Bool[Tensor, " vertices"]:
         """Mask of the vertices of garments that do not ignore a body."""
-        offset = torch.tensor(self.frame.touching[index].offset, device=self.level.rest.device)
-        return offset.isfinite()[self.level.vertex_garment.long()]
+        felt = torch.as_tensor(np.isfinite(self.frame.touching[index].offset), device=self.level.rest.device)
+        return felt[self.level.vertex_garment.long()]
 
     def _behind(self, index: int, x: Tensor, which: Tensor) -> Bool[Tensor, " points"]:
         """Mask of the points x of some vertices that are inside a body or behind it."""

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import Any
 
 import numpy as np
-from scipy import sparse
-from scipy.sparse import csgraph
 from scipy.spatial import cKDTree
 
 from ..colliders.mesh import MeshBody, MeshSurface
 from ..colliders.orient import FIXED
-from ..colliders.pose import Collider, Pose
+from ..colliders.pose import Collider, Pose, bounds_of
 from ..rigid import AT_REST, Rigid
 from ..scene import Garment, GarmentFrame, mean_edge
 from ..strain import has_collapsed
@@ -44,7 +41,6 @@ class TouchingGroups:
         Two cages are near if two of their vertices are closer than the expected distance of the cloth from its cage
         plus an edge, because a vertex may be near the middle of an edge. A collapsed cage is near no cage.
         """
-        count = len(frames)
         whole = [not has_collapsed(garment, own.points) for garment, own in zip(self._garments, frames, strict=True)]
         trees: dict[int, cKDTree] = {}
         near = [
@@ -53,12 +49,12 @@ class TouchingGroups:
             if whole[a] and whole[b] and touch_one_another(self._garments[a], self._garments[b])
             if self._close(a, b, frames, trees)
         ]
-        ends = np.array(near, np.int64).reshape(-1, 2)
-        graph: Any = sparse.coo_matrix((np.ones(len(ends), bool), (ends[:, 0], ends[:, 1])), shape=(count, count))
-        parts: dict[int, list[int]] = {}
-        for index, label in enumerate(csgraph.connected_components(graph, directed=False)[1].tolist()):
-            parts.setdefault(label, []).append(index)
-        return [tuple(part) for part in parts.values()]
+        parts: list[tuple[int, ...]] = [(index,) for index in range(len(frames))]
+        for a, b in near:
+            joined = tuple(sorted({*parts[a], *parts[b]}))
+            for index in joined if parts[a] != parts[b] else ():
+                parts[index] = joined
+        return list(dict.fromkeys(parts))
 
     def _reach(self, index: int, frame: GarmentFrame) -> float:
         """A garment's share of the distance at which two garments are near [m]."""
@@ -142,7 +138,8 @@ class Bodies:
         if pose is None:
             return False
         if index not in self._bounds:
-            points = pose.points[np.isfinite(pose.points).all(axis=1)]
+            finite = np.isfinite(pose.points)
+            points = pose.points if finite.all() else pose.points[finite.all(axis=1)]
             if pose.endless:  # Cloth at any depth behind a plane is near the plane.
                 a, b, c = pose.points[:3]
                 away = FIXED.get(self.colliders[index].side, 1.0) * np.cross(b - a, c - a)
@@ -190,11 +187,3 @@ class Bodies:
 def reach_of(garment: Garment, frame: GarmentFrame) -> float:
     """Distance from the cage's bounds within which a body is near [m]: offset plus expected move of the cloth."""
     return frame.offset + REACH * mean_edge(garment)
-
-
-def bounds_of(points: np.ndarray) -> np.ndarray:
-    """Least and greatest corner, shape (2, 3); without points an empty box that meets nothing."""
-    if not len(points):
-        return np.stack([np.full(3, np.inf), np.full(3, -np.inf)])
-    columns = np.ascontiguousarray(points.T)  # Over rows of three numpy is slow.
-    return np.stack([columns.min(axis=1), columns.max(axis=1)])

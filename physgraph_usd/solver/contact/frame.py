@@ -90,7 +90,7 @@ class FrameContact:
 
         What the last frame solved is never given up because the cage crosses there.
         """
-        if self._last_given_up is None or not (self._last_given_up.any() and self.crossed):
+        if self._last_given_up is None or not (self.crossed and self._last_given_up.any()):
             return None
         mesh, found, *_ = self._cage
         lost = mesh.padded(self._last_given_up)
@@ -175,16 +175,13 @@ class FrameContact:
         """
         moved: dict[str, object] = {}
         if self.aim is not self._coarse:
-            shift = (self.aim - self._coarse).norm(dim=1)
-            moved["repaired"] = {"vertices": int((shift > 0).sum()), "largest_mm": round(1e3 * float(shift.max()), 4)}
+            moved["repaired"] = _moves(self._coarse, self.aim)
         # First all cloth inside is moved, then the vertices inside alone: an edge's way out may put a vertex inside.
         view = self.at(self._levels[-1])
         whole, passes = _out_of_bodies(view, x, vertices=False)
         out, more = _out_of_bodies(view, whole, vertices=True)
         if self._bodies is not None:
-            shifts = (out - x).norm(dim=1)
-            far = round(1e3 * float(shifts.max()), 4) if len(shifts) else 0.0
-            moved["projected"] = {"vertices": int((shifts > 0).sum()), "largest_mm": far, "passes": passes + more}
+            moved["projected"] = _moves(x, out) | {"passes": passes + more}
         return out, moved
 
     def is_out(self, x: Placed) -> bool:
@@ -199,6 +196,14 @@ class FrameContact:
         """
         view = self.at(self._levels[-1])
         return measured(view, view.closed(self._levels[-1].base.apply(self._coarse)), x)
+
+
+def _moves(start: Tensor, end: Tensor) -> dict[str, object]:
+    """Report of vertices that moved from one place to another [m]: their number, and the largest move."""
+    if end is start:
+        return {"vertices": 0, "largest_mm": 0.0}
+    shifts = (end - start).norm(dim=1)
+    return {"vertices": int((shifts > 0).sum()), "largest_mm": round(1e3 * float(shifts.max()), 4)}
 
 
 def _out_of_bodies(view: LevelContact, start: Placed, *, vertices: bool) -> tuple[Placed, int]:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from ..level import Level
-
 
 @dataclass(frozen=True)
 class ContactSettings:
@@ -40,10 +38,11 @@ class ContactSettings:
         on = ContactSettings()
         return replace(self, form=on.form, cloth=on.cloth)
 
-    def scaled(self, cage: Level, *, stretch: float) -> ContactSettings:
+    def scaled(self, edge: float, *, stretch: float) -> ContactSettings:
         """Settings with stiffnesses in SI [N/m^3].
 
         Args:
+            edge: Mean edge of the cage [m].
             stretch: Stretch stiffness of the cloth [N/m].
         """
-        return replace(self, stiffness=self.stiffness * stretch / float(cage.spacing.mean()) ** 2)
+        return replace(self, stiffness=self.stiffness * stretch / edge**2)

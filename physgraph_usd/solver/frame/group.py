@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -90,7 +91,12 @@ class Group:
             seams=level_seams(levels, garments),
         )
 
-    @property
+    @cached_property
+    def spacings(self) -> list[float]:
+        """Mean of each level's local edges [m]."""
+        return [float(level.spacing.mean()) for level in self.levels]
+
+    @cached_property
     def outward(self) -> Float[Tensor, " garments"]:
         """Sign of each garment's normals: 1 for outward, -1 for inward."""
         return torch.tensor([-1.0 if each.flipped else 1.0 for each in self.garments], device=self.levels[0].device)
@@ -151,9 +157,9 @@ class Group:
         if not len(self.levels[0].triangles) or not (itself or touching or any(self.seams)):
             return None
         fabrics = [each.fabric for each in frame.garments]
-        settings = settings.scaled(self.levels[0], stretch=max(each.stretch for each in fabrics))
-        place = {"origin": cage.origin, "settings": settings}
-        bodies = FrameBodies.begin(self.levels[0], touching, cage.points, **place) if touching else None
+        settings = settings.scaled(self.spacings[0], stretch=max(each.stretch for each in fabrics))
+        place = {"edge": self.spacings[0], "origin": cage.origin, "settings": settings}
+        bodies = FrameBodies.begin(touching, cage.points, **place) if touching else None
         cloths = {"thickness": [each.thickness for each in fabrics], "settings": settings, "seams": self.seams}
         cloths["given_up"] = given_up
         return FrameContact(self.levels, cage.points, bodies=bodies, cloth=self.cloth, **cloths)

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from ...errors import SolveError
+from ..colliders.pose import extent
 from ..forces.base import ForceModule
 from ..integrate.descend import LevelReport
 from ..level import Placed, unhindered
@@ -29,7 +30,7 @@ def refuse_swallowed(problem: Problem) -> None:
     """
     swallowed = [] if problem.contact is None else problem.contact.swallowed
     for garment, each, (deep, body) in zip(problem.group.garments, problem.frame.garments, swallowed, strict=False):
-        size = float(np.linalg.norm(np.ptp(each.points, axis=0))) if len(each.points) else 0.0
+        size = float(np.linalg.norm(extent(each.points))) if deep else 0.0
         if deep > size:
             what = f"it is {1e3 * deep:.4g} mm deep in <{body}>, and only {1e3 * size:.4g} mm large"
             raise SolveError(f"{named([garment], problem.frame.at)}: {what}; mend the one or the other there")
@@ -86,7 +87,7 @@ def telemetry_of(problem: Problem, x: Tensor, module: ForceModule, *, reports: S
         "energy_joules": {"input": module.energies(base), "output": module.energies(x)},
         "sharp_folds": sharp_folds(finest, x),
         "strain": edge_strain(finest, x),
-        "remaining_mm": round(1e3 * float(finest.spacing.mean()) * reports[-1].remaining_move, 4) if reports else 0.0,
+        "remaining_mm": round(1e3 * problem.group.spacings[-1] * reports[-1].remaining_move, 4) if reports else 0.0,
         "start": problem.start.why,
     }
 

@@ -214,10 +214,11 @@ def begin(group: Group, frame: FrameInput, last: FrameState | None) -> Problem:
     began = time.perf_counter()
     forces, cage, settings = group.forces_for(frame.garments), group.cage(frame.garments), group.settings
     known = None if settings.temporal == "off" else last
-    before = None if last is None else last.about(cage.origin)[1]
+    places = None if last is None else last.about(cage.origin)
+    before = None if places is None else places[1]
     moved = frame.moved if settings.temporal == "tether" else np.inf  # Only the tether slows the cloth down.
-    reset = {"frames": group.moving_frames, "finest": forces[-1].level, "reset": settings.reset}
-    start = start_of(known, cage, **reset, moved=moved)
+    reset = {"frames": group.moving_frames, "reset": settings.reset, "moved": moved}
+    start = Start("cold") if known is None or places is None else start_of(places, known.held, cage, **reset)
     contact = group.contact(frame, cage, given_up=frame.given_up if known is None else known.given_up)
     if contact is not None and last is not None and last.clean and before is not None:
         contact.at(group.levels[-1]).remember(before)

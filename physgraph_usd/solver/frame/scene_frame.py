@@ -10,8 +10,9 @@ import numpy as np
 import torch
 
 from ...errors import At, GarmentError, SolveError, named_time
+from ..colliders.pose import bounds_of
 from ..contact.bodies import Touching
-from ..contact.broad_phase import Bodies, TouchingGroups, bounds_of, reach_of
+from ..contact.broad_phase import Bodies, TouchingGroups, reach_of
 from ..contact.report import body_crossings, penetration_map
 from ..deadline import is_over
 from ..level import refine_garments
@@ -217,7 +218,7 @@ class SceneFrame:
         """Solve garments together; bodies reached only by the solved cloth are added, and the solve is repeated."""
         frames, memories = [self.frame.garments[index] for index in part], [self.memories[index] for index in part]
         group = self.cloth.group(part, self.settings)
-        origin = origin_of(part, self.frame, memories, near=near, edge=self._edge(part), gap=self.gap)
+        origin = origin_of(part, self.frame, memories, near=near, edge=group.spacings[0], gap=self.gap)
         cage = None if origin.state is not None else self._cage_walked(part)
         elapsed = origin.elapsed(self.frame.time, self.cloth.scene.seconds)
         at = None if self.frame.time is None else float(self.frame.time)
@@ -252,12 +253,8 @@ class SceneFrame:
 
     def _jumped(self, part: tuple[int, ...], near: tuple[int, ...]) -> bool:
         """Whether the last frame, a candidate for reuse, started from a first frame at a different place."""
-        memories = [self.memories[index] for index in part]
-        return jumped_from(part, self.frame, memories, near=near, edge=self._edge(part)) is not None
-
-    def _edge(self, part: tuple[int, ...]) -> float:
-        """Mean edge of the cages of garments [m]."""
-        return float(self.cloth.group(part, self.settings).levels[0].spacing.mean())
+        memories, edge = [self.memories[index] for index in part], self.cloth.group(part, self.settings).spacings[0]
+        return jumped_from(part, self.frame, memories, near=near, edge=edge) is not None
 
     def _surroundings(self, part: tuple[int, ...], near: Sequence[int]) -> dict[str, object]:
         """Telemetry: paths of the bodies near garments, and of garments solved together."""

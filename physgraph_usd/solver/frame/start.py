@@ -5,14 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..level import Level
 from .from_cage import MovingFrames
 from .settings import Reset
-from .values import Cage, FrameState
+from .values import Cage
 
 STILL = 0.02
 """Largest motion of cage and bodies between samples, in mean cage edges, for a held pose: slow settling is visible in a
@@ -44,32 +42,27 @@ class Start:
 
 
 def start_of(
-    state: FrameState | None,
+    places: tuple[Float[Tensor, "coarse 3"], Float[Tensor, "vertices 3"]],
+    held: int,
     cage: Cage,
     *,
     frames: MovingFrames,
-    finest: Level,
     reset: Reset,
     moved: float = np.inf,
 ) -> Start:
     """Carry the last frame's detail along, unless the cage jumped.
 
     Args:
-        state: State left by the last frame, or None for a cold start.
-        finest: The finest level.
+        places: Cage and fine positions in the last frame, about the cage's origin [m].
+        held: As in `Start`, of the last frame.
         reset: Thresholds for a cold start.
         moved: Largest motion of nearby bodies since [m]; infinite if more than poses changed.
     """
-    if state is None:
-        return Start("cold")
-    before, fine = (x.to(cage.points) for x in state.about(cage.origin))
-    detailed, motion, turn = frames.predict(before, fine, cage.points)
+    before, fine = (x.to(cage.points) for x in places)
+    detailed, motion, turn, farthest = frames.predict(before, fine, cage.points)
     if motion > reset.move or turn > reset.turn:
         return Start(f"cold: the cage moved {motion:.3g} edges and turned {np.degrees(turn):.3g} degrees")
-    detailed = torch.where(finest.free, detailed, finest.base.apply(cage.points))
-    moves = (cage.points - before).norm(dim=1)
-    farthest = max(float(moves.max()) if len(moves) else 0.0, moved) / frames.edge
-    held, slowed = slowing(state.held, farthest)
+    held, slowed = slowing(held, max(farthest, moved) / frames.edge)
     why = f"at rest: the pose has been held for {held} frames" if slowed >= SLOWEST else "warm"
     return Start(why, detailed, held, slowed)
 

@@ -120,6 +120,8 @@ _COARSE, _FINE = ("coarse", "given_up"), ("fine", "inside")
 
 def join(parts: Sequence[FrameState]) -> FrameState:
     """Join the states of several garments."""
+    if len(parts) == 1:
+        return parts[0]
     return FrameState(
         **{name: torch.cat([getattr(part, name) for part in parts]) for name in (*_COARSE, *_FINE)},
         held=min(part.held for part in parts),

@@ -27,7 +27,7 @@ from ..schema import COLLIDER, GARMENT
 from ..stage import Notice, timecode, value_at
 from .absence import missing_value
 from .find import is_drawn
-from .placement import is_flipped, place
+from .placement import is_affine, is_flipped, place
 
 DRAWN_NEAR = 0.1
 """Largest error of a body's surface relative to the contact offset: a smaller error is invisible behind the offset."""
@@ -50,11 +50,12 @@ UPRIGHT = {
 
 @dataclass(frozen=True, eq=False)
 class _Faces:
-    """Authored topology arrays of a mesh, the drawn faces, and their triangles, as authored and reversed."""
+    """Authored topology arrays of a mesh, the drawn faces, their triangles as authored and reversed, and notices."""
 
     authored: tuple[np.ndarray, ...]
     drawn: DrawnSurface
     wound: tuple[np.ndarray, np.ndarray]
+    notices: tuple[Notice, ...]
 
     @cached_property
     def authored_triangles(self) -> np.ndarray:
@@ -138,7 +139,7 @@ class ColliderReader:
         """A gprim placed by a matrix from its own space to world metres, shape (4, 4)."""
         if not matrix[:3, :3].any():
             return None, (self._out(time, "its transform to the world scales it to nothing"),)
-        if not np.isfinite(matrix).all() or not np.allclose(matrix[3], [0.0, 0.0, 0.0, 1.0]):
+        if not np.isfinite(matrix).all() or not is_affine(matrix):
             return None, (self._out(time, "its transform to the world is not an affine one"),)
         if self.collider.kind == "mesh":
             return self._mesh(matrix, time, skinned)
@@ -209,7 +210,7 @@ class ColliderReader:
         placed = place(np.where(np.isfinite(points), points, np.nan).astype(np.float64), matrix)
         if skinned is not None and skinned.shape == placed.shape:
             placed = skinned
-        return Pose(faces.drawn.place(placed), triangles), self._coarse(faces.drawn)
+        return Pose(faces.drawn.place(placed), triangles), faces.notices
 
     def polygons(self, time: float | None) -> Polygons | None:
         """The authored polygons at a time code; None for a body that is drawn as authored, or without a pose."""
@@ -233,7 +234,8 @@ class ColliderReader:
             polygons, within = PolygonMesh(counts, indices, len(points)), self.within / self._scale()
             drawn = surface_of(mesh, polygons, first, holes=holes, within=within)
             triangles = drawn.mesh.triangulate().triangles
-            self._faces = _Faces(authored, drawn, (triangles, np.ascontiguousarray(triangles[:, ::-1])))
+            wound = triangles, np.ascontiguousarray(triangles[:, ::-1])
+            self._faces = _Faces(authored, drawn, wound, self._coarse(drawn))
         return self._faces
 
     def _scale(self) -> float:

@@ -200,9 +200,10 @@ class PointReader:
             message = f"the number of points changes from {self.count} to {len(points)}"
             remedy = "export the garment with one topology, or use --frames for the part where it is the same"
             raise GarmentError(self.path, message, time=time, remedy=remedy)
-        broken = ~np.isfinite(points).all(axis=1)
-        if not broken.any():
+        finite = np.isfinite(points)
+        if finite.all():
             return points, ()
+        broken = ~finite.all(axis=1)
         if broken.mean() > MOST_BROKEN and broken.sum() > 1:
             message = (
                 f"{broken.sum()} of {self.count} points are NaN or infinite, the first is points[{broken.argmax()}]"

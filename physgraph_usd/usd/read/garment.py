@@ -13,6 +13,7 @@ import numpy as np
 from pxr import Sdf, Usd, UsdGeom
 
 from ...errors import GarmentError, SchemaError, counted
+from ...solver.colliders.pose import extent
 from ...solver.mesh.borders import open_edges
 from ...solver.mesh.topology import PolygonMesh
 from ...solver.mesh.weld import Weld, seam_reach, weld, weld_skins
@@ -110,7 +111,7 @@ class GarmentReader:
             points = self.weld.joined(place(local, to_metres(prim, metres, time)))
         guide, detail = (self.values.number(name, time) for name in ("guide:stiffness", "refine:detail"))
         offset, thickness = (self.kept(name, time) for name in ("contact:offset", "thickness"))
-        fabric, most = self.values.fabric(time), float(np.linalg.norm(np.ptp(self.garment.rest, axis=0))) / _THICK
+        fabric, most = self.values.fabric(time), self._size / _THICK
         if max(thickness, offset) > most:
             message = f"contact keeps {1e3 * most:.3g} mm, a {_THICK:g}th of the cloth's size, for a thickness of"
             message += f" {1e3 * thickness:.3g} mm and an offset of {1e3 * offset:.3g} mm; check metersPerUnit"
@@ -123,8 +124,12 @@ class GarmentReader:
     @cached_property
     def fitting(self) -> float:
         """Largest contact distance that suits the cage's size and edges [m]."""
-        size = float(np.linalg.norm(np.ptp(self.garment.rest, axis=0)))
-        return max(mean_edge(self.garment) / _PER_EDGE, size / _PER_SIZE)
+        return max(mean_edge(self.garment) / _PER_EDGE, self._size / _PER_SIZE)
+
+    @cached_property
+    def _size(self) -> float:
+        """Diagonal of the rest shape's bounding box [m]."""
+        return float(np.linalg.norm(extent(self.garment.rest)))
 
     def kept(self, name: str, time: float | None) -> float:
         """Contact offset or thickness at a time code [m], by short name; unless authored, at most `fitting`."""

@@ -41,11 +41,16 @@ def check_matrix(prim: Usd.Prim, rows: Gf.Matrix4d, metres: float, *, time: floa
     if not 1.0 / _EXTREME < stretch < _EXTREME:
         message = f"its transform to the world scales by {stretch:.3g}"
         raise GarmentError(path, message, time=time, remedy=f"give a scale of {1 / _EXTREME:g} to {_EXTREME:g}")
-    if not np.allclose(matrix[3], [0.0, 0.0, 0.0, 1.0]):
+    if not is_affine(matrix):
         message = "its transform to the world is projective"
         raise GarmentError(path, message, time=time, remedy="author affine transforms")
     matrix[:3] *= metres
     return matrix
+
+
+def is_affine(matrix: np.ndarray) -> bool:
+    """Whether the last row of a matrix for column vectors, shape (4, 4), is (0, 0, 0, 1) but for rounding."""
+    return matrix[3].tolist() == [0.0, 0.0, 0.0, 1.0] or np.allclose(matrix[3], [0.0, 0.0, 0.0, 1.0])
 
 
 def flattened(matrix: np.ndarray) -> str:
