@@ -49,13 +49,13 @@ class JointSystem(System):
         self.through = through_forces
         self.energies: list[Tensor] = []
 
-    def energy_and_force(self, x: Float[Tensor, "vertices 3"]) -> tuple[float, Float[Tensor, "vertices 3"]]:
-        """Energy [J] and force [N], with gradients."""
+    def evaluated(self, x: Float[Tensor, "vertices 3"]) -> tuple[Float[Tensor, ""], Float[Tensor, "vertices 3"]]:
+        """Energy [J] without gradients, and force [N] with gradients."""
         self.evaluations += 1
         energies, force = cast(tuple[Tensor, Tensor], _EnergyForce.apply(x, self))
         self.energies.append(energies)
         force = force if self.through else force.detach()
-        return float(energies.detach().sum()), force * self.free
+        return energies.detach().sum(), force * self.free
 
     def apply_metric_inverse(
         self, force: Float[Tensor, "vertices 3"], solver: Solver | None = None

@@ -66,7 +66,7 @@ class LearnedMetric:
         """The carry at x [m] with a given memory."""
         energy, force = system.evaluated(x)
         image = system.apply_short_inverse(force)
-        energy, remaining = torch.stack([energy, system.relative_move(image)]).tolist()
+        energy, remaining = torch.stack([energy, system.relative_move(image.detach())]).tolist()
         return Carry(x, energy, force, image, self.name, memory, remaining=remaining)
 
     def step(self, system: System, carry: Carry) -> Carry:
@@ -83,7 +83,7 @@ class LearnedMetric:
         energy, force = system.evaluated(x)
         image = system.apply_short_inverse(force)
         newest, remaining = self._secant(system, (carry.force, force, carry.preconditioned, image, move))
-        energy, remaining = torch.stack([energy, remaining]).tolist()  # On a card one wait for both.
+        energy, remaining = torch.stack([energy, remaining.detach()]).tolist()  # On a card one wait for both.
         return Carry(x, energy, force, image, self.name, carry.memory.after(carry, newest), remaining=remaining)
 
     def _secant(self, system: System, ends: tuple[Any, ...]) -> tuple[Secant, Tensor]:
