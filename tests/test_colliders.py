@@ -48,6 +48,16 @@ class TestMeshes:
         clear = np.abs(radius - 0.2) > 2e-3
         np.testing.assert_array_equal(signed(surface, x)[clear] < 0, radius[clear] < 0.2)
 
+    @pytest.mark.parametrize("parts", [1, 2])
+    def test_all_faces_summed_give_the_inside_of_the_hierarchy(self, parts: int):
+        """Two balls in one another: a card sums over faces, the CPU asks the hierarchy."""
+        soup = together(ball(level=3), ball(0.15, level=3, at=(0.25, 0.0, 0.0)))
+        (surface,) = surfaces(soup)
+        x = torch.as_tensor(around(soup) - surface.origin)
+        inside = surface.inside(x, parts=parts)
+        assert inside.any()
+        assert torch.equal(surface._turns(x) > parts - 0.5, inside)
+
     @pytest.mark.parametrize("rigid", [True, False])
     def test_turned_alone_it_passes_through_itself_as_before(self, monkeypatch: pytest.MonkeyPatch, rigid: bool):
         """What was found out about two balls in one another serves again where both turn, not where one moves."""
