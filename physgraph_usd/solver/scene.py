@@ -233,9 +233,8 @@ def out_of_bounds(points: np.ndarray) -> str:
     return f"point {index} is at ({at}) m; it must be finite and at most {FARTHEST:g} m from the origin"
 
 
-@functools.lru_cache(maxsize=1)
 def refuse_far(scene: Scene, frame: Frame) -> None:
-    """Refuse a frame with garments or bodies out of bounds, once; faces of bodies with NaN are left out later.
+    """Refuse a frame with garments or bodies out of bounds; faces of bodies with NaN are left out later.
 
     Raises:
         GarmentError: With the prim, the time code and the point.

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Collection, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom, UsdShade
@@ -63,7 +63,6 @@ class Found:
     scale: float = 1.0
     compute: Callable[[float | None], float] | None = None
     varies: bool = False
-    _known: dict[float | None, float] = field(default_factory=dict, init=False)
 
     @property
     def animated(self) -> bool:
@@ -71,16 +70,12 @@ class Found:
         return self.varies or (self.attribute is not None and self.attribute.ValueMightBeTimeVarying())
 
     def at(self, time: float | None) -> float | None:
-        """Value in SI at a time code, None without a value; SchemaError for a wrong type or a value beyond limits.
-
-        A value that is the same at all time codes is read once.
-        """
-        when = time if time is None or self.animated else 0.0
-        if when not in self._known and self.compute is not None:
-            self._known[when] = check_limits(self.row, self.compute(time), self.source)
-        if when not in self._known and self.attribute is not None:
-            self._known[when] = check_limits(self.row, read_number(self.attribute, time) * self.scale, self.source)
-        return self._known.get(when, self.constant)
+        """Value in SI at a time code, None without a value; SchemaError for a wrong type or a value beyond limits."""
+        if self.compute is not None:
+            return check_limits(self.row, self.compute(time), self.source)
+        if self.attribute is None:
+            return self.constant
+        return check_limits(self.row, read_number(self.attribute, time) * self.scale, self.source)
 
 
 def check_known(what: str, word: object, known: Collection[object]) -> None:
@@ -250,7 +245,8 @@ def read_number(attribute: Usd.Attribute, time: float | None) -> float:
 
 def check_limits(row: Property, value: float, source: str) -> float:
     """Return a finite value within the row's limits; SchemaError gives value, source and limits."""
-    finite = abs(value) < 2.0**128 - 2.0**103  # What float32 rounds to a finite number.
+    with np.errstate(over="ignore"):
+        finite = np.isfinite(np.float32(value))
     if not (finite and is_within(value, row.minimum, row.maximum)):
         low = -math.inf if row.minimum is None else row.minimum
         high = math.inf if row.maximum is None else row.maximum
