@@ -411,7 +411,7 @@ class MeshBody:
 def _hierarchy(points: wp.array, triangles: np.ndarray, closed: bool) -> wp.Mesh:
     """Warp mesh, on the CPU with winding numbers if the surface has an inside."""
     indices = wp.array(triangles.ravel(), dtype=wp.int32, device=points.device)
-    return wp.Mesh(points=points, indices=indices, support_winding_number=closed and points.device.is_cpu)
+    return wp.Mesh(points=points, indices=indices, support_winding_number=closed and str(points.device) == "cpu")
 
 
 def _vectors(tensor: Tensor) -> Any:
