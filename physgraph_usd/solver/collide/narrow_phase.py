@@ -133,26 +133,6 @@ def blocks_left(parts: Topology, kind: wp.int32, i: wp.int32, block: wp.int32):
     return wp.min(ALL, parts.first[kind * (parts.clusters + 1) + i + 1] - block)
 
 
-@wp.func
-def corners_of(parts: Topology, query: Query, first: wp.int32, k: wp.int32, m: wp.int32):
-    """Corners of two parts; for a search of crossings the numbers of an edge and a face."""
-    p, q = parts.parts[k], parts.parts[m]
-    c = wp.vec4i(p[0], q[0], q[1], q[2])
-    if first == Part.EDGE:
-        c = wp.vec4i(p[0], p[1], q[0], q[1])
-    if query.kind == Ask.CROSSING:
-        c = wp.vec4i(parts.number[k], parts.number[m], 0, 0)
-    return c
-
-
-@wp.func
-def judged(parts: Topology, query: Query, c: wp.vec4i, first: wp.int32, k: wp.int32, m: wp.int32):
-    """Value of two parts, as `value_of`; for a search of crossings 0 if they cross."""
-    if query.kind != Ask.CROSSING:
-        return value_of(first == Part.VERTEX, c, parts, query)
-    return wp.where(is_pierced(query, parts.parts[k], parts.parts[m]), wp.float64(0.0), wp.float64(1.0))
-
-
 @wp.func_native(
     """
 #if defined(__CUDA_ARCH__)
@@ -169,9 +149,18 @@ def next_place(count: wp.array(dtype=wp.int32)) -> wp.int32:
 
 @wp.func
 def write(parts: Topology, query: Query, found: Found, key: wp.int64, first: wp.int32, k: wp.int32, m: wp.int32):
-    """Write two parts if they are a result."""
-    c = corners_of(parts, query, first, k, m)
-    value = judged(parts, query, c, first, k, m)
+    """Write two parts if they are a result: their corners, or the numbers of an edge and the face that it crosses."""
+    p, q = parts.parts[k], parts.parts[m]
+    c = wp.vec4i(p[0], q[0], q[1], q[2])
+    if first == Part.EDGE:
+        c = wp.vec4i(p[0], p[1], q[0], q[1])
+    value = wp.float64(0.0)
+    if query.kind != Ask.CROSSING:
+        value = value_of(first == Part.VERTEX, c, parts, query)
+    elif is_pierced(query, p, q):
+        c = wp.vec4i(parts.number[k], parts.number[m], 0, 0)
+    else:
+        value = wp.float64(1.0)
     if value >= wp.float64(1.0):
         return
     place = next_place(found.count)
