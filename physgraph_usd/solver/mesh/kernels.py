@@ -54,7 +54,7 @@ def _compiled() -> list[Path]:
 def compile_kernels(device: str) -> None:
     """Compile all kernels of imported modules; Warp caches the kernels for later processes."""
     start_warp()
-    wp.force_load(device)
+    wp.force_load(device, max_workers=os.cpu_count())
 
 
 def device_of(asked: str) -> str:
