@@ -30,11 +30,10 @@ Positions = Sequence[np.ndarray | None]
 """Points of each garment, shape (V, 3), None for a garment without a sample."""
 Mover = Callable[[float | None, Positions, Positions, Positions], tuple[Positions, str]]
 """Moves cloth safely at a time code from the nearer solution towards wanted positions; the farther solution is the
-third argument. Also returns a description of new intersections, "" for none. The frames of a seam are moved in order by
-one mover, without any history of frames before."""
-
+third argument. Also returns a description of new intersections, "" for none. One mover moves the frames of a seam in
+order, without a history of earlier frames."""
 Movers = Callable[[], Mover]
-"""Gives a mover for a seam."""
+"""Returns a new mover, for the frames of one seam."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -69,9 +69,14 @@ def axes(sides: np.ndarray, warp: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def edge_cosines(
     rest: np.ndarray, triangles: np.ndarray, sides: np.ndarray, *, count: int, warp: np.ndarray
 ) -> np.ndarray:
-    """Squared cosines of each edge with warp and weft, mean over its triangles, shape (E, 2); see `axes`.
+    """Squared cosines of each edge with warp and weft, mean over the edge's triangles, shape (E, 2); see `axes`.
 
-    The edges along the sides of the triangles have the shape of the triangles, (T, 3); the number of all is given.
+    Args:
+        rest: Rest positions [m], shape (V, 3).
+        triangles: Corner vertices, shape (T, 3).
+        sides: Edge along each side of the triangles, shape (T, 3).
+        count: Number of edges E.
+        warp: As for `axes`.
     """
     corners, which = at_corners(rest, triangles), sides.T.ravel()
     spans = np.roll(corners, -1, axis=0) - corners

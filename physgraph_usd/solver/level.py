@@ -290,7 +290,7 @@ class _GarmentLevel:
 def _garment_level(
     garment: Garment, mesh: PolygonMesh, face: np.ndarray, creases: np.ndarray, maps: dict[str, sp.csr_matrix]
 ) -> _GarmentLevel:
-    """One garment at a level, by what `_carried` yields."""
+    """Arrays of a garment at one level, given mesh, cage faces, creases and maps from `_carried`."""
     linear, smoothing = maps["linear"], maps["smooth"]
     rest, smooth_rest = (np.asarray(each @ np.asarray(garment.rest, dtype=np.float64)) for each in (linear, smoothing))
     split = _sound(mesh.triangulate(rest if mesh is garment.mesh else None), rest, rigid=_is_rigid(garment, linear))
@@ -460,7 +460,7 @@ def _join(
 
 
 def _joined(parts: Sequence[_GarmentLevel]) -> dict[str, np.ndarray]:
-    """The arrays of the garments by name, one after another, their garments, and the spring along edges and hinges."""
+    """Arrays of all garments by name, garment number of each element, and spring along each edge and hinge."""
     tables = [vars(part) | vars(part.elements) | part.vertex_values for part in parts]
     names = "rest smooth_rest metric share twists bent pressed fabric stretch_scale bend_scale pin".split()
     joined = {name: np.concatenate([each[name] for each in tables]) for name in names}
@@ -545,7 +545,8 @@ def rest_shape(joined: dict[str, np.ndarray], *, length: np.ndarray, area: np.nd
     k12 l, so that hinge has 2 D A / l^2.
 
     Args:
-        joined: Arrays of all garments, as `_joined` gives them.
+        joined: Arrays by name, from `_joined`: smooth_rest [m] (V, 3), springs (S, 2), membrane (M, 3), sides (M, 3),
+            share (M,), hinges (H, 6), twists, bent and pressed angles [rad] (H,).
         length: Length of each spring in the cloth [m], shape (S,).
         area: Area that each triangle stands for in the cloth [m^2], shape (M,).
 

@@ -149,7 +149,7 @@ def next_place(count: wp.array(dtype=wp.int32)) -> wp.int32:
 
 @wp.func
 def write(parts: Topology, query: Query, found: Found, key: wp.int64, first: wp.int32, k: wp.int32, m: wp.int32):
-    """Write two parts if they are a result: their corners, or the numbers of an edge and the face that it crosses."""
+    """Append a pair of parts to the results if its value is below 1; for crossings edge and face numbers as corners."""
     p, q = parts.parts[k], parts.parts[m]
     c = wp.vec4i(p[0], q[0], q[1], q[2])
     if first == Part.EDGE:

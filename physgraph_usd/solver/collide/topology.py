@@ -59,7 +59,7 @@ class Topology:
 def topology_of(
     level: Level, meets: np.ndarray, label: np.ndarray, *, size: int, solids: Sequence[Solid] = ()
 ) -> tuple[Any, tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """The parts of a level and of bodies in clusters; and their edges, faces, and the edge along each side of these.
+    """Clusters of the parts of a level and of bodies.
 
     A face belongs to the cluster of its first corner, an edge to that of its first face.
 
@@ -67,6 +67,9 @@ def topology_of(
         meets: True for pairs in contact of garments, then bodies, symmetric, shape (G + B, G + B), bool.
         label: Cloth vertices with equal labels are sewn together, or equal, shape (V,).
         size: Most vertices of a cluster.
+
+    Returns:
+        A `Topology`; and edges, shape (E, 2), faces, shape (F, 3), and the edge along each side, shape (3 F,).
     """
     rest, edges, faces, garment, label = _with_solids(level, label, solids)
     cloths = len(level.spans)

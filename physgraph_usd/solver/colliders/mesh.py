@@ -31,6 +31,8 @@ LIFT = 1e-4
 """Height above a vertex at which the surface is tested for being buried, relative to the surface's size."""
 SHARES = wp.constant(256)
 """Threads that share the faces around a point."""
+MOST_SUMMED = 2**28
+"""Most pairs of a point and a face that a card sums; for more, each point walks the hierarchy, as on the CPU."""
 ON_EDGE = 1e-4
 """Barycentric coordinate below which a point is on an edge."""
 
@@ -217,11 +219,11 @@ class MeshSurface:
     def inside(self, x: Float[Tensor, "points 3"], *, parts: int = 1) -> Bool[Tensor, " points"]:
         """Mask of the points inside at least `parts` parts; all False for open surfaces.
 
-        The number of parts is the generalised winding number (Barill et al. 2018), rounded. On a card all faces are
-        summed: a thread that walks the hierarchy takes 2 ms.
+        The number of parts is the generalised winding number (Barill et al. 2018), rounded. A card sums all faces for
+        up to `MOST_SUMMED` pairs: one walk through the hierarchy takes a thread 2 ms.
         """
         side = torch.ones(len(x), dtype=torch.float32, device=x.device)
-        if self.closed and x.is_cuda:
+        if self.closed and x.is_cuda and len(x) * len(self.triangles) <= MOST_SUMMED:
             return self._turns(x) > parts - 0.5
         if self.closed and len(x):
             far = float(np.linalg.norm(np.ptp(self.bounds, axis=0))) + float(x.abs().max()) + 1.0
@@ -409,9 +411,9 @@ class MeshBody:
 
 
 def _hierarchy(points: wp.array, triangles: np.ndarray, closed: bool) -> wp.Mesh:
-    """Warp mesh, on the CPU with winding numbers if the surface has an inside."""
+    """Warp mesh, with winding numbers only if the surface has an inside."""
     indices = wp.array(triangles.ravel(), dtype=wp.int32, device=points.device)
-    return wp.Mesh(points=points, indices=indices, support_winding_number=closed and str(points.device) == "cpu")
+    return wp.Mesh(points=points, indices=indices, support_winding_number=closed)
 
 
 def _vectors(tensor: Tensor) -> Any:

@@ -11,7 +11,7 @@ from ..rigid import AT_REST, Rigid, best_motion
 RIGID = 1e-6
 """Largest deviation of points from a rigid motion, relative to their extent: float32's rounding."""
 FEW = 64
-"""Points of which the distances are compared before all points."""
+"""Number of points whose distances are compared first."""
 
 
 @dataclass(frozen=True)

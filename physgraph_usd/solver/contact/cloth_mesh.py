@@ -31,7 +31,7 @@ class ClothMesh:
         pieces: Connected piece of each vertex, shape (V,).
         beside: Adjacency of the vertices, also across seams, shape (V, V).
         free: Mask of the vertices that may move, False for the bodies' corners, shape (V + B, 1).
-        opposite: Vertices opposite each of all edges in its first two faces, -1 without a face, shape (E, 2).
+        opposite: Vertices opposite each edge in the edge's first and last face, -1 without a face, shape (E, 2).
     """
 
     def __init__(

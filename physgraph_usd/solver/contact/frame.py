@@ -199,7 +199,7 @@ class FrameContact:
 
 
 def _moves(start: Tensor, end: Tensor) -> dict[str, object]:
-    """Report of vertices that moved from one place to another [m]: their number, and the largest move."""
+    """Number of displaced vertices and largest displacement, given start and end positions [m], shape (V, 3)."""
     if end is start:
         return {"vertices": 0, "largest_mm": 0.0}
     shifts = (end - start).norm(dim=1)

@@ -261,7 +261,7 @@ def sorted_rows(*columns: np.ndarray, count: int) -> np.ndarray:
 
 
 def paired(here: np.ndarray, there: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Different pairs of vertices, the lower first, in order, shape (E, 2), and which each pair is, shape (K,)."""
+    """Unique edges, lower vertex first, in lexicographic order, shape (E, 2); and the edge of each pair, shape (K,)."""
     ends = np.stack([np.minimum(here, there), np.maximum(here, there)])
     order = sorted_rows(*ends, count=count)
     ends, pair = ends[:, order], np.empty(len(order), np.int32)
