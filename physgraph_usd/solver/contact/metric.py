@@ -1,17 +1,9 @@
-"""The preconditioner of cloth that something touches: the cage exactly, each finer level by its diagonal (BPX).
-
-    P = c Z_0 A_0^-1 Z_0^T + sum_l Z_l diag(A_l)^-1 Z_l^T + r diag(A)^-1,   A_l = Z_l^T A Z_l,   A = H + K
-
-| symbol | meaning |
-|---|---|
-| H | metric of the level that is solved, D its diagonal |
-| Z_l | linear map from level l; l = 0 is the cage, the sum has the levels between |
-| K | stiffness of what touches, a diagonal: three times its mean over directions, since a plane holds in one of them |
-| c, r | `coarse.COARSE`, `ROUGH`: about so much that a first step needs no shortening |
+"""The metric of cloth that something touches, level by level, as P in `integrate.metric`.
 
 What touches is far stiffer than cloth, so the metric of free cloth misjudges both a patch that is held and the rough
-errors beside planes that turn from vertex to vertex. Here each level sees the contact at its own size (after Bramble,
-Pasciak and Xu 1990), and only the cage is factorised anew.
+errors beside planes that turn from vertex to vertex. By levels, the contact is seen at each size, and only the cage is
+factorised anew. Of the stiffness of what touches, K is three times the mean over directions, since a plane holds in
+one of them.
 
 The network makes its steps whole, without a line search, and gets half of P.
 """
@@ -24,10 +16,7 @@ from torch import Tensor
 
 from ..integrate.base import Preconditioner, Solver
 from ..integrate.metric import Metric
-from ..mesh.stencil import three_columns
 
-ROUGH = 2.0
-"""Weight of the finest level's part of P."""
 SHORT = 0.5
 """Fraction of P used by steps without a line search."""
 HELD_TOLERANCE = 0.1
@@ -48,12 +37,7 @@ class HeldMetric:
             stiff: K [N/m].
         """
         self.stiff, self._plain = stiff, plain
-        own = plain.diagonal.to(stiff)
-        self._held = plain.between((own / (own + stiff)).sqrt().unsqueeze(1))
-        tiny = torch.finfo(stiff.dtype).tiny  # Where there is no cloth, there is no force.
-        self._rough = ROUGH / plain.gathered(three_columns(own + stiff)).clamp_min(tiny)
-        between, self._cage = plain.coarse.held(plain.gathered(three_columns(stiff))[:, 0])
-        self._middle = [three_columns(1.0 / each.clamp_min(tiny)) for each in between]
+        self._solver = plain.by_levels(stiff)
 
     @staticmethod
     def of(plain: Metric, stiff: Float[Tensor, " vertices"], last: Preconditioner | None) -> Metric | HeldMetric:
@@ -73,16 +57,17 @@ class HeldMetric:
 
     def solve(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
         """P F [m]; zero at fixed vertices, provided that the force is zero there."""
-        force = self._plain.gathered(force)
-        return self._plain.spread(*self._plain.coarse.recorded_move(force, self._cage, self._rough, *self._middle))
+        return self._solver(force)
 
     def stiffened(self, stiffness: Float[Tensor, " vertices"]) -> Solver:
         """P with max(K, stiffness - D) in place of K: the solve for cloth with at least the given stiffness [N/m]."""
         return HeldMetric(self._plain, torch.maximum(self.stiff, stiffness - self._plain.diagonal.to(stiffness))).solve
 
     def held(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
-        """R H^-1 R F [m], R = (D / (D + K))^1/2: the measure of the remaining move."""
-        return self._held(force)
+        """R H^-1 R F [m], R = (D / (D + K))^1/2, with `Metric.estimate` for H^-1: the measure of the remaining move."""
+        own = self._plain.diagonal.to(self.stiff)
+        factor = (own / (own + self.stiff)).sqrt().unsqueeze(1)
+        return self._plain.estimate(force * factor).mul_(factor)
 
     def short(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
         """Half of P F [m]."""

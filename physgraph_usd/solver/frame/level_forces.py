@@ -50,7 +50,7 @@ class Lent:
     """Metric and elastic terms of the previous materials, for use with new materials.
 
     Attributes:
-        metric: Factorised rest Hessian.
+        metric: Rest Hessian.
         stiffness: Diagonal of the Hessian at rest [N/m], shape (V,).
         in_plane, bending: Elastic terms.
     """
@@ -116,14 +116,14 @@ class LevelForces:
 
     @cached_property
     def metric(self) -> Metric:
-        """The factorised rest Hessian of all terms."""
+        """The rest Hessian of all terms."""
         matrix = on_edges(self._module.rest_matrix(), self.level.springs.cpu().numpy())
         return Metric(matrix, free=self.level.free, dtype=self.level.dtype, ups=self.level.ups)
 
     @cached_property
     def rough_metric(self) -> Metric:
-        """The lent metric, scaled to the new diagonal without a factorisation; `metric` without a lent one."""
-        if self.lent is None or self._factorised:
+        """The lent metric, scaled to the new diagonal; `metric` without a lent one."""
+        if self.lent is None or self._is_exact:
             return self.metric
         return self.lent.metric.scaled(self._stiffness / self.lent.stiffness)
 
@@ -161,13 +161,13 @@ class LevelForces:
         return ForceModule((*self.terms, self.guide))
 
     @property
-    def _factorised(self) -> bool:
+    def _is_exact(self) -> bool:
         """Whether `metric` is known."""
         return "metric" in self.__dict__
 
     def lends(self) -> Lent | None:
-        """Metric and terms for the next materials; the lent metric again, if none was factorised here."""
-        if self._factorised:
+        """Metric and terms for the next materials; the lent metric again, if none was built here."""
+        if self._is_exact:
             return Lent(self.metric, self._stiffness, self._in_plane, self._bending)
         return None if self.lent is None else replace(self.lent, in_plane=self._in_plane, bending=self._bending)
 

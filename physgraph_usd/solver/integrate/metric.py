@@ -1,10 +1,21 @@
-"""The metric: one scalar symmetric positive definite matrix per level, factorised once."""
+"""The metric: one scalar symmetric positive definite matrix per level.
+
+Free cloth is solved exactly, by a factor made on first use. Cloth in contact is solved level by level (BPX, after
+Bramble, Pasciak and Xu 1990): the cage exactly, each finer level by its diagonal:
+
+    P = c Z_0 A_0^-1 Z_0^T + sum_l Z_l diag(A_l)^-1 Z_l^T + r diag(A)^-1,   A_l = Z_l^T A Z_l,   A = H0 + K
+
+| symbol | meaning |
+|---|---|
+| Z_l | linear map from level l; l = 0 is the cage, the sum has the levels between |
+| K | stiffness of what touches, a diagonal |
+| c, r | `coarse.COARSE`, `ROUGH`: about so much that a first step needs no shortening |
+"""
 
 from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -15,8 +26,11 @@ from torch import Tensor
 
 from ..mesh.stencil import Stencil, three_columns
 from .base import Solver
-from .coarse import REGULARISATION, CoarseLevels
+from .coarse import COARSE, REGULARISATION, CoarseLevels
 from .factors import Factors
+
+ROUGH = 2.0
+"""Weight of the finest level's part of P."""
 
 
 def on_edges(matrix: sp.csr_matrix, edges: np.ndarray) -> sp.csr_matrix:
@@ -41,7 +55,7 @@ def on_edges(matrix: sp.csr_matrix, edges: np.ndarray) -> sp.csr_matrix:
 
 
 class Metric:
-    """H0, factorised: the same matrix for x, y and z.
+    """H0: the same matrix for x, y and z.
 
     Attributes:
         diagonal: Diagonal of H0 [N/m], float64; 1 at fixed vertices, shape (V,).
@@ -55,7 +69,7 @@ class Metric:
         dtype: torch.dtype,
         ups: Sequence[Stencil] = (),
     ) -> None:
-        """Factorise a scalar Hessian at rest.
+        """Take a scalar Hessian at rest.
 
         Args:
             matrix: Symmetric positive semi-definite [N/m], shape (V, V).
@@ -68,19 +82,25 @@ class Metric:
         self._merged: MergedMetric | None = None
         self._unscaled: tuple[Metric, Tensor] | None = None
         self._keep = sp.diags(self._free.cpu().numpy().astype(np.float64))
-        kept = sp.csr_matrix(self._keep @ matrix @ self._keep)
-        kept.eliminate_zeros()
-        pattern = sp.csr_matrix(abs(kept) + sp.identity(matrix.shape[0]))
-        self._factors = Factors(pattern, dtype=dtype, device=device)
         stiffness = torch.as_tensor(matrix.diagonal(), device=device)
         moved = stiffness[self._free].cpu().numpy()
         # A unit mean diagonal keeps float32 pivots in range whatever the fabric and the level.
-        scale = 1.0 / float(moved.mean()) if (moved > 0).any() else 1.0
-        diagonal = torch.where(self._free, scale * stiffness + REGULARISATION, 1.0)
-        values = torch.as_tensor(scale * self._factors.taken(kept), device=device)
-        values[self._factors.diagonal] = diagonal
-        self._solver, self._scaled = self._factors.of(values), scale * self._mask
-        self.diagonal = torch.where(self._free, diagonal / scale, 1.0)
+        self._scale = 1.0 / float(moved.mean()) if (moved > 0).any() else 1.0
+        self._scaled = self._scale * self._mask
+        self.diagonal = torch.where(self._free, stiffness + REGULARISATION / self._scale, 1.0)
+
+    @cached_property
+    def _solver(self) -> Solver:
+        """The solve by the Cholesky factor of H0."""
+        if self._unscaled is not None:
+            return self._unscaled[0]._solver
+        kept = sp.csr_matrix(self._keep @ self._matrix @ self._keep)
+        kept.eliminate_zeros()
+        pattern = sp.csr_matrix(abs(kept) + sp.identity(kept.shape[0]))
+        factors = Factors(pattern, dtype=self._mask.dtype, device=str(self._mask.device))
+        values = torch.as_tensor(self._scale * factors.taken(kept), device=self._mask.device)
+        values[factors.diagonal] += torch.where(self._free, REGULARISATION, 1.0)
+        return factors.of(values)
 
     @cached_property
     def coarse(self) -> CoarseLevels:
@@ -112,7 +132,8 @@ class Metric:
             stiffer: R^2 at each vertex, positive.
         """
         other, root = copy.copy(self), three_columns(stiffer.to(self._mask).rsqrt())
-        other.__dict__.pop("coarse", None)
+        for own in ("coarse", "_solver", "_of_free"):
+            other.__dict__.pop(own, None)
         other._scaled, other._mask = self._scaled * root, self._mask * root
         other.diagonal = torch.where(self._free, self.diagonal * stiffer.double(), 1.0)
         other._unscaled = self, stiffer
@@ -133,32 +154,29 @@ class Metric:
         """H0^-1 F [m]; zero at fixed vertices."""
         return self._solver(force * self._scaled).mul_(self._mask)
 
-    def between(self, factor: Float[Tensor, "vertices 1"]) -> Solver:
-        """The solve of R H0^-1 R F [m], R a diagonal, in as few passes as for H0^-1 F."""
-        return Between(self._solver, self._scaled * factor, self._mask * factor)
-
     def stiffened(self, stiffness: Float[Tensor, " vertices"]) -> Solver:
         """R H0^-1 R, as in `Preconditioner`."""
         diagonal = self.diagonal.to(stiffness)
-        return self.between((diagonal / torch.maximum(diagonal, stiffness)).sqrt().unsqueeze(1))
+        factor = (diagonal / torch.maximum(diagonal, stiffness)).sqrt().unsqueeze(1)
+        return lambda force: self.solve(force * factor).mul_(factor)
 
+    def by_levels(self, stiff: Float[Tensor, " vertices"]) -> Solver:
+        """The product P F [m], given K [N/m]; zero at fixed vertices, provided that the force is zero there."""
+        tiny = torch.finfo(stiff.dtype).tiny  # Where there is no cloth, there is no force.
+        rough = ROUGH / self.gathered(three_columns(self.diagonal.to(stiff) + stiff)).clamp_min(tiny)
+        between, cage = self.coarse.held(self.gathered(three_columns(stiff))[:, 0])
+        middle = [three_columns(1.0 / each.clamp_min(tiny)) for each in between]
+        move = self.coarse.recorded_move
+        return lambda force: self.spread(*move(self.gathered(force), cage, rough, *middle))
 
-@dataclass(frozen=True, eq=False)
-class Between:
-    """A solve between two diagonals [m]: after * (solver of before * F).
+    @cached_property
+    def _of_free(self) -> Solver:
+        """The product P F [m] of cloth that nothing touches."""
+        return self.by_levels(torch.zeros_like(self._mask[:, 0]))
 
-    Attributes:
-        solver: The solve between.
-        before, after: The diagonals, shape (V, 3).
-    """
-
-    solver: Solver
-    before: Float[Tensor, "vertices 3"]
-    after: Float[Tensor, "vertices 3"]
-
-    def __call__(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
-        """The solution [m]."""
-        return self.solver(force * self.before).mul_(self.after)
+    def estimate(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
+        """An estimate of H0^-1 F [m], without a factor: P F / c, since errors are smooth after a few steps."""
+        return self._of_free(force).mul_(1.0 / COARSE)
 
 
 class MergedMetric(Metric):
@@ -216,7 +234,3 @@ class MergedMetric(Metric):
     def solve(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
         """H0^-1 of each label's total force [m], the same move for all vertices of the label."""
         return self.spread(super().solve(self.gathered(force)))
-
-    def between(self, factor: Float[Tensor, "vertices 1"]) -> Solver:
-        """The solve of R H0^-1 R F [m], with the forces of each label summed."""
-        return lambda force: self.solve(force * factor).mul_(factor)
