@@ -15,7 +15,7 @@ from meshes import grid, mesh_of, planar_mesh
 from sheets import KINDS, Sheet, garment_of, irregular, level_of, quality, rotation
 from torch import Tensor
 
-from physgraph_usd.solver.forces.base import Force, ForceModule
+from physgraph_usd.solver.forces.base import Force
 from physgraph_usd.solver.forces.bending import Bending
 from physgraph_usd.solver.forces.gravity import Gravity
 from physgraph_usd.solver.forces.guide import Guide, GuideMap
@@ -121,43 +121,6 @@ def test_float32_agrees_with_float64_and_repeats_bit_for_bit(case: Case):
         assert torch.equal(g, h)
         assert abs(found - energy) < 1e-5 * max(abs(energy), size)
         assert (g - f).abs().max() < 3e-5 * size
-
-
-class Counted:
-    """A term that counts how often it is asked."""
-
-    name = "counted"
-
-    def __init__(self) -> None:
-        self.asked = 0
-
-    def add_force(self, x: Tensor, force: Tensor) -> Tensor:
-        self.asked += 1
-        force.add_(x)
-        return 0.5 * x.square().sum(dtype=torch.float64)
-
-    def diagonal(self, x: Tensor) -> Tensor:
-        return torch.ones_like(x[:, 0])
-
-    def rest_matrix(self) -> None:
-        return None
-
-
-def test_a_module_that_remembers_evaluates_its_own_terms_once_at_the_same_positions():
-    own, more, x = Counted(), Counted(), torch.arange(6.0, dtype=torch.float64).reshape(2, 3)
-    module = ForceModule([own], remembers=True)
-    first = module.energy_and_force(x)
-    joined = module.joined_by([more])
-    energy, force = joined.energy_and_force(x)
-    assert (own.asked, more.asked) == (1, 1)
-    assert float(energy) == 2.0 * float(first[0])
-    assert torch.equal(force, 2.0 * x)
-    assert torch.equal(first[1], x)  # What was answered before is not written to.
-    assert torch.equal(module.energy_and_force(x)[1], x)
-    x += 1.0
-    assert torch.equal(joined.energy_and_force(x)[1], 2.0 * x)
-    assert torch.equal(module.energy_and_force(x.clone())[1], x)
-    assert own.asked == 3
 
 
 def sheet(kind: str = "irregular") -> Sheet:

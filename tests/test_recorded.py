@@ -9,14 +9,19 @@ from typing import Any
 
 import pytest
 import torch
+from sheets import equilateral, level_of
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.solve import ShotSolver, open_for
+from physgraph_usd.solver.forces.self_contact import LEAST_ROOM, PairConstraints, SelfContact
+from physgraph_usd.solver.integrate.base import Carry, System
 from physgraph_usd.solver.integrate.coarse import CoarseLevels
-from physgraph_usd.solver.mesh.recorded import CALLS, Recorded
+from physgraph_usd.solver.integrate.learned import LearnedMetric
+from physgraph_usd.solver.level import Level
+from physgraph_usd.solver.mesh.recorded import CALLS, Recordings
 
 READS = {"_local_scalar_dense", "nonzero", "masked_select", "_unique2", "is_nonzero"}
 """Operations that wait for a card."""
@@ -35,30 +40,68 @@ class Reading(TorchDispatchMode):
         return func(*args, **(kwargs or {}))
 
 
-def test_what_is_recorded_reads_nothing_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Three frames of a skirt on its body, the cage solved as on a card."""
-    called, kept, made = Counter[str](), Recorded.__call__, CoarseLevels.__init__
+def test_what_a_card_records_reads_nothing_back_and_steps_alike(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Three frames of a skirt on its body, the cage solved, pairs padded and steps made as on a card.
+
+    Each step is made by parts too, as with an exact metric.
+    """
+    called, kept, made = Counter[str](), Recordings.run, CoarseLevels.__init__
 
     def dense(self: CoarseLevels, *given: Any, **more: Any) -> None:
         made(self, *given, **more)
         self.dense = True
 
-    def checked(self: Recorded, *given: Any) -> Sequence[Tensor]:
-        name = self._function.__qualname__
+    def checked(self: Recordings, key: Any, function: Any, *given: Any) -> Sequence[Tensor]:
+        name = function.__qualname__
         if "_search" in name or not all(isinstance(each, Tensor) for each in given):  # On the CPU these read numbers.
-            return kept(self, *given)
+            return kept(self, key, function, *given)
         called[name] += 1
         with Reading():
-            return kept(self, *given)
+            return kept(self, key, function, *given)
 
-    monkeypatch.setattr(Recorded, "__call__", checked)
+    def both(self: LearnedMetric, system: System, carry: Carry, fused: Any, works: Any) -> Carry:
+        whole, move = recorded(self, system, carry, fused, works), self.propose(system, carry)
+        parts = self._reached(system, carry, carry.x + move, move)
+        assert whole.energy == parts.energy
+        assert whole.remaining == parts.remaining
+        for one, other in zip(whole.memory.secants, parts.memory.secants, strict=True):
+            assert torch.equal(one.move, other.move)
+            assert torch.equal(one.curvature, other.curvature)
+        return whole
+
+    recorded = LearnedMetric._recorded
+    monkeypatch.setattr(LearnedMetric, "_recorded", both)
+    monkeypatch.setattr(Recordings, "run", checked)
     monkeypatch.setattr(CoarseLevels, "__init__", dense)
+    monkeypatch.setattr(SelfContact, "aims", SelfContact.with_room)
+    monkeypatch.setattr(System, "on_card", property(lambda self: self.recordings is not None))
     shot = open_for(str(write_sample("skirt", tmp_path)), RefineOptions(level=1))
     solver = ShotSolver(str(tmp_path / "skirt.usdc"), [1], RefineOptions(level=1), opened=shot)
     outcomes = [*solver(list(shot.scene.times)[30:33])]
     shot.close()
     assert all("error" not in each.record for each in outcomes)
-    assert {name.split(".")[0] for name in called} == {"total_of", "MovingFrames", "CoarseLevels"}
+    assert {name.split(".")[0] for name in called} == {"total_of", "MovingFrames", "Metric", "LearnedMetric"}
+    assert called["LearnedMetric._recorded.<locals>.whole"] > 10
+
+
+def test_room_for_more_pairs_changes_no_bit():
+    level, gaps = gapped()
+    own = SelfContact(level, gaps)
+    roomy, x, forces = own.aimed(*own.with_room), level.rest, [torch.zeros_like(level.rest) for _ in range(2)]
+    energies = [float(term.add_force(x, force)) for term, force in zip((own, roomy), forces, strict=True)]
+    assert len(own.with_room[0]) == LEAST_ROOM > len(gaps.corners)
+    assert energies[0] == energies[1] > 0.0
+    assert torch.equal(*forces)
+
+
+def gapped() -> tuple[Level, PairConstraints]:
+    """A sheet, and pairs of each vertex with the first three, that push."""
+    level = level_of(*equilateral(0.2, 0.2, 0.02))
+    count = level.vertex_count
+    corners = torch.stack([torch.arange(count), *(torch.full((count,), n) for n in range(3))], dim=1).int()
+    weight = torch.tensor([[1.0, -0.5, -0.25, -0.25]], dtype=torch.float64).expand(count, 4).contiguous()
+    up, one = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64), torch.ones(count, dtype=torch.float64)
+    return level, PairConstraints(corners, weight, up.expand(count, 3).contiguous(), 0.01 * one, 50.0 * one)
 
 
 def test_what_a_card_cannot_record_is_called_as_it_is(
@@ -75,9 +118,12 @@ def test_what_a_card_cannot_record_is_called_as_it_is(
         is_cuda = True
 
     monkeypatch.setattr("physgraph_usd.solver.mesh.recorded._captured", fail)
-    twice = Recorded(lambda x: [2.0 * x])
+    recordings = Recordings()
     with caplog.at_level("INFO", logger="physgraph_usd"):
-        found = [float(twice(torch.full((1,), float(n)).as_subclass(OnCard))[0]) for n in range(3 * CALLS)]
+        found = [
+            float(recordings.run("twice", lambda x: [2.0 * x], torch.full((1,), float(n)).as_subclass(OnCard))[0])
+            for n in range(3 * CALLS)
+        ]
     assert found == [2.0 * n for n in range(3 * CALLS)]
     assert len(tried) == 1
     assert "is not recorded: out of memory" in caplog.text

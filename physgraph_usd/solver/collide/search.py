@@ -188,14 +188,14 @@ def _search(parts: Parts, arrays: Sequence[Tensor], *, kind: Ask, floor: float =
         return asked
 
     while True:
-        look = parts.recordings.of((kind, floor, half, clusters), lambda *arrays: _looked(parts, query(*arrays)))
-        counts, key, *found = look(*arrays)
+        key = kind, floor, half, clusters
+        counts, order, *found = parts.recordings.run(key, lambda *arrays: _looked(parts, query(*arrays)), *arrays)
         needed = counts.tolist()
         if not parts.room.lacks(*needed):
             break
         parts.recordings.clear()
     count = needed[-1]
-    return Pairs(*(each[:count] for each in found)).where(key[:count].argsort())
+    return Pairs(*(each[:count] for each in found)).where(order[:count].argsort())
 
 
 def _looked(parts: Parts, query: Any) -> tuple[Tensor, ...]:

@@ -10,12 +10,15 @@ The network makes its steps whole, without a line search, and gets half of P.
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from ..integrate.base import Preconditioner, Solver
 from ..integrate.metric import Metric
+from ..mesh.recorded import Work
 
 SHORT = 0.5
 """Fraction of P used by steps without a line search."""
@@ -28,7 +31,11 @@ far."""
 
 
 class HeldMetric:
-    """A level's metric with contact stiffness."""
+    """A level's metric with contact stiffness.
+
+    Attributes:
+        work: The shorter answer, as a function of F and of tensors.
+    """
 
     def __init__(self, plain: Metric, stiff: Float[Tensor, " vertices"]) -> None:
         """Add a contact stiffness.
@@ -37,7 +44,11 @@ class HeldMetric:
             stiff: K [N/m].
         """
         self.stiff, self._plain = stiff, plain
-        self._solver = plain.by_levels(stiff)
+        self._levels = plain.by_levels(stiff)
+        self.work = Work(self._levels.key, self._shorter, self._levels.given)
+
+    def _shorter(self, *given: Any) -> tuple[Tensor]:
+        return (self._levels.function(*given)[0].mul_(SHORT),)
 
     @staticmethod
     def of(plain: Metric, stiff: Float[Tensor, " vertices"], last: Preconditioner | None) -> Metric | HeldMetric:
@@ -57,7 +68,7 @@ class HeldMetric:
 
     def solve(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
         """P F [m]; zero at fixed vertices, provided that the force is zero there."""
-        return self._solver(force)
+        return self._levels.run(self._plain.recordings, force)[0]
 
     def stiffened(self, stiffness: Float[Tensor, " vertices"]) -> Solver:
         """P with max(K, stiffness - D) in place of K: the solve for cloth with at least the given stiffness [N/m]."""

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from ..level import Level
 from ..mesh.formula import SCALAR, VECTOR, block_size, kernel, native, one_by_one
+from ..mesh.recorded import Recordings, Work
 from ..mesh.stencil import incidence, vectors
 from ..mesh.threads import Launch
 
@@ -66,25 +67,6 @@ def _aimed(term: Any, aims: tuple[Tensor, ...]) -> Any:
     return term.aimed(*aims) if aims else term
 
 
-class _Last:
-    """The last result of constant terms."""
-
-    def __init__(self) -> None:
-        """Start without a result."""
-        self._asked: tuple[Tensor, int] | None = None
-        self._answer: tuple[Tensor, Tensor] | None = None
-
-    def recall(self, x: Tensor) -> tuple[Tensor, Tensor] | None:
-        """Energy and a writable force, if known at x."""
-        if self._answer is None or self._asked is None or self._asked[0] is not x or self._asked[1] != x._version:
-            return None
-        return self._answer[0], self._answer[1].clone()
-
-    def keep(self, x: Tensor, energy: Tensor, force: Tensor) -> None:
-        """Remember a result."""
-        self._asked, self._answer = (x, x._version), (energy, force.clone())
-
-
 class ForceModule:
     """The sum of the terms of one frame.
 
@@ -92,46 +74,24 @@ class ForceModule:
         forces: The terms, in order.
     """
 
-    def __init__(
-        self,
-        forces: Sequence[Force],
-        *,
-        remembers: bool = False,
-        total: Callable[..., Sequence[Tensor]] | None = None,
-    ) -> None:
+    def __init__(self, forces: Sequence[Force], recordings: Recordings | None = None) -> None:
         """Keep the terms in order; the order fixes the rounding of the sum.
 
         Args:
-            remembers: Whether the last result is reused at the same positions: for constant terms.
-            total: As `total_of` terms of this kind; None for `total_of` these.
+            recordings: Of sums with the same terms but for their `aims`.
         """
         self.forces = tuple(forces)
-        self._lasting, self._last = self.forces, _Last() if remembers else None
-        self._total = total_of(self.forces) if total is None else total
-        self._aims = [aim for each in self.forces for aim in _aims_of(each)]
+        self._recordings = Recordings() if recordings is None else recordings
+        names, aims = tuple(each.name for each in forces), [aim for each in forces for aim in _aims_of(each)]
+        self.work = Work(names, total_of(self.forces), aims)
 
     def joined_by(self, more: Sequence[Force]) -> ForceModule:
-        """This module's terms and more; this module's remembered result is still used at the same positions."""
-        joined = ForceModule((*self.forces, *more))
-        joined._lasting, joined._last, joined._total, joined._aims = self._lasting, self._last, self._total, self._aims
-        return joined
+        """This module's terms and more."""
+        return ForceModule((*self.forces, *more), self._recordings)
 
     def energy_and_force(self, x: Float[Tensor, "vertices 3"]) -> tuple[Float[Tensor, ""], Float[Tensor, "vertices 3"]]:
         """Total energy [J], float64 scalar, and force [N] at positions x [m]."""
-        total = None if self._last is None else self._last.recall(x)
-        if total is None:
-            energy, force, _ = self._total(x, *self._aims)
-            total = energy, force
-            if self._last is not None:
-                self._last.keep(x, *total)
-        return self._sum(self.forces[len(self._lasting) :], x, total)
-
-    @staticmethod
-    def _sum(terms: Sequence[Force], x: Tensor, so_far: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-        """Energy and force with some terms added; the force is modified in place."""
-        energy, force = so_far
-        for term in terms:
-            energy = energy + term.add_force(x, force)
+        energy, force, _ = self.work.run(self._recordings, x)
         return energy, force
 
     def energy_and_force_each(
@@ -148,8 +108,7 @@ class ForceModule:
 
     def energies(self, x: Float[Tensor, "vertices 3"]) -> dict[str, float]:
         """Energy of each term [J] by name."""
-        others = [term.add_force(x, torch.zeros_like(x)) for term in self.forces[len(self._lasting) :]]
-        values = torch.cat([self._total(x, *self._aims)[2], *(each.reshape(1) for each in others)])
+        values = self.work.run(self._recordings, x)[2]
         return dict(zip((term.name for term in self.forces), values.tolist(), strict=True))
 
     def diagonal(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " vertices"]:
@@ -208,16 +167,18 @@ class Elements:
         parameters: Sequence[Float[Tensor, " elements"] | Float[Tensor, "elements 4"]],
         *,
         level: Level,
+        rows: tuple[Int[Tensor, " starts"], Int[Tensor, " slots"]] | None = None,
     ) -> None:
         """Prepare the launches, gather tables and buffers on the level's device.
 
         Args:
             kernels: The kernels of `element_kernels`.
             parameters: The kernel's two parameters.
+            rows: The corners at each vertex, as of `incidence`, if known.
         """
         self.count, width = corners.shape
         dtype, device, threads = level.dtype, level.device, level.threads
-        starts, slots = incidence(corners, level.vertex_count)
+        starts, slots = incidence(corners, level.vertex_count) if rows is None else rows
         # Not `contiguous`: an empty tensor keeps strides that Warp refuses.
         corners = corners.clone(memory_format=torch.contiguous_format)
         packed = wp.from_torch(corners, dtype=wp.types.vector(length=width, dtype=wp.int32))

@@ -23,6 +23,7 @@ from torch import Tensor
 
 from ..level import Level
 from ..mesh.borders import OnEdge, finer_side, nearest_edges
+from ..mesh.recorded import Work
 from ..mesh.stencil import Stencil
 from ..mesh.topology import edges_of, joined_by
 from ..mesh.weld import WELDED, pairs_within
@@ -127,6 +128,11 @@ class SewnForces:
     def __init__(self, field: ForceModule, seam: Seam) -> None:
         """Take the forces of the unsewn cloth, and the seam."""
         self._field, self._seam = field, seam
+        self.work = Work((seam, *field.work.key), self._sewn, field.work.given)
+
+    def _sewn(self, x: Tensor, *given: Tensor) -> tuple[Tensor, Tensor]:
+        energy, force, *_ = self._field.work.function(self._seam.closed(x), *given)
+        return energy, self._seam.shared(force)
 
     def energy_and_force(self, x: Float[Tensor, "vertices 3"]) -> tuple[Float[Tensor, ""], Float[Tensor, "vertices 3"]]:
         """Energy [J] and force [N] with the seams of x [m] closed."""

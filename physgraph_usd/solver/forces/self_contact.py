@@ -13,6 +13,7 @@ Pairs, weights and normals are constant during the life of the term, so the ener
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
@@ -23,6 +24,7 @@ from torch import Tensor
 
 from ..level import Level
 from ..mesh.formula import QUAD, element_kernels
+from ..mesh.stencil import incidence
 from .base import Elements
 
 
@@ -101,6 +103,10 @@ _KERNELS = element_kernels(
 )
 
 
+LEAST_ROOM, ROOM_GROWTH = 4096, 4
+"""Least room for pairs on a card, and factor of the next larger room: each room is recorded by itself."""
+
+
 class SelfContact:
     """Springs keeping pairs of material points apart.
 
@@ -113,11 +119,40 @@ class SelfContact:
         self.gaps, self.name, self._level = gaps, name, level
 
     @cached_property
+    def _plane(self) -> Float[Tensor, "gaps 4"]:
+        """Normal and offset of each pair, for unit stiffness."""
+        return torch.cat([self.gaps.normal, self.gaps.offset.unsqueeze(1)], 1) * self.gaps.stiffness.sqrt().unsqueeze(1)
+
+    @cached_property
     def _elements(self) -> Elements:
         """The pairs as elements of unit stiffness, built on first use."""
-        gaps = self.gaps
-        plane = torch.cat([gaps.normal, gaps.offset.unsqueeze(1)], dim=1) * gaps.stiffness.sqrt().unsqueeze(1)
-        return Elements(_KERNELS, gaps.corners, [gaps.weight.contiguous(), plane], level=self._level)
+        return Elements(_KERNELS, self.gaps.corners, [self.gaps.weight.contiguous(), self._plane], level=self._level)
+
+    @property
+    def aims(self) -> tuple[Tensor, ...]:
+        """`with_room` on a card."""
+        return self.with_room if self.gaps.corners.is_cuda else ()
+
+    @cached_property
+    def with_room(self) -> tuple[Tensor, ...]:
+        """Corners, weights, planes, and rows of `incidence`, with room for more pairs, of no weight.
+
+        Equal room for different pairs makes the arrays' shapes equal, which a recording needs.
+        """
+        corners, weight = self.gaps.corners, self.gaps.weight
+        starts, slots = incidence(corners, self._level.vertex_count)
+        room = LEAST_ROOM
+        while room < len(corners):
+            room *= ROOM_GROWTH
+        pad, more = torch.nn.functional.pad, room - len(corners)
+        padded = [pad(each, (0, 0, 0, more)) for each in (corners, weight, self._plane)]
+        return *padded, starts, pad(slots, (0, 4 * more))
+
+    def aimed(self, *aims: Tensor) -> SelfContact:
+        """The term of other pairs, given `with_room`."""
+        term, (corners, weight, plane, *rows) = copy.copy(self), aims
+        term._elements = Elements(_KERNELS, corners, [weight, plane], level=self._level, rows=(rows[0], rows[1]))
+        return term
 
     def add_force(self, x: Float[Tensor, "vertices 3"], force: Float[Tensor, "vertices 3"]) -> Float[Tensor, ""]:
         """Add the force [N] in place and return the energy [J]."""

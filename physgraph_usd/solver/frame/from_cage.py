@@ -22,7 +22,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from ..level import PIN_MARGIN, Level, Placed
-from ..mesh.recorded import Recorded
+from ..mesh.recorded import Recordings
 from ..mesh.stencil import Stencil, add_at
 from ..mesh.topology import PolygonMesh
 from ..rigid import best_motion
@@ -46,7 +46,7 @@ class MovingFrames:
         self._level, self._triangles = finest, cage.triangles.long()
         triangles, rest = cage.triangles.cpu().numpy(), cage.rest.double().cpu().numpy()
         self._tangent = Stencil(tangent_operator(triangles, rest), dtype=finest.dtype, device=finest.device)
-        self.edge, self._predicted = mean_edge(triangles, rest), Recorded(self._predict)
+        self.edge, self._recordings = mean_edge(triangles, rest), Recordings()
 
     def frames(self, coarse: Float[Tensor, "coarse 3"]) -> Float[Tensor, "coarse 3 3"]:
         """Orthonormal frames at the cage vertices; columns are tangent, bitangent, normal."""
@@ -69,7 +69,7 @@ class MovingFrames:
             Predicted fine positions [m], the RMS motion of the cage in mean cage edges, its RMS turn [rad], and its
             largest move [m].
         """
-        placed, far = self._predicted(before, fine, coarse)
+        placed, far = self._recordings.run("predict", self._predict, before, fine, coarse)
         motion, turn, farthest = far.tolist()
         return placed, motion / self.edge, turn, farthest
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,7 +14,7 @@ from torch import Tensor
 
 from ..fabric import Fabric
 from ..forces import bending_term, body_terms
-from ..forces.base import Force, ForceModule, total_of
+from ..forces.base import Force, ForceModule
 from ..forces.guide import Guide, GuideMap
 from ..forces.membrane import in_plane_terms
 from ..forces.tether import Tether
@@ -179,11 +180,7 @@ class LevelForces:
 
     def module(self, coarse: Float[Tensor, "coarse 3"]) -> ForceModule:
         """All terms of one frame, given the recentred coarse positions [m]."""
-        return self._joined((*self.terms, self.guide.retarget(coarse)))
-
-    def _joined(self, terms: Sequence[Force], *, remembers: bool = False) -> ForceModule:
-        """The terms as one, recorded together."""
-        return ForceModule(terms, remembers=remembers, total=self._totals.of(len(terms), total_of(terms)))
+        return ForceModule((*self.terms, self.guide.retarget(coarse)), self._recordings)
 
     def system(
         self,
@@ -198,19 +195,19 @@ class LevelForces:
             tie: Stiffness [1/s^2] and predicted positions [m] of a tether, or None.
             rough: Whether to use `rough_metric`.
         """
-        forces = module.forces if tie is None else (*module.forces, self.tether(*tie))
         metric = self.rough_metric if rough else self.metric
-        return self.system_in(self._joined(forces, remembers=True), metric)
+        return self.system_in(module if tie is None else module.joined_by([self.tether(*tie)]), metric)
 
     @cached_property
-    def _totals(self) -> Recordings:
-        """`total_of` the terms by their number: with a tether or without."""
+    def _recordings(self) -> Recordings:
+        """Sums of the terms, and steps under them, recorded on a card."""
         return Recordings()
 
     def system_in(self, field: ForceField, metric: Preconditioner | None = None) -> System:
         """The system of the level in any field, with the level's metric by default."""
         level, metric = self.level, self.metric if metric is None else metric
-        return System(field, metric, free=level.free, spacing=level.spacing, level=level)
+        place: dict[str, Any] = {"free": level.free, "spacing": level.spacing, "level": level}
+        return System(field, metric, recordings=self._recordings, **place)
 
     def tether(self, stiffness: float, predicted: Float[Tensor, "vertices 3"]) -> Tether:
         """The tie to predicted positions [m], of stiffness [1/s^2]."""

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..level import Level
+from ..mesh.recorded import Recordings, Work
 from ..mesh.stencil import three_columns
 
 Solver = Callable[[Tensor], Tensor]
@@ -58,6 +59,13 @@ class Shortened(Preconditioner, Protocol):
         ...
 
 
+@runtime_checkable
+class Recordable(Protocol):
+    """Forces, or a preconditioner, that a card can record."""
+
+    work: Work
+
+
 class System:
     """One level in one frame, as seen by an integrator.
 
@@ -79,12 +87,31 @@ class System:
         free: Bool[Tensor, "vertices 1"],
         spacing: Float[Tensor, " vertices"],
         level: Level | None = None,
+        recordings: Recordings | None = None,
     ) -> None:
-        """Combine a force field with its metric and mask."""
-        self.field, self.metric = field, metric
+        """Combine a force field with its metric and mask; recordings are of steps under forces of this kind."""
+        self.field, self.metric, self.recordings = field, metric, recordings
         self.free, self.spacing, self.level = free, spacing, level
         self._all_free = level.all_free if level is not None and free is level.free else bool(free.all())
         self.evaluations = self.metric_solves = self.failed = 0
+
+    @property
+    def on_card(self) -> bool:
+        """Whether steps are recorded."""
+        return self.spacing.is_cuda and self.recordings is not None
+
+    @cached_property
+    def works(self) -> tuple[Work, Work] | None:
+        """Energy and force of positions, and the shorter answer, if a card can record them."""
+        field, metric = self.field, self.metric
+        if not self.on_card or not isinstance(field, Recordable) or not isinstance(metric, Recordable):
+            return None
+        given = *field.work.given, *metric.work.given
+        return (field.work, metric.work) if all(isinstance(each, Tensor) for each in given) else None
+
+    def masked(self, field: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
+        """The field, and zero at fixed vertices."""
+        return field if self._all_free else field * self._mask
 
     @cached_property
     def _mask(self) -> Float[Tensor, "vertices 3"]:
@@ -109,7 +136,7 @@ class System:
         """`energy_and_force` without waiting for the energy, a float64 scalar on the device."""
         self.evaluations += 1
         energy, force = self.field.energy_and_force(x)
-        return energy, force if self._all_free else force * self._mask
+        return energy, self.masked(force)
 
     def apply_metric_inverse(
         self, force: Float[Tensor, "vertices 3"], solver: Solver | None = None
@@ -121,8 +148,7 @@ class System:
             solver: A solve provided by the metric to replace H0^-1, or None.
         """
         self.metric_solves += 1
-        move = self.metric.solve(force) if solver is None else solver(force)
-        return move if self._all_free else move * self._mask
+        return self.masked(self.metric.solve(force) if solver is None else solver(force))
 
     def apply_short_inverse(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
         """H0^-1 F [m] for a step without a line search: the shorter answer if available."""
@@ -130,8 +156,7 @@ class System:
         if short is None:
             return self.apply_metric_inverse(force)
         self.metric_solves += 1
-        move = short(force)
-        return move if self._all_free else move * self._mask
+        return self.masked(short(force))
 
     @cached_property
     def _short(self) -> Callable[[Tensor], Tensor] | None:

@@ -24,7 +24,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..mesh.recorded import Recorded
+from ..mesh.recorded import Recordings
 from ..mesh.stencil import Stencil, three_columns
 from .base import Solver
 from .factors import Factors
@@ -43,7 +43,7 @@ class CoarseLevels:
     Attributes:
         ups: Linear map to each level from the next coarser one, finest first; at the cage, from itself.
         dense: Whether the cage is solved by its inverse matrix.
-        recorded_move: `move`, recorded.
+        recordings: Of moves, on a card.
     """
 
     def __init__(
@@ -81,7 +81,7 @@ class CoarseLevels:
         self._known = torch.as_tensor(np.concatenate(known), device=device)
         self._weights = Stencil(sp.csr_matrix(sp.vstack(weights)), dtype=torch.float64, device=device)
         self._dtype, self.dense = dtype, device != "cpu" and 0 < basis.shape[1] <= MOST_DENSE
-        self.recorded_move = Recorded(self.move)
+        self.recordings = Recordings()
 
     def held(self, stiff: Float[Tensor, " vertices"]) -> tuple[list[Tensor], Solver | Float[Tensor, "cage cage"]]:
         """Diagonals of the levels between [N/m], finest first, and the solve of the cage, given K [N/m].
@@ -101,8 +101,8 @@ class CoarseLevels:
 
     def move(
         self, force: Float[Tensor, "vertices 3"], cage: Any, rough: Float[Tensor, "vertices 3"], *middle: Tensor
-    ) -> tuple[Float[Tensor, "vertices 3"]]:
-        """P F [m], as in `contact.metric`.
+    ) -> Float[Tensor, "vertices 3"]:
+        """P F [m], as in `metric`.
 
         Args:
             force: F [N].
@@ -114,7 +114,7 @@ class CoarseLevels:
         move = (cage @ low if isinstance(cage, Tensor) else cage(low)).mul_(COARSE)
         for up, part, factor in zip(self.ups[::-1], finer[::-1], [rough, *middle][::-1], strict=True):
             move = up.apply(move).addcmul_(part, factor)
-        return (move,)
+        return move
 
     def forces(self, force: Float[Tensor, "vertices 3"]) -> list[Float[Tensor, "_ 3"]]:
         """Z_l^T F of all levels, finest first [N]."""

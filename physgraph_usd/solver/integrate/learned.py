@@ -13,6 +13,7 @@ The network sees a `System` only.
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Callable, Sequence
 from functools import cache, partial
 from typing import Any, TypeVar
@@ -23,10 +24,11 @@ from torch import Tensor, nn
 
 from ...errors import SolveError
 from ..level import Level
+from ..mesh.recorded import Work
 from .base import Carry, System, root_sum
 from .fused import FusedPhysgraph, fused_physgraph
 from .network import Physgraph
-from .quasi_newton import Secant, StepHistory, dot, secant_direction
+from .quasi_newton import SECANTS, Secant, StepHistory, dot, secant_direction
 from .vertex_frame import VertexFrame
 
 NetworkT = TypeVar("NetworkT", bound=nn.Module)
@@ -55,8 +57,11 @@ class LearnedMetric:
     def start(self, system: System, x: Float[Tensor, "vertices 3"]) -> Carry:
         """Evaluate x with an empty memory; the network runs in the system's precision."""
         self._network = placed(self._network, system, x.dtype)
-        none = torch.zeros_like(x)
-        return self._evaluated(system, x, StepHistory(none, (none, none)))
+        none, secants = torch.zeros_like(x), ()
+        if system.on_card and self._trained:  # A recording has a fixed number of secants.
+            endless = torch.full_like(garment_dot(system.level, none, none), math.inf)
+            secants = (Secant(none, none, none, partial(garment_dot, system.level), known=endless),) * SECANTS
+        return self._evaluated(system, x, StepHistory(none, (none, none), secants))
 
     def resume(self, system: System, carry: Carry) -> Carry:
         """Evaluate the carry's positions after a small change of the forces; the memory is kept."""
@@ -71,6 +76,9 @@ class LearnedMetric:
 
     def step(self, system: System, carry: Carry) -> Carry:
         """One step along the network's combination."""
+        fused = self._fused(system)
+        if fused is not None and system.works is not None:
+            return self._recorded(system, carry, fused, system.works)
         move = self.propose(system, carry)
         return self._reached(system, carry, carry.x + move, move)
 
@@ -90,21 +98,41 @@ class LearnedMetric:
         """The secant of a step, given F and H0^-1 F before and after, and the displacement; and the remaining move."""
         before, force, image_before, image, move = ends
         level = system.level
-        if self._trained and not move.is_cuda:  # Waiting for numbers costs nothing.
+        if self._trained and not system.on_card:  # Waiting for numbers costs nothing.
             spans = level.spans if level is not None and len(level.spans) > 1 else ()
             return Secant(move, before - force, image_before - image, dot, spans), system.relative_move(image)
         product = partial(garment_dot, level)
-        if not self._trained or level is None:
+        if not system.on_card or not self._trained or level is None:
             return Secant(move, before - force, image_before - image, product), system.relative_move(image)
-
-        def parts(
-            before: Tensor, force: Tensor, image_before: Tensor, image: Tensor, move: Tensor, per_edge: Tensor
-        ) -> Sequence[Tensor]:
-            made = Secant(move, before - force, image_before - image, product)
-            return made.yields, made.image, made.curvature, root_sum(image * per_edge)
-
-        yields, change, curvature, remaining = level.recordings.of("secant", parts)(*ends, system.per_edge)
+        given = *ends, system.per_edge
+        made = level.recordings.run("secant", lambda *each: _differences(level, *each), *given)
+        yields, change, curvature, remaining = made
         return Secant(move, yields, change, product, known=curvature), remaining
+
+    def _recorded(self, system: System, carry: Carry, fused: FusedPhysgraph, works: tuple[Work, Work]) -> Carry:
+        """A step on a card as a single recording."""
+        memory, level, (forces, metric), count = carry.memory, level_of(system.level), works, len(works[0].given)
+        assert system.recordings is not None
+
+        def whole(x: Tensor, force: Tensor, image: Tensor, per_edge: Tensor, *more: Tensor) -> list[Tensor]:
+            aims, held, past = more[:count], more[count:-PAST], more[-PAST:]
+            move = _moved(fused, system, (x, force, image, *past))
+            energy, after = forces.function(x + move, *aims)[:2]
+            after = system.masked(after)
+            there = system.masked(metric.function(after, *held)[0])
+            yields, change, curvature, remaining = _differences(level, force, after, image, there, move, per_edge)
+            fields = torch.stack([x + move, move, after, there, yields, change])
+            return [torch.stack([energy, remaining]), curvature, fields]
+
+        bias, stiffness = fused.bias_at(memory.step), system.rest_diagonal_columns
+        now = carry.x, carry.force, carry.preconditioned, system.per_edge, *forces.given, *metric.given
+        past = stiffness, bias, memory.force, *memory.images, *_parts(memory.secants)
+        numbers, curvature, fields = system.recordings.run((fused, forces.key, metric.key), whole, *now, *past)
+        x, move, force, image, yields, change = fields
+        system.evaluations, system.metric_solves = system.evaluations + 1, system.metric_solves + 1
+        energy, remaining = numbers.tolist()
+        newest = Secant(move, yields, change, partial(garment_dot, level), known=curvature)
+        return Carry(x, energy, force, image, self.name, memory.after(carry, newest), remaining=remaining)
 
     def propose(self, system: System, carry: Carry) -> Float[Tensor, "vertices 3"]:
         """The displacement of the next step [m]."""
@@ -112,21 +140,11 @@ class LearnedMetric:
         if fused is None:
             return self._combined(system, carry)
         bias, stiffness = fused.bias_at(memory.step), system.rest_diagonal_columns
-        place = fused, level, (system.spacing, system.reach)
-        if level is None or not carry.x.is_cuda:
-            return _by_kernel(carry, stiffness, bias, *place)
-        product = partial(garment_dot, level)
-
-        def move(x: Tensor, force: Tensor, image: Tensor, *more: Tensor) -> list[Tensor]:
-            stiffness, bias, before, first, second, *parts = more
-            secants = zip(*[iter(parts)] * 4, strict=True)
-            known = tuple(Secant(*fields, dot=product, known=curvature) for *fields, curvature in secants)
-            there = Carry(x, 0.0, force, image, memory=StepHistory(before, (first, second), known))
-            return [_by_kernel(there, stiffness, bias, *place)]
-
-        past = [part for each in memory.secants for part in (each.move, each.yields, each.image, each.curvature)]
-        now = (carry.x, carry.force, carry.preconditioned, stiffness, bias)
-        return level.recordings.of(fused, move)(*now, memory.force, *memory.images, *past)[0]
+        if level is None or not system.on_card:
+            return _by_kernel(fused, system, carry, stiffness=stiffness, bias=bias)
+        past = stiffness, bias, memory.force, *memory.images, *_parts(memory.secants)
+        now = carry.x, carry.force, carry.preconditioned, *past
+        return level.recordings.run(fused, lambda *given: [_moved(fused, system, given)], *now)[0]
 
     def _fused(self, system: System) -> FusedPhysgraph | None:
         """The network as kernels, or None if not fused."""
@@ -146,30 +164,53 @@ class LearnedMetric:
         return limited(move, system.spacing) * system.free
 
 
-def _by_kernel(
-    carry: Carry,
-    stiffness: Tensor,
-    bias: Tensor,
-    fused: FusedPhysgraph,
-    level: Level | None,
-    sizes: tuple[Tensor, Tensor],
-) -> Tensor:
+PAST = 5 + 4 * SECANTS
+"""Number of tensors that hold a step's past: diagonal of H0, bias, force, two images, and four for each secant."""
+
+
+def _moved(fused: FusedPhysgraph, system: System, given: Sequence[Tensor]) -> Tensor:
+    """`_by_kernel` of tensors alone: x, F, H0^-1 F, and the past."""
+    x, force, image, stiffness, bias, before, first, second, *parts = given
+    fields, product = zip(*[iter(parts)] * 4, strict=True), partial(garment_dot, system.level)
+    secants = tuple(Secant(*each, dot=product, known=curvature) for *each, curvature in fields)
+    carry = Carry(x, 0.0, force, image, memory=StepHistory(before, (first, second), secants))
+    return _by_kernel(fused, system, carry, stiffness=stiffness, bias=bias)
+
+
+def _parts(secants: Sequence[Secant]) -> list[Tensor]:
+    """Four tensors of each secant."""
+    return [part for each in secants for part in (each.move, each.yields, each.image, each.curvature)]
+
+
+def _differences(
+    level: Level,
+    before: Tensor,
+    force: Tensor,
+    image_before: Tensor,
+    image: Tensor,
+    move: Tensor,
+    per_edge: Tensor,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Of a step: differences of negative forces and of images, the secant's curvature, and the remaining move."""
+    made = Secant(move, before - force, image_before - image, partial(garment_dot, level))
+    return made.yields, made.image, made.curvature, root_sum(image * per_edge)
+
+
+def _by_kernel(fused: FusedPhysgraph, system: System, carry: Carry, *, stiffness: Tensor, bias: Tensor) -> Tensor:
     """Displacement of the next step [m], by the network as a kernel.
 
     Args:
         carry: The state.
         stiffness: Diagonal of H0 [N/m], in three columns.
-        bias: As `FusedPhysgraph.bias_at`.
-        fused: The network.
-        level: The mesh.
-        sizes: The spacing, and 0 at fixed vertices [m].
+        bias: `FusedPhysgraph.bias_at` the number of steps made.
     """
 
     def frame() -> VertexFrame:
-        return VertexFrame(level_of(level), carry.x)
+        return VertexFrame(level_of(system.level), carry.x)
 
     whole = partial(_vector, carry=carry, stiffness=stiffness)
-    return fused(vectors_of(fused.bases, whole, frame=frame), *sizes, bias, frame=frame)
+    vectors = vectors_of(fused.bases, whole, frame=frame)
+    return fused(vectors, system.spacing, system.reach, bias, frame=frame)
 
 
 def _vector(name: str, *, carry: Carry, stiffness: Tensor) -> Tensor:

@@ -17,6 +17,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Sequence
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -24,6 +25,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from ..mesh.recorded import Recordings, Work
 from ..mesh.stencil import Stencil, three_columns
 from .base import Solver
 from .coarse import COARSE, REGULARISATION, CoarseLevels
@@ -102,6 +104,11 @@ class Metric:
         values[factors.diagonal] += torch.where(self._free, REGULARISATION, 1.0)
         return factors.of(values)
 
+    @property
+    def recordings(self) -> Recordings:
+        """Products by levels, recorded on a card."""
+        return self.coarse.recordings
+
     @cached_property
     def coarse(self) -> CoarseLevels:
         """The coarser levels."""
@@ -160,23 +167,25 @@ class Metric:
         factor = (diagonal / torch.maximum(diagonal, stiffness)).sqrt().unsqueeze(1)
         return lambda force: self.solve(force * factor).mul_(factor)
 
-    def by_levels(self, stiff: Float[Tensor, " vertices"]) -> Solver:
-        """The product P F [m], given K [N/m]; zero at fixed vertices, provided that the force is zero there."""
+    def by_levels(self, stiff: Float[Tensor, " vertices"]) -> Work:
+        """P F [m] of F, given K [N/m]; zero at fixed vertices, provided that the force is zero there."""
         tiny = torch.finfo(stiff.dtype).tiny  # Where there is no cloth, there is no force.
         rough = ROUGH / self.gathered(three_columns(self.diagonal.to(stiff) + stiff)).clamp_min(tiny)
         between, cage = self.coarse.held(self.gathered(three_columns(stiff))[:, 0])
         middle = [three_columns(1.0 / each.clamp_min(tiny)) for each in between]
-        move = self.coarse.recorded_move
-        return lambda force: self.spread(*move(self.gathered(force), cage, rough, *middle))
+        return Work(self, self._by_levels, (cage, rough, *middle))
+
+    def _by_levels(self, force: Tensor, *given: Any) -> tuple[Tensor]:
+        return (self.spread(self.coarse.move(self.gathered(force), *given)),)
 
     @cached_property
-    def _of_free(self) -> Solver:
-        """The product P F [m] of cloth that nothing touches."""
+    def _of_free(self) -> Work:
+        """P F [m] of cloth that nothing touches."""
         return self.by_levels(torch.zeros_like(self._mask[:, 0]))
 
     def estimate(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
         """An estimate of H0^-1 F [m], without a factor: P F / c, since errors are smooth after a few steps."""
-        return self._of_free(force).mul_(1.0 / COARSE)
+        return self._of_free.run(self.recordings, force)[0].mul_(1.0 / COARSE)
 
 
 class MergedMetric(Metric):

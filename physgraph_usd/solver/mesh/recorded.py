@@ -5,7 +5,9 @@ from __future__ import annotations
 import functools
 import gc
 import logging
+import weakref
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -19,59 +21,104 @@ NEVER = -(2**62)
 _logger = logging.getLogger(__name__)
 
 
-class Recorded:
-    """A function of tensors, recorded for each combination of shapes.
+class Recordings:
+    """Functions of tensors, recorded for each key and combination of shapes.
 
-    The function reads nothing back from the card, and all that changes from call to call is an input. Without a card,
-    with an input that is no tensor there, or where recording fails, the function is called as it is.
+    The functions read nothing back from the card, and all that changes from call to call is an input. Without a card,
+    with an input that is no tensor there, or where recording fails, a function is called as it is.
     """
 
-    def __init__(self, function: Callable[..., Sequence[Tensor]]) -> None:
-        """Take the function."""
-        self._function = function
-        self._known: dict[tuple[Any, ...], int | _Recording] = {}
+    def __init__(self) -> None:
+        """Begin without recordings."""
+        self._known: dict[Any, int | _Recording] = {}
+        self._inputs: dict[Any, _Input] = {}
 
-    def __call__(self, *given: Any) -> Sequence[Tensor]:
-        """The function's tensors, the caller's own."""
+    def run(self, key: Any, function: Callable[..., Sequence[Tensor]], *given: Any) -> Sequence[Tensor]:
+        """The function's tensors, the caller's own.
+
+        Args:
+            key: What functions of equal work have in common.
+            function: Computes tensors from those given.
+        """
         if not all(isinstance(each, Tensor) and each.is_cuda for each in given):
-            return self._function(*given)
-        key = tuple((each.shape, each.dtype) for each in given)
+            return function(*given)
+        key = (key, *((each.shape, each.dtype) for each in given))
         known = self._known.get(key, 0)
         if isinstance(known, _Recording):
             return known(given)
-        self._known[key] = known + 1 if known < CALLS else self._recording(given)
-        return self._function(*given)
+        self._known[key] = known + 1 if known < CALLS else self._recording(function, given)
+        return function(*given)
 
-    def _recording(self, given: Sequence[Tensor]) -> _Recording | int:
+    def clear(self) -> None:
+        """Forget all recordings."""
+        self.__init__()
+
+    def _recording(self, function: Callable[..., Sequence[Tensor]], given: Sequence[Tensor]) -> _Recording | int:
+        places = [(number, each.shape, each.dtype) for number, each in enumerate(given)]
         try:
-            return _Recording(self._function, given)
+            self._inputs |= {
+                place: _Input(each) for place, each in zip(places, given, strict=True) if place not in self._inputs
+            }
+            return _Recording(function, [self._inputs[place] for place in places])
         except RuntimeError as error:
-            _logger.info("%s is not recorded: %s", self._function.__qualname__, error)
+            _logger.info("%s is not recorded: %s", function.__qualname__, error)
             return NEVER
 
 
-class Recordings(dict[Any, Recorded]):
-    """Recorded functions by key."""
+@dataclass(frozen=True, eq=False)
+class Work:
+    """A function of a tensor and of others, for cards to record.
 
-    def of(self, key: Any, function: Callable[..., Sequence[Tensor]]) -> Recorded:
-        """The recorded function of a key; the given one, if it is the first."""
-        if key not in self:
-            self[key] = Recorded(function)
-        return self[key]
+    Attributes:
+        key: What functions of equal work have in common.
+        function: Computes tensors from the tensor and those given.
+        given: The other tensors.
+    """
+
+    key: Any
+    function: Callable[..., Sequence[Tensor]]
+    given: Sequence[Any]
+
+    def run(self, recordings: Recordings, *first: Tensor) -> Sequence[Tensor]:
+        """The function's tensors."""
+        return recordings.run(self.key, self.function, *first, *self.given)
+
+
+class _Input:
+    """A tensor read by recordings, shared by those with an input of its shape in the same place.
+
+    Attributes:
+        own: The tensor.
+    """
+
+    def __init__(self, given: Tensor) -> None:
+        """Take the first values."""
+        self.own = given.clone(memory_format=torch.contiguous_format)
+        self._last: tuple[Any, int] | None = None
+
+    def differs(self, given: Tensor) -> bool:
+        """Whether a given tensor is not the last one, unchanged; it is the last one from now on."""
+        if self._last is not None and self._last[0]() is given and self._last[1] == given._version:
+            return False
+        self._last = weakref.ref(given), given._version
+        return True
 
 
 class _Recording:
     """A CUDA graph with its inputs and outputs."""
 
-    def __init__(self, function: Callable[..., Sequence[Tensor]], given: Sequence[Tensor]) -> None:
-        """Record the function, without running it."""
-        self._inputs = [each.clone(memory_format=torch.contiguous_format) for each in given]
-        card = given[0].device
-        self._graph, self._outputs = _captured(lambda: function(*self._inputs), card, pool=_shared(card).pool())
+    def __init__(self, function: Callable[..., Sequence[Tensor]], inputs: Sequence[_Input]) -> None:
+        """Record the function, without running it; what it holds stays, for the graph reads it."""
+        self._function, self._inputs, own = function, inputs, [each.own for each in inputs]
+        card = own[0].device
+        self._graph, self._outputs = _captured(lambda: function(*own), card, pool=_shared(card).pool())
 
     def __call__(self, given: Sequence[Tensor]) -> list[Tensor]:
         """Replay with other inputs."""
-        torch._foreach_copy_(self._inputs, list(given))  # pyright: ignore[reportPrivateImportUsage]
+        changed = [(mine.own, each) for mine, each in zip(self._inputs, given, strict=True) if mine.differs(each)]
+        if changed:
+            own, new = [mine for mine, _ in changed], [each for _, each in changed]
+            torch._foreach_copy_(own, new)  # pyright: ignore[reportPrivateImportUsage]
         self._graph.replay()
         return [each.clone() for each in self._outputs]
 
