@@ -22,7 +22,7 @@ from physgraph_usd.solver.integrate import method_named
 from physgraph_usd.solver.integrate.base import ForceField, Integrator, System
 from physgraph_usd.solver.integrate.descend import solve_level
 from physgraph_usd.solver.integrate.factors import Factors
-from physgraph_usd.solver.integrate.metric import Metric, on_edges
+from physgraph_usd.solver.integrate.metric import Metric, laplacian
 from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton
 from physgraph_usd.solver.integrate.stop import Budget
 
@@ -223,7 +223,7 @@ def test_sewn_vertices_move_together_and_the_solve_is_symmetric(level: int):
     assert system.level is not None
     assert isinstance(system.field, ForceModule)
     side = system.level.rest[:, :1] > system.level.rest[:, 0].min() + 1e-6
-    matrix = on_edges(system.field.rest_matrix(), system.level.springs.numpy())
+    matrix = laplacian(system.level.springs.numpy(), *system.field.rest_springs())
     metric = Metric(matrix, free=side, dtype=torch.float64, ups=system.level.ups)
     rng, label = np.random.default_rng(1), np.arange(len(side))
     label[5], label[9] = 3, 3
