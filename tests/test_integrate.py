@@ -241,6 +241,26 @@ def test_sewn_vertices_move_together_and_the_solve_is_symmetric(level: int):
     torch.testing.assert_close(HeldMetric(metric.merged(label), touched).solve(forces[:, 0].contiguous()), moves[0])
 
 
+@pytest.mark.parametrize("level", [0, 2])
+def test_a_metric_of_new_materials_takes_over_what_only_the_mesh_determines(level: int):
+    """Also where the last materials had no stiffness at all."""
+    mesh, rest = sheet(6, 5)
+    system, _ = finest_system(group_of(mesh, rest, level=level, dtype=torch.float64), wave(rest))
+    assert system.level is not None
+    assert isinstance(system.field, ForceModule)
+    between, fixed = system.field.rest_springs()
+    side = system.level.rest[:, :1] > system.level.rest[:, 0].min() + 1e-6
+    given = {"free": side, "dtype": torch.float64, "ups": system.level.ups}
+    soft, stiff = (laplacian(system.level.springs.numpy(), each, fixed) for each in (0.0 * between, between))
+    last, alone = Metric(soft, **given), Metric(stiff, **given)
+    levels = last.coarse
+    metric = Metric(stiff, **given, last=last)
+    assert metric.coarse.ups is levels.ups
+    touched = torch.as_tensor(np.random.default_rng(1).random(len(side)) * 10.0 * float(alone.diagonal.mean()))
+    force = side * torch.as_tensor(np.random.default_rng(4).normal(size=(len(side), 3)))
+    assert torch.equal(metric.by_levels(touched)(force), alone.by_levels(touched)(force))
+
+
 def test_a_factor_that_something_holds_to_the_end_of_the_process_is_freed_without_a_word():
     """As the traceback of an error does that a host program keeps, or a thread in the midst of a frame."""
     code = """

@@ -118,7 +118,8 @@ class LevelForces:
     def metric(self) -> Metric:
         """The rest Hessian of all terms."""
         matrix = laplacian(self.plain.springs.cpu().numpy(), *self._module.rest_springs())
-        return Metric(matrix, free=self.plain.free, dtype=self.plain.dtype, ups=self.plain.ups)
+        last = None if self.lent is None else self.lent.metric
+        return Metric(matrix, free=self.plain.free, dtype=self.plain.dtype, ups=self.plain.ups, last=last)
 
     @cached_property
     def rough_metric(self) -> Metric:

@@ -65,6 +65,7 @@ class Metric:
         free: Bool[Tensor, "vertices 1"],
         dtype: torch.dtype,
         ups: Sequence[Stencil] = (),
+        last: Metric | None = None,
     ) -> None:
         """Take a scalar Hessian at rest.
 
@@ -73,7 +74,9 @@ class Metric:
             free: False at fixed vertices, whose rows become identity rows.
             dtype: Scalar type of the right-hand sides.
             ups: Linear map to each level from the next coarser one, finest first.
+            last: A metric of the same cloth with a matrix of the same pattern, for what only that determines; or None.
         """
+        self._alike: CoarseLevels | None = None if last is None else last.__dict__.get("coarse", last._alike)
         self._free, self._matrix, self._ups, device = free.squeeze(1), matrix, tuple(ups), str(free.device)
         self._mask = three_columns(self._free.to(dtype))
         self._merged: MergedMetric | None = None
@@ -105,9 +108,10 @@ class Metric:
         if self._unscaled is not None:
             metric, stiffer = self._unscaled
             return metric.coarse.scaled(stiffer)
-        kept, dtype = sp.csr_matrix(self._keep @ self._matrix @ self._keep), self._mask.dtype
-        device = str(self._mask.device)
-        return CoarseLevels(kept, self._ups, self._onto, dtype=dtype, device=device)
+        if self._alike is not None:
+            return self._alike.of(self._matrix)
+        dtype, device = self._mask.dtype, str(self._mask.device)
+        return CoarseLevels(self._matrix, self._ups, self._onto, dtype=dtype, device=device)
 
     @property
     def _onto(self) -> sp.csr_matrix:
