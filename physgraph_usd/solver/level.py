@@ -77,6 +77,7 @@ class Level:
             shape (M, 4); zero where a triangle has no area.
         sides: The spring along each side of the elastic triangles, shape (M, 3).
         hinges: Edge i-j and the corners opposite to it: k and k' of one face, l and l' of the other, shape (H, 6).
+        hinge_spring: The spring along each hinge's edge, shape (H,).
         hinge_shape: Bending stiffness of a hinge over the fabric's, as `rest_shape` gives it, shape (H,).
         rest_angle: [rad], shape (H,).
         vertex_area: A third of the areas of the incident elastic triangles [m^2], shape (V,).
@@ -110,6 +111,7 @@ class Level:
     membrane_inverse: Float[Tensor, "membrane 4"]
     sides: Int[Tensor, "membrane 3"]
     hinges: Int[Tensor, "hinges 6"]
+    hinge_spring: Int[Tensor, " hinges"]
     hinge_shape: Float[Tensor, " hinges"]
     rest_angle: Float[Tensor, " hinges"]
     vertex_area: Float[Tensor, " vertices"]
@@ -455,7 +457,7 @@ def _join(
 ) -> Level:
     """Concatenate garments into one level, with lengths, areas and angles at rest."""
     joined, starts = _joined(parts), np.cumsum([0, *(len(part.rest) for part in parts)])
-    names = (*OF_VERTICES, "sides", "edge_spring", *(f"{each}_garment" for each in OWNED))
+    names = (*OF_VERTICES, "sides", "edge_spring", "hinge_spring", *(f"{each}_garment" for each in OWNED))
     whole = {name: joined[name] for name in names}
     warp, grain = _grain(parts, joined)
     real = _measured(joined, warp=warp)
