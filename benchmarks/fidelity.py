@@ -45,7 +45,7 @@ from physgraph_usd.solver.frame.settings import SolveSettings
 from physgraph_usd.solver.grain import axes
 from physgraph_usd.solver.integrate.base import System
 from physgraph_usd.solver.integrate.descend import solve_level
-from physgraph_usd.solver.integrate.metric import Metric
+from physgraph_usd.solver.integrate.metric import Metric, laplacian
 from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton
 from physgraph_usd.solver.integrate.stop import Budget
 from physgraph_usd.solver.level import Level, build_levels, hinge_geometry, refine_garments
@@ -122,7 +122,8 @@ def simulated(stage: Stage, fabric: Fabric, subdivisions: int, *, frames: int) -
     x = torch.as_tensor(level.from_coarse @ stage.rest).to(level.rest)
     density = torch.tensor([fabric.density])
     module = ForceModule((*terms, Tether(level, density, h**-2, x)))
-    metric = Metric(module.rest_matrix(), free=level.free, dtype=level.dtype)
+    matrix = laplacian(level.springs.numpy(), *module.rest_springs())
+    metric = Metric(matrix, free=level.free, dtype=level.dtype)
     velocity, free = torch.zeros_like(x), level.free
     for frame in range(frames):
         for increment in range(INCREMENTS):

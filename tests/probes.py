@@ -24,7 +24,7 @@ from physgraph_usd.solver.forces.bending import Bending
 from physgraph_usd.solver.forces.gravity import Gravity
 from physgraph_usd.solver.integrate.base import System
 from physgraph_usd.solver.integrate.descend import solve_level
-from physgraph_usd.solver.integrate.metric import Metric
+from physgraph_usd.solver.integrate.metric import Metric, laplacian
 from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton
 from physgraph_usd.solver.integrate.stop import Budget
 from physgraph_usd.solver.level import Level
@@ -41,13 +41,13 @@ class Spread:
     high: float
 
 
-def hessian(force: Force, x: torch.Tensor, axes: Sequence[int]) -> np.ndarray:
-    """Central differences of a force [N/m], shape (n V, n V) for n axes; degrees of freedom vertex by vertex.
+def hessian(force: Force, level: Level, axes: Sequence[int]) -> np.ndarray:
+    """Central differences of a force at rest [N/m], shape (n V, n V) for n axes; degrees of freedom vertex by vertex.
 
     Vertices that share no neighbour move at once: no row feels two of them.
     """
-    step, count, n = 1e-6 * float(x.std()), len(x), len(axes)
-    near = pattern(force)
+    x, near, n = level.rest, pattern(level), len(axes)
+    step, count = 1e-6 * float(x.std()), len(x)
     out = np.zeros((count, n, count, n))
     for together in colours(near):
         rows, which = np.nonzero(near[:, together])
@@ -63,13 +63,12 @@ def hessian(force: Force, x: torch.Tensor, axes: Sequence[int]) -> np.ndarray:
     return 0.5 * (flat + flat.T)
 
 
-def pattern(force: Force) -> np.ndarray:
-    """Which vertices feel which, shape (V, V)."""
-    matrix = force.rest_matrix()
-    assert matrix is not None
-    near = np.zeros(matrix.shape, bool)
-    near[np.repeat(np.arange(len(near)), np.diff(matrix.indptr)), matrix.indices] = True
-    return near
+def pattern(level: Level) -> np.ndarray:
+    """Which vertices may feel which: those within two springs, shape (V, V)."""
+    near = np.eye(level.vertex_count, dtype=np.float32)
+    a, b = level.springs.numpy().T
+    near[a, b] = near[b, a] = 1.0
+    return near @ near > 0
 
 
 def colours(near: np.ndarray) -> list[np.ndarray]:
@@ -110,7 +109,7 @@ def plane_stiffness(level: Level, forces: Sequence[Force]) -> np.ndarray:
     none = np.zeros(len(p))
     modes = [(p[:, 0], none), (none, p[:, 1]), (0.5 * p[:, 1], 0.5 * p[:, 0])]
     modes = np.stack([np.stack(mode, axis=1).reshape(-1) for mode in modes], axis=1)
-    stiffness = np.sum([hessian(force, level.rest, [0, 1]) for force in forces], axis=0)
+    stiffness = np.sum([hessian(force, level, [0, 1]) for force in forces], axis=0)
     held = np.repeat(rim(level, 1.2 * float(level.spacing.mean())), 2)
     u = relaxed(stiffness, modes, held)
     return u.T @ stiffness @ u / float(level.vertex_area.sum())
@@ -121,9 +120,9 @@ def bending_stiffness(level: Level, rigidity: float) -> np.ndarray:
     p, edge = level.rest.numpy(), float(level.spacing.mean())
     modes = 0.5 * np.stack([p[:, 0] ** 2, p[:, 1] ** 2, p[:, 0] * p[:, 1]], axis=1)
     bending = Bending(level, torch.tensor([rigidity]))
-    u = relaxed(hessian(bending, level.rest, [2]), modes, rim(level, 2.2 * edge))
+    u = relaxed(hessian(bending, level, [2]), modes, rim(level, 2.2 * edge))
     weighed, area = inside(level)
-    stiffness = hessian(Bending(weighed, torch.tensor([rigidity])), level.rest, [2])
+    stiffness = hessian(Bending(weighed, torch.tensor([rigidity])), level, [2])
     return u.T @ stiffness @ u / area
 
 
@@ -177,7 +176,7 @@ def bending_constants(stiffness: np.ndarray) -> dict[str, Spread]:
 def tensile_test(level: Level, forces: Sequence[Force]) -> tuple[float, float]:
     """Young's modulus [N/m] and Poisson's ratio along x: short sides pulled, everything else free."""
     p, strain = level.rest.numpy(), 1.0
-    stiffness = np.sum([hessian(force, level.rest, [0, 1]) for force in forces], axis=0)
+    stiffness = np.sum([hessian(force, level, [0, 1]) for force in forces], axis=0)
     edge = float(level.spacing.mean())
     ends = (p[:, 0] < p[:, 0].min() + 0.6 * edge) | (p[:, 0] > p[:, 0].max() - 0.6 * edge)
     held = np.stack([ends, np.arange(len(p)) == int(np.flatnonzero(ends)[0])], axis=1)
@@ -205,9 +204,10 @@ def cylinder_rigidity(level: Level, radius: float, angle: float) -> float:
 def relax(level: Level, forces: Sequence[Force], x: torch.Tensor, *, steps: int = 400) -> torch.Tensor:
     """The positions at rest: quasi-Newton first, Newton to polish."""
     module = ForceModule(forces)
-    system = System(
-        module, Metric(module.rest_matrix(), free=level.free, dtype=level.dtype), free=level.free, spacing=level.spacing
-    )
+    between, fixed = module.rest_springs()
+    matrix = laplacian(level.springs.numpy(), between, fixed + np.zeros(level.vertex_count))
+    metric = Metric(matrix, free=level.free, dtype=level.dtype)
+    system = System(module, metric, free=level.free, spacing=level.spacing)
     for integrator, count in ((QuasiNewton(), steps), (Newton(), 200)):
         x, _ = solve_level(system, integrator, x, level=0, budget=Budget(count, 1e-7))
     return x

@@ -22,7 +22,7 @@ from physgraph_usd.solver.integrate import method_named
 from physgraph_usd.solver.integrate.base import ForceField, Integrator, System
 from physgraph_usd.solver.integrate.descend import solve_level
 from physgraph_usd.solver.integrate.factors import Factors
-from physgraph_usd.solver.integrate.metric import Metric, on_edges
+from physgraph_usd.solver.integrate.metric import Metric, laplacian
 from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton
 from physgraph_usd.solver.integrate.stop import Budget
 
@@ -223,7 +223,7 @@ def test_sewn_vertices_move_together_and_the_solve_is_symmetric(level: int):
     assert system.level is not None
     assert isinstance(system.field, ForceModule)
     side = system.level.rest[:, :1] > system.level.rest[:, 0].min() + 1e-6
-    matrix = on_edges(system.field.rest_matrix(), system.level.springs.numpy())
+    matrix = laplacian(system.level.springs.numpy(), *system.field.rest_springs())
     metric = Metric(matrix, free=side, dtype=torch.float64, ups=system.level.ups)
     rng, label = np.random.default_rng(1), np.arange(len(side))
     label[5], label[9] = 3, 3
@@ -239,6 +239,26 @@ def test_sewn_vertices_move_together_and_the_solve_is_symmetric(level: int):
     assert abs(work[0] - work[1]) < 1e-9 * float((forces[:, 0] * moves[0]).sum())
     metric.merged(label).coarse.dense = True  # As on a card.
     torch.testing.assert_close(HeldMetric(metric.merged(label), touched).solve(forces[:, 0].contiguous()), moves[0])
+
+
+@pytest.mark.parametrize("level", [0, 2])
+def test_a_metric_of_new_materials_takes_over_what_only_the_mesh_determines(level: int):
+    """Also where the last materials had no stiffness at all."""
+    mesh, rest = sheet(6, 5)
+    system, _ = finest_system(group_of(mesh, rest, level=level, dtype=torch.float64), wave(rest))
+    assert system.level is not None
+    assert isinstance(system.field, ForceModule)
+    between, fixed = system.field.rest_springs()
+    side = system.level.rest[:, :1] > system.level.rest[:, 0].min() + 1e-6
+    given = {"free": side, "dtype": torch.float64, "ups": system.level.ups}
+    soft, stiff = (laplacian(system.level.springs.numpy(), each, fixed) for each in (0.0 * between, between))
+    last, alone = Metric(soft, **given), Metric(stiff, **given)
+    levels = last.coarse
+    metric = Metric(stiff, **given, last=last)
+    assert metric.coarse.ups is levels.ups
+    touched = torch.as_tensor(np.random.default_rng(1).random(len(side)) * 10.0 * float(alone.diagonal.mean()))
+    force = side * torch.as_tensor(np.random.default_rng(4).normal(size=(len(side), 3)))
+    assert torch.equal(metric.by_levels(touched)(force), alone.by_levels(touched)(force))
 
 
 def test_a_factor_that_something_holds_to_the_end_of_the_process_is_freed_without_a_word():

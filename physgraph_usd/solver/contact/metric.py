@@ -68,7 +68,7 @@ class HeldMetric:
 
     def solve(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
         """P F [m]; zero at fixed vertices, provided that the force is zero there."""
-        return self._levels.run(self._plain.recordings, force)[0]
+        return self._levels.run(self._plain.coarse.recordings, force)[0]
 
     def stiffened(self, stiffness: Float[Tensor, " vertices"]) -> Solver:
         """P with max(K, stiffness - D) in place of K: the solve for cloth with at least the given stiffness [N/m]."""

@@ -14,7 +14,6 @@ from torch import Tensor
 from ..fabric import Fabric
 from ..folds import carried_bend
 from ..level import Level
-from ..mesh.topology import find_edges
 from .base import Force
 from .bending import Bending
 from .gravity import Gravity
@@ -53,9 +52,8 @@ def body_terms(level: Level, fabrics: Sequence[Fabric], *, gravity: np.ndarray) 
 
 def _carried(level: Level, fabrics: Sequence[Fabric], raised: Sequence[bool]) -> Tensor:
     """Least bending stiffness of the hinges of raised garments [N m], shape (H,); 0 for no bound."""
-    owner, ends = level.hinge_garment.long(), level.hinges[:, :2]
-    painted = level.spring_scale[find_edges(level.springs.cpu().numpy(), ends.cpu().numpy())]
-    edge = level.spacing[ends.long()].mean(dim=1)
+    owner, painted = level.hinge_garment.long(), level.spring_scale[level.hinge_spring.long()]
+    edge = level.spacing[level.hinges[:, :2].long()].mean(dim=1)
     least = torch.zeros_like(edge)
     for index, (fabric, wanted) in enumerate(zip(fabrics, raised, strict=True)):
         if wanted and fabric.bend > 0:

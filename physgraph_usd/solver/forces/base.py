@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping, Sequence
 from itertools import islice
 from typing import Any, Protocol, runtime_checkable
 
-import scipy.sparse as sp
 import torch
 import warp as wp
 from jaxtyping import Float, Int
@@ -36,8 +35,11 @@ class Force(Protocol):
         """A third of the trace of each vertex's positive semi-definite Hessian block [N/m]."""
         ...
 
-    def rest_matrix(self) -> sp.csr_matrix | None:
-        """The term's scalar Hessian at rest [N/m], shape (V, V), or None."""
+    def rest_springs(self) -> tuple[Any, Any]:
+        """Springs in place of the term at rest [N/m]: the level's, shape (S,), and to fixed points, shape (V,); or 0.
+
+        They are the term's scalar Hessian: its couplings along the level's springs, negated, and its row sums.
+        """
         ...
 
 
@@ -115,13 +117,10 @@ class ForceModule:
         """Sum of the terms' Hessian diagonals [N/m]."""
         return torch.stack([term.diagonal(x) for term in self.forces]).sum(dim=0)
 
-    def rest_matrix(self) -> sp.csr_matrix:
-        """Sum of the terms' scalar rest Hessians [N/m], shape (V, V); zero if no term has a Hessian."""
-        parts = [matrix for term in self.forces if (matrix := term.rest_matrix()) is not None]
-        total = parts[0]
-        for part in parts[1:]:
-            total = total + part
-        return sp.csr_matrix(total)
+    def rest_springs(self) -> tuple[Any, Any]:
+        """Sums of the terms' springs at rest, as in `Force` [N/m], shapes (S,) and (V,)."""
+        between, fixed = zip(*(term.rest_springs() for term in self.forces), strict=True)
+        return sum(between), sum(fixed)
 
 
 def _gather_kernel(dtype: torch.dtype) -> wp.Kernel:

@@ -21,7 +21,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.sparse as sp
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -182,38 +181,9 @@ class Bending:
             add_at(total, each.corners.long().reshape(-1), value.reshape(-1))
         return total
 
-    def rest_matrix(self) -> sp.csr_matrix:
-        """The Hessian of the rest shape's pattern, each hinge unfolded flat [N/m]: w row^T row (Bergou et al. 2006).
-
-        A row is the derivative of the angle by the corners' heights above the flat hinge. Constants are in the null
-        space, and on a flat rest shape every linear function is too.
-        """
-        count, rest = self._level.vertex_count, self._level.rest.double().cpu().numpy()
-        total = sp.csr_matrix((count, count))
-        for each in self._kinds:
-            hinges, weight = each.corners.cpu().numpy(), self.weight[each.which].double().cpu().numpy()
-            row, width = flat_rows(rest, hinges), hinges.shape[1]
-            blocks = weight[:, None, None] * row[:, :, None] * row[:, None, :]
-            rows, columns = np.repeat(hinges, width, axis=1).ravel(), np.tile(hinges, (1, width)).ravel()
-            total = total + sp.csr_matrix((blocks.ravel(), (rows, columns)), shape=(count, count))
-        return sp.csr_matrix(total)
-
-
-def flat_rows(rest: np.ndarray, hinges: np.ndarray) -> np.ndarray:
-    """dtheta/dz of each flattened hinge [1/m], in the shape of the corners; zero at triangles without area."""
-    xi, xj, xk, xl = (rest[hinges[:, columns]].mean(axis=1) for columns in _places(hinges.shape[1]))
-    axis, ik, il = xj - xi, xk - xi, xl - xi
-    square = (axis**2).sum(axis=1)
-    size = square + (ik**2).sum(axis=1) + (il**2).sum(axis=1)
-    square = np.maximum(square, 1e-12 * size + 1e-300)
-    double = np.stack([np.linalg.norm(np.cross(axis, side), axis=1) for side in (ik, il)], axis=1)
-    whole = (double > 1e-12 * size[:, None]).all(axis=1, keepdims=True)
-    inverse_height = np.where(whole, np.sqrt(square)[:, None] / np.where(whole, double, 1.0), 0.0)
-    foot = np.stack([(side * axis).sum(axis=1) / square for side in (ik, il)], axis=1)
-    at_i, at_j = -(inverse_height * (1.0 - foot)).sum(axis=1), -(inverse_height * foot).sum(axis=1)
-    at = (at_i, at_j, inverse_height[:, 0], inverse_height[:, 1])
-    places = _places(hinges.shape[1])
-    return np.stack([each / len(columns) for each, columns in zip(at, places, strict=True) for _ in columns], axis=1)
+    def rest_springs(self) -> tuple[np.ndarray, float]:
+        """Springs with the couplings of the rest shape's pattern, each hinge unfolded flat [N/m], shape (S,)."""
+        return self._level.hinge_couplings @ self.weight.double().cpu().numpy(), 0.0
 
 
 def hinge_jacobian(

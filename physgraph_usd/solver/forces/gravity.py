@@ -9,7 +9,6 @@ height.
 from __future__ import annotations
 
 import numpy as np
-import scipy.sparse as sp
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -58,6 +57,6 @@ class Gravity:
         """Zero: the energy is linear."""
         return torch.zeros_like(x[:, 0])
 
-    def rest_matrix(self) -> sp.csr_matrix | None:
+    def rest_springs(self) -> tuple[float, float]:
         """None: the energy is linear."""
-        return None
+        return 0.0, 0.0

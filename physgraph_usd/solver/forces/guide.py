@@ -139,10 +139,10 @@ class Guide:
         spread = self._map.spread_matrix
         return sp.csr_matrix(spread @ sp.diags(self._coarse_weight) @ spread.T + sp.diags(self._pin_weight))
 
-    def rest_matrix(self) -> sp.csr_matrix:
-        """The lumped guide [N/m]: the row sums of R^T W R on the diagonal.
+    def rest_springs(self) -> tuple[float, np.ndarray]:
+        """The lumped guide [N/m]: the row sums of R^T W R and the pins, shape (V,).
 
         The exact product couples every pair of fine vertices around a coarse vertex, which would fill the factor.
         Lumping is accurate for long waves; for short waves stretch and bending outweigh the guide.
         """
-        return sp.csr_matrix(sp.diags(self._map.spread_matrix @ self._coarse_weight + self._pin_weight))
+        return 0.0, self._map.spread_matrix @ self._coarse_weight + self._pin_weight

@@ -30,7 +30,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import scipy.sparse as sp
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -165,19 +164,16 @@ class Membrane:
         total = torch.zeros_like(self._level.spacing)
         return add_at(total, self._level.membrane.long().reshape(-1), value.reshape(-1))
 
-    def rest_matrix(self) -> sp.csr_matrix:
+    def rest_springs(self) -> tuple[np.ndarray, float]:
         """The trace of each block of the Hessian at rest [N/m]: C11 + C66 along the warp, C22 + C66 along the weft.
 
-        On an equilateral mesh with G = 0.375 Y the matrix equals the springs' matrix.
+        On an equilateral mesh with G = 0.375 Y these are the edge springs, shape (S,).
         """
-        triangles = self._level.membrane.cpu().numpy()
-        gradient = shape_gradients(self._level).double().cpu().numpy()
-        c11, c22, _, c66 = (each.double().cpu().numpy() for each in self._stiffnesses)
-        stiffness = np.stack([c11 + c66, c22 + c66], axis=1)
-        blocks = np.einsum("tm,tim,tjm->tij", stiffness, gradient, gradient)
-        rows, columns = np.repeat(triangles, 3, axis=1).ravel(), np.tile(triangles, (1, 3)).ravel()
-        count = self._level.vertex_count
-        return sp.csr_matrix((blocks.ravel(), (rows, columns)), shape=(count, count))
+        level, (g1, g2) = self._level, shape_gradients(self._level).double().unbind(dim=2)
+        c11, c22, _, c66 = (each.double()[:, None] for each in self._stiffnesses)
+        coupling = (c11 + c66) * g1 * g1.roll(-1, 1) + (c22 + c66) * g2 * g2.roll(-1, 1)
+        sides, values = (each.cpu().numpy().ravel() for each in (level.sides, -coupling))
+        return np.bincount(sides, values, len(level.springs)), 0.0
 
     @property
     def _stiffnesses(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -14,7 +14,6 @@ Springs cannot express an independent shear stiffness: an isotropic sheet of spr
 from __future__ import annotations
 
 import numpy as np
-import scipy.sparse as sp
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -75,11 +74,6 @@ class Stretch:
         value = self.stiffness * (1.0 + 2.0 * lateral) / 3.0
         return add_at(torch.zeros_like(self._level.spacing), ends.T.reshape(-1), value.repeat(2))
 
-    def rest_matrix(self) -> sp.csr_matrix:
-        """Graph Laplacian of the springs [N/m]."""
-        ends = self._level.springs.cpu().numpy()
-        k = self.stiffness.double().cpu().numpy()
-        rows = np.concatenate([ends[:, 0], ends[:, 1], ends[:, 0], ends[:, 1]])
-        columns = np.concatenate([ends[:, 0], ends[:, 1], ends[:, 1], ends[:, 0]])
-        count = self._level.vertex_count
-        return sp.csr_matrix((np.concatenate([k, k, -k, -k]), (rows, columns)), shape=(count, count))
+    def rest_springs(self) -> tuple[np.ndarray, float]:
+        """The springs [N/m], shape (S,)."""
+        return self.stiffness.double().cpu().numpy(), 0.0

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import copy
 
-import scipy.sparse as sp
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -82,6 +82,6 @@ class Tether:
         """k_t m_v [N/m]."""
         return self._weight.to(x)
 
-    def rest_matrix(self) -> sp.csr_matrix:
-        """k_t m_v on the diagonal [N/m]."""
-        return sp.csr_matrix(sp.diags(self._weight.double().cpu().numpy()))
+    def rest_springs(self) -> tuple[float, np.ndarray]:
+        """k_t m_v to fixed points [N/m], shape (V,)."""
+        return 0.0, self._weight.double().cpu().numpy()

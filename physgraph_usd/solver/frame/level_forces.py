@@ -19,7 +19,7 @@ from ..forces.guide import Guide, GuideMap
 from ..forces.membrane import in_plane_terms
 from ..forces.tether import Tether
 from ..integrate.base import ForceField, Preconditioner, System
-from ..integrate.metric import Metric, on_edges
+from ..integrate.metric import Metric, laplacian
 from ..integrate.saddle import facets
 from ..level import Level
 from ..mesh.recorded import Recordings
@@ -106,7 +106,7 @@ class LevelForces:
         if self.lent is not None and self.lent.bending.fabrics == fabrics:
             return self.lent.bending
         raised = [each.raises_bending for each in self.garments]
-        return ElasticTerms(fabrics, self.level, (bending_term(self.level, fabrics, raised=raised),))
+        return ElasticTerms(fabrics, self.plain, (bending_term(self.plain, fabrics, raised=raised),))
 
     @cached_property
     def guide(self) -> Guide:
@@ -118,8 +118,9 @@ class LevelForces:
     @cached_property
     def metric(self) -> Metric:
         """The rest Hessian of all terms."""
-        matrix = on_edges(self._module.rest_matrix(), self.level.springs.cpu().numpy())
-        return Metric(matrix, free=self.level.free, dtype=self.level.dtype, ups=self.level.ups)
+        matrix = laplacian(self.plain.springs.cpu().numpy(), *self._module.rest_springs())
+        last = None if self.lent is None else self.lent.metric
+        return Metric(matrix, free=self.plain.free, dtype=self.plain.dtype, ups=self.plain.ups, last=last)
 
     @cached_property
     def rough_metric(self) -> Metric:

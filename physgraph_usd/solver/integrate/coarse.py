@@ -58,7 +58,7 @@ class CoarseLevels:
         """Take a metric to its coarser levels.
 
         Args:
-            matrix: H [N/m], zero at fixed vertices, shape (V, V).
+            matrix: H [N/m], any at fixed vertices, with a full diagonal, shape (V, V).
             ups: Linear map to each level from the next coarser one, finest first.
             onto: Projection of moves of the finest level, zero at fixed vertices, shape (V, V).
             dtype: Scalar type of forces.
@@ -66,22 +66,34 @@ class CoarseLevels:
         """
         first = ups[0].alike(onto @ ups[0].matrix) if ups else Stencil(onto, dtype=dtype, device=device)
         self.ups = [first, *ups[1:]]
-        basis = sp.identity(matrix.shape[0], format="csr")
-        known, weights = list[np.ndarray](), list[sp.csr_matrix]()
+        basis, weights = sp.identity(matrix.shape[0], format="csr"), list[sp.csr_matrix]()
+        pattern = sp.csr_matrix((np.ones(matrix.nnz), matrix.indices, matrix.indptr), shape=matrix.shape)
         for up in self.ups:
             basis = sp.csr_matrix(basis @ up.matrix)
-            matrix = sp.csr_matrix(up.matrix.T @ matrix @ up.matrix)
-            known.append(matrix.diagonal())
+            pattern = abs(up.transposed.matrix) @ pattern @ abs(up.matrix)
             weights.append(sp.csr_matrix(basis.multiply(basis).T))
-        apart = sp.diags((matrix.diagonal() <= 0).astype(np.float64))  # Identity rows where nothing moves.
-        pattern = sp.csr_matrix(abs(matrix) + abs(basis.T) @ abs(basis) + sp.identity(basis.shape[1]))
-        self._factors = Factors(pattern, dtype=dtype, device=device)
-        known[-1:], weights[-1:] = [self._factors.taken(matrix + apart)], [_squares(basis, self._factors)]
-        self._sizes = [len(each) for each in known]
-        self._known = torch.as_tensor(np.concatenate(known), device=device)
+        self._factors = Factors(sp.csr_matrix(pattern + sp.identity(basis.shape[1])), dtype=dtype, device=device)
+        weights[-1] = _squares(basis, self._factors)
+        self._sizes, self._known = [each.shape[0] for each in weights], self._entries(matrix)
         self._weights = Stencil(sp.csr_matrix(sp.vstack(weights)), dtype=torch.float64, device=device)
         self._dtype, self.dense = dtype, device != "cpu" and 0 < basis.shape[1] <= MOST_DENSE
         self.recordings = Recordings()
+
+    def of(self, matrix: sp.csr_matrix) -> CoarseLevels:
+        """The levels of another matrix H [N/m] of the same pattern, shape (V, V)."""
+        other = copy.copy(self)
+        other._known = self._entries(matrix)
+        return other
+
+    def _entries(self, matrix: sp.csr_matrix) -> Float[Tensor, " entries"]:
+        """Diagonals of all H_l, finest first, of the cage all entries [N/m]."""
+        known = list[np.ndarray]()
+        for up in self.ups:
+            matrix = sp.csr_matrix(up.transposed.matrix @ (matrix @ up.matrix))
+            known.append(matrix.diagonal())
+        apart = sp.diags((known[-1] <= 0).astype(np.float64))  # Identity rows where nothing moves.
+        known[-1] = self._factors.taken(sp.csr_matrix(matrix + apart))
+        return torch.as_tensor(np.concatenate(known), device=self._factors.rows.device)
 
     def held(self, stiff: Float[Tensor, " vertices"]) -> tuple[list[Tensor], Solver | Float[Tensor, "cage cage"]]:
         """Diagonals of the levels between [N/m], finest first, and the solve of the cage, given K [N/m].

@@ -25,7 +25,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ..mesh.recorded import Recordings, Work
+from ..mesh.recorded import Work
 from ..mesh.stencil import Stencil, three_columns
 from .base import Solver
 from .coarse import COARSE, REGULARISATION, CoarseLevels
@@ -35,25 +35,22 @@ ROUGH = 2.0
 """Weight of the finest level's part of P."""
 
 
-def on_edges(matrix: sp.csr_matrix, edges: np.ndarray) -> sp.csr_matrix:
-    """A graph Laplacian with a matrix's negative couplings along edges and the same row sums.
-
-    The rest form of bending also couples vertices across two triangles. Including the additional couplings doubles the
-    time of a solve and hardly lowers the energy at equal steps.
+def laplacian(edges: np.ndarray, between: np.ndarray, fixed: np.ndarray) -> sp.csr_matrix:
+    """The matrix of springs, without those that push.
 
     Args:
-        matrix: Symmetric, positive semi-definite [N/m], shape (V, V).
         edges: End vertices, shape (E, 2).
+        between: Stiffness of a spring along each edge [N/m], shape (E,).
+        fixed: Stiffness between each vertex and a fixed point [N/m], not below 0, shape (V,).
 
     Returns:
-        Symmetric positive semi-definite [N/m], shape (V, V).
+        Symmetric positive semi-definite [N/m], shape (V, V), of the same pattern for all stiffnesses.
     """
-    count = matrix.shape[0]
-    ends = np.asarray(edges, dtype=np.int64)
-    pattern = sp.csr_matrix((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(count, count))
-    couplings = sp.csr_matrix(-(matrix.multiply(pattern + pattern.T)).minimum(0.0))
-    excess = np.asarray(matrix.sum(axis=1)).ravel() + np.asarray(couplings.sum(axis=1)).ravel()
-    return sp.csr_matrix(sp.diags(excess) - couplings)
+    count, between, (a, b) = len(fixed), np.maximum(between, 0.0), np.asarray(edges).T
+    diagonal = fixed + np.bincount(a, between, count) + np.bincount(b, between, count)
+    itself = np.arange(count, dtype=a.dtype)
+    place = np.concatenate([a, b, itself]), np.concatenate([b, a, itself])
+    return sp.csr_matrix((np.concatenate([-between, -between, diagonal]), place), shape=(count, count))
 
 
 class Metric:
@@ -70,6 +67,7 @@ class Metric:
         free: Bool[Tensor, "vertices 1"],
         dtype: torch.dtype,
         ups: Sequence[Stencil] = (),
+        last: Metric | None = None,
     ) -> None:
         """Take a scalar Hessian at rest.
 
@@ -78,7 +76,9 @@ class Metric:
             free: False at fixed vertices, whose rows become identity rows.
             dtype: Scalar type of the right-hand sides.
             ups: Linear map to each level from the next coarser one, finest first.
+            last: A metric of the same cloth with a matrix of the same pattern, for what only that determines; or None.
         """
+        self._alike: CoarseLevels | None = None if last is None else last.__dict__.get("coarse", last._alike)
         self._free, self._matrix, self._ups, device = free.squeeze(1), matrix, tuple(ups), str(free.device)
         self._mask = three_columns(self._free.to(dtype))
         self._merged: MergedMetric | None = None
@@ -104,20 +104,16 @@ class Metric:
         values[factors.diagonal] += torch.where(self._free, REGULARISATION, 1.0)
         return factors.of(values)
 
-    @property
-    def recordings(self) -> Recordings:
-        """Products by levels, recorded on a card."""
-        return self.coarse.recordings
-
     @cached_property
     def coarse(self) -> CoarseLevels:
         """The coarser levels."""
         if self._unscaled is not None:
             metric, stiffer = self._unscaled
             return metric.coarse.scaled(stiffer)
-        kept, dtype = sp.csr_matrix(self._keep @ self._matrix @ self._keep), self._mask.dtype
-        device = str(self._mask.device)
-        return CoarseLevels(kept, self._ups, self._onto, dtype=dtype, device=device)
+        if self._alike is not None:
+            return self._alike.of(self._matrix)
+        dtype, device = self._mask.dtype, str(self._mask.device)
+        return CoarseLevels(self._matrix, self._ups, self._onto, dtype=dtype, device=device)
 
     @property
     def _onto(self) -> sp.csr_matrix:
@@ -173,7 +169,7 @@ class Metric:
         rough = ROUGH / self.gathered(three_columns(self.diagonal.to(stiff) + stiff)).clamp_min(tiny)
         between, cage = self.coarse.held(self.gathered(three_columns(stiff))[:, 0])
         middle = [three_columns(1.0 / each.clamp_min(tiny)) for each in between]
-        return Work(self, self._by_levels, (cage, rough, *middle))
+        return Work(self.coarse.ups[0], self._by_levels, (cage, rough, *middle))
 
     def _by_levels(self, force: Tensor, *given: Any) -> tuple[Tensor]:
         return (self.spread(self.coarse.move(self.gathered(force), *given)),)
@@ -185,7 +181,7 @@ class Metric:
 
     def estimate(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
         """An estimate of H0^-1 F [m], without a factor: P F / c, since errors are smooth after a few steps."""
-        return self._of_free.run(self.recordings, force)[0].mul_(1.0 / COARSE)
+        return self._of_free.run(self.coarse.recordings, force)[0].mul_(1.0 / COARSE)
 
 
 class MergedMetric(Metric):

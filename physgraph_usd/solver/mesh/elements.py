@@ -128,3 +128,17 @@ def hinge_geometry(x: np.ndarray, hinges: np.ndarray) -> tuple[np.ndarray, np.nd
     length = norm(axis)
     sine = dot(cross(n1, n2), axis) / np.maximum(length, np.finfo(float).tiny)
     return np.arctan2(sine, dot(n1, n2)), 0.5 * norm(n1), 0.5 * norm(n2), length
+
+
+def flat_rows(x: np.ndarray, hinges: np.ndarray) -> np.ndarray:
+    """dtheta/dz of each hinge, unfolded flat [1/m], shape (6, H) as its corners; zero at triangles without area."""
+    i, j, k, other_k, ell, other_l = at_corners(x, hinges)
+    axis, sides = j - i, (0.5 * (k + other_k) - i, 0.5 * (ell + other_l) - i)
+    square, size = dot(axis, axis), sum(dot(each, each) for each in (axis, *sides))
+    square = np.maximum(square, 1e-12 * size + 1e-300)
+    double = np.stack([norm(cross(axis, side)) for side in sides])
+    whole = (double > 1e-12 * size).all(axis=0)
+    at_k, at_l = np.where(whole, np.sqrt(square) / np.where(whole, double, 1.0), 0.0)
+    foot_k, foot_l = (dot(side, axis) / square for side in sides)
+    at_i, at_j = -(at_k * (1.0 - foot_k) + at_l * (1.0 - foot_l)), -(at_k * foot_k + at_l * foot_l)
+    return np.stack([at_i, at_j, 0.5 * at_k, 0.5 * at_k, 0.5 * at_l, 0.5 * at_l])

@@ -190,8 +190,9 @@ def _level(index: int, level: Level, module: ForceModule, base: torch.Tensor) ->
     }
     for name, value in values.items():
         yield f"{name}{index}", value.double().cpu().numpy() if value.is_floating_point() else value.cpu().numpy()
-    yield f"bound{index}", guide.rest_matrix().diagonal()
-    yield f"diagonal{index}", springs.rest_matrix().diagonal()
+    yield f"bound{index}", guide.rest_springs()[1]
+    values = springs.stiffness.double().cpu().numpy().repeat(2)
+    yield f"diagonal{index}", np.bincount(level.springs.cpu().numpy().ravel(), values, level.vertex_count)
     yield from _sparse("", index, guide.hessian())
 
 
