@@ -258,10 +258,9 @@ def test_a_metric_of_new_materials_takes_over_what_only_the_mesh_determines(leve
     assert metric.coarse.ups is levels.ups
     touched = torch.as_tensor(np.random.default_rng(1).random(len(side)) * 10.0 * float(alone.diagonal.mean()))
     force = side * torch.as_tensor(np.random.default_rng(4).normal(size=(len(side), 3)))
-    of_last, of_own = (
-        each.by_levels(touched).function(force, *each.by_levels(touched).given) for each in (metric, alone)
-    )
-    assert torch.equal(of_last[0], of_own[0])
+    works = [each.by_levels(touched) for each in (metric, alone)]
+    one, other = (work.function(force, *work.given)[0] for work in works)
+    assert torch.equal(one, other)
 
 
 def test_a_factor_that_something_holds_to_the_end_of_the_process_is_freed_without_a_word():

@@ -181,10 +181,10 @@ class Elements:
         # Not `contiguous`: an empty tensor keeps strides that Warp refuses.
         corners = corners.clone(memory_format=torch.contiguous_format)
         packed = wp.from_torch(corners, dtype=wp.types.vector(length=width, dtype=wp.int32))
-        self.energy = torch.zeros(self.count, dtype=dtype, device=device)
+        self.energy = torch.empty(self.count, dtype=dtype, device=device)
         # One more row: the gather reads four numbers at once.
-        self.corner_force = torch.zeros((self.count * width + 1, 3), dtype=dtype, device=device)[:-1]
-        x = vectors(torch.zeros_like(level.rest))
+        self.corner_force = torch.empty((self.count * width + 1, 3), dtype=dtype, device=device)[:-1]
+        x = vectors(level.rest)
         arrays = [vectors(each) if each.ndim == 2 else wp.from_torch(each) for each in parameters]
         buffers = [wp.from_torch(self.energy), vectors(self.corner_force)]
         self._tensors = (corners, starts, slots, parameters)

@@ -111,11 +111,12 @@ class LearnedMetric:
 
     def _recorded(self, system: System, carry: Carry, fused: FusedPhysgraph, works: tuple[Work, Work]) -> Carry:
         """A step on a card as a single recording."""
-        memory, level, (forces, metric), count = carry.memory, level_of(system.level), works, len(works[0].given)
+        memory, level, (forces, metric) = carry.memory, level_of(system.level), works
+        count, rest = len(forces.given), len(forces.given) + len(metric.given)
         assert system.recordings is not None
 
         def whole(x: Tensor, force: Tensor, image: Tensor, per_edge: Tensor, *more: Tensor) -> list[Tensor]:
-            aims, held, past = more[:count], more[count:-PAST], more[-PAST:]
+            aims, held, past = more[:count], more[count:rest], more[rest:]
             move = _moved(fused, system, (x, force, image, *past))
             energy, after = forces.function(x + move, *aims)[:2]
             after = system.masked(after)
@@ -162,10 +163,6 @@ class LearnedMetric:
         coefficients = self._network(stacked / system.spacing.reshape(-1, 1, 1), carry.memory.step)  # V N
         move = (coefficients.unsqueeze(2) * stacked).sum(dim=1)  # V 3
         return limited(move, system.spacing) * system.free
-
-
-PAST = 5 + 4 * SECANTS
-"""Number of tensors that hold a step's past: diagonal of H0, bias, force, two images, and four for each secant."""
 
 
 def _moved(fused: FusedPhysgraph, system: System, given: Sequence[Tensor]) -> Tensor:

@@ -108,9 +108,10 @@ class Stencil:
 
     def apply(self, x: Float[Tensor, "columns 3"]) -> Float[Tensor, "rows 3"]:
         """The matrix times x."""
-        out = torch.zeros((self.shape[0], 3), dtype=x.dtype, device=x.device)
-        if not self._empty:
-            self._launch({3: vectors(x), 4: vectors(out)})
+        out = torch.empty((self.shape[0], 3), dtype=x.dtype, device=x.device)
+        if self._empty:
+            return out.zero_()
+        self._launch({3: vectors(x), 4: vectors(out)})
         return out
 
 
