@@ -56,8 +56,12 @@ def test_what_a_card_records_reads_nothing_back_and_steps_alike(tmp_path: Path, 
         if "_search" in name or not all(isinstance(each, Tensor) for each in given):  # On the CPU these read numbers.
             return kept(self, key, function, *given)
         called[name] += 1
+        systems = [each.cell_contents for each in function.__closure__ or () if isinstance(each.cell_contents, System)]
+        before = [set(vars(each)) for each in systems]
         with Reading():
-            return kept(self, key, function, *given)
+            made = kept(self, key, function, *given)
+        assert before == [set(vars(each)) for each in systems]  # A recording's values exist after a replay only.
+        return made
 
     def both(self: LearnedMetric, system: System, carry: Carry, fused: Any, works: Any) -> Carry:
         whole, move = recorded(self, system, carry, fused, works), self.propose(system, carry)

@@ -117,7 +117,7 @@ class LearnedMetric:
 
         def whole(x: Tensor, force: Tensor, image: Tensor, per_edge: Tensor, *more: Tensor) -> list[Tensor]:
             aims, held, past = more[:count], more[count:rest], more[rest:]
-            move = _moved(fused, system, (x, force, image, *past))
+            move = _moved(fused, level, (x, force, image, *past))
             energy, after = forces.function(x + move, *aims)[:2]
             after = system.masked(after)
             there = system.masked(metric.function(after, *held)[0])
@@ -125,9 +125,8 @@ class LearnedMetric:
             fields = torch.stack([x + move, move, after, there, yields, change])
             return [torch.stack([energy, remaining]), curvature, fields]
 
-        bias, stiffness = fused.bias_at(memory.step), system.rest_diagonal_columns
         now = carry.x, carry.force, carry.preconditioned, system.per_edge, *forces.given, *metric.given
-        past = stiffness, bias, memory.force, *memory.images, *_parts(memory.secants)
+        past = _past(fused, system, memory)
         numbers, curvature, fields = system.recordings.run((fused, forces.key, metric.key), whole, *now, *past)
         x, move, force, image, yields, change = fields
         system.evaluations, system.metric_solves = system.evaluations + 1, system.metric_solves + 1
@@ -140,12 +139,11 @@ class LearnedMetric:
         fused, memory, level = self._fused(system), carry.memory, system.level
         if fused is None:
             return self._combined(system, carry)
-        bias, stiffness = fused.bias_at(memory.step), system.rest_diagonal_columns
         if level is None or not system.on_card:
-            return _by_kernel(fused, system, carry, stiffness=stiffness, bias=bias)
-        past = stiffness, bias, memory.force, *memory.images, *_parts(memory.secants)
-        now = carry.x, carry.force, carry.preconditioned, *past
-        return level.recordings.run(fused, lambda *given: [_moved(fused, system, given)], *now)[0]
+            bias, stiffness = fused.bias_at(memory.step), system.rest_diagonal_columns
+            return _by_kernel(fused, level, carry, bias=bias, sizes=(stiffness, system.spacing, system.reach))
+        now = carry.x, carry.force, carry.preconditioned, *_past(fused, system, memory)
+        return level.recordings.run(fused, lambda *given: [_moved(fused, level, given)], *now)[0]
 
     def _fused(self, system: System) -> FusedPhysgraph | None:
         """The network as kernels, or None if not fused."""
@@ -165,18 +163,20 @@ class LearnedMetric:
         return limited(move, system.spacing) * system.free
 
 
-def _moved(fused: FusedPhysgraph, system: System, given: Sequence[Tensor]) -> Tensor:
-    """`_by_kernel` of tensors alone: x, F, H0^-1 F, and the past."""
-    x, force, image, stiffness, bias, before, first, second, *parts = given
-    fields, product = zip(*[iter(parts)] * 4, strict=True), partial(garment_dot, system.level)
+def _past(fused: FusedPhysgraph, system: System, memory: StepHistory) -> list[Tensor]:
+    """What a step depends on besides x, F and H0^-1 F: all of the system that it reads, and four tensors a secant."""
+    secants = [part for each in memory.secants for part in (each.move, each.yields, each.image, each.curvature)]
+    sizes = system.rest_diagonal_columns, system.spacing, system.reach
+    return [*sizes, fused.bias_at(memory.step), memory.force, *memory.images, *secants]
+
+
+def _moved(fused: FusedPhysgraph, level: Level, given: Sequence[Tensor]) -> Tensor:
+    """`_by_kernel` of tensors alone: x, F, H0^-1 F, and `_past`."""
+    x, force, image, stiffness, spacing, reach, bias, before, first, second, *parts = given
+    fields, product = zip(*[iter(parts)] * 4, strict=True), partial(garment_dot, level)
     secants = tuple(Secant(*each, dot=product, known=curvature) for *each, curvature in fields)
     carry = Carry(x, 0.0, force, image, memory=StepHistory(before, (first, second), secants))
-    return _by_kernel(fused, system, carry, stiffness=stiffness, bias=bias)
-
-
-def _parts(secants: Sequence[Secant]) -> list[Tensor]:
-    """Four tensors of each secant."""
-    return [part for each in secants for part in (each.move, each.yields, each.image, each.curvature)]
+    return _by_kernel(fused, level, carry, bias=bias, sizes=(stiffness, spacing, reach))
 
 
 def _differences(
@@ -193,21 +193,23 @@ def _differences(
     return made.yields, made.image, made.curvature, root_sum(image * per_edge)
 
 
-def _by_kernel(fused: FusedPhysgraph, system: System, carry: Carry, *, stiffness: Tensor, bias: Tensor) -> Tensor:
+def _by_kernel(
+    fused: FusedPhysgraph, level: Level | None, carry: Carry, *, bias: Tensor, sizes: tuple[Tensor, Tensor, Tensor]
+) -> Tensor:
     """Displacement of the next step [m], by the network as a kernel.
 
     Args:
         carry: The state.
-        stiffness: Diagonal of H0 [N/m], in three columns.
         bias: `FusedPhysgraph.bias_at` the number of steps made.
+        sizes: Diagonal of H0 [N/m], in three columns; the spacing, and the spacing, 0 at fixed vertices [m].
     """
 
     def frame() -> VertexFrame:
-        return VertexFrame(level_of(system.level), carry.x)
+        return VertexFrame(level_of(level), carry.x)
 
-    whole = partial(_vector, carry=carry, stiffness=stiffness)
-    vectors = vectors_of(fused.bases, whole, frame=frame)
-    return fused(vectors, system.spacing, system.reach, bias, frame=frame)
+    stiffness, spacing, reach = sizes
+    vectors = vectors_of(fused.bases, partial(_vector, carry=carry, stiffness=stiffness), frame=frame)
+    return fused(vectors, spacing, reach, bias, frame=frame)
 
 
 def _vector(name: str, *, carry: Carry, stiffness: Tensor) -> Tensor:
