@@ -21,7 +21,7 @@ from physgraph_usd.solver.integrate.base import Carry, System
 from physgraph_usd.solver.integrate.coarse import CoarseLevels
 from physgraph_usd.solver.integrate.learned import LearnedMetric
 from physgraph_usd.solver.level import Level
-from physgraph_usd.solver.mesh.recorded import CALLS, Recordings
+from physgraph_usd.solver.mesh.recorded import CALLS, Recordings, _Input
 
 READS = {"_local_scalar_dense", "nonzero", "masked_select", "_unique2", "is_nonzero"}
 """Operations that wait for a card."""
@@ -40,18 +40,10 @@ class Reading(TorchDispatchMode):
         return func(*args, **(kwargs or {}))
 
 
-def test_what_a_card_records_reads_nothing_back_and_steps_alike(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Three frames of a skirt on its body, the cage solved, pairs padded and steps made as on a card.
+def checked(called: Counter[str], kept: Any) -> Any:
+    """`Recordings.run` that notes names in a counter, and refuses what a recording cannot hold."""
 
-    Each step is made by parts too, as with an exact metric.
-    """
-    called, kept, made = Counter[str](), Recordings.run, CoarseLevels.__init__
-
-    def dense(self: CoarseLevels, *given: Any, **more: Any) -> None:
-        made(self, *given, **more)
-        self.dense = True
-
-    def checked(self: Recordings, key: Any, function: Any, *given: Any) -> Sequence[Tensor]:
+    def run(self: Recordings, key: Any, function: Any, *given: Any) -> Sequence[Tensor]:
         name = function.__qualname__
         if "_search" in name or not all(isinstance(each, Tensor) for each in given):  # On the CPU these read numbers.
             return kept(self, key, function, *given)
@@ -63,6 +55,20 @@ def test_what_a_card_records_reads_nothing_back_and_steps_alike(tmp_path: Path, 
         assert before == [set(vars(each)) for each in systems]  # A recording's values exist after a replay only.
         return made
 
+    return run
+
+
+def test_what_a_card_records_reads_nothing_back_and_steps_alike(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Three frames of a skirt on its body, the cage solved, pairs padded and steps made as on a card.
+
+    Each step is made by parts too, as with an exact metric.
+    """
+    called, made, recorded = Counter[str](), CoarseLevels.__init__, LearnedMetric._recorded
+
+    def dense(self: CoarseLevels, *given: Any, **more: Any) -> None:
+        made(self, *given, **more)
+        self.dense = True
+
     def both(self: LearnedMetric, system: System, carry: Carry, fused: Any, works: Any) -> Carry:
         whole, move = recorded(self, system, carry, fused, works), self.propose(system, carry)
         parts = self._reached(system, carry, carry.x + move, move)
@@ -73,9 +79,8 @@ def test_what_a_card_records_reads_nothing_back_and_steps_alike(tmp_path: Path, 
             assert torch.equal(one.curvature, other.curvature)
         return whole
 
-    recorded = LearnedMetric._recorded
     monkeypatch.setattr(LearnedMetric, "_recorded", both)
-    monkeypatch.setattr(Recordings, "run", checked)
+    monkeypatch.setattr(Recordings, "run", checked(called, Recordings.run))
     monkeypatch.setattr(CoarseLevels, "__init__", dense)
     monkeypatch.setattr(SelfContact, "aims", SelfContact.with_room)
     monkeypatch.setattr(System, "on_card", property(lambda self: self.recordings is not None))
@@ -86,6 +91,16 @@ def test_what_a_card_records_reads_nothing_back_and_steps_alike(tmp_path: Path, 
     assert all("error" not in each.record for each in outcomes)
     assert {name.split(".")[0] for name in called} == {"total_of", "MovingFrames", "Metric", "LearnedMetric"}
     assert called["LearnedMetric._recorded.<locals>.whole"] > 10
+
+
+def test_a_recording_is_given_again_what_changed():
+    x = torch.zeros(3)
+    own = _Input(x)
+    assert own.differs(x)
+    assert not own.differs(x)
+    x += 1.0
+    assert own.differs(x)
+    assert own.differs(x.clone())
 
 
 def test_room_for_more_pairs_changes_no_bit():

@@ -164,7 +164,7 @@ class LearnedMetric:
 
 
 def _past(fused: FusedPhysgraph, system: System, memory: StepHistory) -> list[Tensor]:
-    """What a step depends on besides x, F and H0^-1 F: all of the system that it reads, and four tensors a secant."""
+    """All that a step reads besides x, F and H0^-1 F: three sizes of vertices, the past, and four tensors a secant."""
     secants = [part for each in memory.secants for part in (each.move, each.yields, each.image, each.curvature)]
     sizes = system.rest_diagonal_columns, system.spacing, system.reach
     return [*sizes, fused.bias_at(memory.step), memory.force, *memory.images, *secants]
