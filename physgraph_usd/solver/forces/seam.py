@@ -128,11 +128,13 @@ class SewnForces:
     def __init__(self, field: ForceModule, seam: Seam) -> None:
         """Take the forces of the unsewn cloth, and the seam."""
         self._field, self._seam = field, seam
-        self.work = Work((seam, *field.work.key), self._sewn, field.work.given)
+        apart = field.work
 
-    def _sewn(self, x: Tensor, *given: Tensor) -> tuple[Tensor, Tensor]:
-        energy, force, *_ = self._field.work.function(self._seam.closed(x), *given)
-        return energy, self._seam.shared(force)
+        def sewn(x: Tensor, *given: Tensor) -> tuple[Tensor, Tensor]:
+            energy, force, *_ = apart.function(seam.closed(x), *given)
+            return energy, seam.shared(force)
+
+        self.work = Work((seam, *apart.key), sewn, apart.given)
 
     def energy_and_force(self, x: Float[Tensor, "vertices 3"]) -> tuple[Float[Tensor, ""], Float[Tensor, "vertices 3"]]:
         """Energy [J] and force [N] with the seams of x [m] closed."""

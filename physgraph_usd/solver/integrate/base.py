@@ -109,9 +109,11 @@ class System:
         given = *field.work.given, *metric.work.given
         return (field.work, metric.work) if all(isinstance(each, Tensor) for each in given) else None
 
-    def masked(self, field: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
-        """The field, and zero at fixed vertices."""
-        return field if self._all_free else field * self._mask
+    @cached_property
+    def masked(self) -> Callable[[Tensor], Tensor]:
+        """Gives a field of shape (V, 3) that is zero at fixed vertices; holds nothing else of the system."""
+        mask = None if self._all_free else self._mask
+        return lambda field: field if mask is None else field * mask
 
     @cached_property
     def _mask(self) -> Float[Tensor, "vertices 3"]:

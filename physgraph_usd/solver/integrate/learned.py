@@ -112,15 +112,15 @@ class LearnedMetric:
     def _recorded(self, system: System, carry: Carry, fused: FusedPhysgraph, works: tuple[Work, Work]) -> Carry:
         """A step on a card as a single recording."""
         memory, level, (forces, metric) = carry.memory, level_of(system.level), works
-        count, rest = len(forces.given), len(forces.given) + len(metric.given)
+        count, rest, masked = len(forces.given), len(forces.given) + len(metric.given), system.masked
         assert system.recordings is not None
 
         def whole(x: Tensor, force: Tensor, image: Tensor, per_edge: Tensor, *more: Tensor) -> list[Tensor]:
             aims, held, past = more[:count], more[count:rest], more[rest:]
             move = _moved(fused, level, (x, force, image, *past))
             energy, after = forces.function(x + move, *aims)[:2]
-            after = system.masked(after)
-            there = system.masked(metric.function(after, *held)[0])
+            after = masked(after)
+            there = masked(metric.function(after, *held)[0])
             yields, change, curvature, remaining = _differences(level, force, after, image, there, move, per_edge)
             fields = torch.stack([x + move, move, after, there, yields, change])
             return [torch.stack([energy, remaining]), curvature, fields]
