@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import gc
 import subprocess
 import sys
+import weakref
 from itertools import pairwise
 
 import numpy as np
@@ -22,7 +24,7 @@ from physgraph_usd.solver.integrate import method_named
 from physgraph_usd.solver.integrate.base import ForceField, Integrator, System
 from physgraph_usd.solver.integrate.descend import solve_level
 from physgraph_usd.solver.integrate.factors import Factors
-from physgraph_usd.solver.integrate.metric import Metric, laplacian
+from physgraph_usd.solver.integrate.metric import MergedMetric, Metric, laplacian
 from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton
 from physgraph_usd.solver.integrate.stop import Budget
 
@@ -261,6 +263,28 @@ def test_a_metric_of_new_materials_takes_over_what_only_the_mesh_determines(leve
     works = [each.by_levels(touched) for each in (metric, alone)]
     one, other = (work.function(force, *work.given)[0] for work in works)
     assert torch.equal(one, other)
+
+
+@pytest.mark.parametrize("merged", [False, True])
+def test_metrics_are_freed_with_their_last_reference(merged: bool):
+    """They hold factors, on a card dense inverses: collecting garbage comes too late for those."""
+    mesh, rest = sheet(6, 5)
+    system, _ = finest_system(group_of(mesh, rest, level=1, dtype=torch.float64), wave(rest))
+    assert system.level is not None
+    assert isinstance(system.field, ForceModule)
+    matrix, count = laplacian(system.level.springs.numpy(), *system.field.rest_springs()), system.level.vertex_count
+    force, label = torch.ones((count, 3), dtype=torch.float64), np.arange(count) // 2
+    gc.disable()
+    try:
+        given = {"free": system.free, "dtype": torch.float64, "ups": system.level.ups}
+        metric = MergedMetric(matrix, label, **given) if merged else Metric(matrix, **given)
+        held = HeldMetric(metric, force[:, 0].contiguous())
+        held.held(held.short(held.solve(force)))
+        left = [weakref.ref(each) for each in (metric, held)]
+        del metric, held
+        assert [each() for each in left] == [None, None]
+    finally:
+        gc.enable()
 
 
 def test_a_factor_that_something_holds_to_the_end_of_the_process_is_freed_without_a_word():

@@ -10,8 +10,6 @@ The network makes its steps whole, without a line search, and gets half of P.
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -44,11 +42,8 @@ class HeldMetric:
             stiff: K [N/m].
         """
         self.stiff, self._plain = stiff, plain
-        self._levels = plain.by_levels(stiff)
-        self.work = Work(self._levels.key, self._shorter, self._levels.given)
-
-    def _shorter(self, *given: Any) -> tuple[Tensor]:
-        return (self._levels.function(*given)[0].mul_(SHORT),)
+        self._levels = levels = plain.by_levels(stiff)
+        self.work = Work(levels.key, lambda *given: (levels.function(*given)[0].mul_(SHORT),), levels.given)
 
     @staticmethod
     def of(plain: Metric, stiff: Float[Tensor, " vertices"], last: Preconditioner | None) -> Metric | HeldMetric:

@@ -53,11 +53,18 @@ def laplacian(edges: np.ndarray, between: np.ndarray, fixed: np.ndarray) -> sp.c
     return sp.csr_matrix((np.concatenate([-between, -between, diagonal]), place), shape=(count, count))
 
 
+def _same(field: Tensor) -> Tensor:
+    """A field on the vertices of cloth without merged vertices, whose matrix has a row for each."""
+    return field
+
+
 class Metric:
     """H0: the same matrix for x, y and z.
 
     Attributes:
         diagonal: Diagonal of H0 [N/m], float64; 1 at fixed vertices, shape (V,).
+        gathered: Gives the forces on the matrix's rows, given those on vertices [N], shape (V, 3).
+        spread: Gives the moves of vertices, given those of the matrix's rows [m], shape (V, 3).
     """
 
     def __init__(
@@ -81,6 +88,8 @@ class Metric:
         self._alike: CoarseLevels | None = None if last is None else last.__dict__.get("coarse", last._alike)
         self._free, self._matrix, self._ups, device = free.squeeze(1), matrix, tuple(ups), str(free.device)
         self._mask = three_columns(self._free.to(dtype))
+        self.gathered: Solver = _same
+        self.spread: Solver = _same
         self._merged: MergedMetric | None = None
         self._unscaled: tuple[Metric, Tensor] | None = None
         self._keep = sp.diags(self._free.cpu().numpy().astype(np.float64))
@@ -119,14 +128,6 @@ class Metric:
     def _onto(self) -> sp.csr_matrix:
         """Map from the level's vertices to the matrix's rows, for moves, shape (V, V)."""
         return sp.csr_matrix(self._keep)
-
-    def gathered(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
-        """The forces on the matrix's rows."""
-        return force
-
-    def spread(self, move: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
-        """The moves of vertices, given those of the matrix's rows."""
-        return move
 
     def scaled(self, stiffer: Float[Tensor, " vertices"]) -> Metric:
         """R H0 R, R a diagonal, solved by the Cholesky factor of H0; its diagonal is that of H0 times given numbers.
@@ -169,10 +170,12 @@ class Metric:
         rough = ROUGH / self.gathered(three_columns(self.diagonal.to(stiff) + stiff)).clamp_min(tiny)
         between, cage = self.coarse.held(self.gathered(three_columns(stiff))[:, 0])
         middle = [three_columns(1.0 / each.clamp_min(tiny)) for each in between]
-        return Work(self.coarse.ups[0], self._by_levels, (cage, rough, *middle))
+        move, gathered, spread = self.coarse.move, self.gathered, self.spread
 
-    def _by_levels(self, force: Tensor, *given: Any) -> tuple[Tensor]:
-        return (self.spread(self.coarse.move(self.gathered(force), *given)),)
+        def product(force: Tensor, *given: Any) -> tuple[Tensor]:  # Holds no metric: metrics hold products.
+            return (spread(move(gathered(force), *given)),)
+
+        return Work(self.coarse.ups[0], product, (cage, rough, *middle))
 
     @cached_property
     def _of_free(self) -> Work:
@@ -216,25 +219,18 @@ class MergedMetric(Metric):
         held = np.bincount(group, ~free[:, 0].cpu().numpy())[group] > 0
         device, moves = free.device, (representative == np.arange(count)) & ~held
         self.label, self._joined = label, joined
-        self._representative = torch.as_tensor(representative, device=device)
-        self._sum = Stencil(joined, dtype=dtype, device=str(device))
+        first_of = torch.as_tensor(representative, device=device)
         merged, free = sp.csr_matrix(joined @ matrix @ joined.T), torch.as_tensor(moves, device=device).unsqueeze(1)
         super().__init__(merged, free=free, dtype=dtype, ups=ups)
-        self.diagonal = self.diagonal[self._representative] / torch.as_tensor(members[group], device=device)
+        self.diagonal = self.diagonal[first_of] / torch.as_tensor(members[group], device=device)
+        self.gathered = Stencil(joined, dtype=dtype, device=str(device)).apply
+        self.spread = lambda move: move[first_of]
 
     @property
     def _onto(self) -> sp.csr_matrix:
         """The mean over each label."""
         members = sp.diags(1.0 / np.maximum(np.asarray(self._joined.sum(axis=1)).ravel(), 1.0))
         return sp.csr_matrix(self._keep @ members @ self._joined)
-
-    def gathered(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
-        """Each label's total force."""
-        return self._sum.apply(force)
-
-    def spread(self, move: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
-        """The move of each label, at all of its vertices."""
-        return move[self._representative]
 
     def solve(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
         """H0^-1 of each label's total force [m], the same move for all vertices of the label."""

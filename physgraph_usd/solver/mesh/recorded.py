@@ -97,7 +97,7 @@ class _Input:
         self._last: tuple[Any, int] | None = None
 
     def differs(self, given: Tensor) -> bool:
-        """Whether a given tensor is not the last one, unchanged; it is the last one from now on."""
+        """Whether a tensor or its version differs from those of the last call."""
         if self._last is not None and self._last[0]() is given and self._last[1] == given._version:
             return False
         self._last = weakref.ref(given), given._version
@@ -108,7 +108,7 @@ class _Recording:
     """A CUDA graph with its inputs and outputs."""
 
     def __init__(self, function: Callable[..., Sequence[Tensor]], inputs: Sequence[_Input]) -> None:
-        """Record the function, without running it; what it holds stays, for the graph reads it."""
+        """Record a function without running it, and keep its closure alive: the graph reads the closure's tensors."""
         self._function, self._inputs, own = function, inputs, [each.own for each in inputs]
         card = own[0].device
         self._graph, self._outputs = _captured(lambda: function(*own), card, pool=_shared(card).pool())
