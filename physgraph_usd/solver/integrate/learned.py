@@ -13,7 +13,6 @@ The network sees a `System` only.
 from __future__ import annotations
 
 import copy
-import math
 from collections.abc import Callable, Sequence
 from functools import cache, partial
 from typing import Any, TypeVar
@@ -28,7 +27,7 @@ from ..mesh.recorded import Work
 from .base import Carry, System, root_sum
 from .fused import FusedPhysgraph, fused_physgraph
 from .network import Physgraph
-from .quasi_newton import SECANTS, Secant, StepHistory, dot, secant_direction
+from .quasi_newton import Secant, StepHistory, dot, secant_direction
 from .vertex_frame import VertexFrame
 
 NetworkT = TypeVar("NetworkT", bound=nn.Module)
@@ -57,11 +56,8 @@ class LearnedMetric:
     def start(self, system: System, x: Float[Tensor, "vertices 3"]) -> Carry:
         """Evaluate x with an empty memory; the network runs in the system's precision."""
         self._network = placed(self._network, system, x.dtype)
-        none, secants = torch.zeros_like(x), ()
-        if system.on_card and self._trained:  # A recording has a fixed number of secants.
-            endless = torch.full_like(garment_dot(system.level, none, none), math.inf)
-            secants = (Secant(none, none, none, partial(garment_dot, system.level), known=endless),) * SECANTS
-        return self._evaluated(system, x, StepHistory(none, (none, none), secants))
+        none = torch.zeros_like(x)
+        return self._evaluated(system, x, StepHistory(none, (none, none)))
 
     def resume(self, system: System, carry: Carry) -> Carry:
         """Evaluate the carry's positions after a small change of the forces; the memory is kept."""
