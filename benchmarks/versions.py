@@ -3,6 +3,7 @@
     python -m benchmarks.versions OTHER... [--folder SHOTS] [--jobs 16] [--json FIGURES.json] [--out TABLE.md]
     python -m benchmarks.versions --from-json FIGURES.json      print again what was measured
     python -m benchmarks.versions --cores                       this version on several cores, and by several processes
+    python -m benchmarks.versions --device cpu --device cuda    this version on a core beside a card
 
 Each OTHER is a checkout of another version. Every shot is refined by each version with three ripples: invisible
 displacements of the cage by 0.15, 0.20 and 0.25% of its mean edge (`benchmarks.judge_shot`). Figures of one version
@@ -123,7 +124,7 @@ class Task:
     "--frames", default=0, show_default=True, help="Most frames of each, from where cloth touches; 0 for all."
 )
 @click.option("--level", type=int, help="Subdivisions of all.  [default: 2, of 02 and 04 1]")
-@click.option("--device", default="cpu", show_default=True, help="Where to solve: cpu or cuda.")
+@click.option("--device", "devices", multiple=True, default=("cpu",), help="cpu or cuda, or both to compare.")
 @click.option("--jobs", type=int, help="Runs at a time.  [default: number of cores, one on a card]")
 @click.option("--limit", default=400.0, show_default=True, help="Longest run [s].")
 @click.option("--json", "file", type=click.Path(path_type=Path), help="Keep raw figures here, and go on from them.")
@@ -146,10 +147,10 @@ def main(
         return
     if made is not None:
         runs = json.loads(made.read_text("utf-8"))["runs"]
-    elif others:
+    elif others or len(options["devices"]) > 1:
         runs = measured([*(other.resolve() for other in others), HERE], names, level=level, **options)
     else:
-        raise click.UsageError("name a checkout of another version, or give --cores or --from-json")
+        raise click.UsageError("name a checkout of another version, two devices, --cores or --from-json")
     text = tables(runs)
     say(text)
     if out is not None:
@@ -163,22 +164,26 @@ def measured(
     folder: Path | None,
     frames: int,
     level: int | None,
-    device: str,
+    devices: Sequence[str],
     jobs: int | None,
     limit: float,
     file: Path | None,
 ) -> list[dict[str, Any]]:
     """Runs of all shots by all versions with all ripples, each as plain values."""
     cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else list(range(os.cpu_count() or 1))
-    count = jobs or (len(cores) if device == "cpu" else 1)
+    count = jobs or (len(cores) if list(devices) == ["cpu"] else 1)
     with tempfile.TemporaryDirectory() as place:
         rows = [replace(row, level=row.level if level is None else level) for row in chosen(names, folder)]
         found = [job_of(row, Path(place), folder, frames) for row in rows]
-        tasks = tasks_of(trees, rows, [replace(job, device=device) for job in found])
+        tasks = [
+            task for device in devices for task in tasks_of(trees, rows, [replace(j, device=device) for j in found])
+        ]
+        if len(devices) > 1:
+            tasks = [replace(task, version=f"{task.version}, {task.job.device}") for task in tasks]
         known = kept_runs(file)
         runs = [run for task in tasks if (run := known.get(json.dumps(task.asked))) is not None]
         left = [task for task in tasks if json.dumps(task.asked) not in known]
-        if left:
+        for device in {task.job.device for task in left}:
             warm_up(trees, device)
         for run in run_all(left, [cores[k % len(cores)] for k in range(count)], limit=limit, place=Path(place)):
             runs.append(run)
