@@ -17,9 +17,8 @@ from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.solve import ShotSolver, open_for
 from physgraph_usd.solver.forces.self_contact import LEAST_ROOM, PairConstraints, SelfContact
-from physgraph_usd.solver.integrate.base import Carry, System
+from physgraph_usd.solver.integrate.base import System
 from physgraph_usd.solver.integrate.coarse import CoarseLevels
-from physgraph_usd.solver.integrate.learned import LearnedMetric
 from physgraph_usd.solver.level import Level
 from physgraph_usd.solver.mesh.recorded import CALLS, Recordings, _Input
 
@@ -56,39 +55,25 @@ def checked(called: Counter[str], kept: Any) -> Any:
     return run
 
 
-def test_what_a_card_records_reads_nothing_back_and_steps_alike(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Three frames of a skirt on its body, the cage solved, pairs padded and steps made as on a card.
-
-    Each step is made by parts too, as with an exact metric.
-    """
-    called, made, recorded = Counter[str](), CoarseLevels.__init__, LearnedMetric._recorded
+def test_what_a_card_records_reads_nothing_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Three frames of a skirt on its body, the cage solved and pairs padded as on a card."""
+    called, made = Counter[str](), CoarseLevels.__init__
 
     def dense(self: CoarseLevels, *given: Any, **more: Any) -> None:
         made(self, *given, **more)
         self.dense = True
 
-    def both(self: LearnedMetric, system: System, carry: Carry, fused: Any, works: Any) -> Carry:
-        whole, move = recorded(self, system, carry, fused, works), self.propose(system, carry)
-        parts = self._reached(system, carry, carry.x + move, move)
-        assert whole.energy == parts.energy
-        assert whole.remaining == parts.remaining
-        for one, other in zip(whole.memory.secants, parts.memory.secants, strict=True):
-            assert torch.equal(one.move, other.move)
-            assert torch.equal(one.curvature, other.curvature)
-        return whole
-
-    monkeypatch.setattr(LearnedMetric, "_recorded", both)
     monkeypatch.setattr(Recordings, "run", checked(called, Recordings.run))
     monkeypatch.setattr(CoarseLevels, "__init__", dense)
     monkeypatch.setattr(SelfContact, "aims", SelfContact.with_room)
-    monkeypatch.setattr(System, "on_card", property(lambda self: self.recordings is not None))
+    monkeypatch.setattr(System, "on_card", property(lambda self: self.level is not None))
     shot = open_for(str(write_sample("skirt", tmp_path)), RefineOptions(level=1))
     solver = ShotSolver(str(tmp_path / "skirt.usdc"), [1], RefineOptions(level=1), opened=shot)
     outcomes = [*solver(list(shot.scene.times)[30:33])]
     shot.close()
     assert all("error" not in each.record for each in outcomes)
     assert {name.split(".")[0] for name in called} == {"total_of", "MovingFrames", "Metric", "LearnedMetric"}
-    assert called["LearnedMetric._recorded.<locals>.whole"] > 10
+    assert called["LearnedMetric.propose.<locals>.<lambda>"] > 10
 
 
 def test_a_recording_is_given_again_what_changed():

@@ -16,7 +16,6 @@ from torch import Tensor
 
 from ..integrate.base import Preconditioner, Solver
 from ..integrate.metric import Metric
-from ..mesh.recorded import Work
 
 SHORT = 0.5
 """Fraction of P used by steps without a line search."""
@@ -29,11 +28,7 @@ far."""
 
 
 class HeldMetric:
-    """A level's metric with contact stiffness.
-
-    Attributes:
-        work: The shorter answer, as a function of F and of tensors.
-    """
+    """A level's metric with contact stiffness."""
 
     def __init__(self, plain: Metric, stiff: Float[Tensor, " vertices"]) -> None:
         """Add a contact stiffness.
@@ -42,8 +37,7 @@ class HeldMetric:
             stiff: K [N/m].
         """
         self.stiff, self._plain = stiff, plain
-        self._levels = levels = plain.by_levels(stiff)
-        self.work = Work(levels.key, lambda *given: (levels.function(*given)[0].mul_(SHORT),), levels.given)
+        self._levels = plain.by_levels(stiff)
 
     @staticmethod
     def of(plain: Metric, stiff: Float[Tensor, " vertices"], last: Preconditioner | None) -> Metric | HeldMetric:

@@ -85,7 +85,7 @@ class ForceModule:
         self.forces = tuple(forces)
         self._recordings = Recordings() if recordings is None else recordings
         names, aims = tuple(each.name for each in forces), [aim for each in forces for aim in _aims_of(each)]
-        self.work = Work(names, total_of(self.forces), aims)
+        self._work = Work(names, total_of(self.forces), aims)
 
     def joined_by(self, more: Sequence[Force]) -> ForceModule:
         """This module's terms and more."""
@@ -93,7 +93,7 @@ class ForceModule:
 
     def energy_and_force(self, x: Float[Tensor, "vertices 3"]) -> tuple[Float[Tensor, ""], Float[Tensor, "vertices 3"]]:
         """Total energy [J], float64 scalar, and force [N] at positions x [m]."""
-        energy, force, _ = self.work.run(self._recordings, x)
+        energy, force, _ = self._work.run(self._recordings, x)
         return energy, force
 
     def energy_and_force_each(
@@ -110,7 +110,7 @@ class ForceModule:
 
     def energies(self, x: Float[Tensor, "vertices 3"]) -> dict[str, float]:
         """Energy of each term [J] by name."""
-        values = self.work.run(self._recordings, x)[2]
+        values = self._work.run(self._recordings, x)[2]
         return dict(zip((term.name for term in self.forces), values.tolist(), strict=True))
 
     def diagonal(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " vertices"]:

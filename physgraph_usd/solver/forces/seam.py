@@ -23,7 +23,6 @@ from torch import Tensor
 
 from ..level import Level
 from ..mesh.borders import OnEdge, finer_side, nearest_edges
-from ..mesh.recorded import Work
 from ..mesh.stencil import Stencil
 from ..mesh.topology import edges_of, joined_by
 from ..mesh.weld import WELDED, pairs_within
@@ -128,13 +127,6 @@ class SewnForces:
     def __init__(self, field: ForceModule, seam: Seam) -> None:
         """Take the forces of the unsewn cloth, and the seam."""
         self._field, self._seam = field, seam
-        apart = field.work
-
-        def sewn(x: Tensor, *given: Tensor) -> tuple[Tensor, Tensor]:
-            energy, force, *_ = apart.function(seam.closed(x), *given)
-            return energy, seam.shared(force)
-
-        self.work = Work((seam, *apart.key), sewn, apart.given)
 
     def energy_and_force(self, x: Float[Tensor, "vertices 3"]) -> tuple[Float[Tensor, ""], Float[Tensor, "vertices 3"]]:
         """Energy [J] and force [N] with the seams of x [m] closed."""

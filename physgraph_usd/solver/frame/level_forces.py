@@ -201,14 +201,14 @@ class LevelForces:
 
     @cached_property
     def _recordings(self) -> Recordings:
-        """Sums of the terms, and steps under them, recorded on a card."""
+        """Sums of the terms, recorded on a card."""
         return Recordings()
 
     def system_in(self, field: ForceField, metric: Preconditioner | None = None) -> System:
         """The system of the level in any field, with the level's metric by default."""
         level, metric = self.level, self.metric if metric is None else metric
         place: dict[str, Any] = {"free": level.free, "spacing": level.spacing, "level": level}
-        return System(field, metric, recordings=self._recordings, **place)
+        return System(field, metric, **place)
 
     def tether(self, stiffness: float, predicted: Float[Tensor, "vertices 3"]) -> Tether:
         """The tie to predicted positions [m], of stiffness [1/s^2]."""

@@ -12,7 +12,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..level import Level
-from ..mesh.recorded import Recordings, Work
 from ..mesh.stencil import three_columns
 
 Solver = Callable[[Tensor], Tensor]
@@ -59,13 +58,6 @@ class Shortened(Preconditioner, Protocol):
         ...
 
 
-@runtime_checkable
-class Recordable(Protocol):
-    """Forces, or a preconditioner, that a card can record."""
-
-    work: Work
-
-
 class System:
     """One level in one frame, as seen by an integrator.
 
@@ -87,10 +79,9 @@ class System:
         free: Bool[Tensor, "vertices 1"],
         spacing: Float[Tensor, " vertices"],
         level: Level | None = None,
-        recordings: Recordings | None = None,
     ) -> None:
-        """Combine a force field with its metric and mask; recordings are of steps under forces of this kind."""
-        self.field, self.metric, self.recordings = field, metric, recordings
+        """Combine a force field with its metric and mask."""
+        self.field, self.metric = field, metric
         self.free, self.spacing, self.level = free, spacing, level
         self._all_free = level.all_free if level is not None and free is level.free else bool(free.all())
         self.evaluations = self.metric_solves = self.failed = 0
@@ -98,22 +89,11 @@ class System:
     @property
     def on_card(self) -> bool:
         """Whether steps are recorded."""
-        return self.spacing.is_cuda and self.recordings is not None
+        return self.spacing.is_cuda and self.level is not None
 
-    @cached_property
-    def works(self) -> tuple[Work, Work] | None:
-        """Energy and force of positions, and the shorter answer, if a card can record them."""
-        field, metric = self.field, self.metric
-        if not self.on_card or not isinstance(field, Recordable) or not isinstance(metric, Recordable):
-            return None
-        given = *field.work.given, *metric.work.given
-        return (field.work, metric.work) if all(isinstance(each, Tensor) for each in given) else None
-
-    @cached_property
-    def masked(self) -> Callable[[Tensor], Tensor]:
-        """Gives a field of shape (V, 3) that is zero at fixed vertices; holds nothing else of the system."""
-        mask = None if self._all_free else self._mask
-        return lambda field: field if mask is None else field * mask
+    def masked(self, field: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
+        """The field, zero at fixed vertices."""
+        return field if self._all_free else field * self._mask
 
     @cached_property
     def _mask(self) -> Float[Tensor, "vertices 3"]:

@@ -23,7 +23,6 @@ from torch import Tensor, nn
 
 from ...errors import SolveError
 from ..level import Level
-from ..mesh.recorded import Work
 from .base import Carry, System, root_sum
 from .fused import FusedPhysgraph, fused_physgraph
 from .network import Physgraph
@@ -72,9 +71,6 @@ class LearnedMetric:
 
     def step(self, system: System, carry: Carry) -> Carry:
         """One step along the network's combination."""
-        fused = self._fused(system)
-        if fused is not None and system.works is not None:
-            return self._recorded(system, carry, fused, system.works)
         move = self.propose(system, carry)
         return self._reached(system, carry, carry.x + move, move)
 
@@ -104,31 +100,6 @@ class LearnedMetric:
         made = level.recordings.run("secant", lambda *each: _differences(level, *each), *given)
         yields, change, curvature, remaining = made
         return Secant(move, yields, change, product, known=curvature), remaining
-
-    def _recorded(self, system: System, carry: Carry, fused: FusedPhysgraph, works: tuple[Work, Work]) -> Carry:
-        """A step on a card as a single recording."""
-        memory, level, (forces, metric) = carry.memory, level_of(system.level), works
-        count, rest, masked = len(forces.given), len(forces.given) + len(metric.given), system.masked
-        assert system.recordings is not None
-
-        def whole(x: Tensor, force: Tensor, image: Tensor, per_edge: Tensor, *more: Tensor) -> list[Tensor]:
-            aims, held, past = more[:count], more[count:rest], more[rest:]
-            move = _moved(fused, level, (x, force, image, *past))
-            energy, after = forces.function(x + move, *aims)[:2]
-            after = masked(after)
-            there = masked(metric.function(after, *held)[0])
-            yields, change, curvature, remaining = _differences(level, force, after, image, there, move, per_edge)
-            fields = torch.stack([x + move, move, after, there, yields, change])
-            return [torch.stack([energy, remaining]), curvature, fields]
-
-        now = carry.x, carry.force, carry.preconditioned, system.per_edge, *forces.given, *metric.given
-        past = _past(fused, system, memory)
-        numbers, curvature, fields = system.recordings.run((fused, forces.key, metric.key), whole, *now, *past)
-        x, move, force, image, yields, change = fields
-        system.evaluations, system.metric_solves = system.evaluations + 1, system.metric_solves + 1
-        energy, remaining = numbers.tolist()
-        newest = Secant(move, yields, change, partial(garment_dot, level), known=curvature)
-        return Carry(x, energy, force, image, self.name, memory.after(carry, newest), remaining=remaining)
 
     def propose(self, system: System, carry: Carry) -> Float[Tensor, "vertices 3"]:
         """The displacement of the next step [m]."""
