@@ -186,11 +186,10 @@ class Picture:
         return given if column in (CAGE, SUBDIVISION) else None if solved is None else solved.points[index]
 
     def _side(self, points: np.ndarray, corners: np.ndarray, column: str) -> np.ndarray:
-        """The faces or edges, shape (N, k), whose middle is on a column's side of the wipe, if there is one."""
+        """The faces or edges, shape (N, k), that reach a column's side of the wipe, if there is one."""
         if not column or not self.view.wiped or len(self.view.columns) < 2:
             return corners
-        is_left = (points @ self.axes[0])[corners].mean(axis=1) < self._line
-        return corners[is_left == (column == self.view.columns[0])]
+        return reaching(points @ self.axes[0] - self._line, corners, left=column == self.view.columns[0])
 
     def _color(self, path: str, usual: tuple[int, int, int]) -> np.ndarray:
         """A prim's own colour, or the usual one, sRGB: linear RGB, shape (3,)."""
@@ -231,6 +230,17 @@ class Picture:
         """Draw a mesh, or its column's side of the wipe."""
         triangles = self._side(points, whole, column)
         self._skins.place(name, Placed(self._placed(points, at), triangles, whole=whole, **look))
+
+
+def reaching(beyond: np.ndarray, corners: np.ndarray, *, left: bool) -> np.ndarray:
+    """The faces or edges, shape (N, k), that reach a side of a line: those on the line reach both, and leave no gap.
+
+    Args:
+        beyond: How far each point is to the right of the line, shape (V,).
+        corners: Points of each, shape (N, k).
+        left: Whether the side is the left.
+    """
+    return corners[((beyond[corners] < 0.0) == left).any(axis=1)]
 
 
 def _everything(frame: Frame) -> np.ndarray:
