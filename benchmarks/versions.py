@@ -124,7 +124,7 @@ class Task:
     "--frames", default=0, show_default=True, help="Most frames of each, from where cloth touches; 0 for all."
 )
 @click.option("--level", type=int, help="Subdivisions of all.  [default: 2, of 02 and 04 1]")
-@click.option("--device", "devices", multiple=True, default=("cpu",), help="cpu or cuda, or both to compare.")
+@click.option("--device", "devices", multiple=True, default=("cpu",), help="cpu, cuda or both.  [default: cpu]")
 @click.option("--jobs", type=int, help="Runs at a time.  [default: number of cores, one on a card]")
 @click.option("--limit", default=400.0, show_default=True, help="Longest run [s].")
 @click.option("--json", "file", type=click.Path(path_type=Path), help="Keep raw figures here, and go on from them.")

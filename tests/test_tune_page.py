@@ -26,7 +26,7 @@ from stages import add_subset
 
 from physgraph_usd.solver.fabric import PRESETS
 from physgraph_usd.studio.page import TunePage
-from physgraph_usd.studio.picture import reaching
+from physgraph_usd.studio.picture import partly_on_side
 from physgraph_usd.studio.session import TuneSession
 from physgraph_usd.studio.skins import LOADED_SECONDS, Placed, Skins
 from physgraph_usd.studio.value_panel import CHANGED, SWATCHES
@@ -387,6 +387,6 @@ def test_a_wipe_leaves_no_gap():
     """Wherever the line stands, the faces of each side cover all of that side."""
     across, faces = np.tile(np.arange(5.0), 3), np.array([[n, n + 1, n + 6] for n in (0, 1, 2, 3, 5, 6, 7, 8)])
     for line in (-1.0, 1.3, 2.0, 9.0):
-        left, right = (reaching(across - line, faces, left=side) for side in (True, False))
+        left, right = (partly_on_side(across - line, faces, left=side) for side in (True, False))
         assert len(left) == (across[faces].min(axis=1) < line).sum()
         assert len(right) == (across[faces].max(axis=1) >= line).sum()

@@ -186,10 +186,10 @@ class Picture:
         return given if column in (CAGE, SUBDIVISION) else None if solved is None else solved.points[index]
 
     def _side(self, points: np.ndarray, corners: np.ndarray, column: str) -> np.ndarray:
-        """The faces or edges, shape (N, k), that reach a column's side of the wipe, if there is one."""
+        """Faces or edges of a column, shape (N, k): all, or with a wipe those partly on its side."""
         if not column or not self.view.wiped or len(self.view.columns) < 2:
             return corners
-        return reaching(points @ self.axes[0] - self._line, corners, left=column == self.view.columns[0])
+        return partly_on_side(points @ self.axes[0] - self._line, corners, left=column == self.view.columns[0])
 
     def _color(self, path: str, usual: tuple[int, int, int]) -> np.ndarray:
         """A prim's own colour, or the usual one, sRGB: linear RGB, shape (3,)."""
@@ -232,13 +232,13 @@ class Picture:
         self._skins.place(name, Placed(self._placed(points, at), triangles, whole=whole, **look))
 
 
-def reaching(beyond: np.ndarray, corners: np.ndarray, *, left: bool) -> np.ndarray:
-    """The faces or edges, shape (N, k), that reach a side of a line: those on the line reach both, and leave no gap.
+def partly_on_side(beyond: np.ndarray, corners: np.ndarray, *, left: bool) -> np.ndarray:
+    """Faces or edges with a corner on one side of a line, shape (N, k); both sides together leave no gap at the line.
 
     Args:
-        beyond: How far each point is to the right of the line, shape (V,).
-        corners: Points of each, shape (N, k).
-        left: Whether the side is the left.
+        beyond: Signed distance of each point to the right of the line [m], shape (V,).
+        corners: Indices of the corners of each face or edge, shape (N, k).
+        left: True for the left side.
     """
     return corners[((beyond[corners] < 0.0) == left).any(axis=1)]
 

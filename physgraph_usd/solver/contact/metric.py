@@ -56,7 +56,7 @@ class HeldMetric:
         return self._plain.diagonal + self.stiff.double()
 
     def solve(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
-        """P F [m]; zero at fixed vertices, provided that the force is zero there."""
+        """P F [m]; F must be zero at fixed vertices, and P F is."""
         return self._levels.run(self._plain.coarse.recordings, force)[0]
 
     def stiffened(self, stiffness: Float[Tensor, " vertices"]) -> Solver:

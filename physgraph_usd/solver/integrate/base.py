@@ -88,7 +88,7 @@ class System:
 
     @property
     def on_card(self) -> bool:
-        """Whether steps are recorded."""
+        """Whether work on a card is recorded."""
         return self.spacing.is_cuda and self.level is not None
 
     def masked(self, field: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:

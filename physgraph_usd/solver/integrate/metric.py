@@ -179,7 +179,7 @@ class Metric:
 
     @cached_property
     def _of_free(self) -> Work:
-        """P F [m] of cloth that nothing touches."""
+        """P F [m] without contact stiffness."""
         return self.by_levels(torch.zeros_like(self._mask[:, 0]))
 
     def estimate(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:

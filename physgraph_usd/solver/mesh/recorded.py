@@ -97,7 +97,7 @@ class _Input:
         self._last: tuple[Any, int] | None = None
 
     def differs(self, given: Tensor) -> bool:
-        """Whether a tensor or its version differs from those of the last call."""
+        """True for a tensor or a version other than the last call's."""
         if self._last is not None and self._last[0]() is given and self._last[1] == given._version:
             return False
         self._last = weakref.ref(given), given._version
