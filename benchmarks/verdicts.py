@@ -46,10 +46,12 @@ FIGURES = {
     "inside": Figure("vertices in bodies"),
     "jumps": Figure("jumps"),
     "remaining": Figure("remaining move [1/1000 edge]", 1e3),
+    "rest_angle": Figure("angle to own rest, median [degrees]"),
+    "rest_angle90": Figure("angle to own rest, 90th percentile [degrees]"),
     "still": Figure("motion over a still cage [mm]"),
     "sharp": Figure("sharp folds where the smooth cage has none [1/10,000 edges]", 1e4),
 }
-"""Figures of `judge_shot.judged` by name."""
+"""Figures of `judge_shot.judged` by name; angles of normals to own rest are those of a run's last frames."""
 
 Values = Mapping[str, float | None]
 """Figures of one run by name."""

@@ -78,6 +78,12 @@ def test_gaps_lie_between_the_reference_and_plain_upsampling(made: tuple[Path, P
     assert chart.curve(UPSAMPLED)[0].gap == pytest.approx(1.0)
     assert all(p.gap >= -1e-12 for p in chart.points)
     assert chart.curve("quasi-newton")[-1].gap < 0.2 < chart.curve("gd")[0].gap
+    default, plain = chart.curve(DEFAULT)[0].degrees, chart.curve(UPSAMPLED)[0].degrees
+    assert default is not None
+    assert plain is not None
+    assert 0.0 < default < plain < 90.0
+    assert chart.words_of_degrees() in list(chart.lines())
+    assert f"within {default:.2g} degrees of the converged frame" in chart.words_of_degrees()
     assert set(chart.methods) >= {DEFAULT, UPSAMPLED, SMOOTH, "quasi-newton", "gd", "gd, nested"}
 
 
@@ -243,7 +249,7 @@ def test_the_command_prints_a_summary_and_tells_progress(made: tuple[Path, Path,
     line = "--level 1 --method quasi-newton --method gd --collider /World/ball --budget-minutes 0.02".split()
     result = CliRunner().invoke(cli.main, ["chart", str(shot), "-o", str(tmp_path / "out"), *line])
     assert result.exit_code == 0, result.stderr
-    assert result.stdout.startswith("| method | ms to 10% | ms to 3% | ms to 1% | least gap | at ms |")
+    assert result.stdout.startswith("| method | ms to 10% | ms to 3% | ms to 1% | least gap | degrees | at ms |")
     assert "refine's default: " in result.stdout
     assert "left" in result.stderr
 

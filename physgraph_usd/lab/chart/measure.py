@@ -116,8 +116,10 @@ class CurveBench:
             clock.expect(clock.spent + (plan.repeats - 1 - repeat) * (clock.spent - began))
 
     def judged(self, frame: Frame, points: Sequence[np.ndarray]) -> dict[str, Any]:
-        """Energy, strain, contact and distance from the reference of fine positions [m], ready for a row."""
-        return asdict(self._judge.judge(frame, points)) | {"apart_mm": self._solutions.apart_mm(frame, points)}
+        """Energy, strain, contact, distance and angle from the reference of fine positions [m], ready for a row."""
+        degrees = self._solutions.degrees(frame, points, self.timed.triangles)
+        apart = {"apart_mm": self._solutions.apart_mm(frame, points), "degrees": degrees}
+        return asdict(self._judge.judge(frame, points)) | apart
 
     def _without_physics(self) -> None:
         """Measure the two curves that no solver makes."""

@@ -37,7 +37,8 @@ TICKS = [1.0, 0.3, 0.1, 0.03, 0.01, 0.003, 0.001, 0.0003, 0.0001]
 SIGNS = {DEFAULT: "star", UPSAMPLED: "square", SMOOTH: "diamond"}
 READING = (
     "Lower is nearer to rest: 100% is the input, plainly subdivided, 0% the least energy that anybody found. Left is "
-    "faster. The broad line is the front: nothing that was measured is lower in less time than what lies on it."
+    "faster. Degrees are the median angle between the surface and the converged frame's: what one sees of the last "
+    "percents. The broad line is the front: nothing that was measured is lower in less time than what lies on it."
 )
 OWN = """
 #methods { display: flex; flex-wrap: wrap; gap: .3rem .5rem }
@@ -85,7 +86,7 @@ def write_page(chart: Chart, file: Path) -> None:
 
 def _figure(chart: Chart) -> go.Figure:
     """Gap of cold and of warm frames, penetrations and crossings against time."""
-    panels = {"gap": "energy above<br>the best known", **chart.panels, **chart.likeness}
+    panels = {"gap": "energy above<br>the best known", **chart.seen, **chart.panels, **chart.likeness}
     warm = 1 if chart.warm else 0
     figure = make_subplots(
         rows=len(panels) + warm,
@@ -205,7 +206,8 @@ def _looks(chart: Chart, folder: Path) -> str:
 
 
 def _lead(chart: Chart) -> str:
-    sentences = [each for each in (advice(chart), warm_advice(chart), contact_words(chart)) if each]
+    found = advice(chart), chart.words_of_degrees(), warm_advice(chart), contact_words(chart)
+    sentences = [each for each in found if each]
     times = chart.times_to(JUDGED)
     if times:
         order = ", ".join(f"{name} {ms:.0f} ms" for name, ms in list(times.items())[:4])

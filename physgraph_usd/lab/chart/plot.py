@@ -60,7 +60,7 @@ def draw_chart(chart: Chart, folder: Path) -> None:
 
 def _figure(chart: Chart) -> Figure:
     steps = changes(chart)
-    rows = [each for each in (chart.panels, chart.likeness) if each]
+    rows = [each for each in (chart.seen, chart.panels, chart.likeness) if each]
     heights = [4.2, *[2.6] * len(rows), *([0.6 + 0.28 * len(steps)] if steps else [])]
     figure = Figure(figsize=(10.6, sum(heights) + 1.0), layout="constrained")
     words = textwrap.fill(f"{advice(chart)} {contact_words(chart)}", 120)
@@ -163,7 +163,7 @@ def _measure(axes: Axes, name: str, words: str, *, chart: Chart, style: dict[str
         points = [point for point in chart.curve(method) if getattr(point, name) is not None]
         _line(axes, method, points, style[method], [float(getattr(p, name)) for p in points])
     axes.set(xscale="log", xlabel="milliseconds a frame", title=words[0].upper() + words[1:])
-    if name in chart.likeness:
+    if name in chart.likeness or name in chart.seen:
         alone = [getattr(point, name) or 0.0 for each in ONE_POINT for point in chart.curve(each)]
         axes.set_ylim(0, 1.5 * max(alone, default=0.0) or None)
         for line in axes.lines:  # A solver that flew apart flies out of the picture.

@@ -7,6 +7,7 @@ from collections import defaultdict
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -114,6 +115,12 @@ class Problem:
         """Number of fine vertices."""
         chains = zip(self.scene.garments, self.refiner.refinements, strict=True)
         return sum(chain[-1].mesh.vertex_count if chain else each.mesh.vertex_count for each, chain in chains)
+
+    @cached_property
+    def triangles(self) -> tuple[np.ndarray, ...]:
+        """Vertices of each fine triangle, shape (T, 3), one array a garment."""
+        chains = zip(self.scene.garments, self.refiner.refinements, strict=True)
+        return tuple((chain[-1].mesh if chain else each.mesh).triangulate().triangles for each, chain in chains)
 
     def solve(self, frame: Frame, settings: SolveSettings) -> Solved:
         """Solve a frame from a cold start."""

@@ -21,6 +21,7 @@ from ...errors import counted
 from ...solver.frame.settings import SolveSettings
 from ...solver.frame.values import FrameState
 from ...solver.scene import Frame
+from ...solver.seen import normal_angles
 from ..methods import METHODS
 from .problem import COLD, Problem
 
@@ -116,6 +117,23 @@ class Solutions:
         """RMS distance of fine positions [m] from the frame's reference [mm]; None where none is stored."""
         known = self.points(frame.time)
         return None if known is None else rms_mm(points, known)
+
+    def degrees(self, frame: Frame, points: Sequence[np.ndarray], triangles: Sequence[np.ndarray]) -> float | None:
+        """Median angle between the vertex normals of fine positions [m] and of the frame's reference [degrees].
+
+        Args:
+            frame: The frame.
+            points: Fine world positions [m], one array a garment.
+            triangles: Vertices of each triangle, one array a garment.
+
+        Returns:
+            None where no reference is stored.
+        """
+        known = self.points(frame.time)
+        if known is None:
+            return None
+        found = [normal_angles(*each) for each in zip(points, known, triangles, strict=True)]
+        return float(np.median(np.concatenate(found)))
 
     def points(self, time: float | None) -> tuple[np.ndarray, ...] | None:
         """Fine world positions [m] of the reference of a time code, one array a garment; None where none is stored."""

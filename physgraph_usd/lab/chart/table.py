@@ -30,6 +30,7 @@ CONTACT = {
     "crossings": "edges through faces of bodies",
     "tangles": "edges of cloth through cloth",
 }
+SEEN = {"degrees": "angle of the folds to the converged frame [degrees]"}
 LIKENESS = {"strain": "edge strain, 99th percentile", "apart_mm": "distance from Phi*'s shape [mm]"}
 """Fields of points, and their titles."""
 
@@ -57,6 +58,8 @@ class Point:
         frames: Number of frames that are judged: all of them, or the last of a row.
         repeats: Number of times that the time was taken.
         note: How much of the problem a solver outside was given, "" for ours.
+        degrees: Median angle between the vertex normals and the reference's [degrees], mean over the frames; None where
+            the reference's shape is not known.
         apart_mm: RMS distance from the reference's positions [mm], mean over the frames; None where they are not known.
     """
 
@@ -82,6 +85,7 @@ class Point:
     repeats: int
     note: str
     apart_mm: float | None
+    degrees: float | None
     ms_most: float
     ms_prepared: float
 
@@ -140,6 +144,18 @@ class Chart:
     def likeness(self) -> dict[str, str]:
         """Titles of measured similarities to external solvers, by field of `Point`; empty without such solvers."""
         return {name: title for name, title in LIKENESS.items() if self.notes and self._has(name)}
+
+    @property
+    def seen(self) -> dict[str, str]:
+        """Title of the angle to the converged frame by field of `Point`; empty where no reference's shape is known."""
+        return SEEN if self._has("degrees") else {}
+
+    def words_of_degrees(self) -> str:
+        """How far refine's default ends from the converged frame, in a sentence; "" if unknown."""
+        default = next(iter(self.curve(DEFAULT)), None)
+        if default is None or default.degrees is None:
+            return ""
+        return f"Refine's default: half of the folds are within {default.degrees:.2g} degrees of the converged frame."
 
     @property
     def notes(self) -> dict[str, str]:
@@ -212,13 +228,14 @@ class Chart:
 
     def lines(self) -> Iterator[str]:
         """The summary that the command prints: a table in Markdown, and where the default stands."""
-        yield "| method | " + " | ".join(f"ms to {gap:.0%}" for gap in GAPS) + " | least gap | at ms |"
-        yield "|" + "---|" * (len(GAPS) + 3)
+        yield "| method | " + " | ".join(f"ms to {gap:.0%}" for gap in GAPS) + " | least gap | degrees | at ms |"
+        yield "|" + "---|" * (len(GAPS) + 4)
         for name in self.methods:
             best = min(self.curve(name), key=lambda point: point.gap)
             times = [self.time_to(name, gap) for gap in GAPS]
             cells = ["-" if t is None else f"{t:.0f}" for t in times]
-            yield f"| {name} | {' | '.join(cells)} | {best.gap:.2%} | {best.ms:.1f} |"
+            degrees = "-" if best.degrees is None else f"{best.degrees:.1f}"
+            yield f"| {name} | {' | '.join(cells)} | {best.gap:.2%} | {degrees} | {best.ms:.1f} |"
         place = self.default_place()
         if place is not None:
             where = "on the front" if place["on_front"] else "not on the front"
@@ -227,6 +244,8 @@ class Chart:
                 f"refine's default: {place['gap']:.2%} in {place['ms']:.0f} ms, {place['ratio']:.2f} times the "
                 f"{place['fastest_ms']:.0f} ms of the fastest to that gap ({place['fastest']}): {where}"
             )
+        if words := self.words_of_degrees():
+            yield words
         for each in self.references:
             where = "" if each["frame"] is None else f"frame {each['frame']:g}: "
             yield f"{where}{Reference.of(each)}"
@@ -278,7 +297,6 @@ def _point(rows: Sequence[dict[str, Any]], references: dict[Any, Reference]) -> 
     energies = {name: statistics.fmean(v["energies"].get(name, 0.0) for v in values) for name in values[0]["energies"]}
     least, start = (sum(getattr(each, name) for each in references.values()) for name in ("least", "start"))
     energy = sum(energies.values())
-    apart = [each for v in values if (each := v.get("apart_mm")) is not None]
     return Point(
         method=first["method"],
         integrator=first.get("integrator", ""),
@@ -299,5 +317,12 @@ def _point(rows: Sequence[dict[str, Any]], references: dict[Any, Reference]) -> 
         frames=len(values),
         repeats=min(len(each) for each in times),
         note=first.get("note", ""),
-        apart_mm=statistics.fmean(apart) if len(apart) == len(values) else None,
+        apart_mm=_mean_known(values, "apart_mm"),
+        degrees=_mean_known(values, "degrees"),
     )
+
+
+def _mean_known(values: Sequence[dict[str, Any]], name: str) -> float | None:
+    """Mean of a value over the frames; None if some frame has none."""
+    known = [each for v in values if (each := v.get(name)) is not None]
+    return statistics.fmean(known) if len(known) == len(values) else None

@@ -142,7 +142,8 @@ def figures(point: Point, *, touches: bool) -> list[str]:
         f"{counted(point.repeats, 'turn')} of {counted(point.frames, 'frame')})",
         ", ".join(f"{name} {1e3 * value:.3g}" for name, value in sorted(point.energies.items())) + " mJ",
         f"strain p99 {percent(point.strain)}"
-        + (f", {point.apart_mm:.3g} mm from Phi*'s shape" if point.apart_mm is not None else ""),
+        + (f", {point.apart_mm:.3g} mm from Phi*'s shape" if point.apart_mm is not None else "")
+        + (f", {point.degrees:.2g} degrees from it" if point.degrees is not None else ""),
     ]
     if touches:
         lines.append(
