@@ -167,10 +167,11 @@ def film(shot: Path, shown: Shown, layer: Path, out: Path) -> None:
     fine = DrawnStage(shot, layer)
     times = fine.times(tuple(garments))
     fine.bake(times)
+    subdivided = list(smooth(shot, fine, times, garments))
     refined = (fine.meshes(each, cages=garments) for each in times)
-    sides = list(zip(times, smooth(shot, fine, times, garments), refined, strict=True))
-    columns = ([left for _, left, _ in sides], [right for _, _, right in sides])
-    before, after = (sum(crossings(side, garments) for side in column) for column in columns)
+    before, after = (sum(crossings(side, garments) for side in column) for column in (subdivided, refined))
+    surfaces = [fine.meshes(each, cages=()) for each in times]
+    sides = list(zip(times, map(finer, subdivided, surfaces), surfaces, strict=True))
     cage, vertices = (sum(each[kind] for each in report.garments) for kind in ("points", "fine_points"))
     seconds = round(spent / len(times), 2)
     unsettled = len({entry["time"] for entry in report.unsettled})
@@ -207,6 +208,11 @@ def smooth(shot: Path, fine: DrawnStage, times: Sequence[float], garments: Seque
         places = problem.upsampled(coarse.frame(each), smooth=True)
         points = {garment.path: found for garment, found in zip(coarse.scene.garments, places, strict=True)}
         yield [replace(mesh, points=points.get(mesh.path, mesh.points)) for mesh in fine.meshes(each, cages=garments)]
+
+
+def finer(side: Side, like: Side) -> Side:
+    """The meshes of a side subdivided smoothly to as many faces as other meshes have."""
+    return [mesh.subdivided(other.mesh.face_count) for mesh, other in zip(side, like, strict=True)]
 
 
 def crossings(side: Side, garments: Sequence[str]) -> int:

@@ -163,37 +163,69 @@ def subdividing(prim: Usd.Prim) -> dict[str, object]:
     return {each.GetPrimvarName(): each.Get() for each in found if each.GetInterpolation() == "constant"}
 
 
-@pytest.mark.parametrize("mode", ["over", "sibling"])
-def test_renderers_do_not_subdivide_again(tmp_path: Path, mode: str) -> None:
-    """Arnold's, MoonRay's and Redshift's attributes, animated or from an ancestor, are off; others stay."""
-    path, out, types = tmp_path / "shot.usda", tmp_path / "out.usdc", Sdf.ValueTypeNames
-    stage = make_shot(path)
+def with_renderers(path: Path) -> None:
+    """A shot whose garment, and a prim above it, carry renderers' settings of subdivision, one of them animated."""
+    stage, types = make_shot(path), Sdf.ValueTypeNames
     mesh, rig = (UsdGeom.PrimvarsAPI(stage.GetPrimAtPath(each)) for each in (COAT, "/World/rig"))
     mesh.CreatePrimvar("arnold:subdiv_type", types.String, "constant").Set("catclark")
     mesh.CreatePrimvar("arnold:subdiv_iterations", types.UChar, "constant").Set(3, 1.0)
     rig.CreatePrimvar("moonray:mesh_resolution", types.Float, "constant").Set(8.0)
     rig.CreatePrimvar("redshift:object:RS_objprop_rstess_enable", types.Bool, "constant").Set(True)
+    rig.CreatePrimvar("redshift:object:RS_objprop_rstess_maxsubd", types.Int, "constant").Set(1)
+    mesh.CreatePrimvar("cycles:object:mesh:subdivision_max_level", types.Int, "constant").Set(4)
     mesh.CreatePrimvar("karma:object:dicingquality", types.Float, "constant").Set(2.0)
     stage.GetPrimAtPath(COAT).CreateAttribute("arnold:subdiv_type", types.Token).Set("catclark")
     stage.Save()
-    writer = write_shot(open_shot(str(path), level=1), out, mode=mode)
+
+
+LOWERED = {
+    "arnold:subdiv_type": "catclark",
+    "arnold:subdiv_iterations": 1,
+    "moonray:mesh_resolution": 2.0,
+    "redshift:object:RS_objprop_rstess_enable": True,
+    "redshift:object:RS_objprop_rstess_maxsubd": 0,
+    "cycles:object:mesh:subdivision_max_level": 2,
+    "karma:object:dicingquality": 2.0,
+}
+OFF = {
+    "arnold:subdiv_type": "none",
+    "arnold:subdiv_iterations": 0,
+    "moonray:mesh_resolution": 1.0,
+    "redshift:object:RS_objprop_rstess_enable": False,
+    "redshift:object:RS_objprop_rstess_maxsubd": 0,
+    "cycles:object:mesh:subdivision_max_level": 0,
+    "karma:object:dicingquality": 2.0,
+}
+
+
+@pytest.mark.parametrize("mode", ["over", "sibling"])
+@pytest.mark.parametrize(("scheme", "expected"), [("keep", LOWERED), ("none", OFF)])
+def test_renderers_subdivide_as_often_less_as_the_layer_has_done(
+    tmp_path: Path, mode: str, scheme: str, expected: dict[str, object]
+) -> None:
+    """Numbers of subdivisions fall by the layer's two, and all is off where the scheme is none; others stay."""
+    path, out = tmp_path / "shot.usda", tmp_path / "out.usdc"
+    with_renderers(path)
+    writer = write_shot(open_shot(str(path), level=2), out, mode=mode, scheme=scheme)
     composed = open_over(path, out)
     prim = composed.GetPrimAtPath(str(writer.targets[0]))
-    assert subdividing(prim) == {
-        "arnold:subdiv_type": "none",
-        "arnold:subdiv_iterations": 0,
-        "moonray:mesh_resolution": 1.0,
-        "redshift:object:RS_objprop_rstess_enable": False,
-        "karma:object:dicingquality": 2.0,
-    }
-    assert prim.GetAttribute("arnold:subdiv_type").Get() == "none"
-    assert prim.GetAttribute("primvars:arnold:subdiv_iterations").Get(1.0) == 0
+    assert subdividing(prim) == expected
+    assert prim.GetAttribute("arnold:subdiv_type").Get() == expected["arnold:subdiv_type"]
+    assert prim.GetAttribute("primvars:arnold:subdiv_iterations").Get(1.0) == expected["arnold:subdiv_iterations"]
     assert errors(out) == []
     assert sum("arnold:subdiv_iterations" in str(note) for note in writer.notes) == 1
+
+
+@pytest.mark.parametrize("scheme", ["keep", "none"])
+def test_renderers_that_subdivide_too_far_are_faults(tmp_path: Path, scheme: str) -> None:
+    path, out = tmp_path / "shot.usda", tmp_path / "out.usdc"
+    with_renderers(path)
+    writer = write_shot(open_shot(str(path), level=1), out, scheme=scheme)
     layer = Sdf.Layer.FindOrOpen(str(out))
-    layer.GetAttributeAtPath(f"{writer.targets[0]}.primvars:arnold:subdiv_type").default = "catclark"
+    prim = layer.GetPrimAtPath(writer.targets[0])
+    prim.RemoveProperty(prim.properties["primvars:arnold:subdiv_iterations"])
     layer.Save()
-    assert any("a render subdivides again" in error for error in errors(out))
+    assert any("a render subdivides" in error for error in errors(out))
 
 
 def test_vectors_of_the_coarse_surface_are_blocked_and_names_of_faces_carried(tmp_path: Path) -> None:

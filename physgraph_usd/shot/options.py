@@ -87,7 +87,7 @@ class RefineOptions:
         INTEGRATORS[0], f"How forces become displacements: {', '.join(INTEGRATORS)}.", metavar="NAME"
     )
     weights: Path | None = _solver(None, "Weights for the learned integrator.", metavar="FILE")
-    steps: int = _solver(12, "Most steps at the finest level.", metavar="N", least=0)
+    steps: int = _solver(24, "Most steps at the finest level.", metavar="N", least=0)
     tolerance: float = _solver(
         2e-3, "Stop when the cloth would move less, RMS, in local edge lengths.", metavar="T", least=0
     )
@@ -107,6 +107,11 @@ class RefineOptions:
         metavar="PRIM.ATTR=VALUE",
     )
     mode: str = _layer("over", "Refine in place, or beside the coarse mesh.", choices=("over", "sibling"))
+    scheme: str = _layer(
+        "keep",
+        "Subdivision scheme of the refined mesh: the cage's, or none, which is polygons with normals.",
+        choices=("keep", "none"),
+    )
     temporal: str = _solver("tether", "How a frame uses the last one.", choices=("tether", "warm", "off"))
     contact: str = _solver("quadratic", "How bodies push the cloth.", choices=("quadratic", "off"))
     self_contact: str = _solver("auto", "How cloth pushes cloth.", choices=("auto", "off"))

@@ -238,7 +238,8 @@ def inspect_shot(shot: str | Path | Stage, *, timed: bool = False, **given: Any)
 
     Args:
         shot: The stage to read, a file or open.
-        timed: Whether to solve three frames in the middle of the shot, to measure the time of a run on this machine.
+        timed: Whether to solve three frames in the middle of the shot, to measure the time of a run on this machine and
+            how far from rest frames end.
         given: Options of `RefineOptions` for reading.
 
     Returns:
@@ -258,7 +259,7 @@ def inspect_shot(shot: str | Path | Stage, *, timed: bool = False, **given: Any)
             found = describe(opened, options)
             if timed and "problem" not in found:
                 levels = [garment["level"] for garment in found["garments"]]
-                found["timed"] = time_frames(opened, options, levels)
+                found |= time_frames(opened, options, levels)
             return found
     except StageError as error:
         found = describe_meshes(source, str(error), options)

@@ -34,10 +34,10 @@ from .options import RefineOptions
 from .processes import Start, separate_processes
 from .report import LOG, RefineReport, of_a_kind
 from .settled import unsettled_frames
-from .skin import Shown, frames_compared, of_polygons, shown_through
+from .skin import DrawnCloth, Shown, frames_compared, of_polygons, shown_through
 from .solve import Outcomes, ShotSolver
 from .untagged import AUTO
-from .warnings import WARNINGS, of_frames
+from .warnings import WARNINGS, of_drawn, of_frames
 
 try:
     import resource
@@ -101,7 +101,8 @@ class Run:
         provenance = made_from(self.shot, self.out, options) | dict(self.stored.record if self.stored else {})
         known = len(self.shot.warnings)  # Warnings about the shot itself are already reported.
         part = [time for time in (self._times[k] for k in self._numbers) if time is not None]
-        made = {"mode": options.mode, "velocities": options.velocities, "overwrite": options.overwrite}
+        made = {"mode": options.mode, "scheme": options.scheme, "velocities": options.velocities}
+        made["overwrite"] = options.overwrite
         made["times"] = part if len(part) < len(self.shot.scene.times) else None
         refinements = refine_garments(self.shot.scene.garments, self.solver.levels)
         with ExitStack() as stack:
@@ -209,10 +210,12 @@ class Run:
         report, options = self.report, self.options
         written, shot, began = 0.0, {"shot": report.shot}, clock.perf_counter()
         compared = frames_compared(count if options.contact != "off" else 0)
-        shown: list[Shown] = []
+        shown, entered = list[Shown](), dict[float | None, dict[str, float]]()
+        drawn = DrawnCloth(self.shot, self.solver.levels if options.report and options.scheme == "keep" else ())
         for done, outcome in enumerate(solved, start=1):
             written += self._write_frame(writer, outcome)
             shown += shown_through(self.shot, outcome) if done - 1 in compared else []
+            entered[outcome.time] = drawn.depths(outcome) if done - 1 in compared else {}
             LOG.info("frame %d of %d: time code %s", done, count, named_time(outcome.time), extra=shot)
             if done == TIMED_FRAMES < count and (
                 message := ending(clock.perf_counter() - began, count, options.workers)
@@ -237,7 +240,7 @@ class Run:
             report.note(*of_a_kind(map(str, writer.notes)))
         report.seconds["close"] = clock.perf_counter() - start
         report.seconds["write"] = written
-        report.warn(*of_frames(report))
+        report.warn(*of_frames(report), *of_drawn(entered))
         report.note(*of_folds(report.garments, report.frames), *of_energy(report.garments, report.frames))
         report.note(*of_polygons(shown))
         (report.warn if options.strict else report.note)(*of_rest(report.unsettled, len(report.frames)))
@@ -254,12 +257,8 @@ class Run:
         if writer is None:
             return 0.0
         start, records = clock.perf_counter(), self.report.frames
-        how = {
-            "changed": [not reused for reused in outcome.reused],
-            "cuts": self._cuts(records[-2:]),
-            "heat": outcome.heat,
-        }
-        writer.write(outcome.time, outcome.points, **how)
+        how = {"changed": [not reused for reused in outcome.reused], "cuts": self._cuts(records[-2:])}
+        writer.write(outcome.time, outcome.points, heat=outcome.heat, **how)
         return clock.perf_counter() - start
 
 

@@ -1,7 +1,10 @@
-"""Finds where the polygons of a body would show through cloth that lies on the body's smooth surface.
+"""Finds where bodies show through cloth because a program draws one of them otherwise than contact takes it.
 
 Cloth keeps its distance from the limit surface of a subdivided body, as renderers draw the body. A viewport that draws
 the authored polygons shows corners outside that surface.
+
+Contact keeps the polygons of refined cloth outside bodies. A renderer that subdivides the cloth draws its limit
+surface, which is rounder, and may enter a body with sharp edges.
 """
 
 from __future__ import annotations
@@ -15,8 +18,13 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ..errors import counted
+from ..solver.colliders.pose import bounds_of
+from ..solver.contact.broad_phase import Bodies
+from ..solver.contact.measure import DEEP
+from ..solver.contact.report import penetration_map
 from ..usd.mesh.bind import closest
 from ..usd.read.bodies import DRAWN_WITHIN, Polygons
+from ..usd.read.meshes import limit_of
 from ..usd.read.reader import Shot
 from ..usd.schema import GARMENT
 from ..usd.stage import at_time
@@ -46,6 +54,36 @@ class Shown:
     time: float | None
     height: float
     offset: float
+
+
+class DrawnCloth:
+    """The surfaces that renderers draw from the refined cloth of a shot."""
+
+    def __init__(self, shot: Shot, levels: Sequence[int]) -> None:
+        """Take the open shot, and the number of subdivisions of each garment; () to measure none."""
+        self._shot = shot
+        self._limits = [limit_of(shot, index, level) for index, level in enumerate(levels)]
+        self._bodies = Bodies(shot.scene.colliders, device="cpu", threads=1)
+
+    def depths(self, outcome: Outcome) -> dict[str, float]:
+        """Depth inside bodies of the surface drawn from each garment that contact has kept outside [m], by path.
+
+        The surface is measured at the vertices of the refined cloth. Depths up to `DEEP` are left out.
+        """
+        found = dict[str, float]()
+        if not self._limits or not outcome.points:
+            return found
+        self._bodies.pose(self._shot.frame(outcome.time).colliders)
+        for garment, cloth, limit in zip(self._shot.scene.garments, outcome.points, self._limits, strict=False):
+            if cloth is None or limit is None:
+                continue
+            near = self._bodies.near(garment, bounds_of(cloth), 0.0)
+            surfaces = [each.surface for each in self._bodies.touching(near, [[0.0] * len(near)])]
+            solved, drawn = (1e-3 * penetration_map(surfaces, each) for each in (cloth, limit @ cloth))
+            depth = float(drawn[solved <= DEEP].max(initial=0.0))
+            if depth > DEEP:
+                found[garment.path] = depth
+        return found
 
 
 def shown_through(shot: Shot, outcome: Outcome) -> list[Shown]:

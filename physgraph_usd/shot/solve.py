@@ -20,6 +20,7 @@ from ..solver.mesh.kernels import device_of, start_warp
 from ..usd.read.reader import Shot
 from ..usd.view import Stage
 from .frames import Outcome
+from .from_rest import FromRest
 from .joined import Mover, Positions, counts, worse
 from .options import RefineOptions
 from .processes import cores
@@ -143,22 +144,29 @@ def sampled_at(shot: Shot, time: float | None) -> list[bool]:
     return [time in source.times if source.times else time == first for source in shot.sources]
 
 
-def time_frames(shot: Shot, options: RefineOptions, levels: list[int]) -> dict[str, float]:
-    """Measure the wall time of a cold frame and the mean of warm frames, and estimate the whole shot's [s].
+def time_frames(shot: Shot, options: RefineOptions, levels: list[int]) -> dict[str, dict[str, Any]]:
+    """Time up to three frames in the middle of a shot, one cold and two warm, and say how far from rest they end.
 
     Args:
-        shot: The shot; up to three frames in the middle are solved: one cold, then two warm.
+        shot: The shot.
+        options: Options of the solve.
         levels: Subdivisions of each garment.
+
+    Returns:
+        ``timed``: wall time of the cold frame, mean of the warm ones, and the estimate for the whole shot [s]; and
+        ``from_rest``, as `FromRest.plain`.
     """
-    device = prepare_device(options.device)
-    refiner = Refiner(shot.scene, options.solve_settings(), levels=levels, device=device, threads=cores())
+    device, from_rest = prepare_device(options.device), FromRest()
+    settings = dataclasses.replace(options.solve_settings(), ended=from_rest.note)
+    refiner = Refiner(shot.scene, settings, levels=levels, device=device, threads=cores())
     times, spent = list(shot.scene.times) or [None], []
     middle = max(len(times) // 2 - 1, 0)
     for time in times[middle : middle + 3]:
         began = clock.perf_counter()
         refiner.solve(shot.frame(time))
         spent.append(clock.perf_counter() - began)
+        from_rest.measure()
     warm = mean(spent[1:] or spent)
     whole = spent[0] + warm * (len(times) - 1)
     seconds = {"first_frame_seconds": spent[0], "seconds_a_frame": warm, "whole_shot_seconds": whole}
-    return {name: float(f"{value:.3g}") for name, value in seconds.items()}
+    return {"timed": {name: float(f"{value:.3g}") for name, value in seconds.items()}, "from_rest": from_rest.plain()}

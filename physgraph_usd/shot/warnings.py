@@ -96,6 +96,14 @@ WARNINGS = {
         "{left} are left",
         "--heat-map shows where, to mend the cage there",
     ),
+    "drawn": Kind(
+        "the surface that renderers draw enters a body",
+        "renderers subdivide the refined cloth; over a body's sharp edges the surface is rounder than the body. "
+        "`--scheme none` writes polygons, which stay outside; measured where a report is asked for",
+        "the surface that renderers draw from it is up to {depth:.1f} mm inside a body",
+        "--scheme none writes polygons, which stay outside",
+        {"scheme": "none"},
+    ),
     "broken_before": Kind(
         "leaves its place for this frame alone",
         "mend the cage or the body in that frame; the next frame starts from the one before it",
@@ -238,6 +246,16 @@ def of_contact(garment: Mapping[str, Any], entries: Entries) -> Iterator[str]:
         times = sorted(left, key=lambda time: -sum(after for _, after, _ in left[time]))  # The worst first.
         named = [f"{what} ({before:,} in the cage)" for what, _, before in left[times[0]]]
         yield WARNINGS["contact"](garment["path"], times, left=", ".join(named))
+
+
+def of_drawn(found: Mapping[float | None, Mapping[str, float]]) -> list[str]:
+    """A warning for each garment whose drawn surface enters a body, given depths [m] by time code and path."""
+    warnings = []
+    for path in dict.fromkeys(path for depths in found.values() for path in depths):
+        depths = {time: each[path] for time, each in found.items() if path in each}
+        times = sorted(depths, key=lambda time: -depths[time])  # The worst first.
+        warnings.append(WARNINGS["drawn"](path, times, depth=1e3 * depths[times[0]]))
+    return warnings
 
 
 def _measured(contact: Mapping[str, Any]) -> Iterator[tuple[str, int, int]]:

@@ -7,11 +7,12 @@ from typing import Any
 
 import numpy as np
 import viser
+from scipy import sparse
 
 from ..solver.colliders.pose import Pose
 from ..solver.scene import Frame
 from ..usd.read.bindings import GarmentBindings
-from ..usd.read.meshes import color_of
+from ..usd.read.meshes import color_of, limit_of
 from .brush import Stroke, circle
 from .light import add_lights, to_linear
 from .maps import PLAIN, Map, find_map
@@ -32,6 +33,23 @@ LIFT = 0.004
 """How far before the cloth the brush's rings are drawn, in the garments' size."""
 FALLOFF = (1.0, 0.5)
 """Radii of the brush's rings over the brush's radius: full extent, and half strength."""
+
+
+class RenderedCloth:
+    """Moves refined cloth to the surface that a renderer draws."""
+
+    def __init__(self, session: TuneSession) -> None:
+        """Take the session; the matrices are made with the first positions."""
+        self._session = session
+        self._limits: dict[tuple[int, int], sparse.csr_matrix | None] = {}
+
+    def __call__(self, index: int, points: np.ndarray) -> np.ndarray:
+        """Positions of a garment by number on the surface [m], from those of the refined cloth, shape (V, 3)."""
+        levels = len(self._session.refinements[index])
+        if (index, levels) not in self._limits:
+            self._limits[index, levels] = limit_of(self._session.shot, index, levels)
+        limit = self._limits[index, levels]
+        return points if limit is None else limit @ points
 
 
 class Picture:
@@ -65,6 +83,7 @@ class Picture:
         self._cloth, self._line = points, 0.0  # Where the wipe stands to the right [m].
         self._labels: dict[str, viser.LabelHandle] = {}
         self._bindings: dict[int, tuple[int, GarmentBindings]] = {}
+        self._rendered = RenderedCloth(session)
         self._own = {path: color_of(session.shot.stage, path) for path in (*session.garments, *session.shot.colliders)}
         self._skins, self._columns = Skins(server, self.axes), list[list[str]]()
         self.paintable = False
@@ -120,9 +139,10 @@ class Picture:
         """Draw refined garments at new positions [m], by path; maps, wires and a wipe follow in `draw`."""
         at = self._offset(len(self.view.columns) - 1, len(self.view.columns))
         for path, each in points.items():
-            handle = self._skins.meshes.get(name := f"{FINE}/{self._session.garments.index(path)}")
+            index = self._session.garments.index(path)
+            handle = self._skins.meshes.get(name := f"{FINE}/{index}")
             if handle is not None and self.view.map == PLAIN and len(handle.vertices) == len(each):
-                self._skins.move(name, self._placed(each, at))
+                self._skins.move(name, self._placed(self._rendered(index, each), at))
 
     def draw_rings(self, at: np.ndarray | None, radius: float, *, eye: np.ndarray) -> None:
         """Draw the end of a brush, and where it paints half, on the refined cloth.
@@ -183,7 +203,8 @@ class Picture:
         if column == SUBDIVISION and self._session.refinements[index]:
             return self._session.solver.refiner.group_of((index,)).levels[-1].smooth_from_coarse @ given
         solved = {FINE: shown, KEPT: kept}.get(column)
-        return given if column in (CAGE, SUBDIVISION) else None if solved is None else solved.points[index]
+        found = None if solved is None else solved.points[index]
+        return given if column in (CAGE, SUBDIVISION) else None if found is None else self._rendered(index, found)
 
     def _side(self, points: np.ndarray, corners: np.ndarray, column: str) -> np.ndarray:
         """Faces or edges of a column, shape (N, k): all, or with a wipe those partly on its side."""

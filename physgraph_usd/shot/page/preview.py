@@ -94,7 +94,8 @@ def preview(
 class Pictures:
     """A refined layer beside its input shot, or a plain shot alone.
 
-    Both sides are drawn in the same way; the input is subdivided smoothly to the face count of the refined cloth.
+    The refined cloth is drawn as a renderer draws it, by its subdivision surface. The input is subdivided smoothly to
+    as many faces.
 
     Attributes:
         times: Time codes with samples.
@@ -174,7 +175,10 @@ class Pictures:
         return points[((points >= low - margin) & (points <= high + margin)).all(axis=1)]
 
     def _sides(self, code: float | None) -> list[list[DrawnMesh]]:
-        sides = [stage.meshes(code, cages=self._cages) for stage in self._stages]
+        sides = [self._stages[0].meshes(code, cages=self._cages)]
+        if len(self._stages) > 1:
+            cages = None if self._cages is None else self._cages.difference(self._refined)
+            sides.append(self._stages[1].meshes(code, cages=cages))
         faces = {mesh.path: mesh.mesh.face_count for mesh in sides[-1] if mesh.path in self._refined}
         coarse = [mesh.subdivided(faces.get(mesh.path, faces.get(f"{mesh.path}_refined", 0))) for mesh in sides[0]]
         return [coarse, *sides[1:]]
@@ -189,7 +193,7 @@ class Pictures:
             pixels = draw(meshes, view, size=self._panel, floor=floor)
             picture.paste(Image.fromarray(pixels), (i * self._panel[0], 0))
             shown = [mesh for mesh in meshes if mesh.path in (*self._garments, *self._refined)] or meshes
-            count = f"{sum(len(mesh.points) for mesh in shown):,} vertices"
+            count = f"{sum(mesh.authored for mesh in shown):,} vertices"
             label(pen, (i * self._panel[0], 0), self._panel[1], lines=[title, count])
         if code is not None:
             place = (self._size[0] - self._size[1] // 36, self._size[1] - self._size[1] // 24)

@@ -21,12 +21,14 @@ from ..read.skinning import skel_root
 from ..stage import at_time, paths_in, root_metadata, timecode
 from ..times import FrameGrid, is_among, motion_of
 from ..view import StageView
-from ..write.attribute_rules import BLOCKED, EMPTIED, action_on, values_off, with_action
+from ..write.attribute_rules import BLOCKED, EMPTIED, action_on, render_values, with_action
 from ..write.normals import VertexNormals
 from ..write.primvars import INFLUENCES
 from ..write.track import HEAT, PREFIX, extent_of
 
-TOGETHER = ("points", "faceVertexCounts", "faceVertexIndices", "extent", "normals", "subdivisionScheme")
+TOGETHER = ("points", "faceVertexCounts", "faceVertexIndices", "extent", "subdivisionScheme")
+
+SHARPNESS = ("creaseIndices", "creaseLengths", "creaseSharpnesses", "cornerIndices", "cornerSharpnesses")
 
 
 @dataclass(frozen=True)
@@ -75,6 +77,11 @@ class Fine:
         value = self.value(name, time)
         return None if value is None else np.asarray(value)
 
+    @cached_property
+    def polygonal(self) -> bool:
+        """Whether the mesh is drawn by its polygons, with normals; else it is a subdivision surface."""
+        return self.value("subdivisionScheme", None) == UsdGeom.Tokens.none
+
     def written(self, name: str) -> list[float]:
         """Sample times of an attribute in the refined layer itself."""
         return list(self.layer.ListTimeSamplesForPath(self.prim.GetPath().AppendProperty(name)))
@@ -106,7 +113,7 @@ class Fine:
 
 def opinions_together(fine: Fine) -> Iterator[Problem]:
     """Everything that depends on topology is in this layer."""
-    for name in TOGETHER:
+    for name in (*TOGETHER, "normals") if fine.polygonal else TOGETHER:
         spec = fine.layer.GetAttributeAtPath(fine.prim.GetPath().AppendProperty(name))
         if spec is None or not (spec.HasDefaultValue() or fine.written(name)):
             yield fine.problem(name, "is not authored in the refined layer, though it depends on topology")
@@ -157,7 +164,11 @@ def instances(fine: Fine) -> Iterator[Problem]:
 
 
 def normals(fine: Fine) -> Iterator[Problem]:
-    """Normals are per vertex, unit, on the outer side, and sampled with the points."""
+    """Normals of polygons are per vertex, unit, on the outer side, and sampled with the points; others have none."""
+    if not fine.polygonal:
+        if fine.prim.GetAttribute("normals").HasAuthoredValue():
+            yield fine.problem("normals", "is authored on a subdivision surface, which makes its own")
+        return
     if fine.prim.GetAttribute("normals").GetMetadata("interpolation") != UsdGeom.Tokens.vertex:
         yield fine.problem("normals", "has interpolation other than vertex")
     if fine.written("normals") != fine.written("points"):
@@ -278,15 +289,20 @@ def subsets(fine: Fine) -> Iterator[Problem]:
 
 def leftovers(fine: Fine) -> Iterator[Problem]:
     """Nothing that belonged to the coarse topology shows through."""
-    if fine.value("subdivisionScheme", None) != "none":
-        yield fine.problem("subdivisionScheme", f"is {fine.value('subdivisionScheme', None)!r}, not 'none'")
     for attribute in with_action(fine.prim, EMPTIED):
         for time in (None, *attribute.GetTimeSamples()):
             if len(fine.entries(attribute.GetName(), time)):
                 yield fine.problem(attribute.GetName(), "still holds the coarse mesh's entries", time)
-    for attribute, off in values_off(fine.prim):
-        if (value := attribute.Get()) != off:
-            yield fine.problem(attribute.GetName(), f"is {value!r}, not {off!r}: a render subdivides again")
+    for attribute, value in render_values(fine.prim, None if fine.polygonal else 0):
+        found = attribute.Get()
+        if fine.polygonal and found != value:
+            yield fine.problem(attribute.GetName(), f"is {found!r}, not {value!r}: a render subdivides again")
+        if not fine.polygonal and not fine.layer.GetAttributeAtPath(
+            fine.prim.GetPath().AppendProperty(attribute.GetName())
+        ):
+            yield fine.problem(
+                attribute.GetName(), "is not lowered by the layer: a render subdivides as often as the cage"
+            )
     if fine.prim.GetAttribute("accelerations").HasAuthoredValue():
         yield fine.problem("accelerations", "still holds the coarse mesh's values")
     if fine.prim.GetAttribute("primvars:normals").HasAuthoredValue():
@@ -294,6 +310,27 @@ def leftovers(fine: Fine) -> Iterator[Problem]:
     orientation = fine.layer.GetAttributeAtPath(fine.prim.GetPath().AppendProperty("orientation"))
     if orientation is not None:
         yield fine.problem("orientation", "is authored in the refined layer; winding and orientation are kept")
+
+
+def subdivision(fine: Fine) -> Iterator[Problem]:
+    """The scheme suits the faces, and creases and corners are those of the fine mesh."""
+    scheme = fine.value("subdivisionScheme", None)
+    if scheme == UsdGeom.Tokens.loop and (fine.entries("faceVertexCounts", None) != 3).any():
+        yield fine.problem("subdivisionScheme", "is 'loop', which is for triangles only")
+    edges, lengths, sharp, corners, sharp_corners = (len(fine.entries(name, None)) for name in SHARPNESS)
+    if fine.polygonal and edges + lengths + sharp + corners + sharp_corners:
+        yield fine.problem(SHARPNESS[0], "creases or corners sharpen a mesh that is drawn by its polygons")
+    if fine.entries("creaseLengths", None).sum() != edges or sharp != lengths:
+        yield fine.problem("creaseIndices", f"has {edges} entries; the {lengths} lengths and {sharp} values do not fit")
+    if corners != sharp_corners:
+        yield fine.problem("cornerIndices", f"has {corners} entries and {sharp_corners} sharpnesses")
+    for name in (SHARPNESS[0], SHARPNESS[3]):
+        indices = fine.entries(name, None)
+        spec = fine.layer.GetAttributeAtPath(fine.prim.GetPath().AppendProperty(name))
+        if len(indices) and not 0 <= indices.min() <= indices.max() < fine.sizes["vertex"]:
+            yield fine.problem(name, f"names point {indices.max()} of {fine.sizes['vertex']}")
+        if len(indices) and spec is None:
+            yield fine.problem(name, "still holds the coarse mesh's entries")
 
 
 def velocities(fine: Fine) -> Iterator[Problem]:
@@ -335,6 +372,7 @@ RULES: tuple[Callable[[Fine], Iterator[Problem]], ...] = (
     heat_maps,
     subsets,
     leftovers,
+    subdivision,
     velocities,
     skinning,
     limits,

@@ -94,9 +94,16 @@ class ControlMesh:
         creases = np.tile(self.creases[sharp] - 1.0, 2)
         return step, stencil, ControlMesh.of(step.mesh, edges=halves, creases=creases, corners=corners)
 
+    def to_limit(self) -> sparse.csr_matrix:
+        """The matrix that moves the vertices to the limit surface, shape (V, V)."""
+        count = self.mesh.vertex_count
+        moved = self.subdivided()[1][:count, :]
+        same = sparse.identity(count, format="csr")
+        return sparse.csr_matrix(same + TO_LIMIT * (moved - same))
+
 
 def drawn_surface(
-    cage: ControlMesh, points: np.ndarray, *, holes: np.ndarray, scheme: str, within: float
+    cage: ControlMesh, points: np.ndarray, *, holes: np.ndarray, scheme: str, within: float, levels: int | None = None
 ) -> DrawnSurface:
     """The faces drawn by a renderer.
 
@@ -106,6 +113,7 @@ def drawn_surface(
         holes: Numbers of the authored hole faces.
         scheme: "catmullClark", "loop", or another word for flat faces.
         within: Allowed distance from the limit surface, in the points' unit.
+        levels: Number of subdivisions; None chooses by ``within``.
     """
     parents = np.arange(cage.mesh.face_count)
     if scheme not in ("catmullClark", "loop") or not cage.mesh.face_count:
@@ -114,13 +122,14 @@ def drawn_surface(
     cage = replace(cage, mesh=replace(cage.mesh, least_polygon=3 if scheme == "catmullClark" else 4))
     error = flatness(cage, points)
     wanted = 0 if error <= within else math.ceil(math.log(error / within, 4.0))
-    levels = next(n for n in range(wanted, -1, -1) if n == 0 or fine_count(cage.mesh, n) <= MOST_VERTICES)
+    if levels is None:
+        levels = next(n for n in range(wanted, -1, -1) if n == 0 or fine_count(cage.mesh, n) <= MOST_VERTICES)
     stencils = []
     for _ in range(levels):
         step, stencil, cage = cage.subdivided()
         stencils.append(stencil)
         parents = parents[step.parent_face]
-    stencil = reduce(lambda product, each: each @ product, [*stencils, _to_limit(cage)])
+    stencil = reduce(lambda product, each: each @ product, [*stencils, cage.to_limit()])
     kept = ~np.isin(parents, holes)
     return DrawnSurface(_some_faces(cage.mesh, kept), parents[kept], sparse.csr_matrix(stencil), error / 4.0**levels)
 
@@ -140,14 +149,6 @@ def flatness(cage: ControlMesh, points: np.ndarray) -> float:
     moved = stencil @ np.nan_to_num(points)
     away = np.linalg.norm(moved - step.linear @ moved[:count], axis=1)[count:]
     return float(np.quantile(away, NEAR_PART)) if len(away) else 0.0
-
-
-def _to_limit(cage: ControlMesh) -> sparse.csr_matrix:
-    """The matrix moving vertices to the limit surface, shape (V, V)."""
-    count = cage.mesh.vertex_count
-    moved = cage.subdivided()[1][:count, :]
-    same = sparse.identity(count, format="csr")
-    return sparse.csr_matrix(same + TO_LIMIT * (moved - same))
 
 
 def _some_faces(mesh: PolygonMesh, kept: np.ndarray) -> PolygonMesh:

@@ -20,12 +20,14 @@ class Shell:
         vertex: Vertex of the sheet behind each vertex, shape (2 V,).
         face: Face of the sheet, shape (2 F + rims,).
         corner: Corner of the sheet, shape (C,).
+        rims: Edges of the rims along the outer and the inner face, shape (2 rims, 2).
     """
 
     mesh: PolygonMesh
     vertex: Int[np.ndarray, " vertices"]
     face: Int[np.ndarray, " faces"]
     corner: Int[np.ndarray, " corners"]
+    rims: Int[np.ndarray, "edges 2"]
 
     @classmethod
     def of(cls, sheet: PolygonMesh, welded: Int[np.ndarray, " vertices"]) -> Shell:
@@ -45,6 +47,7 @@ class Shell:
             np.tile(np.arange(count), 2),
             np.concatenate([faces, faces, sheet.corner_face[rim]]),
             np.concatenate([corners, turned, np.stack([after, rim, rim, after], axis=1).ravel()]),
+            sides.reshape(-1, 2),
         )
 
     def thickened(

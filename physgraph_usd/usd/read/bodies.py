@@ -356,7 +356,13 @@ def unread(prim: Usd.Prim) -> str:
 
 
 def surface_of(
-    mesh: UsdGeom.Mesh, polygons: PolygonMesh, points: np.ndarray, *, holes: np.ndarray, within: float
+    mesh: UsdGeom.Mesh,
+    polygons: PolygonMesh,
+    points: np.ndarray,
+    *,
+    holes: np.ndarray,
+    within: float,
+    levels: int | None = None,
 ) -> DrawnSurface:
     """A mesh's faces as drawn.
 
@@ -366,28 +372,47 @@ def surface_of(
         points: Its points in any pose, shape (V, 3).
         holes: Numbers of the faces that are holes.
         within: Allowed distance from the limit surface, in the points' unit.
+        levels: Number of subdivisions; None chooses by ``within``.
     """
     scheme = str(mesh.GetSubdivisionSchemeAttr().Get())
-    return drawn_surface(_control_mesh(mesh, polygons), points, holes=holes, scheme=scheme, within=within)
+    cage = _control_mesh(mesh, polygons)
+    return drawn_surface(cage, points, holes=holes, scheme=scheme, within=within, levels=levels)
 
 
 def _control_mesh(mesh: UsdGeom.Mesh, polygons: PolygonMesh) -> ControlMesh:
-    """The faces with their creases and corners; creases or corners with inconsistent arrays are dropped."""
+    """The faces with their creases and corners."""
+    ends, sharpness, corners = sharpness_of(mesh, polygons.vertex_count)
+    return ControlMesh.of(polygons, edges=ends, creases=sharpness, corners=corners)
+
+
+def sharpness_of(mesh: UsdGeom.Mesh, vertex_count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Ends of the crease edges, shape (C, 2), their sharpness, shape (C,), and that of each vertex, shape (V,).
+
+    Creases or corners with inconsistent arrays are dropped.
+    """
     ends, sharpness = np.zeros((0, 2), np.int32), np.zeros(0)
     attributes = (mesh.GetCreaseIndicesAttr(), mesh.GetCreaseLengthsAttr(), mesh.GetCreaseSharpnessesAttr())
-    indices, lengths, given = (_array(attribute, None) for attribute in attributes)
+    indices, lengths, given = map(_numbers, attributes, ("iu", "iu", "iuf"))
     if len(lengths) and lengths.min() >= 2 and lengths.sum() == len(indices):
         chain = np.repeat(np.arange(len(lengths)), lengths)
         along = np.flatnonzero(chain[1:] == chain[:-1])
         given = given[chain[along]] if len(given) == len(lengths) else given  # One value per crease, or one per edge.
         if len(given) == len(along):
-            ends, sharpness = np.stack([indices[along], indices[along + 1]], axis=1), given
-    corners = np.zeros(polygons.vertex_count)
-    places, given = (_array(each, None) for each in (mesh.GetCornerIndicesAttr(), mesh.GetCornerSharpnessesAttr()))
+            ends = np.stack([indices[along], indices[along + 1]], axis=1)
+            inside = ((ends >= 0) & (ends < vertex_count)).all(axis=1)
+            ends, sharpness = ends[inside], given[inside]
+    corners = np.zeros(vertex_count)
+    places, given = map(_numbers, (mesh.GetCornerIndicesAttr(), mesh.GetCornerSharpnessesAttr()), ("iu", "iuf"))
     if len(places) == len(given):
         inside = (places >= 0) & (places < len(corners))
         corners[places[inside]] = given[inside]
-    return ControlMesh.of(polygons, edges=ends, creases=sharpness, corners=corners)
+    return ends, sharpness, corners
+
+
+def _numbers(attribute: Usd.Attribute, kinds: str) -> np.ndarray:
+    """An attribute's list of numbers of some of numpy's kinds; empty for anything else."""
+    array = _array(attribute, None)
+    return array if array.ndim == 1 and array.dtype.kind in kinds else np.zeros(0, np.int32)
 
 
 def _array(attribute: Usd.Attribute, time: float | None) -> np.ndarray:

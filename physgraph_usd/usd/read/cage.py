@@ -72,7 +72,7 @@ def read_cage(prim: Usd.Prim, vertex_count: int, times: Sequence[float]) -> Cage
     kept = np.flatnonzero(keep).astype(np.int32)
     kept_indices = indices[kept_corners(counts, indices, kept)]
     mesh = PolygonMesh(sizes[keep].astype(np.int32), kept_indices, vertex_count)
-    return Cage(mesh, kept, (*notices, *_not_carried(usd), *_odd_controls(usd)))
+    return Cage(mesh, kept, (*notices, *_odd_controls(usd)))
 
 
 def read_integers(attribute: Usd.Attribute, time: float | None) -> np.ndarray:
@@ -144,19 +144,6 @@ def _left_out(path: str, keep: np.ndarray, unknown_holes: int) -> list[Notice]:
     if unknown_holes:
         notices.append(Notice(path, None, f"{unknown_holes} holeIndices name no face and are ignored"))
     return notices
-
-
-def _not_carried(usd: UsdGeom.Mesh) -> list[Notice]:
-    """Notices of the cage's subdivision features not supported by refining."""
-    authored = [
-        attribute.GetName()
-        for attribute in (usd.GetCreaseIndicesAttr(), usd.GetCornerIndicesAttr())
-        if attribute.HasAuthoredValue() and np.size(attribute.Get(Usd.TimeCode.EarliestTime()) or ())
-    ]
-    message = (
-        f"{' and '.join(authored)} sharpen the cage's limit surface; cloth has no sharp edges, so they are dropped"
-    )
-    return [Notice(str(usd.GetPath()), None, message)] if authored else []
 
 
 def _odd_controls(usd: UsdGeom.Mesh) -> list[Notice]:

@@ -9,17 +9,18 @@ from pathlib import Path
 
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdSkel
+from scipy import sparse
 
 from ...errors import LayerError, StageError
-from ...solver.mesh.subdivide import smooth, subdivide
+from ...solver.mesh.subdivide import creases_of, smooth, subdivide
 from ...solver.mesh.topology import PolygonMesh, TriangleSplit
-from ..mesh.drawn import DrawnSurface
+from ..mesh.drawn import ControlMesh, DrawnSurface
 from ..provenance import read_record, recorded_shot
 from ..schema import AXES
 from ..stage import bad_rate, list_meshes, open_layer, paths_in, pxr_errors, quiet, read_units, timecode
 from ..times import merge, motion_of, within
 from ..view import root_over
-from .bodies import DRAWN_WITHIN, surface_of
+from .bodies import DRAWN_WITHIN, sharpness_of, surface_of
 from .find import has_schema, traverse, with_gravity
 from .placement import place
 from .reader import Shot
@@ -38,12 +39,14 @@ class DrawnMesh:
         points: World positions [m], Y up, shape (V, 3).
         mesh: The polygons, counter-clockwise seen from outside, starting at the authored first corner.
         face_colors: Linear RGB per polygon, shape (F, 3).
+        authored: Number of authored points.
     """
 
     path: str
     points: np.ndarray
     mesh: PolygonMesh
     face_colors: np.ndarray
+    authored: int
 
     @cached_property
     def _split(self) -> TriangleSplit:
@@ -88,8 +91,8 @@ class DrawnStage:
         """Compose and open."""
         base = open_layer(shot, StageError)
         layers = [open_layer(path, StageError) for path in (over, shot) if path is not None]
-        points = [] if over is None else [f"{path}.points" for path in refined_in(over)]
-        self._refined = merge(*(layers[0].ListTimeSamplesForPath(name) for name in points))
+        self._fine = () if over is None else refined_in(over)
+        self._refined = merge(*(layers[0].ListTimeSamplesForPath(f"{path}.points") for path in self._fine))
         self._root = root_over(base, [layer.identifier for layer in layers])
         with pxr_errors(f"cannot open {shot}"), quiet():
             self.stage = Usd.Stage.Open(self._root)
@@ -137,8 +140,9 @@ class DrawnStage:
         """All visible meshes of purpose default or render at a time code, in stage order, if not empty.
 
         Args:
-            cages: Paths of the meshes drawn by their authored polygons, the others by their subdivision's limit surface
-                as bodies are in contact; None for all meshes.
+            cages: Paths of the meshes drawn by their authored polygons; None for all meshes. The others are drawn by
+                their subdivision's limit surface: meshes of the layer with one more subdivision, the others as bodies
+                are in contact.
         """
         code = timecode(time)
         transforms = UsdGeom.XformCache(code)
@@ -165,7 +169,8 @@ class DrawnStage:
             np.array_equal(known[0].counts, polygons.counts) and np.array_equal(known[0].indices, polygons.indices)
         ):
             holes = np.asarray(mesh.GetHoleIndicesAttr().Get() or [], np.int64)
-            found = surface_of(mesh, polygons, points, holes=holes, within=DRAWN_WITHIN / (scale * self._scale))
+            within, levels = DRAWN_WITHIN / (scale * self._scale), 1 if path in self._fine else None
+            found = surface_of(mesh, polygons, points, holes=holes, within=within, levels=levels)
             known = self._surfaces[path] = polygons, found
         return known[1]
 
@@ -177,6 +182,31 @@ def upright(up: np.ndarray) -> np.ndarray:
         return np.diag([-1.0, -1.0, 1.0])
     cross = np.array([[0.0, x, 0.0], [-x, 0.0, -z], [0.0, z, 0.0]])
     return np.eye(3) - cross + cross @ cross / (1.0 + y)
+
+
+def limit_of(shot: Shot, index: int, levels: int) -> sparse.csr_matrix | None:
+    """The matrix from the positions of a garment's refined cloth to the surface that a renderer draws, shape (V, V).
+
+    None for cloth that is drawn by its polygons. Levels are the subdivisions between the cage and the refined cloth.
+    """
+    source, garment = shot.sources[index], shot.scene.garments[index]
+    mesh = UsdGeom.Mesh(shot.stage.GetPrimAtPath(source.path))
+    if mesh.GetSubdivisionSchemeAttr().Get(Usd.TimeCode.EarliestTime()) in (
+        UsdGeom.Tokens.none,
+        UsdGeom.Tokens.bilinear,
+    ):
+        return None
+    ends, sharpness, corners = sharpness_of(mesh, len(source.weld.number))
+    sharp = creases_of(garment.mesh, garment.rest, garment.closed)
+    cage = ControlMesh.of(
+        garment.mesh,
+        edges=np.concatenate([source.weld.number[ends], sharp]),
+        creases=np.concatenate([sharpness, np.full(len(sharp), UsdGeom.Mesh.SHARPNESS_INFINITE)]),
+        corners=source.weld.largest(corners),
+    )
+    for _ in range(levels):
+        cage = cage.subdivided()[2]
+    return cage.to_limit()
 
 
 def _gravity_of(layer: Sdf.Layer) -> str | None:
@@ -223,7 +253,7 @@ def _read(
     # Use the determinant's sign only: the cube of a scale can overflow.
     if left != (np.linalg.slogdet(matrix[:3, :3])[0] < 0):
         polygons = replace(polygons, indices=polygons.indices[polygons.mirrored_corners])
-    return DrawnMesh(str(mesh.GetPath()), positions, polygons, colors)
+    return DrawnMesh(str(mesh.GetPath()), positions, polygons, colors, len(points))
 
 
 def color_of(stage: Usd.Stage, path: str) -> np.ndarray | None:

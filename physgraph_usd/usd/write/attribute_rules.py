@@ -1,4 +1,4 @@
-"""One table of the attributes that a refined layer writes, blocks or turns off; docs/layers.md is made from it."""
+"""One table of the attributes that a refined layer writes, blocks, lowers or turns off; docs/layers.md shows it."""
 
 from __future__ import annotations
 
@@ -11,9 +11,12 @@ from pxr import Sdf, Usd, UsdGeom
 from ..stage import Notice
 from .stream import LayerStream
 
-ANEW, EMPTIED, BLOCKED, OFF, CARRIED = "anew", "emptied", "blocked", "off", "refined"
-"""Computed from the fine mesh; an empty array; hidden with its samples; a value that does nothing; one value for each
-fine element, from the coarse values."""
+ANEW, EMPTIED, BLOCKED, CARRIED = "anew", "emptied", "blocked", "refined"
+"""Computed from the fine mesh; an empty array; hidden with its samples; one value for each fine element, from coarse
+values."""
+LOWERED, OFF = "lowered", "off"
+"""A renderer's number of subdivisions, less those of the layer, and off where the scheme is none; and other settings of
+its subdivision, off where the scheme is none and kept elsewhere."""
 PREFIX = "primvars:"
 
 
@@ -26,7 +29,7 @@ class Rule:
         action: One of the actions above.
         reason: How or why, in docs/layers.md and in a note of the run.
         noted: Whether a note of the run says it.
-        number: Value of a number that is off.
+        number: Value of a number that is off; with 1, the number counts parts of an edge, and a subdivision halves it.
     """
 
     names: tuple[str, ...]
@@ -37,9 +40,15 @@ class Rule:
 
 
 RULES = (
-    Rule(("faceVertex*", "points", "normals", "extent", "velocities"), ANEW),
-    Rule(("subdivisionScheme",), ANEW, "none"),
-    Rule(("holeIndices", "crease[ILS]*", "corner[IS]*"), EMPTIED),
+    Rule(("faceVertex*", "points", "extent", "velocities"), ANEW),
+    Rule(("subdivisionScheme",), ANEW, "as the cage's, loop for triangles and catmullClark for others, or none"),
+    Rule(
+        ("crease[ILS]*", "corner[IS]*"),
+        ANEW,
+        "sharpness less the layer's subdivisions; emptied where the scheme is none",
+    ),
+    Rule(("normals",), BLOCKED, "the scheme makes them; anew where it is none"),
+    Rule(("holeIndices",), EMPTIED, "faces that are holes are left out"),
     Rule(("accelerations", f"{PREFIX}velocities", f"{PREFIX}accelerations", f"{PREFIX}normals"), BLOCKED),
     Rule(
         (f"{PREFIX}tangent", f"{PREFIX}tangent[suv]", f"{PREFIX}bitangent*", f"{PREFIX}binormal*"),
@@ -49,12 +58,24 @@ RULES = (
     ),
     Rule((f"{PREFIX}skel:joint*", "skel:joints", "skel:blendShapes"), BLOCKED, "skinned already"),
     Rule(
-        ("*arnold:subdiv_*", "*moonray:is_subd", "*redshift:*rstess_enable", "*:*subdiv*"),
-        OFF,
-        "subdivided already",
+        ("*:*subdiv*iterations*", "*:*subdiv*level*", "*:*max*subd*"),
+        LOWERED,
+        "less the layer's subdivisions; off where the scheme is none",
         noted=True,
     ),
-    Rule(("*moonray:mesh_resolution",), OFF, "subdivided already", noted=True, number=1),
+    Rule(
+        ("*moonray:mesh_resolution",),
+        LOWERED,
+        "halved by each of the layer's subdivisions; off where the scheme is none",
+        noted=True,
+        number=1,
+    ),
+    Rule(
+        ("*arnold:subdiv_*", "*moonray:is_subd", "*redshift:*rstess_enable", "*:*subdiv*"),
+        OFF,
+        "where the scheme is none; else kept",
+        noted=True,
+    ),
     Rule((f"{PREFIX}*", "physics:restShapePoints"), CARRIED, "words and integers copied, constants kept"),
 )
 """Rules in order of precedence; attributes without a rule stay as authored."""
@@ -69,7 +90,7 @@ def rule_of(name: str) -> Rule | None:
 def action_on(attribute: Usd.Attribute) -> str:
     """Action on an attribute; "" for an attribute that stays as authored."""
     rule = rule_of(attribute.GetName())
-    return "" if rule is None or (rule.action == OFF and attribute.GetTypeName().isArray) else rule.action
+    return "" if rule is None or (rule.action in (LOWERED, OFF) and attribute.GetTypeName().isArray) else rule.action
 
 
 def with_action(prim: Usd.Prim, action: str) -> list[Usd.Attribute]:
@@ -78,27 +99,38 @@ def with_action(prim: Usd.Prim, action: str) -> list[Usd.Attribute]:
     return [each for each in own if action_on(each) == action]
 
 
-def values_off(prim: Usd.Prim) -> Iterator[tuple[Usd.Attribute, object]]:
-    """Attributes and inherited primvars of a garment that must be off, each with the value that turns it off."""
+def render_values(prim: Usd.Prim, levels: int | None) -> Iterator[tuple[Usd.Attribute, object]]:
+    """Attributes and inherited primvars that make renderers subdivide a garment too far, each with the right value.
+
+    Args:
+        prim: The coarse mesh.
+        levels: Number of subdivisions of the layer; None where the scheme is none, and renderers must not subdivide.
+    """
     inherited = [each.GetAttr() for each in UsdGeom.PrimvarsAPI(prim).FindPrimvarsWithInheritance()]
-    for attribute in {each.GetName(): each for each in [*inherited, *with_action(prim, OFF)]}.values():
-        rule = rule_of(attribute.GetName())
-        if rule is not None and action_on(attribute) == OFF:
-            default = attribute.GetTypeName().defaultValue
+    authored = [*inherited, *with_action(prim, LOWERED), *with_action(prim, OFF)]
+    for attribute in {each.GetName(): each for each in authored}.values():
+        rule, action = rule_of(attribute.GetName()), action_on(attribute)
+        if rule is None or action not in (LOWERED, OFF):
+            continue
+        default, value = attribute.GetTypeName().defaultValue, attribute.Get(Usd.TimeCode.EarliestTime())
+        if levels is None:
             yield attribute, "none" if isinstance(default, str) else type(default)(rule.number)
+        elif action == LOWERED and isinstance(value, int | float) and not isinstance(value, bool):
+            fewer = value // 2**levels if rule.number else value - levels
+            yield attribute, type(value)(max(fewer, rule.number))
 
 
-def turn_off(stream: LayerStream, target: Sdf.Path, prim: Usd.Prim) -> None:
-    """Author values that keep renderers from subdividing the fine mesh; a block would let an ancestor's value in."""
-    for attribute, value in values_off(prim):
+def limit_renderers(stream: LayerStream, target: Sdf.Path, prim: Usd.Prim, levels: int | None) -> None:
+    """Author the values of `render_values`; a block would let an ancestor's value in."""
+    for attribute, value in render_values(prim, levels):
         path = target.AppendProperty(attribute.GetName())
         stream.attribute(path, attribute.GetTypeName(), interpolation=UsdGeom.Tokens.constant)
         stream.set(path, value)
 
 
-def notes_of(prim: Usd.Prim) -> list[Notice]:
-    """A note for each rule that is noted, with the names of the attributes of a coarse mesh."""
-    attributes = [*(attribute for attribute, _ in values_off(prim)), *with_action(prim, BLOCKED)]
+def notes_of(prim: Usd.Prim, levels: int | None) -> list[Notice]:
+    """A note for each rule that is noted, with the names of the attributes of a coarse mesh; as `render_values`."""
+    attributes = [*(attribute for attribute, _ in render_values(prim, levels)), *with_action(prim, BLOCKED)]
     found: dict[Rule, list[str]] = {}
     for name in (attribute.GetName() for attribute in attributes):
         rule = rule_of(name)

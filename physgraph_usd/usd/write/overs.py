@@ -8,11 +8,13 @@ import numpy as np
 from pxr import Sdf, Usd, UsdGeom, UsdShade, UsdSkel, Vt
 
 from ...errors import LayerError
+from ...solver.mesh.topology import PolygonMesh
 from ...solver.scene import Garment, GarmentFrame
+from ..read.bodies import sharpness_of
 from ..schema import GARMENT, GARMENT_API, fabric_values
 from ..stage import GarmentSource, Notice, value_at
-from .attribute_rules import BLOCKED, CARRIED, EMPTIED, PREFIX, action_on, turn_off, with_action
-from .primvars import FineMap
+from .attribute_rules import BLOCKED, CARRIED, EMPTIED, PREFIX, action_on, limit_renderers, with_action
+from .primvars import INFINITE, FineMap
 from .stream import LayerStream
 
 _TYPES = Sdf.ValueTypeNames
@@ -20,10 +22,42 @@ _ELSEWHERE = (PREFIX, "skel:", "xformOp", "physgraph:")
 REST_POINTS = "physics:restShapePoints"
 
 
-def author_topology(stream: LayerStream, target: Sdf.Path, prim: Usd.Prim, fine: FineMap) -> None:
-    """Author counts, indices, ``subdivisionScheme`` none, and hide all coarse-topology properties.
+def scheme_of(prim: Usd.Prim, fine: PolygonMesh, *, keep: bool) -> str:
+    """The subdivision scheme of a fine mesh.
+
+    Loop's scheme is for triangles only, and it is the scheme of triangles: the cage's Catmull-Clark would show the
+    pattern of its first subdivision, which cuts triangles into quads.
+
+    Args:
+        prim: The coarse mesh as composed.
+        fine: The fine mesh.
+        keep: Whether the fine mesh is a subdivision surface if the coarse mesh is one; False: never.
+    """
+    tokens = UsdGeom.Tokens
+    scheme = UsdGeom.Mesh(prim).GetSubdivisionSchemeAttr().Get(Usd.TimeCode.EarliestTime())
+    if not keep or scheme == tokens.none:
+        return tokens.none
+    if scheme == tokens.bilinear:
+        return tokens.bilinear
+    return tokens.loop if (np.asarray(fine.counts) == 3).all() else tokens.catmullClark
+
+
+def author_topology(
+    stream: LayerStream,
+    target: Sdf.Path,
+    prim: Usd.Prim,
+    fine: FineMap,
+    *,
+    scheme: str,
+    sharp: tuple[np.ndarray, np.ndarray],
+) -> None:
+    """Author counts, indices, scheme, creases and corners, and hide all coarse-topology properties.
 
     Here and below ``target`` is the prim to author on and ``prim`` the coarse mesh as composed.
+
+    Args:
+        scheme: The subdivision scheme, from `scheme_of`.
+        sharp: Edges and vertices that stay sharp beside the coarse mesh's own, shapes (K, 2) and (V,), bool.
     """
     for name, values in (("faceVertexCounts", fine.fine.counts), ("faceVertexIndices", fine.fine.indices)):
         path = target.AppendProperty(name)
@@ -31,12 +65,48 @@ def author_topology(stream: LayerStream, target: Sdf.Path, prim: Usd.Prim, fine:
         stream.set(path, Vt.IntArray.FromNumpy(np.ascontiguousarray(values, np.int32)))
     path = target.AppendProperty("subdivisionScheme")
     stream.attribute(path, _TYPES.Token, uniform=True)
-    stream.set(path, "none")
+    stream.set(path, scheme)
+    smooth = scheme != UsdGeom.Tokens.none
+    _author_sharpness(stream, target, prim, fine, sharp if smooth else None)
     _author_rules(stream, target, prim)
+    limit_renderers(stream, target, prim, fine.levels if smooth else None)
+
+
+def _author_sharpness(
+    stream: LayerStream,
+    target: Sdf.Path,
+    prim: Usd.Prim,
+    fine: FineMap,
+    sharp: tuple[np.ndarray, np.ndarray] | None,
+) -> None:
+    """Author creases and corners of the fine mesh where there are any or the coarse mesh's must be hidden.
+
+    ``sharp`` are further sharp edges and vertices; None: the fine mesh is no subdivision surface.
+    """
+    ends, sharpness, corner = sharpness_of(UsdGeom.Mesh(prim), fine.cage.vertex_count)
+    if sharp is None:
+        edges, of_edges, corners, of_corners = np.zeros(0, np.int32), np.zeros(0), np.zeros(0, np.int32), np.zeros(0)
+    else:
+        always, fixed = sharp
+        ends, sharpness = np.concatenate([always, ends]), np.concatenate([np.full(len(always), INFINITE), sharpness])
+        edges, of_edges = fine.creases(ends, sharpness)
+        corners, of_corners = fine.corners(np.where(fixed, INFINITE, corner))
+    arrays = {
+        "creaseIndices": edges.ravel(),
+        "creaseLengths": np.full(len(of_edges), 2, np.int32),
+        "creaseSharpnesses": of_edges,
+        "cornerIndices": corners,
+        "cornerSharpnesses": of_corners,
+    }
+    for name, values in arrays.items():
+        path, kind = target.AppendProperty(name), prim.GetAttribute(name).GetTypeName()
+        if len(values) or prim.GetAttribute(name).HasAuthoredValue():
+            stream.attribute(path, kind)
+            stream.set(path, type(kind.defaultValue)(values.tolist()))
 
 
 def _author_rules(stream: LayerStream, target: Sdf.Path, prim: Usd.Prim) -> None:
-    """Empty, block and turn off attributes of a coarse mesh by the table of rules; `carry_primvars` blocks primvars."""
+    """Empty and block attributes of a coarse mesh by the table of rules; `carry_primvars` blocks primvars."""
     for attribute in with_action(prim, EMPTIED):
         path, kind = target.AppendProperty(attribute.GetName()), attribute.GetTypeName()
         stream.attribute(path, kind)
@@ -46,7 +116,6 @@ def _author_rules(stream: LayerStream, target: Sdf.Path, prim: Usd.Prim) -> None
             stream.block(target.AppendProperty(attribute.GetName()), attribute.GetTypeName())
     if prim.GetAttribute("velocities").HasAuthoredValue():
         stream.block(target.AppendProperty("velocities"), _TYPES.Vector3fArray)
-    turn_off(stream, target, prim)
 
 
 def speed_notices(prim: Usd.Prim, *, written: bool) -> list[Notice]:

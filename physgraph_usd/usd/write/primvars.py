@@ -11,7 +11,7 @@ from pxr import Sdf, Usd, UsdGeom, Vt
 from scipy import sparse
 
 from ...solver.mesh.subdivide import Refinement, compose
-from ...solver.mesh.topology import PolygonMesh
+from ...solver.mesh.topology import PolygonMesh, find_edges
 from ..lookup import family_of
 from ..mesh.attributes import (
     corner_values,
@@ -28,6 +28,8 @@ from ..stage import Notice, timecode
 from .attribute_rules import BLOCKED, action_on
 from .stream import LayerStream
 
+INFINITE = UsdGeom.Mesh.SHARPNESS_INFINITE
+"""Sharpness from which a crease or a corner is sharp after any number of subdivisions."""
 INFLUENCES = ("primvars:skel:jointIndices", "primvars:skel:jointWeights")
 """Primvars that would skin the mesh twice."""
 
@@ -163,7 +165,14 @@ def carry_subsets(
 
 
 class FineMap:
-    """Map from a garment's authored arrays to its fine mesh, made once for each garment."""
+    """Map from a garment's authored arrays to its fine mesh, made once for each garment.
+
+    Attributes:
+        cage: The coarse mesh.
+        sheet: The refined coarse mesh.
+        fine: The fine mesh: the sheet, or its shell.
+        levels: Number of subdivisions between the coarse and the fine mesh.
+    """
 
     def __init__(
         self,
@@ -184,7 +193,7 @@ class FineMap:
             indices: Authored vertices of all corners, shape (C,).
             shell: Shell of the refined sheet that is the fine mesh; None if the sheet is.
         """
-        self.cage, self._shell = cage, shell
+        self.cage, self._shell, self.levels = cage, shell, len(refinements)
         self.sheet = refinements[-1].mesh if refinements else cage
         self.fine = self.sheet if shell is None else shell.mesh
         self._refinements = tuple(refinements)
@@ -294,6 +303,31 @@ class FineMap:
         fine = self._on_shell("corner", fine)
         return (refined[fine], None) if indices is None else (refined, fine.astype(np.int32))
 
+    def creases(self, ends: np.ndarray, sharpness: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Refine crease edges of the coarse mesh, shape (K, 2), with their sharpness, shape (K,).
+
+        A subdivision lowers a sharpness by one, except an infinite one. What falls to 0 is left out.
+
+        Returns:
+            Fine edges, shape (N, 2), int32, and the sharpness of each, float32; edges of a rim are infinitely sharp.
+        """
+        left = lowered(sharpness, self.levels)
+        sharp = (left > 0) & (find_edges(self.cage.half_edges.edges, ends) >= 0)
+        fine, left = edge_subset(self._refinements, ends[sharp]), np.repeat(left[sharp], 2**self.levels)
+        if self._shell is None:
+            return fine, left
+        rims = self._shell.rims
+        fine = np.concatenate([fine, fine + self.sheet.vertex_count, rims]).astype(np.int32)
+        return fine, np.concatenate([left, left, np.full(len(rims), INFINITE, np.float32)])
+
+    def corners(self, sharpness: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Sharp fine vertices, shape (N,), int32, and their sharpness, from that of each coarse vertex, shape (V,)."""
+        left = lowered(sharpness, self.levels)
+        sharp = np.flatnonzero(left > 0)
+        if self._shell is not None:
+            return np.concatenate([sharp, sharp + self.sheet.vertex_count]).astype(np.int32), np.tile(left[sharp], 2)
+        return sharp.astype(np.int32), left[sharp]
+
     def subset(self, element: str, indices: np.ndarray, *, exclusive: bool = False) -> np.ndarray:
         """Fine indices of a subset, ascending, int32.
 
@@ -326,6 +360,12 @@ class FineMap:
             found = edge_subset(self._refinements, indices.reshape(-1, 2)).reshape(-1)
             return found if self._shell is None else np.concatenate([found, found + self.sheet.vertex_count])
         raise ValueError(f"has elements of type {element!r}; known: edge, face, point")
+
+
+def lowered(sharpness: np.ndarray, levels: int) -> np.ndarray:
+    """Sharpness after some subdivisions, at least 0, float32; an infinite one stays."""
+    sharpness = np.asarray(sharpness, np.float32)
+    return np.where(sharpness >= INFINITE, sharpness, np.maximum(sharpness - levels, 0.0)).astype(np.float32)
 
 
 def _behind(parents: np.ndarray, chosen: np.ndarray) -> np.ndarray:

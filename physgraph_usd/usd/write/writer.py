@@ -37,6 +37,8 @@ from .target_tracks import TargetTracks
 from .track import HeatTrack, ModelHints, PointTrack
 
 MODES = ("over", "sibling")
+SCHEMES = ("keep", "none")
+"""Subdivision scheme of the fine meshes: that of the cage, or none."""
 
 
 class LayerWriter:
@@ -54,6 +56,7 @@ class LayerWriter:
         out: Path | None,
         *,
         mode: str = "over",
+        scheme: str = "keep",
         velocities: bool = False,
         provenance: Mapping[str, Any] | None = None,
         overwrite: bool = False,
@@ -66,6 +69,7 @@ class LayerWriter:
             refinements: Per garment, coarse to fine; empty to keep the cage.
             out: Layer to write, ``.usdc``, ``.usda`` or ``.usd``; None for an in-memory layer.
             mode: ``over`` replaces the garment; ``sibling`` adds ``<name>_refined`` and makes the garment its proxy.
+            scheme: ``keep`` the cage's subdivision scheme, creases and corners, or ``none``: polygons with normals.
             velocities: Whether to author velocities, by finite differences, even for garments without velocities.
             provenance: Further entries of the record in ``customLayerData["physgraph"]``.
             overwrite: Whether an existing file may be replaced.
@@ -73,16 +77,17 @@ class LayerWriter:
                 are left out of the layer.
 
         Raises:
-            UsageError: The mode is unknown, or the file exists or belongs to the shot.
+            UsageError: The mode or scheme is unknown, or the file exists or belongs to the shot.
             LayerError: The layer cannot be written.
         """
         check_known("mode", mode, MODES)
+        check_known("scheme", scheme, SCHEMES)
         if len(refinements) != len(shot.scene.garments):
             raise LayerError(f"{len(refinements)} refinements for {len(shot.scene.garments)} garments")
         if out is not None:
             check_targets([("the layer", out)], files_of(shot.path))
         self._shot, self._mode, self._time = shot, mode, -np.inf
-        self._velocities, self._open = velocities, True
+        self._velocities, self._keep_scheme, self._open = velocities, scheme == "keep", True
         self._record = {"mode": mode} | dict(provenance or {})
         self._times, self._meshes, self._bound = times, dict[int, _RefinedMesh](), dict[int, TargetTracks]()
         self.notices: list[Notice] = []
@@ -97,7 +102,7 @@ class LayerWriter:
         times = self._shot.scene.times
         span = (times[0], times[-1]) if times else None
         provenance.copy_stage_metadata(self._shot.stage, self._stream.layer, span=span)
-        options = {"sibling": self._mode == "sibling", "velocities": self._velocities}
+        options = {"sibling": self._mode == "sibling", "velocities": self._velocities, "keep": self._keep_scheme}
         with pxr_errors(f"cannot read {self._shot.path}"):
             for index in _garments_in(self._shot, self._times):
                 absent = self._shot.sources[index].absent
@@ -108,7 +113,7 @@ class LayerWriter:
                 bound = TargetTracks(self._stream, self._shot, index, steps=refinements[index], **moves)
                 self._bound[index] = bound
                 self.notices += [*mesh.notices, *bound.notices]
-                self.notes += notes_of(self._shot.stage.GetPrimAtPath(self._shot.sources[index].path))
+                self.notes += mesh.notes
 
     def write(
         self,
@@ -219,6 +224,7 @@ class _RefinedMesh:
     Attributes:
         target: Prim path of the fine mesh.
         notices: Properties hidden, emptied or changed, with the reason.
+        notes: Attributes that a render takes from elsewhere.
     """
 
     def __init__(
@@ -230,11 +236,12 @@ class _RefinedMesh:
         steps: Sequence[Refinement],
         absent: Sequence[float],
         sibling: bool,
+        keep: bool,
         velocities: bool,
     ) -> None:
         """Author the defaults of a garment, by number and refinements, coarse to fine, and start its tracks.
 
-        The garment is blocked at the absent time codes.
+        The garment is blocked at the absent time codes. With ``keep`` the fine mesh has the cage's subdivision scheme.
         """
         source, times = shot.sources[index], shot.scene.times
         prim, span = shot.stage.GetPrimAtPath(source.path), (times[0], times[-1]) if times else None
@@ -245,7 +252,12 @@ class _RefinedMesh:
         fine = FineMap(source.weld.apart, steps, counts, source.kept_faces, indices=indices, shell=self._shell)
         self.notices = overs.open_instances(stream, source.path, source.instance_roots)
         self.target = target = overs.make_sibling(stream, prim) if sibling else source.path
-        overs.author_topology(stream, target, prim, fine)
+        scheme = overs.scheme_of(prim, fine.fine, keep=keep)
+        polygonal = scheme == UsdGeom.Tokens.none
+        garment = shot.scene.garments[index]
+        sharp = source.weld.sharp_edges(garment.rest, garment.closed)
+        overs.author_topology(stream, target, prim, fine, scheme=scheme, sharp=(sharp, source.weld.torn))
+        self.notes = notes_of(prim, None if polygonal else fine.levels)
         overs.author_unskinned(stream, target, prim, skinned=source.skinned)
         self.notices += carry_primvars(stream, target, prim, fine, span=span)
         self.notices += carry_subsets(stream, target, prim, fine, span=span)
@@ -261,7 +273,7 @@ class _RefinedMesh:
         rate = shot.stage.GetTimeCodesPerSecond() if velocities or source.velocities else None
         self.notices += overs.speed_notices(prim, written=rate is not None)
         moves = {"rate": rate, "own": partial(_own_velocities, prim, fine), "absent": absent}
-        self._track = PointTrack(stream, target, normals, rest=rest, still=source.still, **moves)
+        self._track = PointTrack(stream, target, normals if polygonal else None, rest=rest, still=source.still, **moves)
         self._heat = HeatTrack(stream, target, self._weld.mesh.vertex_count, still=source.still)
         purpose = "render" if sibling else UsdGeom.Imageable(prim).ComputePurpose()
         self._hints = ModelHints(stream, shot.stage, source.path, purpose=purpose)
