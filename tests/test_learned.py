@@ -61,11 +61,12 @@ def test_the_kernels_do_what_torch_does(vectors: tuple[str, ...]):
     network = random_network(PhysgraphConfig(vectors=vectors, width=16), seed=7, scale=0.3)
     assert isinstance(network, Physgraph)
     one, other = LearnedMetric(network), LearnedMetric(network, fuse=False)
-    carry = one.start(system, x)
-    for _ in range(4):
+    carry, same = one.start(system, x), other.start(system, x)
+    for _ in range(7):  # More steps than secants are kept.
         carry = one.step(system, carry)
-        move, expected = one.propose(system, carry), other.propose(system, carry)
-        assert float((move - expected).abs().max()) < 1e-5 * float(expected.abs().max())
+        same = other.follow(system, same, carry.x)
+        move, expected = one.propose(system, carry), other.propose(system, same)
+        assert float((move - expected).abs().max()) < 5e-5 * float(expected.abs().max())
         assert not bool(move[~system.free.squeeze(1)].any())
 
 

@@ -26,10 +26,18 @@ Mutation = Callable[[Sdf.Layer], None]
 
 @pytest.fixture(scope="module")
 def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A dressed shot and its refined layer, as text."""
+    """A dressed shot and its refined layer of polygons, as text."""
     folder = tmp_path_factory.mktemp("good")
     dress_up(make_shot(folder / "shot.usda"))
-    return write_layer(folder / "shot.usda", folder / "out.usda", velocities=True)
+    return write_layer(folder / "shot.usda", folder / "out.usda", velocities=True, scheme="none")
+
+
+@pytest.fixture(scope="module")
+def surface(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A dressed shot and its refined layer with the cage's scheme, as text."""
+    folder = tmp_path_factory.mktemp("surface")
+    dress_up(make_shot(folder / "shot.usda"))
+    return write_layer(folder / "shot.usda", folder / "out.usda")
 
 
 def at(name: str) -> Sdf.Path:
@@ -141,8 +149,11 @@ FAULTS: dict[str, tuple[str, Mutation]] = {
     "texture indices out of range": ("primvars", drop("primvars:st")),
     "a subset out of range": ("subsets", subset_indices(lambda faces: [*faces, 4800])),
     "a partition with a hole": ("subsets", subset_indices(lambda faces: faces[:-1])),
-    "a limit surface": ("leftovers", author("subdivisionScheme", Sdf.ValueTypeNames.Token, "catmullClark")),
-    "creases left": ("leftovers", drop("creaseIndices")),
+    "a limit surface with normals": (
+        "normals",
+        author("subdivisionScheme", Sdf.ValueTypeNames.Token, "catmullClark"),
+    ),
+    "creases left": ("subdivision", drop("creaseIndices")),
     "accelerations left": ("leftovers", drop("accelerations")),
     "a primvar over the normals": (
         "leftovers",
@@ -166,6 +177,17 @@ FAULTS: dict[str, tuple[str, Mutation]] = {
 }
 
 
+SURFACE_FAULTS: dict[str, tuple[str, Mutation]] = {
+    "the cage's normals": ("normals", drop("normals")),
+    "Loop's scheme of quads": ("subdivision", author("subdivisionScheme", Sdf.ValueTypeNames.Token, "loop")),
+    "the cage's creases": ("subdivision", drop("creaseIndices")),
+    "a length for each edge missing": ("subdivision", drop("creaseLengths")),
+    "a corner out of range": ("subdivision", author("cornerIndices", Sdf.ValueTypeNames.IntArray, Vt.IntArray([63]))),
+    "a corner without sharpness": ("subdivision", author("cornerSharpnesses", Sdf.ValueTypeNames.FloatArray, [])),
+}
+"""Faults of a layer with the cage's scheme."""
+
+
 def find(good: Path, tmp_path: Path, mutate: Mutation) -> list[Problem]:
     """Validate a mutated copy of the good layer."""
     layer = Sdf.Layer.OpenAsAnonymous(str(good))
@@ -184,6 +206,13 @@ def test_a_seeded_fault_is_caught(good: Path, tmp_path: Path, name: str) -> None
     found = [problem for problem in find(good, tmp_path, mutate) if problem.severity == "error"]
     assert rule in {problem.rule for problem in found}
     assert all(problem.path.startswith("/") for problem in found)
+
+
+@pytest.mark.parametrize("name", SURFACE_FAULTS)
+def test_a_seeded_fault_of_a_subdivision_surface_is_caught(surface: Path, tmp_path: Path, name: str) -> None:
+    rule, mutate = SURFACE_FAULTS[name]
+    assert [problem for problem in validate_layer(surface) if problem.rule != "validators"] == []
+    assert rule in {problem.rule for problem in find(surface, tmp_path, mutate) if problem.severity == "error"}
 
 
 def test_a_mesh_still_skinned_is_caught(tmp_path: Path) -> None:

@@ -93,7 +93,12 @@ def stitch(chunks: tuple[Path, ...], out: Path | None, *, check_seams: bool, sea
 @shot_argument
 @scene_options
 @config_option
-@click.option("--time", "timed", is_flag=True, help="Also solve three frames, and say what the whole shot takes.")
+@click.option(
+    "--time",
+    "timed",
+    is_flag=True,
+    help="Also solve three frames, and say what the whole shot takes and how far from rest its frames end.",
+)
 @json_option
 @click.pass_context
 def inspect(ctx: click.Context, shot: str, *, as_json: bool, timed: bool, **options: Any) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
 from itertools import islice
 from typing import Any, Protocol, runtime_checkable
 
@@ -43,20 +44,43 @@ class Force(Protocol):
         ...
 
 
-def total_of(terms: Sequence[Force]) -> Callable[..., tuple[Tensor, Tensor, Tensor]]:
-    """A function of positions [m] and all `_aims_of` the terms: their energy [J], force [N], and each energy."""
+def total_of(terms: Sequence[Force], assembly: Assembly | None = None) -> Callable[..., tuple[Tensor, Tensor, Tensor]]:
+    """A function of positions [m] and all `_aims_of` the terms: their energy [J], force [N], and each energy.
+
+    Args:
+        terms: The terms.
+        assembly: Joint sum of the elements of the first terms, or None.
+    """
+    together = () if assembly is None else assembly.kinds
 
     def total(x: Tensor, *aims: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         left, now = iter(aims), list[Any]()
         for each in terms:
             now.append(_aimed(each, tuple(islice(left, len(_aims_of(each))))))
-        force, energy = torch.zeros_like(x), torch.zeros((), dtype=torch.float64, device=x.device)
-        energies = [each.add_force(x, force) for each in now]
-        for each in energies:
-            energy = energy + each
-        return energy, force, torch.stack(energies) if energies else energy.reshape(1)[:0]
+        if assembly is None:
+            force, first = torch.zeros_like(x), {}
+        else:
+            force = torch.empty_like(x)
+            first = dict(zip(map(id, together), assembly.evaluate(x, force, adds=False), strict=True))
+        energies = list[Tensor]()
+        for each in now:
+            known = [first[id(kind)] for kind in _elements_of(each) if id(kind) in first]
+            energies.append(sum(known[1:], known[0]) if known else each.add_force(x, force))
+        values = torch.stack(energies) if energies else x.new_zeros(0, dtype=torch.float64)
+        return values.sum(), force, values
 
     return total
+
+
+def _elements_of(term: Any) -> tuple[Elements, ...]:
+    """The kinds of elements of a term; () for terms of other kinds."""
+    return getattr(term, "elements", ())
+
+
+def assembly_of(terms: Sequence[Force], level: Level) -> Assembly | None:
+    """The joint sum of the elements of terms that last; None for terms without elements."""
+    kinds = [kind for term in terms for kind in _elements_of(term) if len(kind.corners)]
+    return Assembly(kinds, level) if kinds else None
 
 
 def _aims_of(term: Any) -> tuple[Tensor, ...]:
@@ -76,20 +100,24 @@ class ForceModule:
         forces: The terms, in order.
     """
 
-    def __init__(self, forces: Sequence[Force], recordings: Recordings | None = None) -> None:
+    def __init__(
+        self, forces: Sequence[Force], recordings: Recordings | None = None, assembly: Assembly | None = None
+    ) -> None:
         """Keep the terms in order; the order fixes the rounding of the sum.
 
         Args:
             recordings: Of sums with the same terms but for their `aims`.
+            assembly: As for `total_of`.
         """
         self.forces = tuple(forces)
         self._recordings = Recordings() if recordings is None else recordings
         names, aims = tuple(each.name for each in forces), [aim for each in forces for aim in _aims_of(each)]
-        self._work = Work(names, total_of(self.forces), aims)
+        self._assembly = assembly
+        self._work = Work(names, total_of(self.forces, assembly), aims)
 
     def joined_by(self, more: Sequence[Force]) -> ForceModule:
         """This module's terms and more."""
-        return ForceModule((*self.forces, *more), self._recordings)
+        return ForceModule((*self.forces, *more), self._recordings, self._assembly)
 
     def energy_and_force(self, x: Float[Tensor, "vertices 3"]) -> tuple[Float[Tensor, ""], Float[Tensor, "vertices 3"]]:
         """Total energy [J], float64 scalar, and force [N] at positions x [m]."""
@@ -123,40 +151,52 @@ class ForceModule:
         return sum(between), sum(fixed)
 
 
-def _gather_kernel(dtype: torch.dtype) -> wp.Kernel:
-    """The kernel of (first, starts, slots, corner_force, force) adding the corners' forces at each vertex [N]."""
+def _sum_kernel(name: str, source: str, dtype: torch.dtype) -> wp.Kernel:
+    """A kernel of (first, adds, parts, count, starts, slots, forces, force) adding up forces at each vertex [N]."""
 
-    def of_vertex(vertex, starts, slots, corner_force, force): ...
+    def of_vertex(vertex, adds, parts, count, starts, slots, forces, force): ...
 
-    def gather(first, starts, slots, corner_force, force):
-        add(first + wp.tid(), starts, slots, corner_force, force)
+    def sum_up(first, adds, parts, count, starts, slots, forces, force):
+        add(first + wp.tid(), adds, parts, count, starts, slots, forces, force)
 
-    source = """
+    source = f"""
     Scalar* f = (Scalar*)(force.data + vertex);
-    Four total = three(f);
-    for (int k = starts.data[vertex]; k < starts.data[vertex + 1]; ++k)
-        total += *(const Four*)(corner_force.data + slots.data[k]);
+    Four total = adds ? three(f) : Four{{}};
+    {source}
     for (int i = 0; i < 3; ++i) f[i] = total[i];
     """
-    kinds = [wp.array(dtype=kind) for kind in (wp.int32, wp.int32, VECTOR[dtype], VECTOR[dtype])]
-    name = f"gather_corners_{SCALAR[dtype].__name__}"
-    add = native(of_vertex, name, one_by_one(source, dtype), *kinds)
-    return kernel(gather, name, *kinds)
+    kinds = *[wp.int32] * 3, *(wp.array(dtype=kind) for kind in (wp.int32, wp.int32, VECTOR[dtype], VECTOR[dtype]))
+    full = f"{name}_{SCALAR[dtype].__name__}"
+    add = native(of_vertex, full, one_by_one(source, dtype), *kinds)
+    return kernel(sum_up, full, *kinds)
 
 
-_GATHER = {dtype: _gather_kernel(dtype) for dtype in VECTOR}
+_OF_PARTS = "for (int p = 0; p < parts; ++p) total += ((const Four*)forces.data)[p * count + vertex];"
+_OF_CORNERS = """
+for (int k = starts.data[vertex]; k < starts.data[vertex + 1]; ++k)
+    total += *(const Four*)(forces.data + slots.data[k]);
+"""
+ELEMENT_PARTS, LEAST_PARTED = 2, 8192
+"""Parts of many elements on a CPU, each with its own sums, and thus most threads: as many whatever the threads, so that
+the sums round alike. And the fewest elements in several parts: to zero and add up the sums of a part takes as long as
+some thousand elements."""
+_SUM = {
+    (on_card, dtype): _sum_kernel(name, source, dtype)
+    for on_card, name, source in ((True, "gather_corners", _OF_CORNERS), (False, "add_parts", _OF_PARTS))
+    for dtype in VECTOR
+}
 
 
 class Elements:
-    """Elements of N corners, with buffers for their energies and corner forces.
-
-    Element kernels write one force per corner, then each vertex gathers its corners: no two threads write to the same
-    place and the order of each sum is fixed.
+    """Elements of N corners, and the kernel of their energies and forces.
 
     Attributes:
-        count: Number of elements.
-        energy: Energy of each element [J], shape (count,).
-        corner_force: Force on each corner [N], shape (count * N, 3).
+        kernels: The kernels of `element_kernels`.
+        corners: Vertices of each element, shape (count, N).
+        parameters: The kernel's two parameters.
+        level: The level of the vertices.
+        rows: The corners at each vertex, as of `incidence`, if known; or None.
+        energy: Energy of each element at the positions of the last `evaluate` [J], shape (count,).
     """
 
     def __init__(
@@ -168,44 +208,90 @@ class Elements:
         level: Level,
         rows: tuple[Int[Tensor, " starts"], Int[Tensor, " slots"]] | None = None,
     ) -> None:
-        """Prepare the launches, gather tables and buffers on the level's device.
-
-        Args:
-            kernels: The kernels of `element_kernels`.
-            parameters: The kernel's two parameters.
-            rows: The corners at each vertex, as of `incidence`, if known.
-        """
-        self.count, width = corners.shape
-        dtype, device, threads = level.dtype, level.device, level.threads
-        starts, slots = incidence(corners, level.vertex_count) if rows is None else rows
+        """Take the elements."""
         # Not `contiguous`: an empty tensor keeps strides that Warp refuses.
-        corners = corners.clone(memory_format=torch.contiguous_format)
-        packed = wp.from_torch(corners, dtype=wp.types.vector(length=width, dtype=wp.int32))
-        self.energy = torch.empty(self.count, dtype=dtype, device=device)
-        # One more row: the gather reads four numbers at once.
-        self.corner_force = torch.empty((self.count * width + 1, 3), dtype=dtype, device=device)[:-1]
-        x = vectors(level.rest)
-        arrays = [vectors(each) if each.ndim == 2 else wp.from_torch(each) for each in parameters]
-        buffers = [wp.from_torch(self.energy), vectors(self.corner_force)]
-        self._tensors = (corners, starts, slots, parameters)
-        place: dict[str, Any] = {"device": device, "threads": threads}
-        arrays = [x, packed, *arrays, *buffers]
-        self._elements = Launch(kernels[dtype], self.count, arrays, at_once=block_size(device), **place)
-        inputs = [wp.from_torch(starts), wp.from_torch(slots), buffers[1], x]
-        self._gather = Launch(_GATHER[dtype], level.vertex_count, inputs, **place)
+        self.kernels, self.corners = kernels, corners.clone(memory_format=torch.contiguous_format)
+        self.parameters, self.level, self.rows = parameters, level, rows
+        self.energy = torch.empty(len(corners), dtype=level.dtype, device=level.device)
+
+    @cached_property
+    def _alone(self) -> Assembly:
+        return Assembly([self], self.level, energies=True)
 
     def evaluate(self, x: Float[Tensor, "vertices 3"], force: Float[Tensor, "vertices 3"]) -> Float[Tensor, ""]:
-        """Run the element kernel and gather: adds to ``force`` and returns the energy.
+        """Add the forces [N] to ``force`` and return the energy [J], a float64 scalar, at positions x [m]."""
+        return self._alone.evaluate(x, force)[0]
+
+
+class Assembly:
+    """The sum of the forces of several kinds of elements.
+
+    On a CPU the elements are in `ELEMENT_PARTS` parts, and each part adds to its own forces, which fit into a cache. On
+    CUDA element kernels write one force per corner, then each vertex gathers its corners. Either way no two threads
+    write to the same place and the order of each sum is fixed.
+
+    Attributes:
+        kinds: The elements.
+    """
+
+    def __init__(self, kinds: Sequence[Elements], level: Level, *, energies: bool = False) -> None:
+        """Prepare the launches, tables and buffers on the level's device.
+
+        Args:
+            kinds: The elements.
+            energies: Whether to write the energy of each element.
+        """
+        self.kinds = tuple(kinds)
+        dtype, device, count = level.dtype, level.device, level.vertex_count
+        place: dict[str, Any] = {"device": device, "threads": level.threads}
+        on_card, size = device != "cpu", block_size(device)
+        none = torch.zeros(1, dtype=torch.int32, device=device)
+        self._tables = _corners_at(kinds, count) if on_card else (none, none)
+        # On CUDA one more row: the gather reads four numbers at once.
+        parts = ELEMENT_PARTS if sum(len(each.corners) for each in kinds) >= LEAST_PARTED else 1
+        rows = (sum(each.corners.numel() for each in kinds) + 1, 3) if on_card else (parts * count, 4)
+        self._forces = torch.zeros(rows, dtype=dtype, device=device)
+        flat = self._forces.reshape(-1)[: self._forces.numel() // 3 * 3].reshape(-1, 3)
+        self._totals, self._launches, begin, x = list[Tensor](), list[Launch](), 0, vectors(level.rest)
+        for each in kinds:
+            blocks = -(-len(each.corners) // size)
+            of_part = 1 if on_card else -(-blocks // parts)
+            items = -(-blocks // max(of_part, 1))
+            self._totals.append(torch.zeros(items, dtype=torch.float64, device=device))
+            packed = wp.from_torch(each.corners, dtype=wp.types.vector(length=each.corners.shape[1], dtype=wp.int32))
+            numbers = [vectors(some) if some.ndim == 2 else wp.from_torch(some) for some in each.parameters]
+            energy = wp.from_torch(each.energy) if energies else wp.array(dtype=SCALAR[dtype], device=device)
+            own = flat[begin:] if on_card else flat
+            arrays = [x, packed, *numbers, energy, wp.from_torch(self._totals[-1]), vectors(own)]
+            inputs = [of_part, blocks, len(each.corners), count, *arrays]
+            self._launches.append(Launch(each.kernels[dtype], items, inputs, **place))
+            begin += each.corners.numel()
+        inputs = [1, parts, count, *(wp.from_torch(each) for each in self._tables), vectors(flat), x]
+        self._sum = Launch(_SUM[on_card, dtype], count, inputs, **place)
+
+    def evaluate(
+        self, x: Float[Tensor, "vertices 3"], force: Float[Tensor, "vertices 3"], *, adds: bool = True
+    ) -> list[Float[Tensor, ""]]:
+        """Compute all elements.
 
         Args:
             x: Positions [m].
-            force: Force [N], added to in place.
+            force: The forces [N], written in place.
+            adds: Whether to add to the present values of ``force``.
 
         Returns:
-            Energy [J], float64 scalar.
+            Energy of each kind of elements [J], float64 scalars.
         """
-        if not self.count:
-            return torch.zeros((), dtype=torch.float64, device=x.device)
-        self._elements({0: vectors(x)})
-        self._gather({3: vectors(force)})
-        return self.energy.sum(dtype=torch.float64)
+        if not self._forces.is_cuda:
+            self._forces.zero_()
+        for launch in self._launches:
+            launch({4: x})
+        self._sum({0: int(adds), 6: force})
+        return [totals.sum() for totals in self._totals]
+
+
+def _corners_at(kinds: Sequence[Elements], count: int) -> tuple[Tensor, Tensor]:
+    """The corners of all elements at each of so many vertices, as of `incidence`."""
+    if len(kinds) == 1 and kinds[0].rows is not None:
+        return kinds[0].rows
+    return incidence(torch.cat([each.corners.reshape(-1) for each in kinds]).unsqueeze(1), count)

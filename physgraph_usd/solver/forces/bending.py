@@ -155,6 +155,11 @@ class Bending:
             if len(which)
         ]
 
+    @property
+    def elements(self) -> tuple[Elements, ...]:
+        """The hinges, by number of corners."""
+        return tuple(each.elements for each in self._kinds)
+
     def add_force(self, x: Float[Tensor, "vertices 3"], force: Float[Tensor, "vertices 3"]) -> Float[Tensor, ""]:
         """Add the force [N] in place and return the energy [J]."""
         energy = torch.zeros((), dtype=torch.float64, device=x.device)

@@ -14,6 +14,19 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..level import Level
+from ..mesh.formula import QUAD, element_kernels
+from .base import Elements
+
+_KERNELS = element_kernels(
+    "gravity",
+    """
+    Quad w = load4(parameter0);
+    Vec weight = {w[0], w[1], w[2]};
+    store(-dot(weight, corner(0)), {weight});
+    """,
+    corners=1,
+    parameter=QUAD,
+)
 
 
 class Gravity:
@@ -22,6 +35,7 @@ class Gravity:
     Attributes:
         weight: Force on each vertex [N], shape (V, 3).
         density: Areal density of each garment [kg/m^2].
+        elements: The vertices.
     """
 
     name = "gravity"
@@ -43,11 +57,13 @@ class Gravity:
         self.density = density.to(level.rest)
         mass = self.density[owner] * level.density_scale * level.vertex_area
         self.weight = mass.unsqueeze(1) * torch.as_tensor(gravity, dtype=level.dtype, device=level.device)
+        vertices = torch.arange(level.vertex_count, dtype=torch.int32, device=level.device).unsqueeze(1)
+        weight = torch.nn.functional.pad(self.weight, (0, 1))
+        self.elements = (Elements(_KERNELS, vertices, [weight, weight], level=level),)
 
     def add_force(self, x: Float[Tensor, "vertices 3"], force: Float[Tensor, "vertices 3"]) -> Float[Tensor, ""]:
         """Add the weight [N] in place and return the energy [J]."""
-        force += self.weight
-        return -(self.weight * x).sum(dtype=torch.float64)
+        return self.elements[0].evaluate(x, force)
 
     def split(self, x: Float[Tensor, "vertices 3"]) -> tuple[Float[Tensor, " parts"], Int[Tensor, " parts"]]:
         """Energy of each vertex [J] at positions x [m], and the vertex's garment."""

@@ -113,7 +113,7 @@ class Guide:
         lag = self._map.average.apply(x) - self._target
         pull = self._weight * lag
         force -= self._map.spread.apply(pull)
-        energy = 0.5 * (pull * lag).sum(dtype=torch.float64)
+        energy = 0.5 * torch.dot(pull.reshape(-1), lag.reshape(-1)).double()
         if self._has_soft_pins:
             stray = x - self._base
             force -= self._pin * stray

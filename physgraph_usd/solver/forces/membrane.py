@@ -93,6 +93,7 @@ class Membrane:
     Attributes:
         warp_stiffness, weft_stiffness: C11 and C22 times the rest area [N m], shape (T,).
         shear_stiffness: C66 times the rest area [N m], shape (T,).
+        elements: The triangles.
     """
 
     name = "membrane"
@@ -127,15 +128,15 @@ class Membrane:
         self._level = level
         stiffness = [self.warp_stiffness, self.weft_stiffness, self.shear_stiffness, limits.to(level.rest)[owner]]
         parameters = [level.membrane_inverse.contiguous(), torch.stack(stiffness, dim=1)]
-        self._elements = Elements(_KERNELS, level.membrane, parameters, level=level)
+        self.elements = (Elements(_KERNELS, level.membrane, parameters, level=level),)
 
     def add_force(self, x: Float[Tensor, "vertices 3"], force: Float[Tensor, "vertices 3"]) -> Float[Tensor, ""]:
         """Add the force [N] in place and return the energy [J]."""
-        return self._elements.evaluate(x, force)
+        return self.elements[0].evaluate(x, force)
 
     def split(self, x: Float[Tensor, "vertices 3"]) -> tuple[Float[Tensor, " parts"], Int[Tensor, " parts"]]:
         """Energy of each triangle [J] at the last evaluated positions, and the triangle's garment."""
-        return self._elements.energy, self._level.membrane_garment
+        return self.elements[0].energy, self._level.membrane_garment
 
     def diagonal(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " vertices"]:
         """A third of the trace of each corner's block, without limits, geometric part only if stiffening [N/m].

@@ -43,6 +43,7 @@ class Stretch:
 
     Attributes:
         stiffness: Spring constants [N/m], shape (S,).
+        elements: The springs.
     """
 
     name = "stretch"
@@ -56,15 +57,15 @@ class Stretch:
         modulus = youngs.to(level.rest)[level.spring_garment.long()] * level.spring_scale
         self.stiffness = 3.0 * modulus * level.spring_area / level.spring_length**2
         self._level = level
-        self._elements = Elements(_KERNELS, level.springs, [self.stiffness, level.spring_length], level=level)
+        self.elements = (Elements(_KERNELS, level.springs, [self.stiffness, level.spring_length], level=level),)
 
     def add_force(self, x: Float[Tensor, "vertices 3"], force: Float[Tensor, "vertices 3"]) -> Float[Tensor, ""]:
         """Add the force [N] in place and return the energy [J]."""
-        return self._elements.evaluate(x, force)
+        return self.elements[0].evaluate(x, force)
 
     def split(self, x: Float[Tensor, "vertices 3"]) -> tuple[Float[Tensor, " parts"], Int[Tensor, " parts"]]:
         """Energy of each spring [J] at the last evaluated positions, and the spring's garment."""
-        return self._elements.energy, self._level.spring_garment
+        return self.elements[0].energy, self._level.spring_garment
 
     def diagonal(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " vertices"]:
         """A third of the trace of k (u u^T + max(0, 1 - l0/l) (I - u u^T)), summed at both ends [N/m]."""

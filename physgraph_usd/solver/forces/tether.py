@@ -72,7 +72,7 @@ class Tether:
         stray = x - self.predicted
         pull = self._pull * stray
         force -= pull
-        return 0.5 * (pull * stray).sum(dtype=torch.float64)
+        return 0.5 * torch.dot(pull.reshape(-1), stray.reshape(-1)).double()
 
     def split(self, x: Float[Tensor, "vertices 3"]) -> tuple[Float[Tensor, " parts"], Int[Tensor, " parts"]]:
         """Energy of each vertex's spring [J] at positions x [m], and the vertex's garment."""

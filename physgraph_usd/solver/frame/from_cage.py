@@ -57,7 +57,7 @@ class MovingFrames:
 
     def predict(
         self, before: Float[Tensor, "coarse 3"], fine: Float[Tensor, "vertices 3"], coarse: Float[Tensor, "coarse 3"]
-    ) -> tuple[Float[Tensor, "vertices 3"], float, float, float]:
+    ) -> tuple[Float[Tensor, "vertices 3"], Float[Tensor, "vertices 3 3"], float, float, float]:
         """Carry detail to new cage positions; vertices that are not free go to the cage's.
 
         Args:
@@ -66,17 +66,19 @@ class MovingFrames:
             coarse: Cage positions now [m].
 
         Returns:
-            Predicted fine positions [m], the RMS motion of the cage in mean cage edges, its RMS turn [rad], and its
-            largest move [m].
+            Predicted fine positions [m], the rotation at each, the RMS motion of the cage in mean cage edges, its RMS
+            turn [rad], and its largest move [m].
         """
-        placed, far = self._recordings.run("predict", self._predict, before, fine, coarse)
+        placed, rotation, far = self._recordings.run("predict", self._predict, before, fine, coarse)
         motion, turn, farthest = far.tolist()
-        return placed, motion / self.edge, turn, farthest
+        return placed, rotation, motion / self.edge, turn, farthest
 
-    def _predict(self, before: Tensor, fine: Tensor, coarse: Tensor) -> tuple[Tensor, Tensor]:
-        """Predicted fine positions [m], and the RMS motion [m], RMS turn [rad] and largest move [m] of the cage."""
+    def _predict(self, before: Tensor, fine: Tensor, coarse: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Predicted fine positions [m] and rotations, and RMS motion [m], RMS turn [rad] and largest move [m] of the
+        cage."""
         detail, last, frames = fine - self._level.smooth_base.apply(before), self.frames(before), self.frames(coarse)
-        moved = torch.einsum("vij,vj->vi", self._turned(last, frames), detail)
+        rotation = self._turned(last, frames)
+        moved = torch.einsum("vij,vj->vi", rotation, detail)
         motion = (coarse - before).square().sum(dim=1).mean().sqrt()
         cosine = (torch.einsum("cij,cij->c", frames, last) - 1.0) / 2.0
         turn = torch.arccos(cosine.clamp(-1.0, 1.0)).square().mean().sqrt()
@@ -84,7 +86,7 @@ class MovingFrames:
         farthest = moves.max() if len(moves) else moves.sum()
         placed = self._level.smooth_base.apply(coarse) + moved
         placed = torch.where(self._level.free, placed, self._level.base.apply(coarse))
-        return placed, torch.stack([motion, turn, farthest])
+        return placed, rotation, torch.stack([motion, turn, farthest])
 
     def scaled(
         self, coarse: Float[Tensor, "coarse 3"], fine: Float[Tensor, "vertices 3"], gain: np.ndarray

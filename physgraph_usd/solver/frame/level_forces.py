@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ..fabric import Fabric
 from ..forces import bending_term, body_terms
-from ..forces.base import Force, ForceModule
+from ..forces.base import Assembly, Force, ForceModule, assembly_of
 from ..forces.guide import Guide, GuideMap
 from ..forces.membrane import in_plane_terms
 from ..forces.tether import Tether
@@ -181,7 +181,7 @@ class LevelForces:
 
     def module(self, coarse: Float[Tensor, "coarse 3"]) -> ForceModule:
         """All terms of one frame, given the recentred coarse positions [m]."""
-        return ForceModule((*self.terms, self.guide.retarget(coarse)), self._recordings)
+        return ForceModule((*self.terms, self.guide.retarget(coarse)), self._recordings, self._assembly)
 
     def system(
         self,
@@ -198,6 +198,11 @@ class LevelForces:
         """
         metric = self.rough_metric if rough else self.metric
         return self.system_in(module if tie is None else module.joined_by([self.tether(*tie)]), metric)
+
+    @cached_property
+    def _assembly(self) -> Assembly | None:
+        """The joint sum of the elastic elements."""
+        return assembly_of(self.terms, self.level)
 
     @cached_property
     def _recordings(self) -> Recordings:

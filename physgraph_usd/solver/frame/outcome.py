@@ -19,7 +19,7 @@ from ..resolution import edge_strain, sharp_folds
 from ..scene import FARTHEST
 from .level_forces import named
 from .problem import Problem
-from .values import FrameState
+from .values import Curvature, FrameState
 
 
 def refuse_swallowed(problem: Problem) -> None:
@@ -52,11 +52,12 @@ def scaled(problem: Problem, x: Placed) -> Placed:
     return x if result is x else unhindered(result) if view is None else view.moved(x, result)
 
 
-def state_left(problem: Problem, x: Placed) -> FrameState:
+def state_left(problem: Problem, x: Placed, memory: Any) -> FrameState:
     """State for the start of the next frame.
 
     Args:
         x: The result [m].
+        memory: The integrator's memory, or None.
     """
     view, cage = problem.view(problem.finest), problem.cage
     fine = x.double() + torch.as_tensor(cage.origin).to(x.device)
@@ -70,6 +71,7 @@ def state_left(problem: Problem, x: Placed) -> FrameState:
         given_up=torch.zeros_like(cage.points[:, 0], dtype=torch.bool) if lost is None else lost,
         held=problem.start.held,
         clean=lost is None and state is not None and state.is_clean,
+        curvature=None if memory is None else Curvature(memory, len(x)),
     )
 
 

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,14 +19,14 @@ from ..contact.metric import HeldMetric
 from ..forces.base import ForceModule
 from ..forces.seam import SewnForces
 from ..forces.self_contact import SelfContact
-from ..integrate.base import Integrator, System
+from ..integrate.base import Integrator, System, Turning
 from ..integrate.metric import Metric
 from ..integrate.stop import Budget
 from ..level import Level, Placed
 from .group import Group
 from .level_forces import LevelForces
 from .start import Start, start_of
-from .values import Cage, FrameInput, FrameState
+from .values import Cage, Curvature, FrameInput, FrameState
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +42,7 @@ class LevelProblem:
         budget: Stopping criteria.
         outward: As in `leave_saddle`.
         show: Called with the positions after each round [m]; or None.
+        curvature: The integrator's memory of the last frame, turned with the cloth; or None.
     """
 
     lasting: LevelForces
@@ -52,6 +54,7 @@ class LevelProblem:
     budget: Budget
     outward: Float[Tensor, " garments"]
     show: Callable[[Placed], None] | None = None
+    curvature: Any = None
 
     @property
     def level(self) -> Level:
@@ -100,6 +103,7 @@ class Problem:
         before: Fine positions in the last frame [m], float64; None without a last frame.
         inside: Mask of the vertices inside a body in the last frame; None if none was.
         tether: Stiffness of the tie to the start [1/s^2]; None without tie.
+        known: Curvature learned in the last frame, or None.
     """
 
     began: float
@@ -114,6 +118,7 @@ class Problem:
     before: Placed | None
     inside: Bool[Tensor, " vertices"] | None
     tether: float | None
+    known: Curvature | None = None
 
     @property
     def warm(self) -> bool:
@@ -170,7 +175,18 @@ class Problem:
         budget = settings.budget(self.finest - index, since, warm=self.warm)
         budget = replace(budget, steps=0) if self.start.rests else budget
         who = (self.group.integrator, self.group.untangler)
-        return LevelProblem(lasting, module, alone, self.view(index), *who, budget, self.group.outward)
+        problem = LevelProblem(lasting, module, alone, self.view(index), *who, budget, self.group.outward)
+        return replace(problem, curvature=self._curvature) if index == self.finest else problem
+
+    @property
+    def _curvature(self) -> Any:
+        """The integrator's memory of the last frame, turned with the cloth; None where it does not fit."""
+        known, rotation, integrator = self.known, self.start.rotation, self.group.integrator
+        if known is None or rotation is None or self.start.rests or known.vertices != len(rotation):
+            return None
+        if not np.array_equal(known.turn, np.eye(3)):
+            rotation = rotation @ torch.as_tensor(known.turn).to(rotation)
+        return integrator.turned(known.memory, rotation) if isinstance(integrator, Turning) else None
 
     def placed(self, x: Placed) -> list[np.ndarray]:
         """World positions of each garment [m], given those of the finest level."""
@@ -235,4 +251,5 @@ def begin(group: Group, frame: FrameInput, last: FrameState | None) -> Problem:
         before=before,
         inside=last.inside if last is not None and bool(last.inside.any()) else None,
         tether=start.slowed * settings.tether * frame.rate**2 if settings.temporal == "tether" else None,
+        known=None if known is None else known.curvature,
     )

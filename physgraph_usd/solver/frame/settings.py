@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -44,10 +45,12 @@ class SolveSettings:
         cancelled: Asked before each step whether the result is no longer needed; or None.
         rough: Whether a new material uses the last material's Cholesky factor as preconditioner.
         shown: Called with the positions of each garment [m], by path, after each round of the finest level; or None.
+        ended: Called with the finest level's `LevelProblem` and the final positions [m] after each solve of that level,
+            so that the caller can solve it on; or None.
     """
 
     method: Method = METHODS[LEARNED]
-    steps: int = 12
+    steps: int = 24
     tolerance: float = 2e-3
     budget_ms: float | None = None
     frame_limit: float | None = None
@@ -58,6 +61,7 @@ class SolveSettings:
     cancelled: Callable[[], bool] | None = None
     rough: bool = False
     shown: Callable[[Mapping[str, np.ndarray]], None] | None = None
+    ended: Callable[[Any, Any], None] | None = None
 
     @property
     def whole(self) -> bool:

@@ -23,7 +23,7 @@ from ..contact.frame import STALLED
 from ..contact.metric import HELD_TOLERANCE, HeldMetric
 from ..deadline import is_over
 from ..forces.base import ForceModule
-from ..integrate.base import Carry, System
+from ..integrate.base import Carry, Integrator, System, Turning
 from ..integrate.descend import LevelReport, descend, solve_level
 from ..integrate.guard import PATIENCE
 from ..integrate.saddle import leave_saddle
@@ -59,12 +59,14 @@ def solve_frame(group: Group, frame: FrameInput, last: FrameState | None) -> Sol
     prepared = time.perf_counter()
     try:
         problem, reports = _with_cage_untangled(problem, since=prepared)
-        x, module = None, ForceModule(())
+        x, module, memory = None, ForceModule(()), None
         for index in problem.levels:
             level = problem.level(index, since=prepared)
             if index == problem.finest and group.settings.shown is not None:
                 level = replace(level, show=partial(_show, problem, group.settings.shown))
-            x, made, module = solve_one_level(level, *problem.begun(index, x))
+            x, made, module, memory = solve_one_level(level, *problem.begun(index, x))
+            if index == problem.finest and group.settings.ended is not None:
+                group.settings.ended(level, x)
             if index < problem.finest:
                 made[-1].energies = module.energies(x)
             reports += made
@@ -76,7 +78,7 @@ def solve_frame(group: Group, frame: FrameInput, last: FrameState | None) -> Sol
     if problem.contact is not None:
         shown, finish = problem.contact.finish(x)
         x = shown if problem.contact.is_out(shown) else x  # What is pushed out in vain is not carried on.
-    left, shown = state_left(problem, x), scaled(problem, shown)
+    left, shown = state_left(problem, x, memory), scaled(problem, shown)
     solved = time.perf_counter()
     telemetry = telemetry_of(problem, shown, module, reports=reports)
     contact, crossing = measured(problem, shown)
@@ -95,7 +97,7 @@ def _show(problem: Problem, shown: Callable[[Mapping[str, np.ndarray]], None], x
 
 def solve_one_level(
     problem: LevelProblem, x: Tensor, smoothing: Tensor | None
-) -> tuple[Placed, list[LevelReport], ForceModule]:
+) -> tuple[Placed, list[LevelReport], ForceModule, Any]:
     """Solve a level, in rounds if contact is possible.
 
     Args:
@@ -103,16 +105,11 @@ def solve_one_level(
         smoothing: The move to remove a coarser mesh's facets in a cold start [m]; None in a warm frame.
 
     Returns:
-        Final positions [m], a report per round, and the terms at the end.
+        Final positions [m], a report per round, the terms at the end, and the integrator's memory to go on with.
     """
     level, view, budget = problem.level, problem.view, problem.budget
     if view is None:
-        x = x if smoothing is None else leave_saddle(problem.alone, level, x + smoothing, outward=problem.outward)
-        x, report = solve_level(problem.alone, problem.integrator, x, level=level.index, budget=budget)
-        x = unhindered(x)
-        if problem.show is not None:
-            problem.show(x)
-        return x, [report], problem.module
+        return _solve_without_contact(problem, x, smoothing)
     x, reports = _untangle(problem, view, Placed(view.closed(x)), view.moved, most=WARM_UNTANGLINGS)
     if smoothing is not None:
         x = view.moved(x, x + smoothing) if level.index else x
@@ -123,7 +120,7 @@ def solve_one_level(
         terms = view.terms(x)
         touched = touched or bool(terms)
         system = problem.system(view, terms, x, last=last)
-        resume = carry if last is not None and system.has_same_metric(last) else None
+        resume = _resumed(problem, x) if last is None else carry if system.has_same_metric(last) else None
         shrunk = HELD_TOLERANCE if isinstance(system.metric, HeldMetric) else 1.0
         of_round = budget.for_round(made=made, touching=bool(terms), blocked=blocked, shrunk=shrunk)
         carry, report = descend(system, integrator, x, level=level.index, budget=of_round, resume=resume)
@@ -131,17 +128,48 @@ def solve_one_level(
         reports.append(report)
         made += report.steps
         wanted = carry.x
-        x, last = view.moved(x, wanted), system
+        begun, x, last = x, view.moved(x, wanted), system
         blocked = x is not wanted
         if problem.show is not None:
             problem.show(x)
-        if budget.ends(report, made=made, touched=touched, blocked=blocked):
+        missing = _missing(begun, x, wanted) if blocked else 0.0
+        if budget.ends(report, made=made, touched=touched, missing=missing):
+            memory = _learned(integrator, carry)
             break
         if carry.setbacks >= PATIENCE:
             integrator, carry = problem.untangler, None
         elif blocked:  # The guard's corrections do not apply to the blocked positions.
             carry = None if carry.setbacks else replace(carry, x=x)
-    return x, reports, problem.module.joined_by(terms)
+    return x, reports, problem.module.joined_by(terms), memory
+
+
+def _solve_without_contact(
+    problem: LevelProblem, x: Tensor, smoothing: Tensor | None
+) -> tuple[Placed, list[LevelReport], ForceModule, Any]:
+    """`solve_one_level` of cloth that nothing may touch."""
+    system, level, resume = problem.alone, problem.level, _resumed(problem, x)
+    x = x if smoothing is None else leave_saddle(system, level, x + smoothing, outward=problem.outward)
+    carry, report = descend(system, problem.integrator, x, level=level.index, budget=problem.budget, resume=resume)
+    placed = unhindered(carry.x)
+    if problem.show is not None:
+        problem.show(placed)
+    return placed, [report], problem.module, _learned(problem.integrator, carry)
+
+
+def _missing(start: Tensor, x: Tensor, wanted: Tensor) -> float:
+    """Part of the wanted moves that was blocked: the mean distance missing over the mean distance wanted."""
+    return float((wanted - x).norm(dim=1).sum() / (wanted - start).norm(dim=1).sum().clamp_min(1e-30))
+
+
+def _resumed(problem: LevelProblem, x: Tensor) -> Carry | None:
+    """A carry at x [m] with the last frame's memory, to resume; None without."""
+    goes_on = problem.curvature is not None and isinstance(problem.integrator, Turning)
+    return Carry(x, math.inf, x, memory=problem.curvature) if goes_on else None
+
+
+def _learned(integrator: Integrator, carry: Carry) -> Any:
+    """The memory for the next frame, or None."""
+    return integrator.learned(carry) if isinstance(integrator, Turning) else None
 
 
 def _with_cage_untangled(problem: Problem, *, since: float) -> tuple[Problem, list[LevelReport]]:

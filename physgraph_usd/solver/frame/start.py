@@ -28,12 +28,14 @@ class Start:
         detailed: The finest vertices with the last frame's detail [m], shape (V, 3); None in a cold start.
         held: Number of frames with a held pose of everything felt by the cloth.
         slowed: Resulting factor of the tether stiffness; from `SLOWEST` on the cloth rests.
+        rotation: Rotation of the detail at each vertex, shape (V, 3, 3); None in a cold start.
     """
 
     why: str
     detailed: Float[Tensor, "vertices 3"] | None = None
     held: int = 0
     slowed: float = 1.0
+    rotation: Float[Tensor, "vertices 3 3"] | None = None
 
     @property
     def rests(self) -> bool:
@@ -59,12 +61,12 @@ def start_of(
         moved: Largest motion of nearby bodies since [m]; infinite if more than poses changed.
     """
     before, fine = (x.to(cage.points) for x in places)
-    detailed, motion, turn, farthest = frames.predict(before, fine, cage.points)
+    detailed, rotation, motion, turn, farthest = frames.predict(before, fine, cage.points)
     if motion > reset.move or turn > reset.turn:
         return Start(f"cold: the cage moved {motion:.3g} edges and turned {np.degrees(turn):.3g} degrees")
     held, slowed = slowing(held, max(farthest, moved) / frames.edge)
     why = f"at rest: the pose has been held for {held} frames" if slowed >= SLOWEST else "warm"
-    return Start(why, detailed, held, slowed)
+    return Start(why, detailed, held, slowed, rotation)
 
 
 def slowing(held: int, motion: float) -> tuple[int, float]:

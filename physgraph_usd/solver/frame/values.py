@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -61,6 +61,21 @@ class Cage:
 
 
 @dataclass(frozen=True, eq=False)
+class Curvature:
+    """Curvature of the potential learned in the last frame's descent, for the next frame's descent to go on with.
+
+    Attributes:
+        memory: The integrator's memory, of the garments that were solved together.
+        vertices: Number of their fine vertices.
+        turn: Rotation of the cloth since, as a whole, shape (3, 3).
+    """
+
+    memory: Any
+    vertices: int
+    turn: Float[np.ndarray, "3 3"] = field(default_factory=lambda: np.eye(3))
+
+
+@dataclass(frozen=True, eq=False)
 class FrameState:
     """State passed from frame to frame.
 
@@ -73,6 +88,7 @@ class FrameState:
         clean: Whether nothing crosses and is given up, neither garments solved together nor bodies.
         failures: Consecutive starts from the cage that did not cure an unsound result.
         wait: Frames until the next start from the cage.
+        curvature: Of the last frame's descent, the same object for all garments solved together; None without.
     """
 
     coarse: Float[Tensor, "coarse 3"]
@@ -83,13 +99,16 @@ class FrameState:
     clean: bool = False
     failures: int = 0
     wait: int = 0
+    curvature: Curvature | None = None
 
     def carried(self, motion: Rigid) -> FrameState:
         """This state after a rigid motion."""
         if motion is AT_REST:
             return self
         coarse, fine = (torch.as_tensor(motion(x.cpu().numpy())).to(x) for x in (self.coarse, self.fine))
-        return replace(self, coarse=coarse, fine=fine)
+        known = self.curvature
+        turned = None if known is None else replace(known, turn=motion.turn @ known.turn)
+        return replace(self, coarse=coarse, fine=fine, curvature=turned)
 
     def about(self, origin: np.ndarray) -> tuple[Float[Tensor, "coarse 3"], Placed]:
         """Cage and fine positions relative to an origin [m], float64."""
@@ -122,12 +141,14 @@ def join(parts: Sequence[FrameState]) -> FrameState:
     """Join the states of several garments."""
     if len(parts) == 1:
         return parts[0]
+    one = parts[0].curvature if all(part.curvature is parts[0].curvature for part in parts) else None
     return FrameState(
         **{name: torch.cat([getattr(part, name) for part in parts]) for name in (*_COARSE, *_FINE)},
         held=min(part.held for part in parts),
         clean=all(part.clean for part in parts),
         failures=max(part.failures for part in parts),
         wait=max(part.wait for part in parts),
+        curvature=one,
     )
 
 

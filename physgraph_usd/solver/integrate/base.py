@@ -86,11 +86,6 @@ class System:
         self._all_free = level.all_free if level is not None and free is level.free else bool(free.all())
         self.evaluations = self.metric_solves = self.failed = 0
 
-    @property
-    def on_card(self) -> bool:
-        """Whether work on a card is recorded."""
-        return self.spacing.is_cuda and self.level is not None
-
     def masked(self, field: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
         """The field, zero at fixed vertices."""
         return field if self._all_free else field * self._mask
@@ -175,12 +170,8 @@ class System:
 
     def relative_move(self, preconditioned: Float[Tensor, "vertices 3"]) -> Float[Tensor, ""]:
         """`remaining_move` as a tensor on the device, float64."""
-        return root_sum(preconditioned * self.per_edge)
-
-
-def root_sum(values: Tensor) -> Float[Tensor, ""]:
-    """Root of the sum of squares, float64."""
-    return values.square().sum(dtype=torch.float64).sqrt()
+        moves = (preconditioned * self.per_edge).reshape(-1)
+        return torch.dot(moves, moves).double().sqrt()
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,6 +233,19 @@ def resumed(integrator: Integrator, system: System, carry: Carry) -> Carry:
     if isinstance(integrator, Resumable):
         return integrator.resume(system, carry)
     return integrator.start(system, carry.x)
+
+
+@runtime_checkable
+class Turning(Protocol):
+    """An integrator able to go on, after the cloth was moved, with what it learned before."""
+
+    def learned(self, carry: Carry) -> Any:
+        """The memory of a carry, to keep; None if there is none to go on with."""
+        ...
+
+    def turned(self, memory: Any, rotation: Float[Tensor, "vertices 3 3"]) -> Any:
+        """The memory after a rotation at each vertex; `Carry.memory` of a carry to resume."""
+        ...
 
 
 @runtime_checkable

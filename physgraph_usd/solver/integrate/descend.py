@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections import Counter
 from dataclasses import dataclass, field
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from ...errors import SolveError
+from ..level import Level
 from .base import Carry, Integrator, System, resumed
-from .stop import Budget
+from .stop import SEEN_PART, SEEN_STEPS, SEEN_TURN, Budget
 
 
 @dataclass(eq=False)
@@ -24,7 +27,7 @@ class LevelReport:
         energy_after: Energy at the end [J].
         remaining_move: RMS of H0^-1 F at the end, in local edge lengths.
         milliseconds: Wall time of the level.
-        stopped: "tolerance", "steps", "budget" or "stalled".
+        stopped: "tolerance", "seen", "steps", "budget" or "stalled"; "seen" where nothing is seen to move any more.
         movers: Number of steps by mover.
         energies: Energy of each term at the end [J], if requested by the solver's caller.
         failed: Evaluations in failed line searches.
@@ -84,10 +87,14 @@ def descend(
     _require_finite(carry, level)
     report.energy_before = carry.energy
     movers: Counter[str] = Counter()
+    stands = Stands(system.level, carry.x) if budget.warm and system.level is not None else None
     while not (stopped := _reason_to_stop(system, carry, report.steps, budget)):
         carry = integrator.step(system, carry)
         movers[carry.mover] += 1
         report.steps += 1
+        if stands is not None and stands.at(carry.x, report.steps) and not carry.setbacks:
+            stopped = _reason_to_stop(system, carry, report.steps, budget) or "seen"
+            break
     _require_finite(carry, level)
     report.stopped, report.movers = stopped, dict(movers)
     report.energy_after = carry.energy
@@ -110,6 +117,28 @@ def _remaining_move(system: System, carry: Carry) -> float:
     return system.remaining_move(
         preconditioned if preconditioned is not None else system.apply_metric_inverse(carry.force)
     )
+
+
+class Stands:
+    """Tells when nothing is seen to move: of a sample of faces, most keep their direction over some steps."""
+
+    def __init__(self, level: Level, x: Float[Tensor, "vertices 3"]) -> None:
+        """Take the start [m]."""
+        self._level, self._normals = level, _directions(level, x)
+
+    def at(self, x: Float[Tensor, "vertices 3"], steps: int) -> bool:
+        """Whether cloth at x [m] stands, after so many steps; looked at every `SEEN_STEPS`."""
+        if steps % SEEN_STEPS or not len(self._normals):
+            return False
+        before, self._normals = self._normals, _directions(self._level, x)
+        turned = torch.linalg.vecdot(before, self._normals) < math.cos(math.radians(SEEN_TURN))
+        return float(turned.float().mean()) <= SEEN_PART
+
+
+def _directions(level: Level, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "triangles 3"]:
+    """Unit normals of a sample of a level's triangles at x [m]."""
+    normals = level.some_normals(x)
+    return normals * torch.linalg.vector_norm(normals, dim=1, keepdim=True).clamp_min(1e-30).reciprocal()
 
 
 def _require_finite(carry: Carry, level: int) -> None:

@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import functools
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 import warp as wp
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..mesh.formula import at_once, block_size, kernel, native
@@ -34,19 +35,20 @@ from .network import (
     in_rows,
     pairs_in,
 )
+from .secants import SECANTS, SLOTS, WEIGHTS, Secants
 from .vertex_frame import VertexFrame
 
 _NORMAL = """
 Four area[BLOCK] = {};
 for (int i = 0; i < BLOCK; ++i) {
     const int at = element[i];
-    const Four here = three(x.data[at]);
+    const Four here = *row_of(at, POSITION);
     for (int k = corners.data[at]; k < corners.data[at + 1]; ++k) {
-        const Four a = three(x.data[others.data[k][0]]) - here, b = three(x.data[others.data[k][1]]) - here;
+        const Four a = *row_of(others.data[k][0], POSITION) - here, b = *row_of(others.data[k][1], POSITION) - here;
         area[i] += turned(a * turned(b) - turned(a) * b);
     }
 }
-across = vec([&](int i) { return &area[i]; });
+across = wide([&](int i) { return &area[i]; });
 const Number length = root(dot(across, across));
 across = across * (length > 0.0f ? 1.0f / length : Number{});
 """
@@ -55,10 +57,10 @@ Four mean[MEANS][BLOCK] = {};
 for (int i = 0; i < BLOCK; ++i) {
     const int at = element[i], degree = ends.data[at + 1] - ends.data[at];
     for (int k = ends.data[at]; k < ends.data[at + 1]; ++k)
-        for (int s = 0; s < MEANS; ++s) mean[s][i] += three(v.data[SMOOTHED[s] * vertices + far.data[k]]);
+        for (int s = 0; s < MEANS; ++s) mean[s][i] += *row_of(far.data[k], s);
     for (int s = 0; s < MEANS; ++s) mean[s][i] *= 1.0f / (degree > 1 ? degree : 1);
 }
-for (int s = 0; s < MEANS; ++s) row[WHOLES + s] = vec([&](int i) { return &mean[s][i]; });
+for (int s = 0; s < MEANS; ++s) row[WHOLES + s] = wide([&](int i) { return &mean[s][i]; });
 """
 ROW = 8
 """Numbers of a layer computed at once."""
@@ -85,15 +87,12 @@ move = move + across * lift;
 const Number length_of_move = root(dot(move, move)), most = longest * load(reach);
 move = move * (length_of_move > most ? most / length_of_move : 1.0f + Number{});
 put(out, move);
+put(to, wide([&](int i) { return row_of(element[i], POSITION); }) + move);
 """
 
 
 class FusedPhysgraph:
-    """A network's weights for a given number of vertices.
-
-    Attributes:
-        bases: Names of the input vectors; the kernel derives the other vectors as parts.
-    """
+    """A network's weights for a given number of vertices."""
 
     def __init__(self, network: Physgraph, vertices: int, longest: float, *, device: str, threads: int) -> None:
         """Lay out the weights.
@@ -104,10 +103,6 @@ class FusedPhysgraph:
             device: "cpu" or a CUDA device; the network is there.
             threads: Most threads that the kernel uses on the CPU.
         """
-        self.bases, smoothed, parts = in_rows(network.config.vectors)
-        self._frames = bool(smoothed) or any(normal for _, normal in parts)
-        self._rows = torch.zeros((len(self.bases), vertices, 3), device=device)
-        self._out = torch.zeros((vertices, 3), device=device)
         layers: list[Any] = [network.encode, *network.hidden, network.decode]
         widths = _widths(network.config)
         bias = torch.cat([_padded(layer.bias, to) for layer, to in zip(layers, widths, strict=True)])
@@ -117,44 +112,72 @@ class FusedPhysgraph:
         inputs = (layers[0].in_features, *widths[:-1])
         sizes = zip(layers, inputs, widths, strict=True)
         self._weights = torch.cat([_padded(layer.weight.T, from_, to).reshape(-1) for layer, from_, to in sizes])
-        x, others, number = (wp.zeros(1, dtype=kind, device=device) for kind in (wp.vec3f, wp.vec2i, wp.int32))
-        length = wp.zeros(vertices, dtype=wp.float32, device=device)
-        places = [vectors(self._rows.reshape(-1, 3)), length, length, x, number, others, number, number]
-        learned = [argument(self._weights), argument(self._bias), longest, vectors(self._out)]
-        given: dict[str, Any] = {"device": device, "threads": threads, "at_once": block_size(device)}
-        self._launch = Launch(fused_kernel(network.config), vertices, [vertices, *places, *learned], **given)
+        self._rows = torch.zeros((vertices * len(_places(network.config.vectors)), 4), device=device)
+        none = vectors(torch.zeros((1, 3), device=device))
+        number, whole, pair = (wp.zeros(1, dtype=kind, device=device) for kind in (wp.float32, wp.int32, wp.vec2i))
+        rows, place = vectors(self._rows), dict[str, Any](device=device, threads=threads)
+        given = [vertices, 0, 0, whole, number, number, *[none] * 7, rows]
+        place["at_once"] = block_size(device)
+        self._pack = Launch(pack_kernel(network.config.vectors), vertices, given, **place)
+        learned = [argument(self._weights), argument(self._bias), longest, none, none]
+        given = [vertices, rows, number, number, whole, pair, whole, whole, *learned]
+        self._launch = Launch(fused_kernel(network.config), vertices, given, **place)
 
     def __call__(
-        self,
-        bases: Sequence[Float[Tensor, "vertices 3"]],
-        spacing: Float[Tensor, " vertices"],
-        reach: Float[Tensor, " vertices"],
-        bias: Float[Tensor, " outputs"],
-        *,
-        frame: Callable[[], VertexFrame],
-    ) -> Float[Tensor, "vertices 3"]:
-        """The displacement [m], limited to the longest allowed.
+        self, past: Past, x: Float[Tensor, "vertices 3"], frame: VertexFrame | None
+    ) -> tuple[Float[Tensor, "vertices 3"], Float[Tensor, "vertices 3"]]:
+        """The displacement, limited to the longest allowed, and the positions after it [m].
 
         Args:
-            bases: The vectors named by `bases` [m].
-            spacing: Mean rest edge at each vertex [m].
-            reach: The spacing, and 0 at fixed vertices [m].
-            bias: As `bias_at` a number of previous steps.
-            frame: Gives the surroundings of the vertices; called only if parts need them.
+            past: What the vectors are made of.
+            x: Positions [m].
+            frame: The surroundings of the vertices; None without a mesh, for networks that need none.
         """
-        torch.stack(list(bases), out=self._rows)
-        changed = {2: argument(spacing), 3: argument(reach), 10: argument(bias)}
-        if self._frames:
-            surface = frame()
-            changed |= {4: surface.positions} | dict(enumerate(surface.mesh, start=5))
+        secants = past.secants
+        fields = secants.fields.view(-1, 3)
+        packed = [past.garment, secants.weights.view(-1), past.stiffness, fields, x]
+        packed += [past.force, past.image, past.force1, past.image1, past.image2]
+        self._pack(dict(enumerate([secants.newest, secants.known, *packed], start=1)))
+        move, moved = torch.empty_like(x), torch.empty_like(x)
+        changed = {2: past.spacing, 3: past.reach, 9: self.bias_at(past.step), 11: move, 12: moved}
+        if frame is not None:
+            changed |= dict(enumerate(frame.mesh, start=4))
         self._launch(changed)
-        return self._out.clone()
+        return move, moved
 
     def bias_at(self, step: int) -> Float[Tensor, " outputs"]:
         """The layers' biases after a number of previous steps."""
         if step not in self._biases:
             self._biases[step] = self._bias + self._clock * clock_of(step)
         return self._biases[step]
+
+
+@dataclass(frozen=True, eq=False)
+class Past:
+    """Forces, their images, and secants: the sources of a network's vectors.
+
+    Attributes:
+        secants: The secants, with the direction for the force.
+        force, force1: F now and one step ago [N].
+        image, image1, image2: H0^-1 F now, and one and two steps ago [m].
+        stiffness: Diagonal of H0 [N/m], shape (V,).
+        spacing: Mean rest edge at each vertex [m], shape (V,).
+        reach: The spacing, and 0 at fixed vertices [m].
+        garment: Number of each vertex's garment, int32, shape (V,).
+        step: Number of steps made.
+    """
+
+    secants: Secants
+    force: Float[Tensor, "vertices 3"]
+    force1: Float[Tensor, "vertices 3"]
+    image: Float[Tensor, "vertices 3"]
+    image1: Float[Tensor, "vertices 3"]
+    image2: Float[Tensor, "vertices 3"]
+    stiffness: Float[Tensor, " vertices"]
+    spacing: Float[Tensor, " vertices"]
+    reach: Float[Tensor, " vertices"]
+    garment: Int[Tensor, " vertices"]
+    step: int
 
 
 def _padded(values: Tensor, *shape: int) -> Tensor:
@@ -174,21 +197,89 @@ def fused_physgraph(network: Physgraph, vertices: int, longest: float, *, device
 def fused_kernel(config: PhysgraphConfig) -> wp.Kernel:
     """The kernel of a network of a given size; an item is a block of vertices."""
     names, name = config.vectors, f"physgraph_{hashlib.sha256(repr(config).encode()).hexdigest()[:16]}"
-    (_, smoothed, parts), families = in_rows(names), counted_families(names)
+    (_, _, parts), families = in_rows(names), counted_families(names)
     features = _features(parts, pairs_in(names), families)
-    sources = (_rows(parts, smoothed), _units(parts, families), features, _layers(_widths(config)), _combined(parts))
+    sources = (_rows(names), _units(parts, families), features, _layers(_widths(config)), _combined(parts))
     formula = "".join(line for lines in sources for line in lines)
 
-    def of_block(block, vertices, v, spacing, reach, x, corners, others, ends, far, weights, biases, longest, out): ...
+    def of_block(
+        block, vertices, rows, spacing, reach, corners, others, ends, far, weights, biases, longest, out, to
+    ): ...
 
-    def physgraph(first, vertices, v, spacing, reach, x, corners, others, ends, far, weights, biases, longest, out):
+    def physgraph(first, vertices, rows, spacing, reach, corners, others, ends, far, weights, biases, longest, out, to):
         block = first + wp.tid()
-        compute(block, vertices, v, spacing, reach, x, corners, others, ends, far, weights, biases, longest, out)
+        compute(block, vertices, rows, spacing, reach, corners, others, ends, far, weights, biases, longest, out, to)
 
     number, index, vector, pair = (wp.array(dtype=kind) for kind in (wp.float32, wp.int32, wp.vec3f, wp.vec2i))
-    kinds = (wp.int32, vector, number, number, vector, index, pair, index, index, number, number, wp.float32, vector)
+    row = wp.array(dtype=wp.vec4f)
+    kinds = (wp.int32, row, number, number, index, pair, index, index, number, number, wp.float32, vector, vector)
     compute = native(of_block, name, at_once(formula, "vertices", torch.float32), *kinds)
     return kernel(physgraph, name, *kinds)
+
+
+def _places(names: Sequence[str]) -> dict[str, int]:
+    """Row of each whole vector, and of the positions "x", in a vertex's table; first those with neighbour means."""
+    wholes, smoothed, _ = in_rows(names)
+    first = [wholes[place] for place in smoothed]
+    return {name: row for row, name in enumerate([*first, "x", *(each for each in wholes if each not in first)])}
+
+
+_VECTOR_SOURCES = {
+    "metric": "at((const float*)g.data, vertex)",
+    "metric1": "at((const float*)g1.data, vertex)",
+    "metric2": "at((const float*)g2.data, vertex)",
+    "diagonal": "at((const float*)f.data, vertex) * soft[i]",
+    "diagonal1": "at((const float*)f1.data, vertex) * soft[i]",
+    "move1": "known > 0 ? at(moves[0], vertex) : Four{}",
+    "move2": "known > 1 ? at(moves[1], vertex) : Four{}",
+    "secant": "direction(vertex)",
+    "x": "at((const float*)x.data, vertex)",
+}
+_PACK = (
+    f"constexpr int SECANTS = {SECANTS}, SLOTS = {SLOTS}, WEIGHTS = {WEIGHTS};"
+    """
+const float *moves[SECANTS], *images[SECANTS], *all = (const float*)fields.data;
+for (int i = 0; i < SECANTS; ++i) {
+    const int slot = (newest + SLOTS - i) % SLOTS;
+    moves[i] = all + 3 * (size_t)slot * vertices, images[i] = all + 3 * (size_t)(2 * SLOTS + slot) * vertices;
+}
+const Number softness = 1.0f / load(stiffness);
+const float* soft = (const float*)&softness;
+auto at = [&](const float* field, size_t vertex) {  // Four numbers are read where there are as many.
+    const float* p = field + 3 * vertex;
+    return vertex + 1 < count ? *(const Four*)p : Four{p[0], p[1], p[2], 0.0f};
+};
+auto direction = [&](size_t vertex) {
+    const float* w = weights.data + WEIGHTS * garment.data[vertex];
+    Four sum = at((const float*)g.data, vertex) * w[0];
+    for (int i = 0; i < known; ++i)
+        sum += at(images[i], vertex) * w[1 + i] + at(moves[i], vertex) * w[1 + SECANTS + i];
+    return sum;
+};
+"""
+)
+
+
+@functools.cache
+def pack_kernel(names: tuple[str, ...]) -> wp.Kernel:
+    """The kernel that writes each vertex's table of vectors, for networks of given vectors; an item is a block."""
+    places = _places(names)
+    lines = ["for (int i = 0; i < BLOCK; ++i) {\nconst size_t vertex = element[i];\n"]
+    lines += [f"Four* row = (Four*)rows.data + vertex * {len(places)};\n"]
+    lines += [f"row[{row}] = {_VECTOR_SOURCES[name]};\n" for name, row in places.items()]
+    name = f"pack_{hashlib.sha256(repr(names).encode()).hexdigest()[:16]}"
+
+    def of_block(block, vertices, newest, known, garment, weights, stiffness, fields, x, f, g, f1, g1, g2, rows): ...
+
+    def pack(first, vertices, newest, known, garment, weights, stiffness, fields, x, f, g, f1, g1, g2, rows):
+        block = first + wp.tid()
+        write(block, vertices, newest, known, garment, weights, stiffness, fields, x, f, g, f1, g1, g2, rows)
+
+    number, index, vector = (wp.array(dtype=kind) for kind in (wp.float32, wp.int32, wp.vec3f))
+    kinds = (wp.int32, wp.int32, wp.int32, index, number, number, *[vector] * 7, wp.array(dtype=wp.vec4f))
+    source = at_once(_PACK + "".join([*lines, "}\n"]), "vertices", torch.float32)
+    write = native(of_block, name, source, *kinds)
+    return kernel(pack, name, *kinds)
 
 
 def _widths(config: PhysgraphConfig) -> tuple[int, ...]:
@@ -196,18 +287,19 @@ def _widths(config: PhysgraphConfig) -> tuple[int, ...]:
     return tuple(-(-each // ROW) * ROW for each in (*[config.width] * config.depth, len(config.vectors)))
 
 
-def _rows(parts: Parts, smoothed: tuple[int, ...]) -> list[str]:
+def _rows(names: Sequence[str]) -> list[str]:
     """Source of the normal ``across``, 0 if no part needs it, and of the vectors ``row`` [m]."""
-    rows = 1 + max(row for row, _ in parts)
-    wholes = rows - len(smoothed)
+    (wholes, smoothed, parts), places = in_rows(names), _places(names)
+    order = ", ".join(str(places[name]) for name in wholes)
     lines = [
-        f"Vec across = {{}}, row[{rows}];\n",
-        f"for (int u = 0; u < {wholes}; ++u)\n",
-        "    row[u] = vec([&](int i) { return v.data + u * vertices + element[i]; });\n",
+        f"constexpr int ROWS = {len(places)}, POSITION = {places['x']}, PLACES[] = {{{order}}};\n",
+        "auto row_of = [&](size_t vertex, int row) { return (const Four*)rows.data + vertex * ROWS + row; };\n",
+        f"Vec across = {{}}, row[{len(wholes) + len(smoothed)}];\n",
+        f"for (int u = 0; u < {len(wholes)}; ++u)\n",
+        "    row[u] = wide([&](int i) { return row_of(element[i], PLACES[u]); });\n",
     ]
     if smoothed:
-        sizes = f"constexpr int MEANS = {len(smoothed)}, WHOLES = {wholes};\n"
-        lines += [sizes, f"constexpr int SMOOTHED[] = {{{', '.join(map(str, smoothed))}}};\n", _MEANS]
+        lines += [f"constexpr int MEANS = {len(smoothed)}, WHOLES = {len(wholes)};\n", _MEANS]
     return [*lines, _NORMAL] if any(is_normal for _, is_normal in parts) else lines
 
 
@@ -272,7 +364,6 @@ def _features(parts: Parts, pairs: Pairs, families: Families) -> list[str]:
     logarithm = f"{LOG_SCALE!r}f * logarithm(size[%d]) + {LOG_OFFSET!r}f"
     values = ", ".join([*terms, *(logarithm % kind for kind in range(kinds))])
     return [
-        "auto logarithm = [&](Number a) { return each([](Scalar b) { return wp::log(b); }, a); };\n",
         f"const Number seen[] = {{{values}}};\n",
         f"constexpr int SEEN = {len(terms) + kinds};\n",
     ]

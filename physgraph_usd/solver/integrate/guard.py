@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 from jaxtyping import Float
 from torch import Tensor
 
-from .base import Carry, Integrator, System, followed, resumed
+from .base import Carry, Integrator, System, Turning, followed, resumed
 from .quasi_newton import backtrack, truncated
 
 PATIENCE = 4
@@ -64,6 +65,16 @@ class Guard:
             return corrected
         handed = spare.start(system, corrected.x)
         return replace(handed, mover=corrected.mover, setbacks=corrected.setbacks)
+
+    def learned(self, carry: Carry) -> Any:
+        """The wrapped integrator's memory, unless the spare made the last steps."""
+        if self._spare_of(carry) is not None or not isinstance(self._inner, Turning):
+            return None
+        return self._inner.learned(carry)
+
+    def turned(self, memory: Any, rotation: Float[Tensor, "vertices 3 3"]) -> Any:
+        """The wrapped integrator's memory after a rotation at each vertex."""
+        return self._inner.turned(memory, rotation) if isinstance(self._inner, Turning) else None
 
     def _corrected(self, system: System, carry: Carry, proposed: Carry) -> Carry:
         """The carry after shortening or replacing a step that raised the energy."""

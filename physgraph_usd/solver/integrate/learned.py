@@ -14,7 +14,8 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Sequence
-from functools import cache, partial
+from dataclasses import dataclass, replace
+from functools import cache, lru_cache, partial
 from typing import Any, TypeVar
 
 import torch
@@ -23,16 +24,19 @@ from torch import Tensor, nn
 
 from ...errors import SolveError
 from ..level import Level
-from .base import Carry, System, root_sum
-from .fused import FusedPhysgraph, fused_physgraph
+from .base import Carry, System
+from .fused import Past, fused_physgraph
 from .network import Physgraph
-from .quasi_newton import Secant, StepHistory, dot, secant_direction
+from .quasi_newton import Secant, StepHistory, secant_direction
+from .secants import SecantProducts, Secants, secant_products, turned_fields
 from .vertex_frame import VertexFrame
 
 NetworkT = TypeVar("NetworkT", bound=nn.Module)
 
 MOST_GARMENTS = 8
 """Largest number of garments with scalar products summed per garment, in a fixed order."""
+LONG_AGO = 8
+"""Most steps that a memory carried from another frame counts as; networks are trained on descents of some 12 steps."""
 LONGEST_STEP = 5.0
 """Longest move of a vertex in a step, in edge lengths."""
 
@@ -46,33 +50,38 @@ class LearnedMetric:
         """Keep the network.
 
         Args:
-            fuse: Use the kernels of `fused` if no gradient is needed.
+            fuse: Use the kernels of `fused` and `secants` in single precision if no gradient is needed.
         """
         self._network = network
-        self._trained = not any(parameter.requires_grad for parameter in network.parameters())
-        self._fuse = fuse and self._trained
+        self._fuse = fuse and not any(parameter.requires_grad for parameter in network.parameters())
 
     def start(self, system: System, x: Float[Tensor, "vertices 3"]) -> Carry:
         """Evaluate x with an empty memory; the network runs in the system's precision."""
         self._network = placed(self._network, system, x.dtype)
         none = torch.zeros_like(x)
-        return self._evaluated(system, x, StepHistory(none, (none, none)))
+        memory = _FusedHistory(none, (none, none), Secants.none(x, len(_spans(system)))) if self._fuses(x) else None
+        return self._evaluated(system, x, memory or StepHistory(none, (none, none)))
 
     def resume(self, system: System, carry: Carry) -> Carry:
         """Evaluate the carry's positions after a small change of the forces; the memory is kept."""
         return self._evaluated(system, carry.x, carry.memory)
 
-    def _evaluated(self, system: System, x: Tensor, memory: StepHistory) -> Carry:
+    def _evaluated(self, system: System, x: Tensor, memory: StepHistory | _FusedHistory) -> Carry:
         """The carry at x [m] with a given memory."""
         energy, force = system.evaluated(x)
         image = system.apply_short_inverse(force)
-        energy, remaining = torch.stack([energy, system.relative_move(image.detach())]).tolist()
-        return Carry(x, energy, force, image, self.name, memory, remaining=remaining)
+        if isinstance(memory, _FusedHistory):
+            secants = _products_of(system).directed(memory.secants, force, image, is_new=False)
+            memory = replace(memory, secants=secants)
+        return self._carry(system, x, (energy, force, image), memory)
 
     def step(self, system: System, carry: Carry) -> Carry:
         """One step along the network's combination."""
-        move = self.propose(system, carry)
-        return self._reached(system, carry, carry.x + move, move)
+        if not isinstance(carry.memory, _FusedHistory):
+            move = self.propose(system, carry)
+            return self._reached(system, carry, carry.x + move, move)
+        move, x = self._by_kernel(system, carry)
+        return self._reached(system, carry, x, move)
 
     def follow(self, system: System, carry: Carry, x: Float[Tensor, "vertices 3"]) -> Carry:
         """Evaluate x [m] and remember the displacement to x as a step of the network."""
@@ -82,43 +91,66 @@ class LearnedMetric:
         """The carry at x [m], a displacement away from the previous carry."""
         energy, force = system.evaluated(x)
         image = system.apply_short_inverse(force)
-        newest, remaining = self._secant(system, (carry.force, force, carry.preconditioned, image, move))
-        energy, remaining = torch.stack([energy, remaining.detach()]).tolist()  # On a card one wait for both.
-        return Carry(x, energy, force, image, self.name, carry.memory.after(carry, newest), remaining=remaining)
+        assert carry.preconditioned is not None
+        if isinstance(carry.memory, _FusedHistory):
+            secants = carry.memory.secants.after(move, (carry.force, force), (carry.preconditioned, image))
+            secants = _products_of(system).directed(secants, force, image, is_new=True)
+            memory = carry.memory.after(carry, secants)
+        else:
+            product, differences = (
+                partial(garment_dot, system.level),
+                (carry.force - force, carry.preconditioned - image),
+            )
+            memory = carry.memory.after(carry, Secant(move, *differences, product))
+        return self._carry(system, x, (energy, force, image), memory)
 
-    def _secant(self, system: System, ends: tuple[Any, ...]) -> tuple[Secant, Tensor]:
-        """The secant of a step, given F and H0^-1 F before and after, and the displacement; and the remaining move."""
-        before, force, image_before, image, move = ends
-        level = system.level
-        if self._trained and not system.on_card:  # Waiting for numbers costs nothing.
-            spans = level.spans if level is not None and len(level.spans) > 1 else ()
-            return Secant(move, before - force, image_before - image, dot, spans), system.relative_move(image)
-        product = partial(garment_dot, level)
-        if not system.on_card or not self._trained or level is None:
-            return Secant(move, before - force, image_before - image, product), system.relative_move(image)
-        given = *ends, system.per_edge
-        made = level.recordings.run("secant", lambda *each: _differences(level, *each), *given)
-        yields, change, curvature, remaining = made
-        return Secant(move, yields, change, product, known=curvature), remaining
+    def _carry(self, system: System, x: Tensor, evaluated: tuple[Tensor, Tensor, Tensor], memory: Any) -> Carry:
+        """A carry, given energy [J], force [N] and H0^-1 F [m] at x [m]; on a card one wait for both numbers."""
+        energy, force, image = evaluated
+        energy, remaining = torch.stack([energy, system.relative_move(image.detach())]).tolist()
+        return Carry(x, energy, force, image, self.name, memory, remaining=remaining)
 
     def propose(self, system: System, carry: Carry) -> Float[Tensor, "vertices 3"]:
         """The displacement of the next step [m]."""
-        fused, memory, level = self._fused(system), carry.memory, system.level
-        if fused is None:
-            return self._combined(system, carry)
-        if level is None or not system.on_card:
-            bias, stiffness = fused.bias_at(memory.step), system.rest_diagonal_columns
-            return _by_kernel(fused, level, carry, bias=bias, sizes=(stiffness, system.spacing, system.reach))
-        now = carry.x, carry.force, carry.preconditioned, *_past(fused, system, memory)
-        return level.recordings.run(fused, lambda *given: [_moved(fused, level, given)], *now)[0]
+        fused = isinstance(carry.memory, _FusedHistory)
+        return self._by_kernel(system, carry)[0] if fused else self._combined(system, carry)
 
-    def _fused(self, system: System) -> FusedPhysgraph | None:
-        """The network as kernels, or None if not fused."""
-        if not self._fuse or system.spacing.dtype != torch.float32:
-            return None
-        threads = 1 if system.level is None else system.level.threads
-        spacing = system.spacing
-        return fused_physgraph(self._network, len(spacing), LONGEST_STEP, device=str(spacing.device), threads=threads)
+    def learned(self, carry: Carry) -> Any:
+        """The memory of a carry, if it has secants."""
+        memory = carry.memory
+        return memory if isinstance(memory, _FusedHistory) and memory.secants.known else None
+
+    def turned(self, memory: Any, rotation: Float[Tensor, "vertices 3 3"]) -> Any:
+        """The memory after a rotation at each vertex; scalar products stay."""
+        fields = memory.secants.fields
+        secants = replace(memory.secants, fields=turned_fields(fields.flatten(0, 1), rotation).reshape(fields.shape))
+        force, *images = turned_fields(torch.stack([memory.force, *memory.images]), rotation)
+        return _FusedHistory(force, (images[0], images[1]), secants, min(memory.step, LONG_AGO))
+
+    def _fuses(self, x: Tensor) -> bool:
+        """Whether the kernels make the steps from x."""
+        return self._fuse and x.dtype == torch.float32
+
+    def _by_kernel(self, system: System, carry: Carry) -> tuple[Tensor, Tensor]:
+        """The displacement of the next step, and the positions after it [m], by the network as a kernel."""
+        memory, level, spacing = carry.memory, system.level, system.spacing
+        threads = 1 if level is None else level.threads
+        fused = fused_physgraph(self._network, len(spacing), LONGEST_STEP, device=str(spacing.device), threads=threads)
+        past = Past(
+            memory.secants,
+            force=carry.force,
+            force1=memory.force,
+            image=_of(carry.preconditioned),
+            image1=memory.images[0],
+            image2=memory.images[1],
+            stiffness=system.rest_diagonal,
+            spacing=spacing,
+            reach=system.reach,
+            garment=_no_garments(len(spacing), spacing.device) if level is None else level.vertex_garment,
+            step=memory.step,
+        )
+        needs_mesh = any("." in name for name in self._network.config.vectors)
+        return fused(past, carry.x, VertexFrame(level_of(level), carry.x) if needs_mesh else None)
 
     def _combined(self, system: System, carry: Carry) -> Tensor:
         """The network's combination of vectors [m]."""
@@ -130,53 +162,43 @@ class LearnedMetric:
         return limited(move, system.spacing) * system.free
 
 
-def _past(fused: FusedPhysgraph, system: System, memory: StepHistory) -> list[Tensor]:
-    """All that a step reads besides x, F and H0^-1 F: three sizes of vertices, the past, and four tensors a secant."""
-    secants = [part for each in memory.secants for part in (each.move, each.yields, each.image, each.curvature)]
-    sizes = system.rest_diagonal_columns, system.spacing, system.reach
-    return [*sizes, fused.bias_at(memory.step), memory.force, *memory.images, *secants]
+@dataclass(frozen=True, eq=False)
+class _FusedHistory:
+    """The past of a step, as `StepHistory`, with the secants as fields of one tensor."""
+
+    force: Float[Tensor, "vertices 3"]
+    images: tuple[Tensor, Tensor]
+    secants: Secants
+    step: int = 0
+
+    def after(self, carry: Carry, secants: Secants) -> _FusedHistory:
+        """The memory after a step from a carry with this memory."""
+        return _FusedHistory(carry.force, (_of(carry.preconditioned), self.images[0]), secants, self.step + 1)
 
 
-def _moved(fused: FusedPhysgraph, level: Level, given: Sequence[Tensor]) -> Tensor:
-    """`_by_kernel` of tensors alone: x, F, H0^-1 F, and `_past`."""
-    x, force, image, stiffness, spacing, reach, bias, before, first, second, *parts = given
-    fields, product = zip(*[iter(parts)] * 4, strict=True), partial(garment_dot, level)
-    secants = tuple(Secant(*each, dot=product, known=curvature) for *each, curvature in fields)
-    carry = Carry(x, 0.0, force, image, memory=StepHistory(before, (first, second), secants))
-    return _by_kernel(fused, level, carry, bias=bias, sizes=(stiffness, spacing, reach))
+def _of(image: Tensor | None) -> Tensor:
+    """H0^-1 F of a carry of this integrator [m]."""
+    assert image is not None
+    return image
 
 
-def _differences(
-    level: Level,
-    before: Tensor,
-    force: Tensor,
-    image_before: Tensor,
-    image: Tensor,
-    move: Tensor,
-    per_edge: Tensor,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Of a step: differences of negative forces and of images, the secant's curvature, and the remaining move."""
-    made = Secant(move, before - force, image_before - image, partial(garment_dot, level))
-    return made.yields, made.image, made.curvature, root_sum(image * per_edge)
+def _spans(system: System) -> tuple[tuple[int, int], ...]:
+    """First vertex of each garment, and the one after its last."""
+    if system.level is None:
+        return ((0, len(system.spacing)),)
+    return tuple((span.start, span.stop) for span in system.level.spans)
 
 
-def _by_kernel(
-    fused: FusedPhysgraph, level: Level | None, carry: Carry, *, bias: Tensor, sizes: tuple[Tensor, Tensor, Tensor]
-) -> Tensor:
-    """Displacement of the next step [m], by the network as a kernel.
+def _products_of(system: System) -> SecantProducts:
+    """The launches for a system's garments."""
+    threads = 1 if system.level is None else system.level.threads
+    return secant_products(_spans(system), device=str(system.spacing.device), threads=threads)
 
-    Args:
-        carry: The state.
-        bias: `FusedPhysgraph.bias_at` the number of steps made.
-        sizes: Diagonal of H0 [N/m], in three columns; the spacing, and the spacing, 0 at fixed vertices [m].
-    """
 
-    def frame() -> VertexFrame:
-        return VertexFrame(level_of(level), carry.x)
-
-    stiffness, spacing, reach = sizes
-    vectors = vectors_of(fused.bases, partial(_vector, carry=carry, stiffness=stiffness), frame=frame)
-    return fused(vectors, spacing, reach, bias, frame=frame)
+@lru_cache(maxsize=4)
+def _no_garments(count: int, device: torch.device) -> Tensor:
+    """The garment of each vertex where all are of one."""
+    return torch.zeros(count, dtype=torch.int32, device=device)
 
 
 def _vector(name: str, *, carry: Carry, stiffness: Tensor) -> Tensor:

@@ -14,8 +14,8 @@ as there are secants, because an opening triangle would otherwise remain slow.
 | rho_i | 1 / ``curvature`` | 1 / s_i.y_i |
 | gamma | s.y / y.z of the newest secant | scales H0^-1 to the latest curvature |
 
-Scalar products are numbers, of all cloth or of one garment after another, or tensors: one per garment, at each vertex
-of the garment. Tensors avoid waiting for a number, and let gradients flow.
+Scalar products are numbers, of all cloth, or tensors: one per garment, at each vertex of the garment. Tensors let
+gradients flow. `secants` has the same direction by coefficients, for steps without gradients.
 """
 
 from __future__ import annotations
@@ -237,31 +237,16 @@ def dot(a: Tensor, b: Tensor) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Secant:
-    """Differences of positions, of negative forces, of their images under H0^-1, and the scalar product to use.
-
-    Garments are treated one after another if ``spans`` has their vertices.
-
-    Attributes:
-        known: The `curvature`, if known.
-    """
+    """Differences of positions, of negative forces, of their images under H0^-1, and the scalar product to use."""
 
     move: Tensor
     yields: Tensor
     image: Tensor
     dot: Dot = dot
-    spans: tuple[slice, ...] = ()
-    known: Tensor | None = None
-
-    @cached_property
-    def parts(self) -> list[Secant]:
-        """The secant of each garment."""
-        return [Secant(self.move[span], self.yields[span], self.image[span], self.dot) for span in self.spans]
 
     @cached_property
     def curvature(self) -> Any:
         """s.y, infinite if not safely positive: the secant then has no effect."""
-        if self.known is not None:
-            return self.known
         dot = self.dot
         curvature, size = dot(self.move, self.yields), dot(self.yields, self.image)
         floor = 1e-8 * (dot(self.move, self.move) * dot(self.yields, self.yields)) ** 0.5
@@ -307,9 +292,6 @@ def secant_direction(
     """
     if not secants:
         return preconditioned
-    if secants[-1].spans:
-        garments = zip(secants[-1].spans, *(each.parts for each in secants), strict=True)
-        return torch.cat([secant_direction(force[span], preconditioned[span], each) for span, *each in garments])
     weights, residual, image = [], force.clone(), preconditioned.clone()
     for secant in reversed(secants):
         weight = secant.dot(secant.move, residual) / secant.curvature

@@ -8,7 +8,6 @@ their numbers there.
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -22,13 +21,15 @@ near pairs are found again after a round. With 16 for 8, beside 4 for all, two o
 higher, layers by 5% and the overcoat by 10% (three ripples each); 12 are equal. With 8 the overcoat ends 6% higher."""
 HURRIED = 2
 """Most steps of a first round that somebody waits for."""
-TOUCHING = 3
+TOUCHING = 2
 """Most steps of the finest level with contact, relative to the budget's: blocked moves cost steps."""
 REST = 2.0
 """Remaining move [tolerances] below which a warm frame makes no step."""
-NEAR, EARLY = 10.0, 5.0 / 12.0
-"""A warm frame in contact ends below this remaining move [tolerances] after this fraction of its steps, which are its
-first round: a step costs far less than finding the near pairs again."""
+LEAST_MISSING = 0.01
+"""Part of a round's moves that may be blocked at the end of a warm frame's steps; of six shots, contact blocked 0.0 to
+0.8% after a round of 24 steps."""
+SEEN_STEPS, SEEN_TURN, SEEN_PART = 4, 0.5, 0.1
+"""Cloth rests to the eye where in so many steps at most this part of its faces turned by more than so many degrees."""
 COARSE_STEPS, COARSE_TOLERANCE, COARSE_TIME = 4, 0.1, 0.3
 """Steps and tolerance of a coarse level, relative to the finest: coarse steps are cheap and shape the folds. And the
 fraction of its time that a level leaves to the coarser levels."""
@@ -56,7 +57,8 @@ class Budget:
         cancelled: Asked before each step whether the result is no longer needed; or None.
         least: Number of steps exempt from the deadline.
         touching: Most steps with contact, if more.
-        near: Remaining move, in tolerances, below which a level in contact ends early; 0 for never.
+        warm: Whether the level starts from the last frame's result. Its first round then has all steps, since steps
+            cost far less than finding the near pairs again, and ends when nothing is seen to move.
         hurried: Whether somebody waits for the first round, and another solve follows: contact gives no more steps.
     """
 
@@ -67,7 +69,7 @@ class Budget:
     cancelled: Callable[[], bool] | None = None
     least: int = 0
     touching: int = 0
-    near: float = 0.0
+    warm: bool = False
     hurried: bool = False
 
     def for_round(self, *, made: int, touching: bool, blocked: bool, shrunk: float) -> Budget:
@@ -81,10 +83,10 @@ class Budget:
         """
         first, left = not made, max(self.steps, self.touching) - made
         longest = ROUND if blocked or first else CLEAR_ROUND
-        longest = max(longest, math.ceil(EARLY * self.steps)) if first and self.near else longest
         longest = HURRIED if self.hurried and first else min(longest, left) if touching else FREE_ROUND
+        longest = self.steps if first and self.warm and not self.hurried else longest
         once = {} if first else {"rest": 1.0, "least": 0}
-        return replace(self, steps=min(longest, FREE_ROUND, self.steps), tolerance=shrunk * self.tolerance, **once)
+        return replace(self, steps=min(longest, self.steps), tolerance=shrunk * self.tolerance, **once)
 
     def for_untangling(self) -> Budget:
         """The budget of an untangling round, without a tolerance: contours shorten while nothing moves much."""
@@ -103,18 +105,18 @@ class Budget:
             return "steps"
         return "budget" if self.is_spent(steps) else ""
 
-    def ends(self, report: Ended, *, made: int, touched: bool, blocked: bool) -> bool:
+    def ends(self, report: Ended, *, made: int, touched: bool, missing: float) -> bool:
         """Whether no further round of the level follows.
 
         Args:
             report: Report of the last round.
             made: Steps of all rounds.
             touched: Whether any round had contact.
-            blocked: Whether the last move was blocked.
+            missing: Part of the last round's moves that was blocked.
         """
-        if report.stopped == "budget" or not report.steps or (report.stopped == "tolerance" and not blocked):
+        if report.stopped == "budget" or not report.steps or (report.stopped == "tolerance" and not missing):
             return True
-        if touched and made >= EARLY * self.steps and report.remaining_move < self.near * self.tolerance:
+        if self.warm and missing <= LEAST_MISSING and (report.stopped == "seen" or made >= self.steps):
             return True
         return made >= (max(self.steps, self.touching) if touched and not self.hurried else self.steps)
 
@@ -149,4 +151,4 @@ def level_budget(
     if below:
         return Budget(COARSE_STEPS * steps, COARSE_TOLERANCE * tolerance, deadline, cancelled=cancelled)
     finest = Budget(steps, tolerance, deadline, cancelled=cancelled, least=1, touching=TOUCHING * steps)
-    return replace(finest, rest=REST, near=NEAR) if warm else finest
+    return replace(finest, rest=REST, warm=True) if warm else finest

@@ -17,6 +17,8 @@ A formula is C++ with these names; the last two only in `element_kernels`:
 | ``element[i]`` | index of the i-th element; the last block repeats the last element |
 | ``load(array)``, ``load4(array)`` | a `Number` of an array with a number for each element; a `Quad` |
 | ``vec([&](int i) { return address; })`` | the `Vec` with three scalars of each element, from any address |
+| ``wide([&](int i) { return address; })`` | likewise, from the address of a `Four` |
+| ``logarithm`` | natural logarithm of positive, normal numbers |
 | ``put(array, vec)`` | writes a `Vec` to an array of vectors |
 | ``corner(k)`` | positions of the k-th corners [m], a `Vec` |
 | ``store(energy, {force, ...})`` | writes energies [J], a `Number`, and the force on each corner [N], a `Vec` |
@@ -96,6 +98,11 @@ auto vec = [&](auto address) -> Vec {{
     const Scalar* p = (const Scalar*)address(0);
     return {{p[0], p[1], p[2]}};
 }};
+auto wide = [&](auto address) -> Vec {{
+    const auto& a = *address(0);
+    return {{a[0], a[1], a[2]}};
+}};
+auto logarithm = [](Number a) {{ return wp::log(a); }};
 auto write = [&](Scalar* to, int width, const Number* values, int n) {{
     for (int c = 0; c < n; ++c) to[width * block + c] = values[c];
 }};
@@ -158,6 +165,23 @@ auto vec = [&](auto address) -> Vec {
     Quad c = columns(row);
     return {c[0], c[1], c[2]};
 };
+auto wide = [&](auto address) -> Vec {
+    Four row[BLOCK];
+    for (int i = 0; i < BLOCK; ++i) row[i] = *address(i);
+    Quad c = columns(row);
+    return {c[0], c[1], c[2]};
+};
+auto logarithm = [&](Number a) -> Number {
+    if (sizeof(Scalar) == 8) return each([](Scalar b) { return wp::log(b); }, a);
+    // a = 2^power m with m in [1, 2), and ln m = 2 artanh(t), t = (m - 1) / (m + 1), to 2e-6.
+    typedef int Bits __attribute__((vector_size(BLOCK * sizeof(int))));
+    union { Number number; Bits bits; } whole = {a};
+    Bits power = (whole.bits >> 23) - 127;
+    whole.bits = (whole.bits & 0x7fffff) | 0x3f800000;
+    Number m = whole.number, t = (m - 1.0f) / (m + 1.0f), s = t * t;
+    Number series = 1.0f + s * (0.33333333f + s * (0.2f + s * (0.14285714f + s * (0.11111111f + s * 0.09090909f))));
+    return __builtin_convertvector(power, Number) * 0.69314718f + 2.0f * t * series;
+};
 auto write = [&](Scalar* to, int width, const Number* values, int n) {
     for (int c = 0; c < n; c += 4) {  // Four columns at a time; the last four may overlap.
         const int from = c + 4 <= n ? c : n - 4;
@@ -181,8 +205,29 @@ _OF_ELEMENTS = r"""
 constexpr int K = sizeof(*corners.data) / sizeof(int);
 auto corner = [&](int k) { return vec([&](int i) { return x.data + corners.data[element[i]][k]; }); };
 auto store = [&](Number energy, const Vec (&force)[K]) {
-    for (int i = 0; i < BLOCK; ++i) energies.data[element[i]] = ((const Scalar*)&energy)[i];
-    write((Scalar*)corner_force.data, 3 * K, &force[0].x, 3 * K);
+    double total = 0.0;
+    for (int i = 0; i < BLOCK && BLOCK * block + i < count; ++i) {  // The last block repeats an element.
+        const Scalar value = ((const Scalar*)&energy)[i];
+        if (energies.data) energies.data[element[i]] = value;
+        total += value;
+    }
+    totals.data[part] = block == part * blocks ? total : totals.data[part] + total;
+#ifdef __CUDACC__
+    write((Scalar*)forces.data, 3 * K, &force[0].x, 3 * K);
+#else
+    for (int k = 0; k < K; ++k) {
+        const Number values[4] = {force[k].x, force[k].y, force[k].z, Number{}};
+        Number half[4];
+        transpose(values, half);
+        Four at[BLOCK];
+        for (int i = 0; i < 4; ++i) {
+            at[i] = __builtin_shufflevector(half[i], half[i], 0, 1, 2, 3);
+            at[i + 4] = __builtin_shufflevector(half[i], half[i], 4, 5, 6, 7);
+        }
+        for (int i = 0; i < BLOCK && BLOCK * block + i < count; ++i)
+            ((Four*)forces.data)[part * vertices + corners.data[element[i]][k]] += at[i];
+    }
+#endif
 };
 """
 
@@ -227,28 +272,49 @@ def _annotate(function: Any, *kinds: Any) -> None:
 def element_kernels(
     name: str, formula: str, *, corners: int, parameter: dict[torch.dtype, Any]
 ) -> dict[torch.dtype, wp.Kernel]:
-    """Kernels of (first, x, corners, parameter0, parameter1, energy, corner_force), for each torch scalar type.
+    """Kernels of the energies and forces of elements, for each torch scalar type.
+
+    Their arguments are (first, blocks, all blocks, elements, vertices, x, corners, parameter0, parameter1, energies,
+    totals, forces). An item is a part of so many blocks of elements. On a CPU it adds to its own forces on all
+    vertices, on CUDA it writes the force on each corner. Energies of single elements are written if there is room.
 
     Args:
         name: The kernels' name.
         formula: Energy and forces of a block of elements, see this module.
         corners: Corners of an element.
         parameter: Type of both parameters, `SCALAR` or `QUAD`.
-
-    Returns:
-        The kernels; an item is a block of elements, see `block_size`.
     """
 
     def kernel_of(dtype: torch.dtype) -> wp.Kernel:
-        def of_block(block, x, corners, parameter0, parameter1, energies, corner_force): ...
+        def of_block(
+            block, part, blocks, elements, vertices, x, corners, parameter0, parameter1, energies, totals, forces
+        ): ...
 
-        def elements(first, x, corners, parameter0, parameter1, energies, corner_force):
-            compute(first + wp.tid(), x, corners, parameter0, parameter1, energies, corner_force)
+        def parts(
+            first, blocks, whole, elements, vertices, x, corners, parameter0, parameter1, energies, totals, forces
+        ):
+            part = first + wp.tid()
+            for block in range(part * blocks, wp.min((part + 1) * blocks, whole)):
+                compute(
+                    block,
+                    part,
+                    blocks,
+                    elements,
+                    vertices,
+                    x,
+                    corners,
+                    parameter0,
+                    parameter1,
+                    energies,
+                    totals,
+                    forces,
+                )
 
         vector, number, ends = VECTOR[dtype], parameter[dtype], wp.types.vector(corners, wp.int32)
-        kinds = [wp.array(dtype=kind) for kind in (vector, ends, number, number, SCALAR[dtype], vector)]
+        arrays = [wp.array(dtype=kind) for kind in (vector, ends, number, number, SCALAR[dtype], wp.float64, vector)]
         full = f"{name}_{SCALAR[dtype].__name__}"
-        compute = native(of_block, full, at_once(_OF_ELEMENTS + formula, "energies.shape[0]", dtype), *kinds)
-        return kernel(elements, full, *kinds)
+        source, whole = at_once(_OF_ELEMENTS + formula, "elements", dtype), [wp.int32] * 4
+        compute = native(of_block, full, source, *whole, *arrays)
+        return kernel(parts, full, *whole, *arrays)
 
     return {dtype: kernel_of(dtype) for dtype in SCALAR}

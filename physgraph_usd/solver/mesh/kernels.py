@@ -20,7 +20,9 @@ _TARGET = "-target-cpu x86-64-v3" if torch.backends.cpu.get_cpu_capability() in 
 _FLAGS = (wp.config.cpu_compiler_flags or "-march=native").replace("-march=native", _TARGET)
 KERNELS = {"enable_backward": False, "cpu_compiler_flags": _FLAGS}
 """Options of Warp modules: no derivatives; on the CPU Warp's default flags, for the target instructions."""
-ALONE: dict[str, Any] = {"module": "unique", "module_options": KERNELS}
+FUSED = {**KERNELS, "cpu_compiler_flags": f"{_FLAGS} -ffp-contract=fast"}
+"""These options with fused multiply-adds on the CPU. Warp's own option for it, on by default, makes none there."""
+ALONE: dict[str, Any] = {"module": "unique", "module_options": FUSED}
 """Arguments of `wp.kernel` for a kernel that compiles alone."""
 
 

@@ -101,7 +101,7 @@ class ElementValues:
         """The values at positions x [m], shape (elements, *shape)."""
         out = x.new_empty(self._shape)
         if self._launch is not None:
-            self._launch({1: vectors(x.contiguous()), 2: _packed(out)})
+            self._launch({1: x.contiguous(), 2: out})
         return out
 
 

@@ -8,6 +8,7 @@ launch gets follows from the time that the kernel took for an item so far.
 from __future__ import annotations
 
 import copy
+import ctypes
 import functools
 import time
 from collections import defaultdict
@@ -61,35 +62,46 @@ class Launch:
         self._most = min(threads, MOST_THREADS) if self._device is None else 1
         whole = wp.launch(kernel, dim=self._size, inputs=[0, *inputs], device=device, record_cmd=True)
         self._whole: wp.Launch | None = whole if self._size else None
-        self._slices: list[wp.Launch] = []
+        self._call = None if self._whole is None or self._device is not None else _Call(self._whole)
+        self._slices: list[_Call] = []
 
     def change(self, changed: Mapping[int, Any]) -> None:
-        """Replace some inputs from now on, by position in ``inputs``."""
-        for command in (self._whole, *self._slices) if self._whole is not None else ():
-            for place, array in changed.items():
-                command.set_param_at_index(place + 1, array)
+        """Replace some inputs from now on, by position in ``inputs``; tensors only by tensors of equal shape."""
+        if self._whole is None:
+            return
+        if self._call is None:
+            kinds = self._whole.kernel.adj.args
+            for place, value in changed.items():
+                packed = value
+                if isinstance(value, Tensor):
+                    packed = argument(value, kinds[place + 1].type.dtype)
+                    if packed.ndim != 1:
+                        raise ValueError("a kernel reads arrays of one dimension only")
+                self._whole.set_param_at_index(place + 1, packed)
+        for call in (self._call, *self._slices) if self._call is not None else ():
+            call.change(changed)
 
     def __call__(self, changed: Mapping[int, Any]) -> None:
         """Run with some inputs replaced, by position in ``inputs``."""
         self.change(changed)
         if self._whole is None:
             return
-        if self._device is not None:
-            self._whole.launch(stream=current_stream(self._device))
+        if self._call is None:
+            self._whole.launch(stream=current_stream(str(self._device)))
             return
         known = _item_seconds[self._name]
         work = known * self._size
         threads = min(self._most, int(work / LEAST_SECONDS))
-        spent = _run([self._whole]) if threads < 2 else self._shared(threads, work)
+        spent = _run([self._call]) if threads < 2 else self._shared(threads, work)
         _item_seconds[self._name] = 0.5 * (known + spent / self._size)
 
     def _shared(self, threads: int, work: float) -> float:
         """Run on several threads, given the work [s]; returns the time of all threads together [s]."""
-        assert self._whole is not None
+        assert self._call is not None
         if not self._slices:
             bounds = _tapered(self._size, min(SLICES * threads, int(work / SLICE_SECONDS), self._size))
-            self._slices = [_part(self._whole, a, b) for a, b in pairwise(bounds) if b > a]
-        left = iter(self._slices)  # A list's iterator hands each command to one thread only.
+            self._slices = [self._call.part(a, b) for a, b in pairwise(bounds) if b > a]
+        left = iter(self._slices)  # A list's iterator hands each call to one thread only.
         others: list[Future[float]] = []
         try:
             for _ in range(threads - 1):
@@ -98,6 +110,46 @@ class Launch:
         finally:
             wait(others)  # The caller may free its arrays only after all threads have finished.
         return spent + sum(other.result() for other in others)
+
+
+class _Call:
+    """A launch on the CPU whose arguments are packed once: packing takes as long as many kernels."""
+
+    def __init__(self, command: wp.Launch) -> None:
+        """Pack the arguments of a recorded launch, and keep it, and thus its arrays, alive."""
+        self._command, self._bounds = command, command.params[0]
+        self._places = [f"argument{number}" for number in range(len(command.params) - 1)]
+        kinds = [*zip(self._places, map(type, command.params[1:]), strict=True)]
+        self._packed: Any = type("Arguments", (ctypes.Structure,), {"_fields_": kinds})()
+        hooks: Any = command.hooks
+        self._forward = hooks.forward
+        for place, value in zip(self._places, command.params[1:], strict=True):
+            setattr(self._packed, place, value)
+
+    def change(self, changed: Mapping[int, Any]) -> None:
+        """Replace some inputs, as in `Launch.change`."""
+        for place, value in changed.items():
+            if isinstance(value, Tensor):
+                if not value.is_contiguous():
+                    raise ValueError("a kernel reads contiguous tensors only")
+                getattr(self._packed, self._places[place + 1]).data = value.data_ptr()
+            else:
+                plain = value.__ctype__() if isinstance(value, wp.array) else value
+                setattr(self._packed, self._places[place + 1], plain)
+
+    def part(self, begin: int, end: int) -> _Call:
+        """The call for a slice of the items."""
+        command = copy.copy(self._command)
+        command.params, command.fwd_args = list(command.params), list(command.fwd_args or ())
+        command.set_dim(end - begin)
+        part = _Call(command)
+        part._packed = type(self._packed).from_buffer_copy(self._packed)
+        setattr(part._packed, part._places[0], begin)
+        return part
+
+    def launch(self) -> None:
+        """Run the kernel on this thread; Python's lock is free meanwhile."""
+        self._forward(ctypes.byref(self._bounds), ctypes.byref(self._packed))
 
 
 def run(
@@ -135,18 +187,8 @@ def _tapered(size: int, slices: int) -> list[int]:
     return [size * i * (2 * slices + 1 - i) // weight for i in range(slices + 1)]
 
 
-def _part(whole: wp.Launch, begin: int, end: int) -> wp.Launch:
-    """A launch over a slice of the items: packing all parameters again would take longer than many slices."""
-    part = copy.copy(whole)
-    part.params = list(whole.params)
-    part.fwd_args = list(whole.fwd_args or ())  # Keeps the arrays alive.
-    part.set_dim(end - begin)
-    part.set_param_at_index(0, begin)
-    return part
-
-
-def _run(commands: Iterable[wp.Launch]) -> float:
-    """Launch the remaining commands; returns the time that they took [s]."""
+def _run(commands: Iterable[_Call]) -> float:
+    """Launch the remaining calls; returns the time that they took [s]."""
     began = time.perf_counter()
     for command in commands:
         command.launch()

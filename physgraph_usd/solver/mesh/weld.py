@@ -13,11 +13,11 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from .borders import open_edges
-from .subdivide import Refinement, face_points, subdivide_times
+from .subdivide import Refinement, creases_of, face_points, subdivide_times
 from .topology import PolygonMesh, area_vectors, find_edges, joined_by
 
 WELDED = 5e-3
@@ -94,6 +94,42 @@ class Weld:
             apart, welded = step.mesh, fine.mesh
             across = None if across is None else step.linear @ across
         return steps, Weld(apart, welded, number, faces, across)
+
+    def sharp_edges(self, rest: Float[np.ndarray, "welded 3"], closed: np.ndarray | None) -> Int[np.ndarray, "edges 2"]:
+        """Edges of ``apart`` that subdivision keeps sharp: those of closed pieces, and the rims' of a thick sheet.
+
+        Args:
+            rest: Rest positions of the welded mesh [m].
+            closed: Whether each welded vertex belongs to a closed piece; None without such pieces.
+        """
+        half, beside = self.apart.half_edges, self.apart.corner_face
+        if self.across is None:
+            creases = creases_of(self.mesh, rest, closed)
+            return half.edges[find_edges(creases, self.number[half.edges]) >= 0]
+        rim = _are_rims(_sorted_corners(self.apart, self.number[self.apart.indices]))
+        one, two = self.apart.twin_corners.T
+        return half.edges[half.edge[one[rim[beside[one]] != rim[beside[two]]]]]
+
+    @property
+    def torn(self) -> Bool[np.ndarray, " vertices"]:
+        """Vertices of ``apart`` with welded copies that subdivision would move elsewhere, for their open edges differ.
+
+        Three panels meet at such a vertex, or the border of one panel has a corner there and that of another has none.
+        """
+        count = len(self.number)
+        if self.is_none or self.across is not None:
+            return np.zeros(count, bool)
+        ends = open_edges(self.apart)
+        here, there = np.concatenate([ends, ends[:, ::-1]]).T
+        rules = np.zeros((4, count), np.int64)
+        rules[0] = np.bincount(here, minlength=count)
+        rules[1] = np.bincount(self.apart.indices, minlength=count) < 2
+        np.maximum.at(rules[2], here, self.number[there])
+        np.maximum.at(rules[3], here, count - self.number[there])
+        unlike = np.zeros(len(self._first), bool)
+        for rule in rules:
+            unlike[self.number[rule != rule[self._first][self.number]]] = True
+        return unlike[self.number]
 
     @property
     def without_rims(self) -> Weld:
