@@ -265,7 +265,7 @@ def json_of(report: Path) -> Path:
 
 
 def scene_words(options: RefineOptions) -> list[str]:
-    """The options that say what of the shot to refine, where they are not the default, as words of a command."""
+    """Command-line arguments for the Scene options that differ from their defaults."""
     words = []
     for field in dataclasses.fields(options):
         value, option = getattr(options, field.name), OPTIONS[field.name]

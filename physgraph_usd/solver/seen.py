@@ -73,5 +73,5 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
 
 
 def _angles(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Angle between each two vectors [rad]; 0 where one of them is zero."""
+    """Angles between corresponding rows of two arrays of vectors [rad], shape (N,); 0 for zero vectors."""
     return np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), (a * b).sum(axis=1))

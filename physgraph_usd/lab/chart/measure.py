@@ -28,8 +28,7 @@ FLAT = 1e-4
 """Fall of the energy over a budget, over the whole fall, under which a method has stopped getting anywhere."""
 MOST_BUDGETS = 24
 JUDGED, NEARLY, FURTHER = 0.03, 0.1, 3.0
-"""Gap by which methods are put in order, gap under which one is nearly there, and how many times the longest time it
-then may take."""
+"""Ranking gap; gap that counts as nearly converged; time limit of such methods as a multiple of the plan's."""
 DEFAULT = "refine's default"
 UPSAMPLED, SMOOTH = "plain upsampling", "Loop subdivision"
 """Curves of one point each."""
@@ -133,7 +132,7 @@ class CurveBench:
                 self._add(name, frame, spent, steps=0, repeat=0, made=0, **self.judged(frame, points))
 
     def _run(self, name: str, curve: Curve | None, steps: int, *, repeat: int) -> None:
-        """One method with one budget on all frames; refine's own settings when there is no curve."""
+        """Measure a method at one step budget on all frames; ``curve`` None measures refine's default settings."""
         settings = COLD
         about: dict[str, Any] = {"tolerance": COLD.tolerance}
         if curve is not None:

@@ -159,7 +159,7 @@ def _add_front(figure: go.Figure, chart: Chart) -> None:
 
 
 def _trace(chart: Chart, name: str, style: Style, points: Sequence[Point], *, field: str) -> go.Scatter:
-    """One line; what a click on the method's name hides has its name for a group."""
+    """Plot line of a method, in the legend group of the method's name."""
     ms = [max(p.ms, 1e-2) for p in points]
     most = [max(p.ms_most, own) - own for p, own in zip(points, ms, strict=True)]
     least = [own - min(max(p.ms_least, 1e-2), own) for p, own in zip(points, ms, strict=True)]

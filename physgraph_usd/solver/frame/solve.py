@@ -146,7 +146,7 @@ def solve_one_level(
 def _solve_without_contact(
     problem: LevelProblem, x: Tensor, smoothing: Tensor | None
 ) -> tuple[Placed, list[LevelReport], ForceModule, Any]:
-    """`solve_one_level` of cloth that nothing may touch."""
+    """Solve a level without contact detection; arguments and results of `solve_one_level`."""
     system, level, resume = problem.alone, problem.level, _resumed(problem, x)
     x = x if smoothing is None else leave_saddle(system, level, x + smoothing, outward=problem.outward)
     carry, report = descend(system, problem.integrator, x, level=level.index, budget=problem.budget, resume=resume)

@@ -197,7 +197,7 @@ def _products_of(system: System) -> SecantProducts:
 
 @lru_cache(maxsize=4)
 def _no_garments(count: int, device: torch.device) -> Tensor:
-    """The garment of each vertex where all are of one."""
+    """Garment numbers of a system without a level: zeros, int32, shape (V,)."""
     return torch.zeros(count, dtype=torch.int32, device=device)
 
 

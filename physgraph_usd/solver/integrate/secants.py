@@ -34,9 +34,9 @@ from ..mesh.threads import Launch, argument, run
 from .quasi_newton import SECANTS
 
 SLOTS = SECANTS + 1
-"""Slots of the ring: one more than the secants of a carry, so that a step from it overwrites none of them."""
+"""Slots of the ring buffer: the secants of a carry, and a free slot for the secant of the next step."""
 CHUNK = {"cpu": 1024, "cuda": 64}
-"""Vertices whose products are added up by one item of the kernel."""
+"""Vertices per item of the product kernel, by device type."""
 SUMS = 4 * SECANTS + 2
 """Scalar products of a pass."""
 WEIGHTS = 2 * SECANTS + 1
@@ -111,7 +111,7 @@ def add_up(
     partial: wp.array(dtype=wp.float64),
     sums: wp.array(dtype=wp.float64),
 ):
-    """One product of one garment: the sum of its chunks, in order."""
+    """Add up the chunks of a garment for one scalar product, in fixed order."""
     item = first + wp.tid()
     garment, product = item // _SUMS, item % _SUMS
     total = wp.float64(0.0)
@@ -128,7 +128,7 @@ def keep_products(
     before: wp.array(dtype=wp.float64),
     gram: wp.array(dtype=wp.float64),
 ):
-    """Take over the products of secants with one another, and add those with the newest secant, if it is new."""
+    """Copy the secants' mutual products from the last step, and fill in the row and column of a new secant."""
     size = 2 * _N * _N + _N
     sy, yz, good, s = garment * size, garment * size + _N * _N, (garment + 1) * size - _N, garment * _SUMS
     for i in range(is_new, _N):

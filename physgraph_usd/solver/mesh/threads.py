@@ -188,7 +188,7 @@ def _tapered(size: int, slices: int) -> list[int]:
 
 
 def _run(commands: Iterable[_Call]) -> float:
-    """Launch the remaining calls; returns the time that they took [s]."""
+    """Run launches one after another, and return the wall time [s]."""
     began = time.perf_counter()
     for command in commands:
         command.launch()

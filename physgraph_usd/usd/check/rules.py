@@ -79,7 +79,7 @@ class Fine:
 
     @cached_property
     def polygonal(self) -> bool:
-        """Whether the mesh is drawn by its polygons, with normals; else it is a subdivision surface."""
+        """Whether the mesh is a polygon mesh (`subdivisionScheme` none), not a subdivision surface."""
         return self.value("subdivisionScheme", None) == UsdGeom.Tokens.none
 
     def written(self, name: str) -> list[float]:
