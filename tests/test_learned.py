@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -68,6 +69,17 @@ def test_the_kernels_do_what_torch_does(vectors: tuple[str, ...]):
         move, expected = one.propose(system, carry), other.propose(system, same)
         assert float((move - expected).abs().max()) < 5e-5 * float(expected.abs().max())
         assert not bool(move[~system.free.squeeze(1)].any())
+
+
+def test_another_networks_steps_go_on_from_a_memory_in_the_systems_precision():
+    """A frame may be resumed by an integrator that was built since, whose network is in double precision."""
+    system, x = problem(torch.float32, level=2)
+    network = random_network(PhysgraphConfig(width=16), seed=7, scale=0.3)
+    assert isinstance(network, Physgraph)
+    carry = run(LearnedMetric(network), system, x)
+    other = LearnedMetric(copy.deepcopy(network).double())
+    expected, found = (each.step(system, each.resume(system, carry)).x for each in (LearnedMetric(network), other))
+    torch.testing.assert_close(found, expected)
 
 
 CONFIGURATIONS: dict[str, Callable[[dict[str, Any]], str]] = {

@@ -19,7 +19,7 @@ from ..contact.metric import HeldMetric
 from ..forces.base import ForceModule
 from ..forces.seam import SewnForces
 from ..forces.self_contact import SelfContact
-from ..integrate.base import Integrator, System, Turning
+from ..integrate.base import Integrator, System, Transporting
 from ..integrate.metric import Metric
 from ..integrate.stop import Budget
 from ..level import Level, Placed
@@ -42,7 +42,7 @@ class LevelProblem:
         budget: Stopping criteria.
         outward: As in `leave_saddle`.
         show: Called with the positions after each round [m]; or None.
-        curvature: The integrator's memory of the last frame, turned with the cloth; or None.
+        curvature: The last frame's integrator memory, transported to this frame; or None.
     """
 
     lasting: LevelForces
@@ -180,13 +180,13 @@ class Problem:
 
     @property
     def _curvature(self) -> Any:
-        """The integrator's memory of the last frame, turned with the cloth; None where it does not fit."""
+        """The last frame's integrator memory, transported to this frame; None for cold starts and changed garments."""
         known, rotation, integrator = self.known, self.start.rotation, self.group.integrator
         if known is None or rotation is None or self.start.rests or known.vertices != len(rotation):
             return None
         if not np.array_equal(known.turn, np.eye(3)):
             rotation = rotation @ torch.as_tensor(known.turn).to(rotation)
-        return integrator.turned(known.memory, rotation) if isinstance(integrator, Turning) else None
+        return integrator.transported(known.memory, rotation) if isinstance(integrator, Transporting) else None
 
     def placed(self, x: Placed) -> list[np.ndarray]:
         """World positions of each garment [m], given those of the finest level."""

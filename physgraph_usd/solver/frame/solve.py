@@ -23,7 +23,7 @@ from ..contact.frame import STALLED
 from ..contact.metric import HELD_TOLERANCE, HeldMetric
 from ..deadline import is_over
 from ..forces.base import ForceModule
-from ..integrate.base import Carry, Integrator, System, Turning
+from ..integrate.base import Carry, Integrator, System, Transporting
 from ..integrate.descend import LevelReport, descend, solve_level
 from ..integrate.guard import PATIENCE
 from ..integrate.saddle import leave_saddle
@@ -105,7 +105,7 @@ def solve_one_level(
         smoothing: The move to remove a coarser mesh's facets in a cold start [m]; None in a warm frame.
 
     Returns:
-        Final positions [m], a report per round, the terms at the end, and the integrator's memory to go on with.
+        Final positions [m], a report per round, the terms at the end, and curvature information for the next frame.
     """
     level, view, budget = problem.level, problem.view, problem.budget
     if view is None:
@@ -134,7 +134,7 @@ def solve_one_level(
             problem.show(x)
         missing = _missing(begun, x, wanted) if blocked else 0.0
         if budget.ends(report, made=made, touched=touched, missing=missing):
-            memory = _learned(integrator, carry)
+            memory = _curvature(integrator, carry)
             break
         if carry.setbacks >= PATIENCE:
             integrator, carry = problem.untangler, None
@@ -153,7 +153,7 @@ def _solve_without_contact(
     placed = unhindered(carry.x)
     if problem.show is not None:
         problem.show(placed)
-    return placed, [report], problem.module, _learned(problem.integrator, carry)
+    return placed, [report], problem.module, _curvature(problem.integrator, carry)
 
 
 def _missing(start: Tensor, x: Tensor, wanted: Tensor) -> float:
@@ -163,13 +163,14 @@ def _missing(start: Tensor, x: Tensor, wanted: Tensor) -> float:
 
 def _resumed(problem: LevelProblem, x: Tensor) -> Carry | None:
     """A carry at x [m] with the last frame's memory, to resume; None without."""
-    goes_on = problem.curvature is not None and isinstance(problem.integrator, Turning)
-    return Carry(x, math.inf, x, memory=problem.curvature) if goes_on else None
+    if problem.curvature is None or not isinstance(problem.integrator, Transporting):
+        return None
+    return Carry(x, math.inf, x, memory=problem.curvature)
 
 
-def _learned(integrator: Integrator, carry: Carry) -> Any:
-    """The memory for the next frame, or None."""
-    return integrator.learned(carry) if isinstance(integrator, Turning) else None
+def _curvature(integrator: Integrator, carry: Carry) -> Any:
+    """Curvature information for the next frame, or None."""
+    return integrator.curvature(carry) if isinstance(integrator, Transporting) else None
 
 
 def _with_cage_untangled(problem: Problem, *, since: float) -> tuple[Problem, list[LevelReport]]:

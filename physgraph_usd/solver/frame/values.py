@@ -62,12 +62,12 @@ class Cage:
 
 @dataclass(frozen=True, eq=False)
 class Curvature:
-    """Curvature of the potential learned in the last frame's descent, for the next frame's descent to go on with.
+    """Curvature information of a frame's descent, for the next frame.
 
     Attributes:
-        memory: The integrator's memory, of the garments that were solved together.
-        vertices: Number of their fine vertices.
-        turn: Rotation of the cloth since, as a whole, shape (3, 3).
+        memory: The integrator's memory, for all garments solved together.
+        vertices: Fine vertices of these garments.
+        turn: Rigid rotation of the cloth since the descent, shape (3, 3).
     """
 
     memory: Any

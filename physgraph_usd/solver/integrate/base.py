@@ -236,15 +236,15 @@ def resumed(integrator: Integrator, system: System, carry: Carry) -> Carry:
 
 
 @runtime_checkable
-class Turning(Protocol):
-    """An integrator able to go on, after the cloth was moved, with what it learned before."""
+class Transporting(Protocol):
+    """An integrator whose curvature information can be transported to the next frame's cloth."""
 
-    def learned(self, carry: Carry) -> Any:
-        """The memory of a carry, to keep; None if there is none to go on with."""
+    def curvature(self, carry: Carry) -> Any:
+        """The curvature information in a carry's memory; None without any."""
         ...
 
-    def turned(self, memory: Any, rotation: Float[Tensor, "vertices 3 3"]) -> Any:
-        """The memory after a rotation at each vertex; `Carry.memory` of a carry to resume."""
+    def transported(self, memory: Any, rotation: Float[Tensor, "vertices 3 3"]) -> Any:
+        """The memory with its fields rotated at each vertex: the ``Carry.memory`` of a carry to resume."""
         ...
 
 

@@ -87,12 +87,12 @@ def descend(
     _require_finite(carry, level)
     report.energy_before = carry.energy
     movers: Counter[str] = Counter()
-    stands = Stands(system.level, carry.x) if budget.warm and system.level is not None else None
+    motion = VisibleMotion(system.level, carry.x) if budget.warm and system.level is not None else None
     while not (stopped := _reason_to_stop(system, carry, report.steps, budget)):
         carry = integrator.step(system, carry)
         movers[carry.mover] += 1
         report.steps += 1
-        if stands is not None and stands.at(carry.x, report.steps) and not carry.setbacks:
+        if motion is not None and motion.has_ended(carry.x, report.steps) and not carry.setbacks:
             stopped = _reason_to_stop(system, carry, report.steps, budget) or "seen"
             break
     _require_finite(carry, level)
@@ -119,15 +119,15 @@ def _remaining_move(system: System, carry: Carry) -> float:
     )
 
 
-class Stands:
-    """Tells when nothing is seen to move: of a sample of faces, most keep their direction over some steps."""
+class VisibleMotion:
+    """Rotation of face normals during a descent, on a sample of the faces."""
 
     def __init__(self, level: Level, x: Float[Tensor, "vertices 3"]) -> None:
         """Take the start [m]."""
         self._level, self._normals = level, _directions(level, x)
 
-    def at(self, x: Float[Tensor, "vertices 3"], steps: int) -> bool:
-        """Whether cloth at x [m] stands, after so many steps; looked at every `SEEN_STEPS`."""
+    def has_ended(self, x: Float[Tensor, "vertices 3"], steps: int) -> bool:
+        """Whether most normals kept their direction over the last `SEEN_STEPS`; tested when these divide ``steps``."""
         if steps % SEEN_STEPS or not len(self._normals):
             return False
         before, self._normals = self._normals, _directions(self._level, x)

@@ -9,7 +9,7 @@ from typing import Any
 from jaxtyping import Float
 from torch import Tensor
 
-from .base import Carry, Integrator, System, Turning, followed, resumed
+from .base import Carry, Integrator, System, Transporting, followed, resumed
 from .quasi_newton import backtrack, truncated
 
 PATIENCE = 4
@@ -66,15 +66,15 @@ class Guard:
         handed = spare.start(system, corrected.x)
         return replace(handed, mover=corrected.mover, setbacks=corrected.setbacks)
 
-    def learned(self, carry: Carry) -> Any:
-        """The wrapped integrator's memory, unless the spare made the last steps."""
-        if self._spare_of(carry) is not None or not isinstance(self._inner, Turning):
+    def curvature(self, carry: Carry) -> Any:
+        """Curvature information of the wrapped integrator; None if the spare made the last steps."""
+        if self._spare_of(carry) is not None or not isinstance(self._inner, Transporting):
             return None
-        return self._inner.learned(carry)
+        return self._inner.curvature(carry)
 
-    def turned(self, memory: Any, rotation: Float[Tensor, "vertices 3 3"]) -> Any:
-        """The wrapped integrator's memory after a rotation at each vertex."""
-        return self._inner.turned(memory, rotation) if isinstance(self._inner, Turning) else None
+    def transported(self, memory: Any, rotation: Float[Tensor, "vertices 3 3"]) -> Any:
+        """The wrapped integrator's memory with its fields rotated at each vertex."""
+        return self._inner.transported(memory, rotation) if isinstance(self._inner, Transporting) else None
 
     def _corrected(self, system: System, carry: Carry, proposed: Carry) -> Carry:
         """The carry after shortening or replacing a step that raised the energy."""

@@ -28,7 +28,7 @@ from .base import Carry, System
 from .fused import Past, fused_physgraph
 from .network import Physgraph
 from .quasi_newton import Secant, StepHistory, secant_direction
-from .secants import SecantProducts, Secants, secant_products, turned_fields
+from .secants import SecantProducts, Secants, rotated_fields, secant_products
 from .vertex_frame import VertexFrame
 
 NetworkT = TypeVar("NetworkT", bound=nn.Module)
@@ -36,7 +36,7 @@ NetworkT = TypeVar("NetworkT", bound=nn.Module)
 MOST_GARMENTS = 8
 """Largest number of garments with scalar products summed per garment, in a fixed order."""
 LONG_AGO = 8
-"""Most steps that a memory carried from another frame counts as; networks are trained on descents of some 12 steps."""
+"""Limit of the step count in a memory from another frame: networks are trained on descents of some 12 steps."""
 LONGEST_STEP = 5.0
 """Longest move of a vertex in a step, in edge lengths."""
 
@@ -64,6 +64,7 @@ class LearnedMetric:
 
     def resume(self, system: System, carry: Carry) -> Carry:
         """Evaluate the carry's positions after a small change of the forces; the memory is kept."""
+        self._network = placed(self._network, system, carry.x.dtype)
         return self._evaluated(system, carry.x, carry.memory)
 
     def _evaluated(self, system: System, x: Tensor, memory: StepHistory | _FusedHistory) -> Carry:
@@ -115,16 +116,16 @@ class LearnedMetric:
         fused = isinstance(carry.memory, _FusedHistory)
         return self._by_kernel(system, carry)[0] if fused else self._combined(system, carry)
 
-    def learned(self, carry: Carry) -> Any:
+    def curvature(self, carry: Carry) -> Any:
         """The memory of a carry, if it has secants."""
         memory = carry.memory
         return memory if isinstance(memory, _FusedHistory) and memory.secants.known else None
 
-    def turned(self, memory: Any, rotation: Float[Tensor, "vertices 3 3"]) -> Any:
-        """The memory after a rotation at each vertex; scalar products stay."""
+    def transported(self, memory: Any, rotation: Float[Tensor, "vertices 3 3"]) -> Any:
+        """The memory with all fields rotated at each vertex; rotations keep the scalar products."""
         fields = memory.secants.fields
-        secants = replace(memory.secants, fields=turned_fields(fields.flatten(0, 1), rotation).reshape(fields.shape))
-        force, *images = turned_fields(torch.stack([memory.force, *memory.images]), rotation)
+        secants = replace(memory.secants, fields=rotated_fields(fields.flatten(0, 1), rotation).reshape(fields.shape))
+        force, *images = rotated_fields(torch.stack([memory.force, *memory.images]), rotation)
         return _FusedHistory(force, (images[0], images[1]), secants, min(memory.step, LONG_AGO))
 
     def _fuses(self, x: Tensor) -> bool:

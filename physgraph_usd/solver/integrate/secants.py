@@ -318,10 +318,10 @@ def _turn_kernel() -> wp.Kernel:
 _TURN_KERNEL = _turn_kernel()
 
 
-def turned_fields(
+def rotated_fields(
     fields: Float[Tensor, "fields vertices 3"], rotation: Float[Tensor, "vertices 3 3"]
 ) -> Float[Tensor, "fields vertices 3"]:
-    """Fields after a rotation at each vertex, single precision."""
+    """Fields rotated at each vertex, single precision, shape (N, V, 3)."""
     out, rotation = torch.empty_like(fields), rotation.contiguous()
     arrays = [argument(each.reshape(-1)) for each in (rotation, fields, out)]
     run(_TURN_KERNEL, len(rotation), [len(rotation), len(fields), *arrays], device=str(fields.device))
