@@ -122,7 +122,10 @@ def solve_one_level(
         system = problem.system(view, terms, x, last=last)
         resume = _resumed(problem, x) if last is None else carry if system.has_same_metric(last) else None
         shrunk = HELD_TOLERANCE if isinstance(system.metric, HeldMetric) else 1.0
-        of_round = budget.for_round(made=made, touching=bool(terms), blocked=blocked, shrunk=shrunk)
+        in_bodies = sum(view.look(x).in_bodies)
+        of_round = budget.for_round(
+            made=made, touching=bool(terms), crosses=in_bodies > 0, blocked=blocked, shrunk=shrunk
+        )
         carry, report = descend(system, integrator, x, level=level.index, budget=of_round, resume=resume)
         report.remaining_move = _smooth_move(system, carry, report)
         reports.append(report)
@@ -133,7 +136,8 @@ def solve_one_level(
         if problem.show is not None:
             problem.show(x)
         missing = _missing(begun, x, wanted) if blocked else 0.0
-        if budget.ends(report, made=made, touched=touched, missing=missing):
+        leaves = sum(view.look(x).in_bodies) < in_bodies
+        if budget.ends(report, made=made, touched=touched, leaves=leaves, missing=missing):
             memory = _curvature(integrator, carry)
             break
         if carry.setbacks >= PATIENCE:
