@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from functools import cache
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pytest
 from numpy.typing import ArrayLike
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdSkel, Vt
 
 from physgraph_usd.usd.read.reader import Shot
+from physgraph_usd.usd.stage import quiet
 from physgraph_usd.usd.write.plain import PlainStage
 
 GARMENT_API = "PhysGraphGarmentAPI"
@@ -211,6 +214,43 @@ def set_matrix(prim: Usd.Prim, matrix: np.ndarray, time: float | None = None) ->
     ops = xform.GetOrderedXformOps()
     op = ops[0] if ops else xform.AddTransformOp()
     op.Set(Gf.Matrix4d(np.asarray(matrix, float).T.tolist()), Usd.TimeCode.Default() if time is None else time)
+
+
+def set_spline(
+    attribute: Usd.Attribute,
+    knots: Mapping[float, float],
+    *,
+    post: str = "Held",
+    gaps: Collection[float] = (),
+    loops: int = 0,
+) -> None:
+    """Give a double attribute a spline of straight segments; skips the test with a USD older than splines.
+
+    Args:
+        attribute: An attribute of type double.
+        knots: Values by time code.
+        post: USD's name of the extrapolation after the last knot.
+        gaps: Time codes of the knots after which the attribute has no value.
+        loops: How often the knots repeat after the last one, by an inner loop.
+    """
+    if not hasattr(Usd.Attribute, "SetSpline"):
+        pytest.skip("splines came with a later USD")
+    ts: Any = import_module("pxr.Ts")
+    spline = ts.Spline("double")
+    for time, value in knots.items():
+        knot = ts.Knot("double")
+        knot.SetTime(time)
+        knot.SetValue(value)
+        knot.SetNextInterpolation(ts.InterpValueBlock if time in gaps else ts.InterpLinear)
+        spline.SetKnot(knot)
+    spline.SetPostExtrapolation(ts.Extrapolation(getattr(ts, f"Extrap{post}")))
+    with quiet():  # USD 26 calls inner loops deprecated.
+        if loops:
+            params = spline.GetInnerLoopParams()
+            params.protoStart, params.protoEnd, params.numPostLoops = min(knots), max(knots), loops
+            spline.SetInnerLoopParams(params)
+    splined: Any = attribute
+    splined.SetSpline(spline)
 
 
 def affine(linear: ArrayLike, offset: Sequence[float] = (0.0, 0.0, 0.0)) -> np.ndarray:

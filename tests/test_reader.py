@@ -7,8 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pxr import Gf, Sdf, UsdGeom
+from pxr import Gf, Sdf, Usd, UsdGeom
 from stages import (
+    COLLIDER_API,
     KINDS,
     add_sheet,
     affine,
@@ -18,6 +19,7 @@ from stages import (
     said,
     save,
     set_matrix,
+    set_spline,
     sheet_faces,
     sheet_points,
     sheet_shot,
@@ -277,26 +279,72 @@ def test_s31_times_are_the_union_of_authored_samples_and_nothing_else(tmp_path: 
     assert open_shot(path, frames=(2.0, 7.5)).scene.times == (2.0, 7.0)
 
 
-def test_a_transform_on_a_spline_has_its_knots_and_whole_time_codes(tmp_path: Path) -> None:
-    ts = pytest.importorskip("pxr.Ts", reason="splines came with a later USD")
-    stage = new_stage(tmp_path / "s.usda")
+def turning_sheet(path: Path, *, end: float | None = 9.0) -> tuple[Usd.Stage, Usd.Attribute]:
+    """A still sheet below a rotation about z without value, in a shot from 1 to an end."""
+    stage = new_stage(path)
     add_sheet(stage, times=())
-    xform = UsdGeom.Xformable(stage.GetPrimAtPath("/World"))
-    add_translate_x = getattr(xform, "AddTranslateXOp", None)
-    if add_translate_x is None:
-        pytest.skip("this USD has no scalar transform ops")
-    attribute = add_translate_x().GetAttr()
-    spline = ts.Spline("double")
-    for time, value in ((1.5, 0.0), (4.0, 2.0)):
-        knot = ts.Knot("double")
-        knot.SetTime(time)
-        knot.SetValue(value)
-        knot.SetNextInterpolation(ts.InterpLinear)
-        spline.SetKnot(knot)
-    attribute.SetSpline(spline)
+    if end is not None:
+        stage.SetStartTimeCode(1.0)
+        stage.SetEndTimeCode(end)
+    turn = UsdGeom.Xformable(stage.GetPrimAtPath("/World")).AddRotateZOp(UsdGeom.XformOp.PrecisionDouble)
+    return stage, turn.GetAttr()
+
+
+def turned(angle: float) -> np.ndarray:
+    """The points of the sheet, turned about z by an angle in degrees."""
+    x, y, z = sheet_points().T.astype(np.float64)
+    cos, sin = np.cos(np.radians(angle)), np.sin(np.radians(angle))
+    return np.stack([cos * x - sin * y, sin * x + cos * y, z], axis=1)
+
+
+@pytest.mark.parametrize(
+    ("knots", "options", "times"),
+    [
+        ({1.5: 0.0, 4.0: 50.0}, {}, (1.5, 2.0, 3.0, 4.0)),
+        ({1.0: 0.0, 5.0: 20.0}, {"post": "Linear"}, tuple(range(1, 10))),
+        ({1.0: 0.0, 5.0: 20.0}, {"post": "LoopOscillate"}, tuple(range(1, 10))),
+        ({1.0: 0.0, 5.0: 20.0}, {"post": "LoopRepeat"}, tuple(range(1, 10))),
+        ({1.0: 0.0, 2.0: 10.0, 3.0: 0.0}, {"loops": 2}, tuple(range(1, 8))),
+    ],
+)
+def test_a_transform_on_a_spline_is_solved_as_far_as_it_moves(tmp_path: Path, knots, options, times) -> None:
+    stage, attribute = turning_sheet(tmp_path / "s.usda")
+    set_spline(attribute, knots, **options)
+    angles = [attribute.Get(time) for time in times]
+    assert np.ptp(angles) > 5.0
     shot = open_shot(save(stage))
-    assert shot.scene.times == (1.5, 2.0, 3.0, 4.0)
-    np.testing.assert_allclose(world(shot, 4.0), sheet_points() + np.array([2.0, 0, 0]), atol=1e-9)
+    assert shot.scene.times == times
+    for time, angle in zip(times, angles, strict=True):
+        np.testing.assert_allclose(world(shot, time), turned(angle), atol=1e-6)
+
+
+def test_a_spline_that_holds_or_a_shot_without_an_end_has_no_time_codes_after_its_last_knot(tmp_path: Path) -> None:
+    for name, post, end in (("held", "Held", 9.0), ("endless", "Linear", None)):
+        stage, attribute = turning_sheet(tmp_path / f"{name}.usda", end=end)
+        set_spline(attribute, {1.0: 0.0, 5.0: 20.0}, post=post)
+        assert open_shot(save(stage)).scene.times == (1.0, 2.0, 3.0, 4.0, 5.0)
+
+
+def test_a_gap_in_a_spline_is_named_and_left_out(tmp_path: Path) -> None:
+    stage, attribute = turning_sheet(tmp_path / "s.usda")
+    set_spline(attribute, {1.0: 0.0, 4.0: 20.0, 7.0: 20.0, 9.0: 0.0}, gaps=(4.0,))
+    gap = tuple(time for time in map(float, range(1, 10)) if attribute.Get(time) is None)
+    assert {5.0, 6.0} <= {*gap}
+    shot = open_shot(save(stage))
+    assert shot.scene.times == tuple(time for time in map(float, range(1, 10)) if time not in gap)
+    assert shot.sources[0].absent == gap
+    assert "rotateZ of </World> has no value" in said(shot)
+
+
+def test_a_body_in_a_gap_of_a_spline_is_left_out_there(tmp_path: Path) -> None:
+    stage, _ = turning_sheet(tmp_path / "s.usda")
+    add_sheet(stage, "/World/body", times=(), tagged=False).GetPrim().AddAppliedSchema(COLLIDER_API)
+    lift = UsdGeom.Xformable(stage.GetPrimAtPath("/World/body")).AddRotateZOp(UsdGeom.XformOp.PrecisionDouble)
+    set_spline(lift.GetAttr(), {1.0: 0.0, 4.0: 20.0, 7.0: 20.0}, gaps=(4.0,), post="Linear")
+    shot = open_shot(save(stage))
+    assert shot.scene.times == tuple(map(float, range(1, 10)))
+    left_out = {time for time in shot.scene.times if shot.frame(time).colliders[0] is None}
+    assert {5.0, 6.0} <= left_out <= {4.0, 5.0, 6.0}
 
 
 def test_a_shot_without_samples_has_one_default_frame(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby, pairwise
 from operator import itemgetter
+from typing import Any
 
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom
@@ -20,6 +21,7 @@ from ..errors import AbsentError, named_time
 from ..solver.scene import FARTHEST, SAME_TIME
 from .instances import drawn_with
 from .lookup import with_ancestors
+from .stage import quiet
 
 _PLACED = ("protoIndices", "ids", "invisibleIds", "positions", "orientations", "orientationsf", "scales")
 _SHAPE = ("points", "radius", "radiusTop", "radiusBottom", "height", "size", *_PLACED)
@@ -29,6 +31,8 @@ _SLOWEST, _FASTEST, _FRAME_RATE = 12.0, 120.0, 24.0
 """Least and most frames a second, and how many where none of the stage's rates is between [1/s]."""
 _MOST = 10_000
 """Most whole frames between two keys: a key farther away is a stray one."""
+_HELD = "ExtrapHeld"
+"""Name of USD's extrapolation by which a spline keeps its first or last value."""
 _ALIKE = 1e-6
 """Largest difference of two equal values, relative to the largest number: the rounding of single precision."""
 
@@ -107,17 +111,42 @@ def motion_alone(prim: Usd.Prim, *, shape: bool = True) -> Motion:
 
 
 def motion_by(attribute: Usd.Attribute, *, turns: bool = False) -> Motion:
-    """Motion by an attribute: its time samples or spline knots; arcs between samples of a rotation."""
-    has_spline, get_spline = (getattr(attribute, name, None) for name in ("HasSpline", "GetSpline"))
-    if has_spline is not None and get_spline is not None and has_spline():
-        knots = sorted(float(time) for time in get_spline().GetKnots().keys())
-        return Motion(tuple(knots), tuple(pairwise(knots)))
+    """Motion by an attribute: its time samples or spline; arcs between samples of a rotation and along splines."""
+    spline = spline_of(attribute)
+    if spline is not None:
+        times = _spline_times(spline, attribute.GetStage())
+        return Motion(times, tuple(pairwise(times)))
     times = attribute.GetTimeSamples()
     double = {a for a, b in pairwise(times) if b - a <= SAME_TIME and _alike(attribute.Get(a), attribute.Get(b))}
     inside = FrameGrid.of(attribute.GetStage()).inside if turns and len(times) > 1 else None
     spans = [span for span in pairwise(times) if inside and inside(*span)]
     arcs = [(a, b) for a, b in spans if not _alike(attribute.Get(a), attribute.Get(b))]
     return Motion(tuple(time for time in times if time not in double), tuple(arcs))
+
+
+def spline_of(attribute: Usd.Attribute) -> Any | None:
+    """The spline that an attribute's value comes from; None without one, and with a USD older than splines."""
+    has_spline, get_spline = (getattr(attribute, name, None) for name in ("HasSpline", "GetSpline"))
+    return get_spline() if has_spline is not None and get_spline is not None and has_spline() else None
+
+
+def is_animated(attribute: Usd.Attribute) -> bool:
+    """Whether an attribute's value comes from time samples or a spline."""
+    return attribute.GetNumTimeSamples() > 0 or spline_of(attribute) is not None
+
+
+def _spline_times(spline: Any, stage: Usd.Stage) -> tuple[float, ...]:
+    """Time codes of a spline's knots and ends of loops; the stage's start and end too, unless it holds there."""
+    knots = sorted(float(time) for time in spline.GetKnots().keys())
+    with quiet():  # USD 26 calls inner loops deprecated.
+        looped = spline.GetInnerLoopParams().GetLoopedInterval() if spline.HasInnerLoops() else None
+    knots += [looped.min, looped.max] if looped is not None else []
+    if not knots or not stage.HasAuthoredTimeCodeRange():
+        return tuple(sorted({*knots}))
+    start, end = stage.GetStartTimeCode(), stage.GetEndTimeCode()
+    moves = [each.mode.name != _HELD for each in (spline.GetPreExtrapolation(), spline.GetPostExtrapolation())]
+    knots += [start] * (moves[0] and start < min(knots)) + [end] * (moves[1] and max(knots) < end)
+    return tuple(sorted({*knots}))
 
 
 def solve_times(cloth: Motion, bodies: Iterable[Motion], frames: FrameGrid) -> tuple[float, ...]:

@@ -10,7 +10,7 @@ from pxr import Usd, UsdGeom
 
 from ...errors import counted, named_time
 from ..stage import Notice, timecode
-from ..times import transform_chain
+from ..times import is_animated, transform_chain
 from .placement import flattened
 
 _SHAPE = ("points", "faceVertexCounts", "faceVertexIndices")
@@ -72,7 +72,7 @@ def missing_value(prim: Usd.Prim, time: float) -> str:
     for transform in transform_chain(prim):
         for op in transform.GetOrderedXformOps():
             attribute = op.GetAttr()
-            if attribute.GetNumTimeSamples() and attribute.Get(code) is None:
+            if is_animated(attribute) and attribute.Get(code) is None:
                 return f"{attribute.GetName()} of <{transform.GetPath()}> has no value"
     return ""
 

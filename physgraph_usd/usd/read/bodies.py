@@ -25,6 +25,7 @@ from ..lookup import Override, find_token, find_value, is_on
 from ..mesh.drawn import MOST_VERTICES, ControlMesh, DrawnSurface, drawn_surface
 from ..schema import COLLIDER, GARMENT
 from ..stage import Notice, timecode, value_at
+from ..times import is_animated
 from .absence import missing_value
 from .find import is_drawn
 from .placement import is_affine, is_flipped, place
@@ -430,7 +431,7 @@ def _measures(prim: Usd.Prim, time: float | None) -> tuple[str, np.ndarray, np.n
     def number(name: str, fallback: float) -> float:
         attribute = prim.GetAttribute(name)
         value = value_at(attribute, time) if attribute else None
-        if value is None and not (attribute and attribute.GetNumTimeSamples()):
+        if value is None and not (attribute and is_animated(attribute)):
             return fallback
         return float(value) if isinstance(value, int | float) else np.nan
 
