@@ -8,7 +8,7 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdSkel
+from pxr import Sdf, Usd, UsdGeom, UsdShade, UsdSkel
 from scipy import sparse
 
 from ...errors import LayerError, StageError
@@ -24,6 +24,7 @@ from .bodies import DRAWN_WITHIN, sharpness_of, surface_of
 from .find import has_schema, traverse, with_gravity
 from .placement import place
 from .reader import Shot
+from .skinning import Bake
 
 NEUTRAL = (0.55, 0.54, 0.52)
 """Linear colour of a mesh without colour."""
@@ -120,12 +121,11 @@ class DrawnStage:
         return within(merge(*found), (self._refined[0], self._refined[-1]) if self._refined else None)
 
     def bake(self, times: tuple[float, ...]) -> None:
-        """Skin the skinned meshes for the given times, in the anonymous root."""
-        span = Gf.Interval(min(times), max(times)) if times else Gf.Interval.GetFullInterval()
+        """Skin the skinned meshes at the given times, in an anonymous layer of the session."""
         with quiet():
-            for prim in Usd.PrimRange.Stage(self.stage):
-                if UsdSkel.Root(prim):
-                    UsdSkel.BakeSkinning(UsdSkel.Root(prim), span)
+            self._skinning = Bake(self.stage)
+            self._skinning.bind([Sdf.Path(path) for path in self.paths()])
+            self._skinning.bake(times)
 
     def paths(self) -> tuple[str, ...]:
         """Return the paths of all meshes, drawn or not."""

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom, UsdSkel
@@ -17,10 +16,11 @@ from ..lookup import with_ancestors
 from ..stage import TRAVERSAL, pxr_errors, quiet, timecode, value_at
 from ..times import motion_of
 from .bodies import ColliderReader, kind_of, parts_of
-from .find import BODIES, MARKS, has_schema, is_drawn, traverse
+from .find import BODIES, MARKS, has_schema, is_drawn
 from .garment import is_visible
 from .placement import place, to_metres
 from .reader import Shot
+from .skinning import find_skinned
 
 Box = np.ndarray
 """Least and greatest corner [m], world space, shape (2, 3)."""
@@ -204,49 +204,25 @@ def _same_place(a: Pose | None, b: Pose | None) -> bool:
 
 
 class _Skinning:
-    """Joint skinning of meshes at single time codes, without blend shapes: accurate enough to find cloth contact."""
+    """Meshes that are no colliders, as UsdSkel skins them at single time codes."""
 
     def __init__(self, shot: Shot, paths: Sequence[Sdf.Path]) -> None:
-        """Find the skeletons of meshes, on a stage like the shot's before garments were baked."""
-        self._metres, self._stage = shot.metres_per_unit, None
-        self._bound: Mapping[Sdf.Path, tuple[UsdSkel.SkeletonQuery, UsdSkel.SkinningQuery]] = {}
-        if paths:
-            self._stage = shot.view.open(mask=Usd.StagePopulationMask(paths))
-            self._stage.ExpandPopulationMask()
-            self._cache = UsdSkel.Cache()
-            self._bound = dict(self._bindings({*paths}))
-
-    def _bindings(
-        self, paths: set[Sdf.Path]
-    ) -> Iterator[tuple[Sdf.Path, tuple[UsdSkel.SkeletonQuery, UsdSkel.SkinningQuery]]]:
-        assert self._stage is not None
-        for root in filter(None, map(UsdSkel.Root, traverse(self._stage))):
-            self._cache.Populate(root, TRAVERSAL)
-            for binding in self._cache.ComputeSkelBindings(root, TRAVERSAL):
-                skeleton = self._cache.GetSkelQuery(binding.GetSkeleton())
-                for query in binding.GetSkinningTargets():
-                    path = query.GetPrim().GetPath()
-                    if path in paths and query.HasJointInfluences() and not query.IsRigidlyDeformed():
-                        yield path, (skeleton, query)
+        """Find the skeletons of the meshes."""
+        self._metres, self._stage = shot.metres_per_unit, shot.stage
+        self._skinned, _ = find_skinned(shot.stage, paths)
 
     def pose(self, reader: ColliderReader, time: float | None) -> Pose | None:
-        """A mesh at a time code, skinned if bent by joints."""
+        """A mesh at a time code, skinned if UsdSkel deforms it."""
         return reader.pose(time, self.points(reader.prim.GetPath(), time))[0]
 
     def points(self, path: Sdf.Path, time: float | None) -> np.ndarray | None:
-        """World positions of a skinned mesh [m], shape (V, 3), float64; None for a mesh not bent by joints."""
-        if path not in self._bound or self._stage is None:
-            return None
-        skeleton, query = self._bound[path]
-        code = timecode(time)
-        points = UsdGeom.Mesh(query.GetPrim()).GetPointsAttr().Get(code)
-        if points is None:
-            return None
-        joints: Any = skeleton.ComputeSkinningTransforms(code)
-        if joints is None or not query.ComputeSkinnedPoints(joints, points, code):
+        """World positions of a skinned mesh [m], shape (V, 3), float64; None for a mesh that is not skinned."""
+        skinned = self._skinned.get(path)
+        points = None if skinned is None else skinned.points(time)
+        if skinned is None or points is None:
             return None
         try:
-            matrix = to_metres(skeleton.GetPrim(), self._metres, time)
+            matrix = to_metres(self._stage.GetPrimAtPath(skinned.space), self._metres, time)
         except GarmentError:
             return None
         return place(np.asarray(points, dtype=np.float64), matrix)

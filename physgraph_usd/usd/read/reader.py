@@ -512,7 +512,7 @@ def _read(
     notices += request.bake.bind([*roots, *moved])
     own, solved = _times(stage, contacts, moved, bake=request.bake)
     # Bake the whole shot: the chosen level and the plan must not depend on the frame range.
-    request.bake.bake(every_time := merge(*solved.values()))
+    notices += request.bake.bake(every_time := merge(*solved.values()))
     readers, every = [], []
     for path, instances in roots.items():
         prim = stage.GetPrimAtPath(path)

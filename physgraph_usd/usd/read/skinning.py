@@ -1,25 +1,28 @@
-"""Bakes UsdSkel skinning and blend shapes into an anonymous layer of the session.
+"""Skins prims as UsdSkel plays them, by joints and blend shapes, into an anonymous layer of the session.
 
-Nothing is written to disk and the stage's own layers are not touched. After baking, a skinned mesh has ordinary point
-samples, in its own local space.
+Nothing is written to disk and the stage's own layers are not touched. Points are computed at exactly the time codes
+that are read, whatever moves them: the animation, the skeleton, the mesh or a transform above. After baking, a skinned
+mesh has ordinary point samples, in its own local space.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
 
-from ...errors import GarmentError
 from ..lookup import with_ancestors
-from ..stage import TRAVERSAL, Notice, timecode
+from ..stage import TRAVERSAL, Notice, in_brief, quiet, timecode, value_at
 from ..times import Motion, merge, motion_alone, motion_by, motion_of
 from .find import instance_roots
+from .placement import place
 
 _ANIMATED = ("rotations", "translations", "scales", "blendShapeWeights")
 """Attributes of an animation. Translations alone, and weights of shapes without in-betweens, move points straight."""
+_API, _SKELETON, _ANIMATION = "SkelBindingAPI", "skel:skeleton", "skel:animationSource"
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,14 +32,49 @@ class Skinned:
     Attributes:
         motion: Motion of the mesh by the skeleton's animation, and by the transforms of skeleton and mesh.
         query: UsdSkel's query of the binding.
+        joints: UsdSkel's query of the skeleton's pose.
+        skeleton: Path of the skeleton.
+        animation: Path of its animation, or None.
+        shapes: UsdSkel's query of the blend shapes, or None.
     """
 
     path: Sdf.Path
-    root: Sdf.Path
     motion: Motion
     query: UsdSkel.SkinningQuery
+    joints: UsdSkel.SkeletonQuery
     skeleton: Sdf.Path
     animation: Sdf.Path | None
+    shapes: UsdSkel.BlendShapeQuery | None
+
+    @property
+    def space(self) -> Sdf.Path:
+        """The prim in whose space `points` are: the skeleton, or the mesh itself without joint influences."""
+        return self.skeleton if self.query.HasJointInfluences() else self.path
+
+    def points(self, time: float | None) -> Vt.Vec3fArray | None:
+        """Deformed points in the space of `space`; None where the mesh has no points or UsdSkel rejects its influences.
+
+        Read them before they are baked.
+        """
+        code = timecode(time)
+        points = UsdGeom.PointBased(self.query.GetPrim()).GetPointsAttr().Get(code)
+        if not points:
+            return None
+        animation, mapper = self.joints.GetAnimQuery(), self.query.GetBlendShapeMapper()
+        if self.shapes is not None and animation and mapper is not None:
+            weights: Any = mapper.Remap(animation.ComputeBlendShapeWeights(code))
+            indices, offsets = self.shapes.ComputeBlendShapePointIndices(), self.shapes.ComputeSubShapePointOffsets()
+            deform: Any = self.shapes.ComputeDeformedPoints
+            deform(*self.shapes.ComputeSubShapeWeights(weights), indices, offsets, points)
+        if not self.query.HasJointInfluences():
+            return points
+        # Without a bind pose, UsdSkel's Python binding gives the joints' poses in place of skinning transforms.
+        transforms: Any = self.joints.ComputeSkinningTransforms(code) if self.joints.HasBindPose() else None
+        return points if transforms and self.query.ComputeSkinnedPoints(transforms, points, code) else None
+
+    def bind_transform(self, code: Usd.TimeCode) -> Gf.Matrix4d:
+        """Matrix (row vectors) from authored points to the space of `space`."""
+        return self.query.GetGeomBindTransform(code) if self.query.HasJointInfluences() else Gf.Matrix4d(1.0)
 
 
 class Bake:
@@ -57,32 +95,53 @@ class Bake:
         stage.GetSessionLayer().subLayerPaths.insert(0, self.layer.identifier)
 
     def bind(self, paths: Sequence[Sdf.Path]) -> list[Notice]:
-        """Find the skinned among mesh prims, to be baked; notices of prims with unused joint influences.
+        """Find the skinned among mesh prims, to be baked; notices of skinning that UsdSkel does not play as authored.
 
         Prims inside instances become editable in the anonymous layer.
         """
-        bound = [path for path in paths if skel_root(self._stage.GetPrimAtPath(path))]
-        for path in bound:
+        for path in [path for path in paths if skel_root(self._stage.GetPrimAtPath(path))]:
             while roots := instance_roots(self._stage.GetPrimAtPath(path)):
                 Sdf.CreatePrimInLayer(self.layer, roots[0]).instanceable = False
-        self.skinned.update({path: skinned for path in bound if (skinned := _find_skinning(self._stage, path))})
-        bare = [path for path in paths if path not in self.skinned]
-        return [notice for path in bare for notice in _unskinned(self._stage.GetPrimAtPath(path))]
+        self.skinned, notices = find_skinned(self._stage, paths)
+        rejected = {notice.path for notice in notices}
+        bare = [
+            self._stage.GetPrimAtPath(path) for path in paths if path not in self.skinned and str(path) not in rejected
+        ]
+        return [*notices, *(notice for prim in bare for notice in _unskinned(prim))]
 
     def motion(self, prim: Usd.Prim) -> Motion:
-        """Motion of a prim as by `motion_of`; a skinned prim's own points do not count."""
+        """Motion of a prim as by `motion_of`, with that of skinned prims by their skeletons."""
         return motion_of(prim, skinned={path: each.motion for path, each in self.skinned.items()})
 
-    def bake(self, times: Sequence[float]) -> None:
-        """Bake the skinned prims at the samples of their animation, and at the time codes given.
-
-        Raises:
-            GarmentError: When UsdSkel bakes nothing for a skinned mesh.
-        """
-        if self.skinned:
-            _bake(self._stage, self.layer, [*self.skinned.values()], times)
+    def bake(self, times: Sequence[float]) -> list[Notice]:
+        """Bake the skinned prims at the time codes given and those of their motion; notices of what UsdSkel rejects."""
+        notices = []
         for skinned in self.skinned.values():
-            _check(self._stage, self.layer, skinned)
+            with quiet() as diagnostics:
+                every = merge(times, skinned.motion.times) or (None,)
+                poses = {time: self._local(skinned, time) for time in every}
+                texts = [each.commentary for each in diagnostics.TakeUncoalescedDiagnostics()]
+            notices += _diagnosed(skinned, texts)
+            with Usd.EditContext(self._stage, self.layer):
+                attribute = UsdGeom.PointBased(self._stage.GetPrimAtPath(skinned.path)).GetPointsAttr()
+                for time, points in poses.items():
+                    attribute.Set(points, timecode(time))
+        return notices
+
+    def _local(self, skinned: Skinned, time: float | None) -> Vt.Vec3fArray | Sdf.ValueBlock:
+        """A mesh's deformed points in its own space; as authored where UsdSkel rejects the influences."""
+        code, prim = timecode(time), self._stage.GetPrimAtPath(skinned.path)
+        points = skinned.points(time)
+        if points is None:
+            return UsdGeom.PointBased(prim).GetPointsAttr().Get(code) or Sdf.ValueBlock()
+        if skinned.space == skinned.path:
+            return points
+        transforms = UsdGeom.XformCache(code)
+        deforming = transforms.GetLocalToWorldTransform(self._stage.GetPrimAtPath(skinned.space))
+        matrix = np.array(deforming * transforms.GetLocalToWorldTransform(prim).GetInverse()).T
+        with np.errstate(over="ignore"):  # The inverse of a singular matrix; the prim is absent at this time code.
+            local = place(np.asarray(points, dtype=np.float64), matrix).astype(np.float32)
+        return Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(local))
 
     def prims(self) -> list[Sdf.Path]:
         """Paths of the skeletons and animations of the baked meshes."""
@@ -90,11 +149,10 @@ class Bake:
         return [path for path in dict.fromkeys(found) if path is not None]
 
     def rest_transform(self, path: Sdf.Path, time: float | None) -> Gf.Matrix4d:
-        """Matrix (row vectors) from a skinned mesh's rest points to world: geomBindTransform, then the skeleton's."""
-        skinned = self.skinned[path]
-        code = timecode(time)
-        skeleton = self._stage.GetPrimAtPath(skinned.skeleton)
-        return skinned.query.GetGeomBindTransform(code) * UsdGeom.XformCache(code).GetLocalToWorldTransform(skeleton)
+        """Matrix (row vectors) from a skinned mesh's rest points to world: its bind transform, then the skeleton's."""
+        skinned, code = self.skinned[path], timecode(time)
+        placed = UsdGeom.XformCache(code).GetLocalToWorldTransform(self._stage.GetPrimAtPath(skinned.space))
+        return skinned.bind_transform(code) * placed
 
 
 def skel_root(prim: Usd.Prim) -> Usd.Prim | None:
@@ -102,27 +160,37 @@ def skel_root(prim: Usd.Prim) -> Usd.Prim | None:
     return next((each for each in with_ancestors(prim) if UsdSkel.Root(each)), None)
 
 
-def _find_skinning(stage: Usd.Stage, path: Sdf.Path) -> Skinned | None:
-    """The skinning of a mesh by UsdSkel, or None."""
-    prim = stage.GetPrimAtPath(path)
-    root = skel_root(prim)
-    if root is None:
-        return None
-    cache = UsdSkel.Cache()
-    cache.Populate(UsdSkel.Root(root), TRAVERSAL)
-    for binding in cache.ComputeSkelBindings(UsdSkel.Root(root), TRAVERSAL):
-        for query in binding.GetSkinningTargets():
-            if query.GetPrim() == prim and (query.HasJointInfluences() or query.HasBlendShapes()):
-                skeleton = cache.GetSkelQuery(binding.GetSkeleton())
-                query_of_animation, bones = skeleton.GetAnimQuery(), skeleton.GetPrim()
-                animation = query_of_animation.GetPrim() if query_of_animation else None
-                values = [animation.GetAttribute(name) for name in _ANIMATED] if animation else []
-                bent = {"rotations", "scales"} | ({"blendShapeWeights"} if _has_inbetweens(prim) else set())
-                by = [motion_by(each, turns=each.GetName() in bent) for each in values if each]
-                motion = Motion.joined([*by, motion_alone(bones), motion_alone(prim, shape=False)])
-                moved_by = animation.GetPath() if animation else None
-                return Skinned(path, root.GetPath(), motion, query, bones.GetPath(), moved_by)
-    return None
+def find_skinned(stage: Usd.Stage, paths: Iterable[Sdf.Path]) -> tuple[dict[Sdf.Path, Skinned], list[Notice]]:
+    """The meshes that UsdSkel deforms, by path, and notices of bindings that UsdSkel rejects or ignores."""
+    found, notices, wanted = dict[Sdf.Path, Skinned](), list[Notice](), dict.fromkeys(paths)
+    for root in dict.fromkeys(root for path in wanted if (root := skel_root(stage.GetPrimAtPath(path)))):
+        cache = UsdSkel.Cache()
+        with quiet() as diagnostics:
+            cache.Populate(UsdSkel.Root(root), TRAVERSAL)
+            bindings = cache.ComputeSkelBindings(UsdSkel.Root(root), TRAVERSAL)
+            texts = [each.commentary for each in diagnostics.TakeUncoalescedDiagnostics()]
+        targets = [(query, each.GetSkeleton()) for each in bindings for query in each.GetSkinningTargets()]
+        for query, skeleton in targets:
+            if query.GetPrim().GetPath() in wanted and (query.HasJointInfluences() or query.HasBlendShapes()):
+                skinned = _skinned(query, cache.GetSkelQuery(skeleton))
+                fault = _rejected(skinned)
+                found |= {} if fault else {skinned.path: skinned}
+                notices += [*fault, *_diagnosed(skinned, texts), *_ignored_animation(stage, skinned)]
+    return found, notices
+
+
+def _skinned(query: UsdSkel.SkinningQuery, joints: UsdSkel.SkeletonQuery) -> Skinned:
+    """A mesh and its motion, from UsdSkel's queries."""
+    prim, played = query.GetPrim(), joints.GetAnimQuery()
+    skeleton = _target(_binder(prim, _SKELETON), _SKELETON) or joints.GetPrim().GetPath()
+    bones = prim.GetStage().GetPrimAtPath(skeleton)
+    values = [played.GetPrim().GetAttribute(name) for name in _ANIMATED] if played else []
+    bent = {"rotations", "scales"} | ({"blendShapeWeights"} if _has_inbetweens(prim) else set())
+    by = [motion_by(each, turns=each.GetName() in bent) for each in values if each]
+    motion = Motion.joined([*by, motion_alone(bones), motion_alone(prim)])
+    shapes = UsdSkel.BlendShapeQuery(UsdSkel.BindingAPI(prim)) if query.HasBlendShapes() else None
+    animation = _target(_binder(bones, _ANIMATION), _ANIMATION) if played else None
+    return Skinned(prim.GetPath(), motion, query, joints, skeleton, animation, shapes)
 
 
 def _has_inbetweens(prim: Usd.Prim) -> bool:
@@ -132,88 +200,103 @@ def _has_inbetweens(prim: Usd.Prim) -> bool:
     return any(shape and shape.GetInbetweens() for shape in shapes)
 
 
-def _bake(stage: Usd.Stage, layer: Sdf.Layer, wanted: Sequence[Skinned], times: Sequence[float]) -> None:
-    """Bake each skel root once, with unwanted skinned prims deactivated meanwhile."""
-    keep = [skinned.path for skinned in wanted]
-    roots = list(dict.fromkeys(skinned.root for skinned in wanted))
-    mask = Sdf.Layer.CreateAnonymous("physgraph-mask.usda")
-    mask.timeCodesPerSecond = stage.GetTimeCodesPerSecond()
-    for path in _others(stage, roots, keep):
-        Sdf.CreatePrimInLayer(mask, path).active = False
-    session = stage.GetSessionLayer()
-    session.subLayerPaths.insert(0, mask.identifier)
-    try:
-        for skinned in wanted:
-            _sample_animation(stage, mask, skinned, times)
-        with Usd.EditContext(stage, layer):
-            for root in roots:
-                UsdSkel.BakeSkinning(UsdSkel.Root.Get(stage, root), Gf.Interval.GetFullInterval())
-    finally:
-        session.subLayerPaths.remove(mask.identifier)
+def _binder(prim: Usd.Prim, name: str, *, applied: bool = True) -> Usd.Prim | None:
+    """The nearest prim up to the skel root with a binding relationship; UsdSkel reads those with SkelBindingAPI.
 
-
-def _sample_animation(stage: Usd.Stage, layer: Sdf.Layer, skinned: Skinned, times: Sequence[float]) -> None:
-    """In a temporary layer, sample the animation at the time codes of transforms and of the shot too.
-
-    UsdSkel bakes at the animation's samples; in between, baked points would move along a chord.
+    Args:
+        prim: A mesh or a skeleton.
+        name: Name of the relationship.
+        applied: Whether prims without SkelBindingAPI are passed over, as UsdSkel does.
     """
-    animation = stage.GetPrimAtPath(skinned.animation) if skinned.animation else None
-    if animation is None or animation.IsInstanceProxy():
-        return
-    attributes = [animation.GetAttribute(name) for name in _ANIMATED]
-    attribute = next((each for each in attributes if each and each.GetNumTimeSamples()), None)
-    if attribute is None:
-        return
-    samples = attribute.GetTimeSamples()
-    every = {*samples, *merge(samples, skinned.motion.times, times)}
-    if len(every) == len(samples):
-        return
-    values = {time: attribute.Get(time) for time in every}
-    with Usd.EditContext(stage, layer):
-        for time, value in values.items():
-            attribute.Set(value, time)
+    for each in with_ancestors(prim):
+        if each.GetRelationship(name).HasAuthoredTargets() and (not applied or each.HasAPI(_API)):
+            return each
+        if UsdSkel.Root(each):
+            break
+    return None
 
 
-def _others(stage: Usd.Stage, roots: Iterable[Sdf.Path], keep: Sequence[Sdf.Path]) -> list[Sdf.Path]:
-    """Skinnable prims below the roots, except wanted prims and their ancestors."""
-    below = [prim for root in roots for prim in Usd.PrimRange(stage.GetPrimAtPath(root))]
-    skinnable = [prim.GetPath() for prim in below if UsdSkel.IsSkinnablePrim(prim)]
-    return [path for path in skinnable if not any(each.HasPrefix(path) for each in keep)]
+def _target(prim: Usd.Prim | None, name: str) -> Sdf.Path | None:
+    """The target of a prim's relationship; None without prim or target."""
+    return next(iter(prim.GetRelationship(name).GetForwardedTargets()), None) if prim else None
 
 
-def _check(stage: Usd.Stage, layer: Sdf.Layer, skinned: Skinned) -> None:
-    """Convert a rigid mesh's baked transform to points; GarmentError if baking produced neither."""
-    if layer.GetAttributeAtPath(skinned.path.AppendProperty("points")) is not None:
-        return
-    if layer.GetAttributeAtPath(skinned.path.AppendProperty(UsdGeom.Tokens.xformOpOrder)) is not None:
-        _rigid_points(stage, layer, skinned.path)
-        return
-    remedy = "check skel:skeleton, skel:animationSource and the joint influences"
-    raise GarmentError(str(skinned.path), "is skinned, but UsdSkel baked no points for it", remedy=remedy)
+def _rejected(skinned: Skinned) -> list[Notice]:
+    """A notice of joint influences or of a bind pose that UsdSkel rejects; empty if the mesh is skinned."""
+    prim, time = skinned.query.GetPrim(), next(iter(skinned.motion.times), None)
+    points = value_at(UsdGeom.PointBased(prim).GetPointsAttr(), time) if UsdGeom.PointBased(prim) else None
+    with quiet() as diagnostics:
+        if not points or skinned.points(time) is not None:
+            return []
+        texts = [in_brief(each.commentary).rstrip(".") for each in diagnostics.TakeUncoalescedDiagnostics()]
+    indices, size = skinned.query.GetJointIndicesPrimvar(), skinned.query.GetNumInfluencesPerComponent()
+    count, remainder = divmod(len(value_at(indices.GetAttr(), time) or ()), len(points))
+    why = f"UsdSkel rejects its joint influences: {texts[0]}" if texts else "UsdSkel rejects them"
+    remedy = (
+        "bind it again" if remainder or count in (0, size) else f"set elementSize of its joint influences to {count}"
+    )
+    if not skinned.joints.HasBindPose():
+        why, remedy = (
+            f"<{skinned.skeleton}> has no bind pose",
+            "author one bindTransform for each of its joints",
+        )
+    message = f"is not skinned and stays in its bind pose, because {why}; {remedy}"
+    return [Notice(str(skinned.path), None, message)]
 
 
-def _rigid_points(stage: Usd.Stage, layer: Sdf.Layer, path: Sdf.Path) -> None:
-    """Move a baked transform into the points, so the prim keeps the transform of its layers."""
-    mesh = UsdGeom.Mesh.Get(stage, path)
-    times = mesh.GetTimeSamples() or [None]
-    codes = [timecode(time) for time in times]
-    baked = [UsdGeom.XformCache(code).GetLocalToWorldTransform(mesh.GetPrim()) for code in codes]
-    spec = layer.GetPrimAtPath(path)
-    for each in [each for each in spec.properties if each.name.startswith("xformOp")]:
-        spec.RemoveProperty(each)
-    with Usd.EditContext(stage, layer):
-        for code, matrix in zip(codes, baked, strict=True):
-            unbaked = UsdGeom.XformCache(code).GetLocalToWorldTransform(mesh.GetPrim())
-            change = np.array(matrix * unbaked.GetInverse())
-            local = np.asarray(mesh.GetPointsAttr().Get(Usd.TimeCode.Default()), dtype=np.float64)
-            moved = local @ change[:3, :3] + change[3, :3]
-            mesh.GetPointsAttr().Set(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(moved, dtype=np.float32)), code)
+def _diagnosed(skinned: Skinned, texts: Iterable[str]) -> list[Notice]:
+    """The first of UsdSkel's diagnostics of a mesh, of its skeleton and of its animation, as notices.
+
+    A missing rest pose does not matter where the animation moves every joint.
+    """
+    played, partial = skinned.joints.GetAnimQuery(), skinned.joints.GetMapper().IsSparse()
+    prims = {str(skinned.query.GetPrim().GetPath()): (skinned.path, "bind it again")}
+    prims[str(skinned.joints.GetPrim().GetPath())] = skinned.skeleton, "correct it there"
+    if played and skinned.animation:
+        remedy = "author one translation, one rotation and one scale for each of its joints"
+        prims[str(played.GetPrim().GetPath())] = skinned.animation, remedy
+    found = dict[Sdf.Path, Notice]()
+    for text in texts:
+        where, _, reason = text.partition(" -- ")
+        path, remedy = prims.get(where.partition(".")[0], (None, ""))
+        if path is not None and not (played and not partial and "restTransforms" in reason):
+            message = f"UsdSkel rejects a part of it: {in_brief(reason).rstrip('.')}; {remedy}"
+            found.setdefault(path, Notice(str(path), None, message))
+    return [*found.values()]
+
+
+def _ignored_animation(stage: Usd.Stage, skinned: Skinned) -> list[Notice]:
+    """A notice of an animation that UsdSkel ignores, because the prim that names it has no SkelBindingAPI."""
+    binder = _binder(stage.GetPrimAtPath(skinned.skeleton), _ANIMATION, applied=False)
+    if binder is None or binder.HasAPI(_API):
+        return []
+    message = f"names the animation <{_target(binder, _ANIMATION)}> but has no {_API}: UsdSkel ignores the animation,"
+    message += f" and <{skinned.path}> stays in the skeleton's rest pose; apply {_API} to <{binder.GetPath()}>"
+    return [Notice(str(binder.GetPath()), None, message)]
 
 
 def _unskinned(prim: Usd.Prim) -> list[Notice]:
-    """A notice of joint influences not used by UsdSkel."""
+    """A notice of joint influences not used by UsdSkel, with the remedy."""
     binding = UsdSkel.BindingAPI(prim)
-    if not binding.GetJointIndicesAttr().HasAuthoredValue():
+    if not any(each.HasAuthoredValue() for each in (binding.GetJointIndicesAttr(), binding.GetJointWeightsAttr())):
         return []
-    reason = "it has no SkelRoot above it" if skel_root(prim) is None else "it is bound to no skeleton"
-    return [Notice(str(prim.GetPath()), None, f"has joint influences but is not skinned: {reason}")]
+    return [Notice(str(prim.GetPath()), None, f"has joint influences but is not skinned: {_why_unskinned(prim)}")]
+
+
+def _why_unskinned(prim: Usd.Prim) -> str:
+    """Why UsdSkel does not skin a mesh with joint influences, and the remedy."""
+    root, binder = skel_root(prim), _binder(prim, _SKELETON, applied=False)
+    if root is None:
+        return "it has no SkelRoot above it; make a prim above mesh and Skeleton a SkelRoot"
+    between = [each for each in with_ancestors(prim.GetParent()) if each.GetPath().HasPrefix(root.GetPath())]
+    if folder := next((each for each in reversed(between) if not UsdGeom.Imageable(each)), None):
+        kind = f"is a {folder.GetTypeName()}" if folder.GetTypeName() else "has no type"
+        return f"<{folder.GetPath()}> {kind}, and UsdSkel skins nothing below it; make it a Scope"
+    if binder is None:
+        return f"it is bound to no skeleton; author {_SKELETON} on it or above it"
+    if bare := next((each for each in (binder, prim) if not each.HasAPI(_API)), None):
+        return f"<{bare.GetPath()}> has no {_API}, without which UsdSkel ignores its binding; apply {_API} to it"
+    target = _target(binder, _SKELETON) or Sdf.Path.emptyPath
+    if not UsdSkel.Skeleton(prim.GetStage().GetPrimAtPath(target)):
+        return f"{_SKELETON} of <{binder.GetPath()}> names <{target}>, which is no Skeleton; name its Skeleton"
+    return "it has only one of jointIndices and jointWeights; author both"
