@@ -41,6 +41,8 @@ _ALIKE = 1e-6
 class FrameGrid:
     """Whole frames of a stage: whole time codes, unless these are too long or too short for frames, as seconds are.
 
+    Where framesPerSecond is authored and a frame is a whole number of time codes, its frames are the stage's.
+
     Attributes:
         length: Length of a frame in time codes.
         first: Time code of a whole frame.
@@ -52,8 +54,9 @@ class FrameGrid:
     @staticmethod
     def of(stage: Usd.Stage) -> FrameGrid:
         """The frames of a stage."""
-        rate, start = stage.GetTimeCodesPerSecond(), stage.GetStartTimeCode()
-        rates = (rate, stage.GetFramesPerSecond())
+        rate, start, played = stage.GetTimeCodesPerSecond(), stage.GetStartTimeCode(), stage.GetFramesPerSecond()
+        is_multiple = stage.HasAuthoredMetadata("framesPerSecond") and abs(rate / played % 1.0) <= _ALIKE
+        rates = (played, rate) if is_multiple else (rate, played)
         frames = next((each for each in rates if _SLOWEST <= each <= _FASTEST), _FRAME_RATE)
         return FrameGrid(rate / frames, float(round(start)) if abs(start) <= FARTHEST else 0.0)
 

@@ -159,20 +159,51 @@ class TestSamplesOfBodies:
             ball.GetRadiusAttr().Set(time / 2.0, time)
         assert open_shot(save(stage)).scene.times == (1.0, 2.0, 7.0)
 
+    FINE = (1.0, 1.25, 2.0, 2.25, 3.0)
+
     def test_that_are_not_solved_get_one_word(self, tmp_path: Path):
         stage = new_stage(tmp_path / "s.usda")
         flat(stage, times=(1.0, 2.0, 3.0))
-        add_ball(stage, "/World/ball", {time: (3.0, 3.0, -4.0 - time) for time in (1.0, 1.25, 2.0, 2.25, 3.0)})
+        add_ball(stage, "/World/ball", {time: (3.0, 3.0, -4.0 - time**2) for time in self.FINE})
         shot = open_shot(save(stage))
         assert shot.scene.times == (1.0, 2.0, 3.0)
         word = "</World/ball>: has 2 samples at time codes at which </World/cloth> is not solved, the first at 1.25"
         assert said(shot).count(word) == 1
+
+    @pytest.mark.parametrize("bend", [0.0, 0.01])
+    def test_that_are_not_solved_get_no_word_where_the_body_moves_straight(self, tmp_path: Path, bend: float):
+        stage = new_stage(tmp_path / "s.usda")
+        flat(stage, times=(1.0, 2.0, 3.0))
+        add_ball(stage, "/World/ball", {time: (3.0, 3.0, -4.0 - time) for time in self.FINE})
+        floor = add_sheet(stage, "/World/floor", times=(), tagged=False)
+        floor.GetPrim().AddAppliedSchema(COLLIDER_API)
+        for time in self.FINE:
+            low = sheet_points() - np.array([0.0, 0.0, 5.0 + time + bend * (time == 2.25)])
+            floor.GetPointsAttr().Set(vec3(low), time)
+        assert ("not solved" in said(open_shot(save(stage)))) == bool(bend)
 
 
 def refine_range(shot: Path, folder: Path, frames: tuple[float, float]) -> Path:
     out = folder / f"range{frames[0]:g}.usdc"
     refine(shot, out, frames=frames)
     return out
+
+
+@pytest.mark.parametrize(
+    ("rates", "length"),
+    [((96.0, 24.0), 4.0), ((120.0, 30.0), 4.0), ((48.0, 24.0), 2.0), ((96.0, None), 1.0), ((25.0, 24.0), 1.0)],
+)
+def test_whole_frames_are_those_of_frames_per_second(tmp_path: Path, rates, length: float) -> None:
+    stage = new_stage(tmp_path / "s.usda", rate=rates[0])
+    stage.GetRootLayer().ClearFramesPerSecond()
+    if rates[1] is not None:
+        stage.SetFramesPerSecond(rates[1])
+    stage.SetStartTimeCode(1.0)
+    add_sheet(stage, times=())
+    turn = UsdGeom.Xformable(stage.GetPrimAtPath("/World")).AddRotateZOp()
+    for time, angle in ((1.0, 0.0), (25.0, 90.0)):
+        turn.Set(angle, time)
+    assert open_shot(save(stage)).scene.times == tuple(np.arange(1.0, 25.5, length))
 
 
 class TestJumps:

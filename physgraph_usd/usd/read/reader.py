@@ -495,7 +495,7 @@ def _timing(
         [number for number, reader in enumerate(readers) if index in reader.garment.colliders]
         for index in range(len(bodies))
     ]
-    return timing_notices(garments, [(body.prim, by) for body, by in zip(bodies, felt_by, strict=True)], bake)
+    return timing_notices(garments, [*zip(bodies, felt_by, strict=True)], bake)
 
 
 def _read(

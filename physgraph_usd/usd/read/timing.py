@@ -2,36 +2,42 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Iterator, Sequence
 
+import numpy as np
 from pxr import Sdf, Usd, UsdGeom
 
 from ...errors import counted, named_time
 from ..instances import mover
 from ..stage import GarmentSource, Notice
 from ..times import SAME_TIME, is_among, transform_chain
+from .bodies import ColliderReader
 from .skinning import Bake
 
 
 def timing_notices(
-    garments: Sequence[tuple[Usd.Prim, GarmentSource]], bodies: Sequence[tuple[Usd.Prim, Sequence[int]]], bake: Bake
+    garments: Sequence[tuple[Usd.Prim, GarmentSource]],
+    bodies: Sequence[tuple[ColliderReader, Sequence[int]]],
+    bake: Bake,
 ) -> list[Notice]:
     """One notice for each prim with mismatched sample times.
 
     Args:
         garments: Mesh prims and their sources.
-        bodies: Prims of bodies, and for each the numbers of the garments in contact.
+        bodies: Readers of bodies, and for each the numbers of the garments in contact.
         bake: Baked skinning.
     """
     found: dict[Sdf.Path, list[str]] = {prim.GetPath(): _rates(prim, bake) for prim, _ in garments}
-    for prim, felt_by in bodies:
-        faults = [fault for number in felt_by for fault in _misses(prim, garments[number][1], bake)]
-        found[prim.GetPath()] = [*faults[:1], *_rates(prim, bake)]
+    for body, felt_by in bodies:
+        faults = [fault for number in felt_by for fault in _misses(body, garments[number][1], bake)]
+        found[body.prim.GetPath()] = [*faults[:1], *_rates(body.prim, bake)]
     return [Notice(str(path), None, "; ".join(faults)) for path, faults in found.items() if faults]
 
 
-def _misses(body: Usd.Prim, garment: GarmentSource, bake: Bake) -> Iterator[str]:
+def _misses(reader: ColliderReader, garment: GarmentSource, bake: Bake) -> Iterator[str]:
     """Faults of a body's sample times compared with a garment's, in words."""
+    body = reader.prim
     own = bake.motion(mover(body.GetStage(), body.GetPath(), garment.path)).times
     cloth, every = garment.times, tuple(sorted([*garment.times, *garment.left_out]))
     if not cloth and UsdGeom.Mesh(body) and UsdGeom.Mesh(body).GetPointsAttr().Get() is None and own:
@@ -49,9 +55,21 @@ def _misses(body: Usd.Prim, garment: GarmentSource, bake: Bake) -> Iterator[str]
         yield f"{spans}, and share no time{held}{remedy}"
     elif still:
         yield f"{spans}{held}{remedy}"
-    elif unsolved:
+    elif any(_is_off_line(reader, time, cloth) for time in unsolved):
         message = f"has {counted(len(unsolved), 'sample')} at time codes at which <{garment.path}> is not solved"
         yield f"{message}, the first at {named_time(unsolved[0])}; sample the garment there, too"
+
+
+def _is_off_line(body: ColliderReader, time: float, cloth: Sequence[float]) -> bool:
+    """Whether a body leaves the straight line between the two solved time codes around a time code, by `within`."""
+    number = bisect_left(cloth, time)
+    before, after = cloth[number - 1], cloth[number]
+    first, here, last = (body.authored_points(each) for each in (before, time, after))
+    if not len(here) == len(first) == len(last):
+        return True
+    share = (time - before) / (after - before)
+    away = np.linalg.norm(here - (1.0 - share) * first - share * last, axis=1)
+    return not bool((away <= body.within).all())
 
 
 def _rates(prim: Usd.Prim, bake: Bake) -> list[str]:
