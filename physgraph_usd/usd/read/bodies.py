@@ -218,16 +218,8 @@ class ColliderReader:
         pose, faces = self.pose(time)[0], self._faces
         if pose is None or faces is None or faces.drawn.stencil is None:
             return None
-        placed = self.authored_points(time)
+        placed = authored_points(self, time)
         return Polygons(placed, pose.points[: len(placed)], faces.authored_triangles)
-
-    def authored_points(self, time: float | None) -> np.ndarray:
-        """World positions of a mesh's authored points [m], shape (V, 3); of another body, those of its pose, if any."""
-        if self.collider.kind != "mesh" or self.instancer is not None:
-            pose = self.pose(time)[0]
-            return np.zeros((0, 3)) if pose is None else pose.points
-        points = np.asarray(_array(UsdGeom.Mesh(self.prim).GetPointsAttr(), time), dtype=np.float64)
-        return place(points.reshape(-1, 3), self._matrix(timecode(time)))
 
     def _faces_of(self, points: np.ndarray, authored: tuple[np.ndarray, ...]) -> _Faces:
         """The drawn faces; cached while the topology stays the same.
@@ -288,6 +280,15 @@ class ColliderReader:
 
     def _out(self, time: float | None, why: str) -> Notice:
         return Notice(self.collider.path, time, f"this collider is left out here: {why}")
+
+
+def authored_points(body: ColliderReader, time: float | None) -> np.ndarray:
+    """World positions of a mesh's authored points [m], shape (V, 3); of another body, those of its pose, if any."""
+    if body.collider.kind != "mesh" or body.instancer is not None:
+        pose = body.pose(time)[0]
+        return np.zeros((0, 3)) if pose is None else pose.points
+    points = np.asarray(_array(UsdGeom.Mesh(body.prim).GetPointsAttr(), time), dtype=np.float64)
+    return place(points.reshape(-1, 3), body._matrix(timecode(time)))
 
 
 def read_collider(

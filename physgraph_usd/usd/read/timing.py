@@ -12,7 +12,7 @@ from ...errors import counted, named_time
 from ..instances import mover
 from ..stage import GarmentSource, Notice
 from ..times import SAME_TIME, is_among, transform_chain
-from .bodies import ColliderReader
+from .bodies import ColliderReader, authored_points
 from .skinning import Bake
 
 
@@ -64,7 +64,7 @@ def _is_off_line(body: ColliderReader, time: float, cloth: Sequence[float]) -> b
     """Whether a body leaves the straight line between the two solved time codes around a time code, by `within`."""
     number = bisect_left(cloth, time)
     before, after = cloth[number - 1], cloth[number]
-    first, here, last = (body.authored_points(each) for each in (before, time, after))
+    first, here, last = (authored_points(body, each) for each in (before, time, after))
     if not len(here) == len(first) == len(last):
         return True
     share = (time - before) / (after - before)
