@@ -88,7 +88,16 @@ def broad_excepts(tree: ast.AST) -> Iterator[str]:
                 yield f"{node.lineno}: catches everything"
 
 
-RULES = {rule.__name__: rule for rule in (too_long, options_by_position, prints, broad_excepts)}
+def sums_out_of_order(tree: ast.AST) -> Iterator[str]:
+    """Sums at repeated indices whose rounding changes from run to run on a CPU; `add_at` keeps the order."""
+    allowed = {id(node) for each in functions(tree) if each.name == "add_at" for node in ast.walk(each)}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and id(node) not in allowed:
+            if any(keyword.arg == "accumulate" for keyword in node.keywords):
+                yield f"{node.lineno}: {node.func.attr}; use add_at"
+
+
+RULES = {rule.__name__: rule for rule in (too_long, options_by_position, prints, broad_excepts, sums_out_of_order)}
 
 
 @pytest.mark.parametrize("rule", RULES)

@@ -193,3 +193,15 @@ def test_distances_to_a_primitive_are_those_of_its_formula(kind: str):
     local = np.random.default_rng(4).uniform(-0.4, 0.4, (400, 3))
     local[::4, :2] *= 100.0 if pose.endless else 1.0
     np.testing.assert_allclose(signed(surface, local @ turn.T + centre), distance_to(kind, local), atol=1.5e-4)
+
+
+def test_normals_of_a_body_repeat_bit_for_bit_on_two_threads():
+    points, triangles = ball(level=6)
+    (surface,) = MeshBody(side="auto", device="cpu", threads=2).pose(Pose(points, triangles))
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        first, *others = (Faces(surface)._normals() for _ in range(6))
+    finally:
+        torch.set_num_threads(before)
+    assert all(torch.equal(first, each) for each in others)

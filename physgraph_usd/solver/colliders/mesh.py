@@ -19,6 +19,7 @@ from torch import Tensor
 
 from ..mesh.kernels import KERNELS
 from ..mesh.piercing import passes_through, wide
+from ..mesh.stencil import add_at
 from ..mesh.threads import argument, run
 from ..mesh.topology import paired
 from .base import Nearest, Solid
@@ -355,10 +356,9 @@ class Faces:
         points = wp.to_torch(self._surface.mesh.points)
         a, b, c = (points[self._surface.corners[:, corner]] for corner in range(3))
         area = torch.linalg.cross(b - a, c - a)
-        # Not `index_add_`: on CUDA its order, and so its rounding, changes from run to run.
         normal = torch.zeros_like(points)
         for corner in range(3):
-            normal.index_put_((self._surface.corners[:, corner],), area, accumulate=True)
+            add_at(normal, self._surface.corners[:, corner], area)
         return torch.nn.functional.normalize(normal, dim=1, eps=1e-30)
 
     def bare(self, whole: bool) -> tuple[wp.Mesh, Tensor] | None:

@@ -29,6 +29,7 @@ from torch import Tensor
 
 from ..collide.crossings import Crossings, Pierced
 from ..forces.self_contact import PairConstraints
+from ..mesh.stencil import add_at
 from ..mesh.topology import joined_by
 from .bodies import Chords
 from .cloth_mesh import RINGS, ClothMesh
@@ -177,7 +178,7 @@ def chords_of(
     key = number * len(inside) + pierced.body
     keys, row = torch.unique(key, return_inverse=True)
     mean = torch.zeros((len(keys), 4), dtype=weight.dtype, device=x.device)
-    mean = mean.index_put_((row,), weight, accumulate=True)
+    mean = add_at(mean, row, weight)
     mean = mean / mean.sum(dim=1, keepdim=True)
     first = torch.full_like(keys, len(key)).scatter_reduce(0, row, torch.arange(len(key), device=x.device), "amin")
     body, corners = pierced.body[first], corners[first]

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from ..level import Level
 from ..mesh.formula import QUAD, element_kernels
-from ..mesh.stencil import incidence
+from ..mesh.stencil import add_at, incidence
 from .base import Elements
 
 
@@ -166,9 +166,7 @@ class SelfContact:
         value = (
             (self.gaps.penetration(x) > 0).to(x).unsqueeze(1) * self.gaps.stiffness.unsqueeze(1) * self.gaps.weight**2
         )
-        # Not `index_add_`: on CUDA its order, and thus its rounding, changes from run to run.
-        out = torch.zeros_like(x[:, 0])
-        return out.index_put_((self.gaps.corners.long().reshape(-1),), value.reshape(-1) / 3.0, accumulate=True)
+        return add_at(torch.zeros_like(x[:, 0]), self.gaps.corners.long().reshape(-1), value.reshape(-1) / 3.0)
 
     def rest_springs(self) -> tuple[float, float]:
         """None: no contact at rest."""

@@ -61,7 +61,8 @@ def vectors(tensor: Tensor) -> Any:
 def add_at(total: Tensor, places: Int[Tensor, " items"], values: Tensor) -> Tensor:
     """Add values in place at first indices, possibly repeated, in the same order on every run; returns ``total``.
 
-    On CUDA the order of `index_add_`, and thus its rounding, changes from run to run.
+    The order, and thus the rounding, of `index_add_` changes from run to run on CUDA; that of `index_put_` does on
+    several threads of a CPU.
     """
     if total.is_cuda:
         return total.index_put_((places,), values, accumulate=True)
