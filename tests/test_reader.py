@@ -399,3 +399,13 @@ def test_both_sides_of_a_jump_stay(others: list[float]) -> None:
 
 def test_sub_frames_stay_apart() -> None:
     assert merge([1.0, 1.25], [1.002]) == (1.0, 1.002, 1.25)
+
+
+def test_samples_in_falling_order_are_those_in_rising_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As USD before 26 gives them below a layer offset of negative scale; of equal neighbours none is dropped."""
+    stage = new_stage(tmp_path / "s.usda")
+    points = add_sheet(stage, times=(1.0, 5.0, 9.0)).GetPointsAttr()
+    points.Set(points.Get(5.0), 9.0)
+    rising = Usd.Attribute.GetTimeSamples
+    monkeypatch.setattr(Usd.Attribute, "GetTimeSamples", lambda attribute: rising(attribute)[::-1])
+    assert open_shot(save(stage)).scene.times == (1.0, 5.0, 9.0)

@@ -171,7 +171,7 @@ class PointReader:
         """Read the number of points of a mesh prim at a time code."""
         self.path = str(prim.GetPath())
         self._attribute = UsdGeom.Mesh(prim).GetPointsAttr()
-        self._times = self._attribute.GetTimeSamples()
+        self._times = sorted(self._attribute.GetTimeSamples())
         self.count = len(self._raw(first))
 
     def read(self, time: float | None, edges: np.ndarray) -> tuple[np.ndarray, tuple[Notice, ...]]:
