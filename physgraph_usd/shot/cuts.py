@@ -1,4 +1,4 @@
-"""Finds frames to which cloth jumps from the previous sample: no velocity is computed across a jump."""
+"""Finds frames to which cloth jumps: from the previous sample, without velocity there, or round a loop."""
 
 from __future__ import annotations
 
@@ -11,12 +11,20 @@ import numpy as np
 
 from ..errors import GarmentError
 from ..solver.frame.settings import Reset
-from ..solver.scene import SAME_TIME
+from ..solver.scene import SAME_TIME, Frame, mean_edge
 from ..usd.read.reader import Shot
+from .frames import Outcome
 
 JUMP = Reset().move
 """Least deviation of a step from its neighbouring steps to count as a jump, RMS over a garment's points, in mean cage
 edges. The solver treats cloth as a new pose from the same distance."""
+OPEN, SEEN_AT = 0.1, 99.0
+"""Least distance between the ends of a loop, in edges of the refined cloth: a tenth of one is visible, as in `settled`.
+And the percentile of the points' distances that counts: a few points at a hem make no jump."""
+_CLOSED = 1e-5
+"""Largest distance between equal points, relative to their extent: single precision, far from the origin."""
+_LEAST = 4
+"""Least time codes of a loop: two steps that differ, and its end."""
 _STARTED_ANEW = "cold: "
 """Prefix, in a frame's telemetry, of the reason for not continuing from the previous frame."""
 
@@ -96,3 +104,60 @@ def _mean_edge(opened: Shot, index: int) -> float:
 
 def _rms(vectors: np.ndarray) -> float:
     return float(np.sqrt((vectors**2).sum(axis=1).mean()))
+
+
+class Loop:
+    """The ends of a run, of interest where the shot is a loop.
+
+    In a loop, the last cages and bodies are the first ones, and the first step of the cages goes on from the last one.
+    A motion that only returns, as of an arm that is lowered again, begins with the opposite of its last step.
+    """
+
+    def __init__(self, opened: Shot, levels: Sequence[int]) -> None:
+        """Start without a result; ``levels``: the number of subdivisions of each garment."""
+        self._shot, self._levels = opened, levels
+        self._times: list[float | None] = []
+        self._ends: list[Outcome] = []
+
+    def add(self, outcome: Outcome) -> None:
+        """Take the result of the next time code."""
+        self._times.append(outcome.time)
+        self._ends = [*self._ends[:1], outcome]
+
+    def gaps(self) -> dict[str, float]:
+        """Distance between first and last result [m] of each garment in a loop, by path, if visible."""
+        if len(self._times) < _LEAST or not all(outcome.points for outcome in self._ends):
+            return {}
+        frames = [self._shot.frame(outcome.time) for outcome in self._ends]
+        found = {}
+        for index, garment in enumerate(self._shot.scene.garments):
+            gap = _apart(*(outcome.points[index] for outcome in self._ends))
+            if gap > OPEN * mean_edge(garment) / 2 ** self._levels[index] and self._is_loop(index, frames):
+                found[garment.path] = gap
+        return found
+
+    def _is_loop(self, index: int, frames: Sequence[Frame]) -> bool:
+        """Whether a garment, by number, and its bodies are the same in the first and last frame and move on alike."""
+        numbers = self._shot.scene.garments[index].colliders
+        poses = [[frame.colliders[number] for number in numbers] for frame in frames]
+        ends = [[pose.points for pose in each if pose is not None] for each in poses]
+        ends = [[frame.garments[index].points, *each] for frame, each in zip(frames, ends, strict=True)]
+        if len(ends[0]) != len(ends[1]) or not all(map(_is_closed, *ends)):
+            return False
+        second, last_but_one = (self._shot.cage(index, self._times[number]) for number in (1, -2))
+        return float(np.vdot(second - ends[0][0], ends[1][0] - last_but_one)) > 0.0
+
+
+def _is_closed(first: np.ndarray, last: np.ndarray) -> bool:
+    """Whether two poses are the same, up to rounding."""
+    if first.shape != last.shape:
+        return False
+    within = _CLOSED * float(np.ptp(first, axis=0).max(initial=0.0))
+    return bool(np.allclose(first, last, rtol=0.0, atol=within, equal_nan=True))
+
+
+def _apart(first: np.ndarray | None, last: np.ndarray | None) -> float:
+    """Distance between two results [m], at `SEEN_AT`; 0 where a garment has none."""
+    if first is None or last is None:
+        return 0.0
+    return float(np.percentile(np.linalg.norm(last - first, axis=1), SEEN_AT))

@@ -24,7 +24,7 @@ from ..usd.times import none_within, within
 from ..usd.view import Layer
 from ..usd.write.writer import LayerWriter
 from .chunks import PREROLL, solve_in_chunks
-from .cuts import Cuts
+from .cuts import Cuts, Loop
 from .describe import say_what_was
 from .farm import connected
 from .finished import made_from
@@ -37,7 +37,7 @@ from .settled import unsettled_frames
 from .skin import DrawnCloth, Shown, frames_compared, of_polygons, shown_through
 from .solve import Outcomes, ShotSolver
 from .untagged import AUTO
-from .warnings import WARNINGS, of_drawn, of_frames
+from .warnings import WARNINGS, of_drawn, of_frames, of_loops
 
 try:
     import resource
@@ -164,6 +164,11 @@ class Run:
         """Jumps of the garments, across which no velocity is taken."""
         return Cuts(self.shot, velocities=self.options.velocities)
 
+    @cached_property
+    def _loop(self) -> Loop:
+        """First and last result, compared where the shot closes."""
+        return Loop(self.shot, self.solver.levels)
+
     @property
     def _preroll(self) -> int:
         """Frames solved before a chunk if frames depend on their predecessors."""
@@ -179,20 +184,12 @@ class Run:
             yield from self.solver(self._times)
             return
         self._warn_of_finished(frames, len(self._numbers))
-        with self._processes() as start:
+        with _processes(self.options) as start:
             how = {"workers": self.options.workers, "only": self._numbers, "preroll": self._preroll, "start": start}
             movers = None if self._is_chunk else self.solver.mover
             how |= {"movers": movers, "warn": self.report.warn}
             with closing(solve_in_chunks(self.solver, self._times, frames, **how)) as solved:
                 yield from solved
-
-    def _processes(self) -> AbstractContextManager[Start | None]:
-        """Starter of chunks: on a farm, in processes of this machine, or None to solve in this process."""
-        if self.options.scheduler:
-            return connected(self.options.scheduler)
-        if self.options.workers == 1:
-            return nullcontext()
-        return separate_processes(self.options.workers, cards=cards_for(self.options.device))
 
     def _warn_of_finished(self, frames: FrameFolder, count: int) -> None:
         """Warn if frames of an earlier run are used, or could have been."""
@@ -240,7 +237,7 @@ class Run:
             report.note(*of_a_kind(map(str, writer.notes)))
         report.seconds["close"] = clock.perf_counter() - start
         report.seconds["write"] = written
-        report.warn(*of_frames(report), *of_drawn(entered))
+        report.warn(*of_frames(report), *of_drawn(entered), *of_loops(self._loop.gaps()))
         report.note(*of_folds(report.garments, report.frames), *of_energy(report.garments, report.frames))
         report.note(*of_polygons(shown))
         (report.warn if options.strict else report.note)(*of_rest(report.unsettled, len(report.frames)))
@@ -249,6 +246,7 @@ class Run:
     def _write_frame(self, writer: LayerWriter | None, outcome: Outcome) -> float:
         """Write the result of one time code and record the result; returns the seconds spent writing."""
         self.report.frames.append(outcome.record)
+        self._loop.add(outcome)
         if not outcome.points:
             name, error = named_time(outcome.time), str(outcome.record["error"])
             self.report.failed[name] = error
@@ -260,6 +258,15 @@ class Run:
         how = {"changed": [not reused for reused in outcome.reused], "cuts": self._cuts(records[-2:])}
         writer.write(outcome.time, outcome.points, heat=outcome.heat, **how)
         return clock.perf_counter() - start
+
+
+def _processes(options: RefineOptions) -> AbstractContextManager[Start | None]:
+    """Starter of chunks: on a farm, in processes of this machine, or None to solve in this process."""
+    if options.scheduler:
+        return connected(options.scheduler)
+    if options.workers == 1:
+        return nullcontext()
+    return separate_processes(options.workers, cards=cards_for(options.device))
 
 
 def numbers_in(every: Sequence[float], frames: tuple[float, float] | None) -> range:

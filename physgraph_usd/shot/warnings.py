@@ -104,6 +104,14 @@ WARNINGS = {
         "--scheme none writes polygons, which stay outside",
         {"scheme": "none"},
     ),
+    "open_loop": Kind(
+        "cage and bodies close a loop, but the cloth does not",
+        "played as a loop, the cloth jumps there. `--temporal off` solves each frame by itself and closes the loop, "
+        "with less continuity between frames; a shot that plays once needs nothing",
+        "cage and bodies close a loop, but the cloth ends {gap:.1f} mm from where it begins",
+        "if it is played as a loop, --temporal off closes it",
+        {"temporal": "off"},
+    ),
     "broken_before": Kind(
         "leaves its place for this frame alone",
         "mend the cage or the body in that frame; the next frame starts from the one before it",
@@ -256,6 +264,11 @@ def of_drawn(found: Mapping[float | None, Mapping[str, float]]) -> list[str]:
         times = sorted(depths, key=lambda time: -depths[time])  # The worst first.
         warnings.append(WARNINGS["drawn"](path, times, depth=1e3 * depths[times[0]]))
     return warnings
+
+
+def of_loops(found: Mapping[str, float]) -> list[str]:
+    """A warning for each garment whose loop does not close, given the distance between its ends [m] by path."""
+    return [WARNINGS["open_loop"](path, gap=1e3 * gap) for path, gap in found.items()]
 
 
 def _measured(contact: Mapping[str, Any]) -> Iterator[tuple[str, int, int]]:

@@ -119,9 +119,8 @@ def motion_by(attribute: Usd.Attribute, *, turns: bool = False) -> Motion:
     if spline is not None:
         times = _spline_times(spline, attribute.GetStage())
         return Motion(times, tuple(pairwise(times)))
-    times = sorted(
-        attribute.GetTimeSamples()
-    )  # USD before 26 gives them falling below a layer offset of negative scale.
+    # Below a layer offset of negative scale, USD before 26 gives samples in falling order.
+    times = sorted(attribute.GetTimeSamples())
     double = {a for a, b in pairwise(times) if b - a <= SAME_TIME and _alike(attribute.Get(a), attribute.Get(b))}
     inside = FrameGrid.of(attribute.GetStage()).inside if turns and len(times) > 1 else None
     spans = [span for span in pairwise(times) if inside and inside(*span)]

@@ -298,3 +298,27 @@ def test_cloth_that_stands_still_is_solved_where_a_nested_instancer_moves(tmp_pa
     assert shot.scene.times == (1.0, 2.0, 3.0)
     poses = [pose for time in shot.scene.times for pose in shot.frame(time).colliders if pose is not None]
     assert [pose.points[:, 1].mean() for pose in poses] == pytest.approx([0.0, 0.01, 0.0], abs=1e-6)
+
+
+class TestLoops:
+    ROUND, BACK = (0, 1, 2, 3, 4, 5, 0), (0, 1, 2, 3, 2, 1, 0)
+
+    def shot(self, path: Path, phases: Sequence[int]) -> Path:
+        """A sheet over which a wave travels, by phases in sixths of its length."""
+        stage = new_stage(path, metres=EDGE)
+        attribute = add_sheet(stage, CLOTH, times=(), size=SIZE).GetPointsAttr()
+        for number, phase in enumerate(phases):
+            attribute.Set(vec3(sheet_points(2 * np.pi / 0.7 * phase / 6, SIZE)), float(number))
+        return Path(save(stage))
+
+    @pytest.mark.parametrize(("phases", "temporal"), [(ROUND, "tether"), (ROUND, "off"), (BACK, "tether")])
+    def test_that_do_not_close_get_a_word_with_a_remedy_that_closes_them(self, tmp_path: Path, phases, temporal: str):
+        shot, out = self.shot(tmp_path / "s.usda", phases), tmp_path / "fine.usdc"
+        report = refine(shot, out, overrides=("rest:weftEase=12",), temporal=temporal)
+        first, last = (fine(shot, out, time) for time in (0.0, 6.0))
+        is_open = phases is self.ROUND and temporal != "off"
+        assert any("--temporal off closes it" in warning for warning in report.warnings) == is_open
+        if temporal == "off":
+            np.testing.assert_array_equal(first, last)
+        else:
+            assert np.percentile(np.linalg.norm(last - first, axis=1), 99) > 0.05 * EDGE
