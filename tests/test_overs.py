@@ -24,7 +24,9 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdSkel
 from stages import add_skeleton, clip_shot, skinned_points
 
 from physgraph_usd.errors import LayerError
+from physgraph_usd.usd.check.validate import validate_layer
 from physgraph_usd.usd.read.reader import open_shot
+from physgraph_usd.usd.write.track import extent_of
 from physgraph_usd.usd.write.writer import LayerWriter
 
 
@@ -137,6 +139,41 @@ def test_a_skinned_garment_is_not_skinned_twice(tmp_path: Path, mode: str, inher
         np.testing.assert_allclose(found, fine_points(shot, refine_all(shot), time)[0], atol=1e-6)
         np.testing.assert_allclose(found[:20], 0.01 * skinned_points(grid()[0], [1] * 20, time), atol=1e-6)
     assert errors(out) == []
+
+
+@pytest.mark.parametrize("mode", ["over", "sibling"])
+@pytest.mark.parametrize("default", [None, 2.0])
+def test_the_default_of_a_skinned_garment_is_its_default_pose(tmp_path: Path, mode: str, default: float | None) -> None:
+    """The pose of the animation's default, and the skeleton's rest pose without one, as UsdSkel shows both."""
+    path, out = tmp_path / "shot.usda", tmp_path / "out.usdc"
+    make_skinned(path, inherited=False)
+    stage = Usd.Stage.Open(str(path))
+    rotations = UsdSkel.Animation(stage.GetPrimAtPath("/World/skel/anim")).GetRotationsAttr()
+    if default is not None:
+        rotations.Set(rotations.Get(default))
+        stage.Save()
+    writer = write_shot(open_shot(str(path), level=1), out, mode=mode)
+    over = open_over(path, out)
+    found = world_metres(over, str(writer.targets[0]), None)
+    expected = 0.01 * (grid()[0] if default is None else skinned_points(grid()[0], [1] * 20, default))
+    np.testing.assert_allclose(found[:20], expected, atol=1e-6)
+    mesh = UsdGeom.Mesh(over.GetPrimAtPath(str(writer.targets[0])))
+    np.testing.assert_allclose(mesh.GetExtentAttr().Get(), extent_of(np.array(mesh.GetPointsAttr().Get())))
+    assert errors(out) == []
+
+
+def test_a_bind_transform_stays_with_its_schema_and_no_validator_objects(tmp_path: Path) -> None:
+    path, out = tmp_path / "shot.usda", tmp_path / "out.usdc"
+    make_skinned(path, inherited=False)
+    stage = Usd.Stage.Open(str(path))
+    UsdSkel.BindingAPI(stage.GetPrimAtPath(COAT)).CreateGeomBindTransformAttr(Gf.Matrix4d().SetTranslate((1, 2, 3)))
+    stage.Save()
+    write_layer(path, out)
+    stage = open_over(path, out)
+    coat = stage.GetPrimAtPath(COAT)
+    assert "SkelBindingAPI" in coat.GetAppliedSchemas()
+    assert coat.GetAttribute("primvars:skel:geomBindTransform").HasAuthoredValue()
+    assert [problem for problem in validate_layer(out) if "Skel" in problem.rule] == []
 
 
 def test_animated_subsets_and_deformable_rest_shapes(dressed: Path, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +22,7 @@ from layers import (
     write_layer,
     write_shot,
 )
-from pxr import Gf, Sdf, Usd, UsdGeom
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdUtils
 
 from physgraph_usd.solver.mesh.subdivide import subdivide_times
 from physgraph_usd.solver.mesh.topology import PolygonMesh
@@ -199,6 +200,78 @@ def test_velocities_are_units_per_second(tmp_path: Path) -> None:
     for time in TIMES:
         np.testing.assert_allclose(mesh.GetVelocitiesAttr().Get(time), np.tile([0, 0, 5.0], (63, 1)), atol=1e-4)
     assert errors(out) == []
+
+
+def speeds(stage: Usd.Stage, times: Sequence[float]) -> list[float]:
+    """Speed of the coat along Z at each time code [units/s]."""
+    velocities = UsdGeom.Mesh(stage.GetPrimAtPath(COAT)).GetVelocitiesAttr()
+    return [float(np.asarray(velocities.Get(time))[0, 2]) for time in times]
+
+
+def drawn_at(stage: Usd.Stage, time: float) -> np.ndarray:
+    """Points of the coat half a time code later, by the velocities at a time code."""
+    return np.array(UsdGeom.Mesh(stage.GetPrimAtPath(COAT)).ComputePointsAtTime(time + 0.5, time))
+
+
+@pytest.mark.parametrize("part", ["frames", "times"])
+def test_cloth_that_is_held_outside_the_frames_has_no_velocity(tmp_path: Path, part: str) -> None:
+    path, out = tmp_path / "shot.usda", tmp_path / "out.usdc"
+    make_shot(path, times=range(1, 11))
+    shot = open_shot(str(path), level=1, frames=(4.0, 6.0) if part == "frames" else None)
+    times = (4.0, 5.0, 6.0)
+    refinements = refine_all(shot)
+    with LayerWriter(shot, refinements, out, velocities=True, times=times if part == "times" else None) as writer:
+        for time in times:
+            writer.write(time, fine_points(shot, refinements, time))
+    stage = open_over(path, out)
+    assert speeds(stage, range(1, 11)) == pytest.approx([0.0] * 3 + [7.5] * 3 + [0.0] * 4)
+    points = UsdGeom.Mesh(stage.GetPrimAtPath(COAT)).GetPointsAttr()
+    for time in (1.0, 2.5, 3.0, 7.0, 8.5, 10.0):
+        np.testing.assert_allclose(drawn_at(stage, time), points.Get(4.0 if time < 4.0 else 6.0), atol=1e-6)
+    np.testing.assert_allclose(drawn_at(stage, 5.0), np.add(points.Get(5.0), (0.0, 0.0, 0.125)), atol=1e-6)
+    assert errors(out) == []
+
+
+def test_cloth_that_is_held_after_its_last_sample_has_no_velocity(tmp_path: Path) -> None:
+    path, out = tmp_path / "shot.usda", tmp_path / "out.usdc"
+    stage = make_shot(path, times=(2.0, 3.0, 4.0))
+    stage.SetStartTimeCode(1.0)
+    stage.SetEndTimeCode(8.0)
+    stage.Save()
+    write_layer(path, out, velocities=True)
+    assert speeds(open_over(path, out), range(1, 9)) == pytest.approx([0.0] + [7.5] * 3 + [0.0] * 4)
+    assert errors(out) == []
+
+
+def test_velocities_where_motion_begins_and_ends_are_those_of_the_motion(tmp_path: Path) -> None:
+    path, out = tmp_path / "shot.usda", tmp_path / "out.usdc"
+    stage = make_shot(path, times=range(1, 9))
+    attribute = UsdGeom.Mesh(stage.GetPrimAtPath(COAT)).GetPointsAttr()
+    for held, moved in ((2.0, 1.0), (3.0, 1.0), (7.0, 6.0), (8.0, 6.0)):
+        attribute.Set(attribute.Get(moved), held)
+    stage.Save()
+    write_layer(path, out, velocities=True)
+    found = speeds(open_over(path, out), range(1, 9))
+    assert found == pytest.approx([0.0, 0.0, 22.5, 15.0, 7.5, 7.5, 0.0, 0.0])
+
+
+def test_layers_of_ranges_name_their_frames_and_join_as_value_clips(tmp_path: Path) -> None:
+    path, ranges = tmp_path / "shot.usda", ((1.0, 3.0), (4.0, 6.0))
+    make_shot(path, times=range(1, 7)).SetEndTimeCode(20.0)
+    layers = []
+    for first, last in ranges:
+        out = tmp_path / f"{first:g}.usdc"
+        write_shot(open_shot(str(path), level=1, frames=(first, last)), out, velocities=True)
+        layers.append(Sdf.Layer.FindOrOpen(str(out)))
+        assert (layers[-1].startTimeCode, layers[-1].endTimeCode) == (first, last)
+        assert errors(out) == []
+    joined = Sdf.Layer.CreateNew(str(tmp_path / "joined.usda"))
+    assert UsdUtils.StitchClips(joined, [layer.identifier for layer in layers], COAT)
+    joined.timeCodesPerSecond = layers[0].timeCodesPerSecond
+    stage = Usd.Stage.Open(joined)
+    for layer, time in ((layers[0], 3.0), (layers[1], 4.0), (layers[1], 6.0)):
+        found = UsdGeom.Mesh(stage.GetPrimAtPath(COAT)).GetPointsAttr().Get(time)
+        assert found == layer.QueryTimeSample(f"{COAT}.points", time)
 
 
 def test_extents_hold_points_and_model_hints_hold_extents(tmp_path: Path) -> None:

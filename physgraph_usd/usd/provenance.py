@@ -37,12 +37,18 @@ _TYPES: dict[str, Any] = {
     "shot": str,
     "left_out": Mapping,
 }
-METADATA = ("upAxis", "metersPerUnit", "kilogramsPerUnit", "defaultPrim", "startTimeCode", "endTimeCode")
-"""Stage metadata shared by a refined layer and its shot."""
+RANGE = ("startTimeCode", "endTimeCode")
+METADATA = ("upAxis", "metersPerUnit", "kilogramsPerUnit", "defaultPrim", *RANGE)
+"""Stage metadata shared by a refined layer and its shot; a layer of some of the shot's frames has its own range."""
 
 
-def copy_stage_metadata(stage: Usd.Stage, layer: Sdf.Layer, *, span: tuple[float, float] | None = None) -> None:
-    """Copy the metadata of a shot to a new layer; ``span`` is the time range if the shot authors none.
+def copy_stage_metadata(
+    stage: Usd.Stage, layer: Sdf.Layer, *, span: tuple[float, float] | None = None, whole: bool = True
+) -> None:
+    """Copy the metadata of a shot to a new layer.
+
+    ``span`` is the time range of the layer if the shot authors none, or if the layer does not hold the ``whole`` shot:
+    UsdUtils' StitchClips takes the ranges of its clips from there.
 
     Time codes per second are always authored: a layer without authored rate counts as 24 and USD would rescale its
     samples.
@@ -55,7 +61,7 @@ def copy_stage_metadata(stage: Usd.Stage, layer: Sdf.Layer, *, span: tuple[float
             layer.pseudoRoot.SetInfo(key, stage.GetMetadata(key))
         elif root.HasInfo(key):
             layer.pseudoRoot.SetInfo(key, root.GetInfo(key))
-    if span is not None and not stage.HasAuthoredTimeCodeRange():
+    if span is not None and not (whole and stage.HasAuthoredTimeCodeRange()):
         layer.startTimeCode, layer.endTimeCode = span
 
 

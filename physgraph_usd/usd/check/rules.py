@@ -10,11 +10,11 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from pxr import Sdf, Usd, UsdGeom, UsdSkel
+from pxr import Sdf, Usd, UsdGeom
 
 from ...solver.mesh.topology import PolygonMesh
 from ..lookup import family_of
-from ..provenance import METADATA, mute_refined, read_record
+from ..provenance import METADATA, RANGE, mute_refined, read_record
 from ..read.absence import absence
 from ..read.authored import beyond_limits
 from ..read.skinning import skel_root
@@ -23,7 +23,7 @@ from ..times import FrameGrid, is_among, motion_of
 from ..view import StageView
 from ..write.attribute_rules import BLOCKED, EMPTIED, action_on, render_values, with_action
 from ..write.normals import VertexNormals
-from ..write.primvars import INFLUENCES
+from ..write.primvars import INFLUENCES, inherits_influences
 from ..write.track import HEAT, PREFIX, extent_of
 
 TOGETHER = ("points", "faceVertexCounts", "faceVertexIndices", "extent", "subdivisionScheme")
@@ -349,9 +349,9 @@ def skinning(fine: Fine) -> Iterator[Problem]:
     """The mesh is not skinned a second time."""
     skeleton = fine.prim.GetRelationship("skel:skeleton")
     cut_off = skeleton and skeleton.HasAuthoredTargets() and not skeleton.GetTargets()
-    if UsdSkel.BindingAPI(fine.prim) and not cut_off:
-        yield fine.problem("", "SkelBindingAPI is still applied; the mesh would be skinned twice")
-    for name in INFLUENCES:
+    if inherits_influences(fine.prim) and not cut_off:
+        yield fine.problem("", "inherits joint influences; the mesh would be skinned twice")
+    for name in (*INFLUENCES, "skel:blendShapes"):
         if len(fine.entries(name, None)):
             yield fine.problem(name, "still holds influences; the mesh would be skinned twice")
 
@@ -432,11 +432,12 @@ LAYER_RULES: tuple[Callable[[Sdf.Layer], Iterator[Problem]], ...] = (record, tim
 
 
 def same_metadata(layer: Sdf.Layer, shot: Usd.Stage) -> Iterator[Problem]:
-    """Units, axes, rate and range are the shot's."""
+    """Units, axes and rate are the shot's, and so is the range unless samples are left out."""
     if layer.timeCodesPerSecond != shot.GetTimeCodesPerSecond():
         rate = f"{layer.timeCodesPerSecond:g}; the shot has {shot.GetTimeCodesPerSecond():g}"
         yield _error(f"timeCodesPerSecond is {rate}")
-    for key in METADATA:
+    part = (read_record(layer) or {}).get("left_out")
+    for key in (key for key in METADATA if not (part and key in RANGE)):
         expected = root_metadata(shot, key)
         found = layer.pseudoRoot.GetInfo(key) if layer.pseudoRoot.HasInfo(key) else None
         if expected is not None and found != expected:
@@ -465,10 +466,12 @@ def against_shot(layer: Sdf.Layer, coarse: Usd.Prim, target: Sdf.Path) -> Iterat
     if skel_root(coarse) is not None:  # The points of a skinned mesh are a bind pose.
         return
     authored, frames = motion_of(coarse).times, FrameGrid.of(coarse.GetStage())
+    first, *_, last = authored if len(authored) > 1 else (-np.inf, np.inf)  # Else the bodies' samples count.
     for time in written:
-        between = len(authored) > 1 and authored[0] < time < authored[-1] and frames.has(time)
-        if len(authored) > 1 and not (between or is_among(time, authored)):  # Else the bodies' samples count.
-            yield _error("is a sample neither at a time that the shot authors nor at a whole frame between", name, time)
+        near = np.isinf(last) or (first - frames.length <= time <= last + frames.length and frames.has(time))
+        if not (near or is_among(time, authored)):
+            message = "is a sample neither at a time that the shot authors nor at a whole frame between or beside"
+            yield _error(message, name, time)
             break
     spec, clouds = layer.GetAttributeAtPath(name), []
     for time in written[:1] + written[-1:] if written else [None]:

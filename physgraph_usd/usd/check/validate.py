@@ -178,9 +178,8 @@ def _on_coarse(key: tuple[str, ...], fine: Mapping[str, str]) -> tuple[str, ...]
 
 
 def _is_meant(problem: Problem, fine: Mapping[str, str]) -> bool:
-    """Whether a finding is intended: removed skinning, or a subset family whose faces were all left out."""
-    emptied = problem.rule.endswith(_COUNTS) and "No indices in family" in problem.message
-    return problem.path in fine and (emptied or problem.rule.endswith("MissingSkelBindingAPI"))
+    """Whether a finding is intended: a subset family whose faces were all left out."""
+    return problem.path in fine and problem.rule.endswith(_COUNTS) and "No indices in family" in problem.message
 
 
 def _findings(

@@ -17,6 +17,7 @@ from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
+from typing import Any
 
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom
@@ -63,7 +64,7 @@ from .placement import place, to_metres
 from .rest import AUTO
 from .seams import sewn_garments
 from .skinning import Bake
-from .targets import Bound, Target, find_bound, read_targets
+from .targets import Bound, Target, find_bound, points_attribute, read_targets
 from .timing import timing_notices
 
 
@@ -134,6 +135,11 @@ class Shot:
             GarmentError: The points are broken.
         """
         return place(self.local(index, time), self.to_metres(index, time))
+
+    def default_points(self, path: Sdf.Path) -> Any:
+        """Points or positions of a garment or target at the default time in local space, skinned; None without any."""
+        baked = self._request.bake.defaults
+        return baked[path] if path in baked else points_attribute(self.stage.GetPrimAtPath(path)).Get()
 
     @cached_property
     def targets(self) -> list[Target]:

@@ -82,6 +82,8 @@ class Bake:
 
     Attributes:
         skinned: The baked meshes, by prim path.
+        defaults: Deformed points of these meshes at the default time in their own space, by prim path; None where the
+            mesh has no points then.
         layer: The anonymous layer; keep the layer alive as long as the stage.
     """
 
@@ -89,6 +91,7 @@ class Bake:
         """Put an empty anonymous layer on the stage's session layer."""
         self._stage = stage
         self.skinned: dict[Sdf.Path, Skinned] = {}
+        self.defaults: dict[Sdf.Path, Vt.Vec3fArray | None] = {}
         self.layer = Sdf.Layer.CreateAnonymous("physgraph-skinning.usda")
         # A layer without authored rate has 24 time codes per second, and USD would rescale the baked samples.
         self.layer.timeCodesPerSecond = stage.GetTimeCodesPerSecond()
@@ -120,7 +123,9 @@ class Bake:
             with quiet() as diagnostics:
                 every = merge(times, skinned.motion.times) or (None,)
                 poses = {time: self._local(skinned, time) for time in every}
+                default = self._local(skinned, None)
                 texts = [each.commentary for each in diagnostics.TakeUncoalescedDiagnostics()]
+            self.defaults[skinned.path] = None if isinstance(default, Sdf.ValueBlock) else default
             notices += _diagnosed(skinned, texts)
             with Usd.EditContext(self._stage, self.layer):
                 attribute = UsdGeom.PointBased(self._stage.GetPrimAtPath(skinned.path)).GetPointsAttr()

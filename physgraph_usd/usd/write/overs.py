@@ -14,7 +14,7 @@ from ..read.bodies import sharpness_of
 from ..schema import GARMENT, GARMENT_API, fabric_values
 from ..stage import GarmentSource, Notice, value_at
 from .attribute_rules import BLOCKED, CARRIED, EMPTIED, PREFIX, action_on, limit_renderers, with_action
-from .primvars import INFINITE, FineMap
+from .primvars import INFINITE, FineMap, inherits_influences
 from .stream import LayerStream
 
 _TYPES = Sdf.ValueTypeNames
@@ -161,18 +161,19 @@ def author_rest_points(stream: LayerStream, target: Sdf.Path, prim: Usd.Prim, fi
 
 
 def author_unskinned(stream: LayerStream, target: Sdf.Path, prim: Usd.Prim, *, skinned: bool) -> None:
-    """Remove a mesh from skinning; ``skinned``: whether its points are already skinned."""
+    """Remove a mesh from skinning; ``skinned``: whether its points are already skinned.
+
+    The mesh keeps SkelBindingAPI for its bind transform; without the schema, USD's validators report that transform.
+    """
     for name in ("skel:joints", "skel:blendShapes"):
         if prim.GetAttribute(name).HasAuthoredValue():
             stream.block(target.AppendProperty(name), _TYPES.TokenArray)
-    if skinned and not prim.GetAttribute("primvars:skel:jointIndices").HasAuthoredValue():
+    if skinned and inherits_influences(prim):
         # An ancestor's influences reach the mesh with or without the schema; an empty skeleton target stops skinning.
         edit_schemas(stream, target, added=["SkelBindingAPI"])
         spec = stream.prim(target)
         skeleton = spec.relationships.get("skel:skeleton") or Sdf.RelationshipSpec(spec, "skel:skeleton", False)
         skeleton.targetPathList.ClearEditsAndMakeExplicit()
-    elif UsdSkel.BindingAPI(prim):
-        edit_schemas(stream, target, deleted=["SkelBindingAPI"])
 
 
 def edit_schemas(

@@ -73,6 +73,12 @@ def hide_influences(stream: LayerStream, target: Sdf.Path, prim: Usd.Prim) -> No
             _hide(stream, target, primvar)
 
 
+def inherits_influences(prim: Usd.Prim) -> bool:
+    """Whether joint influences of an ancestor reach a prim that has none of its own."""
+    above = UsdGeom.PrimvarsAPI(prim.GetParent()).FindInheritablePrimvars()
+    return any(primvar.GetAttr().GetName() in INFLUENCES for primvar in above)
+
+
 def _numbers_points(primvar: UsdGeom.Primvar) -> bool:
     """Whether a primvar holds a unique whole number per point, such as ids."""
     if primvar.GetInterpolation() not in (UsdGeom.Tokens.vertex, UsdGeom.Tokens.varying):

@@ -40,16 +40,18 @@ class TargetTracks:
         *,
         steps: Sequence[Refinement],
         absent: Sequence[float],
+        outside: Sequence[float],
         velocities: bool,
     ) -> None:
         """Bind the targets of a garment, by number and refinements, coarse to fine, and author constant properties.
 
         Args:
             absent: Time codes at which the garment is absent.
+            outside: The shot's time codes without a sample of the garment in the layer, ascending.
             velocities: Whether velocities are authored for all.
         """
         self._bindings = GarmentBindings(shot, index, steps)
-        given = {"still": shot.sources[index].still, "absent": absent, "velocities": velocities}
+        given = {"still": shot.sources[index].still, "absent": absent, "outside": outside, "velocities": velocities}
         self._tracks = [_TargetTrack(stream, shot, target, **given) for target in self._bindings.targets]
         self.notices = [notice for track in self._tracks for notice in track.notices]
 
@@ -80,6 +82,7 @@ class _TargetTrack:
         *,
         still: bool,
         absent: Sequence[float],
+        outside: Sequence[float],
         velocities: bool,
     ) -> None:
         """Author constant properties, and start the track."""
@@ -93,12 +96,12 @@ class _TargetTrack:
         for name in ("accelerations", "angularVelocities"):
             if prim.GetAttribute(name).HasAuthoredValue():
                 stream.block(path.AppendProperty(name), Sdf.ValueTypeNames.Vector3fArray)
-        moves = {"rate": rate, "absent": absent, "still": still, "margin": _half_width(prim)}
+        moves = {"rate": rate, "absent": absent, "outside": outside, "still": still, "margin": _half_width(prim)}
         turned = _Orientations if UsdGeom.PointInstancer(prim) else _TurnedNormals
         self._turned = turned.of(stream, shot, target)
         given, points = None if self._turned is None else self._turned.path, points_attribute(prim)
-        default = points.Get(Usd.TimeCode.Default())
-        fits = default is not None and len(default) == len(target.points) and not still
+        default = None if still else shot.default_points(path)
+        fits = default is not None and len(default) == len(target.points)
         rest = np.asarray(default, np.float32) if fits else None
         self._track = PointTrack(stream, path, None, rest=rest, turned=given, points=points.GetName(), **moves)
         self._hints = ModelHints(stream, shot.stage, path, purpose=UsdGeom.Imageable(prim).ComputePurpose())

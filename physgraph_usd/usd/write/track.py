@@ -67,7 +67,7 @@ class PointTrack:
     every sample is written, because each velocity belongs to a sample's time.
 
     Velocities are differences of samples connected by continuous motion. A sample without connected neighbours gets the
-    shot's own velocity, or a block.
+    shot's own velocity, or a block. Samples beside the layer's, where points are held, have velocity zero.
 
     Attributes:
         box: Extent of the last sample.
@@ -88,6 +88,7 @@ class PointTrack:
         points: str = "points",
         own: Callable[[float | None], np.ndarray | None] = lambda _: None,
         absent: Sequence[float] = (),
+        outside: Sequence[float] = (),
     ) -> None:
         """Author the attributes, without values.
 
@@ -101,6 +102,7 @@ class PointTrack:
             margin: Distance by which the extent exceeds the points, such as half the width of curves.
             own: The shot's velocities at a time code [units/s], shape (V, 3), float32; None without velocities.
             absent: Time codes to block, ascending: the garment is absent.
+            outside: The shot's time codes without a sample in the layer, ascending.
         """
         self._stream, self._normals, self._margin = stream, normals, np.float32(margin)
         self._paths = {name: target.AppendProperty(points if name == "points" else name) for name in TYPES}
@@ -112,7 +114,7 @@ class PointTrack:
         if turned is not None:
             self._paths["normals"] = turned
         self._rest, self._still, self._rate, self._own = rest, still, rate, own
-        self._absent = list(absent)
+        self._absent, self._outside = list(absent), outside
         self.unknown: list[float] = []
         self._has_default = False
         self._last: _Sample | None = None
@@ -207,6 +209,8 @@ class PointTrack:
             self._end_run()
         self._end_stretch()
         self._block_until(np.inf)
+        if self._rate is not None:
+            _hold(self._stream, self._paths, self._outside)
 
     def _end_stretch(self) -> None:
         """Author the velocity of the last sample before a cut, a block or the end."""
@@ -243,10 +247,9 @@ class PointTrack:
         return extent_of(points) + np.array([[-self._margin], [self._margin]], np.float32)
 
     def _author_velocity(self, at: _Sample, before: _Sample, after: _Sample) -> None:
-        """Author the velocity of a sample by finite differences [units/s], or the shot's own for an isolated sample."""
-        seconds = (after.time - before.time) / (self._rate or 24.0)
-        moves = after.time - before.time > SAME_TIME
-        velocity = (after.points.astype(np.float64) - before.points) / seconds if moves else self._own(at.time)
+        """Author the velocity of a sample: by finite differences, the shot's own for an isolated sample, or a block."""
+        velocity = _difference(at, before, after, rate=self._rate or 24.0)
+        velocity = self._own(at.time) if velocity is None else velocity
         if velocity is not None:
             self._set_velocity(at.time, velocity)
         else:
@@ -256,6 +259,40 @@ class PointTrack:
     def _set_velocity(self, time: float | None, velocity: np.ndarray) -> None:
         self._stream.attribute(self._paths["velocities"], TYPES["velocities"])
         _set_sample(self._stream, self._paths["velocities"], np.ascontiguousarray(velocity, np.float32), time)
+
+
+def _difference(at: _Sample, before: _Sample, after: _Sample, *, rate: float) -> np.ndarray | None:
+    """Velocity of a sample between two others, by finite differences [units/s]; None if all three are the same sample.
+
+    The velocity of cloth that begins or ends to move at the sample is that of its motion, not half of it.
+    """
+    stops = [beside is not at and np.array_equal(beside.points, at.points) for beside in (before, after)]
+    if stops == [True, False] and after is not at:
+        before = at
+    elif stops == [False, True] and before is not at:
+        after = at
+    if after.time - before.time <= SAME_TIME:
+        return None
+    return (after.points.astype(np.float64) - before.points) / ((after.time - before.time) / rate)
+
+
+def _hold(stream: LayerStream, paths: Mapping[str, Sdf.Path], outside: Sequence[float]) -> None:
+    """Repeat the first and the last of several samples, with velocity zero, at the time codes beside them.
+
+    Args:
+        paths: Attributes of a garment or target by name.
+        outside: The shot's time codes without a sample in the layer, ascending.
+    """
+    written = stream.layer.ListTimeSamplesForPath(paths["points"])
+    before = [(time, written[0]) for time in outside if len(written) > 1 and time < written[0]]
+    after = [(time, written[-1]) for time in outside if len(written) > 1 and time > written[-1]]
+    for time, nearest in (*before[-1:], *after[:1]):
+        for name, path in paths.items():
+            value = stream.layer.QueryTimeSample(path, nearest)
+            if name == "velocities" and isinstance(value, Vt.Vec3fArray):
+                value = Vt.Vec3fArray(len(value))
+            if value is not None:
+                stream.set(path, value, time=time)
 
 
 def to_local(world: np.ndarray, to_metres: np.ndarray, path: str, time: float | None) -> np.ndarray:

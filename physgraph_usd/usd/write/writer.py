@@ -25,8 +25,8 @@ from ..lookup import check_known
 from ..mesh.shell import Shell
 from ..read.absence import named_times
 from ..read.reader import Shot
-from ..stage import Notice, at_time, authored_topology, pxr_errors, value_at
-from ..times import within
+from ..stage import GarmentSource, Notice, at_time, authored_topology, pxr_errors, value_at
+from ..times import FrameGrid, within
 from . import overs
 from .attribute_rules import notes_of
 from .normals import VertexNormals
@@ -99,21 +99,28 @@ class LayerWriter:
 
     def _author_still(self, refinements: Sequence[Sequence[Refinement]]) -> None:
         """Author metadata and the topology-dependent opinions of each garment."""
-        times = self._shot.scene.times
+        times = self._times or self._shot.scene.times
         span = (times[0], times[-1]) if times else None
-        provenance.copy_stage_metadata(self._shot.stage, self._stream.layer, span=span)
+        whole = self._times is None and not any(source.left_out for source in self._shot.sources)
+        provenance.copy_stage_metadata(self._shot.stage, self._stream.layer, span=span, whole=whole)
         options = {"sibling": self._mode == "sibling", "velocities": self._velocities, "keep": self._keep_scheme}
         with pxr_errors(f"cannot read {self._shot.path}"):
             for index in _garments_in(self._shot, self._times):
-                absent = self._shot.sources[index].absent
-                absent = absent if self._times is None else within(absent, (self._times[0], self._times[-1]))
-                mesh = _RefinedMesh(self._stream, self._shot, index, steps=refinements[index], absent=absent, **options)
+                when = self._when(self._shot.sources[index])
+                mesh = _RefinedMesh(self._stream, self._shot, index, steps=refinements[index], **options, **when)
                 self._meshes[index] = mesh
-                moves = {"absent": absent, "velocities": self._velocities}
-                bound = TargetTracks(self._stream, self._shot, index, steps=refinements[index], **moves)
+                when["velocities"] = self._velocities
+                bound = TargetTracks(self._stream, self._shot, index, steps=refinements[index], **when)
                 self._bound[index] = bound
                 self.notices += [*mesh.notices, *bound.notices]
                 self.notes += mesh.notes
+
+    def _when(self, source: GarmentSource) -> dict[str, Any]:
+        """Time codes at which a garment is blocked, and time codes beside those written, by argument."""
+        span = None if self._times is None else (self._times[0], self._times[-1])
+        outside = {*source.times, *source.left_out}.difference(within(source.times, span))
+        outside |= _frames_beside(self._shot.stage, source)
+        return {"absent": within(source.absent, span), "outside": sorted(outside)}
 
     def write(
         self,
@@ -235,13 +242,15 @@ class _RefinedMesh:
         *,
         steps: Sequence[Refinement],
         absent: Sequence[float],
+        outside: Sequence[float],
         sibling: bool,
         keep: bool,
         velocities: bool,
     ) -> None:
         """Author the defaults of a garment, by number and refinements, coarse to fine, and start its tracks.
 
-        The garment is blocked at the absent time codes. With ``keep`` the fine mesh has the cage's subdivision scheme.
+        The garment is blocked at the absent time codes and held at those outside. With ``keep`` the fine mesh has the
+        cage's subdivision scheme.
         """
         source, times = shot.sources[index], shot.scene.times
         prim, span = shot.stage.GetPrimAtPath(source.path), (times[0], times[-1]) if times else None
@@ -263,9 +272,8 @@ class _RefinedMesh:
         self.notices += carry_subsets(stream, target, prim, fine, span=span)
         self.notices += overs.author_rest_points(stream, target, prim, fine)
         left = UsdGeom.Mesh(prim).GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded
-        rest = None
-        if not (source.still or source.skinned or self._shell):
-            rest = fine.vectors(UsdGeom.Mesh(prim).GetPointsAttr().Get(Usd.TimeCode.Default()))
+        still = source.still or self._shell is not None
+        rest = None if still else fine.vectors(shot.default_points(source.path))
         self._sheet_normals = VertexNormals(sheet, left_handed=left, welded=sides)
         normals, self._middle_normals = self._sheet_normals, VertexNormals(self._weld.mesh)
         if self._shell is not None:
@@ -273,6 +281,7 @@ class _RefinedMesh:
         rate = shot.stage.GetTimeCodesPerSecond() if velocities or source.velocities else None
         self.notices += overs.speed_notices(prim, written=rate is not None)
         moves = {"rate": rate, "own": partial(_own_velocities, prim, fine), "absent": absent}
+        moves["outside"] = outside
         self._track = PointTrack(stream, target, normals if polygonal else None, rest=rest, still=source.still, **moves)
         self._heat = HeatTrack(stream, target, self._weld.mesh.vertex_count, still=source.still)
         purpose = "render" if sibling else UsdGeom.Imageable(prim).ComputePurpose()
@@ -347,6 +356,15 @@ def _garments_in(shot: Shot, times: Sequence[float] | None) -> list[int]:
         return [*every]
     first = shot.scene.times[0]
     return [index for index in every if not {*(shot.sources[index].times or (first,))}.isdisjoint(times)]
+
+
+def _frames_beside(stage: Usd.Stage, source: GarmentSource) -> set[float]:
+    """The whole frames of a stage right before the first and after the last of a garment's samples, if any."""
+    if not source.times or not stage.HasAuthoredTimeCodeRange():
+        return set()
+    every, grid = sorted({*source.times, *source.left_out, *source.absent}), FrameGrid.of(stage)
+    before = grid.inside(stage.GetStartTimeCode() - grid.length, every[0])
+    return {*before[-1:], *grid.inside(every[-1], stage.GetEndTimeCode() + grid.length)[:1]}
 
 
 def _own_velocities(prim: Usd.Prim, fine: FineMap, time: float | None) -> np.ndarray | None:
