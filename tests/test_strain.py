@@ -13,7 +13,7 @@ from sheets import garment_of
 from shots import fine, refine, run, sample_times
 from stages import add_mesh, add_sheet, affine, author, new_stage, save, set_matrix, sheet_points, vec3
 
-from physgraph_usd.errors import GarmentError
+from physgraph_usd.errors import GarmentError, StageError
 from physgraph_usd.shot.refine import inspect_shot
 from physgraph_usd.solver.level import build_levels, hinge_geometry
 from physgraph_usd.usd.read.reader import Shot, open_shot
@@ -181,9 +181,10 @@ def test_the_order_of_rest_shapes_from_weakest_to_strongest(tmp_path: Path) -> N
         name, points = rest()
         assert name == f"</World/cloth>.primvars:{attribute}"
         np.testing.assert_allclose(points, FLAT * (1 + 0.1 * number), rtol=1e-6)
-    author(mesh.GetPrim(), "physics:restShapePoints", vec3(FLAT), kind="point3f[]")
-    name, points = rest()
-    assert name == "</World/cloth>.physics:restShapePoints"
+    for schema in ("omniphysics", "physics"):
+        author(mesh.GetPrim(), f"{schema}:restShapePoints", vec3(FLAT), kind="point3f[]")
+        name, points = rest()
+        assert name == f"</World/cloth>.{schema}:restShapePoints"
     np.testing.assert_allclose(points, FLAT)
     name, points = rest(rest_frame=6.0)
     assert name == "edge lengths at time code 6 (--rest)"
@@ -250,3 +251,23 @@ def test_hinges_rest_flat_or_bent(tmp_path: Path, value: str | None, bent: bool,
     assert [(notice.path, f"author {renamed!r}" in notice.message) for notice in told] == (
         [(str(mesh.GetPath()), True)] if renamed else []
     )
+
+
+@pytest.mark.parametrize("kind", ["edit", "block"])
+def test_points_in_several_layers_are_read_as_composed(tmp_path: Path, kind: str) -> None:
+    """An edit of an array changes some of a weaker layer's points, and a block of the animation shows the default."""
+    stage = new_stage(tmp_path / "cage.usda")
+    add_sheet(stage, times=(1.0, 2.0))
+    weaker = save(stage)
+    value = "edit [write (9, 9, 9) to [3]]" if kind == "edit" else "AnimationBlock"
+    text = '#usda 1.0\n(\n metersPerUnit = 1\n upAxis = "Y"\n subLayers = [@./cage.usda@]\n)\n'
+    text += f'over "World"\n{{\n over "cloth"\n {{\n  point3f[] points = {value}\n }}\n}}\n'
+    (tmp_path / "shot.usda").write_text(text)
+    try:
+        shot = open_shot(str(tmp_path / "shot.usda"))
+    except StageError as error:
+        pytest.skip(f"this USD does not read it: {error}")
+    rest, plain = (each.scene.garments[0].rest for each in (shot, open_shot(weaker)))
+    changed = np.any(rest != plain, axis=1)
+    assert np.flatnonzero(changed).tolist() == ([3] if kind == "edit" else [])
+    assert bool(shot.scene.times) == (kind == "edit")

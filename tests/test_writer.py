@@ -22,7 +22,7 @@ from layers import (
     write_layer,
     write_shot,
 )
-from pxr import Gf, Sdf, Usd, UsdGeom, UsdUtils
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, UsdUtils, Vt
 
 from physgraph_usd.solver.mesh.subdivide import subdivide_times
 from physgraph_usd.solver.mesh.topology import PolygonMesh
@@ -290,6 +290,76 @@ def test_extents_hold_points_and_model_hints_hold_extents(tmp_path: Path) -> Non
     assert np.all(world[1] >= 3 * box[1] - 1e-5)
     rig = UsdGeom.ModelAPI(fine.GetPrimAtPath("/World/rig")).GetExtentsHintAttr()
     assert np.all(np.asarray(rig.Get(4.0))[1] >= box[1] - 1e-6)
+
+
+@pytest.mark.parametrize("part", [False, True])
+def test_extents_of_skel_roots_above_hold_the_cloth_at_every_time(tmp_path: Path, part: bool) -> None:
+    """The root's extent is the coarse cloth's, with more samples than the cloth, outside a range of frames too."""
+    path = tmp_path / "shot.usda"
+    stage = make_shot(path, times=(1.0, 3.0, 5.0))
+    root = UsdSkel.Root.Define(stage, "/World/rig")
+    for time in (1.0, 2.0, 3.0, 4.0, 5.0):
+        root.CreateExtentAttr().Set([(0, 0, 0), (1, time, 0.1)], time)
+    stage.Save()
+    shot = open_shot(str(path), level=1, frames=(3.0, 5.0) if part else None)
+    write_shot(shot, tmp_path / "out.usdc")
+    fine = open_over(path, tmp_path / "out.usdc")
+    assert fine.GetPrimAtPath("/World/rig").GetAttribute("extent").GetTimeSamples() == [1.0, 2.0, 3.0, 4.0, 5.0]
+    for time in (1.0, 1.5, 2.0, 3.0, 4.0, 5.0):
+        box = UsdGeom.BBoxCache(time, ["default"]).ComputeWorldBound(fine.GetPrimAtPath("/World/rig")).GetRange()
+        points = np.array(UsdGeom.Mesh(fine.GetPrimAtPath(COAT)).GetPointsAttr().Get(time))
+        held = np.concatenate([points, [[0.0, time, 0.0]]])
+        assert np.all(np.array(box.GetMin()) <= held.min(axis=0) + 1e-6)
+        assert np.all(np.array(box.GetMax()) >= held.max(axis=0) - 1e-6)
+
+
+def test_the_extent_of_an_instancer_holds_the_cloth_at_its_instances(tmp_path: Path) -> None:
+    path = tmp_path / "shot.usda"
+    stage = make_shot(path)
+    crowd = UsdGeom.PointInstancer.Define(stage, "/World")
+    crowd.CreatePrototypesRel().SetTargets(["/World/rig"])
+    crowd.CreateProtoIndicesAttr([0, 0])
+    crowd.CreatePositionsAttr([(0, 0, 0), (50, 0, 0)])
+    crowd.CreateExtentAttr([(0, 0, 0), (1, 1, 0)])
+    stage.Save()
+    fine = open_over(path, write_layer(path, tmp_path / "out.usdc"))
+    low, high = np.array(UsdGeom.PointInstancer(fine.GetPrimAtPath("/World")).GetExtentAttr().Get())
+    boxes = [np.array(UsdGeom.Mesh(fine.GetPrimAtPath(COAT)).GetExtentAttr().Get(time)) for time in TIMES]
+    np.testing.assert_allclose(low, np.minimum(0.0, np.min(boxes, axis=0)[0]), atol=1e-5)
+    np.testing.assert_allclose(high, np.max(boxes, axis=0)[1] + [50.0, 0.0, 0.0], atol=1e-5)
+
+
+def test_a_primvar_with_unsigned_indices_follows(tmp_path: Path) -> None:
+    path = tmp_path / "shot.usda"
+    stage = make_shot(path)
+    prim = stage.GetPrimAtPath(COAT)
+    for interpolation, count in (("vertex", 20), ("uniform", 12), ("faceVarying", 48)):
+        made = UsdGeom.PrimvarsAPI(prim).CreatePrimvar(interpolation, Sdf.ValueTypeNames.FloatArray, interpolation)
+        made.Set([1.0, 3.0])
+        indices = prim.CreateAttribute(f"primvars:{interpolation}:indices", Sdf.ValueTypeNames.UIntArray)
+        indices.Set(Vt.UIntArray.FromNumpy(np.arange(count, dtype=np.uint32) % 2))
+    stage.Save()
+    out = write_layer(path, tmp_path / "out.usdc")
+    stage = open_over(path, out)
+    api = UsdGeom.PrimvarsAPI(stage.GetPrimAtPath(COAT))
+    names = ("vertex", "uniform", "faceVarying")
+    vertex, uniform, corners = (api.GetPrimvar(name).ComputeFlattened() for name in names)
+    assert (len(vertex), len(corners)) == (63, 192)
+    assert list(uniform) == ([1.0] * 4 + [3.0] * 4) * 6
+    assert errors(out) == []
+
+
+def test_a_primvar_that_no_integers_index_is_hidden_and_named(tmp_path: Path) -> None:
+    path = tmp_path / "shot.usda"
+    stage = make_shot(path)
+    prim = stage.GetPrimAtPath(COAT)
+    UsdGeom.PrimvarsAPI(prim).CreatePrimvar("odd", Sdf.ValueTypeNames.FloatArray, "vertex").Set([1.0, 3.0])
+    prim.CreateAttribute("primvars:odd:indices", Sdf.ValueTypeNames.FloatArray).Set([0.0] * 20)
+    stage.Save()
+    writer = write_shot(open_shot(str(path), level=1), tmp_path / "out.usdc")
+    assert any("primvars:odd is indexed by no array of integers; hidden" in str(notice) for notice in writer.notices)
+    stage = open_over(path, tmp_path / "out.usdc")
+    assert not UsdGeom.PrimvarsAPI(stage.GetPrimAtPath(COAT)).GetPrimvar("odd").HasAuthoredValue()
 
 
 def test_no_area_takes_the_neighbours_and_stays_unit() -> None:

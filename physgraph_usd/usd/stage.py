@@ -96,6 +96,24 @@ def first_value(attribute: Usd.Attribute) -> Any:
     return next((value for value in later if value is not None and np.size(value)), first)
 
 
+def indices_of(primvar: UsdGeom.Primvar, code: Usd.TimeCode) -> np.ndarray | None:
+    """Indices of an indexed primvar, shape (N,), of any integer type; USD reads ``int[]`` alone. None without any."""
+    value = primvar.GetIndicesAttr().Get(code) if primvar.IsIndexed() else None
+    indices = np.asarray(value)
+    return indices if value is not None and indices.ndim == 1 and indices.dtype.kind in "iu" else None
+
+
+def flattened(primvar: UsdGeom.Primvar, code: Usd.TimeCode) -> Any:
+    """Values of a primvar with its indices applied, as ``ComputeFlattened`` gives them; None where they do not fit."""
+    indices = indices_of(primvar, code)
+    if indices is None or indices.dtype == np.int32:
+        return None if indices is None and primvar.IsIndexed() else primvar.ComputeFlattened(code)
+    values, size = np.asarray(primvar.Get(code)), max(primvar.GetElementSize(), 1)
+    if values.ndim == 0 or len(values) % size or int(indices.max(initial=0)) * size >= len(values):
+        return None
+    return values.reshape(-1, size, *values.shape[1:])[indices].reshape(-1, *values.shape[1:])
+
+
 def authored_topology(prim: Usd.Prim) -> tuple[np.ndarray, np.ndarray]:
     """Corners of each face of a mesh, shape (F,), and the vertices of all corners, shape (C,), at the first sample."""
     mesh = UsdGeom.Mesh(prim)

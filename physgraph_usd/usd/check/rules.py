@@ -18,7 +18,7 @@ from ..provenance import METADATA, RANGE, mute_refined, read_record
 from ..read.absence import absence
 from ..read.authored import beyond_limits
 from ..read.skinning import skel_root
-from ..stage import at_time, paths_in, root_metadata, timecode
+from ..stage import at_time, indices_of, paths_in, root_metadata, timecode
 from ..times import FrameGrid, is_among, motion_of
 from ..view import StageView
 from ..write.attribute_rules import BLOCKED, EMPTIED, action_on, render_values, with_action
@@ -249,7 +249,9 @@ def _primvar_fault(primvar: UsdGeom.Primvar, time: float | None, expected: int) 
     groups = len(np.atleast_1d(np.asarray(value))) / max(primvar.GetElementSize(), 1)
     if not primvar.IsIndexed():
         return "" if groups == expected else f"has {groups:g} elements; its interpolation needs {expected}"
-    indices = np.asarray(primvar.GetIndices(timecode(time)))
+    indices = indices_of(primvar, timecode(time))
+    if indices is None:
+        return "is indexed by no array of integers"
     if len(indices) != expected:
         return f"has {len(indices)} indices; its interpolation needs {expected}"
     if len(indices) and not 0 <= indices.min() <= indices.max() < groups:

@@ -21,7 +21,7 @@ from ...solver.scene import Garment, GarmentFrame, mean_edge
 from ..lookup import Found, Override, bound_materials, check_limits, find_value
 from ..mesh.pieces import sort_pieces
 from ..schema import GARMENT
-from ..stage import GarmentSource, Notice, Units
+from ..stage import GarmentSource, Notice, Units, flattened
 from ..times import within
 from .absence import Samples, absence
 from .cage import PointReader, read_cage
@@ -434,7 +434,7 @@ def read_painted(
     if found.source == "--set":
         return np.full(count, found.constant), ()
     primvar = _primvar(prim, row.name.removeprefix("primvars:"))
-    flat = primvar.ComputeFlattened(Usd.TimeCode.EarliestTime()) if primvar else None
+    flat = flattened(primvar, Usd.TimeCode.EarliestTime()) if primvar else None
     if primvar is None or flat is None:
         return np.full(count, float(row.fallback or 0.0)), ()
     values = np.atleast_1d(np.asarray(flat))

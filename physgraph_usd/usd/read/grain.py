@@ -14,7 +14,7 @@ from ...solver.mesh.topology import PolygonMesh, face_normals
 from ...solver.mesh.weld import Weld
 from ...solver.scene import Grain
 from ..mesh.attributes import kept_corners
-from ..stage import authored_topology
+from ..stage import authored_topology, flattened
 
 SKEWED = 1.5
 """Ratio of a face's two texture stretches from which the texture coordinates count as not shape-preserving."""
@@ -101,7 +101,7 @@ def _texture_coordinates(prim: Usd.Prim, mesh: PolygonMesh, kept: np.ndarray) ->
     for name in dict.fromkeys([each for each in _NAMES if each in every] + every):
         primvar = api.GetPrimvar(name)
         try:
-            flat = primvar.ComputeFlattened(Usd.TimeCode.EarliestTime())
+            flat = flattened(primvar, Usd.TimeCode.EarliestTime())
         except Tf.ErrorException:  # Indices of a wrong type: the layer writer reports such primvars.
             continue
         values = np.zeros((0, 2)) if flat is None else np.asarray(flat, np.float64)

@@ -17,7 +17,7 @@ from ...solver.mesh.topology import PolygonMesh, TriangleSplit
 from ..mesh.drawn import ControlMesh, DrawnSurface
 from ..provenance import read_record, recorded_shot
 from ..schema import AXES
-from ..stage import bad_rate, list_meshes, open_layer, paths_in, pxr_errors, quiet, read_units, timecode
+from ..stage import bad_rate, flattened, list_meshes, open_layer, paths_in, pxr_errors, quiet, read_units, timecode
 from ..times import merge, motion_of, within
 from ..view import root_over
 from .bodies import DRAWN_WITHIN, sharpness_of, surface_of
@@ -269,7 +269,7 @@ def color_of(stage: Usd.Stage, path: str) -> np.ndarray | None:
 def _colors(mesh: UsdGeom.Mesh, code: Usd.TimeCode, faces: int) -> np.ndarray:
     """Linear colour of each authored face, shape (F, 3): its subset's or mesh's material, displayColor, or neutral."""
     colors = np.tile(np.array(NEUTRAL), (faces, 1))
-    shown = mesh.GetDisplayColorPrimvar().ComputeFlattened(code)
+    shown = flattened(mesh.GetDisplayColorPrimvar(), code)
     if shown:
         values = np.asarray(shown, dtype=float)
         colors[:] = values if len(values) == faces else values.mean(axis=0)

@@ -1,7 +1,8 @@
 """Reads or fits a garment's rest shape in metres, and its source.
 
-The first available of: the points at the time code of ``--rest``, ``physics:restShapePoints``, ``primvars:rest``,
-``primvars:Pref``, the points' default value, a shape fitted to the median length of each edge over the shot.
+The first available of: the points at the time code of ``--rest``, ``physics:restShapePoints``, NVIDIA's
+``omniphysics:restShapePoints``, ``primvars:rest``, ``primvars:Pref``, the points' default value, a shape fitted to the
+median length of each edge over the shot.
 ``--rest auto`` requests the fitted shape even if a shape is authored. Authored shapes are placed in the world like the
 garment at its first time code, or by a skinned garment's bind transform. Of a frame of animated points, as ``--rest``
 or as default points, only the edge lengths count: its folds are not those at rest.
@@ -28,7 +29,7 @@ from ...solver.mesh.weld import Weld
 from ...solver.scene import out_of_bounds
 from ...solver.strain import COLLAPSED
 from ..lookup import nearest, source_name
-from ..stage import Notice, first_value
+from ..stage import Notice, first_value, flattened
 from .cage import as_points, repair
 
 AUTO = "auto"
@@ -50,7 +51,7 @@ SHORTEST = 1e-3
 SHARP, KEPT = math.radians(60.0), 0.1
 """Least angle of a pressed fold that nobody marked, and its most relative change. All 28 edges of a turned collar are
 so, 251 of two skinned garments with modelled hems, 10 of two made samples; none of eight simulated shots."""
-_AUTHORED = ("physics:restShapePoints", "primvars:rest", "primvars:Pref")
+_AUTHORED = ("physics:restShapePoints", "omniphysics:restShapePoints", "primvars:rest", "primvars:Pref")
 _BENT = ("restShape", "restShapeDefault")
 _PER_CORNER = UsdGeom.Tokens.faceVarying
 _SAME_PLACE = 1e-6
@@ -222,8 +223,8 @@ def _authored(prim: Usd.Prim, count: int, notices: list[Notice]) -> tuple[np.nda
         attribute = prim.GetAttribute(name)
         if not attribute or not attribute.HasAuthoredValue():
             continue
-        source = UsdGeom.Primvar(attribute).ComputeFlattened if name.startswith("primvars:") else attribute.Get
-        value = source(Usd.TimeCode.EarliestTime())
+        first, primvar = Usd.TimeCode.EarliestTime(), name.startswith("primvars:")
+        value = flattened(UsdGeom.Primvar(attribute), first) if primvar else attribute.Get(first)
         if value is None or np.size(value) == 0:
             continue
         points = as_points(value, str(prim.GetPath()), name)
@@ -264,12 +265,16 @@ def _of_corners(attribute: Usd.Attribute, values: np.ndarray, count: int) -> tup
 
 
 def _default_points(prim: Usd.Prim, baked: Sdf.Layer) -> np.ndarray | None:
-    """The points' default value from the stage's own layers."""
-    for spec in UsdGeom.Mesh(prim).GetPointsAttr().GetPropertyStack(Usd.TimeCode.Default()):
-        if spec.layer != baked and spec.HasDefaultValue():
-            value = spec.default
-            return None if isinstance(value, Sdf.ValueBlock) else as_points(value, str(prim.GetPath()), "points")
-    return None
+    """The points' default value as composed, without baked skinning; None if blocked or not authored."""
+    attribute = UsdGeom.Mesh(prim).GetPointsAttr()
+    value, spec = attribute.Get(Usd.TimeCode.Default()), baked.GetAttributeAtPath(attribute.GetPath())
+    if spec is not None and spec.HasDefaultValue():  # Blocks of samples and edits of arrays have no length.
+        stack = [each for each in attribute.GetPropertyStack(Usd.TimeCode.Default()) if each.layer != baked]
+        values = [each.default for each in stack if each.HasDefaultValue()]
+        value = next((each for each in values if isinstance(each, Sdf.ValueBlock) or hasattr(each, "__len__")), None)
+    return (
+        None if value is None or isinstance(value, Sdf.ValueBlock) else as_points(value, str(prim.GetPath()), "points")
+    )
 
 
 def _braced(mesh: PolygonMesh) -> np.ndarray:

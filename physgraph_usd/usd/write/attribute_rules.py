@@ -18,6 +18,8 @@ LOWERED, OFF = "lowered", "off"
 """A renderer's number of subdivisions, less those of the layer, and off where the scheme is none; and other settings of
 its subdivision, off where the scheme is none and kept elsewhere."""
 PREFIX = "primvars:"
+REST_POINTS = ("physics:restShapePoints", "omniphysics:restShapePoints")
+"""Rest shape by AOUSD's proposal, and by NVIDIA's schemas of the same."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +78,11 @@ RULES = (
         "where the scheme is none; else kept",
         noted=True,
     ),
-    Rule((f"{PREFIX}*", "physics:restShapePoints"), CARRIED, "words and integers copied, constants kept"),
+    Rule(
+        (f"{PREFIX}*", *REST_POINTS),
+        CARRIED,
+        "words and integers copied, constants kept",
+    ),
 )
 """Rules in order of precedence; attributes without a rule stay as authored."""
 

@@ -13,13 +13,12 @@ from ...solver.scene import Garment, GarmentFrame
 from ..read.bodies import sharpness_of
 from ..schema import GARMENT, GARMENT_API, fabric_values
 from ..stage import GarmentSource, Notice, value_at
-from .attribute_rules import BLOCKED, CARRIED, EMPTIED, PREFIX, action_on, limit_renderers, with_action
+from .attribute_rules import BLOCKED, CARRIED, EMPTIED, PREFIX, REST_POINTS, action_on, limit_renderers, with_action
 from .primvars import INFINITE, FineMap, inherits_influences
 from .stream import LayerStream
 
 _TYPES = Sdf.ValueTypeNames
 _ELSEWHERE = (PREFIX, "skel:", "xformOp", "physgraph:")
-REST_POINTS = "physics:restShapePoints"
 
 
 def scheme_of(prim: Usd.Prim, fine: PolygonMesh, *, keep: bool) -> str:
@@ -150,7 +149,7 @@ def author_rest_points(stream: LayerStream, target: Sdf.Path, prim: Usd.Prim, fi
                 message = f"{name} may number points or faces of the coarse mesh and stays as authored"
                 notices.append(Notice(str(prim.GetPath()), None, message))
             continue
-        if name == REST_POINTS and len(value) == fine.count("vertex"):
+        if name in REST_POINTS and len(value) == fine.count("vertex"):
             path = target.AppendProperty(name)
             stream.attribute(path, attribute.GetTypeName())
             stream.set(path, Vt.Vec3fArray.FromNumpy(fine.interpolate(np.asarray(value, np.float32))))

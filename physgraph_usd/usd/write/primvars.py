@@ -24,7 +24,7 @@ from ..mesh.attributes import (
     vertex_values,
 )
 from ..mesh.shell import Shell
-from ..stage import Notice, timecode
+from ..stage import Notice, flattened, indices_of, timecode
 from .attribute_rules import BLOCKED, action_on
 from .stream import LayerStream
 
@@ -83,7 +83,7 @@ def _numbers_points(primvar: UsdGeom.Primvar) -> bool:
     """Whether a primvar holds a unique whole number per point, such as ids."""
     if primvar.GetInterpolation() not in (UsdGeom.Tokens.vertex, UsdGeom.Tokens.varying):
         return False
-    values = np.asarray(primvar.ComputeFlattened(Usd.TimeCode.EarliestTime()))
+    values = np.asarray(flattened(primvar, Usd.TimeCode.EarliestTime()))
     return values.ndim == 1 and values.dtype.kind in "iu" and 1 < len(values) == len(np.unique(values))
 
 
@@ -115,7 +115,7 @@ def _carry(
             stream.attribute(indices_path, Sdf.ValueTypeNames.IntArray)
             stream.set(indices_path, Vt.IntArray.FromNumpy(indices), time=time)
     if was_indexed and not is_indexed:
-        stream.block(indices_path, Sdf.ValueTypeNames.IntArray)
+        stream.block(indices_path, primvar.GetIndicesAttr().GetTypeName())
 
 
 def _refined(
@@ -127,9 +127,21 @@ def _refined(
     if size > 1 and len(array) % size:
         raise ValueError(f"has {len(array)} values, no multiple of its elementSize {size}")
     grouped = array.reshape(-1, size, *array.shape[1:]) if size > 1 else array
-    indices = np.asarray(primvar.GetIndices(code), np.int32) if primvar.IsIndexed() else None
+    indices = indices_of(primvar, code)
+    if primvar.IsIndexed() and indices is None:
+        raise ValueError("is indexed by no array of integers")
+    if indices is not None and indices.dtype != np.int32:  # USD reads no other indices.
+        grouped, indices = grouped[_checked(indices, len(grouped))], None
     values, indices = fine.primvar(primvar.GetInterpolation(), grouped, indices=indices, smooth=smooth)
     return (None if values is None else values.reshape(-1, *array.shape[1:])), indices
+
+
+def _checked(indices: np.ndarray, count: int) -> np.ndarray:
+    """Indices of any integer type; ValueError for an index without a value."""
+    outside = indices[(indices < 0) | (indices >= count)]
+    if len(outside):
+        raise ValueError(f"has the index {outside[0]} into {count} values")
+    return indices
 
 
 def _times(times: Sequence[float], span: tuple[float, float] | None) -> Iterable[float]:

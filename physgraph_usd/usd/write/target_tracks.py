@@ -16,11 +16,11 @@ from ..read.find import instance_roots
 from ..read.placement import to_metres
 from ..read.reader import Shot
 from ..read.targets import Target, points_attribute
-from ..stage import timecode
+from ..stage import flattened, timecode
 from . import overs
 from .primvars import hide_influences
 from .stream import LayerStream
-from .track import ModelHints, PointTrack
+from .track import BoundsAbove, PointTrack
 
 _FIRST = Usd.TimeCode.EarliestTime()
 
@@ -104,7 +104,7 @@ class _TargetTrack:
         fits = default is not None and len(default) == len(target.points)
         rest = np.asarray(default, np.float32) if fits else None
         self._track = PointTrack(stream, path, None, rest=rest, turned=given, points=points.GetName(), **moves)
-        self._hints = ModelHints(stream, shot.stage, path, purpose=UsdGeom.Imageable(prim).ComputePurpose())
+        self._bounds = BoundsAbove(stream, shot.stage, path, purpose=UsdGeom.Imageable(prim).ComputePurpose())
 
     def write(self, time: float | None, placed: PlacedTarget, *, changed: bool, cut: bool) -> None:
         """Write one time code; ``changed`` and ``cut`` are those of the cloth, as in `PointTrack.write`."""
@@ -112,11 +112,12 @@ class _TargetTrack:
         normals = None if self._turned is None else self._turned.at(placed.follower, to_world)
         moves = {"changed": changed or placed.target.detail, "cut": cut}
         self._track.write(time, placed.points, to_world, normals=normals, **moves)
-        self._hints.write(time, self._track.box)
+        self._bounds.write(time, self._track.box)
 
     def finish(self) -> None:
         """Author pending samples at the end."""
         self._track.finish()
+        self._bounds.finish()
 
 
 class _TurnedNormals:
@@ -139,7 +140,7 @@ class _TurnedNormals:
         attribute, kind = UsdGeom.PointBased(prim).GetNormalsAttr(), UsdGeom.PointBased(prim).GetNormalsInterpolation()
         values = attribute.Get(code) if attribute.HasAuthoredValue() else None
         if primvar and primvar.HasAuthoredValue():
-            attribute, kind, values = primvar.GetAttr(), primvar.GetInterpolation(), primvar.ComputeFlattened(code)
+            attribute, kind, values = primvar.GetAttr(), primvar.GetInterpolation(), flattened(primvar, code)
         owner = _owners(target, kind)
         if values is None or owner is None or len(values) != len(owner):
             return None

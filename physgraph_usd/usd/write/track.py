@@ -1,11 +1,12 @@
 """Writes the animated opinions of one garment, one time code after another.
 
-Points, normals, extent and velocities; heat maps of depth inside bodies and of crossings; and the ``extentsHint`` of
-ancestor models, a hand-cached box possibly too small for the finer cloth.
+Points, normals, extent and velocities; heat maps of depth inside bodies and of crossings; and the bounds authored on
+ancestors, possibly too small for the finer cloth.
 """
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
@@ -15,6 +16,7 @@ import numpy as np
 from pxr import Sdf, Usd, UsdGeom, Vt
 
 from ...errors import LayerError
+from ..instances import placements
 from ..lookup import with_ancestors
 from ..stage import at_time, timecode
 from ..times import SAME_TIME
@@ -380,47 +382,68 @@ class HeatTrack:
         _set_sample(self._stream, self._path(name), values, time)
 
 
-class ModelHints:
-    """Enlarges the authored extent hints of one garment's ancestors to contain the fine cloth."""
+class BoundsAbove:
+    """Enlarges the authored bounds of one garment's ancestors to contain the fine cloth.
+
+    The bounds are extent hints of models, and the extents of skel roots and point instancers.
+    """
 
     def __init__(self, stream: LayerStream, stage: Usd.Stage, path: Sdf.Path, *, purpose: str) -> None:
-        """Find the ancestors of a coarse garment with a hint; the fine mesh's purpose chooses the box to enlarge."""
-        self._stream, self._stage = stream, stage
-        self._prim = stage.GetPrimAtPath(path)
+        """Find the ancestors of a coarse garment with bounds; the fine mesh's purpose chooses the hint's box."""
+        self._stream, self._prim = stream, stage.GetPrimAtPath(path)
         self._row = 2 * _PURPOSES.index(purpose if purpose in _PURPOSES else "default")
-        self._models = []
-        for prim in with_ancestors(self._prim):
-            attribute = prim.GetAttribute(ATTRIBUTE)
-            if attribute and attribute.HasAuthoredValue() and isinstance(attribute.Get(_FIRST), Vt.Vec3fArray):
-                self._models.append(prim)
+        self._boxes = dict[str, list[tuple[float | None, np.ndarray]]]()
+        above = [*with_ancestors(self._prim.GetParent())]
+        self._instancers = [prim for prim in above if UsdGeom.PointInstancer(prim)]
+        bounds = [prim.GetAttribute(ATTRIBUTE) for prim in (self._prim, *above)]
+        # A skel root is an Xform while its skinning is baked; a gprim's extent is that of its own points.
+        bounds += [prim.GetAttribute("extent") for prim in above if not UsdGeom.Gprim(prim)]
+        authored = (each for each in bounds if each and each.HasAuthoredValue())
+        self._bounds = [each for each in authored if isinstance(each.Get(_FIRST), Vt.Vec3fArray)]
 
     def write(self, time: float | None, box: np.ndarray) -> None:
-        """Enlarge the hints by the local extent of the fine mesh, shape (2, 3), at a time code."""
-        if not self._models:
-            return
-        cache = UsdGeom.XformCache(timecode(time))
+        """Enlarge the bounds by the local extent of the fine mesh, shape (2, 3), at a time code."""
         corners = np.array([[box[i][0], box[j][1], box[k][2], 1.0] for i, j, k in product((0, 1), repeat=3)])
-        local = np.array(cache.GetLocalToWorldTransform(self._prim))
-        for model in self._models:
-            inverse = np.linalg.pinv(np.array(cache.GetLocalToWorldTransform(model)))
-            grown = (corners @ local @ inverse)[:, :3]
+        for attribute in self._bounds:
+            to_world = np.array(UsdGeom.XformCache(timecode(time)).GetLocalToWorldTransform(attribute.GetPrim()))
+            grown = (self._in_world(attribute, time, corners) @ np.linalg.pinv(to_world))[:, :3]
             if np.isfinite(grown).all():
-                self._grow(model, time, grown)
+                ends = np.stack([grown.min(axis=0), grown.max(axis=0)])
+                self._boxes.setdefault(str(attribute.GetPath()), []).append((time, ends))
+                if time is not None or not attribute.GetNumTimeSamples():
+                    self._grow(attribute, time, ends)
 
-    def _grow(self, model: Usd.Prim, time: float | None, corners: np.ndarray) -> None:
-        """Author the union of a hint and eight corners, at the time code for an animated hint, else as default."""
-        attribute = model.GetAttribute(ATTRIBUTE)
+    def _in_world(self, bound: Usd.Attribute, time: float | None, corners: np.ndarray) -> np.ndarray:
+        """Local corners of the garment in the world, shape (N, 4), at each instance that a bound holds."""
+        held = [each for each in self._instancers if each.GetPath().HasPrefix(bound.GetPrim().GetPath())]
+        places = (placements(held[-1], time) or {}).get(self._prim.GetPath()) if held else None
+        if places is None:
+            return corners @ np.array(UsdGeom.XformCache(timecode(time)).GetLocalToWorldTransform(self._prim))
+        return np.concatenate([corners @ place.T for place in places])
+
+    def finish(self) -> None:
+        """Enlarge the bounds at their other samples by the cloth at the time codes written on either side."""
+        for attribute in self._bounds:
+            boxes, path = self._boxes.get(str(attribute.GetPath()), []), attribute.GetPath()
+            written = [time for time, _ in boxes if time is not None]
+            samples = {*attribute.GetTimeSamples(), *self._stream.layer.ListTimeSamplesForPath(path)}
+            for time in sorted(samples.difference(written)) if boxes else ():
+                after = bisect_left(written, time)
+                for _, ends in boxes[max(after - 1, 0) : after + 1]:
+                    self._grow(attribute, time, ends)
+
+    def _grow(self, attribute: Usd.Attribute, time: float | None, ends: np.ndarray) -> None:
+        """Author the union of a bound and a box, shape (2, 3), at the time code for an animated bound, else default."""
         time = time if attribute.GetNumTimeSamples() > 0 else None
-        path = model.GetPath().AppendProperty(ATTRIBUTE)
+        path = attribute.GetPath()
         spec = self._stream.attribute(path, Sdf.ValueTypeNames.Float3Array)
         grown = self._stream.layer.QueryTimeSample(path, time) if time is not None else spec.default
         value = attribute.Get(timecode(time)) if grown is None else grown
+        row = self._row if attribute.GetName() == ATTRIBUTE else 0
         rows = np.array(value if value is not None else [], np.float32).reshape(-1, 3)
         empty = np.tile(np.array([[np.finfo(np.float32).max], [-np.finfo(np.float32).max]], np.float32), (1, 3))
-        while len(rows) < self._row + 2:
+        while len(rows) < row + 2:
             rows = np.concatenate([rows, empty])
-        low, high = rows[self._row], rows[self._row + 1]
-        grown = rows.copy()
-        grown[self._row] = np.minimum(low, corners.min(axis=0))
-        grown[self._row + 1] = np.maximum(high, corners.max(axis=0))
-        self._stream.set(path, Vt.Vec3fArray.FromNumpy(grown), time=time)
+        low, high = np.minimum(rows[row], ends[0]), np.maximum(rows[row + 1], ends[1])
+        rows[row : row + 2] = low, high
+        self._stream.set(path, Vt.Vec3fArray.FromNumpy(rows), time=time)

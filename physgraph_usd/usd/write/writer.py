@@ -34,7 +34,7 @@ from .overs import author_used_values
 from .primvars import FineMap, carry_primvars, carry_subsets
 from .stream import LayerStream
 from .target_tracks import TargetTracks
-from .track import HeatTrack, ModelHints, PointTrack
+from .track import BoundsAbove, HeatTrack, PointTrack
 
 MODES = ("over", "sibling")
 SCHEMES = ("keep", "none")
@@ -285,7 +285,7 @@ class _RefinedMesh:
         self._track = PointTrack(stream, target, normals if polygonal else None, rest=rest, still=source.still, **moves)
         self._heat = HeatTrack(stream, target, self._weld.mesh.vertex_count, still=source.still)
         purpose = "render" if sibling else UsdGeom.Imageable(prim).ComputePurpose()
-        self._hints = ModelHints(stream, shot.stage, source.path, purpose=purpose)
+        self._bounds = BoundsAbove(stream, shot.stage, source.path, purpose=purpose)
         self._shot, self._index = shot, index
 
     def write(
@@ -301,7 +301,7 @@ class _RefinedMesh:
             points = self._shell.thickened(points, self._sheet_normals(points), thickness)
             maps = {name: values[self._shell.vertex] for name, values in maps.items()}
         self._track.write(time, points, to_world, changed=changed, cut=cut)
-        self._hints.write(time, self._track.box)
+        self._bounds.write(time, self._track.box)
         self._heat.write(time, maps)
 
     def check(self, points: np.ndarray | None, heat: Mapping[str, np.ndarray], time: float | None) -> None:
@@ -315,6 +315,7 @@ class _RefinedMesh:
     def finish(self) -> list[Notice]:
         """Author pending samples at the end; a notice of samples between cuts for which no velocity is known."""
         self._track.finish()
+        self._bounds.finish()
         if not self._track.unknown:
             return []
         message = f"its velocities are blocked at {named_times(self._track.unknown)}: it has no sample beside that one"
