@@ -123,3 +123,25 @@ def test_every_mesh_is_told_and_broken_ones_say_why(tmp_path: Path) -> None:
     assert (meshes["good"].points, meshes["good"].faces, meshes["good"].times) == (20, 12, (1.0, 2.0, 3.0))
     assert found.metres_per_unit == 0.01
     assert "metersPerUnit" in str(found.notices[0])
+
+
+@pytest.mark.parametrize("shown", ["default", "override"])
+def test_a_level_of_detail_that_is_not_shown_is_no_garment_and_no_body(tmp_path: Path, shown: str) -> None:
+    stage = new_stage(tmp_path / "s.usda")
+    for kind, tagged in (("coat", True), ("body", False)):
+        for level in ("high", "low"):
+            mesh = add_sheet(stage, f"/World/{kind}/{level}/shape", tagged=tagged)
+            if not tagged:
+                mesh.GetPrim().AddAppliedSchema(COLLIDER_API)
+        root = stage.GetPrimAtPath(f"/World/{kind}")
+        root.AddAppliedSchema("LODRootAPI")
+        author(root, "lod:default:index", 1 if shown == "default" else 0, kind="int")
+    if shown == "override":
+        author(stage.GetPrimAtPath("/World"), "lod:override:mode", "indexedLOD", kind="token")
+        author(stage.GetPrimAtPath("/World"), "lod:override:index", 1.0, kind="double")
+    for wanted in ([], ["/World/coat"], ["/World/coat/*"]):
+        assert paths(find_garments(stage, wanted)) == ["/World/coat/low/shape"]
+    garments = find_garments(stage)
+    for wanted in ([], ["/World/body"]):
+        assert paths(find_colliders(stage, garments, wanted)) == ["/World/body/low/shape"]
+    assert paths(find_garments(stage, ["/World/coat/high/shape"])) == ["/World/coat/high/shape"]

@@ -15,6 +15,8 @@ from ..stage import TRAVERSAL, Notice, Units, list_meshes
 GRAVITY_OPTION = "--gravity"
 """Source of gravity set by the option."""
 _COLLECTION = ".collection:"
+_LOD_ROOT = "LODRootAPI"
+"""Schema of a prim whose children are levels of detail, since USD 26.8."""
 _COLLIDERS_RELATIONSHIP = "physgraph:colliders"
 _SHOWN = 20
 MARKS = (GARMENT_API, COLLIDER_API, "PhysicsCollisionAPI")
@@ -45,7 +47,7 @@ def find_garments(stage: Usd.Stage, wanted: Sequence[str] = ()) -> list[Usd.Prim
     if wanted:
         chosen = {path for item in wanted for path in find_paths(stage, item, (UsdGeom.Mesh,))}
         return [prim for prim in traverse(stage) if prim.GetPath() in chosen]
-    found = [prim for prim in traverse(stage) if has_schema(prim, GARMENT_API)]
+    found = [prim for prim in traverse(stage) if has_schema(prim, GARMENT_API) and not _hidden_level(prim)]
     if not found:
         raise StageError(
             f"no prim has {GARMENT_API} and no garment was named; --garment PATH names one; {_mesh_list(stage)}"
@@ -123,7 +125,7 @@ def _named_or_marked(stage: Usd.Stage, named: Sequence[str]) -> list[Sdf.Path]:
     """Named gprims, or else all colliders of the stage."""
     if named:
         return list(dict.fromkeys(path for item in named for path in find_paths(stage, item, BODIES)))
-    marked = (prim for prim in traverse(stage) if _collides(prim))
+    marked = (prim for prim in traverse(stage) if _collides(prim) and not _hidden_level(prim))
     return [each.GetPath() for prim in marked for each in _drawn(_below(prim, BODIES))]
 
 
@@ -133,9 +135,8 @@ def purpose_notices(prims: Iterable[Usd.Prim], named: Sequence[str]) -> list[Not
     for prim in prims:
         by_itself = {str(prim.GetPath()), prim.GetName()} & {*named}
         marked = any(has_schema(prim, mark) for mark in MARKS)
-        if not (is_drawn(prim) or by_itself or marked):
-            purpose = UsdGeom.Imageable(prim).ComputePurpose()
-            message = f"no final render shows it, a {purpose}; it is taken, for what was named holds nothing else"
+        if (reason := why_not_drawn(prim)) and not (by_itself or marked):
+            message = f"no final render shows it, {reason}; it is taken, for what was named holds nothing else"
             notices.append(Notice(str(prim.GetPath()), None, message))
     return notices
 
@@ -162,8 +163,38 @@ def colliders_of(garments: Sequence[Usd.Prim]) -> list[str]:
 
 
 def is_drawn(prim: Usd.Prim) -> bool:
-    """Whether a final render shows prims of a prim's purpose: default and render, not proxy or guide."""
-    return UsdGeom.Imageable(prim).ComputePurpose() in {UsdGeom.Tokens.default_, UsdGeom.Tokens.render}
+    """Whether a final render shows a prim by its purpose, default or render, and by its level of detail."""
+    return not why_not_drawn(prim)
+
+
+def why_not_drawn(prim: Usd.Prim) -> str:
+    """The kind of a prim that no final render shows, such as "a proxy"; "" for a prim shown."""
+    purpose = UsdGeom.Imageable(prim).ComputePurpose()
+    return _hidden_level(prim) if purpose in {UsdGeom.Tokens.default_, UsdGeom.Tokens.render} else f"a {purpose}"
+
+
+def _hidden_level(prim: Usd.Prim) -> str:
+    """A level of detail that is not shown and holds a prim, in words; "" without any."""
+    for level in with_ancestors(prim):
+        root = level.GetParent()
+        if root and has_schema(root, _LOD_ROOT) and level != shown_level(root):
+            return f"a level of detail of <{root.GetPath()}> that is not shown"
+    return ""
+
+
+def shown_level(root: Usd.Prim) -> Usd.Prim | None:
+    """The child of a prim with levels of detail (UsdLod) that is shown: of its default index, or of an override's."""
+    index = root.GetAttribute("lod:default:index").Get()
+    for prim in with_ancestors(root):
+        mode = prim.GetAttribute("lod:override:mode").Get() or "inherited"
+        if mode == "indexedLOD":
+            index = prim.GetAttribute("lod:override:index").Get()
+        if mode != "inherited":
+            break
+    children = root.GetFilteredChildren(TRAVERSAL)  # Among them may be heuristics, which choose a level by distance.
+    levels = [prim for prim in children if UsdGeom.Imageable(prim) or not prim.GetTypeName()]
+    number = round(index) if isinstance(index, int | float) else 0
+    return levels[number] if 0 <= number < len(levels) else None
 
 
 def instance_roots(prim: Usd.Prim) -> tuple[Sdf.Path, ...]:
@@ -234,7 +265,8 @@ def find_paths(stage: Usd.Stage, item: str, kinds: Kinds, *, drawn: bool = True)
 
 
 def _named(stage: Usd.Stage, name: str) -> list[Usd.Prim]:
-    return [prim for prim in traverse(stage) if prim.GetName() == name]
+    found = [prim for prim in traverse(stage) if prim.GetName() == name]
+    return [prim for prim in found if not _hidden_level(prim)] or found
 
 
 def _below(root: Usd.Prim, kinds: Kinds) -> list[Usd.Prim]:

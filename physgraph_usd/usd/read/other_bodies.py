@@ -16,7 +16,7 @@ from ..lookup import with_ancestors
 from ..stage import TRAVERSAL, pxr_errors, quiet, timecode, value_at
 from ..times import motion_of
 from .bodies import ColliderReader, kind_of, parts_of
-from .find import BODIES, MARKS, has_schema, is_drawn
+from .find import BODIES, MARKS, has_schema, why_not_drawn
 from .garment import is_visible
 from .placement import place, to_metres
 from .reader import Shot
@@ -180,8 +180,8 @@ def _why_left(prim: Usd.Prim, times: Sequence[float | None]) -> str:
     for each in with_ancestors(prim):
         if mark := next((mark for mark in MARKS if has_schema(each, mark)), None):
             return f"{mark} on <{each.GetPath()}> marks it, and this run does not have it"
-    if not is_drawn(prim):
-        return f"a {UsdGeom.Imageable(prim).ComputePurpose()}, which no final render shows"
+    if reason := why_not_drawn(prim):
+        return f"{reason}, which no final render shows"
     known = [time for time in times if time is not None]
     visible = is_visible(prim, known if _visibility_varies(prim) else known[:1])
     return "" if visible else "invisible"
