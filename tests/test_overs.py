@@ -16,6 +16,7 @@ from layers import (
     make_shot,
     open_over,
     refine_all,
+    vec3,
     world_metres,
     write_layer,
     write_shot,
@@ -286,3 +287,66 @@ def test_vectors_of_the_coarse_surface_are_blocked_and_names_of_faces_carried(tm
     assert list(api.GetPrimvar("crypto_asset").ComputeFlattened()) == [f"part{face % 3}" for face in groups]
     assert ["tangentu" in str(note) for note in writer.notes] == [True]
     assert errors(out) == []
+
+
+def add_twin(stage: Usd.Stage, arc: str) -> UsdGeom.Mesh:
+    """A mesh that takes all but its points from the coat, by an arc to the coat itself or to the prim above."""
+    path = "/World/other" if arc != "above" else "/World/more"
+    mesh = stage.DefinePrim(path, "Mesh" if arc != "above" else "Xform")
+    if arc == "inherit":
+        mesh.GetInherits().AddInherit(COAT)
+    else:
+        mesh.GetReferences().AddInternalReference(COAT if arc == "reference" else "/World/rig")
+    twin = UsdGeom.Mesh(stage.GetPrimAtPath(path if arc != "above" else f"{path}/coat"))
+    for time in TIMES:
+        twin.GetPointsAttr().Set(vec3(2.0 * grid()[0]), time)
+    stage.Save()
+    return twin
+
+
+@pytest.mark.parametrize(("arc", "mode"), [("reference", "over"), ("inherit", "over"), ("above", "sibling")])
+def test_a_mesh_that_takes_faces_from_the_garment_keeps_its_own_arrays(
+    dressed: Path, tmp_path: Path, arc: str, mode: str
+) -> None:
+    stage = Usd.Stage.Open(str(dressed))
+    path = str(add_twin(stage, arc).GetPath())
+    before = shown(stage, path)
+    writer = write_shot(open_shot(str(dressed), garments=[COAT], level=1), tmp_path / "out.usdc", mode=mode)
+    over = open_over(dressed, tmp_path / "out.usdc")
+    after = shown(over, path)
+    assert [name for name in before if before[name] != after.get(name)] == []
+    assert [str(prim.GetPath()) for prim in over.Traverse() if prim.GetName() == "coat_refined"] == (
+        [] if mode == "over" else [f"{COAT}_refined"]
+    )
+    fine = UsdGeom.Mesh(over.GetPrimAtPath(str(writer.targets[0])))
+    assert len(fine.GetPointsAttr().Get(1.0)) == 63
+    assert any(f"<{path}>: is composed from <{COAT}> and has points of its own" in str(note) for note in writer.notes)
+    assert errors(tmp_path / "out.usdc") == []
+
+
+def shown(stage: Usd.Stage, path: str) -> dict[str, object]:
+    """All values of a mesh and its subsets at the default and at each time code of the coat, without empty ones."""
+    prims = Usd.PrimRange(stage.GetPrimAtPath(path))
+    codes = [Usd.TimeCode.Default(), *map(Usd.TimeCode, TIMES)]
+    found = {str(each.GetPath()): [each.Get(code) for code in codes] for prim in prims for each in prim.GetAttributes()}
+    return {name: values for name, values in found.items() if any(value is not None for value in values)}
+
+
+def test_a_mesh_that_is_all_of_the_garment_is_refined_with_it(dressed: Path, tmp_path: Path) -> None:
+    stage = Usd.Stage.Open(str(dressed))
+    stage.DefinePrim("/World/copy").GetReferences().AddInternalReference(COAT)
+    stage.Save()
+    writer = write_shot(open_shot(str(dressed), garments=[COAT], level=1), tmp_path / "out.usdc")
+    over = open_over(dressed, tmp_path / "out.usdc")
+    copy = UsdGeom.Mesh(over.GetPrimAtPath("/World/copy"))
+    assert len(copy.GetPointsAttr().Get(1.0)) == 63
+    assert not any("/World/copy" in str(note) for note in writer.notes)
+
+
+def test_validate_names_a_mesh_broken_by_the_faces_of_a_refined_one(dressed: Path, tmp_path: Path) -> None:
+    out = write_layer(dressed, tmp_path / "out.usdc")
+    assert errors(out) == []
+    add_twin(Usd.Stage.Open(str(dressed)), "reference")
+    (problem,) = [each for each in validate_layer(out) if each.rule == "other_meshes"]
+    assert problem.path == "/World/other.faceVertexIndices"
+    assert "composed from a refined mesh" in problem.message

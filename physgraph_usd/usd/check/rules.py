@@ -18,7 +18,7 @@ from ..provenance import METADATA, RANGE, mute_refined, read_record
 from ..read.absence import absence
 from ..read.authored import beyond_limits
 from ..read.skinning import skel_root
-from ..stage import at_time, indices_of, paths_in, root_metadata, timecode
+from ..stage import TRAVERSAL, at_time, indices_of, paths_in, root_metadata, timecode
 from ..times import FrameGrid, is_among, motion_of
 from ..view import StageView
 from ..write.attribute_rules import BLOCKED, EMPTIED, action_on, render_values, with_action
@@ -455,6 +455,24 @@ def prim_fault(path: str, composed: Usd.Stage, kinds: Sequence[type] = (UsdGeom.
         return "lies in an instance, where overs are ignored; its instance root must be instanceable = false"
     names = " or ".join(kind.__name__ for kind in kinds)
     return "" if any(kind(prim) for kind in kinds) else f"is of type {prim.GetTypeName() or 'none'}, not {names}"
+
+
+def other_meshes(
+    layer: Sdf.Layer, composed: Usd.Stage, shot: Usd.Stage, *, refined: Sequence[str]
+) -> Iterator[Problem]:
+    """Other meshes with opinions of the layer, by references or inherits, fit themselves as they do in the shot."""
+    for prim in Usd.PrimRange.Stage(composed, TRAVERSAL):
+        path = str(prim.GetPath())
+        if path in refined or not UsdGeom.Mesh(prim) or all(spec.layer != layer for spec in prim.GetPrimStack()):
+            continue
+        samples = prim.GetAttribute("points").GetTimeSamples()
+        times = (samples[0], samples[-1]) if samples else (None,)
+        fine, coarse = (Fine(each, layer, times) for each in (prim, shot.GetPrimAtPath(path)))
+        for time in times:
+            fault = fine.topology_fault(time)
+            if fault and not (coarse.prim and coarse.topology_fault(time)):
+                yield fine.problem("faceVertexIndices", f"is composed from a refined mesh and invalid: {fault}", time)
+                break
 
 
 def against_shot(layer: Sdf.Layer, coarse: Usd.Prim, target: Sdf.Path) -> Iterator[Problem]:

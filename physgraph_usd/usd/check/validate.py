@@ -24,6 +24,7 @@ from .rules import (
     Fine,
     Problem,
     against_shot,
+    other_meshes,
     prim_fault,
     same_metadata,
     same_variants,
@@ -67,7 +68,7 @@ def validate_layer(layer: str | Path | Sdf.Layer, shot: str | Path | Usd.Stage |
             message = f"the shot that its record names is not at {below}; give it with --shot, or bring the layer back"
             problems.append(Problem("error", "/", None, message, "record"))
         elif view is not None and not any(problem.rule == "composition" for problem in problems):
-            problems += _own_validators(opened, view)
+            problems += _on_whole_stage(opened, view)
     return sorted(problems, key=lambda problem: problem.severity != "error")
 
 
@@ -149,8 +150,17 @@ def _coarse_path(layer: Sdf.Layer, path: str) -> str:
     return str(references[0].primPath) if references else path
 
 
-def _own_validators(layer: Sdf.Layer, shot: StageView) -> list[Problem]:
-    """Problems found by USD's validators, as far as available, in the layer but not in its shot."""
+def _on_whole_stage(layer: Sdf.Layer, shot: StageView) -> list[Problem]:
+    """Problems of meshes that are composed from refined ones, and those that USD's validators find."""
+    refined = [*_garments(layer), *(str(path) for path in (read_record(layer) or {}).get("bound") or ())]
+    alone, composed = shot.open(), shot.open(over=[layer])
+    with quiet():
+        problems = [*_named("other_meshes", other_meshes(layer, composed, alone, refined=refined))]
+    return problems + _own_validators(layer, alone, composed)
+
+
+def _own_validators(layer: Sdf.Layer, shot: Usd.Stage, composed: Usd.Stage) -> list[Problem]:
+    """Problems found by USD's validators, as far as available, in the layer over its shot but not in the shot."""
     try:
         from pxr import UsdValidation  # type: ignore[attr-defined] # noqa: PLC0415 - not in every host
     except ImportError:
@@ -158,7 +168,7 @@ def _own_validators(layer: Sdf.Layer, shot: StageView) -> list[Problem]:
     if not hasattr(UsdValidation, "ValidationContext"):
         return []
     # Both stages have an anonymous session layer; `_without_names` drops its name from the messages.
-    (before, after), missing = _findings(UsdValidation, [shot.open(), shot.open(over=[layer])])
+    (before, after), missing = _findings(UsdValidation, [shot, composed])
     fine = {path: _coarse_path(layer, path) for path in _garments(layer)}
     sites = {key[:2] for key in before}
     new = [

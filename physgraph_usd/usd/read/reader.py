@@ -56,6 +56,7 @@ from .find import (
     instance_roots,
     purpose_notices,
     read_apart,
+    traverse,
     with_gravity,
 )
 from .garment import GarmentReader, Request, is_visible, read_garment, samples_of, seam_tolerance, worn_notices
@@ -66,6 +67,9 @@ from .seams import sewn_garments
 from .skinning import Bake
 from .targets import Bound, Target, find_bound, points_attribute, read_targets
 from .timing import timing_notices
+
+_MARK = "physgraph:refined"
+"""Attribute authored for a moment on a garment, to find the prims that it reaches."""
 
 
 class Shot:
@@ -140,6 +144,21 @@ class Shot:
         """Points or positions of a garment or target at the default time in local space, skinned; None without any."""
         baked = self._request.bake.defaults
         return baked[path] if path in baked else points_attribute(self.stage.GetPrimAtPath(path)).Get()
+
+    def composed_from(self, path: Sdf.Path) -> list[Usd.Prim]:
+        """Other meshes that get the opinions at a prim's path, by references, payloads, inherits or specializes."""
+        layer = self._request.bake.layer
+        made = layer.GetPrimAtPath(path) is None
+        spec = Sdf.CreatePrimInLayer(layer, path)
+        mark = Sdf.AttributeSpec(spec, _MARK, Sdf.ValueTypeNames.Bool)
+        meshes = (prim for prim in traverse(self.stage) if prim.GetPath() != path and UsdGeom.Mesh(prim))
+        found = [prim.GetPath() for prim in meshes if prim.HasAttribute(_MARK)]
+        spec.RemoveProperty(mark)
+        if made:
+            edit = Sdf.BatchNamespaceEdit()
+            edit.Add(path, Sdf.Path.emptyPath)
+            layer.Apply(edit)
+        return [self.stage.GetPrimAtPath(each) for each in found]
 
     @cached_property
     def targets(self) -> list[Target]:

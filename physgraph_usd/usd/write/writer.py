@@ -35,6 +35,7 @@ from .primvars import FineMap, carry_primvars, carry_subsets
 from .stream import LayerStream
 from .target_tracks import TargetTracks
 from .track import BoundsAbove, HeatTrack, PointTrack
+from .twins import keep_twins
 
 MODES = ("over", "sibling")
 SCHEMES = ("keep", "none")
@@ -182,6 +183,7 @@ class LayerWriter:
             self.notices += mesh.finish()
         for bound in self._bound.values():
             bound.finish()
+        self._keep_twins()
         facts = _facts(self._shot, self.targets, self._stream.target)
         facts["bound"] = [str(path) for bound in self._bound.values() for path in bound.paths] or None
         if self._times is not None:
@@ -195,6 +197,14 @@ class LayerWriter:
         self._open = False
         self._cleanup.close()
         return path
+
+    def _keep_twins(self) -> None:
+        """Keep meshes that are composed from refined prims, and not refined themselves, as they are in the shot."""
+        followed = [path for bound in self._bound.values() for path in bound.paths]
+        coarse = [self._shot.sources[index].path for index in self._meshes]
+        with pxr_errors(f"cannot read {self._shot.path}"):
+            for path in (*coarse, *followed):
+                self.notes += keep_twins(self._stream, self._shot, path)
 
     def _check_written(self) -> None:
         """Validate the first, middle and last sample."""
