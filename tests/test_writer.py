@@ -390,3 +390,22 @@ def test_corners_given_twice_leave_no_faces_without_area(tmp_path: Path, level: 
     for name in ("points", "faceVertexCounts", "faceVertexIndices", "primvars:st"):
         found, expected = (np.asarray(each.GetPrimAtPath(COAT).GetAttribute(name).Get(1.0)) for each in stages)
         np.testing.assert_array_equal(found, expected)
+
+
+@pytest.mark.parametrize("value", [8e5, float("nan")])
+def test_a_point_in_no_face_does_not_count(tmp_path: Path, value: float) -> None:
+    path = tmp_path / "shot.usda"
+    stage = make_shot(path)
+    attribute = UsdGeom.Mesh(stage.GetPrimAtPath(COAT)).GetPointsAttr()
+    plain = open_shot(str(path), level=1)
+    for code in (Usd.TimeCode.Default(), *map(Usd.TimeCode, TIMES)):
+        attribute.Set(vec3(np.concatenate([attribute.Get(code), [[value] * 3] * 2])), code)
+    stage.Save()
+    shot = open_shot(str(path), level=1)
+    assert [*map(str, shot.warnings)] == [*map(str, plain.warnings)]
+    writer = write_shot(shot, tmp_path / "out.usdc")
+    assert shot.warnings == plain.warnings
+    over = open_over(path, tmp_path / "out.usdc")
+    fine = UsdGeom.Mesh(over.GetPrimAtPath(str(writer.targets[0])))
+    assert np.abs(fine.GetExtentAttr().Get(1.0)).max() < 10.0
+    assert errors(tmp_path / "out.usdc") == []

@@ -18,7 +18,7 @@ from ..provenance import METADATA, RANGE, mute_refined, read_record
 from ..read.absence import absence
 from ..read.authored import beyond_limits
 from ..read.skinning import skel_root
-from ..stage import TRAVERSAL, at_time, indices_of, paths_in, root_metadata, timecode
+from ..stage import TRAVERSAL, at_time, authored_topology, indices_of, paths_in, root_metadata, timecode
 from ..times import FrameGrid, is_among, motion_of
 from ..view import StageView
 from ..write.attribute_rules import BLOCKED, EMPTIED, action_on, render_values, with_action
@@ -500,7 +500,9 @@ def against_shot(layer: Sdf.Layer, coarse: Usd.Prim, target: Sdf.Path) -> Iterat
         if value is not None and below is not None and len(value) and len(below):
             to_world = np.array(UsdGeom.XformCache(timecode(time)).GetLocalToWorldTransform(coarse))
             with np.errstate(invalid="ignore", over="ignore"):
-                fine, cage = (np.asarray(each, np.float64) @ to_world[:3, :3] for each in (value, below))
+                used = np.unique(authored_topology(coarse)[1])
+                cage = np.asarray(below, np.float64)[used[(used >= 0) & (used < len(below))]]
+                fine, cage = (np.asarray(each, np.float64) @ to_world[:3, :3] for each in (value, cage))
             clouds.append((fine, cage, time))
     yield from _compare(clouds, name)
 

@@ -187,6 +187,7 @@ class PointReader:
             message = f"the number of points changes from {self.count} to {len(points)}"
             remedy = "export the garment with one topology, or use --frames for the part where it is the same"
             raise GarmentError(self.path, message, time=time, remedy=remedy)
+        points = gather_unused(points, edges)
         finite = np.isfinite(points)
         if finite.all():
             return points, ()
@@ -222,6 +223,15 @@ class PointReader:
             if len(points) == self.count and np.isfinite(points).all():
                 return points
         return None
+
+
+def gather_unused(points: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """Positions with the points that are in no face at a point of a face, shape (V, 3): only faces are cloth."""
+    used = np.zeros(len(points), bool)
+    used[edges.ravel()] = True
+    if used.all() or not used.any():
+        return points
+    return np.where(used[:, None], points, points[used.argmax()])
 
 
 def as_points(value: object, path: str, name: str, *, time: float | None = None) -> np.ndarray:

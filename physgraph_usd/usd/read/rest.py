@@ -30,7 +30,7 @@ from ...solver.scene import out_of_bounds
 from ...solver.strain import COLLAPSED
 from ..lookup import nearest, source_name
 from ..stage import Notice, first_value, flattened
-from .cage import as_points, repair
+from .cage import as_points, gather_unused, repair
 
 AUTO = "auto"
 """Value of ``--rest`` to request the fitted rest shape even if a shape is authored."""
@@ -154,6 +154,7 @@ def _lengths_of(prim: Usd.Prim, weld: Weld, pose: np.ndarray) -> np.ndarray:
 
 def _from_default(prim: Usd.Prim, edges: np.ndarray, points: np.ndarray, *, first: np.ndarray) -> Rest:
     """Rest shape of the points' default value [m], repaired from the first sample."""
+    points = gather_unused(points, edges)
     if np.isfinite(points).all():
         return Rest(points, "default points")
     message = "the default points have NaN or infinite values, repaired for the rest shape"
@@ -179,7 +180,7 @@ def _checked(prim: Usd.Prim, edges: np.ndarray, rest: Rest, *, first: np.ndarray
     Raises:
         GarmentError: When all points coincide, or a point is out of bounds.
     """
-    path = str(prim.GetPath())
+    path, rest = str(prim.GetPath()), replace(rest, points=gather_unused(rest.points, edges))
     if message := out_of_bounds(rest.points):
         raise GarmentError(path, f"the rest shape's ({rest.source}) {message}", remedy="check units and transforms")
     edges = edges[edges[:, 0] != edges[:, 1]]
