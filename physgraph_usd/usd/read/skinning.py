@@ -123,8 +123,8 @@ class Bake:
             with quiet() as diagnostics:
                 every = merge(times, skinned.motion.times) or (None,)
                 poses = {time: self._local(skinned, time) for time in every}
-                default = self._local(skinned, None)
                 texts = [each.commentary for each in diagnostics.TakeUncoalescedDiagnostics()]
+                default = self._local(skinned, None)
             self.defaults[skinned.path] = None if isinstance(default, Sdf.ValueBlock) else default
             notices += _diagnosed(skinned, texts)
             with Usd.EditContext(self._stage, self.layer):
