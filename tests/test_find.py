@@ -11,6 +11,7 @@ from stages import COLLIDER_API, add_sheet, author, new_stage, save, set_matrix
 
 from physgraph_usd.errors import StageError
 from physgraph_usd.usd.read.find import find_colliders, find_garments
+from physgraph_usd.usd.read.reader import open_shot
 from physgraph_usd.usd.read.survey import survey
 
 
@@ -145,3 +146,18 @@ def test_a_level_of_detail_that_is_not_shown_is_no_garment_and_no_body(tmp_path:
     for wanted in ([], ["/World/body"]):
         assert paths(find_colliders(stage, garments, wanted)) == ["/World/body/low/shape"]
     assert paths(find_garments(stage, ["/World/coat/high/shape"])) == ["/World/coat/high/shape"]
+
+
+def test_faces_that_are_counted_elsewhere_are_named(tmp_path: Path) -> None:
+    """The refined mesh has other faces; vertices of the cage keep their numbers."""
+    stage = new_stage(tmp_path / "s.usda")
+    add_sheet(stage, "/World/coat")
+    add_sheet(stage, "/World/body", tagged=False)
+    attachment = stage.DefinePrim("/World/attachment", "PhysicsVtxTriAttachment")
+    for number, target in enumerate(("/World/body", "/World/coat")):
+        attachment.CreateRelationship(f"physics:src{number}").SetTargets([target])
+        author(attachment, f"physics:triIndicesSrc{number}", [0, 1], kind="int[]")
+        author(attachment, f"physics:vtxIndicesSrc{number}", [0, 1], kind="int[]")
+    notices = [str(each) for each in open_shot(save(stage), level=1).warnings]
+    assert [each.partition(" ")[0] for each in notices] == ["</World/attachment>:"]
+    assert "triIndicesSrc1 counts faces of </World/coat>" in notices[0]

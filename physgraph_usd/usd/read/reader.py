@@ -47,6 +47,7 @@ from ..times import FrameGrid, Motion, merge, none_within, snap, solve_times, wi
 from ..view import StageView
 from .authored import authored_faults
 from .bodies import ColliderReader, Polygons, read_collider
+from .face_numbers import face_number_notices
 from .find import (
     colliders_of,
     disabled_colliders,
@@ -326,6 +327,7 @@ def open_shot(
         opened = Shot(path, stage, view, request=request, readers=readers, bodies=_with_sides(stage, readers, solids))
         opened.bound = tuple(bound)
         notices += _timing(stage, readers, solids, bake=request.bake)
+        notices += face_number_notices(stage, [reader.source.path for reader in readers])
         read = [*(source.path for source in opened.sources), *moved, *request.bake.prims()]
         opened.selections = selections(map(stage.GetPrimAtPath, read))
     opened.unsaved, opened.colliders = unsaved, tuple(map(str, bodies))

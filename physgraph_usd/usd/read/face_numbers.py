@@ -1,0 +1,37 @@
+"""Finds prims that count a garment's faces: attachments and collision filters of the deformable body schemas."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from pxr import Sdf, Usd
+
+from ..stage import TRAVERSAL, Notice
+
+_COUNTED = ("triIndices", "faceIndices", "groupElemIndices")
+"""Beginnings of names, without their namespace, of integer attributes that count faces; the rest names the source."""
+
+
+def face_number_notices(stage: Usd.Stage, garments: Sequence[Sdf.Path]) -> list[Notice]:
+    """A notice for each attribute that counts faces of a garment, whose refined mesh has others in their place."""
+    return [
+        Notice(
+            str(attribute.GetPrim().GetPath()),
+            None,
+            f"{attribute.GetName()} counts faces of <{path}>, and the refined mesh has others: author it again for "
+            "the refined mesh, or name vertices instead (the cage's keep their numbers)",
+        )
+        for prim in Usd.PrimRange(stage.GetPseudoRoot(), TRAVERSAL)
+        for attribute, targets in _counting(prim)
+        for path in garments
+        if path in targets
+    ]
+
+
+def _counting(prim: Usd.Prim) -> Iterator[tuple[Usd.Attribute, list[Sdf.Path]]]:
+    """A prim's attributes that count faces, each with the targets of the relationship ``src`` of its number."""
+    for attribute in prim.GetAuthoredAttributes():
+        name = attribute.GetBaseName()
+        if name.startswith(_COUNTED):
+            source = prim.GetRelationship(attribute.GetName().removesuffix(name) + f"src{name[-1]}")
+            yield attribute, source.GetForwardedTargets() if source else []
