@@ -14,7 +14,7 @@ from physgraph_usd.errors import UsageError
 from physgraph_usd.shot.refine import inspect_shot
 from physgraph_usd.usd.check.rules import Problem
 from physgraph_usd.usd.check.validate import validate_layer
-from physgraph_usd.usd.provenance import file_hashes, mute_refined, read_record, refined_layers, write_root
+from physgraph_usd.usd.provenance import asset_path, file_hashes, mute_refined, read_record, refined_layers, write_root
 from physgraph_usd.usd.read.reader import open_shot
 from physgraph_usd.usd.view import root_over
 
@@ -177,3 +177,15 @@ def test_variants_of_bodies_count_too(shot: Path, tmp_path: Path) -> None:
     stage.Save()
     out = write_layer(shot, tmp_path / "out.usdc")
     assert [p.path for p in told(out, selecting(shot, "/World/ball", "size", "large"))] == ["/World/ball"]
+
+
+def test_paths_from_a_linked_folder_lead_to_the_file_by_the_links_name_too(tmp_path: Path) -> None:
+    shot, real, link = tmp_path / "show" / "shot.usda", tmp_path / "disk" / "publish" / "v1", tmp_path / "show" / "link"
+    real.mkdir(parents=True)
+    shot.parent.mkdir()
+    shot.touch()
+    link.symlink_to(real)
+    (real / "cloth.usdc").touch()
+    assert asset_path(shot, shot.parent) == "./shot.usda"
+    assert asset_path(link / "cloth.usdc", link) == "./cloth.usdc"
+    assert asset_path(shot, link) == shot.resolve().as_posix()

@@ -232,17 +232,6 @@ def test_cloth_that_is_held_outside_the_frames_has_no_velocity(tmp_path: Path, p
     assert errors(out) == []
 
 
-def test_cloth_that_is_held_after_its_last_sample_has_no_velocity(tmp_path: Path) -> None:
-    path, out = tmp_path / "shot.usda", tmp_path / "out.usdc"
-    stage = make_shot(path, times=(2.0, 3.0, 4.0))
-    stage.SetStartTimeCode(1.0)
-    stage.SetEndTimeCode(8.0)
-    stage.Save()
-    write_layer(path, out, velocities=True)
-    assert speeds(open_over(path, out), range(1, 9)) == pytest.approx([0.0] + [7.5] * 3 + [0.0] * 4)
-    assert errors(out) == []
-
-
 def test_velocities_where_motion_begins_and_ends_are_those_of_the_motion(tmp_path: Path) -> None:
     path, out = tmp_path / "shot.usda", tmp_path / "out.usdc"
     stage = make_shot(path, times=range(1, 9))

@@ -205,13 +205,18 @@ def file_hashes(stage: Usd.Stage, folder: Path | None, *, absolute: bool = False
 
 
 def asset_path(path: str | Path, folder: Path | None, *, absolute: bool = False) -> str:
-    """A path relative to a folder, in USD notation; absolute on request or if no relative path exists."""
+    """A path relative to a folder, in USD notation; absolute on request or if no relative path exists.
+
+    In a linked folder a path that leaves it is absolute: USD follows ``..`` from the folder's name, not from its place.
+    """
     full = Path(path).resolve()
     if absolute or folder is None:
         return full.as_posix()
     try:
         relative = Path(os.path.relpath(full, folder.resolve())).as_posix()
     except ValueError:
+        return full.as_posix()
+    if Path(os.path.normpath(folder.absolute() / relative)).resolve() != full:
         return full.as_posix()
     return relative if relative.startswith(".") else f"./{relative}"
 

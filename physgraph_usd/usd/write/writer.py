@@ -26,7 +26,7 @@ from ..mesh.shell import Shell
 from ..read.absence import named_times
 from ..read.reader import Shot
 from ..stage import GarmentSource, Notice, at_time, authored_topology, pxr_errors, value_at
-from ..times import FrameGrid, within
+from ..times import within
 from . import overs
 from .attribute_rules import notes_of
 from .normals import VertexNormals
@@ -117,10 +117,9 @@ class LayerWriter:
                 self.notes += mesh.notes
 
     def _when(self, source: GarmentSource) -> dict[str, Any]:
-        """Time codes at which a garment is blocked, and time codes beside those written, by argument."""
+        """Time codes at which a garment is blocked, and those outside the layer's range, by argument."""
         span = None if self._times is None else (self._times[0], self._times[-1])
         outside = {*source.times, *source.left_out}.difference(within(source.times, span))
-        outside |= _frames_beside(self._shot.stage, source)
         return {"absent": within(source.absent, span), "outside": sorted(outside)}
 
     def write(
@@ -367,15 +366,6 @@ def _garments_in(shot: Shot, times: Sequence[float] | None) -> list[int]:
         return [*every]
     first = shot.scene.times[0]
     return [index for index in every if not {*(shot.sources[index].times or (first,))}.isdisjoint(times)]
-
-
-def _frames_beside(stage: Usd.Stage, source: GarmentSource) -> set[float]:
-    """The whole frames of a stage right before the first and after the last of a garment's samples, if any."""
-    if not source.times or not stage.HasAuthoredTimeCodeRange():
-        return set()
-    every, grid = sorted({*source.times, *source.left_out, *source.absent}), FrameGrid.of(stage)
-    before = grid.inside(stage.GetStartTimeCode() - grid.length, every[0])
-    return {*before[-1:], *grid.inside(every[-1], stage.GetEndTimeCode() + grid.length)[:1]}
 
 
 def _own_velocities(prim: Usd.Prim, fine: FineMap, time: float | None) -> np.ndarray | None:
