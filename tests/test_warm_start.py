@@ -148,9 +148,9 @@ def turned_about_y(angle: float) -> np.ndarray:
 
 
 def test_frames_in_a_row_come_nearer_to_rest_with_the_curvature_of_the_last():
-    """A sheet squeezed in seven frames of twelve steps; the energy above that of many steps, with and without."""
+    """A squeezed sheet in four frames of eight steps; the energy above that of many steps, with and without."""
     mesh, rest = sheet(12, 12)
-    squeezed = [rest * [scale, 1.0, 1.0] + wave(rest) - rest for scale in np.linspace(0.97, 0.88, 7)]
+    squeezed = [rest * [scale, 1.0, 1.0] + wave(rest) - rest for scale in (0.97, 0.94, 0.91, 0.88)]
 
     def energy(steps: int, *, forget: bool) -> float:
         group = group_of(mesh, rest, level=2, dtype=torch.float32, steps=steps, integrator="physgraph")
@@ -164,7 +164,7 @@ def test_frames_in_a_row_come_nearer_to_rest_with_the_curvature_of_the_last():
         return sum(solved.telemetry["energy_joules"]["output"].values())
 
     least = energy(300, forget=False)
-    assert energy(12, forget=False) - least < 0.9 * (energy(12, forget=True) - least)
+    assert energy(8, forget=False) - least < 0.9 * (energy(8, forget=True) - least)
 
 
 @pytest.mark.slow
