@@ -6,25 +6,25 @@ from collections.abc import Iterator, Sequence
 
 from pxr import Sdf, Usd
 
-from ..stage import TRAVERSAL, Notice
+from ..stage import TRAVERSAL, GarmentSource, Notice
 
 _COUNTED = ("triIndices", "faceIndices", "groupElemIndices")
 """Beginnings of names, without their namespace, of integer attributes that count faces; the rest names the source."""
 
 
-def face_number_notices(stage: Usd.Stage, garments: Sequence[Sdf.Path]) -> list[Notice]:
+def face_number_notices(stage: Usd.Stage, garments: Sequence[GarmentSource]) -> list[Notice]:
     """A notice for each attribute that counts faces of a garment, whose refined mesh has others in their place."""
     return [
         Notice(
             str(attribute.GetPrim().GetPath()),
             None,
-            f"{attribute.GetName()} counts faces of <{path}>, and the refined mesh has others: author it again for "
-            "the refined mesh, or name vertices instead (the cage's keep their numbers)",
+            f"{attribute.GetName()} counts faces of <{garment.path}>, and the refined mesh has others: author it again "
+            "for the refined mesh, or name vertices instead (the cage's keep their numbers)",
         )
         for prim in Usd.PrimRange(stage.GetPseudoRoot(), TRAVERSAL)
         for attribute, targets in _counting(prim)
-        for path in garments
-        if path in targets
+        for garment in garments
+        if garment.path in targets
     ]
 
 
