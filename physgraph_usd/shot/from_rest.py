@@ -43,7 +43,7 @@ class FromRest:
         self._ended[id(problem.level)] = problem, x
 
     def measure(self) -> None:
-        """Solve the noted levels on to their rest, and forget them."""
+        """Continue the solve of the noted levels to rest, record the angles, and drop the levels."""
         ended, self._ended = self._ended, {}
         self._frames += 1
         with ends_after(SECONDS):

@@ -104,7 +104,7 @@ def indices_of(primvar: UsdGeom.Primvar, code: Usd.TimeCode) -> np.ndarray | Non
 
 
 def flattened(primvar: UsdGeom.Primvar, code: Usd.TimeCode) -> Any:
-    """Values of a primvar with its indices applied, as ``ComputeFlattened`` gives them; None where they do not fit."""
+    """Values of a primvar with its indices applied, of any integer type; None for bad indices."""
     indices = indices_of(primvar, code)
     if indices is None or indices.dtype == np.int32:
         return None if indices is None and primvar.IsIndexed() else primvar.ComputeFlattened(code)

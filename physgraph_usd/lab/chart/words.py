@@ -11,7 +11,7 @@ from .measure import DEFAULT, SMOOTH, UPSAMPLED
 from .table import TOLERANCE, Chart, Point
 
 FAR = 1e4
-"""Distance beyond which cloth that nothing holds has fallen away [mm]."""
+"""Distance to the reference from which unsupported cloth counts as fallen away [mm]."""
 PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7a5195", "#8c6d31")
 """Okabe and Ito's colours, which colour-blind readers tell apart, and two more."""
 OUTSIDE = ("#e6007e", "#7fa800", "#5a2d0c")

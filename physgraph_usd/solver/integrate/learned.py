@@ -184,7 +184,7 @@ def _of(image: Tensor | None) -> Tensor:
 
 
 def _spans(system: System) -> tuple[tuple[int, int], ...]:
-    """First vertex of each garment, and the one after its last."""
+    """Range of the vertices of each garment: start, and end (exclusive)."""
     if system.level is None:
         return ((0, len(system.spacing)),)
     return tuple((span.start, span.stop) for span in system.level.spans)

@@ -22,8 +22,8 @@ higher, layers by 5% and the overcoat by 10% (three ripples each); 12 are equal.
 HURRIED = 2
 """Most steps of a first round that somebody waits for."""
 TOUCHING = 1.5
-"""Most steps of the finest level with contact, relative to the budget's: blocked moves cost steps. With 2 frames of the
-tshirt, which its body crosses in the cage, take 1.6 times as long and cross as often."""
+"""Most steps of the finest level with contact, relative to the budget's: blocked moves cost steps. With 2, frames of
+the tshirt, which its body crosses in the cage, took 1.6 times as long and crossed as often."""
 REST = 2.0
 """Remaining move [tolerances] below which a warm frame makes no step."""
 LEAST_MISSING = 0.01

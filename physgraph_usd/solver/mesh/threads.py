@@ -188,7 +188,7 @@ def _tapered(size: int, slices: int) -> list[int]:
 
 
 def _run(commands: Iterable[_Call]) -> float:
-    """Run launches one after another, and return the wall time [s]."""
+    """Run launches in sequence, and return the wall time [s]."""
     began = time.perf_counter()
     for command in commands:
         command.launch()

@@ -112,9 +112,10 @@ class Weld:
 
     @property
     def torn(self) -> Bool[np.ndarray, " vertices"]:
-        """Vertices of ``apart`` with welded copies that subdivision would move elsewhere, for their open edges differ.
+        """Mask of the vertices of ``apart`` whose welded copies subdivision would move differently.
 
-        Three panels meet at such a vertex, or the border of one panel has a corner there and that of another has none.
+        Open edges of the copies differ: three panels meet at the vertex, or one panel's border has a corner there and
+        the other's has none.
         """
         count = len(self.number)
         if self.is_none or self.across is not None:

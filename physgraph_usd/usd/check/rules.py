@@ -486,12 +486,10 @@ def against_shot(layer: Sdf.Layer, coarse: Usd.Prim, target: Sdf.Path) -> Iterat
     if skel_root(coarse) is not None:  # The points of a skinned mesh are a bind pose.
         return
     authored, frames = motion_of(coarse).times, FrameGrid.of(coarse.GetStage())
-    first, *_, last = authored if len(authored) > 1 else (-np.inf, np.inf)  # Else the bodies' samples count.
     for time in written:
-        near = np.isinf(last) or (first - frames.length <= time <= last + frames.length and frames.has(time))
-        if not (near or is_among(time, authored)):
-            message = "is a sample neither at a time that the shot authors nor at a whole frame between or beside"
-            yield _error(message, name, time)
+        between = len(authored) > 1 and authored[0] < time < authored[-1] and frames.has(time)
+        if len(authored) > 1 and not (between or is_among(time, authored)):  # Else the bodies' samples count.
+            yield _error("is a sample neither at a time that the shot authors nor at a whole frame between", name, time)
             break
     spec, clouds = layer.GetAttributeAtPath(name), []
     for time in written[:1] + written[-1:] if written else [None]:

@@ -151,7 +151,7 @@ def _coarse_path(layer: Sdf.Layer, path: str) -> str:
 
 
 def _on_whole_stage(layer: Sdf.Layer, shot: StageView) -> list[Problem]:
-    """Problems of meshes that are composed from refined ones, and those that USD's validators find."""
+    """Problems of the composed stage: of meshes that reference or inherit refined meshes, and by USD's validators."""
     refined = [*_garments(layer), *(str(path) for path in (read_record(layer) or {}).get("bound") or ())]
     alone, composed = shot.open(), shot.open(over=[layer])
     with quiet():

@@ -6,25 +6,27 @@ from collections.abc import Iterator, Sequence
 
 from pxr import Sdf, Usd
 
-from ..stage import TRAVERSAL, GarmentSource, Notice
+from ..stage import TRAVERSAL, Notice
+from .garment import GarmentReader
 
 _COUNTED = ("triIndices", "faceIndices", "groupElemIndices")
 """Beginnings of names, without their namespace, of integer attributes that count faces; the rest names the source."""
 
 
-def face_number_notices(stage: Usd.Stage, garments: Sequence[GarmentSource]) -> list[Notice]:
-    """A notice for each attribute that counts faces of a garment, whose refined mesh has others in their place."""
+def face_number_notices(stage: Usd.Stage, readers: Sequence[GarmentReader]) -> list[Notice]:
+    """A notice for each attribute that counts faces of a subdivided garment: the refined mesh numbers faces anew."""
+    garments = [reader.source.path for reader in readers if reader.garment.level]
     return [
         Notice(
             str(attribute.GetPrim().GetPath()),
             None,
-            f"{attribute.GetName()} counts faces of <{garment.path}>, and the refined mesh has others: author it again "
+            f"{attribute.GetName()} counts faces of <{garment}>, and the refined mesh has others: author it again "
             "for the refined mesh, or name vertices instead (the cage's keep their numbers)",
         )
         for prim in Usd.PrimRange(stage.GetPseudoRoot(), TRAVERSAL)
         for attribute, targets in _counting(prim)
         for garment in garments
-        if garment.path in targets
+        if garment in targets
     ]
 
 

@@ -326,7 +326,7 @@ def open_shot(
         readers, solids = _link(stage, readers, bodies, **given)
         opened = Shot(path, stage, view, request=request, readers=readers, bodies=_with_sides(stage, readers, solids))
         opened.bound = tuple(bound)
-        notices += [*_timing(stage, readers, solids, bake=request.bake), *face_number_notices(stage, opened.sources)]
+        notices += [*_timing(stage, readers, solids, bake=request.bake), *face_number_notices(stage, readers)]
         read = [*(source.path for source in opened.sources), *moved, *request.bake.prims()]
         opened.selections = selections(map(stage.GetPrimAtPath, read))
     opened.unsaved, opened.colliders = unsaved, tuple(map(str, bodies))

@@ -271,7 +271,7 @@ def _diagnosed(skinned: Skinned, texts: Iterable[str]) -> list[Notice]:
 
 
 def _ignored_animation(stage: Usd.Stage, skinned: Skinned) -> list[Notice]:
-    """A notice of an animation that UsdSkel ignores, because the prim that names it has no SkelBindingAPI."""
+    """A notice of an animation ignored by UsdSkel: a prim without SkelBindingAPI authors skel:animationSource."""
     binder = _binder(stage.GetPrimAtPath(skinned.skeleton), _ANIMATION, applied=False)
     if binder is None or binder.HasAPI(_API):
         return []

@@ -1,7 +1,7 @@
-"""Keeps meshes that are composed from a refined one and have arrays of their own as the shot has them.
+"""Keeps meshes that reference or inherit a garment, but author some arrays themselves, as the shot has them.
 
-A mesh that references or inherits a garment gets the garment's fine faces with it. With points of its own it would be
-broken, so the layer authors on it all that it took from the garment, with the shot's values.
+Such a mesh gets the garment's fine faces, which do not fit its points. The layer therefore authors the shot's value of
+every attribute that the mesh takes from the garment.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def keep_twins(stream: LayerStream, shot: Shot, path: Sdf.Path) -> list[Notice]:
 
 
 def _is_taken(attribute: Usd.Attribute, source: Usd.Attribute) -> bool:
-    """Whether an attribute has no opinions, or its strongest opinion is one of another attribute's."""
+    """Whether an attribute is unauthored, or its strongest opinion is an opinion of the source attribute."""
     stack, taken = attribute.GetPropertyStack(), source.GetPropertyStack()
     return not stack or stack[0] in taken
 

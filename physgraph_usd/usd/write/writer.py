@@ -104,23 +104,27 @@ class LayerWriter:
         span = (times[0], times[-1]) if times else None
         whole = self._times is None and not any(source.left_out for source in self._shot.sources)
         provenance.copy_stage_metadata(self._shot.stage, self._stream.layer, span=span, whole=whole)
-        options = {"sibling": self._mode == "sibling", "velocities": self._velocities, "keep": self._keep_scheme}
+        stream, shot = self._stream, self._shot
+        options, velocities = {"sibling": self._mode == "sibling", "keep": self._keep_scheme}, self._velocities
         with pxr_errors(f"cannot read {self._shot.path}"):
             for index in _garments_in(self._shot, self._times):
-                when = self._when(self._shot.sources[index])
-                mesh = _RefinedMesh(self._stream, self._shot, index, steps=refinements[index], **options, **when)
+                steps, (absent, outside) = refinements[index], self._absent_and_outside(self._shot.sources[index])
+                mesh = _RefinedMesh(
+                    stream, shot, index, steps=steps, absent=absent, outside=outside, velocities=velocities, **options
+                )
+                bound = TargetTracks(
+                    stream, shot, index, steps=steps, absent=absent, outside=outside, velocities=velocities
+                )
                 self._meshes[index] = mesh
-                when["velocities"] = self._velocities
-                bound = TargetTracks(self._stream, self._shot, index, steps=refinements[index], **when)
                 self._bound[index] = bound
                 self.notices += [*mesh.notices, *bound.notices]
                 self.notes += mesh.notes
 
-    def _when(self, source: GarmentSource) -> dict[str, Any]:
-        """Time codes at which a garment is blocked, and those outside the layer's range, by argument."""
+    def _absent_and_outside(self, source: GarmentSource) -> tuple[Sequence[float], Sequence[float]]:
+        """Time codes at which a garment is blocked, and those outside the layer's range, ascending."""
         span = None if self._times is None else (self._times[0], self._times[-1])
         outside = {*source.times, *source.left_out}.difference(within(source.times, span))
-        return {"absent": within(source.absent, span), "outside": sorted(outside)}
+        return within(source.absent, span), sorted(outside)
 
     def write(
         self,
@@ -289,9 +293,10 @@ class _RefinedMesh:
             normals = VertexNormals(fine.fine, left_handed=left, welded=np.concatenate([sides, sides + len(sides)]))
         rate = shot.stage.GetTimeCodesPerSecond() if velocities or source.velocities else None
         self.notices += overs.speed_notices(prim, written=rate is not None)
-        moves = {"rate": rate, "own": partial(_own_velocities, prim, fine), "absent": absent}
-        moves["outside"] = outside
-        self._track = PointTrack(stream, target, normals if polygonal else None, rest=rest, still=source.still, **moves)
+        own, drawn = partial(_own_velocities, prim, fine), normals if polygonal else None
+        self._track = PointTrack(
+            stream, target, drawn, rest=rest, still=source.still, rate=rate, own=own, absent=absent, outside=outside
+        )
         self._heat = HeatTrack(stream, target, self._weld.mesh.vertex_count, still=source.still)
         purpose = "render" if sibling else UsdGeom.Imageable(prim).ComputePurpose()
         self._bounds = BoundsAbove(stream, shot.stage, source.path, purpose=purpose)
