@@ -49,6 +49,20 @@ def test_real_shots(real_data: Path, tmp_path: Path, name: str):
     assert len(check(report)) >= 2
 
 
+@pytest.mark.real_data
+@pytest.mark.slow
+def test_knees_that_come_up_through_a_kilt_end_under_it(real_data: Path, tmp_path: Path):
+    """The way out of a body changes every few steps: with one long first round edges stay in the knees."""
+    garments, colliders, _ = SHOTS["09_cesiumman_kilt/shot.usda"]
+    shot, frames = real_data / "shots/09_cesiumman_kilt/shot.usda", (31, 38)
+    report = refine(
+        shot, tmp_path / "fine.usdc", level=2, steps=24, frames=frames, garments=garments, colliders=colliders
+    )
+    measured = check(report)
+    assert all(body["before"]["crossings"] > 100 for body in measured)
+    assert [body["after"]["crossings"] for body in measured] == [0] * 8
+
+
 def test_why_contact_is_left_out_is_told(sample: Callable[[str], Path], tmp_path: Path):
     shot = cloth_shot(tmp_path / "sheet.usda")
     assert refine(shot, tmp_path / "a.usdc").left_out["contact"] == "no collider is tagged or named"

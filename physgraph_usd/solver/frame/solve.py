@@ -124,7 +124,7 @@ def solve_one_level(
         shrunk = HELD_TOLERANCE if isinstance(system.metric, HeldMetric) else 1.0
         in_bodies = sum(view.look(x).in_bodies)
         of_round = budget.for_round(
-            made=made, touching=bool(terms), crosses=in_bodies > 0, blocked=blocked, shrunk=shrunk
+            made=made, touching=bool(terms), in_bodies=in_bodies > 0, blocked=blocked, shrunk=shrunk
         )
         carry, report = descend(system, integrator, x, level=level.index, budget=of_round, resume=resume)
         report.remaining_move = _smooth_move(system, carry, report)
@@ -136,8 +136,8 @@ def solve_one_level(
         if problem.show is not None:
             problem.show(x)
         missing = _missing(begun, x, wanted) if blocked else 0.0
-        leaves = sum(view.look(x).in_bodies) < in_bodies
-        if budget.ends(report, made=made, touched=touched, leaves=leaves, missing=missing):
+        emerging = sum(view.look(x).in_bodies) < in_bodies
+        if budget.ends(report, made=made, touched=touched, emerging=emerging, missing=missing):
             memory = _curvature(integrator, carry)
             break
         if carry.setbacks >= PATIENCE:

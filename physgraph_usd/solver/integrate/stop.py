@@ -21,9 +21,9 @@ near pairs are found again after a round. With 16 for 8, beside 4 for all, two o
 higher, layers by 5% and the overcoat by 10% (three ripples each); 12 are equal. With 8 the overcoat ends 6% higher."""
 HURRIED = 2
 """Most steps of a first round that somebody waits for."""
-TOUCHING = 1.5
-"""Most steps of the finest level with contact, relative to the budget's: blocked moves cost steps. With 2, frames of
-the tshirt, which its body crosses in the cage, took 1.6 times as long and crossed as often."""
+TOUCHING = 2
+"""Most steps of the finest level with contact, relative to the budget's: blocked moves cost steps. With 1, 1.5 and 3
+warm frames of 09, tshirt, layers and overcoat take as long and cross about as often; with 1 first frames end higher."""
 REST = 2.0
 """Remaining move [tolerances] below which a warm frame makes no step."""
 LEAST_MISSING = 0.01
@@ -73,20 +73,20 @@ class Budget:
     warm: bool = False
     hurried: bool = False
 
-    def for_round(self, *, made: int, touching: bool, crosses: bool, blocked: bool, shrunk: float) -> Budget:
+    def for_round(self, *, made: int, touching: bool, in_bodies: bool, blocked: bool, shrunk: float) -> Budget:
         """The budget of a round.
 
         Args:
             made: Steps of all rounds before.
             touching: Whether there is contact.
-            crosses: Whether cloth is in or through a body: each round sees more of the way out.
+            in_bodies: Whether cloth is inside or through a body: the way out changes every few steps.
             blocked: Whether the last round's move was blocked.
             shrunk: Factor of the tolerance: a metric with contact underestimates moves.
         """
         first, left = not made, max(self.steps, self.touching) - made
         longest = ROUND if blocked or first else CLEAR_ROUND
         longest = HURRIED if self.hurried and first else min(longest, left) if touching else FREE_ROUND
-        longest = self.steps if first and self.warm and not (self.hurried or crosses) else longest
+        longest = self.steps if first and self.warm and not (self.hurried or in_bodies) else longest
         once = {} if first else {"rest": 1.0, "least": 0}
         return replace(self, steps=min(longest, self.steps), tolerance=shrunk * self.tolerance, **once)
 
@@ -107,19 +107,19 @@ class Budget:
             return "steps"
         return "budget" if self.is_spent(steps) else ""
 
-    def ends(self, report: Ended, *, made: int, touched: bool, leaves: bool, missing: float) -> bool:
+    def ends(self, report: Ended, *, made: int, touched: bool, emerging: bool, missing: float) -> bool:
         """Whether no further round of the level follows.
 
         Args:
             report: Report of the last round.
             made: Steps of all rounds.
             touched: Whether any round had contact.
-            leaves: Whether less cloth is in or through a body than before the last round.
+            emerging: Whether less cloth is inside or through a body than before the last round.
             missing: Part of the last round's moves that was blocked.
         """
         if report.stopped == "budget" or not report.steps or (report.stopped == "tolerance" and not missing):
             return True
-        if self.warm and not leaves and missing <= LEAST_MISSING and (report.stopped == "seen" or made >= self.steps):
+        if self.warm and not emerging and missing <= LEAST_MISSING and (report.stopped == "seen" or made >= self.steps):
             return True
         return made >= (max(self.steps, self.touching) if touched and not self.hurried else self.steps)
 
@@ -153,5 +153,5 @@ def level_budget(
     deadline = None if seconds is None else clock + seconds * COARSE_TIME ** min(below, 2)
     if below:
         return Budget(COARSE_STEPS * steps, COARSE_TOLERANCE * tolerance, deadline, cancelled=cancelled)
-    finest = Budget(steps, tolerance, deadline, cancelled=cancelled, least=1, touching=round(TOUCHING * steps))
+    finest = Budget(steps, tolerance, deadline, cancelled=cancelled, least=1, touching=TOUCHING * steps)
     return replace(finest, rest=REST, warm=True) if warm else finest
