@@ -154,3 +154,28 @@ def of_folds(garments: Sequence[Mapping[str, Any]], frames: Sequence[Mapping[str
     text += f", and in {counted(others, 'other garment')}" if others else ""
     finer = f"--level {level + 1} halves the edges of {worst['fine_edge_mm']:.1f} mm, for up to 4 times the time"
     return [text + (f"; {finer}" if level < (GARMENT["refine:level"].maximum or 0) else "")]
+
+
+def of_following(garments: Sequence[Mapping[str, Any]], frames: Sequence[Mapping[str, Any]]) -> list[str]:
+    """A note of the frames in which part of the cloth follows its subdivided cage, with the frame of the largest part.
+
+    Args:
+        garments: A report's garments.
+        frames: A report's frames.
+    """
+    found = [
+        (entry["follows_cage"], garment["path"], frame["time"])
+        for frame in frames
+        for garment, entry in zip(garments, frame.get("garments", ()), strict=False)
+        if entry.get("follows_cage") and is_first(garment["path"], entry)
+    ]
+    if not found:
+        return []
+    part, path, time = max(found, key=lambda each: each[0]["vertices"])
+    when, vertices = (
+        counted(len({each[2] for each in found}), "frame"),
+        counted(part["vertices"], "vertex", "vertices"),
+    )
+    text = f"in {when} part of the cloth follows its subdivided cage, where the solution crosses more often: "
+    text += f"{vertices} of <{path}>{at_time(time)}, with {part['left']:,} crossings"
+    return [f"{text} for {part['solved']:,} as solved"]

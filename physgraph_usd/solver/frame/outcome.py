@@ -18,6 +18,7 @@ from ..level import Placed, unhindered
 from ..resolution import edge_strain, sharp_folds
 from ..scene import FARTHEST
 from .level_forces import named
+from .no_worse import no_worse
 from .problem import Problem
 from .values import Curvature, FrameState
 
@@ -52,12 +53,22 @@ def scaled(problem: Problem, x: Placed) -> Placed:
     return x if result is x else unhindered(result) if view is None else view.moved(x, result)
 
 
-def state_left(problem: Problem, x: Placed, memory: Any) -> FrameState:
+def patched(problem: Problem, x: Placed) -> tuple[Placed, Tensor, dict[str, int]]:
+    """The cloth with no patch worse than the subdivided cage, and more, as returned by `no_worse`."""
+    view, level = problem.view(problem.finest), problem.forces[-1].level
+    if view is None:
+        return x, problem.following, {}
+    smooth = level.smooth_base.apply(problem.cage.points)
+    return no_worse(view, x, smooth, from_coarse=level.from_coarse, before=problem.following)
+
+
+def state_left(problem: Problem, x: Placed, memory: Any, following: Tensor) -> FrameState:
     """State for the start of the next frame.
 
     Args:
         x: The result [m].
         memory: The integrator's memory, or None.
+        following: As in `FrameState`.
     """
     view, cage = problem.view(problem.finest), problem.cage
     fine = x.double() + torch.as_tensor(cage.origin).to(x.device)
@@ -69,6 +80,7 @@ def state_left(problem: Problem, x: Placed, memory: Any) -> FrameState:
         fine=fine,
         inside=torch.zeros_like(x[:, 0], dtype=torch.bool) if exempt is None else exempt[: len(x)],
         given_up=torch.zeros_like(cage.points[:, 0], dtype=torch.bool) if lost is None else lost,
+        following=following,
         held=problem.start.held,
         clean=lost is None and state is not None and state.is_clean,
         curvature=None if memory is None else Curvature(memory, len(x)),

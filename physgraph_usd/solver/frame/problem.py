@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ..contact.cloth import LevelContact
@@ -104,6 +104,7 @@ class Problem:
         inside: Mask of the vertices inside a body in the last frame; None if none was.
         tether: Stiffness of the tie to the start [1/s^2]; None without tie.
         known: Curvature learned in the last frame, or None.
+        following: As in `FrameState`, after the last frame, shape (C,).
     """
 
     began: float
@@ -118,7 +119,8 @@ class Problem:
     before: Placed | None
     inside: Bool[Tensor, " vertices"] | None
     tether: float | None
-    known: Curvature | None = None
+    known: Curvature | None
+    following: Int[Tensor, " coarse"]
 
     @property
     def warm(self) -> bool:
@@ -252,4 +254,5 @@ def begin(group: Group, frame: FrameInput, last: FrameState | None) -> Problem:
         inside=last.inside if last is not None and bool(last.inside.any()) else None,
         tether=start.slowed * settings.tether * frame.rate**2 if settings.temporal == "tether" else None,
         known=None if known is None else known.curvature,
+        following=torch.zeros_like(cage.points[:, 0], dtype=torch.int64) if known is None else known.following,
     )

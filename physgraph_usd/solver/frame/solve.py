@@ -21,6 +21,7 @@ from ...errors import SolveError
 from ..contact.cloth import LevelContact
 from ..contact.frame import STALLED
 from ..contact.metric import HELD_TOLERANCE, HeldMetric
+from ..contact.stuck import stuck
 from ..deadline import is_over
 from ..forces.base import ForceModule
 from ..integrate.base import Carry, Integrator, System, Transporting
@@ -31,7 +32,7 @@ from ..integrate.stop import UNTANGLINGS, WARM_UNTANGLINGS
 from ..level import Placed, unhindered
 from .group import Group
 from .level_forces import blame
-from .outcome import measured, refuse_swallowed, scaled, state_left, telemetry_of
+from .outcome import measured, patched, refuse_swallowed, scaled, state_left, telemetry_of
 from .problem import LevelProblem, Problem, begin
 from .values import FrameInput, FrameState, Solved
 
@@ -78,11 +79,13 @@ def solve_frame(group: Group, frame: FrameInput, last: FrameState | None) -> Sol
     if problem.contact is not None:
         shown, finish = problem.contact.finish(x)
         x = shown if problem.contact.is_out(shown) else x  # What is pushed out in vain is not carried on.
-    left, shown = state_left(problem, x, memory), scaled(problem, shown)
+    shown, following, followed = patched(problem, scaled(problem, shown))
+    left = state_left(problem, x, memory, following)
     solved = time.perf_counter()
     telemetry = telemetry_of(problem, shown, module, reports=reports)
     contact, crossing = measured(problem, shown)
     telemetry |= {"contact": contact | finish} if contact else {}
+    telemetry |= {"follows_cage": followed} if followed else {}
     marks = (problem.began, prepared, solved, time.perf_counter())
     pairs = zip(("prepare", "solve", "measure"), marks, marks[1:], strict=False)
     telemetry["milliseconds"] = {name: round(1e3 * (end - start), 3) for name, start, end in pairs}
@@ -180,7 +183,7 @@ def _curvature(integrator: Integrator, carry: Carry) -> Any:
 def _with_cage_untangled(problem: Problem, *, since: float) -> tuple[Problem, list[LevelReport]]:
     """A cold frame that starts at its untangled cage, and a report per round.
 
-    Pieces of cloth that are mostly tangled afterwards are given up.
+    Cloth that is stuck in tangles afterwards is given up.
 
     Args:
         since: Time at which the frame was ready to be solved [s].
@@ -191,8 +194,9 @@ def _with_cage_untangled(problem: Problem, *, since: float) -> tuple[Problem, li
     level = problem.level(0, since=since)
     view, start = level.view, problem.begun(0, None)[0]
     assert view is not None
-    x, reports = _untangle(level, view, Placed(view.closed(start)), view.drawn, most=UNTANGLINGS)
-    return replace(problem, contact=contact.after_cage(x), walked=x), reports
+    start = Placed(view.closed(start))
+    x, reports = _untangle(level, view, start, view.drawn, most=UNTANGLINGS)
+    return replace(problem, contact=contact.after_cage(start, x), walked=x), reports
 
 
 def _untangle(
@@ -200,14 +204,14 @@ def _untangle(
 ) -> tuple[Placed, list[LevelReport]]:
     """Rounds of few steps to shorten intersection contours.
 
-    Rounds end early if whole pieces of cloth are tangled, and would be still at the pace of the last `STALLED` rounds.
+    Rounds end early if cloth is stuck, and would be still at the pace of the last `STALLED` rounds.
 
     Args:
         x: Positions [m].
         move: Moves the cloth to wanted positions [m] as far as is safe.
         most: Most rounds.
     """
-    level, budget = problem.level, problem.budget
+    level, budget, start = problem.level, problem.budget, x
     reports: list[LevelReport] = []
     short, counts = budget.for_untangling(), [view.look(x).hopeful.count]
     for left in reversed(range(most)):
@@ -220,7 +224,7 @@ def _untangle(
         reports.append(report)
         counts.append(view.look(x).hopeful.count)
         gone = counts[-1 - STALLED] - counts[-1] if len(counts) > STALLED else math.inf
-        if counts[-1] * STALLED > gone * left and view.tangled_pieces(x) is not None:
+        if counts[-1] * STALLED > gone * left and stuck(view, start, x) is not None:
             break
     return x, reports
 
@@ -256,7 +260,8 @@ def solve_soundly(group: Group, frame: FrameInput, last: FrameState | None) -> S
     why = _unsound(solved.telemetry)
     settings = group.settings
     ended_early = is_over() or settings.budget_ms is not None or settings.steps == 0 or not settings.whole
-    if not why or (last is None and frame.walked is None) or ended_early:
+    lost = bool(solved.state.given_up.any())  # A start from the cage would be stuck there again.
+    if not why or lost or (last is None and frame.walked is None) or ended_early:
         return solved
     if last is not None and last.wait:
         return _waiting(solved, last.failures, last.wait - 1)

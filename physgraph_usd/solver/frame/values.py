@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ..contact.bodies import Touching
@@ -84,6 +84,7 @@ class FrameState:
         fine: Fine positions [m], world space, float64, shape (V, 3).
         inside: Mask of the vertices inside a body, shape (V,), bool.
         given_up: Mask of the pieces of the cage that are given up, shape (C,), bool.
+        following: Frames for which each cage vertex's cloth still follows the subdivided cage, as in `no_worse`.
         held: Number of frames of a held pose.
         clean: Whether nothing crosses and is given up, neither garments solved together nor bodies.
         failures: Consecutive starts from the cage that did not cure an unsound result.
@@ -95,6 +96,7 @@ class FrameState:
     fine: Float[Tensor, "vertices 3"]
     inside: Bool[Tensor, " vertices"]
     given_up: Bool[Tensor, " coarse"]
+    following: Int[Tensor, " coarse"]
     held: int = 0
     clean: bool = False
     failures: int = 0
@@ -133,7 +135,7 @@ class Solved:
     crossing: list[np.ndarray]
 
 
-_COARSE, _FINE = ("coarse", "given_up"), ("fine", "inside")
+_COARSE, _FINE = ("coarse", "given_up", "following"), ("fine", "inside")
 """Fields of `FrameState` with a row for each vertex of the cage, and of the finest level."""
 
 

@@ -1,0 +1,70 @@
+"""No patch of refined cloth crosses more often than the subdivided cage: else it follows that cage."""
+
+from __future__ import annotations
+
+import torch
+from folds import levels_of, named, square, view_of
+from test_tangles import pair
+
+from physgraph_usd.solver.frame.no_worse import STAY, all_crossed, no_worse
+from physgraph_usd.solver.level import Placed
+
+APART = torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)
+
+
+def two_pairs() -> tuple:
+    """Contact of two pairs of sheets that cross, their subdivided cages, and the first vertex of the second pair."""
+    garments = [named(square(4), name) for name in "ABCD"]
+    levels = levels_of(*garments, dtype=torch.float64)
+    base = pair("cornered")[1].double()
+    return view_of(levels, garments), levels[-1], torch.cat([base, base + APART])
+
+
+def kept(view, level, x, smooth, *, before=None):
+    none = torch.zeros(level.from_coarse.shape[1], dtype=torch.int64)
+    return no_worse(view, Placed(x), smooth, from_coarse=level.from_coarse, before=none if before is None else before)
+
+
+def test_only_the_pair_that_crosses_more_follows_its_cage():
+    view, level, smooth = two_pairs()
+    number, x = level.vertex_garment, smooth.clone()
+    x[number == 1, 1] -= 0.004
+    x[number == 3, 1] += 0.012
+    y, left, told = kept(view, level, x, smooth)
+    first, counts = number < 2, [len(all_crossed(view, each)) for each in (x, smooth, y)]
+    crossing = torch.zeros_like(first)
+    crossing[torch.cat([all_crossed(view, each).reshape(-1) for each in (x, smooth)]).long()] = True
+    crossing &= first
+    moved = (y != x).any(dim=1)
+    assert torch.equal(y[crossing], smooth[crossing])
+    assert 0 < int(moved.sum()) < 0.5 * int(first.sum())
+    assert not bool((moved & ~first).any())
+    assert counts[2] < min(counts[:2])
+    assert (told["solved"], told["subdivided"], told["left"]) == tuple(counts)
+    assert told["vertices"] >= int(crossing.sum())
+    assert set(left.tolist()) == {0, STAY}
+
+
+def test_cloth_that_crosses_less_is_as_solved():
+    view, level, smooth = two_pairs()
+    x = smooth.clone()
+    x[level.vertex_garment == 1, 1] += 0.012
+    placed = Placed(x)
+    none = torch.zeros(level.from_coarse.shape[1], dtype=torch.int64)
+    y, left, told = no_worse(view, placed, smooth, from_coarse=level.from_coarse, before=none)
+    assert y is placed
+    assert not left.any()
+    assert told == {}
+
+
+def test_cloth_follows_for_some_frames_and_returns_at_once():
+    view, level, smooth = two_pairs()
+    smooth[level.vertex_garment % 2 == 1, 1] += 0.1  # Nothing crosses any more.
+    x = smooth.clone()
+    x[:, 0] += 0.001
+    left = torch.full((level.from_coarse.shape[1],), STAY)
+    same = []
+    for _ in range(STAY):
+        y, left, _ = kept(view, level, x, smooth, before=left)
+        same.append((torch.equal(y, smooth), torch.equal(y, x)))
+    assert same == [(True, False)] * (STAY - 1) + [(False, True)]
