@@ -18,11 +18,12 @@ from pxr import Sdf, Usd, UsdGeom
 from ...solver.colliders.orient import FIXED
 from ...solver.colliders.pose import Collider, Pose
 from ...solver.colliders.primitives import AROUND, KINDS, primitive, segments
+from ...solver.mesh.subdivide import ControlMesh
 from ...solver.mesh.topology import PolygonMesh
 from ...solver.scene import FARTHEST, out_of_bounds
 from ..instances import instanced_gprims, instancer_above, placements
 from ..lookup import Override, find_token, find_value, is_on
-from ..mesh.drawn import MOST_VERTICES, ControlMesh, DrawnSurface, drawn_surface
+from ..mesh.drawn import MOST_VERTICES, DrawnSurface, drawn_surface
 from ..schema import COLLIDER, GARMENT
 from ..stage import Notice, timecode, value_at
 from ..times import is_animated
@@ -384,14 +385,8 @@ def surface_of(
         levels: Number of subdivisions; None chooses by ``within``.
     """
     scheme = str(mesh.GetSubdivisionSchemeAttr().Get())
-    cage = _control_mesh(mesh, polygons)
+    cage = ControlMesh(polygons, *sharpness_of(mesh, polygons.vertex_count))
     return drawn_surface(cage, points, holes=holes, scheme=scheme, within=within, levels=levels)
-
-
-def _control_mesh(mesh: UsdGeom.Mesh, polygons: PolygonMesh) -> ControlMesh:
-    """The faces with their creases and corners."""
-    ends, sharpness, corners = sharpness_of(mesh, polygons.vertex_count)
-    return ControlMesh.of(polygons, edges=ends, creases=sharpness, corners=corners)
 
 
 def sharpness_of(mesh: UsdGeom.Mesh, vertex_count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
