@@ -13,7 +13,7 @@ from ..stage import Notice, timecode
 from ..times import is_animated, transform_chain
 from .placement import flattened
 
-_SHAPE = ("points", "faceVertexCounts", "faceVertexIndices")
+_SHAPE = ("points", "faceVertexCounts", "faceVertexIndices", "tetVertexIndices")
 _MOST_NAMED = 3
 """Most time codes named in a notice."""
 
@@ -65,9 +65,9 @@ def missing_value(prim: Usd.Prim, time: float) -> str:
     A value is missing if blocked. An empty array counts as missing for a mesh not empty at all times.
     """
     code = timecode(time)
-    for name in _SHAPE if UsdGeom.Mesh(prim) else ():
+    for name in _SHAPE if UsdGeom.PointBased(prim) else ():
         attribute = prim.GetAttribute(name)
-        if attribute.GetNumTimeSamples() and not (value := attribute.Get(code)):
+        if attribute and attribute.GetNumTimeSamples() and not (value := attribute.Get(code)):
             return f"its {name} {'have no value' if value is None else 'are empty'}"
     for transform in transform_chain(prim):
         for op in transform.GetOrderedXformOps():

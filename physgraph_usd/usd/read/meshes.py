@@ -170,7 +170,7 @@ class DrawnStage:
         ):
             holes = np.asarray(mesh.GetHoleIndicesAttr().Get() or [], np.int64)
             within, levels = DRAWN_WITHIN / (scale * self._scale), 1 if path in self._fine else None
-            found = surface_of(mesh, polygons, points, holes=holes, within=within, levels=levels)
+            found = surface_of(mesh.GetPrim(), polygons, points, holes=holes, within=within, levels=levels)
             known = self._surfaces[path] = polygons, found
         return known[1]
 
