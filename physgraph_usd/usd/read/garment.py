@@ -90,6 +90,7 @@ class GarmentReader:
         edges: Edges as authored, shape (E, 2).
         weld: The mesh as authored and as solved.
         notices: Warnings about the garment.
+        hidden: Time codes of its samples at which it is invisible.
     """
 
     garment: Garment
@@ -99,6 +100,7 @@ class GarmentReader:
     edges: np.ndarray
     weld: Weld
     notices: list[Notice] = field(default_factory=list)
+    hidden: frozenset[float] = frozenset()
 
     def frame(self, prim: Usd.Prim, metres: float, time: float | None) -> tuple[GarmentFrame, tuple[Notice, ...]]:
         """The garment at a time code, and notices of repairs.
@@ -106,7 +108,7 @@ class GarmentReader:
         All points of an absent garment are at one place, without contact: other garments may still have a frame.
         """
         notices: tuple[Notice, ...] = ()
-        if time is not None and absence(prim, time):
+        if time is not None and (time in self.hidden or absence(prim, time)):
             points = np.broadcast_to(self.garment.rest.mean(axis=0), self.garment.rest.shape)
         else:
             local, notices = self.points.read(time, self.edges)
@@ -210,7 +212,7 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], samples: Samples, re
         words=_words(prim, [name for name, faces in subsets.faces.items() if 2 * len(faces) > len(weld.faces)]),
         shell=float(find_value(prim, GARMENT["shell:thickness"], request.overrides).at(None) or 0.0),
     )
-    return GarmentReader(garment, source, values, points, cage.mesh.half_edges.edges, weld, notices)
+    return GarmentReader(garment, source, values, points, cage.mesh.half_edges.edges, weld, notices, samples.hidden)
 
 
 def _animation(
