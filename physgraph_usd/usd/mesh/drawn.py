@@ -96,7 +96,7 @@ def flatness(cage: ControlMesh, points: np.ndarray) -> float:
     """Distance of flat faces, with vertices on the limit surface, from the limit surface, over `NEAR_PART` of its area.
 
     The distance is estimated from the vertices added by a subdivision: their distance from the flat faces of the old
-    vertices after smoothing.
+    vertices after smoothing. Distances that overflow are ignored.
 
     Args:
         cage: The cage.
@@ -104,7 +104,9 @@ def flatness(cage: ControlMesh, points: np.ndarray) -> float:
     """
     step, count = subdivide(cage.mesh), cage.mesh.vertex_count
     moved = cage.subdivided(step)[0] @ np.nan_to_num(points)
-    away = np.linalg.norm(moved - step.linear @ moved[:count], axis=1)[count:]
+    with np.errstate(over="ignore", invalid="ignore"):  # A broken skeleton throws points far away.
+        away = np.linalg.norm(moved - step.linear @ moved[:count], axis=1)[count:]
+    away = away[np.isfinite(away)]
     return float(np.quantile(away, NEAR_PART)) if len(away) else 0.0
 
 
