@@ -54,7 +54,7 @@ def _spline(draft: Draft, kind: str, values: tuple[float, ...]) -> Any:
     if draft.chance(0.3):
         loop = ts.LoopParams()
         loop.protoStart, loop.protoEnd = times[0], draft.pick([times[-1], times[0], times[0] + 0.1])
-        loop.numPreLoops, loop.numPostLoops = draft.pick([0, 1, 3]), draft.pick([0, 1, 5, 1000])
+        loop.numPreLoops, loop.numPostLoops = draft.pick([0, 1, 3]), draft.pick([0, 1, 3])
         spline.SetInnerLoopParams(loop)
     return spline
 
@@ -188,6 +188,8 @@ def _break_animation(draft: Draft, _: Usd.Prim, skeleton: Usd.Prim) -> str:
     attribute = draft.pick(animation.GetAuthoredAttributes())
     how = draft.pick(["empty", "cleared", "one less", "inactive"])
     value = attribute.Get(Usd.TimeCode.EarliestTime())
+    if value is None:
+        return f"{attribute.GetName()} without a value"
     if how == "inactive":
         animation.SetActive(False)
     else:
