@@ -148,6 +148,17 @@ def test_a_level_of_detail_that_is_not_shown_is_no_garment_and_no_body(tmp_path:
     assert paths(find_garments(stage, ["/World/coat/high/shape"])) == ["/World/coat/high/shape"]
 
 
+@pytest.mark.parametrize("index", [float("nan"), float("inf"), -float("inf")])
+def test_a_level_of_detail_by_no_number_is_the_first(tmp_path: Path, index: float) -> None:
+    stage = new_stage(tmp_path / "s.usda")
+    for name in ("high", "low"):
+        add_sheet(stage, f"/World/coat/{name}")
+    stage.GetPrimAtPath("/World/coat").AddAppliedSchema("LODRootAPI")
+    author(stage.GetPrimAtPath("/World"), "lod:override:mode", "indexedLOD", kind="token")
+    author(stage.GetPrimAtPath("/World"), "lod:override:index", index, kind="double")
+    assert paths(find_garments(stage)) == ["/World/coat/high"]
+
+
 def test_faces_that_are_counted_elsewhere_are_named(tmp_path: Path) -> None:
     """The refined mesh has other faces; vertices of the cage keep their numbers."""
     stage = new_stage(tmp_path / "s.usda")

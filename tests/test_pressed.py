@@ -13,6 +13,8 @@ from stages import add_mesh, new_stage, save, vec3
 
 from physgraph_usd.shot.refine import inspect_shot
 from physgraph_usd.solver.level import build_levels, refine_garments
+from physgraph_usd.solver.mesh.elements import elastic_elements, hinge_geometry
+from physgraph_usd.solver.mesh.topology import PolygonMesh, find_edges
 from physgraph_usd.usd.read.reader import open_shot
 from physgraph_usd.usd.read.rest import pressed_folds
 
@@ -109,3 +111,94 @@ def test_an_artist_says_that_a_gentle_fold_is_pressed(tmp_path: Path):
     bent = row[finest.hinges[:, :2].numpy()].mean(axis=1)[finest.rest_angle.numpy() != 0.0]
     assert len(bent)
     assert (np.minimum(np.abs(bent - 4), np.abs(bent - 7)) < 1.0).all()
+
+
+TROUSERS, LEG, HEIGHTS = "/World/trousers", 16, 6
+CREASE, BACK = 0, 8
+"""Columns of a trouser leg with an edge in front and behind."""
+
+
+def leg(time: float) -> np.ndarray:
+    """Points of a leg that swings [m], pointed in front and behind: the cage folds by 53 degrees there."""
+    turn = 2 * np.pi * np.arange(LEG) / LEG
+    across = 0.09 * np.sin(turn) * (1.0 - 0.1 * np.abs(np.cos(turn)))
+    along = 0.1 * np.cos(turn) * (1.0 - 0.12 * np.abs(np.sin(2 * turn)))
+    height = np.linspace(0.0, 0.4, HEIGHTS)[:, None]
+    x = along + 0.02 * (time - 1.0) * height
+    return np.stack(np.broadcast_arrays(x, height, across), axis=-1).reshape(-1, 3)
+
+
+def leg_shot(path: Path, *, sharpness: float, scheme: str = "catmullClark", pressed: bool | None = None) -> Path:
+    """A shot of it with creases along both columns."""
+    stage = new_stage(path)
+    ids = np.arange(LEG * HEIGHTS).reshape(HEIGHTS, LEG)
+    across = np.roll(ids, -1, axis=1)
+    quads = np.stack([ids[:-1], ids[1:], across[1:], across[:-1]], axis=-1).reshape(-1, 4)
+    mesh = add_mesh(stage, TROUSERS, leg(1.0), quads)
+    for time in TIMES:
+        mesh.GetPointsAttr().Set(vec3(leg(time)), time)
+    mesh.GetSubdivisionSchemeAttr().Set(scheme)
+    mesh.CreateCreaseIndicesAttr([*ids[:, CREASE].tolist(), *ids[:, BACK].tolist()])
+    mesh.CreateCreaseLengthsAttr([HEIGHTS, HEIGHTS])
+    mesh.CreateCreaseSharpnessesAttr([sharpness, sharpness])
+    if pressed is not None:
+        ends = np.stack([ids[:-1, [CREASE, BACK]], ids[1:, [CREASE, BACK]]], axis=-1).reshape(-1)
+        indices = Vt.IntArray.FromNumpy(ends.astype(np.int32))
+        subset = UsdGeom.Subset.CreateGeomSubset(mesh, "fold", UsdGeom.Tokens.edge, indices, "folds")
+        subset.GetPrim().CreateAttribute("physgraph:pressed", Sdf.ValueTypeNames.Bool).Set(pressed)
+    return Path(save(stage))
+
+
+def fold_at(mesh: PolygonMesh, points: np.ndarray, ends: np.ndarray) -> float:
+    """Median angle between the faces at some edges of a mesh [degrees]."""
+    hinges = elastic_elements(mesh, mesh.triangulate(points), points).hinges
+    at = find_edges(np.unique(np.sort(ends, axis=1), axis=0), hinges[:, :2]) >= 0
+    return float(np.degrees(np.median(np.abs(hinge_geometry(points, hinges[at])[0]))))
+
+
+def crease_of(shot: Path, out: Path, *, level: int) -> tuple[float, float]:
+    """Median angle at the creases of the cage and of the refined mesh [degrees], at the last time code."""
+    refine(shot, out, level=level)
+    garment = open_shot(str(shot)).scene.garments[0]
+    ids = np.arange(LEG * HEIGHTS).reshape(HEIGHTS, LEG)[:, [CREASE, BACK]]
+    ends, points = np.stack([ids[:-1], ids[1:]], axis=-1).reshape(-1, 2), leg(TIMES[-1])
+    coarse, mesh = fold_at(garment.mesh, points, ends), garment.mesh
+    for step in refine_garments([garment], [level])[0]:
+        middle = mesh.vertex_count + find_edges(step.edges, ends)
+        ends, mesh = np.concatenate([np.stack([ends[:, side], middle], axis=1) for side in (0, 1)]), step.mesh
+    return coarse, fold_at(mesh, fine(shot, out, TIMES[-1], prim=TROUSERS), ends)
+
+
+@pytest.mark.parametrize("level", [1, 2])
+def test_a_crease_of_the_cage_keeps_its_angle(tmp_path: Path, level: int):
+    coarse, kept = crease_of(leg_shot(tmp_path / "shot.usda", sharpness=10.0), tmp_path / "fine.usdc", level=level)
+    assert coarse > 40.0
+    assert kept == pytest.approx(coarse, rel=0.12)
+
+
+def test_a_crease_of_sharpness_1_is_rounded_by_the_second_subdivision(tmp_path: Path):
+    coarse, kept = crease_of(leg_shot(tmp_path / "shot.usda", sharpness=1.0), tmp_path / "fine.usdc", level=2)
+    assert kept < 0.7 * coarse
+
+
+@pytest.mark.parametrize(("scheme", "pressed"), [("none", None), ("catmullClark", False)])
+def test_creases_without_a_subdivision_scheme_or_refused_are_not_pressed(
+    tmp_path: Path, scheme: str, pressed: bool | None
+):
+    shot = leg_shot(tmp_path / "shot.usda", sharpness=10.0, scheme=scheme, pressed=pressed)
+    assert open_shot(str(shot)).scene.garments[0].pressed is None
+
+
+def test_a_sharp_corner_of_the_cage_stays(tmp_path: Path):
+    """Corners of a lapel: a sharp one stays a corner of the cloth, and the other is rounded by subdivision."""
+    stage = new_stage(tmp_path / "shot.usda")
+    mesh, points = grid(4, 4)
+    lapel = add_mesh(stage, COLLAR, points, mesh.indices.reshape(-1, mesh.counts[0]))
+    inner = int(np.argmin(np.linalg.norm(points - points.mean(axis=0), axis=1)))
+    lapel.CreateCornerIndicesAttr([inner])
+    lapel.CreateCornerSharpnessesAttr([10.0])
+    garment = open_shot(save(stage)).scene.garments[0]
+    moved = points.copy()
+    moved[inner, 2] += 0.1
+    smooth, _ = garment.control.subdivided(refine_garments([garment], [1])[0][0])
+    assert (smooth @ moved)[inner, 2] == pytest.approx(moved[inner, 2])

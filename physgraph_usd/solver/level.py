@@ -21,16 +21,8 @@ from .mesh.elements import QUAD_SPRING, ElasticElements, elastic_elements, flat_
 from .mesh.lengths import FOLDS, LENGTHS, NORMALS, ElementValues
 from .mesh.recorded import Recordings
 from .mesh.stencil import Stencil
-from .mesh.subdivide import (
-    Refinement,
-    crease_mask,
-    creases_of,
-    halves_of,
-    on_triangles,
-    smooth,
-    subdivide_times,
-)
-from .mesh.topology import PolygonMesh, TriangleSplit, edges_of, find_edges, sorted_rows
+from .mesh.subdivide import ControlMesh, Refinement, on_triangles, subdivide_times
+from .mesh.topology import TriangleSplit, edges_of, find_edges, sorted_rows
 from .mesh.vectors import at_corners, cross, dot, inverse, mean_of, norm, product
 from .scene import Garment
 from .seen import vertex_normals
@@ -311,10 +303,11 @@ class _GarmentLevel:
 
 
 def _garment_level(
-    garment: Garment, mesh: PolygonMesh, face: np.ndarray, creases: np.ndarray, maps: dict[str, sp.csr_matrix]
+    garment: Garment, cage: ControlMesh, face: np.ndarray, maps: dict[str, sp.csr_matrix]
 ) -> _GarmentLevel:
-    """Arrays of a garment at one level, given mesh, cage faces, creases and maps from `_carried`."""
-    linear, smoothing = maps["linear"], maps["smooth"]
+    """Arrays of a garment at one level, given mesh, cage faces and maps from `_carried`."""
+    linear, smoothing, mesh = maps["linear"], maps["smooth"], cage.mesh
+    always = np.unique(np.sort(cage.ends[np.isinf(cage.creases)], axis=1), axis=0)
     rest, smooth_rest = (np.asarray(each @ np.asarray(garment.rest, dtype=np.float64)) for each in (linear, smoothing))
     split = _sound(mesh.triangulate(rest if mesh is garment.mesh else None), rest, rigid=_is_rigid(garment, linear))
     elements = elastic_elements(mesh, split, rest)
@@ -332,7 +325,7 @@ def _garment_level(
         triangles=split.triangles,
         edges=edges_of(split.triangles, mesh.vertex_count).vertices,
         elements=elements,
-        bent=garment.bent_rest | (find_edges(creases, elements.hinges[:, :2]) >= 0),
+        bent=garment.bent_rest | (find_edges(always, elements.hinges[:, :2]) >= 0),
         pressed=_pressed_angles(garment, elements, linear=linear, smoothing=smoothing),
         vertex_values={name: np.asarray(linear @ each.astype(np.float64)) for name, each in painted.items()},
         warp=None if garment.grain is None else garment.grain.warp[face[elements.face]],
@@ -354,25 +347,24 @@ def _pressed_angles(
 
 def _carried(
     garment: Garment, chain: Sequence[Refinement]
-) -> Iterator[tuple[PolygonMesh, np.ndarray, np.ndarray, dict[str, sp.csr_matrix]]]:
-    """A garment's mesh at each level, the cage's face of each face, its creases, and its maps by name.
+) -> Iterator[tuple[ControlMesh, np.ndarray, dict[str, sp.csr_matrix]]]:
+    """A garment's mesh at each level with what is sharp, the cage's face of each face, and its maps by name.
 
     Maps from the level below are the identity where the garment stays at the end of its chain.
     """
     mesh, face = garment.mesh, np.arange(garment.mesh.face_count)
     linear = smoothing = sp.identity(mesh.vertex_count, format="csr")
-    creases = creases_of(mesh, garment.rest, garment.closed)
+    cage = garment.control
     steps = dict.fromkeys(("linear_step", "smooth_step", "flat_step"), linear)
     for number, refinement in enumerate(chain):
-        yield mesh, face, creases, {"linear": linear, "smooth": smoothing} | steps
-        smooth_step = sp.csr_matrix(smooth(mesh, refinement, creased=crease_mask(mesh, creases)))
+        yield cage, face, {"linear": linear, "smooth": smoothing} | steps
+        smooth_step, cage = cage.subdivided(refinement)
         flat_step = on_triangles(mesh, refinement, mesh.triangulate(None if number else garment.rest))
         steps = {"linear_step": refinement.linear, "smooth_step": smooth_step, "flat_step": flat_step}
         smoothing, linear = sp.csr_matrix(smooth_step @ smoothing), sp.csr_matrix(refinement.linear @ linear)
-        creases = halves_of(creases, mesh.vertex_count + find_edges(refinement.edges, creases))
         mesh, face = refinement.mesh, face[refinement.parent_face]
     while True:
-        yield mesh, face, creases, {"linear": linear, "smooth": smoothing} | steps
+        yield cage, face, {"linear": linear, "smooth": smoothing} | steps
         steps = dict.fromkeys(steps, sp.identity(mesh.vertex_count, format="csr"))
 
 

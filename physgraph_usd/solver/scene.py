@@ -13,6 +13,7 @@ import numpy as np
 from ..errors import GarmentError
 from .colliders.pose import Collider, Pose, extent
 from .fabric import Fabric
+from .mesh.subdivide import ControlMesh, creases_of
 from .mesh.topology import PolygonMesh
 
 FARTHEST = 1e9
@@ -78,6 +79,8 @@ class Garment:
         folded: A pose in which pressed folds are as they rest [m], shape (V, 3); None without.
         closed: Whether each vertex belongs to a closed piece, whose sharp edges stay sharp, shape (V,); None without
             such pieces.
+        creases: Vertices of the cage's crease edges, shape (C, 2), and the sharpness of each, shape (C,); None without.
+        corners: Sharpness of each vertex, shape (V,); None without sharp corners.
         rigid: Number of the rigid part that each vertex belongs to, -1 for cloth, shape (V,); None without parts.
         fabric_scale: Multipliers of the fabric's stretch, bending and density on each face of the cage, shape (F, 3);
             None for one fabric.
@@ -103,9 +106,19 @@ class Garment:
     pressed: np.ndarray | None = None
     folded: np.ndarray | None = None
     closed: np.ndarray | None = None
+    creases: tuple[np.ndarray, np.ndarray] | None = None
+    corners: np.ndarray | None = None
     rigid: np.ndarray | None = None
     fabric_scale: np.ndarray | None = None
     flipped: bool = False
+
+    @property
+    def control(self) -> ControlMesh:
+        """The cage with its creases and corners; sharp edges of closed pieces are creases after any subdivision."""
+        always = creases_of(self.mesh, self.rest, self.closed)
+        ends, sharpness = self.creases or (always[:0], np.zeros(0))
+        sharpness = np.concatenate([np.full(len(always), np.inf), sharpness])
+        return ControlMesh(self.mesh, np.concatenate([always, ends]), sharpness, self.corners)
 
     @staticmethod
     def of(

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from meshes import mesh_of
 from pxr import Usd, UsdGeom
 from shots import fine, refine
 from stages import COLLIDER_API, add_mesh, author, new_stage, save, vec3
@@ -16,6 +17,8 @@ from physgraph_usd.errors import UsageError
 from physgraph_usd.shot.refine import inspect_shot
 from physgraph_usd.solver.colliders.mesh import MeshBody
 from physgraph_usd.solver.colliders.pose import Pose
+from physgraph_usd.solver.mesh.subdivide import ControlMesh
+from physgraph_usd.usd.mesh.drawn import flatness
 from physgraph_usd.usd.read.reader import open_shot
 
 Faces = list[list[int]]
@@ -301,3 +304,12 @@ class TestPolygons:
     def test_that_stay_below_the_cloth_are_not_told(self, stage: Usd.Stage, tmp_path: Path, scheme: str, around: int):
         self.body(stage, scheme, around)
         assert self.notes(stage, tmp_path)[0] == []
+
+
+def test_points_that_a_broken_skeleton_throws_away_have_no_flatness():
+    points, faces = capped(RADIUS, 0.0, 0.2)
+    mesh = mesh_of(faces, len(points))
+    cage = ControlMesh(mesh, np.zeros((0, 2), np.int32), np.zeros(0))
+    near = flatness(cage, points)
+    points[0] = 1e300
+    assert flatness(cage, points) == pytest.approx(near, rel=0.5)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import closing
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -200,6 +201,48 @@ def hanging(stage: Usd.Stage, path: str, height: float) -> None:
     curves = UsdGeom.BasisCurves.Define(stage, path)
     curves.CreateCurveVertexCountsAttr([4])
     curves.CreatePointsAttr(vec3(np.array([[x, height, 0.0] for x in (-0.2, -0.1, 0.1, 0.2)])))
+
+
+class TestTetrahedra:
+    """A TetMesh is its surface."""
+
+    @staticmethod
+    def flesh(stage: Usd.Stage, *, surface: bool) -> tuple[UsdGeom.TetMesh, np.ndarray]:
+        """A closed tube filled with tetrahedra to its middle, with its surface authored or not, and its points."""
+        points, faces = capped(RADIUS, -0.1, 0.3)
+        triangles = np.array([[face[0], *pair] for face in faces for pair in pairwise(face[1:])])
+        tets = np.column_stack([triangles, np.full(len(triangles), len(points))])
+        mesh = UsdGeom.TetMesh.Define(stage, BODY)
+        mesh.CreatePointsAttr(vec3(np.vstack([points, [[0.0, 0.1, 0.0]]])))
+        mesh.CreateTetVertexIndicesAttr(Vt.Vec4iArray.FromNumpy(tets.astype(np.int32)))
+        if surface:
+            mesh.CreateSurfaceFaceVertexIndicesAttr(Vt.Vec3iArray.FromNumpy(triangles.astype(np.int32)))
+        return mesh, points
+
+    @pytest.mark.parametrize("surface", [True, False])
+    def test_cloth_rests_on_their_surface(self, stage: Usd.Stage, surface: bool, tmp_path: Path):
+        """The skirt is pressed into a body of 1.06 times its usual radius."""
+        mesh, _ = self.flesh(stage, surface=surface)
+        UsdGeom.XformCommonAPI(mesh).SetScale((1.06, 1.0, 1.06))
+        assert inspect_shot(save(stage), garments=[SKIRT])["candidates"][BODY].startswith("taken")
+        shot = Path(save(stage))
+        refine(shot, tmp_path / "fine.usdc", garments=[SKIRT], colliders=[BODY])
+        points = fine(shot, tmp_path / "fine.usdc", 2.0, prim=SKIRT)
+        assert np.hypot(points[:, 0], points[:, 2]).min() > 1.06 * RADIUS * np.cos(np.pi / 16)
+
+    def test_their_points_move(self, stage: Usd.Stage):
+        mesh, points = self.flesh(stage, surface=False)
+        moved = np.vstack([points, [[0.0, 0.1, 0.0]]]) + np.array([0.0, 0.02, 0.0])
+        mesh.GetPointsAttr().Set(vec3(moved), 2.0)
+        (found,), said_of_it = posed(stage, BODY, time=2.0)
+        assert np.allclose(found, moved, atol=1e-6)
+        assert "not read" not in said_of_it
+
+    def test_tetrahedra_beyond_the_points_are_named(self, stage: Usd.Stage):
+        mesh, _ = self.flesh(stage, surface=False)
+        mesh.GetTetVertexIndicesAttr().Set([Gf.Vec4i(0, 1, 2, 900)])
+        assert posed(stage, BODY)[0] == [None]
+        assert f"<{BODY}> at time code 1: this collider is left out here: its points and faces" in posed(stage, BODY)[1]
 
 
 class TestUnread:

@@ -126,6 +126,57 @@ class TestFramesWithoutTheGarment:
         assert not any(problem.severity == "error" for problem in validate_layer(out, shot))
 
 
+def show(prim: UsdGeom.Imageable, *, at: dict[float, bool]) -> None:
+    """Make a prim visible or invisible from some time codes on."""
+    attribute = prim.CreateVisibilityAttr()
+    for time, is_visible in at.items():
+        attribute.Set("inherited" if is_visible else "invisible", time)
+
+
+class TestFramesInWhichItIsInvisible:
+    @pytest.mark.parametrize("path", [CLOTH, "/World"])
+    @pytest.mark.parametrize(("at", "expected"), [({0: False, 3: True}, (3.0, 4.0)), ({1: True, 3: False}, (1.0, 2.0))])
+    def test_are_neither_solved_nor_warned_about(
+        self, tmp_path: Path, path: str, at: dict[float, bool], expected: tuple[float, ...]
+    ):
+        """There its points lie piled up at one place; it fits no rest shape to them and blocks them in the layer."""
+        stage = new_stage(tmp_path / "s.usda")
+        mesh = add_sheet(stage, times=TIMES, default=False)
+        for time in {*TIMES} - {*expected}:
+            mesh.GetPointsAttr().Set(vec3(1e-4 * sheet_points(time)), time)
+        show(UsdGeom.Imageable(stage.GetPrimAtPath(path)), at=at)
+        shot = open_shot(save(stage))
+        assert shot.scene.times == expected
+        assert not [line for line in said(shot).splitlines() if CLOTH in line]
+        layer = Sdf.Layer.FindOrOpen(str(write_layer(Path(save(stage)), tmp_path / "fine.usdc")))
+        values = {time: layer.QueryTimeSample(f"{CLOTH}.points", time) for time in TIMES}
+        assert tuple(time for time, value in values.items() if not isinstance(value, Sdf.ValueBlock)) == expected
+        assert errors(tmp_path / "fine.usdc", Path(save(stage))) == []
+
+    def test_are_solved_beside_frames_that_lie_between_samples(self, tmp_path: Path):
+        """Visible from 6 to 7, between samples at 1, 5, 9 and 13: the poses there are those of 5 and of 9."""
+        stage = new_stage(tmp_path / "s.usda")
+        add_sheet(stage, times=(1.0, 5.0, 9.0, 13.0))
+        show(UsdGeom.Imageable(stage.GetPrimAtPath(CLOTH)), at={0: False, 6: True, 8: False})
+        assert open_shot(save(stage)).scene.times == (5.0, 9.0)
+
+    @pytest.mark.parametrize("at", [{0: False}, {0: False, 100: True}])
+    def test_are_refined_where_no_other_is_left(self, tmp_path: Path, at: dict[float, bool]):
+        """A hidden cage that is named, as those of simulations are, and one that is shown after the shot."""
+        stage = new_stage(tmp_path / "s.usda")
+        add_sheet(stage, times=TIMES)
+        show(UsdGeom.Imageable(stage.GetPrimAtPath(CLOTH)), at=at)
+        assert open_shot(save(stage)).scene.times == TIMES
+
+    def test_leave_it_out_of_a_range_with_a_word(self, tmp_path: Path):
+        stage = new_stage(tmp_path / "s.usda")
+        add_sheet(stage, times=TIMES)
+        add_sheet(stage, "/World/other", times=TIMES)
+        show(UsdGeom.Imageable(stage.GetPrimAtPath(CLOTH)), at={0: False, 3: True})
+        found = said(open_shot(save(stage), frames=(1.0, 2.0)))
+        assert f"<{CLOTH}>: left out: it is invisible in the frame range; its time codes run from 3 to 4" in found
+
+
 class TestValuesOfAnotherTime:
     @pytest.mark.parametrize("name", ["points", "xformOp:translate", "xformOp:scale"])
     def test_are_no_pose_of_a_body(self, tmp_path: Path, name: str):

@@ -173,6 +173,26 @@ class TestSewn:
         assert not report.unsettled
         assert "not sewn" not in warnings_of(shot)
 
+    def test_strips_sewn_to_an_edge_between_its_points_stay_on_it(self, tmp_path: Path):
+        """The rest shape is fitted to the shot, and the strips lie off the edge in it."""
+        stage = new_stage(tmp_path / "shot.usda")
+        mesh = add_mesh(stage, "/World/hem", *fringe(0.9))
+        for time in range(1, 5):
+            mesh.GetPointsAttr().Set(vec3(fringe(0.9 * time)[0]), time)
+        shot = Path(save(stage))
+        refine(shot, tmp_path / "fine.usdc", level=LEVEL)
+        steps = subdivide_times(mesh_of(fringe(0.0)[1], len(fringe(0.0)[0])), LEVEL)
+        band = 4 * (STRIPS + 1)
+        ends = steps[0].edges[:, 0] < STRIPS, steps[0].edges[:, 1] == steps[0].edges[:, 0] + 1
+        middles = steps[0].parent_vertex_count + np.flatnonzero(ends[0] & ends[1])
+        for time in range(1, 5):
+            points = fine(shot, tmp_path / "fine.usdc", float(time), prim="/World/hem")
+            hem = np.stack([points[:STRIPS], points[middles], points[1 : STRIPS + 1]], axis=1)
+            for number in range(STRIPS):
+                first = band + 2 * ROWS * number
+                off = [to_line(points[first + side], hem[number]) for side in (0, 1)]
+                assert max(off) < 1e-4
+
     @pytest.mark.parametrize("meshes", [1, 2])
     def test_borders_beside_one_another_are_told_of_and_sewn_on_request(self, tmp_path: Path, meshes: int):
         parts = panel(-0.12, 0.12, 4), panel(3e-4, 0.12, 4)
@@ -186,6 +206,33 @@ class TestSewn:
         assert "not sewn" not in warnings_of(shot, overrides=[remedy])
         refine(shot, tmp_path / "fine.usdc", overrides=(remedy,))
         assert widest_gap(shot, tmp_path / "fine.usdc", shapes, within=4e-4) < 1e-6
+
+
+STRIPS, ALONG, WIDE, ROWS = 6, (0.2, 0.5), 0.006, 4
+"""Strips of a fringe, between which parts of a hem's edge each is sewn, its width [m] and its rows of points."""
+
+
+def fringe(time: float) -> Shape:
+    """A waving band with strips sewn to its lower edge [m]: each strip's upper end lies on an edge, between points."""
+    points, faces = panel(0.0, 0.02 * STRIPS, STRIPS, rows=3, height=0.06)
+    points[:, 2] = 0.004 * np.sin(40.0 * points[:, 0] + time) * (1.0 - points[:, 1] / 0.06)
+    shapes = [(points, faces)]
+    for number in range(STRIPS):
+        left, right = points[number], points[number + 1]
+        top = np.stack([left + part * (right - left) for part in ALONG])
+        swing = 0.3 * np.sin(2.0 * time + number)
+        rows = [top + 0.02 * row * np.array([0.5 * swing, -1.0, swing]) for row in range(ROWS)]
+        ids = np.arange(2 * ROWS).reshape(ROWS, 2)
+        quads = np.stack([ids[:-1, 0], ids[1:, 0], ids[1:, 1], ids[:-1, 1]], axis=1)
+        shapes.append((np.concatenate(rows), quads.tolist()))
+    return together(*shapes)
+
+
+def to_line(point: np.ndarray, line: np.ndarray) -> float:
+    """Distance of a point from a line of points [m]."""
+    start, along = line[:-1], np.diff(line, axis=0)
+    part = np.clip(((point - start) * along).sum(axis=1) / (along**2).sum(axis=1), 0.0, 1.0)
+    return float(np.linalg.norm(start + part[:, None] * along - point, axis=1).min())
 
 
 def pieces_of(shot: Shot) -> np.ndarray | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from . import attributes, files, meshes, odd, records, shown, wholes
+from . import attributes, composed, files, meshes, odd, records, shown, wholes
 
 KINDS = (
     *files.KINDS,
@@ -12,4 +12,5 @@ KINDS = (
     *odd.KINDS,
     *records.KINDS,
     *shown.KINDS,
+    *composed.KINDS,
 )

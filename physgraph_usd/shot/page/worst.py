@@ -16,7 +16,6 @@ from ...solver.frame.scene_frame import SceneCloth
 from ...solver.frame.settings import SolveSettings
 from ...solver.level import Level, build_levels, hinge_geometry, refine_garments
 from ...solver.mesh.elements import hinges_of
-from ...solver.mesh.subdivide import smooth
 from ...solver.scene import recentred
 from ...usd.read.meshes import RefinedLayer
 from ...usd.read.reader import Shot
@@ -139,10 +138,11 @@ def _folds(report: RefineReport, shot: Shot, time: float | None, points: Sequenc
     """
     found, cages = [], shot.frame(time).garments
     for garment, level, fine, cage in zip(shot.scene.garments, _levels(report), points, cages, strict=True):
-        mesh, given = garment.mesh, cage.points
+        control, given = garment.control, cage.points
         for step in refine_garments([garment], [level])[0]:
-            given, mesh = smooth(mesh, step) @ given, step.mesh
-        hinges = hinges_of(mesh.triangulate().triangles)
+            smooth, control = control.subdivided(step)
+            given = smooth @ given
+        hinges = hinges_of(control.mesh.triangulate().triangles)
         squares, before = (hinge_geometry(each, hinges)[0] ** 2 for each in (fine, given))
         more = np.maximum(squares - before, 0.0)
         found.append(np.bincount(hinges[:, :2].ravel(), np.repeat(more, 2), minlength=len(fine)))

@@ -19,6 +19,8 @@ from .topology import PolygonMesh, TriangleSplit, face_normals, find_edges
 
 SHARP = 45.0
 """Least angle between the rest normals of two faces for a sharp edge [degrees]."""
+SHARPNESS = 0.5
+"""Sharpness from which an edge or a vertex counts as sharp in a subdivision: USD's fractional sharpness is rounded."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -337,12 +339,35 @@ def creases_of(
     return half.edges[half.edge[one[cosine < np.cos(np.radians(SHARP))]]]
 
 
-def halves_of(edges: Int[np.ndarray, "edges 2"], middle: Int[np.ndarray, " edges"]) -> Int[np.ndarray, "halves 2"]:
-    """Edges of the next subdivision along edges with given midpoints, lower vertex first, in order."""
-    halves = np.concatenate([np.stack([edges[:, side], middle], axis=1) for side in (0, 1)])
-    return halves[np.lexsort((halves[:, 1], halves[:, 0]))].astype(np.int32)
+@dataclass(frozen=True, eq=False)
+class ControlMesh:
+    """A subdivision cage with sharp edges and vertices.
 
+    Attributes:
+        mesh: The faces.
+        ends: Vertices of the crease edges, shape (C, 2).
+        creases: Sharpness of each crease edge, the number of subdivisions that it stays a crease, shape (C,).
+        corners: Sharpness of each vertex, shape (V,); None without corners.
+    """
 
-def crease_mask(mesh: PolygonMesh, creases: Int[np.ndarray, "creases 2"]) -> Bool[np.ndarray, " edges"] | None:
-    """Whether each edge of a mesh is a crease; None without creases."""
-    return find_edges(creases, mesh.half_edges.edges) >= 0 if len(creases) else None
+    mesh: PolygonMesh
+    ends: Int[np.ndarray, "creases 2"]
+    creases: Float[np.ndarray, " creases"]
+    corners: Float[np.ndarray, " vertices"] | None = None
+
+    def subdivided(self, step: Refinement) -> tuple[sparse.csr_matrix, ControlMesh]:
+        """The smooth placement of the child vertices, shape (V_child, V), and the child with what is still sharp.
+
+        Args:
+            step: Subdivision of the mesh, from :func:`subdivide`.
+        """
+        row = find_edges(step.edges, self.ends)
+        sharp = (self.creases >= SHARPNESS) & (row >= 0)
+        creased, middles = np.isin(np.arange(len(step.edges)), row[sharp]), self.mesh.vertex_count + row[sharp]
+        halves = np.concatenate([np.stack([self.ends[sharp, end], middles], axis=1) for end in (0, 1)])
+        corners, pinned = None, None
+        if self.corners is not None:
+            pinned, corners = self.corners >= SHARPNESS, np.zeros(step.mesh.vertex_count)
+            corners[: self.mesh.vertex_count] = self.corners - 1.0
+        stencil = sparse.csr_matrix(smooth(self.mesh, step, creased=creased, corners=pinned))
+        return stencil, ControlMesh(step.mesh, halves, np.tile(self.creases[sharp] - 1.0, 2), corners)

@@ -14,16 +14,14 @@ from functools import reduce
 import numpy as np
 from scipy import sparse
 
-from ...solver.mesh.subdivide import Refinement, fine_count, smooth, subdivide
-from ...solver.mesh.topology import PolygonMesh, find_edges
+from ...solver.mesh.subdivide import ControlMesh, fine_count, subdivide
+from ...solver.mesh.topology import PolygonMesh
 
 MOST_VERTICES = 25_000
 """Most vertices after subdivision, about as many as the cloth on top. Frames of a shirt of 22,000 vertices over a body
 of 53,000 take half as long again as over a body of 13,000: the body's hierarchy is refitted in each frame."""
 NEAR_PART = 0.95
 """Fraction of the surface required to be near enough: nostrils and fingertips would ask for more everywhere."""
-_SHARP = 0.5
-"""Sharpness from which an edge or a vertex counts as sharp in a subdivision: USD's fractional sharpness is rounded."""
 TO_LIMIT = 4.0 / 3.0
 """Ratio of a vertex's distance to the limit surface to its move in one subdivision: 1 + 1/4 + 1/16 + ..."""
 
@@ -53,53 +51,12 @@ class DrawnSurface:
         return points if self.stencil is None else np.asarray(self.stencil @ points)
 
 
-@dataclass(frozen=True, eq=False)
-class ControlMesh:
-    """A subdivision cage with sharp features.
-
-    Attributes:
-        mesh: The faces.
-        creases: Sharpness of each edge, the number of subdivisions as a crease, shape (E,).
-        corners: Sharpness of each vertex, shape (V,).
-    """
-
-    mesh: PolygonMesh
-    creases: np.ndarray
-    corners: np.ndarray
-
-    @staticmethod
-    def of(mesh: PolygonMesh, *, edges: np.ndarray, creases: np.ndarray, corners: np.ndarray) -> ControlMesh:
-        """A cage.
-
-        Args:
-            mesh: The faces.
-            edges: Ends of the crease edges, shape (C, 2).
-            creases: Sharpness of the crease edges, shape (C,).
-            corners: Sharpness of each vertex, shape (V,).
-        """
-        row = find_edges(mesh.half_edges.edges, edges)
-        sharpness = np.zeros(len(mesh.half_edges.edges))
-        sharpness[row[row >= 0]] = creases[row >= 0]
-        return ControlMesh(mesh, sharpness, corners)
-
-    def subdivided(self) -> tuple[Refinement, sparse.csr_matrix, ControlMesh]:
-        """The refinement, the matrix of the smooth placement, and the finer cage."""
-        step = subdivide(self.mesh)
-        stencil = smooth(self.mesh, step, creased=self.creases >= _SHARP, corners=self.corners >= _SHARP)
-        sharp = np.flatnonzero(self.creases >= _SHARP)
-        ends, middles = step.edges[sharp], self.mesh.vertex_count + sharp
-        halves = np.concatenate([np.stack([ends[:, end], middles], axis=1) for end in (0, 1)])
-        corners = np.zeros(step.mesh.vertex_count)
-        corners[: self.mesh.vertex_count] = self.corners - 1.0
-        creases = np.tile(self.creases[sharp] - 1.0, 2)
-        return step, stencil, ControlMesh.of(step.mesh, edges=halves, creases=creases, corners=corners)
-
-    def to_limit(self) -> sparse.csr_matrix:
-        """The matrix that moves the vertices to the limit surface, shape (V, V)."""
-        count = self.mesh.vertex_count
-        moved = self.subdivided()[1][:count, :]
-        same = sparse.identity(count, format="csr")
-        return sparse.csr_matrix(same + TO_LIMIT * (moved - same))
+def to_limit(cage: ControlMesh) -> sparse.csr_matrix:
+    """The matrix that moves a cage's vertices to its limit surface, shape (V, V)."""
+    count = cage.mesh.vertex_count
+    moved = cage.subdivided(subdivide(cage.mesh))[0][:count, :]
+    same = sparse.identity(count, format="csr")
+    return sparse.csr_matrix(same + TO_LIMIT * (moved - same))
 
 
 def drawn_surface(
@@ -126,10 +83,11 @@ def drawn_surface(
         levels = next(n for n in range(wanted, -1, -1) if n == 0 or fine_count(cage.mesh, n) <= MOST_VERTICES)
     stencils = []
     for _ in range(levels):
-        step, stencil, cage = cage.subdivided()
+        step = subdivide(cage.mesh)
+        stencil, cage = cage.subdivided(step)
         stencils.append(stencil)
         parents = parents[step.parent_face]
-    stencil = reduce(lambda product, each: each @ product, [*stencils, cage.to_limit()])
+    stencil = reduce(lambda product, each: each @ product, [*stencils, to_limit(cage)])
     kept = ~np.isin(parents, holes)
     return DrawnSurface(_some_faces(cage.mesh, kept), parents[kept], sparse.csr_matrix(stencil), error / 4.0**levels)
 
@@ -138,16 +96,17 @@ def flatness(cage: ControlMesh, points: np.ndarray) -> float:
     """Distance of flat faces, with vertices on the limit surface, from the limit surface, over `NEAR_PART` of its area.
 
     The distance is estimated from the vertices added by a subdivision: their distance from the flat faces of the old
-    vertices after smoothing.
+    vertices after smoothing. Distances that overflow are ignored.
 
     Args:
         cage: The cage.
         points: Points of the cage, shape (V, 3).
     """
-    step, stencil, _ = cage.subdivided()
-    count = cage.mesh.vertex_count
-    moved = stencil @ np.nan_to_num(points)
-    away = np.linalg.norm(moved - step.linear @ moved[:count], axis=1)[count:]
+    step, count = subdivide(cage.mesh), cage.mesh.vertex_count
+    moved = cage.subdivided(step)[0] @ np.nan_to_num(points)
+    with np.errstate(over="ignore", invalid="ignore"):  # A broken skeleton throws points far away.
+        away = np.linalg.norm(moved - step.linear @ moved[:count], axis=1)[count:]
+    away = away[np.isfinite(away)]
     return float(np.quantile(away, NEAR_PART)) if len(away) else 0.0
 
 

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 from pxr import Usd, UsdGeom
 
 from ...errors import counted, named_time
+from ..lookup import with_ancestors
 from ..stage import Notice, timecode
-from ..times import is_animated, transform_chain
+from ..times import FrameGrid, is_animated, transform_chain
 from .placement import flattened
 
-_SHAPE = ("points", "faceVertexCounts", "faceVertexIndices")
+_SHAPE = ("points", "faceVertexCounts", "faceVertexIndices", "tetVertexIndices")
+_INVISIBLE = "it is invisible"
 _MOST_NAMED = 3
 """Most time codes named in a notice."""
 
@@ -23,31 +26,64 @@ class Samples:
     """Time codes of a garment.
 
     Attributes:
-        times: Time codes with a shape, ascending.
-        absent: Time codes without a shape, ascending, with the reason in words.
+        times: Time codes with a shape that is visible, ascending.
+        absent: All others, ascending, with the reason in words.
+        hidden: Those of them at which the garment is invisible.
         own: Time codes with a shape that the garment itself has samples at, ascending.
     """
 
     times: tuple[float, ...] = ()
     absent: Mapping[float, str] = field(default_factory=dict)
     own: tuple[float, ...] = ()
+    hidden: frozenset[float] = frozenset()
 
     @staticmethod
     def of(prim: Usd.Prim, times: Iterable[float], own: Iterable[float] = ()) -> Samples:
         """Sort the time codes of a garment's mesh prim, among them its own."""
-        reasons = {time: absence(prim, time) for time in times}
+        times = [*times]
+        hidden = hidden_at(prim, times)
+        reasons = {time: _INVISIBLE if time in hidden else absence(prim, time) for time in times}
         there = tuple(time for time, reason in reasons.items() if not reason)
         absent = {time: reason for time, reason in reasons.items() if reason}
-        return Samples(there, absent, tuple(time for time in own if time in there))
+        return Samples(there, absent, tuple(time for time in own if time in there), hidden)
 
     def notices(self, path: str, times: Sequence[float]) -> list[Notice]:
-        """Notices of the garment's absences among some time codes, one for each reason."""
+        """Notices of the garment's absences among some time codes, one for each reason but invisibility."""
         found = []
-        for reason in dict.fromkeys(self.absent[time] for time in times):
+        for reason in dict.fromkeys(self.absent[time] for time in times if time not in self.hidden):
             named = named_times([time for time in times if self.absent[time] == reason])
             message = f"is not there at {named}: {reason}; left out, and blocked in the layer"
             found.append(Notice(path, None, message))
         return found
+
+
+def hidden_at(prim: Usd.Prim, times: Sequence[float]) -> frozenset[float]:
+    """Time codes among a garment's samples, ascending, that no picture shows: it is invisible there.
+
+    Shown is also an invisible sample beside a whole frame at which the garment is visible: it interpolates between
+    them. A garment that is invisible at all of them hides none: it was named to be refined all the same.
+    """
+    if not times or not visibility_varies(prim):
+        return frozenset()
+    stage, imageable = prim.GetStage(), UsdGeom.Imageable(prim)
+    frames = FrameGrid.of(stage)
+    spans = [*pairwise(times)]
+    spans.insert(0, (min(times[0], stage.GetStartTimeCode()) - frames.length, times[0]))
+    spans.append((times[-1], max(times[-1], stage.GetEndTimeCode()) + frames.length))
+
+    def is_visible(time: float) -> bool:
+        return imageable.ComputeVisibility(Usd.TimeCode(time)) != UsdGeom.Tokens.invisible
+
+    visible = [is_visible(time) for time in times]
+    beside = pairwise(any(map(is_visible, frames.inside(*span))) for span in spans)
+    shown = [here or any(both) for here, both in zip(visible, beside, strict=True)]
+    return frozenset(time for time, is_shown in zip(times, shown, strict=True) if not is_shown and any(shown))
+
+
+def visibility_varies(prim: Usd.Prim) -> bool:
+    """Whether the visibility of a prim or of a prim above it may change in time."""
+    shapes = map(UsdGeom.Imageable, with_ancestors(prim))
+    return any(shape and shape.GetVisibilityAttr().ValueMightBeTimeVarying() for shape in shapes)
 
 
 def absence(prim: Usd.Prim, time: float) -> str:
@@ -65,9 +101,9 @@ def missing_value(prim: Usd.Prim, time: float) -> str:
     A value is missing if blocked. An empty array counts as missing for a mesh not empty at all times.
     """
     code = timecode(time)
-    for name in _SHAPE if UsdGeom.Mesh(prim) else ():
+    for name in _SHAPE if UsdGeom.PointBased(prim) else ():
         attribute = prim.GetAttribute(name)
-        if attribute.GetNumTimeSamples() and not (value := attribute.Get(code)):
+        if attribute and attribute.GetNumTimeSamples() and not (value := attribute.Get(code)):
             return f"its {name} {'have no value' if value is None else 'are empty'}"
     for transform in transform_chain(prim):
         for op in transform.GetOrderedXformOps():

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import reduce
 
 import numpy as np
 from pxr import Sdf
 from scipy import sparse
 
 from ...errors import GarmentError
-from ...solver.mesh.subdivide import Refinement, smooth
-from ...solver.mesh.topology import PolygonMesh
+from ...solver.mesh.subdivide import ControlMesh, Refinement
 from ..mesh.bind import Binding, Follower
 from .reader import Shot
 from .targets import Target, points_at
@@ -44,7 +42,7 @@ class GarmentBindings:
         garment = shot.scene.garments[index]
         self.targets = [target for target in shot.targets if target.garment == index]
         self._shot, self._index = shot, index
-        self._smooth = _smooth_map(garment.mesh, steps) if self.targets else None
+        self._smooth = _smooth_map(garment.control, steps) if self.targets else None
         self._fine = steps[-1].mesh if steps else garment.mesh
         self._bindings: dict[Sdf.Path, Binding] = {}
         bound = {target.path: target for target in self.targets}
@@ -86,8 +84,10 @@ class GarmentBindings:
         return points
 
 
-def _smooth_map(mesh: PolygonMesh, steps: Sequence[Refinement]) -> sparse.csr_matrix | None:
+def _smooth_map(cage: ControlMesh, steps: Sequence[Refinement]) -> sparse.csr_matrix | None:
     """The smooth map from a cage to its fine mesh, shape (V, C); None at level 0."""
-    meshes = [mesh, *(step.mesh for step in steps)]
-    maps = [smooth(parent, step) for parent, step in zip(meshes, steps, strict=False)]
-    return reduce(lambda product, one: one @ product, maps[1:], maps[0]) if maps else None
+    smooth = None
+    for step in steps:
+        once, cage = cage.subdivided(step)
+        smooth = once if smooth is None else sparse.csr_matrix(once @ smooth)
+    return smooth

@@ -1,8 +1,8 @@
 """Reads colliders from meshes, primitives and point instancers: triangles posed in world metres.
 
-A mesh is read as rendered: without holes, and subdivided by its scheme. A point instancer is the triangles of its
-instances; a prim below an instancer is drawn at the instances only. An unusable pose is left out at its time, with a
-notice. A primitive transformed into a shape without a name, such as an ellipsoid, becomes a mesh.
+A mesh is read as rendered: without holes, and subdivided by its scheme; a TetMesh is its surface. A point instancer is
+the triangles of its instances; a prim below an instancer is drawn at the instances only. An unusable pose is left out
+at its time, with a notice. A primitive transformed into a shape without a name, such as an ellipsoid, becomes a mesh.
 """
 
 from __future__ import annotations
@@ -18,11 +18,12 @@ from pxr import Sdf, Usd, UsdGeom
 from ...solver.colliders.orient import FIXED
 from ...solver.colliders.pose import Collider, Pose
 from ...solver.colliders.primitives import AROUND, KINDS, primitive, segments
+from ...solver.mesh.subdivide import ControlMesh
 from ...solver.mesh.topology import PolygonMesh
 from ...solver.scene import FARTHEST, out_of_bounds
 from ..instances import instanced_gprims, instancer_above, placements
 from ..lookup import Override, find_token, find_value, is_on
-from ..mesh.drawn import MOST_VERTICES, ControlMesh, DrawnSurface, drawn_surface
+from ..mesh.drawn import MOST_VERTICES, DrawnSurface, drawn_surface
 from ..schema import COLLIDER, GARMENT
 from ..stage import Notice, timecode, value_at
 from ..times import is_animated
@@ -107,6 +108,7 @@ class ColliderReader:
     unit: float | None = None
     _faces: _Faces | None = None
     _triangles: np.ndarray | None = None
+    _tets: tuple[np.ndarray, np.ndarray] | None = None
 
     def on_side(self, side: str) -> ColliderReader:
         """A reader of the collider on a different side, one of `schema.SIDES`."""
@@ -195,14 +197,9 @@ class ColliderReader:
     def _mesh(
         self, matrix: np.ndarray, time: float | None, skinned: np.ndarray | None
     ) -> tuple[Pose | None, tuple[Notice, ...]]:
-        mesh = UsdGeom.Mesh(self.prim)
-        points, counts, indices, holes = (
-            _array(attribute, time)
-            for attribute in (
-                *(mesh.GetPointsAttr(), mesh.GetFaceVertexCountsAttr(), mesh.GetFaceVertexIndicesAttr()),
-                mesh.GetHoleIndicesAttr(),
-            )
-        )
+        points = _array(UsdGeom.PointBased(self.prim).GetPointsAttr(), time)
+        read = _surface_of_tets(self, time) if UsdGeom.TetMesh(self.prim) else _topology(self.prim, time)
+        counts, indices, holes = read
         usable = points.ndim == 2 and points.shape[1] == 3 and len(indices) and counts.sum() == len(indices)
         if not usable or counts.min() < 0 or indices.min() < 0 or indices.max() >= len(points):
             return None, (self._out(time, "its points and faces do not fit together"),)
@@ -228,11 +225,11 @@ class ColliderReader:
         """
         if self._faces is None or not all(map(np.array_equal, self._faces.authored, authored)):
             counts, indices, holes = authored
-            mesh = UsdGeom.Mesh(self.prim)
-            first = np.asarray(mesh.GetPointsAttr().Get(Usd.TimeCode.EarliestTime()), dtype=np.float64)
+            attribute = UsdGeom.PointBased(self.prim).GetPointsAttr()
+            first = np.asarray(attribute.Get(Usd.TimeCode.EarliestTime()), dtype=np.float64)
             first = np.nan_to_num(first if first.shape == points.shape else points).astype(np.float64)
             polygons, within = PolygonMesh(counts, indices, len(points)), self.within / self._scale()
-            drawn = surface_of(mesh, polygons, first, holes=holes, within=within)
+            drawn = surface_of(self.prim, polygons, first, holes=holes, within=within)
             triangles = drawn.mesh.triangulate().triangles
             wound = triangles, np.ascontiguousarray(triangles[:, ::-1])
             self._faces = _Faces(authored, drawn, wound, self._coarse(drawn))
@@ -287,7 +284,7 @@ def authored_points(body: ColliderReader, time: float | None) -> np.ndarray:
     if body.collider.kind != "mesh" or body.instancer is not None:
         pose = body.pose(time)[0]
         return np.zeros((0, 3)) if pose is None else pose.points
-    points = np.asarray(_array(UsdGeom.Mesh(body.prim).GetPointsAttr(), time), dtype=np.float64)
+    points = np.asarray(_array(UsdGeom.PointBased(body.prim).GetPointsAttr(), time), dtype=np.float64)
     return place(points.reshape(-1, 3), body._matrix(timecode(time)))
 
 
@@ -356,7 +353,7 @@ def kind_of(prim: Usd.Prim) -> str | None:
     if UsdGeom.PointInstancer(prim):
         return "instancer"
     kind = str(prim.GetTypeName()).removesuffix("_1").lower()
-    return "mesh" if UsdGeom.Mesh(prim) else kind if kind in KINDS else None
+    return "mesh" if UsdGeom.Mesh(prim) or UsdGeom.TetMesh(prim) else kind if kind in KINDS else None
 
 
 def unread(prim: Usd.Prim) -> str:
@@ -365,7 +362,7 @@ def unread(prim: Usd.Prim) -> str:
 
 
 def surface_of(
-    mesh: UsdGeom.Mesh,
+    prim: Usd.Prim,
     polygons: PolygonMesh,
     points: np.ndarray,
     *,
@@ -376,22 +373,19 @@ def surface_of(
     """A mesh's faces as drawn.
 
     Args:
-        mesh: The prim, with scheme, creases and corners.
+        prim: The mesh, with scheme, creases and corners; a TetMesh has none of these.
         polygons: Its faces.
         points: Its points in any pose, shape (V, 3).
         holes: Numbers of the faces that are holes.
         within: Allowed distance from the limit surface, in the points' unit.
         levels: Number of subdivisions; None chooses by ``within``.
     """
+    mesh = UsdGeom.Mesh(prim)
+    if not mesh:
+        return DrawnSurface(polygons, np.arange(polygons.face_count))
     scheme = str(mesh.GetSubdivisionSchemeAttr().Get())
-    cage = _control_mesh(mesh, polygons)
+    cage = ControlMesh(polygons, *sharpness_of(mesh, polygons.vertex_count))
     return drawn_surface(cage, points, holes=holes, scheme=scheme, within=within, levels=levels)
-
-
-def _control_mesh(mesh: UsdGeom.Mesh, polygons: PolygonMesh) -> ControlMesh:
-    """The faces with their creases and corners."""
-    ends, sharpness, corners = sharpness_of(mesh, polygons.vertex_count)
-    return ControlMesh.of(polygons, edges=ends, creases=sharpness, corners=corners)
 
 
 def sharpness_of(mesh: UsdGeom.Mesh, vertex_count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -416,6 +410,32 @@ def sharpness_of(mesh: UsdGeom.Mesh, vertex_count: int) -> tuple[np.ndarray, np.
         inside = (places >= 0) & (places < len(corners))
         corners[places[inside]] = given[inside]
     return ends, sharpness, corners
+
+
+def _surface_of_tets(body: ColliderReader, time: float | None) -> tuple[np.ndarray, ...]:
+    """Counts, corners and holes of a TetMesh's surface, as authored or else from its tetrahedra.
+
+    A surface from tetrahedra is cached while they stay the same: USD takes a second for 150,000.
+    """
+    mesh = UsdGeom.TetMesh(body.prim)
+    surface, tets = (
+        _array(mesh.GetSurfaceFaceVertexIndicesAttr(), time),
+        _array(mesh.GetTetVertexIndicesAttr(), time),
+    )
+    if not len(surface) and len(tets):
+        if body._tets is None or not np.array_equal(body._tets[0], tets):
+            codes = timecode(time), Usd.TimeCode.EarliestTime()
+            faces = next(filter(len, (UsdGeom.TetMesh.ComputeSurfaceFaces(mesh, code) for code in codes)), ())
+            body._tets = tets, np.asarray(faces, np.int32)
+        surface = body._tets[1]
+    return np.full(len(surface), 3), surface.reshape(-1), np.zeros(0, np.int32)
+
+
+def _topology(prim: Usd.Prim, time: float | None) -> tuple[np.ndarray, ...]:
+    """Counts, corners and holes of a Mesh's faces at a time code."""
+    mesh = UsdGeom.Mesh(prim)
+    attributes = (mesh.GetFaceVertexCountsAttr(), mesh.GetFaceVertexIndicesAttr(), mesh.GetHoleIndicesAttr())
+    return tuple(_array(attribute, time) for attribute in attributes)
 
 
 def _numbers(attribute: Usd.Attribute, kinds: str) -> np.ndarray:

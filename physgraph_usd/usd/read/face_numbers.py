@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from pxr import Sdf, Usd
+from pxr import Sdf, Usd, UsdGeom, UsdShade
 
 from ..stage import TRAVERSAL, Notice
 from .garment import GarmentReader
 
 _COUNTED = ("triIndices", "faceIndices", "groupElemIndices")
 """Beginnings of names, without their namespace, of integer attributes that count faces; the rest names the source."""
+_NEVER = (UsdGeom.Gprim, UsdShade.Shader, UsdShade.NodeGraph)
+"""Prims without such attributes, which are most of a shot: listing the attributes of 5,000 meshes takes 0.4 s."""
 
 
 def face_number_notices(stage: Usd.Stage, readers: Sequence[GarmentReader]) -> list[Notice]:
@@ -24,6 +26,7 @@ def face_number_notices(stage: Usd.Stage, readers: Sequence[GarmentReader]) -> l
             "for the refined mesh, or name vertices instead (the cage's keep their numbers)",
         )
         for prim in Usd.PrimRange(stage.GetPseudoRoot(), TRAVERSAL)
+        if not any(prim.IsA(kind) for kind in _NEVER)
         for attribute, targets in _counting(prim)
         for garment in garments
         if garment in targets

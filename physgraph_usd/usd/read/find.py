@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fnmatch
+import math
 from collections.abc import Iterable, Iterator, Sequence
 
 from pxr import Sdf, Usd, UsdGeom, UsdPhysics
@@ -193,7 +194,7 @@ def shown_level(root: Usd.Prim) -> Usd.Prim | None:
             break
     children = root.GetFilteredChildren(TRAVERSAL)  # Among them may be heuristics, which choose a level by distance.
     levels = [prim for prim in children if UsdGeom.Imageable(prim) or not prim.GetTypeName()]
-    number = round(index) if isinstance(index, int | float) else 0
+    number = round(index) if isinstance(index, int | float) and math.isfinite(index) else 0
     return levels[number] if 0 <= number < len(levels) else None
 
 

@@ -15,7 +15,8 @@ from pxr import Sdf, Usd, UsdGeom
 from ...errors import GarmentError, SchemaError, counted
 from ...solver.colliders.pose import extent
 from ...solver.mesh.borders import open_edges
-from ...solver.mesh.topology import PolygonMesh
+from ...solver.mesh.subdivide import SHARPNESS
+from ...solver.mesh.topology import PolygonMesh, find_edges
 from ...solver.mesh.weld import Weld, seam_reach, weld, weld_skins
 from ...solver.scene import Garment, GarmentFrame, mean_edge
 from ..lookup import Found, Override, bound_materials, check_limits, find_value
@@ -24,6 +25,7 @@ from ..schema import GARMENT
 from ..stage import GarmentSource, Notice, Units, flattened
 from ..times import within
 from .absence import Samples, absence
+from .bodies import sharpness_of
 from .cage import PointReader, read_cage
 from .grain import read_grain
 from .materials import Values, find_values
@@ -88,6 +90,7 @@ class GarmentReader:
         edges: Edges as authored, shape (E, 2).
         weld: The mesh as authored and as solved.
         notices: Warnings about the garment.
+        hidden: Time codes of its samples at which it is invisible.
     """
 
     garment: Garment
@@ -97,6 +100,7 @@ class GarmentReader:
     edges: np.ndarray
     weld: Weld
     notices: list[Notice] = field(default_factory=list)
+    hidden: frozenset[float] = frozenset()
 
     def frame(self, prim: Usd.Prim, metres: float, time: float | None) -> tuple[GarmentFrame, tuple[Notice, ...]]:
         """The garment at a time code, and notices of repairs.
@@ -104,7 +108,7 @@ class GarmentReader:
         All points of an absent garment are at one place, without contact: other garments may still have a frame.
         """
         notices: tuple[Notice, ...] = ()
-        if time is not None and absence(prim, time):
+        if time is not None and (time in self.hidden or absence(prim, time)):
             points = np.broadcast_to(self.garment.rest.mean(axis=0), self.garment.rest.shape)
         else:
             local, notices = self.points.read(time, self.edges)
@@ -193,7 +197,7 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], samples: Samples, re
         bent_rest=bent,
         grain=grain,
         fabric_scale=subsets.scale,
-        **constants | pieces | painted | _pressed(prim, weld, animation),
+        **constants | pieces | painted | _folds(prim, weld, animation),
     )
     notices += [*rest.notices, *_size_notices(prim, animation.first, matrix, request), *values.notices]
     source = GarmentSource(
@@ -208,7 +212,7 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], samples: Samples, re
         words=_words(prim, [name for name, faces in subsets.faces.items() if 2 * len(faces) > len(weld.faces)]),
         shell=float(find_value(prim, GARMENT["shell:thickness"], request.overrides).at(None) or 0.0),
     )
-    return GarmentReader(garment, source, values, points, cage.mesh.half_edges.edges, weld, notices)
+    return GarmentReader(garment, source, values, points, cage.mesh.half_edges.edges, weld, notices, samples.hidden)
 
 
 def _animation(
@@ -279,11 +283,24 @@ def _pieces(
     return {"closed": found.closed if found.closed.any() else None, "rigid": found.rigid if count else None}
 
 
-def _pressed(prim: Usd.Prim, weld: Weld, animation: Animation) -> dict[str, Any]:
-    """Pressed vertices and the pose with the folds as they rest, by field name; empty without pressed folds."""
+def _folds(prim: Usd.Prim, weld: Weld, animation: Animation) -> dict[str, Any]:
+    """Creases, corners, pressed vertices and the pose with the pressed folds, by field name.
+
+    Creases are pressed folds, unless an artist says that they are not.
+    """
     poses = [weld.joined(pose) for pose in animation.poses.values()]
-    found = pressed_folds(weld.mesh, poses, *(_marked_edges(prim, weld, pressed=value) for value in (True, False)))
-    return {} if found is None else {"pressed": found[0], "folded": found[1]}
+    creases, fields = np.zeros((0, 2), np.int64), dict[str, Any]()
+    if UsdGeom.Mesh(prim).GetSubdivisionSchemeAttr().Get() in (UsdGeom.Tokens.catmullClark, UsdGeom.Tokens.loop):
+        ends, sharpness, corners = sharpness_of(UsdGeom.Mesh(prim), len(weld.number))
+        creases = np.sort(weld.number[ends], axis=1)[sharpness >= SHARPNESS]
+        if len(ends):
+            fields["creases"] = weld.number[ends], sharpness
+        if corners.any():
+            fields["corners"] = weld.largest(corners)
+    pressed, flat = (_marked_edges(prim, weld, pressed=value) for value in (True, False))
+    pressed = np.concatenate([pressed, creases[find_edges(flat, creases) < 0]])
+    found = pressed_folds(weld.mesh, poses, np.unique(pressed, axis=0), flat)
+    return fields if found is None else fields | {"pressed": found[0], "folded": found[1]}
 
 
 def _marked_edges(prim: Usd.Prim, weld: Weld, *, pressed: bool) -> np.ndarray:

@@ -12,15 +12,15 @@ from pxr import Sdf, Usd, UsdGeom, UsdShade, UsdSkel
 from scipy import sparse
 
 from ...errors import LayerError, StageError
-from ...solver.mesh.subdivide import creases_of, smooth, subdivide
+from ...solver.mesh.subdivide import smooth, subdivide
 from ...solver.mesh.topology import PolygonMesh, TriangleSplit
-from ..mesh.drawn import ControlMesh, DrawnSurface
+from ..mesh.drawn import DrawnSurface, to_limit
 from ..provenance import read_record, recorded_shot
 from ..schema import AXES
 from ..stage import bad_rate, flattened, list_meshes, open_layer, paths_in, pxr_errors, quiet, read_units, timecode
 from ..times import merge, motion_of, within
 from ..view import root_over
-from .bodies import DRAWN_WITHIN, sharpness_of, surface_of
+from .bodies import DRAWN_WITHIN, surface_of
 from .find import has_schema, traverse, with_gravity
 from .placement import place
 from .reader import Shot
@@ -170,7 +170,7 @@ class DrawnStage:
         ):
             holes = np.asarray(mesh.GetHoleIndicesAttr().Get() or [], np.int64)
             within, levels = DRAWN_WITHIN / (scale * self._scale), 1 if path in self._fine else None
-            found = surface_of(mesh, polygons, points, holes=holes, within=within, levels=levels)
+            found = surface_of(mesh.GetPrim(), polygons, points, holes=holes, within=within, levels=levels)
             known = self._surfaces[path] = polygons, found
         return known[1]
 
@@ -196,17 +196,10 @@ def limit_of(shot: Shot, index: int, levels: int) -> sparse.csr_matrix | None:
         UsdGeom.Tokens.bilinear,
     ):
         return None
-    ends, sharpness, corners = sharpness_of(mesh, len(source.weld.number))
-    sharp = creases_of(garment.mesh, garment.rest, garment.closed)
-    cage = ControlMesh.of(
-        garment.mesh,
-        edges=np.concatenate([source.weld.number[ends], sharp]),
-        creases=np.concatenate([sharpness, np.full(len(sharp), UsdGeom.Mesh.SHARPNESS_INFINITE)]),
-        corners=source.weld.largest(corners),
-    )
+    cage = garment.control
     for _ in range(levels):
-        cage = cage.subdivided()[2]
-    return cage.to_limit()
+        cage = cage.subdivided(subdivide(cage.mesh))[1]
+    return to_limit(cage)
 
 
 def _gravity_of(layer: Sdf.Layer) -> str | None:

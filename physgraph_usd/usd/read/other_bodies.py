@@ -15,6 +15,7 @@ from ...solver.colliders.primitives import tessellated
 from ..lookup import with_ancestors
 from ..stage import TRAVERSAL, pxr_errors, quiet, timecode, value_at
 from ..times import motion_of
+from .absence import visibility_varies
 from .bodies import ColliderReader, kind_of, parts_of
 from .find import BODIES, MARKS, has_schema, why_not_drawn
 from .garment import is_visible
@@ -139,12 +140,7 @@ def _moves(prim: Usd.Prim, reader: ColliderReader) -> bool:
     for shape in shapes:
         times |= {time for each in shape.GetAuthoredAttributes() for time in each.GetTimeSamples()}
         times |= {*motion_of(shape).times}
-    return len(times) > 1 or any(_visibility_varies(each) for each in shapes)
-
-
-def _visibility_varies(prim: Usd.Prim) -> bool:
-    shapes = map(UsdGeom.Imageable, with_ancestors(prim))
-    return any(shape and shape.GetVisibilityAttr().ValueMightBeTimeVarying() for shape in shapes)
+    return len(times) > 1 or any(visibility_varies(each) for each in shapes)
 
 
 def _points(prim: Usd.Prim, metres: float, time: float | None) -> np.ndarray:
@@ -183,7 +179,7 @@ def _why_left(prim: Usd.Prim, times: Sequence[float | None]) -> str:
     if reason := why_not_drawn(prim):
         return f"{reason}, which no final render shows"
     known = [time for time in times if time is not None]
-    visible = is_visible(prim, known if _visibility_varies(prim) else known[:1])
+    visible = is_visible(prim, known if visibility_varies(prim) else known[:1])
     return "" if visible else "invisible"
 
 

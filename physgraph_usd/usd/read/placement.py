@@ -72,7 +72,7 @@ def place(points: np.ndarray, matrix: np.ndarray) -> np.ndarray:
 
 def is_flipped(prim: Usd.Prim, matrix: np.ndarray) -> bool:
     """Whether the authored winding is clockwise seen from outside, in world space."""
-    left_handed = UsdGeom.Mesh(prim).GetOrientationAttr().Get(Usd.TimeCode.EarliestTime()) == UsdGeom.Tokens.leftHanded
+    left_handed = UsdGeom.Gprim(prim).GetOrientationAttr().Get(Usd.TimeCode.EarliestTime()) == UsdGeom.Tokens.leftHanded
     linear = matrix[:3, :3] / max(float(np.abs(matrix[:3, :3]).max()), np.finfo(float).tiny)
     return left_handed != bool(np.linalg.det(linear) < 0)
 

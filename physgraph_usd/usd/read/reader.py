@@ -546,8 +546,9 @@ def _read(
         times = samples.times
         every += times
         if samples.own and not within(times, request.frames):
+            why = "is invisible" if within(samples.hidden, request.frames) else "has no sample"
             span = f"its time codes run from {named_time(times[0])} to {named_time(times[-1])}"
-            notices.append(_left_out(prim, f"has no sample in the frame range; {span}; give --frames that hold one"))
+            notices.append(_left_out(prim, f"{why} in the frame range; {span}; give --frames that hold one"))
         elif skip_invisible and not is_visible(prim, within(times, request.frames)):
             notices.append(_left_out(prim, "is invisible"))
         else:

@@ -29,7 +29,7 @@ def sewn_garments(
     """Garments with the positions of their sewn vertices, and notices of adjacent unsewn borders.
 
     Vertices of different garments are sewn if coincident in every pose; vertices of the same garment must also coincide
-    in the rest shape.
+    in the rest shape; on an edge, within a border edge there.
 
     Args:
         garments: The garments, welded.
@@ -105,8 +105,10 @@ class _Cloth:
         )
 
     def _rest_on(self, near: OnEdge) -> np.ndarray:
+        """Whether vertices are of another garment, or at rest within a border edge: a fitted rest shape moves them."""
         apart = self._owner[near.vertex] != self._owner[near.edge[:, 0]]
-        return apart | (near.at(self._rest).distance <= self.reach(near.vertex, near.edge[:, 0]))
+        within = np.maximum(self.reach(near.vertex, near.edge[:, 0]), self.edge_at(self._rest, near.vertex))
+        return apart | (near.at(self._rest).distance <= within)
 
     def sewn(self, points: np.ndarray, pairs: np.ndarray, between: OnEdge) -> list[Garment]:
         """Garments with the closed positions of their sewn vertices: the mean of a pair, or a point on an edge."""

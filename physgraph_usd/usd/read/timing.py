@@ -40,7 +40,7 @@ def _misses(reader: ColliderReader, garment: GarmentSource, bake: Bake) -> Itera
     body = reader.prim
     own = bake.motion(mover(body.GetStage(), body.GetPath(), garment.path)).times
     cloth, every = garment.times, tuple(sorted([*garment.times, *garment.left_out]))
-    if not cloth and UsdGeom.Mesh(body) and UsdGeom.Mesh(body).GetPointsAttr().Get() is None and own:
+    if not cloth and UsdGeom.PointBased(body) and UsdGeom.PointBased(body).GetPointsAttr().Get() is None and own:
         yield f"has no points by default, at which still garments are read; its sample at {named_time(own[0])} is used"
     if len(own) < 2 or not cloth:
         return
@@ -90,7 +90,7 @@ def _layers(prim: Usd.Prim, bake: Bake) -> Iterator[Sdf.Layer]:
     """Layers with samples of a prim's points, transforms and skeletal animation."""
     skinned = bake.skinned.get(prim.GetPath())
     animation = prim.GetStage().GetPrimAtPath(skinned.animation) if skinned and skinned.animation else None
-    attributes = [prim.GetAttribute("points")] if UsdGeom.Mesh(prim) else []
+    attributes = [prim.GetAttribute("points")] if UsdGeom.PointBased(prim) else []
     attributes += [op.GetAttr() for transform in transform_chain(prim) for op in transform.GetOrderedXformOps()]
     attributes += animation.GetAuthoredAttributes() if animation else []
     for attribute in attributes:
