@@ -13,6 +13,7 @@ import click
 from benchmarks.films import SHOWN, Shown
 from physgraph_usd.cli import main
 from physgraph_usd.shot.warnings import advice_table
+from physgraph_usd.usd.schema_files import attribute_table
 from physgraph_usd.usd.write.attribute_rules import rules_table
 
 DOCS = Path(__file__).resolve().parent
@@ -115,6 +116,7 @@ def _cell(text: str) -> str:
 
 
 TABLES = {
+    "attributes.md": attribute_table,
     "commands.md": commands_table,
     "gallery.md": film_wall,
     "layers.md": rules_table,
