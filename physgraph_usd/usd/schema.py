@@ -152,7 +152,7 @@ def _material(schema: str, fallbacks: bool) -> tuple[Property, ...]:
 
 def _ease(way: str) -> Property:
     """Row of the length of cloth along warp or weft in excess of the rest shape."""
-    doc = f"Extra cloth length along the {way}, in percent of the rest shape. Makes folds."
+    doc = f"Extra cloth length along the {way}, in percent of the rest shape; makes folds."
     return Property(
         GARMENT_API, f"physgraph:rest:{way}Ease", "float", 0.0, "%", -50.0, 100.0, doc,
         f"{way.title()} Ease", REST, (0.0, 10.0),
