@@ -89,7 +89,7 @@ def test_wheel_carries_schemas_weights_and_licence(built: tuple[Path, Path]) -> 
     assert any(name.endswith("licenses/LICENSE") for name in names)
     assert not [name for name in names if name.startswith(("tests/", "schemas/"))]
     metadata = zipfile.ZipFile(wheel).read(next(name for name in names if name.endswith("METADATA"))).decode()
-    assert "A coarse animated garment" in metadata
+    assert "with coarse animated garments goes in" in metadata
     assert not re.findall(r"\]\((?!https?:)", metadata), "links and pictures that lead nowhere on a package index"
 
 

@@ -19,7 +19,7 @@ from pxr import Gf, Usd, UsdGeom
 from shots import CLOTH, EDGE, TIMES, cloth_shot, refine
 from stages import add_mesh, author, new_stage, save
 
-from physgraph_usd.shot.page.worst import close_up, verdict
+from physgraph_usd.shot.page.worst import close_up, seconds_as_text, verdict
 from physgraph_usd.shot.report import RefineReport
 from physgraph_usd.usd.read.meshes import RefinedLayer
 from physgraph_usd.usd.read.reader import open_shot
@@ -51,6 +51,13 @@ def test_warnings_name_prim_and_time_code(made: tuple[Path, Path, RefineReport])
     assert f"&lt;{CLOTH}&gt;" in warnings[1]
 
 
+@pytest.mark.parametrize(
+    ("seconds", "text"), [(0.0, "0 s"), (0.0234, "0.023 s"), (5.93, "5.9 s"), (284.0, "280 s"), (12345.0, "12,000 s")]
+)
+def test_durations_have_no_exponent(seconds: float, text: str):
+    assert seconds_as_text(seconds) == text
+
+
 def test_what_was_left_out_and_why(made: tuple[Path, Path, RefineReport]):
     text = text_of(made)
     for name, why in (made[2].modelled | made[2].left_out).items():
@@ -62,7 +69,7 @@ def test_the_page_begins_with_a_verdict_and_ends_its_times_with_the_report(made:
     text = text_of(made)
     assert re.search(
         r"</h1><p id='verdict'>1 of 8 frames could not be solved; 7 frames refined, nothing crosses, "
-        r"[\d.e+-]+ s of wall time a frame",
+        r"[\d.,]+ s of wall time per frame",
         text,
     )
     assert f"<tr><td>report</td><td class=number>{made[2].seconds['report']:.2f}</td></tr>" in text

@@ -48,29 +48,32 @@ session_options = together(
 @click.command()
 @click.argument("chunks", nargs=-1, required=True, metavar="CHUNK...", type=click.Path(path_type=Path))
 @out_option("LAYER", "Layer to write.", required=False)
-@click.option("--check-seams", is_flag=True, help="Look at the seams of those there, and write nothing.")
-@click.option("--frames", type=FRAME_RANGE, help="Time codes that must be there.  [default: all of the shot]")
+@click.option("--check-seams", is_flag=True, help="Measure the seams between the present chunks, and write nothing.")
+@click.option("--frames", type=FRAME_RANGE, help="First and last time code to join.  [default: all of the shot]")
 @click.option(
     "--seam-bound",
     type=click.FloatRange(min=0),
     metavar="EDGES",
     default=0.05,
-    help="Most that a seam may move, RMS, in mean fine edge lengths.",
+    help="Largest movement of a seam, RMS, in mean fine edge lengths.",
 )
-@click.option("--shot", type=click.Path(dir_okay=False), help="The shot where it is not where the chunks say.")
+@click.option("--shot", type=click.Path(dir_okay=False), help="The shot, if moved since the chunks were written.")
 @click.option(
     "--report",
     "report_to",
     type=click.Path(path_type=Path),
     metavar="FILE.json|DIR",
-    help="Write one report of all frames.",
+    help="Write a report of all frames.",
 )
-@click.option("--root", type=click.Path(path_type=Path), help="Also write a .usda with the layer over the shot.")
+@click.option(
+    "--root", type=click.Path(path_type=Path), help="Also write a root file (.usda) with the layer over the shot."
+)
 @overwrite_option
 def stitch(chunks: tuple[Path, ...], out: Path | None, *, check_seams: bool, seam_bound: float, **options: Any) -> None:
-    """Join each CHUNK of a shot, a folder as refine --preroll leaves it, into one layer and print its path.
+    """Join chunks of a shot, folders written by refine --preroll, into a layer and print the path of the layer.
 
-    A folder of chunks stands for all in it. How far each seam moves goes to stderr. Exits with 3 where a frame failed.
+    A folder of chunks counts as all its chunks. The movement of each seam is printed on stderr. Exits with 3 if a frame
+    failed.
     """
     with signals_noted():
         with imports_uncollected():
@@ -97,14 +100,14 @@ def stitch(chunks: tuple[Path, ...], out: Path | None, *, check_seams: bool, sea
     "--time",
     "timed",
     is_flag=True,
-    help="Also solve three frames, and say what the whole shot takes and how far from rest its frames end.",
+    help="Also solve three frames; print the time for the whole shot, and the distance of the frames from rest.",
 )
 @json_option
 @click.pass_context
 def inspect(ctx: click.Context, shot: str, *, as_json: bool, timed: bool, **options: Any) -> None:
-    """Print what would be refined, with what, from where, and every defect found in SHOT.
+    """Print the garments, bodies and values of SHOT, the source of each value, and every defect.
 
-    Exits with 1 when SHOT cannot be refined as asked, with 2 when what was named is not there.
+    Exits with 1 if SHOT cannot be refined with these options, with 2 if a named prim or file does not exist.
     """
     with imports_uncollected():
         from ..shot.refine import inspect_shot
@@ -126,7 +129,7 @@ def inspect(ctx: click.Context, shot: str, *, as_json: bool, timed: bool, **opti
 @of_field("asset_paths")
 @overwrite_option
 def tag(shot: str, out: Path, *, garments: tuple[str, ...], colliders: tuple[str, ...], **options: Any) -> None:
-    """Write a layer over SHOT that marks garments, colliders and targets for refine."""
+    """Write a layer over SHOT with marks on garments, colliders and bound prims, for refine."""
     from ..usd.write.tag import tag as tag_shot
 
     values = {name: value for name, value in options.items() if value is not None}
@@ -174,11 +177,11 @@ def _words(line: bytes) -> list[str]:
 @click.command()
 @shot_argument
 @session_options
-@click.option("--port", type=int, default=8080, help="Port on this machine; the next free one where it is taken.")
+@click.option("--port", type=int, default=8080, help="Port on this machine; if taken, the next free port.")
 def tune(shot: str, *, port: int, **options: Any) -> None:
-    """Show SHOT in the browser, with sliders for each garment's values; Save writes them as tag does.
+    """Show SHOT in the browser, with sliders for each garment's values; Save writes the values as tag does.
 
-    Prints the page's address, and serves it to this machine alone until it is interrupted.
+    Prints the address of the page, and serves the page to this machine alone until interrupted.
     """
     with signals_noted():
         with imports_uncollected():
@@ -194,11 +197,11 @@ def tune(shot: str, *, port: int, **options: Any) -> None:
 @click.command()
 @click.argument("layer", type=click.Path(dir_okay=False))
 @click.option(
-    "--shot", type=click.Path(dir_okay=False), help="The shot it goes over.  [default: the one the layer names]"
+    "--shot", type=click.Path(dir_okay=False), help="The shot below the layer.  [default: the shot named in the layer]"
 )
 @json_option
 def validate(layer: str, *, shot: str | None, as_json: bool) -> None:
-    """Check a refined LAYER by our rules and by USD's own validators; exit with 1 when it breaks one."""
+    """Check a refined LAYER by our rules and by USD's own validators; exit with 1 if a rule is broken."""
     from ..usd.check.validate import validate_layer
 
     problems = validate_layer(layer, shot)
@@ -224,15 +227,19 @@ def sample(name: str, out: Path, *, overwrite: bool) -> None:
 @click.command()
 @click.argument("layer", type=click.Path(dir_okay=False))
 @out_option("PNG|GIF", "Picture to write.")
-@click.option("--shot", type=click.Path(dir_okay=False), help="The coarse shot.  [default: the one the layer names]")
-@click.option("--time", "times", type=float, multiple=True, metavar="T", help="Time code to draw; repeatable.")
+@click.option(
+    "--shot", type=click.Path(dir_okay=False), help="The coarse shot.  [default: the shot named in the layer]"
+)
+@click.option(
+    "--time", "times", type=float, multiple=True, metavar="T", help="Time code to draw; repeatable for a GIF."
+)
 @click.option("--size", type=PICTURE_SIZE, default="1280x640", help="Pixels.")
-@click.option("--camera", type=(float, float), metavar="AZIMUTH ELEVATION", help="Where to look from, in degrees.")
+@click.option("--camera", type=(float, float), metavar="AZIMUTH ELEVATION", help="Direction of the camera, in degrees.")
 @overwrite_option
 def preview(layer: str, out: Path, *, times: tuple[float, ...], **options: Any) -> None:
     """Draw the smoothly subdivided input beside the cloth of LAYER and print the picture's path.
 
-    A PNG shows one time code, a GIF all of them.
+    A PNG shows a single time code, a GIF all time codes.
     """
     from ..shot.page.preview import preview as draw
 
@@ -241,16 +248,16 @@ def preview(layer: str, out: Path, *, times: tuple[float, ...], **options: Any) 
 
 @click.command()
 @shot_argument
-@out_option("DIR", "Folder to write into; a chart that was begun there goes on.")
+@out_option("DIR", "Folder to write into; an unfinished chart there is continued.")
 @scene_options
 @click.option("--device", metavar="cpu|cuda", help="Where to compute.")
 @click.option("--clock", type=click.Choice(["wall", "cpu"]), help="cpu: one core's own time, for busy machines.")
 @click.option("--method", "methods", multiple=True, metavar="NAME", help="Integrator to measure; repeatable.")
 @click.option(
-    "--peer", "peers", multiple=True, metavar="NAME=PYTHON", help="Solver outside, and the Python that has it."
+    "--peer", "peers", multiple=True, metavar="NAME=PYTHON", help="A solver of others, and the Python with that solver."
 )
 @click.option("--count", type=click.IntRange(min=1), metavar="N", help="Frames to measure.")
-@click.option("--repeats", type=click.IntRange(min=1), metavar="N", help="How often each time is taken.")
+@click.option("--repeats", type=click.IntRange(min=1), metavar="N", help="Number of repetitions of each measurement.")
 @click.option("--short", is_flag=True, help="Take less than 15 minutes.")
 @click.option("--budget-minutes", type=float, metavar="M", help="Plan with this time.")
 @overwrite_option
@@ -266,12 +273,17 @@ def chart(shot: str, out: Path, **options: Any) -> None:
 
 @click.command()
 @click.option(
-    "--config", "config_file", required=True, type=click.Path(path_type=Path), metavar="FILE.toml", help="What and how."
+    "--config",
+    "config_file",
+    required=True,
+    type=click.Path(path_type=Path),
+    metavar="FILE.toml",
+    help="Configuration of the training.",
 )
 @out_option("DIR", "Folder for the log, the checkpoint, the weights and their card.")
 @of_field("device")
-@click.option("--minutes", type=float, metavar="M", help="Train so long.  [default: the configuration's]")
-@click.option("--resume", is_flag=True, help="Go on from the folder's checkpoint.")
+@click.option("--minutes", type=float, metavar="M", help="Training time.  [default: the configuration's]")
+@click.option("--resume", is_flag=True, help="Continue from the checkpoint in the folder.")
 def train(config_file: Path, out: Path, *, device: str, **options: Any) -> None:
     """Train a learned integrator and print its weights' path."""
     from ..lab.train.record import run_training
@@ -286,7 +298,7 @@ def train(config_file: Path, out: Path, *, device: str, **options: Any) -> None:
 def warm_up(device: str) -> None:
     """Compile all kernels ahead of the first refine, as for an image of a farm's machines.
 
-    They are kept in the folder that WARP_CACHE_PATH names, by default in the user's cache.
+    Compiled kernels are kept in the folder WARP_CACHE_PATH, by default in the user's cache.
     """
     from ..shot.solve import prepare_device
     from ..solver.mesh.kernels import compile_kernels

@@ -41,10 +41,10 @@ RENAMED = {"run-up": "preroll"}
 def refine(
     ctx: click.Context, shots: tuple[str, ...], out: Path, *, summary: Path | None, dry_run: bool, **options: object
 ) -> None:
-    """Refine the garments of each SHOT into a layer of its own and print only the layers' paths on stdout.
+    """Refine the garments of each SHOT into a separate layer, and print only the paths of the layers on stdout.
 
-    Several shots are refined one beside the other, and one that fails leaves the others alone. A table of them all
-    comes last, on stderr. Exits with 0 when all is done, 1 when all failed, 2 for wrong usage, 3 when a part failed.
+    Several shots are refined in separate processes; if a shot fails, the others continue. A table of all shots is
+    printed last, on stderr. Exits with 0 if all is done, 1 if all failed, 2 for wrong usage, 3 if a part failed.
     """
     with signals_noted():
         with imports_uncollected():

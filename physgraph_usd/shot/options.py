@@ -87,19 +87,21 @@ class RefineOptions:
         INTEGRATORS[0], f"How forces become displacements: {', '.join(INTEGRATORS)}.", metavar="NAME"
     )
     weights: Path | None = _solver(None, "Weights for the learned integrator.", metavar="FILE")
-    steps: int = _solver(24, "Most steps at the finest level.", metavar="N", least=0)
+    steps: int = _solver(24, "Largest number of steps at the finest level.", metavar="N", least=0)
     tolerance: float = _solver(
-        2e-3, "Stop when the cloth would move less, RMS, in local edge lengths.", metavar="T", least=0
+        2e-3, "Convergence tolerance: remaining move, RMS, in local edge lengths.", metavar="T", least=0
     )
-    budget_ms: float | None = _solver(None, "Stop a frame when its steps took this time.", metavar="MS", above=0)
+    budget_ms: float | None = _solver(None, "Time limit of the steps of a frame.", metavar="MS", above=0)
     frame_limit: float | None = _solver(
         None,
-        "A frame that takes longer stops where it stands and counts as not settled.  [default: 20 times what the "
-        "shot's frames take, never under two minutes]",
+        "Time limit per frame. A frame over the limit keeps its current state and is reported as not settled.  "
+        "[default: 20 times the time of the shot's frames, at least two minutes]",
         metavar="SECONDS",
         above=0,
     )
-    device: str = _solver("cpu", "Where to compute; auto: on the card where there is one.", metavar="cpu|cuda|auto")
+    device: str = _solver(
+        "cpu", "Where to compute; auto: on the graphics card, if there is one.", metavar="cpu|cuda|auto"
+    )
     overrides: Sequence[str] = _scene(
         (),
         f"Override a value of garments or colliders, such as bendStiffness=2e-4 or preset=denim for all{LIST}.",
@@ -117,14 +119,15 @@ class RefineOptions:
     self_contact: str = _solver("auto", "How cloth pushes cloth.", choices=("auto", "off"))
     workers: int = _solver(
         1,
-        "Processes, each beginning 6 frames early; of several shots, so many at a time; with --scheduler, chunks.",
+        "Number of processes, each starting 6 frames early; for several shots, number of shots at a time; with "
+        "--scheduler, number of chunks.",
         metavar="N",
         least=1,
         result=False,
     )
     preroll: int | None = _farm(
         None,
-        "Leave --frames in folder OUT, a chunk for stitch, which joins it to the one before over the N frames before.",
+        "Write --frames as a chunk in folder OUT; stitch blends it with the previous chunk over N overlapping frames.",
         metavar="N",
         least=0,
     )
@@ -132,15 +135,15 @@ class RefineOptions:
         None, "Solve on the workers of this Dask scheduler (extra farm).", metavar="ADDRESS", result=False
     )
     report: Path | None = _files(
-        None, "Write what was done, or what failed; DIR: as a page too.", metavar="FILE.json|DIR"
+        None, "Write a report of the run, also of a failed run; DIR: as a page too.", metavar="FILE.json|DIR"
     )
     overwrite: bool = _files(False, "Replace files that exist.")
-    dry_run: bool = _files(False, "Print what would be done; write nothing.")
-    resume: bool = _batch(False, "Go on from the frames and layers that an interrupted run finished.")
-    skip_existing: bool = _batch(False, "Leave a shot whose layer is there.")
-    keep_frames: bool = _batch(True, "Leave finished frames when interrupted.")
+    dry_run: bool = _files(False, "Print the work to be done; write nothing.")
+    resume: bool = _batch(False, "Continue from the finished frames and layers of an interrupted run.")
+    skip_existing: bool = _batch(False, "Skip shots with an existing layer.")
+    keep_frames: bool = _batch(True, "Keep finished frames after an interruption.")
     velocities: bool = _layer(False, "Write point velocities even where the shot has none.")
-    heat_map: bool = _layer(False, "Also write depth inside bodies and crossings as primvars.")
+    heat_map: bool = _layer(False, "Also write depth inside bodies and intersections as primvars.")
     rest_frame: float | str | None = _scene(
         None,
         "Rest shape: this frame, or fitted to the shot.  [default: the authored one, else fitted]",
@@ -154,11 +157,13 @@ class RefineOptions:
         metavar="AXIS",
         choices=AXES,
     )
-    root: Path | None = _files(None, "Also write a .usda with the layer over the shot.")
+    root: Path | None = _files(None, "Also write a root file (.usda) with the layer over the shot.")
     strict: bool = _layer(
-        False, "Exit with 3 where a frame did not settle or over a tenth of what crossed is left.", result=False
+        False,
+        "Exit with 3 if a frame did not settle, or over a tenth of the input's intersections are left.",
+        result=False,
     )
-    asset_paths: str = _layer("relative", "How files written name other files.", choices=ASSET_PATHS, result=False)
+    asset_paths: str = _layer("relative", "How written files name other files.", choices=ASSET_PATHS, result=False)
     progress: Callable[[int, int], None] | None = _option(
         "", None, "Called with the number of frames done and of all frames.", result=False
     )

@@ -73,98 +73,102 @@ class Kind:
 WARNINGS = {
     "failed": Kind(
         "no sample is written at time code",
-        "that frame failed, the reason follows; mend the input, run again",
+        "that frame failed, for the reason that follows; mend the input and run again",
         "no sample is written at time code {name}: {error}",
     ),
     LIMITED: Kind(
         "the frame reached its limit of time",
-        "it took over 20 times as long as other frames and stands where it was stopped: valid, not at rest, and "
-        "dependent on the machine's speed. Look at its cage and bodies; `--frame-limit SECONDS` sets the limit",
+        "the frame took over 20 times as long as the others and was stopped. The cloth is valid but has not converged, "
+        "and depends on the machine's speed. Look at the cage and the bodies there; `--frame-limit SECONDS` "
+        "sets the limit",
         "the frame was not solved to its end: it reached its limit of time",
         "see --frame-limit",
     ),
     UNSOLVED: Kind(
         "it follows its cage there, not solved",
-        "the reason stands before it; mend the animation there, or leave the frame out with `--frames`",
+        "the text before it says why; mend the animation there, or leave the frame out with `--frames`",
         "{how}; it follows its cage there, not solved",
         "cache that frame again, or leave it out with --frames",
     ),
     "contact": Kind(
         "crossings or vertices inside a body are left",
-        "`--heat-map` writes where: mend the cage there; `physgraph:collider:side` mends a wrong "
-        "side. Some frames come out clean alone (`--frames`)",
+        "`--heat-map` writes where, so that you can mend the cage there; `physgraph:collider:side` corrects a side "
+        "that was guessed wrong. Some frames come out clean if they are refined alone (`--frames`)",
         "{left} are left",
         "--heat-map shows where, to mend the cage there",
     ),
     "drawn": Kind(
         "the surface that renderers draw enters a body",
-        "renderers subdivide the refined cloth; over a body's sharp edges the surface is rounder than the body. "
-        "`--scheme none` writes polygons, which stay outside; measured where a report is asked for",
+        "renderers subdivide the refined cloth, and over a body's sharp edges the surface is rounder than the body. "
+        "`--scheme none` writes polygons, which stay outside. This is measured only with `--report`",
         "the surface that renderers draw from it is up to {depth:.1f} mm inside a body",
         "--scheme none writes polygons, which stay outside",
         {"scheme": "none"},
     ),
     "open_loop": Kind(
         "cage and bodies close a loop, but the cloth does not",
-        "played as a loop, the cloth jumps there. `--temporal off` solves each frame by itself and closes the loop, "
-        "with less continuity between frames; a shot that plays once needs nothing",
+        "if the shot is played as a loop, the cloth jumps there. `--temporal off` solves each frame by itself and "
+        "closes the loop, with less continuity between frames. A shot that plays once needs no change",
         "cage and bodies close a loop, but the cloth ends {gap:.1f} mm from where it begins",
         "if it is played as a loop, --temporal off closes it",
         {"temporal": "off"},
     ),
     "broken_before": Kind(
         "leaves its place for this frame alone",
-        "mend the cage or the body in that frame; the next frame starts from the one before it",
+        "mend the cage or the body in that frame; the next frame starts from the frame before it",
         "the garment or a body leaves its place for this frame alone",
         "mend it. Time code {next} starts from the frame before it",
     ),
     "jumped_from": Kind(
         "jumps from this first frame to the next",
-        "if the first frame is broken: `--frames` without it",
+        "if the first frame is broken, leave it out with `--frames`",
         "the garment or a body jumps from this first frame to the next",
         "if it is broken, leave it out with --frames. Time code {next} starts anew",
     ),
     "strained": Kind(
         "in most frames the cage has not its rest shape's size",
-        "`--rest auto`, or `primvars:rest` in the cloth's own size: refined cloth takes the rest shape's size",
+        "refined cloth takes the size of its rest shape. `--rest auto` fits one to the shot, or author "
+        "`primvars:rest` in the cloth's own size",
         "in most frames the cage has not its rest shape's size, which refined cloth takes: {parts}",
         "give --rest auto, or author primvars:rest in the cloth's own size",
         {"rest_frame": "auto"},
     ),
     "unfelt": Kind(
         "cloth is inside or near a body that it does not feel",
-        "`--collider auto`, or the command that the warning names",
+        "use `--collider auto`, or the command that the warning names",
         "cloth is inside or within {near:.0f} mm of {bodies} that it does not feel, for {why}: {named}",
         "give --collider {auto}, or by name {options}",
     ),
     "unread": Kind(
         "a shape that is not read may touch cloth",
-        "convert it to a mesh, or put a mesh in its place; curves and points on cloth: `--bind`",
+        "convert it to a mesh, or put a mesh in its place; curves and points that lie on the cloth can follow "
+        "it by `--bind`",
         "{named} may touch cloth and {are} not read",
         "convert {them} to a Mesh, or put one in {their} place",
     ),
     "gravity": Kind(
         "gravity pulls across it",
-        "set the stage's `upAxis` right, or give `--gravity` the axis; also where a body lies and gravity is right",
+        "correct the stage's `upAxis`, or give `--gravity` the axis. If the body lies down and gravity is "
+        "right, no action is needed",
         "it and <{body}> inside it stand along {axis}, but gravity is {pull} by {source}",
         "give --gravity -{axis}, or mend the stage's upAxis",
         {"gravity": "-{axis}"},
     ),
     "solved_anew": Kind(
         "finished frames are solved anew",
-        "`--resume` in place of `--overwrite` uses them",
+        "`--resume` instead of `--overwrite` uses them",
         "{dropped} of a run that was interrupted {are} solved anew",
         "--resume would have used {them}",
     ),
     "resumed": Kind(
         "frames are those of a run that was interrupted",
-        "nothing; a run in one piece may fold a little otherwise",
+        "no action needed; folds may differ slightly from an uninterrupted run",
         "{kept} are those of a run that was interrupted; the others are solved{again}",
         "folds that can lie in several ways may lie otherwise there than in an undisturbed run",
     ),
     "slower": Kind(
         "cholespy is not installed",
-        "install it, where it has a wheel: solves take less time",
+        "install it, if it has a wheel for your system; solves then take less time",
         "cholespy is not installed: matrices are factorised by scipy, which is slower",
     ),
 }

@@ -101,23 +101,23 @@ _PULL, _BEND = ("N/m", (1e-3, 1e9), (1.0, 1e4)), ("N m", (0.0, 1e5), (1e-7, 1e-2
 _FABRIC_ROWS = (
     (
         "stretchStiffness", "Stretch Stiffness", _JERSEY.stretch, *_PULL,
-        "In-plane stiffness E h: Young's modulus of the sheet; along the warp where the weft's is given.",
+        "In-plane stiffness E h: Young's modulus of the sheet; along the warp if the weft has a separate value.",
     ),
     (
         "weftStretchStiffness", "Weft Stretch Stiffness", None, *_PULL,
-        "Stretch stiffness along the weft, where it is not the warp's.",
+        "Stretch stiffness along the weft, if different from the warp.",
     ),
     (
         "shearStiffness", "Shear Stiffness", None, "N/m", (0.0, 1e9), (0.1, 1e4),
-        "Shear stiffness G h; without one it is 0.375 times the stretch stiffness.",
+        "Shear stiffness G h; without a value, 0.375 times the stretch stiffness.",
     ),
     (
         "bendStiffness", "Bending Stiffness", _JERSEY.bend, *_BEND,
-        "Bending stiffness E h^3 / 12 (1 - nu^2); along the warp where the weft's is given.",
+        "Bending stiffness E h^3 / 12 (1 - nu^2); along the warp if the weft has a separate value.",
     ),
     (
         "weftBendStiffness", "Weft Bending Stiffness", None, *_BEND,
-        "Bending stiffness along the weft, where it is not the warp's; a quarter to four times that.",
+        "Bending stiffness along the weft, if different from the warp; a quarter to four times the warp's.",
     ),
     ("density", "Density", _JERSEY.density, "kg/m^2", (1e-4, 1e5), (0.01, 2.0), "Mass per area."),
     ("thickness", "Thickness", _JERSEY.thickness, "m", (1e-6, 1.0), (1e-4, 1e-2), "Thickness of the cloth."),
@@ -129,7 +129,7 @@ def _material(schema: str, fallbacks: bool) -> tuple[Property, ...]:
     """Rows of the fabric values; values missing in a material are looked up elsewhere for the garment."""
     limit = Property(
         schema, MATERIAL + "stretchLimit", "float", None, "%", 0.0, 1000.0,
-        "Strain along warp or weft from which the cloth is twenty times as stiff; without one it never is.",
+        "Strain along warp or weft above which the cloth is twenty times as stiff; without a value, no limit.",
         "Stretch Limit", FABRIC, (1.0, 50.0),
     )  # fmt: skip
     rows = (
@@ -152,7 +152,7 @@ def _material(schema: str, fallbacks: bool) -> tuple[Property, ...]:
 
 def _ease(way: str) -> Property:
     """Row of the length of cloth along warp or weft in excess of the rest shape."""
-    doc = f"Length along the {way} that the cloth has and the rest shape does not show; folds come from it."
+    doc = f"Extra cloth length along the {way}, in percent of the rest shape; makes folds."
     return Property(
         GARMENT_API, f"physgraph:rest:{way}Ease", "float", 0.0, "%", -50.0, 100.0, doc,
         f"{way.title()} Ease", REST, (0.0, 10.0),
@@ -174,7 +174,7 @@ PROPERTIES: tuple[Property, ...] = (
     ),
     Property(
         GARMENT_API, "physgraph:refine:level", "int", 2, "", -1, 5,
-        "Number of subdivisions; -1 chooses it from the buckling wavelength.",
+        "Number of subdivisions; -1 chooses by the buckling wavelength.",
         "Subdivisions", REFINEMENT, (-1, 4), uniform=True,
     ),
     Property(
@@ -183,12 +183,12 @@ PROPERTIES: tuple[Property, ...] = (
     ),
     Property(
         GARMENT_API, "physgraph:refine:raiseBending", "bool", True, "", None, None,
-        "Whether bending is raised on a level whose edges are too long for the fabric's folds.",
+        "Whether bending is raised on a level with edges too long for the fabric's folds.",
         "Raise Bending", REFINEMENT, uniform=True,
     ),
     Property(
         GARMENT_API, "physgraph:gravity", "token", None, "", None, None,
-        "Axis of the stage along which gravity pulls, one for all garments.",
+        "Axis of the stage along which gravity pulls, the same for all garments.",
         "Gravity", REFINEMENT, uniform=True, tokens=AXES,
     ),
     *_material(GARMENT_API, fallbacks=True),
@@ -223,12 +223,12 @@ PROPERTIES: tuple[Property, ...] = (
     ),
     Property(
         GARMENT_API, "physgraph:shell:thickness", "float", 0.0, "m", 0.0, 1.0,
-        "Thickness of a closed shell that is written in place of the refined sheet; 0 writes the sheet." + SI,
+        "Thickness of a closed shell, written instead of the refined sheet; 0 writes the sheet." + SI,
         "Shell Thickness", REFINEMENT, (0.0, 0.01), uniform=True,
     ),
     Property(
         GARMENT_API, "physgraph:seam:tolerance", "float", 0.0, "m", 0.0, 1.0,
-        "Distance within which open borders are sewn together; 0 sews borders at one place." + SI,
+        "Largest distance between open borders that are sewn together; 0 sews only coincident borders." + SI,
         "Seam Tolerance", REST, (0.0, 5e-3), uniform=True,
     ),
     _scale(
@@ -253,16 +253,16 @@ PROPERTIES: tuple[Property, ...] = (
     ),
     Property(
         GARMENT_API, "primvars:physgraph:gather", "float[]", 0.0, "%", -50.0, 400.0,
-        "Painted length that the cloth has more along the weft, as at a gathered seam; vertex or constant.",
+        "Painted extra cloth length along the weft, as at a gathered seam; vertex or constant.",
         "Gather", PAINTED, (0.0, 100.0), interpolation="vertex",
     ),
     Property(
         GARMENT_API, "primvars:physgraph:grain", "float[]", 0.0, "degrees", -360.0, 360.0,
         "Painted turn of the warp, counter-clockwise on the face, from v of the texture coordinates, or from "
-        "downwards where these are no pattern; vertex or constant.",
+        "downwards if the texture coordinates are no pattern; vertex or constant.",
         "Grain", PAINTED, (-90.0, 90.0), interpolation="vertex",
     ),
-    _scale("pin", "Pin", 0.0, most=1.0, soft=1.0, doc="1 where the fine cloth follows the coarse cloth exactly."),
+    _scale("pin", "Pin", 0.0, most=1.0, soft=1.0, doc="1 on vertices that follow the coarse cloth exactly, 0 if free."),
     Property(
         COLLIDER_API, "physgraph:collider:enabled", "bool", True, "", None, None,
         "Whether garments collide with this prim; unless authored, while it is visible.",
@@ -274,9 +274,9 @@ PROPERTIES: tuple[Property, ...] = (
     ),
     Property(
         COLLIDER_API, "physgraph:collider:side", "token", "auto", "", None, None,
-        "Where cloth belongs: auto, outside closed parts, and at open ones as their shape and the coarse cloth tell; "
-        "winding, outside by the winding number; start, where the coarse cloth is; front or back, that side of the "
-        "faces of open parts.",
+        "Side for the cloth: auto, outside closed parts, and at open parts by shape and coarse cloth; winding, outside "
+        "by the winding number; start, the side of the coarse cloth; front or back, this side of the faces of open "
+        "parts.",
         "Side", COLLISION, uniform=True, tokens=SIDES,
     ),
     *_material(MATERIAL_API, fallbacks=False),

@@ -59,9 +59,14 @@ def verdict(report: RefineReport) -> str:
             right.append(nothing)
     if report.unsettled:
         wrong.append(f"{counted(len({each['time'] for each in report.unsettled}), 'frame')} did not settle")
-    pace = [f"{report.seconds.get('frames', 0.0) / count:.2g} s of wall time a frame"] if count else []
+    pace = [f"{seconds_as_text(report.seconds.get('frames', 0.0) / count)} of wall time per frame"] if count else []
     sentence = "; ".join([*wrong, ", ".join([*right, *pace])])
     return f"{sentence[:1].upper()}{sentence[1:]}."
+
+
+def seconds_as_text(seconds: float) -> str:
+    """A duration [s] with two significant digits and no exponent, such as "0.42 s", "5.9 s" or "280 s"."""
+    return f"{float(f'{seconds:.2g}'):,g} s"
 
 
 def close_up(report: RefineReport, shot: Shot) -> CloseUp | None:
