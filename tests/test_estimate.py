@@ -47,9 +47,10 @@ def test_the_estimate_is_within_a_factor_of_two_of_what_a_run_takes(tmp_path: Pa
 
 
 def test_a_long_run_says_after_three_frames_when_it_will_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    assert re.fullmatch(r"3 of 48 frames in 30 s: all in about 8 min more, at \d\d:\d\d", ending(30.0, 48, 1))
-    assert "about 4 min more" in ending(30.0, 48, 2)
-    assert ending(0.3, 48, 1) == ""
+    assert re.fullmatch(r"3 of 48 frames in 30 s: all in about 8 min more, at \d\d:\d\d", ending(30.0, 10.0, 48, 1))
+    assert "about 4 min more" in ending(30.0, 10.0, 48, 2)
+    assert "about 4 min more" in ending(30.0, 20.0, 48, 1)  # The first frame is no measure of the others.
+    assert ending(0.3, 0.1, 48, 1) == ""
     monkeypatch.setattr("physgraph_usd.shot.run.LONG_RUN", 0.0)
     shot = cloth_shot(tmp_path / "shot.usda", times=(1.0, 2.0, 3.0, 4.0, 5.0))
     done = run("refine", shot, "-o", tmp_path / "out.usdc", "--level", 0)

@@ -44,7 +44,9 @@ class TestSlowing:
 class TestState:
     def test_garments_that_join_count_from_the_last_to_move(self):
         coarse, fine = (torch.zeros(count, 3) for count in (2, 4))
-        one, other = (FrameState(coarse, fine, fine[:, 0] > 0, coarse[:, 0] > 0, coarse[:, 0].long(), held) for held in (7, 2))
+        one, other = (
+            FrameState(coarse, fine, fine[:, 0] > 0, coarse[:, 0] > 0, coarse[:, 0].long(), held) for held in (7, 2)
+        )
         both = join([one, other])
         assert both.held == 2
         assert [each.held for each in split(both, [slice(0, 2), slice(2, 4)], [slice(0, 4), slice(4, 8)])] == [2, 2]

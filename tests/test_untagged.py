@@ -11,7 +11,7 @@ import pytest
 from bodies import box
 from pxr import Usd, UsdGeom
 from shots import refine
-from stages import COLLIDER_API, GARMENT_API, add_mesh, add_sheet, author, new_stage, save
+from stages import COLLIDER_API, GARMENT_API, add_mesh, add_sheet, author, new_stage, save, vec3
 
 from physgraph_usd.shot.refine import inspect_shot
 from physgraph_usd.studio.session import TuneSession
@@ -49,13 +49,30 @@ def test_it_is_named_with_what_to_type(stage: Usd.Stage, tmp_path: Path):
 def test_animated_cloth_without_a_body_is_a_garment(tmp_path: Path):
     stage = new_stage(tmp_path / "shot.usda", metres=0.1)
     add_sheet(stage, times=(1.0, 2.0))
-    add_sheet(stage, "/World/backdrop", times=())
+    add_sheet(stage, "/World/backdrop", times=()).AddTranslateOp().Set((0.0, 0.0, -9.0))
     for name in ("cloth", "backdrop"):
         stage.GetPrimAtPath(f"/World/{name}").RemoveAppliedSchema(GARMENT_API)
     found = inspect_shot(save(stage))
     assert shlex.split(found["command"])[-2:] == ["--garment", "/World/cloth"]
     assert "/World/backdrop" not in found["command"]
     assert found["exit_code"] == 0
+
+
+def test_names_and_motion_say_what_is_cloth(tmp_path: Path):
+    """Closed clothes on a body that was cut off under them, and a hat that moves with its transform."""
+    stage = new_stage(tmp_path / "shot.usda", metres=0.1)
+    around = box((4.0, 3.0, 0.4))[0] + [2.0, 1.5, 0.0]
+    clothes = add_box(stage, "/World/hero/clothes", around)
+    for time in (1.0, 2.0):
+        clothes.GetPointsAttr().Set(vec3(around + np.array([0.0, 0.0, 0.02 * time])), time)
+    add_sheet(stage, "/World/hero/body", tagged=False)
+    hat = add_sheet(stage, "/World/hero/hat", times=(), tagged=False)
+    move = hat.AddTranslateOp()
+    for time in (1.0, 2.0):
+        move.Set((0.0, 0.0, 0.1 * time), time)
+    command = shlex.split(inspect_shot(save(stage))["command"])
+    assert [command[k + 1] for k, word in enumerate(command) if word == "--garment"] == ["/World/hero/clothes"]
+    assert "/World/hero/body" in [command[k + 1] for k, word in enumerate(command) if word == "--collider"]
 
 
 def test_auto_takes_it_and_what_is_marked(stage: Usd.Stage, tmp_path: Path):

@@ -155,7 +155,8 @@ def _command(opened: Shot, garments: Sequence[GarmentSource], options: RefineOpt
 def _proposal(shot: str | Stage, meshes: Sequence[str], options: RefineOptions) -> str:
     """The command for a shot without tags.
 
-    Open meshes, the largest first, that lie on other meshes are the garments; if none does, those that are animated.
+    Of meshes that look like cloth, the largest first, those that lie on others are the garments; if none does, those
+    that are animated.
     "" if no garment is found or the meshes cannot be read together.
     """
     try:
@@ -183,7 +184,8 @@ def describe_meshes(shot: str | Stage, problem: str, options: RefineOptions) -> 
     """
     found, command = survey(shot), ""
     if not options.garments and not any(mesh.garment for mesh in found.meshes):
-        cloth = [mesh for mesh in found.meshes if mesh.is_open and not mesh.problem]
+        cloth = [mesh for mesh in found.meshes if mesh.looks_like_cloth and not mesh.problem]
+        cloth = [mesh for mesh in cloth if mesh.deforms] or cloth
         cloth.sort(key=lambda mesh: -mesh.faces)
         command = _proposal(shot, [mesh.path for mesh in cloth], options)
     return {

@@ -59,7 +59,7 @@ def refine_shot(shot: str | Path, out: str | Path, options: RefineOptions = DEFA
         return there
     if not options.dry_run:
         if not out.resolve().parent.is_dir():
-            raise UsageError(f"the folder {out.resolve().parent} does not exist")
+            raise UsageError(f"the folder {out.resolve().parent} does not exist; make it, or name another by -o")
         check_places(out, options)
     with running(str(shot), options, out=out) as (opened, report):
         if options.dry_run:

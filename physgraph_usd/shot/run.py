@@ -205,7 +205,7 @@ class Run:
     def _write_frames(self, writer: LayerWriter | None, solved: Outcomes, count: int) -> None:
         """Write each frame as soon as solved, then close the layer; a chunk's frames are already in its folder."""
         report, options = self.report, self.options
-        written, shot, began = 0.0, {"shot": report.shot}, clock.perf_counter()
+        written, first, shot, began = 0.0, 0.0, {"shot": report.shot}, clock.perf_counter()
         compared = frames_compared(count if options.contact != "off" else 0)
         shown, entered = list[Shown](), dict[float | None, dict[str, float]]()
         drawn = DrawnCloth(self.shot, self.solver.levels if options.report and options.scheme == "keep" else ())
@@ -214,9 +214,9 @@ class Run:
             shown += shown_through(self.shot, outcome) if done - 1 in compared else []
             entered[outcome.time] = drawn.depths(outcome) if done - 1 in compared else {}
             LOG.info("frame %d of %d: time code %s", done, count, named_time(outcome.time), extra=shot)
-            if done == TIMED_FRAMES < count and (
-                message := ending(clock.perf_counter() - began, count, options.workers)
-            ):
+            spent = clock.perf_counter() - began
+            first = spent if done == 1 else first
+            if done == TIMED_FRAMES < count and (message := ending(spent, first, count, options.workers)):
                 LOG.log(NOTICE, "%s", message, extra=shot)
             LOG.debug("%s", outcome.record, extra=shot)
             if options.progress:
@@ -293,16 +293,19 @@ def fine_meshes(garments: Sequence[Garment], refinements: Sequence[Sequence[Refi
     return [[cage, *steps][-1].mesh for cage, steps in zip(garments, refinements, strict=True)]
 
 
-def ending(seconds: float, count: int, workers: int) -> str:
+def ending(seconds: float, first: float, count: int, workers: int) -> str:
     """When a run will end, as text; "" if soon.
+
+    The first frame starts from the cage and takes longer than the others, which the rest of the run is judged by.
 
     Args:
         seconds: Duration of the first `TIMED_FRAMES` frames [s].
+        first: Duration of the first of them [s].
         count: Frames of the run.
         workers: Processes sharing the frames; the first frames to arrive are the first process's.
     """
     frames = -(-count // workers) - TIMED_FRAMES
-    left = frames * seconds / TIMED_FRAMES
+    left = frames * (seconds - first) / (TIMED_FRAMES - 1)
     if left < LONG_RUN:
         return ""
     at = clock.strftime("%H:%M", clock.localtime(clock.time() + left))

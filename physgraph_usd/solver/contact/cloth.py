@@ -221,6 +221,11 @@ class LevelContact:
             exempt = mesh.padded(exempt if inside is None else exempt | inside.any(dim=0))
         return ContactState(x, x._version, corners, found, tangles, pierced, inside, exempt)
 
+    def tangled_pieces(self, x: Float[Tensor, "vertices 3"]) -> Bool[Tensor, " vertices"] | None:
+        """Mask of the connected pieces of cloth with most of their vertices in tangles at x [m]; None without any."""
+        tangles = self.look(x).tangles
+        return None if tangles is None else self.mesh.pieces_with(tangles.label >= 0, over=0.5)
+
     def pushed_out(self, x: Float[Tensor, "vertices 3"], *, vertices: bool = False) -> Float[Tensor, "vertices 3"]:
         """As `LevelBodies.pushed_out`, or for vertices alone; x [m] itself if no cloth is inside or through a body."""
         state = self.look(x)

@@ -22,7 +22,6 @@ from .cloth_mesh import ClothMesh
 from .repair import repaired_cage
 from .report import measured, swallowed
 from .settings import ContactSettings
-from .stuck import stuck
 from .tangles import Tangles
 
 STALLED = 4
@@ -87,7 +86,7 @@ class FrameContact:
 
     @cached_property
     def given_up(self) -> Bool[Tensor, " coarse"] | None:
-        """Mask of the cage's cloth that the last frame gave up and that crosses still; None for none.
+        """Mask of the pieces of the cage that the last frame gave up and that cross still; None for none.
 
         What the last frame solved is never given up because the cage crosses there.
         """
@@ -95,19 +94,12 @@ class FrameContact:
             return None
         mesh, found, *_ = self._cage
         lost = mesh.padded(self._last_given_up)
-        tangles = Tangles.find(mesh, found, torch.zeros_like(lost))
-        reached = torch.bincount((tangles.label[lost] + 1).long(), minlength=len(tangles.before) + 1)[1:] > 0
-        again = tangles.of(reached)[: len(self._coarse)]
-        return again if bool(again.any()) else None
+        tangled = Tangles.find(mesh, found, torch.zeros_like(lost)).label >= 0
+        return mesh.pieces_with(lost & tangled, over=0.0)
 
-    def after_cage(self, start: Float[Tensor, "coarse 3"], x: Float[Tensor, "coarse 3"]) -> FrameContact:
-        """This contact, where cloth that is stuck in tangles is given up: in a cold frame's cage, untangled to x [m].
-
-        Args:
-            start: The cage before the rounds that untangle it [m].
-            x: The cage after them [m].
-        """
-        lost = stuck(self.at(self._levels[0]), start, x)
+    def after_cage(self, x: Float[Tensor, "coarse 3"]) -> FrameContact:
+        """This contact, where pieces that are mostly tangled in the cage x [m] of a cold frame are given up."""
+        lost = self.at(self._levels[0]).tangled_pieces(x)
         if lost is None:
             return self
         out = copy(self)

@@ -83,19 +83,18 @@ class Tangles:
         """Mask of the vertices of hopeful tangles with more crossings than before."""
         of = self.label[self._mesh.corners_of(crossings)].amax(dim=1).long()
         counts = torch.bincount(of.clamp_min(0), minlength=len(self.before))
-        return self.of((counts > self.before) & ~self.hopeless)
+        return self._of((counts > self.before) & ~self.hopeless)
 
     @property
     def given_up(self) -> Bool[Tensor, " all"]:
         """Mask of the vertices of hopeless tangles."""
-        return self.of(self.hopeless)
+        return self._of(self.hopeless)
 
     def hopeful(self, crossings: Crossings) -> Crossings:
         """Crossings outside hopeless tangles."""
         return crossings.where(~self.given_up[self._mesh.corners_of(crossings)].any(dim=1))
 
-    def of(self, some: Bool[Tensor, " tangles"]) -> Bool[Tensor, " all"]:
-        """Mask of the vertices of some tangles."""
+    def _of(self, some: Bool[Tensor, " tangles"]) -> Bool[Tensor, " all"]:
         return some[self.label.clamp_min(0).long()] & (self.label >= 0)
 
 

@@ -1,4 +1,6 @@
-"""No patch of refined cloth crosses cloth and bodies more often than the subdivided cage: else it follows that cage.
+"""No patch of refined cloth crosses more than the subdivided cage: else it follows that cage.
+
+A patch is worse if cloth crosses cloth or bodies more often in it than in the subdivided cage, and neither less often.
 
 A patch is connected cloth around what crosses, in the solution or in the subdivided cage, with the cloth that it
 crosses. A patch follows the subdivided cage until the solution was as good there for `STAY` frames, so that it does not
@@ -37,7 +39,7 @@ def all_crossed(view: LevelContact, x: Float[Tensor, "vertices 3"]) -> Crossed:
 
 
 def patches_worse(view: LevelContact, x: Crossed, base: Crossed) -> Bool[Tensor, " vertices"]:
-    """Mask of the patches in which more crosses than in the subdivided cage.
+    """Mask of the patches in which more crosses than in the subdivided cage, and neither less cloth nor less of bodies.
 
     Args:
         x: Corners of what crosses, shape (N, 5).
@@ -51,8 +53,12 @@ def patches_worse(view: LevelContact, x: Crossed, base: Crossed) -> Bool[Tensor,
     across = torch.cat([corners[:, [0, place]] for place in range(1, 5)])
     links = torch.cat([edges[region[edges].all(dim=1)], across[(across < count).all(dim=1)]])
     patch = torch.as_tensor(joined_by(links.cpu().numpy(), count), device=region.device).long()
-    solved, given = (torch.bincount(patch[each.amin(dim=1).long()], minlength=count) for each in (x, base))
-    return region & (solved > given)[patch]
+    more = []
+    for of_bodies in (False, True):
+        some = (each[(each >= count).any(dim=1) == of_bodies].amin(dim=1).long() for each in (x, base))
+        solved, given = (torch.bincount(patch[each], minlength=count) for each in some)
+        more.append(solved - given)
+    return region & ((torch.minimum(*more) >= 0) & (torch.maximum(*more) > 0))[patch]
 
 
 def no_worse(
@@ -101,7 +107,7 @@ def no_worse(
         more = longer(found)
         if more is None:
             break
-    if not bool(left.any()) or len(found) > len(solved):
+    if not bool(left.any()) or (len(found) > len(solved) and not bool(before.any())):
         return x, torch.zeros_like(left), {}
     share = np.asarray(from_coarse @ (left > 0).double().cpu().numpy())
     figures = {"vertices": int((share > 0).sum()), "solved": len(solved), "subdivided": len(base), "left": len(found)}

@@ -21,7 +21,6 @@ from ...errors import SolveError
 from ..contact.cloth import LevelContact
 from ..contact.frame import STALLED
 from ..contact.metric import HELD_TOLERANCE, HeldMetric
-from ..contact.stuck import stuck
 from ..deadline import is_over
 from ..forces.base import ForceModule
 from ..integrate.base import Carry, Integrator, System, Transporting
@@ -79,13 +78,14 @@ def solve_frame(group: Group, frame: FrameInput, last: FrameState | None) -> Sol
     if problem.contact is not None:
         shown, finish = problem.contact.finish(x)
         x = shown if problem.contact.is_out(shown) else x  # What is pushed out in vain is not carried on.
-    shown, following, followed = patched(problem, scaled(problem, shown))
+    solution = scaled(problem, shown)
+    shown, following, figures = patched(problem, solution)
     left = state_left(problem, x, memory, following)
     solved = time.perf_counter()
-    telemetry = telemetry_of(problem, shown, module, reports=reports)
+    telemetry = telemetry_of(problem, solution, module, reports=reports)
     contact, crossing = measured(problem, shown)
     telemetry |= {"contact": contact | finish} if contact else {}
-    telemetry |= {"follows_cage": followed} if followed else {}
+    telemetry |= {"follows_cage": figures} if figures else {}
     marks = (problem.began, prepared, solved, time.perf_counter())
     pairs = zip(("prepare", "solve", "measure"), marks, marks[1:], strict=False)
     telemetry["milliseconds"] = {name: round(1e3 * (end - start), 3) for name, start, end in pairs}
@@ -183,7 +183,7 @@ def _curvature(integrator: Integrator, carry: Carry) -> Any:
 def _with_cage_untangled(problem: Problem, *, since: float) -> tuple[Problem, list[LevelReport]]:
     """A cold frame that starts at its untangled cage, and a report per round.
 
-    Cloth that is stuck in tangles afterwards is given up.
+    Pieces of cloth that are mostly tangled afterwards are given up.
 
     Args:
         since: Time at which the frame was ready to be solved [s].
@@ -194,9 +194,8 @@ def _with_cage_untangled(problem: Problem, *, since: float) -> tuple[Problem, li
     level = problem.level(0, since=since)
     view, start = level.view, problem.begun(0, None)[0]
     assert view is not None
-    start = Placed(view.closed(start))
-    x, reports = _untangle(level, view, start, view.drawn, most=UNTANGLINGS)
-    return replace(problem, contact=contact.after_cage(start, x), walked=x), reports
+    x, reports = _untangle(level, view, Placed(view.closed(start)), view.drawn, most=UNTANGLINGS)
+    return replace(problem, contact=contact.after_cage(x), walked=x), reports
 
 
 def _untangle(
@@ -204,14 +203,14 @@ def _untangle(
 ) -> tuple[Placed, list[LevelReport]]:
     """Rounds of few steps to shorten intersection contours.
 
-    Rounds end early if cloth is stuck, and would be still at the pace of the last `STALLED` rounds.
+    Rounds end early if whole pieces of cloth are tangled, and would be still at the pace of the last `STALLED` rounds.
 
     Args:
         x: Positions [m].
         move: Moves the cloth to wanted positions [m] as far as is safe.
         most: Most rounds.
     """
-    level, budget, start = problem.level, problem.budget, x
+    level, budget = problem.level, problem.budget
     reports: list[LevelReport] = []
     short, counts = budget.for_untangling(), [view.look(x).hopeful.count]
     for left in reversed(range(most)):
@@ -224,7 +223,7 @@ def _untangle(
         reports.append(report)
         counts.append(view.look(x).hopeful.count)
         gone = counts[-1 - STALLED] - counts[-1] if len(counts) > STALLED else math.inf
-        if counts[-1] * STALLED > gone * left and stuck(view, start, x) is not None:
+        if counts[-1] * STALLED > gone * left and view.tangled_pieces(x) is not None:
             break
     return x, reports
 
@@ -260,8 +259,7 @@ def solve_soundly(group: Group, frame: FrameInput, last: FrameState | None) -> S
     why = _unsound(solved.telemetry)
     settings = group.settings
     ended_early = is_over() or settings.budget_ms is not None or settings.steps == 0 or not settings.whole
-    lost = bool(solved.state.given_up.any())  # A start from the cage would be stuck there again.
-    if not why or lost or (last is None and frame.walked is None) or ended_early:
+    if not why or (last is None and frame.walked is None) or ended_early:
         return solved
     if last is not None and last.wait:
         return _waiting(solved, last.failures, last.wait - 1)

@@ -49,7 +49,7 @@ _PER_EDGE, _PER_SIZE = 5.0, 400.0
 larger one counts. A coat with edges of 10 mm keeps the full offset, a doll's of 1:12 a quarter of it."""
 _STANDS_OFF = 2.5
 """Multiple of that distance from which an authored offset or thickness is large for a garment."""
-_WORD = re.compile("[A-Z]?[a-z]+|[A-Z]+(?![a-z])")
+WORD = re.compile("[A-Z]?[a-z]+|[A-Z]+(?![a-z])")
 """A word of a name such as "LeatherBelt_geo1"."""
 _THICK = 10.0
 """Inverse of the largest contact distance relative to the cloth's size. Beyond, all vertices are near all vertices,
@@ -322,7 +322,7 @@ def _words(prim: Usd.Prim, subsets: Sequence[str]) -> tuple[str, ...]:
     prims = [prim, prim.GetParent(), *bound_materials(prim)]
     for subset in (prim.GetChild(name) for name in subsets):
         prims += [subset, *bound_materials(subset)]
-    return tuple(word.lower() for each in prims for word in _WORD.findall(each.GetName()))
+    return tuple(word.lower() for each in prims for word in WORD.findall(each.GetName()))
 
 
 def _rest_and_weld(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from pxr import Usd
+from pxr import Usd, UsdGeom, UsdSkel
 
 from ...errors import StageError
 from ...solver.colliders.orient import pieces_of
@@ -14,7 +14,19 @@ from ..times import motion_of
 from .absence import Samples
 from .cage import PointReader, read_cage
 from .find import has_schema
+from .garment import WORD
 from .placement import check_placement
+
+CLOTH = frozenset(
+    "apron blouse cape clothes clothing cloth cloak coat costume dress dungarees garment garments gown hoodie jacket"
+    " jeans kilt leggings outfit overalls overcoat pants robe scarf shirt shorts skirt suit sweater tee trousers tshirt"
+    " uniform vest".split()
+)
+NO_CLOTH = frozenset(
+    "arm arms body bed chair char character face feet floor foot ground hair hand hands head leg legs seat set skin"
+    " stool table teeth torso wall".split()
+)
+"""Words in the name of a mesh that is cloth, and of one that is not."""
 
 
 @dataclass(frozen=True)
@@ -26,6 +38,7 @@ class MeshReport:
         points: Number of points; 0 if unreadable.
         faces: Number of faces to be refined.
         is_open: Whether open pieces have more faces than closed pieces.
+        deforms: Whether its points change in time, or follow a skeleton.
         times: Authored time codes of points and transforms, without a skeleton's.
         problem: Why the mesh cannot be refined; "" for none.
         notices: Warnings of refining the mesh.
@@ -36,9 +49,16 @@ class MeshReport:
     points: int = 0
     faces: int = 0
     is_open: bool = False
+    deforms: bool = False
     times: tuple[float, ...] = ()
     problem: str = ""
     notices: tuple[Notice, ...] = ()
+
+    @property
+    def looks_like_cloth(self) -> bool:
+        """Whether the name says so; open meshes too, if it does not name a part of a body or of a set."""
+        words = {word.lower() for word in WORD.findall(self.path.rsplit("/", 1)[-1])}
+        return not words.isdisjoint(CLOTH) or (self.is_open and words.isdisjoint(NO_CLOTH))
 
 
 @dataclass(frozen=True)
@@ -86,4 +106,6 @@ def _survey_mesh(prim: Usd.Prim, metres: float) -> MeshReport:
         return MeshReport(path, garment, points=count, problem=str(error))
     is_open = len(pieces.open) > len(pieces.closed)
     notices = (*samples.notices(path, tuple(samples.absent)), *cage.notices, *odd)
-    return MeshReport(path, garment, count, len(cage.kept_faces), is_open, times, notices=notices)
+    skinned = UsdSkel.BindingAPI(prim).GetJointIndicesAttr().HasAuthoredValue()
+    deforms = skinned or UsdGeom.Mesh(prim).GetPointsAttr().ValueMightBeTimeVarying()
+    return MeshReport(path, garment, count, len(cage.kept_faces), is_open, deforms, times, notices=notices)
