@@ -59,7 +59,7 @@ def _command(parent: click.Context, command: click.Command) -> Iterator[str]:
     usage = " ".join(command.collect_usage_pieces(context))
     yield f"## {command.name}\n\n`physgraph-usd {command.name} {usage}`\n\n{inspect.cleandoc(command.help or '')}\n"
     groups: dict[str, list[tuple[str, str]]] = {}
-    for option in command.get_params(context):
+    for option in command.params:
         record = option.get_help_record(context) if isinstance(option, click.Option) else None
         if record is not None:
             groups.setdefault(getattr(option, "heading", "Options"), []).append(record)

@@ -6,7 +6,7 @@ import torch
 from folds import levels_of, named, square, view_of
 from test_tangles import pair
 
-from physgraph_usd.solver.frame.no_worse import STAY, all_crossed, no_worse
+from physgraph_usd.solver.frame.no_worse import STAY, Faults, no_worse
 from physgraph_usd.solver.level import Placed
 
 APART = torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)
@@ -31,9 +31,9 @@ def test_only_the_pair_that_crosses_more_follows_its_cage():
     x[number == 1, 1] -= 0.004
     x[number == 3, 1] += 0.012
     y, left, told = kept(view, level, x, smooth)
-    first, counts = number < 2, [len(all_crossed(view, each)) for each in (x, smooth, y)]
+    first, counts = number < 2, [len(Faults.of(view, view.found(each)).corners) for each in (x, smooth, y)]
     crossing = torch.zeros_like(first)
-    crossing[torch.cat([all_crossed(view, each).reshape(-1) for each in (x, smooth)]).long()] = True
+    crossing[torch.cat([Faults.of(view, view.found(each)).corners.reshape(-1) for each in (x, smooth)]).long()] = True
     crossing &= first
     moved = (y != x).any(dim=1)
     assert torch.equal(y[crossing], smooth[crossing])

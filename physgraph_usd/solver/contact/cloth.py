@@ -187,12 +187,12 @@ class LevelContact:
         """As `look` for an upsampled cage [m], searched only around what crosses in the cage itself."""
         if self._doubtful is None:
             return ContactState.clean(x, self.corners(x))
-        return self._found(x, self._doubtful)
+        return self.found(x, self._doubtful)
 
     def look(self, x: Float[Tensor, "vertices 3"]) -> ContactState:
         """Crossings at x [m]; cached for the same tensor until its version changes."""
         if self._looked is None or self._looked.x is not x or self._looked.version != x._version:
-            self._looked = self._found(x)
+            self._looked = self.found(x)
         return self._looked
 
     def remember(self, x: Float[Tensor, "vertices 3"], given_up: Tangles | None = None) -> None:
@@ -203,8 +203,8 @@ class LevelContact:
         """Corners of the cloth, then of the bodies in this frame [m], float64."""
         return x.double() if self.frame is None else torch.cat([x.double(), self.frame.points])
 
-    def _found(self, x: Tensor, some: Bool[Tensor, " all"] | None = None) -> ContactState:
-        """Crossings, tangles and cloth inside bodies at x, of the given vertices; of all when None."""
+    def found(self, x: Tensor, some: Bool[Tensor, " all"] | None = None) -> ContactState:
+        """Crossings, tangles and cloth inside bodies at x [m], of the given vertices or of all; not cached."""
         mesh, corners, lost = self.mesh, self.corners(x), self.given_up
         asked = self._asked if some is None else some if self._asked is None else some & self._asked
         found, pierced = all_crossings(mesh.parts, corners, asked)

@@ -1,13 +1,14 @@
-"""No patch of refined cloth crosses more than the subdivided cage: else it follows that cage.
-
-A patch is worse if cloth crosses cloth or bodies more often in it than in the subdivided cage, and neither less often.
+"""No patch of refined cloth is worse than the subdivided cage: else it follows that cage.
 
 A patch is connected cloth around what crosses, in the solution or in the subdivided cage, with the cloth that it
-crosses. A patch follows the subdivided cage until the solution was as good there for `STAY` frames, so that it does not
-flicker between the two.
+crosses. A patch is worse if more cloth or bodies cross in it than in the subdivided cage, and neither of these nor the
+vertices inside bodies are fewer. It follows the subdivided cage until the solution was as good there for `STAY` frames,
+so that it does not flicker between the two.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
@@ -16,12 +17,10 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ..collide.crossings import all_crossings
-from ..contact.cloth import LevelContact
+from ..contact.cloth import ContactState, LevelContact
 from ..contact.cloth_mesh import RINGS
 from ..level import Placed, unhindered
 from ..mesh.topology import joined_by
-
-Crossed = Int[Tensor, "_ 5"]
 
 STAY = 20
 """Frames for which a patch follows the subdivided cage after the last one with a worse solution."""
@@ -29,36 +28,48 @@ GROWTHS = 4
 """Most times that the patches grow: where a patch meets its neighbours, new crossings may come."""
 
 
-def all_crossed(view: LevelContact, x: Float[Tensor, "vertices 3"]) -> Crossed:
-    """Vertices of each edge and face that cross at x [m], of cloth and bodies, those of given-up cloth too."""
-    if view.given_up is None:
-        found, pierced = view.look(x).crossings, view.look(x).pierced
-    else:
-        found, pierced = all_crossings(view.mesh.parts, view.corners(x))
-    return torch.cat([view.mesh.corners_of(each) for each in (found, pierced.crossings)])
+@dataclass(frozen=True, eq=False)
+class Faults:
+    """Crossings and vertices inside bodies.
 
-
-def patches_worse(view: LevelContact, x: Crossed, base: Crossed) -> Bool[Tensor, " vertices"]:
-    """Mask of the patches in which more crosses than in the subdivided cage, and neither less cloth nor less of bodies.
-
-    Args:
-        x: Corners of what crosses, shape (N, 5).
-        base: The same of the subdivided cage.
+    Attributes:
+        corners: Vertices of each edge and face that cross, of cloth and bodies, those of given-up cloth too, (N, 5).
+        inside: The vertices inside bodies, shape (M,).
     """
+
+    corners: Int[Tensor, "crossings 5"]
+    inside: Int[Tensor, " inside"]
+
+    @staticmethod
+    def of(view: LevelContact, state: ContactState) -> Faults:
+        """Faults of a contact state."""
+        found, pierced, inside = state.crossings, state.pierced, state.inside
+        if view.given_up is not None:
+            found, pierced = all_crossings(view.mesh.parts, state.corners)
+        corners = torch.cat([view.mesh.corners_of(each).long() for each in (found, pierced.crossings)])
+        none = corners.new_zeros(0)
+        return Faults(corners, none if inside is None else torch.nonzero(inside.any(dim=0)).squeeze(1))
+
+    def by(self, patch: Int[Tensor, " vertices"]) -> Int[Tensor, "3 vertices"]:
+        """Crossings of cloth with cloth, with bodies, and vertices inside, of the patches by number."""
+        count = len(patch)
+        of_bodies, cloth = (self.corners >= count).any(dim=1), self.corners.amin(dim=1)  # Cloth has the lower numbers.
+        kinds = cloth[~of_bodies], cloth[of_bodies], self.inside
+        return torch.stack([torch.bincount(patch[each], minlength=count) for each in kinds])
+
+
+def patches_worse(view: LevelContact, x: Faults, base: Faults) -> Bool[Tensor, " vertices"]:
+    """Mask of the patches that are worse at x than in the subdivided cage, given the faults of both."""
     mesh, count = view.mesh, view.mesh.level.vertex_count
-    corners = torch.cat([x, base]).long()
+    corners = torch.cat([x.corners, base.corners])
     region = torch.zeros_like(mesh.level.free[:, 0])
     region[corners[corners < count]] = True
     region, edges = mesh.grown(region, RINGS), mesh.level.edges.long()
     across = torch.cat([corners[:, [0, place]] for place in range(1, 5)])
     links = torch.cat([edges[region[edges].all(dim=1)], across[(across < count).all(dim=1)]])
     patch = torch.as_tensor(joined_by(links.cpu().numpy(), count), device=region.device).long()
-    more = []
-    for of_bodies in (False, True):
-        some = (each[(each >= count).any(dim=1) == of_bodies].amin(dim=1).long() for each in (x, base))
-        solved, given = (torch.bincount(patch[each], minlength=count) for each in some)
-        more.append(solved - given)
-    return region & ((torch.minimum(*more) >= 0) & (torch.maximum(*more) > 0))[patch]
+    more = x.by(patch) - base.by(patch)
+    return region & ((more.amin(dim=0) >= 0) & (more[:2].amax(dim=0) > 0))[patch]
 
 
 def no_worse(
@@ -83,32 +94,35 @@ def no_worse(
         figures for the report, {} if all cloth is as solved.
     """
     left = (before - 1).clamp_min(0)
-    solved = all_crossed(view, x)
-    if not bool(left.any()) and not len(solved):
+    solved = Faults.of(view, view.look(x))
+    if not bool(left.any()) and not len(solved.corners):
         return x, left, {}
-    base = all_crossed(view, smooth)
+    base = Faults.of(view, view.found(smooth))
     free = view.mesh.level.free
 
     def blended(left: Tensor) -> Tensor:
         kept = from_coarse @ ((left == 0).double().cpu().numpy())
         return torch.where(free, smooth + torch.as_tensor(kept).to(x).unsqueeze(1) * (x - smooth), x)
 
-    def longer(found: Tensor) -> Tensor | None:
+    def longer(found: Faults) -> Tensor | None:
         worse = patches_worse(view, found, base)
         share = from_coarse.T @ worse.double().cpu().numpy()
         again = torch.as_tensor(share > 0, device=left.device)
         return torch.where(again, torch.full_like(left, STAY), left) if bool(worse.any()) else None
 
-    y, found, more = x, solved, longer(solved)
+    more = longer(solved)
+    if more is None and not bool(left.any()):
+        return x, left, {}
+    y, found = x, solved
     for _ in range(GROWTHS):
         left = left if more is None else more
         y = blended(left)
-        found = all_crossed(view, y)
+        found = Faults.of(view, view.found(y))
         more = longer(found)
         if more is None:
             break
-    if not bool(left.any()) or (len(found) > len(solved) and not bool(before.any())):
+    crossings = {name: len(each.corners) for name, each in (("solved", solved), ("subdivided", base), ("left", found))}
+    if crossings["left"] > crossings["solved"] and not bool(before.any()):
         return x, torch.zeros_like(left), {}
     share = np.asarray(from_coarse @ (left > 0).double().cpu().numpy())
-    figures = {"vertices": int((share > 0).sum()), "solved": len(solved), "subdivided": len(base), "left": len(found)}
-    return unhindered(y), left, figures
+    return unhindered(y), left, {"vertices": int((share > 0).sum()), **crossings}

@@ -241,11 +241,12 @@ class RunawayError(SolveError):
 def solve_soundly(group: Group, frame: FrameInput, last: FrameState | None) -> Solved:
     """Solve a frame, and once more from the cage if the result is unsound.
 
-    A result is unsound if cloth crosses cloth, or a body over `MORE` times as often as the upsampled cage does, or if
-    its energy is above the upsampled cage's energy without self contact (the self contact energy is as large as the
-    cage's own crossings are deep). The second result is used if it has fewer crossings of cloth with cloth. If it has
-    as many: if the first alone crosses bodies too often (a few crossings less are no reason to change the folds); or
-    if neither does, the first energy is above the cage's, and the second is lower.
+    A result is unsound if patches of it follow the subdivided cage, if cloth crosses cloth, or a body over `MORE` times
+    as often as the upsampled cage does, or if its energy is above the upsampled cage's energy without self contact (the
+    self contact energy is as large as the cage's own crossings are deep). The second result is used if no patch of it
+    follows the subdivided cage, or if it has fewer crossings of cloth with cloth. If it has as many: if the first alone
+    crosses bodies too often (a few crossings less are no reason to change the folds); or if neither does, the first
+    energy is above the cage's, and the second is lower.
 
     Args:
         group: Garments solved together.
@@ -280,6 +281,8 @@ def _waiting(solved: Solved, failures: int, wait: int) -> Solved:
 
 def _unsound(telemetry: Mapping[str, Any]) -> str:
     """Why a result is unsound; "" if sound."""
+    if (worse := telemetry.get("follows_cage")) and not _given_up(telemetry):
+        return f"it kept {worse['solved']:,} crossings, and the subdivided cage has {worse['subdivided']:,}"
     if crossings := _crossings(telemetry) + _through_bodies(telemetry):
         return f"it kept {crossings:,} crossings"
     excess = _excess(telemetry)
@@ -288,6 +291,9 @@ def _unsound(telemetry: Mapping[str, Any]) -> str:
 
 def _is_better(fresh: Mapping[str, Any], solved: Mapping[str, Any]) -> bool:
     """Whether a second result replaces an unsound first one."""
+    worse = "follows_cage" in fresh, "follows_cage" in solved
+    if worse[0] != worse[1]:
+        return worse[1]
     crossings = _crossings(fresh, given_up=True), _crossings(solved, given_up=True)
     if crossings[0] != crossings[1]:
         return crossings[0] < crossings[1]
@@ -300,7 +306,12 @@ def _is_better(fresh: Mapping[str, Any], solved: Mapping[str, Any]) -> bool:
 def _crossings(telemetry: Mapping[str, Any], *, given_up: bool = False) -> int:
     """Crossings of cloth with cloth in a result, with or without those of given-up cloth."""
     after = telemetry.get("contact", {}).get("cloth", {}).get("after", {})
-    return int(after.get("crossings", 0) - (0 if given_up else after.get("given_up", 0)))
+    return int(after.get("crossings", 0) - (0 if given_up else _given_up(telemetry)))
+
+
+def _given_up(telemetry: Mapping[str, Any]) -> int:
+    """Crossings of given-up cloth in a result."""
+    return int(telemetry.get("contact", {}).get("cloth", {}).get("after", {}).get("given_up", 0))
 
 
 def _through_bodies(telemetry: Mapping[str, Any]) -> int:

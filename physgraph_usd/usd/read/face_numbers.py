@@ -26,7 +26,7 @@ def face_number_notices(stage: Usd.Stage, readers: Sequence[GarmentReader]) -> l
             "for the refined mesh, or name vertices instead (the cage's keep their numbers)",
         )
         for prim in Usd.PrimRange(stage.GetPseudoRoot(), TRAVERSAL)
-        if not any(prim.IsA(kind) for kind in _NEVER)
+        if not any(kind(prim) for kind in _NEVER)
         for attribute, targets in _counting(prim)
         for garment in garments
         if garment in targets
