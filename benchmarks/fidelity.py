@@ -1,6 +1,7 @@
 """Refined cloth beside the same cloth simulated finely, from one animation.
 
     python -m benchmarks.fidelity [--newton PYTHON] [--short] [-o benchmarks/results/fidelity.md]
+    python -m benchmarks.fidelity --paired [--guide 2000] [-o benchmarks/results/paired.md]
 
 Each scene is simulated once at the cage's resolution and once at two subdivisions. The first is the animation that is
 refined, as a shot is; the second is what a fine simulation of that fabric shows. Four scenes are simulated by the
@@ -8,6 +9,9 @@ solver's own potential and inertia (backward Euler, two increments a frame, no g
 names a Python that has newton, four more by Newton's Style3D solver, with its material, contact and friction
 (`newton_cloth.py`), refined with bodies and contact. The page says what each column is. The fine simulation has a
 history of its own: it sways out of step, and its folds need not lie where the cage's do.
+
+With ``--paired`` the cage is instead every fourth vertex of our own fine simulation, those that subdivision keeps from
+the cage, so the simulation shows where the folds of this very animation were.
 """
 
 from __future__ import annotations
@@ -26,6 +30,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy.sparse as sp
 import torch
 import trimesh
 
@@ -83,6 +88,16 @@ SIDES = {"cage": "Cage", "loop": "Loop subdivision", "refined": "Refined", "simu
 FILMED = [("curtain", "Newton", "jersey"), ("elbow", "Newton", "silk"), ("ball", "Newton", "denim")]
 FILMED += [("flag", "Newton", "denim")]
 PAGE = Path("benchmarks/results/fidelity.md")
+PAIRED, PAIRED_PAGE = ("curtain", "flag", "skirt"), Path("benchmarks/results/paired.md")
+"""Scenes whose cage is a part of the fine simulation, and their page."""
+PAIRED_TEXT = """# Beside the fine simulation that the cage is every fourth vertex of
+
+Written by `python -m benchmarks.fidelity --paired`. Means over the last half of the frames; without contact.
+
+- **Distance** [mm]: RMS, of the subdivided cage and of the refined cloth, from the simulation.
+- **Correlation** of the detail, the difference from the linearly upsampled cage, with the simulation's.
+- **Bands**: RMS of the detail in each band of wavelengths, refined / simulated.
+"""
 RATIO, ANGLE = 6, -3
 """Columns of the table: curvature refined over simulated, and the angle between folds."""
 TEXT = """# Beside the same cloth simulated finely
@@ -375,11 +390,44 @@ def made(task: Task) -> tuple[list[str], Sides]:
     return row_of(task, sides), sides
 
 
+def paired_row(scene: str, fabric: str, *, frames: int, guide: float) -> list[str]:
+    """A row of the table with `--paired`; the guide's stiffness is in N/m^3."""
+    stage, values = SCENES[scene](), PRESETS[fabric]
+    level = level_at(garment_of(stage, LEVEL), LEVEL)
+    truth = np.array(list(simulated(stage, values, LEVEL, frames=frames)))
+    cages = truth[:, kept_from_cage(level.from_coarse)]
+    refiner = Refiner(Scene((garment_of(stage, LEVEL),), GRAVITY), SolveSettings())
+    given = [Frame(float(n), (GarmentFrame(cage, values, guide=guide),)) for n, cage in enumerate(cages)]
+    fine = np.array([state.points[0] for state in refiner.refine(given)])
+    late, judge = slice(frames // 2, None), Judge(level, level.from_coarse @ stage.flat)
+    maps = level.from_coarse, level.smooth_from_coarse
+    linear, smooth = (np.array([each @ cage for cage in cages[late]]) for each in maps)
+    detail, true_detail = fine[late] - linear, truth[late] - linear
+    bands = [np.mean([judge.amplitudes(x) for x in each], axis=0) for each in (detail, true_detail)]
+    far = [1e3 * np.sqrt(((each - truth[late]) ** 2).sum(axis=2).mean()) for each in (smooth, fine[late])]
+    correlation = (detail * true_detail).sum() / np.sqrt((detail**2).sum() * (true_detail**2).sum())
+    return [scene, fabric, *(f"{each:.2f}" for each in (*far, correlation, *(bands[0] / bands[1])))]
+
+
+def kept_from_cage(from_coarse: sp.csr_matrix) -> np.ndarray:
+    """The fine vertex at each vertex of the cage, shape (C,): it depends on that one alone."""
+    matrix = sp.coo_matrix(from_coarse)
+    alone = matrix.data == 1.0
+    out = np.empty(from_coarse.shape[1], np.int64)
+    out[matrix.col[alone]] = matrix.row[alone]
+    return out
+
+
 def heading() -> list[str]:
     """The table's head."""
+    names = ["scene", "simulated by", "fabric", "Loop, m", "refined, m", "simulated, m", "refined / simulated"]
+    return [*names, *band_names(), "angle, degrees", "where", "motion"]
+
+
+def band_names() -> list[str]:
+    """Names of the bands."""
     ends = [f"{1e3 * a:g}-{1e3 * b:g} mm" for a, b in pairwise(BANDS)]
-    names = ["scene", "simulated by", "fabric", "Loop, m", "refined, m", "simulated, m", "refined / simulated", *ends]
-    return [*names, f"under {1e3 * BANDS[-1]:g} mm", "angle, degrees", "where", "motion"]
+    return [*ends, f"under {1e3 * BANDS[-1]:g} mm"]
 
 
 def body_at(body: Body | Skin, time: float) -> Thing:
@@ -425,14 +473,24 @@ def film(task: Task, sides: Sides, out: Path) -> None:
 def main() -> None:
     """Write the page and the films."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("-o", "--out", type=Path, default=PAGE)
+    parser.add_argument("-o", "--out", type=Path)
+    parser.add_argument("--paired", action="store_true", help="The cage as every fourth vertex of our simulation.")
+    parser.add_argument("--guide", type=float, default=2000.0, help="Stiffness of the guide with --paired [N/m^3].")
     parser.add_argument("--newton", default="", metavar="PYTHON", help="A Python that has newton.")
     parser.add_argument("--short", action="store_true", help="Ten frames in jersey alone.")
     parser.add_argument("--kept", type=Path, help="Folder of Newton's problems and results, which are used again.")
     parser.add_argument("--jobs", type=int, default=2, help="Rows made at once.")
     given = parser.parse_args()
+    given.out = given.out or (PAIRED_PAGE if given.paired else PAGE)
     given.out.parent.mkdir(parents=True, exist_ok=True)
     fabrics, frames = (FABRICS[:1], 10) if given.short else (FABRICS, 24)
+    if given.paired:
+        prepare_device("cpu")
+        pairs = product(PAIRED, [each for each in fabrics if each != "silk"])
+        rows = [paired_row(*each, frames=frames, guide=given.guide) for each in pairs]
+        head = ["scene", "fabric", "subdivided, mm", "refined, mm", "correlation", *band_names()]
+        given.out.write_text(f"{PAIRED_TEXT}\n{table(head, rows)}\n", encoding="utf-8")
+        return
     foreign = product(NEWTON if given.newton else (), fabrics)
     tasks = [Task(*each, frames, given.newton, given.kept) for each in foreign]
     tasks += [Task(*each, frames) for each in product(OURS, fabrics)]
