@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from folds import levels_of, named, square, view_of
 from test_tangles import pair
 
+from physgraph_usd.solver.forces.seam import Seam
 from physgraph_usd.solver.frame.no_worse import STAY, Faults, no_worse
 from physgraph_usd.solver.level import Placed
 
@@ -68,3 +70,18 @@ def test_cloth_follows_for_some_frames_and_returns_at_once():
         y, left, _ = kept(view, level, x, smooth, before=left)
         same.append((torch.equal(y, smooth), torch.equal(y, x)))
     assert same == [(True, False)] * (STAY - 1) + [(False, True)]
+
+
+def test_seams_between_cloth_that_follows_and_cloth_as_solved_stay_closed():
+    garments = [named(square(4), name) for name in "AB"]
+    levels = levels_of(*garments, dtype=torch.float64)
+    level, smooth = levels[-1], pair("cornered")[1].double()
+    follows = level.vertex_garment == 0
+    smooth[~follows, 1] += 0.1
+    ends = [int(torch.nonzero(follows)[0]), int(torch.nonzero(~follows)[0])]
+    view = view_of(levels, garments, seam=Seam(level, np.array([ends])))
+    x = view.closed(smooth + torch.tensor([0.001, 0.0, 0.0], dtype=torch.float64))
+    before = torch.where(levels[0].vertex_garment == 0, STAY, 0).long()
+    y, _, _ = kept(view, level, x, smooth, before=before)
+    assert not torch.equal(y, x)
+    assert torch.equal(y[ends[0]], y[ends[1]])

@@ -186,7 +186,7 @@ class LevelContact:
     def of_cage(self, x: Float[Tensor, "vertices 3"]) -> ContactState:
         """As `look` for an upsampled cage [m], searched only around what crosses in the cage itself."""
         if self._doubtful is None:
-            return ContactState.clean(x, self.corners(x))
+            return ContactState.clean(x, self._corners(x))
         return self.found(x, self._doubtful)
 
     def look(self, x: Float[Tensor, "vertices 3"]) -> ContactState:
@@ -197,15 +197,15 @@ class LevelContact:
 
     def remember(self, x: Float[Tensor, "vertices 3"], given_up: Tangles | None = None) -> None:
         """Record that nothing crosses at x [m] but given-up cloth, as after a safe move from such positions."""
-        self._looked = ContactState.clean(x, self.corners(x), given_up)
+        self._looked = ContactState.clean(x, self._corners(x), given_up)
 
-    def corners(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "all 3"]:
+    def _corners(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "all 3"]:
         """Corners of the cloth, then of the bodies in this frame [m], float64."""
         return x.double() if self.frame is None else torch.cat([x.double(), self.frame.points])
 
     def found(self, x: Tensor, some: Bool[Tensor, " all"] | None = None) -> ContactState:
         """Crossings, tangles and cloth inside bodies at x [m], of the given vertices or of all; not cached."""
-        mesh, corners, lost = self.mesh, self.corners(x), self.given_up
+        mesh, corners, lost = self.mesh, self._corners(x), self.given_up
         asked = self._asked if some is None else some if self._asked is None else some & self._asked
         found, pierced = all_crossings(mesh.parts, corners, asked)
         inside = None if self._all_bodies is None else self._all_bodies.inside(x, pierced)
@@ -304,7 +304,7 @@ class LevelContact:
 
     def _go(self, start: Placed, aim: Tensor, tangle: Tensor | None, since: _Since | None) -> tuple[Placed, bool]:
         """As `moved`, without a promise for pairs in one tangle; and whether all pairs with bodies are proved apart."""
-        state, end, springs = self.look(start), self.corners(aim), self._springs
+        state, end, springs = self.look(start), self._corners(aim), self._springs
         begin, exempt = since or (state.corners, state.exempt)
         near = springs.known(start) if since is None else None
         promise = Promise(self.mesh, self.seam, KEPT_GAP * float(self._thickness.min()), tangle, exempt)

@@ -23,9 +23,9 @@ from ..level import Placed, unhindered
 from ..mesh.topology import joined_by
 
 STAY = 20
-"""Frames for which a patch follows the subdivided cage after the last one with a worse solution."""
+"""Number of frames for which a patch follows the subdivided cage after the last frame with a worse solution."""
 GROWTHS = 4
-"""Most times that the patches grow: where a patch meets its neighbours, new crossings may come."""
+"""Largest number of times that patches grow: cloth that follows the cage may newly cross its neighbours."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,12 +97,12 @@ def no_worse(
     solved = Faults.of(view, view.look(x))
     if not bool(left.any()) and not len(solved.corners):
         return x, left, {}
+    smooth, free = view.closed(smooth), view.mesh.level.free
     base = Faults.of(view, view.found(smooth))
-    free = view.mesh.level.free
 
     def blended(left: Tensor) -> Tensor:
         kept = from_coarse @ ((left == 0).double().cpu().numpy())
-        return torch.where(free, smooth + torch.as_tensor(kept).to(x).unsqueeze(1) * (x - smooth), x)
+        return view.closed(torch.where(free, smooth + torch.as_tensor(kept).to(x).unsqueeze(1) * (x - smooth), x))
 
     def longer(found: Faults) -> Tensor | None:
         worse = patches_worse(view, found, base)

@@ -26,7 +26,7 @@ NO_CLOTH = frozenset(
     "arm arms body bed chair char character face feet floor foot ground hair hand hands head leg legs seat set skin"
     " stool table teeth torso wall".split()
 )
-"""Words in the name of a mesh that is cloth, and of one that is not."""
+"""Words in names of cloth meshes, and in names of meshes of bodies and sets."""
 
 
 @dataclass(frozen=True)
