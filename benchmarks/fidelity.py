@@ -57,6 +57,7 @@ from physgraph_usd.solver.level import Level, build_levels, hinge_geometry, refi
 from physgraph_usd.solver.mesh.elements import hinges_of
 from physgraph_usd.solver.mesh.vectors import at_corners, dot
 from physgraph_usd.solver.scene import Frame, Garment, GarmentFrame, Grain, Scene
+from physgraph_usd.usd.read.motion import CageMotion
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
 RATE, INCREMENTS = 24.0, 2
@@ -397,7 +398,10 @@ def paired_row(scene: str, fabric: str, *, frames: int, guide: float) -> list[st
     truth = np.array(list(simulated(stage, values, LEVEL, frames=frames)))
     cages = truth[:, kept_from_cage(level.from_coarse)]
     refiner = Refiner(Scene((garment_of(stage, LEVEL),), GRAVITY), SolveSettings())
-    given = [Frame(float(n), (GarmentFrame(cage, values, guide=guide),)) for n, cage in enumerate(cages)]
+    motion = CageMotion([*map(float, range(len(cages)))], lambda n: cages[int(n)], frame=1.0, seconds=1.0 / RATE)
+    felt = [motion.felt(float(n), cage) for n, cage in enumerate(cages)]
+    each = zip(cages, felt, strict=True)
+    given = [Frame(float(n), (GarmentFrame(c, values, guide=guide, acceleration=a),)) for n, (c, a) in enumerate(each)]
     fine = np.array([state.points[0] for state in refiner.refine(given)])
     late, judge = slice(frames // 2, None), Judge(level, level.from_coarse @ stage.flat)
     maps = level.from_coarse, level.smooth_from_coarse

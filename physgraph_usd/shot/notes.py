@@ -179,3 +179,24 @@ def of_following(garments: Sequence[Mapping[str, Any]], frames: Sequence[Mapping
     text = f"in {when} part of the cloth follows its subdivided cage, where the solution crosses more often: "
     text += f"{vertices} of <{path}>{at_time(time)}, with {part['left']:,} crossings"
     return [f"{text} for {part['solved']:,} as solved"]
+
+
+def of_inertia(garments: Sequence[Mapping[str, Any]], frames: Sequence[Mapping[str, Any]]) -> list[str]:
+    """A note of the frames in which cloth feels the acceleration of its cage, with the largest.
+
+    Args:
+        garments: A report's garments.
+        frames: A report's frames.
+    """
+    found = [
+        (entry["inertia"], garment["path"], frame["time"])
+        for frame in frames
+        for garment, entry in zip(garments, frame.get("garments", ()), strict=False)
+        if entry.get("inertia")
+    ]
+    if not found:
+        return []
+    most, path, time = max(found, key=lambda each: each[0])
+    when = counted(len({each[2] for each in found}), "frame")
+    text = f"inertia: in {when} cloth feels the acceleration of its animation, up to {most:.2g} times gravity beyond it"
+    return [f"{text} (<{path}>{at_time(time)}); --set inertia=0 leaves it out"]

@@ -147,6 +147,8 @@ class GarmentFrame:
         guide: Guide stiffness [N/m^3].
         detail: Gain of the added detail, 1 writes the solution itself.
         offset: Distance kept from colliders [m].
+        acceleration: Acceleration of the coarse points that the cloth feels [m/s^2], shape (V, 3), as
+            `inertia.felt` gives it; None where it feels none.
     """
 
     points: np.ndarray
@@ -154,6 +156,7 @@ class GarmentFrame:
     guide: float = 2000.0
     detail: float = 1.0
     offset: float = 0.002
+    acceleration: np.ndarray | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -197,6 +197,11 @@ PROPERTIES: tuple[Property, ...] = (
         "How firmly the mean of the fine cloth follows the coarse animation." + SI,
         "Guide Stiffness", REFINEMENT, (10.0, 1e6),
     ),
+    Property(
+        GARMENT_API, "physgraph:inertia", "float", 1.0, "", 0.0, 1.0,
+        "Share of the animation's acceleration beyond gravity that the cloth feels; 0 for none.",
+        "Inertia", REFINEMENT, (0.0, 1.0),
+    ),
     _ease("warp"),
     _ease("weft"),
     Property(

@@ -85,15 +85,26 @@ class Guide:
             three_columns(torch.as_tensor(each, dtype=level.dtype, device=level.device))
             for each in (self._coarse_weight, self._pin_weight)
         )
+        yields = np.divide(1.0, per_area, out=np.zeros_like(per_area), where=per_area > 0)
+        self._yields = three_columns(torch.as_tensor(yields, dtype=level.dtype, device=level.device))
         self._has_soft_pins = bool(soft.any())
         self._target = torch.zeros((len(per_area), 3), dtype=level.dtype, device=level.device)
         self._base = torch.zeros_like(level.rest)
         self.coarse = torch.zeros_like(self._target)
 
-    def retarget(self, coarse: Float[Tensor, "coarse 3"]) -> Guide:
-        """The guide of a frame, given the cage's positions [m], shape (C, 3)."""
+    def retarget(self, coarse: Float[Tensor, "coarse 3"], push: Float[Tensor, "coarse 3"] | None = None) -> Guide:
+        """The guide of a frame.
+
+        A push on the cage is a shift of its target: with R^T W = k_g A P, W d = k_g A_c s_c d pulls every fine vertex
+        as hard as the push, subdivided, does on its area.
+
+        Args:
+            coarse: The cage's positions [m], shape (C, 3).
+            push: Force per area at each vertex of the cage [N/m^2], felt where the guide pulls; or None.
+        """
         base = self._level.base.apply(coarse)
-        guide = self.aimed(self._map.average.apply(base), base)
+        target = self._map.average.apply(base)
+        guide = self.aimed(target if push is None else target + self._yields * push, base)
         guide.coarse = coarse
         return guide
 

@@ -221,10 +221,10 @@ class Group:
         cage = self.cage(frames)
         contact = self.contact(FrameInput(frames, touching=touching), cage)
         aim = cage.points if contact is None else contact.aim
-        return self.forces_for(frames)[-1].module(aim), contact, cage.origin
+        return self.forces_for(frames)[-1].module(aim, frames), contact, cage.origin
 
     def modules(self, frames: Sequence[GarmentFrame]) -> tuple[list[ForceModule], Float[Tensor, "coarse 3"]]:
         """The forces of one frame, one module per level, and the recentred coarse positions [m]."""
         world = torch.as_tensor(np.concatenate([f.points for f in frames]), dtype=torch.float64)
         coarse = self.tensor((world - world.mean(dim=0)).numpy())
-        return [lasting.module(coarse) for lasting in self.forces_for(frames)], coarse
+        return [lasting.module(coarse, frames) for lasting in self.forces_for(frames)], coarse

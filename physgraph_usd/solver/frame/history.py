@@ -216,10 +216,17 @@ def is_same(part: tuple[int, ...], frame: Frame, memories: Sequence[GarmentHisto
         now, then = frame.garments[index], each.frame
         if not (set_alike(now, then) and np.array_equal(now.points, then.points)):
             return False
+        if not _pushed_alike(now.acceleration, then.acceleration):
+            return False
         poses = [(each.colliders[body], frame.colliders[body]) for body in near]
         if not all(a is not None and b is not None and a.equals(b) for a, b in poses):
             return False
     return True
+
+
+def _pushed_alike(a: np.ndarray | None, b: np.ndarray | None) -> bool:
+    """Whether the cloth feels equal accelerations."""
+    return a is b or (a is not None and b is not None and np.array_equal(a, b))
 
 
 def set_alike(a: GarmentFrame, b: GarmentFrame) -> bool:

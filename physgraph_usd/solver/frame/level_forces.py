@@ -23,7 +23,7 @@ from ..integrate.metric import Metric, laplacian
 from ..integrate.saddle import facets
 from ..level import Level
 from ..mesh.recorded import Recordings
-from ..mesh.stencil import Stencil
+from ..mesh.stencil import Stencil, three_columns
 from ..scene import Garment, GarmentFrame
 
 
@@ -179,9 +179,28 @@ class LevelForces:
         """The move to remove a coarser mesh's facets from x, as in `facets` [m]; zero if nothing resists bending."""
         return facets(self.level, x, below, smooth.apply) if self.bends else torch.zeros_like(x)
 
-    def module(self, coarse: Float[Tensor, "coarse 3"]) -> ForceModule:
-        """All terms of one frame, given the recentred coarse positions [m]."""
-        return ForceModule((*self.terms, self.guide.retarget(coarse)), self._recordings, self._assembly)
+    def module(self, coarse: Float[Tensor, "coarse 3"], frames: Sequence[GarmentFrame] = ()) -> ForceModule:
+        """All terms of one frame.
+
+        Args:
+            coarse: The recentred coarse positions [m].
+            frames: The garments in that frame, whose inertia pushes; () for none.
+        """
+        guide = self.guide.retarget(coarse, self._push(frames))
+        return ForceModule((*self.terms, guide), self._recordings, self._assembly)
+
+    def _push(self, frames: Sequence[GarmentFrame]) -> Float[Tensor, "coarse 3"] | None:
+        """Minus the acceleration that cloth feels, times its density around each cage vertex [N/m^2]; None without."""
+        if all(frame.acceleration is None for frame in frames):
+            return None
+        felt = [np.zeros_like(each.points) if each.acceleration is None else each.acceleration for each in frames]
+        return self._coarse_density * torch.as_tensor(-np.concatenate(felt)).to(self._coarse_density)
+
+    @cached_property
+    def _coarse_density(self) -> Float[Tensor, "coarse 3"]:
+        """Areal density around each cage vertex [kg/m^2], in each of three columns."""
+        density = self.density[self.level.vertex_garment.long()] * self.level.density_scale
+        return self.guide_map.average.apply(three_columns(density))
 
     def system(
         self,

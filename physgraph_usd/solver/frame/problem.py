@@ -171,7 +171,7 @@ class Problem:
             since: Time at which the frame was ready to be solved [s].
         """
         lasting, settings = self.forces[index], self.group.settings
-        module = lasting.module(self.aim)
+        module = lasting.module(self.aim, self.frame.garments)
         tie = None if self.tether is None or self.start.detailed is None else (self.tether, self.start.detailed)
         alone = lasting.system(module, tie, rough=settings.rough)
         budget = settings.budget(self.finest - index, since, warm=self.warm)

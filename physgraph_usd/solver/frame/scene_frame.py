@@ -15,6 +15,7 @@ from ..contact.bodies import Touching
 from ..contact.broad_phase import Bodies, TouchingGroups, reach_of
 from ..contact.report import body_crossings, penetration_map
 from ..deadline import is_over
+from ..inertia import GRAVITY
 from ..level import refine_garments
 from ..rigid import AT_REST
 from ..scene import Frame, GarmentFrame, Scene, out_of_bounds
@@ -131,6 +132,13 @@ class SceneCloth:
         return {"penetration": depth, "crossing": crosses.astype(np.float32)}
 
 
+def _inertia(frames: Sequence[GarmentFrame]) -> dict[str, object]:
+    """Telemetry: the largest acceleration of the cages that is felt, relative to gravity; empty without any."""
+    felt = [frame.acceleration for frame in frames if frame.acceleration is not None]
+    sizes = [float(np.linalg.norm(each, axis=1).max(initial=0.0)) / GRAVITY for each in felt]
+    return {"inertia": round(max(sizes), 2)} if sizes else {}
+
+
 @dataclass(frozen=True, eq=False)
 class Answer:
     """One garment's frame.
@@ -240,6 +248,7 @@ class SceneFrame:
         begun = origin.telemetry(None if cage is None else cage[1])
         entry |= begun | ({"start": solved.telemetry["start"]} if solved.telemetry["start"] != "cold" else {})
         entry |= {"time_limit": float(f"{self.limit:.3g}")} if is_over() else {}
+        entry |= _inertia(frames)
         states = split(solved.state, group.levels[0].spans, group.levels[-1].spans)
         found = list[Answer]()
         for place, (index, memory) in enumerate(zip(part, memories, strict=True)):

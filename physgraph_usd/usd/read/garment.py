@@ -23,12 +23,13 @@ from ..lookup import Found, Override, bound_materials, check_limits, find_value
 from ..mesh.pieces import sort_pieces
 from ..schema import GARMENT
 from ..stage import GarmentSource, Notice, Units, flattened
-from ..times import within
+from ..times import FrameGrid, within
 from .absence import Samples, absence
 from .bodies import sharpness_of
 from .cage import PointReader, read_cage
 from .grain import read_grain
 from .materials import Values, find_values
+from .motion import CageMotion
 from .placement import check_matrix, check_placement, is_flipped, place, to_metres
 from .rest import Animation, Rest, pressed_folds, read_rest, rests_bent
 from .skinning import Bake
@@ -91,6 +92,7 @@ class GarmentReader:
         weld: The mesh as authored and as solved.
         notices: Warnings about the garment.
         hidden: Time codes of its samples at which it is invisible.
+        motion: Acceleration of its cage; None for a still one.
     """
 
     garment: Garment
@@ -101,6 +103,7 @@ class GarmentReader:
     weld: Weld
     notices: list[Notice] = field(default_factory=list)
     hidden: frozenset[float] = frozenset()
+    motion: CageMotion | None = None
 
     def frame(self, prim: Usd.Prim, metres: float, time: float | None) -> tuple[GarmentFrame, tuple[Notice, ...]]:
         """The garment at a time code, and notices of repairs.
@@ -108,7 +111,8 @@ class GarmentReader:
         All points of an absent garment are at one place, without contact: other garments may still have a frame.
         """
         notices: tuple[Notice, ...] = ()
-        if time is not None and (time in self.hidden or absence(prim, time)):
+        there = time is None or not (time in self.hidden or absence(prim, time))
+        if not there:
             points = np.broadcast_to(self.garment.rest.mean(axis=0), self.garment.rest.shape)
         else:
             local, notices = self.points.read(time, self.edges)
@@ -123,7 +127,14 @@ class GarmentReader:
         half = 0.0 if self.weld.across is None else float(np.abs(self.weld.across).max())
         thickness, offset = max(min(thickness, most), 2.0 * half), min(offset, most) + half
         fabric = replace(fabric, thickness=thickness)
-        return GarmentFrame(points, fabric, guide, detail, offset), notices
+        acceleration = self._felt(time, points) if there else None
+        return GarmentFrame(points, fabric, guide, detail, offset, acceleration), notices
+
+    def _felt(self, time: float | None, points: np.ndarray) -> np.ndarray | None:
+        """Acceleration of the cage that the cloth feels [m/s^2], shape (V, 3); None where it feels none."""
+        share = self.values.number("inertia", time)
+        found = None if self.motion is None or not share else self.motion.felt(time, points)
+        return None if found is None else share * found
 
     @cached_property
     def fitting(self) -> float:
@@ -212,7 +223,22 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], samples: Samples, re
         words=_words(prim, [name for name, faces in subsets.faces.items() if 2 * len(faces) > len(weld.faces)]),
         shell=float(find_value(prim, GARMENT["shell:thickness"], request.overrides).at(None) or 0.0),
     )
-    return GarmentReader(garment, source, values, points, cage.mesh.half_edges.edges, weld, notices, samples.hidden)
+    edges = cage.mesh.half_edges.edges
+    motion = _motion(prim, points, weld, edges=edges, times=every, metres=request.units.metres)
+    return GarmentReader(garment, source, values, points, edges, weld, notices, samples.hidden, motion)
+
+
+def _motion(
+    prim: Usd.Prim, points: PointReader, weld: Weld, *, edges: np.ndarray, times: Sequence[float], metres: float
+) -> CageMotion | None:
+    """The acceleration of a garment's solved vertices; None for a still garment."""
+    stage = prim.GetStage()
+
+    def read(time: float) -> np.ndarray:
+        return weld.joined(place(points.read(time, edges)[0], to_metres(prim, metres, time)))
+
+    pace = {"frame": FrameGrid.of(stage).length, "seconds": 1.0 / stage.GetTimeCodesPerSecond()}
+    return CageMotion(times, read, **pace) if times else None
 
 
 def _animation(

@@ -53,7 +53,7 @@ _WOVEN = ("weftStretchStiffness", "weftBendStiffness", "stretchLimit")
 _EASE = ("rest:warpEase", "rest:weftEase")
 _FRAME_VALUES = (
     *(*STIFFNESSES, *_WOVEN, "density", "thickness", *_EASE),
-    *("guide:stiffness", "refine:detail", "contact:offset"),
+    *("guide:stiffness", "refine:detail", "inertia", "contact:offset"),
 )
 DENSITY = "physics:density"
 YOUNGS = "physics:youngsModulus"
