@@ -162,7 +162,7 @@ def radius(layer: Path, time: float) -> float:
 
 
 def test_a_fast_spin_draws_cloth_outwards_and_the_report_says_so(tmp_path: Path) -> None:
-    """Two turns a second at 0.3 m are 4.8 times gravity, 4.4 over chords of two frames; authored or set, 0 leaves it out."""
+    """Two turns a second at 0.3 m are 4.8 times gravity, 4.4 over chords of two frames."""
     found = {}
     for name, overrides, inertia in (("on", (), 1.0), ("half", ("inertia=0.5",), 1.0), ("off", (), 0.0)):
         shot = spinning(tmp_path / f"{name}.usda", 2.0, inertia=inertia)

@@ -165,6 +165,7 @@ class PointReader:
 
     Attributes:
         count: Number of points, the same at every time.
+        edges: Edges of the mesh, by which points are repaired, shape (E, 2); set when the topology is known.
     """
 
     def __init__(self, prim: Usd.Prim, first: float | None) -> None:
@@ -173,11 +174,10 @@ class PointReader:
         self._attribute = UsdGeom.Mesh(prim).GetPointsAttr()
         self._times = sorted(self._attribute.GetTimeSamples())
         self.count = len(self._raw(first))
+        self.edges = np.zeros((0, 2), np.int32)
 
-    def read(self, time: float | None, edges: np.ndarray) -> tuple[np.ndarray, tuple[Notice, ...]]:
+    def read(self, time: float | None) -> tuple[np.ndarray, tuple[Notice, ...]]:
         """Local positions [stage units] at a time code, shape (V, 3), float64, all finite, and notices of repairs.
-
-        ``edges`` are those of the mesh, shape (E, 2).
 
         Raises:
             GarmentError: When the number of points changes or too many are broken.
@@ -187,7 +187,7 @@ class PointReader:
             message = f"the number of points changes from {self.count} to {len(points)}"
             remedy = "export the garment with one topology, or use --frames for the part where it is the same"
             raise GarmentError(self.path, message, time=time, remedy=remedy)
-        points = gather_unused(points, edges)
+        points = gather_unused(points, self.edges)
         finite = np.isfinite(points)
         if finite.all():
             return points, ()
@@ -199,7 +199,7 @@ class PointReader:
             remedy = "cache that frame again, or leave it out with --frames"
             raise GarmentError(self.path, message, time=time, remedy=remedy)
         reference = self._good_sample(time)
-        repaired = repair(points, edges, reference)
+        repaired = repair(points, self.edges, reference)
         if not np.isfinite(repaired).all():
             message = (
                 f"points[{broken.argmax()}] is NaN or infinite, with no neighbour or other sample to repair it from"

@@ -88,7 +88,6 @@ class GarmentReader:
         garment: Constant data.
         source: Place on the stage.
         values: Sources of the animated values.
-        edges: Edges as authored, shape (E, 2).
         weld: The mesh as authored and as solved.
         notices: Warnings about the garment.
         hidden: Time codes of its samples at which it is invisible.
@@ -99,7 +98,6 @@ class GarmentReader:
     source: GarmentSource
     values: Values
     points: PointReader
-    edges: np.ndarray
     weld: Weld
     notices: list[Notice] = field(default_factory=list)
     hidden: frozenset[float] = frozenset()
@@ -115,7 +113,7 @@ class GarmentReader:
         if not there:
             points = np.broadcast_to(self.garment.rest.mean(axis=0), self.garment.rest.shape)
         else:
-            local, notices = self.points.read(time, self.edges)
+            local, notices = self.points.read(time)
             points = self.weld.joined(place(local, to_metres(prim, metres, time)))
         guide, detail = (self.values.number(name, time) for name in ("guide:stiffness", "refine:detail"))
         offset, thickness = (self.kept(name, time) for name in ("contact:offset", "thickness"))
@@ -188,9 +186,9 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], samples: Samples, re
     every, times = samples.times, within(samples.times, request.frames)
     points = PointReader(prim, times[0] if times else None)
     cage = read_cage(prim, points.count, times)
-    placement = check_placement(prim, request.units.metres, times)
+    points.edges, placement = cage.mesh.half_edges.edges, check_placement(prim, request.units.metres, times)
     matrix = to_metres(prim, request.units.metres, every[0] if every else None)
-    animation = _animation(prim, points, request, edges=cage.mesh.half_edges.edges, every=samples.own, times=times)
+    animation = _animation(prim, points, request, every=samples.own, times=times)
     rest, weld = _rest_and_weld(prim, cage.mesh, animation, request, matrix=matrix)
     (bent, odd), absent = rests_bent(prim), within(samples.absent, request.frames)
     notices = [*samples.notices(str(prim.GetPath()), absent), *cage.notices, *odd, *placement]
@@ -223,19 +221,18 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], samples: Samples, re
         words=_words(prim, [name for name, faces in subsets.faces.items() if 2 * len(faces) > len(weld.faces)]),
         shell=float(find_value(prim, GARMENT["shell:thickness"], request.overrides).at(None) or 0.0),
     )
-    edges = cage.mesh.half_edges.edges
-    motion = _motion(prim, points, weld, edges=edges, times=every, metres=request.units.metres)
-    return GarmentReader(garment, source, values, points, edges, weld, notices, samples.hidden, motion)
+    motion = _motion(prim, points, weld, times=every, metres=request.units.metres)
+    return GarmentReader(garment, source, values, points, weld, notices, samples.hidden, motion)
 
 
 def _motion(
-    prim: Usd.Prim, points: PointReader, weld: Weld, *, edges: np.ndarray, times: Sequence[float], metres: float
+    prim: Usd.Prim, points: PointReader, weld: Weld, *, times: Sequence[float], metres: float
 ) -> CageMotion | None:
     """The acceleration of a garment's solved vertices; None for a still garment."""
     stage = prim.GetStage()
 
     def read(time: float) -> np.ndarray:
-        return weld.joined(place(points.read(time, edges)[0], to_metres(prim, metres, time)))
+        return weld.joined(place(points.read(time)[0], to_metres(prim, metres, time)))
 
     pace = {"frame": FrameGrid.of(stage).length, "seconds": 1.0 / stage.GetTimeCodesPerSecond()}
     return CageMotion(times, read, **pace) if times else None
@@ -246,7 +243,6 @@ def _animation(
     points: PointReader,
     request: Request,
     *,
-    edges: np.ndarray,
     every: Sequence[float],
     times: Sequence[float],
 ) -> Animation:
@@ -254,7 +250,7 @@ def _animation(
 
     @cache
     def read(time: float | None) -> tuple[np.ndarray, tuple[Notice, ...]]:
-        local, notices = points.read(time, edges)
+        local, notices = points.read(time)
         return place(local, to_metres(prim, request.units.metres, time)), notices
 
     return Animation(every, read(times[0] if times else None)[0], read)

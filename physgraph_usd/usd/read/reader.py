@@ -131,7 +131,7 @@ class Shot:
             GarmentError: The points are broken.
         """
         reader = self._readers[index]
-        return reader.weld.joined(reader.points.read(time, reader.edges)[0])
+        return reader.weld.joined(reader.points.read(time)[0])
 
     def cage(self, index: int, time: float | None) -> np.ndarray:
         """A garment's coarse points [m] in world space at a time code, by number, shape (V, 3), float64.

@@ -99,7 +99,8 @@ def _survey_mesh(prim: Usd.Prim, metres: float) -> MeshReport:
             points = PointReader(prim, first)
             count = points.count
             cage = read_cage(prim, count, times)
-            placed = points.read(first, cage.mesh.half_edges.edges)[0]
+            points.edges = cage.mesh.half_edges.edges
+            placed = points.read(first)[0]
             pieces = pieces_of(placed, cage.mesh.triangulate(placed).triangles)
             odd = check_placement(prim, metres, times)
     except StageError as error:
