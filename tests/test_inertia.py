@@ -91,6 +91,14 @@ def test_what_alternates_from_frame_to_frame_is_not_felt() -> None:
     assert all(at(motion, path, time) is None for time in range(9))
 
 
+def test_a_broken_sample_is_not_felt_beside_it() -> None:
+    """By one difference alone it would be felt as 29 m/s^2 there, and as 14 m/s^2 two frames away."""
+    path = np.zeros(13)
+    path[6] = 0.1
+    motion = motion_of(path)
+    assert all(at(motion, path, time) is None for time in range(13))
+
+
 def test_samples_of_motion_blur_do_not_amplify_noise() -> None:
     times = np.sort(np.concatenate([np.arange(9.0), np.arange(9.0) + 0.1]))
     path = 1e-3 * np.random.default_rng(0).normal(size=len(times))

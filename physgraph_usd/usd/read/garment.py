@@ -196,7 +196,6 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], samples: Samples, re
     constants, of_constants = _constants(prim, request)
     painted, cut = _painted(prim, weld, notices, values=values, overrides=request.overrides)
     subsets = read_subsets(prim, cage.kept_faces[weld.faces], units=request.units, time=times[0] if times else None)
-    pieces = _pieces(prim, weld, rest.points, subsets.faces, notices)
     grain, lies = read_grain(prim, weld, rest.points, kept=cage.kept_faces, up=request.units.up, painted=cut)
     garment = Garment(
         str(prim.GetPath()),
@@ -206,7 +205,10 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], samples: Samples, re
         bent_rest=bent,
         grain=grain,
         fabric_scale=subsets.scale,
-        **constants | pieces | painted | _folds(prim, weld, animation),
+        **constants
+        | painted
+        | _pieces(prim, weld, rest.points, subsets.faces, notices)
+        | _folds(prim, weld, animation),
     )
     notices += [*rest.notices, *_size_notices(prim, animation.first, matrix, request), *values.notices]
     source = GarmentSource(

@@ -11,9 +11,11 @@ from ...errors import GarmentError
 from ...solver.inertia import acceleration_of, felt
 from ..times import SAME_TIME
 
+MOST = 3
+"""Most frames whose accelerations are compared."""
 FRAMES = 2
 """Frames from a time code to the samples before and after."""
-_KEPT = 2 * FRAMES + 2
+_KEPT = 2 * FRAMES + 4
 """Number of samples kept: a shot that is read in order reads each sample once."""
 
 
@@ -21,7 +23,8 @@ class CageMotion:
     """Acceleration of one cage at its time codes.
 
     It comes from the nearest samples at least two frames before and after, in which what alternates from frame to
-    frame cancels out. At the shot's ends it is that of the nearest time code with samples on both sides.
+    frame cancels out. Of the accelerations of three frames in a row each vertex takes the one nearest to the others:
+    a single broken sample has no effect. At the shot's ends these are the nearest frames with samples on both sides.
     """
 
     def __init__(
@@ -36,7 +39,7 @@ class CageMotion:
             seconds: Length of a time code [s].
         """
         self._times, self._read = sorted(times), read
-        self._least, self._seconds = FRAMES * frame - SAME_TIME, seconds
+        self._frame, self._seconds = frame, seconds
         self._known: dict[float, np.ndarray] = {}
 
     def felt(self, time: float | None, points: np.ndarray) -> np.ndarray | None:
@@ -45,24 +48,40 @@ class CageMotion:
         Args:
             points: The cage's positions at that time code [m].
         """
-        if time is None or not self._times:
+        if time is None:
             return None
         self._keep(time, points)
-        inner = self._times[0] + self._least, self._times[-1] - self._least
-        if inner[0] > inner[1]:
-            return None
-        middle = self._times[bisect_left(self._times, inner[0])] if time < inner[0] else time
-        middle = self._times[bisect_right(self._times, inner[1]) - 1] if time > inner[1] else middle
-        before = bisect_right(self._times, middle - self._least) - 1
-        after = bisect_left(self._times, middle + self._least)
-        if before < 0 or after == len(self._times):
-            return None
-        three = self._times[before], middle, self._times[after]
+        found = [self._acceleration(*three) for three in self._around(time)]
+        known = [each for each in found if each is not None]
+        return felt(_agreed(known)) if known else None
+
+    def _around(self, time: float) -> list[tuple[float, float, float]]:
+        """Time codes before, at and after each of up to three frames: this one and those around it."""
+        apart = FRAMES * self._frame
+        first, last = (self._beside(end, by) for end, by in ((self._times[0], apart), (self._times[-1], -apart)))
+        if first is None or last is None or first > last:
+            return []
+        middle = min(max(time, first), last)
+        chosen = {middle}
+        for by in (-self._frame, self._frame, -2.0 * self._frame, 2.0 * self._frame):
+            other = self._beside(middle, by)
+            if other is not None and first <= other <= last and len(chosen) < MOST:
+                chosen.add(other)
+        found = [(self._beside(each, -apart), each, self._beside(each, apart)) for each in sorted(chosen)]
+        return [(a, b, c) for a, b, c in found if a is not None and c is not None]
+
+    def _beside(self, time: float, by: float) -> float | None:
+        """The nearest sample that is at least so far after a time code, or before it; None without any."""
+        wanted = time + by - np.sign(by) * SAME_TIME
+        number = bisect_left(self._times, wanted) if by > 0 else bisect_right(self._times, wanted) - 1
+        return self._times[number] if 0 <= number < len(self._times) else None
+
+    def _acceleration(self, *three: float) -> np.ndarray | None:
         try:
             poses = [self._at(each) for each in three]
         except GarmentError:  # A broken sample beside this one has its own error, at its own time code.
             return None
-        return felt(acceleration_of(poses, [each * self._seconds for each in three]))
+        return acceleration_of(poses, [each * self._seconds for each in three])
 
     def _at(self, time: float) -> np.ndarray:
         return self._known[time] if time in self._known else self._keep(time, self._read(time))
@@ -73,3 +92,12 @@ class CageMotion:
         while len(self._known) > _KEPT:
             del self._known[next(iter(self._known))]
         return points
+
+
+def _agreed(found: Sequence[np.ndarray]) -> np.ndarray:
+    """At each vertex the one of up to three vectors that is nearest to the others; the shortest of two."""
+    rows = np.arange(len(found[0]))
+    stacked = np.stack(found)  # N V 3
+    others = stacked if len(found) == MOST else np.zeros_like(stacked[:1])
+    far = np.linalg.norm(stacked[:, None] - others[None], axis=3).sum(axis=1)  # N V
+    return stacked[far.argmin(axis=0), rows]
