@@ -196,11 +196,10 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], samples: Samples, re
     constants, of_constants = _constants(prim, request)
     painted, cut = _painted(prim, weld, notices, values=values, overrides=request.overrides)
     subsets = read_subsets(prim, cage.kept_faces[weld.faces], units=request.units, time=times[0] if times else None)
+    pieces = _pieces(prim, weld, rest.points, subsets.faces, notices)
     grain, lies = read_grain(prim, weld, rest.points, kept=cage.kept_faces, up=request.units.up, painted=cut)
     garment = Garment(
-        str(prim.GetPath()),
-        weld.mesh,
-        weld.joined(rest.points),
+        *(str(prim.GetPath()), weld.mesh, weld.joined(rest.points)),
         flipped=is_flipped(prim, matrix),
         bent_rest=bent,
         grain=grain,
