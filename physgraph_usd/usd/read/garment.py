@@ -204,10 +204,7 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], samples: Samples, re
         bent_rest=bent,
         grain=grain,
         fabric_scale=subsets.scale,
-        **constants
-        | painted
-        | _pieces(prim, weld, rest.points, subsets.faces, notices)
-        | _folds(prim, weld, animation),
+        **constants | pieces | painted | _folds(prim, weld, animation),
     )
     notices += [*rest.notices, *_size_notices(prim, animation.first, matrix, request), *values.notices]
     source = GarmentSource(
