@@ -44,21 +44,27 @@ MOST_WAIT = 64
 little in a shot with cloth impossible to pull apart."""
 
 
-def solve_frame(group: Group, frame: FrameInput, last: FrameState | None) -> Solved:
+class _MoreCrossingsError(Exception):
+    """A coarse level crosses as often as the result to be replaced: finer levels cross more often still."""
+
+
+def solve_frame(group: Group, frame: FrameInput, last: FrameState | None, *, fewer_than: float = math.inf) -> Solved:
     """Solve one frame.
 
     Args:
         group: Garments solved together.
         last: State left by the last frame, or None for a cold start.
+        fewer_than: Crossings of a coarse level from which on the frame is not wanted.
 
     Raises:
         SolveError: A term of the potential is not finite, or cloth lies wholly in a body.
+        _MoreCrossingsError: A coarse level has ``fewer_than`` crossings or more.
     """
     problem = begin(group, frame, last)
     refuse_swallowed(problem)
     prepared = time.perf_counter()
     try:
-        problem, reports = _with_cage_untangled(problem, since=prepared)
+        problem, reports = _with_cage_untangled(problem, since=prepared, fewer_than=fewer_than)
         x, module, memory = None, ForceModule(()), None
         for index in problem.levels:
             level = problem.level(index, since=prepared)
@@ -69,6 +75,8 @@ def solve_frame(group: Group, frame: FrameInput, last: FrameState | None) -> Sol
                 group.settings.ended(level, x)
             if index < problem.finest:
                 made[-1].energies = module.energies(x)
+                if level.view is not None and level.view.look(x).hopeful.count >= fewer_than:
+                    raise _MoreCrossingsError
             reports += made
     except SolveError as error:
         broken = blame(group.garments, problem.forces[-1], problem.cage.points, error=error, at=frame.at)
@@ -119,6 +127,7 @@ def solve_one_level(
         terms = view.terms(x)
         x = view.moved(x, leave_saddle(problem.system(view, terms, x), level, x, outward=problem.outward))
     carry, last, terms, made, blocked, touched, integrator = None, None, (), 0, False, False, problem.integrator
+    left = [view.look(x).hopeful.count]
     while True:
         terms = view.terms(x)
         touched = touched or bool(terms)
@@ -140,7 +149,9 @@ def solve_one_level(
             problem.show(x)
         missing = _missing(begun, x, wanted) if blocked else 0.0
         emerging = sum(view.look(x).in_bodies) < in_bodies
-        if budget.ends(report, made=made, touched=touched, emerging=emerging, missing=missing):
+        left.append(view.look(x).hopeful.count)
+        stuck = min(left[-STALLED:]) > 0 and min(left[-STALLED:]) >= min(left[:-STALLED], default=0)
+        if budget.ends(report, made=made, touched=touched, emerging=emerging, missing=missing, stuck=stuck):
             memory = _curvature(integrator, carry)
             break
         if carry.setbacks >= PATIENCE:
@@ -180,13 +191,14 @@ def _curvature(integrator: Integrator, carry: Carry) -> Any:
     return integrator.curvature(carry) if isinstance(integrator, Transporting) else None
 
 
-def _with_cage_untangled(problem: Problem, *, since: float) -> tuple[Problem, list[LevelReport]]:
+def _with_cage_untangled(problem: Problem, *, since: float, fewer_than: float) -> tuple[Problem, list[LevelReport]]:
     """A cold frame that starts at its untangled cage, and a report per round.
 
     Pieces of cloth that are mostly tangled afterwards are given up.
 
     Args:
         since: Time at which the frame was ready to be solved [s].
+        fewer_than: As in `solve_frame`.
     """
     contact = problem.contact
     if contact is None or problem.warm or not contact.crossed:
@@ -195,6 +207,8 @@ def _with_cage_untangled(problem: Problem, *, since: float) -> tuple[Problem, li
     view, start = level.view, problem.begun(0, None)[0]
     assert view is not None
     x, reports = _untangle(level, view, Placed(view.closed(start)), view.drawn, most=UNTANGLINGS)
+    if view.look(x).hopeful.count >= fewer_than:
+        raise _MoreCrossingsError
     return replace(problem, contact=contact.after_cage(x), walked=x), reports
 
 
@@ -265,13 +279,21 @@ def solve_soundly(group: Group, frame: FrameInput, last: FrameState | None) -> S
     if last is not None and last.wait:
         return _waiting(solved, last.failures, last.wait - 1)
     given_up = None if last is None else last.given_up
-    fresh = solve_frame(group, replace(frame, moved=np.inf, walked=None, elapsed=0.0, given_up=given_up), None)
+    again = replace(frame, moved=np.inf, walked=None, elapsed=0.0, given_up=given_up)
+    failures = 1 if last is None else last.failures + 1
+    wait = min(2**failures - 1, MOST_WAIT)
+    fewer_than = _crossings(solved.telemetry, given_up=True) or math.inf
+    try:
+        fresh = solve_frame(
+            group, again, None, fewer_than=math.inf if "follows_cage" in solved.telemetry else fewer_than
+        )
+    except _MoreCrossingsError:
+        return _waiting(solved, failures, wait)
     if _is_better(fresh.telemetry, solved.telemetry):
         return replace(fresh, telemetry=fresh.telemetry | {"start": f"cold: started anew, since {why}"})
     if all(_excess(each.telemetry, whole=True) > 0.0 for each in (solved, fresh)):
         raise RunawayError(f"{why}, and a start from the cage ends no better")
-    failures = 1 if last is None else last.failures + 1
-    return _waiting(solved, failures, min(2**failures - 1, MOST_WAIT))
+    return _waiting(solved, failures, wait)
 
 
 def _waiting(solved: Solved, failures: int, wait: int) -> Solved:

@@ -58,6 +58,7 @@ class Budget:
         cancelled: Asked before each step whether the result is no longer needed; or None.
         least: Number of steps exempt from the deadline.
         touching: Most steps with contact, if more.
+        stuck: Steps after which a level ends whose crossings do not become fewer.
         warm: Whether the level starts from the last frame's result. Its first round then has all steps, since steps
             cost far less than finding the near pairs again, and ends when nothing is seen to move.
         hurried: Whether somebody waits for the first round, and another solve follows: contact gives no more steps.
@@ -70,6 +71,7 @@ class Budget:
     cancelled: Callable[[], bool] | None = None
     least: int = 0
     touching: int = 0
+    stuck: int = 0
     warm: bool = False
     hurried: bool = False
 
@@ -107,7 +109,9 @@ class Budget:
             return "steps"
         return "budget" if self.is_spent(steps) else ""
 
-    def ends(self, report: Ended, *, made: int, touched: bool, emerging: bool, missing: float) -> bool:
+    def ends(
+        self, report: Ended, *, made: int, touched: bool, emerging: bool, missing: float, stuck: bool = False
+    ) -> bool:
         """Whether no further round of the level follows.
 
         Args:
@@ -116,7 +120,10 @@ class Budget:
             touched: Whether any round had contact.
             emerging: Whether less cloth is inside or through a body than before the last round.
             missing: Part of the last round's moves that was blocked.
+            stuck: Whether the last rounds left as many crossings.
         """
+        if stuck and made >= self.stuck:
+            return True
         if report.stopped == "budget" or not report.steps or (report.stopped == "tolerance" and not missing):
             return True
         if self.warm and not emerging and missing <= LEAST_MISSING and (report.stopped == "seen" or made >= self.steps):
@@ -152,6 +159,7 @@ def level_budget(
     """
     deadline = None if seconds is None else clock + seconds * COARSE_TIME ** min(below, 2)
     if below:
-        return Budget(COARSE_STEPS * steps, COARSE_TOLERANCE * tolerance, deadline, cancelled=cancelled)
-    finest = Budget(steps, tolerance, deadline, cancelled=cancelled, least=1, touching=TOUCHING * steps)
+        coarse = COARSE_STEPS * steps, COARSE_TOLERANCE * tolerance, deadline
+        return Budget(*coarse, cancelled=cancelled, stuck=steps)
+    finest = Budget(steps, tolerance, deadline, cancelled=cancelled, least=1, touching=TOUCHING * steps, stuck=steps)
     return replace(finest, rest=REST, warm=True) if warm else finest
