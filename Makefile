@@ -2,6 +2,7 @@
 # make test       every check, and the fast tests
 # make test-all   every check, and all tests
 # make site       the documentation as a site, in build/site
+# make blender    the add-on for Blender as a zip, build/physgraph_usd-blender.zip
 # make films      the films of README.md and the gallery and the pictures of tune; SHOTS=folder has the real shots
 # make format     let ruff rewrite what it can
 # make newest     the demo and the fast tests with the newest release of each dependency, in .venv-newest
@@ -15,12 +16,13 @@ JOBS ?= 2
 VENV := .venv
 BIN := $(VENV)/bin
 UPGRADE :=
-PIP := $(BIN)/python -m pip install --disable-pip-version-check --quiet $(UPGRADE)
+PIP := $(BIN)/python -m pip install --disable-pip-version-check --quiet --quiet $(UPGRADE)
 DEMO := out/demo
+ADDON := build/physgraph_usd-blender.zip
 # A process begins with tests of its own files, so that what a file solves once is solved once, and helps out at the end.
 TESTS := $(BIN)/pytest -n $(JOBS) --dist worksteal
 
-.PHONY: demo site films test test-all fast all lint style types format newest clean
+.PHONY: demo site blender films test test-all fast all lint style types format newest clean
 
 demo: $(VENV)/.demo
 	@mkdir -p $(DEMO)
@@ -45,6 +47,12 @@ all: $(VENV)/.dev
 
 site: $(VENV)/.dev
 	$(BIN)/mkdocs build --strict
+
+# The files stand at the top of the zip, as Blender wants them.
+blender:
+	@mkdir -p $(dir $(ADDON))
+	@cd plugins/blender && $(PYTHON) -m zipfile -c $(abspath $(ADDON)) *.py *.toml README.md
+	@echo $(ADDON)
 
 # Takes the program ffmpeg and a browser.
 films: $(VENV)/.dev

@@ -6,6 +6,7 @@ import os
 import shutil
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -81,6 +82,17 @@ def test_a_mirror_that_pip_is_set_to_use_is_asked(checkout: Path, how: str) -> N
     """By the environment variable, and by pip's configuration."""
     _, asked = make(checkout, **{how: "https://mirror.example.org/simple"})
     assert "--default-index https://mirror.example.org/simple" in asked[0]
+
+
+def test_the_add_on_for_blender_is_a_zip_with_the_manifest_at_the_top(tmp_path: Path) -> None:
+    place = tmp_path / "made" / "addon.zip"
+    line = ["make", "blender", f"ADDON={place}", f"PYTHON={sys.executable}"]
+    done = subprocess.run(line, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (0, f"{place}\n", "")
+    folder = ROOT / "plugins" / "blender"
+    there = {file.name for file in folder.iterdir() if file.is_file()}
+    assert {*zipfile.ZipFile(place).namelist()} == there
+    assert "blender_manifest.toml" in there
 
 
 def test_the_newest_releases_go_into_a_folder_of_their_own() -> None:
