@@ -22,7 +22,7 @@ from ..shot.warnings import of_unfelt
 from ..solver.mesh.subdivide import Refinement
 from .setting import Setting
 from .solver import FrameSolver, Seen
-from .takes import Shown, Start, Take, Takes
+from .takes import MOST_SETTINGS, Shown, Start, Take, Takes
 from .tried import TriedShot
 from .tuning import Tuning
 
@@ -75,11 +75,12 @@ class TuneSession(Tuning):
         self._shown: tuple[Setting, Shown] | None = None
         self.takes = Takes()
         self.kept: Take | None = None
+        self._steps: dict[Setting, Take] = {}  # Settled cloth of the settings looked at last, for undo.
 
     def close(self) -> None:
         """Let go of the stage and of all solvers; the session cannot be used afterwards."""
         self._tried.close()
-        self.takes, self.kept, self._shown = Takes(), None, None
+        self.takes, self.kept, self._shown, self._steps = Takes(), None, None, {}
         del self.solver
 
     @property
@@ -95,8 +96,18 @@ class TuneSession(Tuning):
         """
         self.time, self._shown = (time := self.sampled(time)), None
         if take := self.takes.fresh(time, self.setting):
-            self.solver, self._solves = copy(take.start.solver), take.setting
-            self._shown = take.setting, take.shown
+            self._go_to(take)
+
+    def _go(self, way: int) -> None:
+        super()._go(way)
+        take = self._steps.get(self.setting)
+        if take is not None and take.shown.frame.time == self.time:
+            self._go_to(take)
+
+    def _go_to(self, take: Take) -> None:
+        """Go to solved cloth, and on from there."""
+        self.solver, self._solves = copy(take.start.solver), take.setting
+        self._shown = take.setting, take.shown
 
     def keep(self) -> None:
         """Store the present setting and its settled cloth as A."""
@@ -208,6 +219,11 @@ class TuneSession(Tuning):
         state = self.solver.solve(self.shot, self.time, rough=rough, seen=seen, cancelled=cancelled)
         shown = Shown.of(self.shot.frame(self.time), state, began=began, settled=not (rough or cancelled()))
         self._shown = self.setting, shown
+        if shown.settled:
+            self._steps.pop(self.setting, None)
+            self._steps[self.setting] = Take(Start(self.setting, self.shot, copy(self.solver)), shown)
+            for old in list(self._steps)[:-MOST_SETTINGS]:
+                del self._steps[old]
         return shown
 
     def _prepare(self) -> None:
