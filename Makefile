@@ -2,22 +2,27 @@
 # make test       every check, and the fast tests
 # make test-all   every check, and all tests
 # make site       the documentation as a site, in build/site
+# make blender    the add-on for Blender as a zip, build/physgraph_usd-blender.zip
 # make films      the films of README.md and the gallery and the pictures of tune; SHOTS=folder has the real shots
 # make format     let ruff rewrite what it can
+# make newest     the demo and the fast tests with the newest release of each dependency, in .venv-newest
 # PYTHON=python3.12 picks the interpreter of the environment; JOBS=8 the number of test processes.
-# TORCH=auto takes torch's build for this machine's card, TORCH=cu128 the one for that CUDA; else its CPU build.
+# TORCH=auto takes torch's build for this machine's card, TORCH=cu128 the one for that CUDA, TORCH=pip the one on pip's
+# index; else its CPU build.
 
 PYTHON ?= python3
 TORCH ?= cpu
 JOBS ?= 2
 VENV := .venv
 BIN := $(VENV)/bin
-PIP := $(BIN)/python -m pip install --disable-pip-version-check --quiet
+UPGRADE :=
+PIP := $(BIN)/python -m pip install --disable-pip-version-check --quiet --quiet $(UPGRADE)
 DEMO := out/demo
+ADDON := build/physgraph_usd-blender.zip
 # A process begins with tests of its own files, so that what a file solves once is solved once, and helps out at the end.
 TESTS := $(BIN)/pytest -n $(JOBS) --dist worksteal
 
-.PHONY: demo site films test test-all fast all lint style types format clean
+.PHONY: demo site blender films test test-all fast all lint style types format newest clean
 
 demo: $(VENV)/.demo
 	@mkdir -p $(DEMO)
@@ -43,6 +48,12 @@ all: $(VENV)/.dev
 site: $(VENV)/.dev
 	$(BIN)/mkdocs build --strict
 
+# The files stand at the top of the zip, as Blender wants them.
+blender:
+	@mkdir -p $(dir $(ADDON))
+	@cd plugins/blender && $(PYTHON) -m zipfile -c $(abspath $(ADDON)) *.py *.toml README.md
+	@echo $(ADDON)
+
 # Takes the program ffmpeg and a browser.
 films: $(VENV)/.dev
 	$(BIN)/python -m benchmarks.films docs/films $(if $(SHOTS),--folder $(SHOTS))
@@ -63,8 +74,14 @@ format: $(VENV)/.dev
 	$(BIN)/ruff check --fix
 	$(BIN)/ruff format
 
+# pip says which versions there are that the bounds in pyproject.toml leave out.
+newest:
+	@rm -f .venv-newest/.torch .venv-newest/.demo .venv-newest/.dev
+	@$(MAKE) --no-print-directory VENV=.venv-newest DEMO=out/newest UPGRADE='--upgrade --upgrade-strategy eager' demo fast
+	.venv-newest/bin/python -m pip list --disable-pip-version-check --outdated
+
 clean:
-	rm -rf $(VENV) out build dist .pytest_cache .ruff_cache .hypothesis .import_linter_cache
+	rm -rf $(VENV) .venv-newest out build dist .pytest_cache .ruff_cache .hypothesis .import_linter_cache
 
 $(VENV)/.python:
 	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 14))' || \
@@ -72,10 +89,17 @@ $(VENV)/.python:
 	$(PYTHON) -m venv --clear $(VENV)
 	@touch $@
 
-# pip takes torch's CUDA build on Linux, 5.5 GB; uv knows where the others are.
+# uv knows where torch's builds are, and takes all else from pip's index. Its errors are kept in a file.
 $(VENV)/.torch: $(VENV)/.python
-	@$(PIP) uv && $(BIN)/uv pip install --quiet --python $(BIN)/python --torch-backend $(TORCH) -r pyproject.toml || \
-		echo 'uv could not install the $(TORCH) build of torch; pip installs the one that it finds'
+ifeq ($(TORCH),pip)
+	@echo "installing torch from pip's index"
+else
+	@echo "installing the $(TORCH) build of torch from torch's own index"
+	@index=$${PIP_INDEX_URL:-$$($(BIN)/python -m pip config get global.index-url 2>/dev/null)}; \
+	{ $(PIP) uv && $(BIN)/uv pip install --quiet --python $(BIN)/python --torch-backend $(TORCH) \
+		$(if $(UPGRADE),--upgrade) $${index:+--default-index "$$index"} -r pyproject.toml; } 2>$(VENV)/uv.log || \
+	echo "not available here ($(VENV)/uv.log says why): installing torch from pip's index, on Linux 5.6 GB instead of 1.8"
+endif
 	@touch $@
 
 $(VENV)/.demo: pyproject.toml $(VENV)/.torch

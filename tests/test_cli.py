@@ -18,10 +18,11 @@ import pytest
 import torch
 from frame_solvers import as_named
 from jsonschema import Draft202012Validator
-from pxr import Usd
-from shots import CLOTH, cloth_shot, command, run
+from pxr import Sdf, Usd, UsdGeom
+from shots import CLOTH, TIMES, cloth_shot, command, run
 
 from physgraph_usd import cli, errors
+from physgraph_usd.cli import inspected
 from physgraph_usd.shot import summary
 from physgraph_usd.shot.report import RefineReport
 
@@ -257,12 +258,71 @@ class TestErrors:
 
 
 class TestOtherCommands:
-    def test_inspect(self, sample: Sample) -> None:
+    def test_inspect_begins_with_the_garments_and_ends_with_the_command(self, sample: Sample) -> None:
         text, data = run("inspect", sample("swatch")), run("inspect", sample("swatch"), "--json")
         assert (text.exit_code, data.exit_code) == (0, 0)
-        assert json.loads(data.stdout)
-        assert "swatch" in text.stdout
-        assert "times: 1, 2, 3, ..., 24 (24 in all)" in text.stdout
+        found, lines = json.loads(data.stdout), text.stdout.splitlines()
+        (garment,) = found["garments"]
+        assert lines[0] == f"shot: {sample('swatch')}, 24 frames, 1 to 24, 1 unit is 1 m"
+        assert lines[1:2] == ["garments:"]
+        points, fine = f"{garment['points']:,} vertices", f"{garment['fine_points']:,} at level {garment['level']}"
+        assert lines[2].startswith(f"  {garment['path']}: {points} become {fine}, ")
+        assert lines[-1] == f"command: {found['command']}"
+        assert len(lines) < 20
+
+    def test_inspect_prints_every_value_on_request(self, sample: Sample) -> None:
+        """What the summary leaves out, so that nothing is in the JSON alone."""
+        brief, full = (run("inspect", sample("swatch"), *more).stdout for more in ((), ("--details",)))
+        found = json.loads(run("inspect", sample("swatch"), "--json").stdout)
+        assert full.startswith(brief)
+        rest = full[len(brief) :]
+        assert "times: 1, 2, 3, ..., 24 (24 in all)" in rest
+        for name in {*found, *found["garments"][0], *found["garments"][0]["fabric"]} - {*inspected.PRINTED_IN_FULL}:
+            assert f"{name}:" in rest, name
+
+    def test_inspect_names_problems_and_warnings_above_the_command(self, tmp_path: Path) -> None:
+        """Of cloth with a face that is there twice, and with a misspelt value."""
+        stage = Usd.Stage.Open(str(cloth_shot(tmp_path / "shot.usda")))
+        mesh = UsdGeom.Mesh(stage.GetPrimAtPath(CLOTH))
+        counts, indices = mesh.GetFaceVertexCountsAttr(), mesh.GetFaceVertexIndicesAttr()
+        counts.Set([*counts.Get(), 4])
+        indices.Set([*indices.Get(), *indices.Get()[:4]])
+        mesh.GetPrim().CreateAttribute("physgraph:material:bendStifness", Sdf.ValueTypeNames.Float).Set(1e-5)
+        stage.GetRootLayer().Export(str(tmp_path / "faulty.usda"))
+        data = json.loads(run("inspect", tmp_path / "faulty.usda", "--json").stdout)
+        lines = run("inspect", tmp_path / "faulty.usda").stdout.splitlines()
+        defects, warnings = data["defects"][CLOTH], data["warnings"]
+        first, second, command = (
+            lines.index(each) for each in ("problems:", "warnings:", f"command: {data['command']}")
+        )
+        assert defects
+        assert lines[first + 1 : second] == [f"  {CLOTH}: {each}" for each in defects]
+        assert any("bendStifness" in each for each in warnings)
+        assert lines[second + 1 : second + 1 + len(warnings)] == [f"  {each}" for each in warnings]
+        assert command == len(lines) - 1
+
+    def test_inspect_lists_the_meshes_of_a_shot_without_garments(self, tmp_path: Path) -> None:
+        stage = Usd.Stage.Open(str(cloth_shot(tmp_path / "shot.usda")))
+        stage.GetPrimAtPath(CLOTH).RemoveAppliedSchema("PhysGraphGarmentAPI")
+        stage.GetRootLayer().Export(str(tmp_path / "plain.usda"))
+        lines = run("inspect", tmp_path / "plain.usda").stdout.splitlines()
+        assert lines[1:3] == ["meshes:", f"  {CLOTH}: 35 vertices, open, {len(TIMES)} samples"]
+        assert lines[3] == "problems:"
+        assert lines[-1].endswith(f"--garment {CLOTH}")
+
+    def test_validate_says_what_was_checked(self, sample: Sample, tmp_path: Path) -> None:
+        out = tmp_path / "fine.usdc"
+        assert run("refine", sample("swatch"), "-o", out, *SMALL).exit_code == 0
+        done = run("validate", out)
+        warning, last = done.stdout.splitlines()
+        assert (done.exit_code, warning.startswith("warning")) == (0, True)
+        checked = f"1 prim at 2 time codes, alone and over {sample('swatch')}, by the rules of this package"
+        assert last.startswith(f"{out} is valid, with 1 warning: {checked}")
+        layer = Sdf.Layer.FindOrOpen(str(out))
+        layer.framesPerSecond = layer.timeCodesPerSecond = 7.0
+        layer.Save()
+        broken = run("validate", out)
+        assert (broken.exit_code, "is valid" in broken.stdout) == (1, False)
 
     @pytest.mark.parametrize("option", ["--garment", "--collider"])
     def test_a_prim_that_is_not_there_is_2(self, sample: Sample, tmp_path: Path, option: str) -> None:

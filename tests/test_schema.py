@@ -71,7 +71,10 @@ def test_every_row_is_what_the_registered_schema_says(prims: dict[str, Usd.Prim]
         assert UsdGeom.Primvar(attribute).GetInterpolation() == row.interpolation
     assert (attribute.GetDisplayName(), attribute.GetDisplayGroup()) == (row.label, row.group)
     said = attribute.GetDocumentation()
-    assert ("Where nothing gives it" in said) == (row.fallback is not None)
+    assert ("Default: " in said) == (row.fallback is not None)
+    assert (f"Unit: {row.unit}" in said) == bool(row.unit)
+    assert row.doc.endswith(".")
+    assert said.endswith(".")
 
 
 GIVERS = {"nobody": (), "a material": ("material",), "an ancestor": ("rig",), "the prim": ("cloth", "rig", "material")}

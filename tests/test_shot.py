@@ -44,7 +44,7 @@ class TestDone:
         found = inspect_shot(shot, level=1)
         report = refine(shot, tmp_path / "fine.usdc", progress=lambda *_: seen.append(caplog.messages), frames=frames)
         (garment,), (refined,) = found["garments"], report.garments
-        for name in ("wavelength_mm", "level_needed", "level_reason", "strained", "unfelt"):
+        for name in ("wavelength_mm", "level_for_finest_wrinkles", "level_reason", "strained", "unfelt"):
             assert refined[name] == garment[name], name
         assert report.notes[: len(found["notes"])] == found["notes"]
         assert {*report.warnings, *found["notes"]} >= {*found["warnings"]} | {*found["notes"]}

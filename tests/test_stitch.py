@@ -16,11 +16,12 @@ from pxr import Sdf, Usd, UsdGeom
 from shots import CLOTH, EDGE, cloth_shot, faults, fine, interrupted, refine, run, sample_times
 from stages import add_sheet, new_stage, save, vec3
 
+from physgraph_usd.cli.printing import seam_lines
 from physgraph_usd.errors import LayerError, PhysGraphError, UsageError
 from physgraph_usd.shot.frames import Finished, kept_for
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.refine import refine_shot
-from physgraph_usd.shot.stitch import SEAM_BOUND, check_seams, stitch
+from physgraph_usd.shot.stitch import SEAM_BOUND, Seam, check_seams, stitch
 from physgraph_usd.usd.check.validate import validate_layer
 from physgraph_usd.usd.provenance import read_record
 from physgraph_usd.usd.stage import paths_in
@@ -110,6 +111,7 @@ class TestOneLayer:
         assert [frame["time"] for frame in json.loads(report.read_text())["frames"]] == list(TIMES)
         assert done.stdout.strip() == str(tmp_path / "joined.usdc")
         assert [line.partition(":")[0] for line in done.stderr.splitlines()] == ["seam at 9", "seam at 17"]
+        assert all("bound" in line and f"{SEAM_BOUND:g} RMS" in line for line in done.stderr.splitlines())
         assert faults(tmp_path / "joined.usdc", runs.shot) == []
 
     @pytest.mark.parametrize("time", [12.0, 16.0])
@@ -323,6 +325,15 @@ def test_a_root_shows_one_layer_over_the_shot_too_and_replaces_no_file(runs: Run
     stitch(runs.chunks, **out, overwrite=True)
     shown, asked = Usd.Stage.Open(str(tmp_path / "root.usda")), open_over(runs.shot, runs.joined)
     assert points_in(shown, CLOTH, TIMES[-1]) == points_in(asked, CLOTH, TIMES[-1])
+
+
+def test_a_seam_near_the_bound_is_named_with_the_remedy():
+    def line(rms: float) -> str:
+        (line,) = seam_lines([Seam(9.0, CLOTH, rms, 0.2, 6)], SEAM_BOUND)
+        return line
+
+    assert line(0.044).endswith("; near the bound of 0.05 RMS, and a longer --preroll moves the seam less")
+    assert line(0.02).endswith("; the bound is 0.05 RMS")
 
 
 def test_a_refused_seam_is_mended_by_the_chunk_and_the_preroll_that_the_error_names(

@@ -222,6 +222,25 @@ def test_undo_and_redo_bring_back_values_maps_and_levels(session: TuneSession):
     assert session.history.redone_next == ""
 
 
+def test_undo_brings_back_the_cloth_of_the_step_and_goes_on_from_there(session: TuneSession):
+    first = session.settle()
+    session.set_value(CLOTH, "guide:stiffness", 20.0)
+    second = session.settle()
+    assert not np.array_equal(points(first), points(second))
+    session.undo()
+    assert session.solve() is first
+    session.redo()
+    assert session.solve() is second
+    session.undo()
+    session.set_value(CLOTH, "guide:stiffness", 20.0)
+    assert session.solve() is not second
+    assert np.linalg.norm(points(session.settle()) - points(second), axis=1).max() < 0.01
+    for k in range(MOST_SETTINGS):
+        session.set_value(CLOTH, "density", 0.2 + 0.1 * k)
+        session.settle()
+    assert len(session._steps._kept) == MOST_SETTINGS
+
+
 def test_a_drag_is_one_step_of_undo():
     now = [0.0]
     history = History(Setting((1,)), seconds=lambda: now[0])

@@ -294,7 +294,7 @@ def test_cloth_that_moves_and_rests_again_leaves_no_nodes_in_the_scene():
         for step in range(4):
             moved = points + np.float32(step)
             skins.place("refined/0", Placed(moved, triangles, whole=triangles, color=np.ones(3)))
-            skins.shade([["refined/0"]], lambda: False)
+            skins.shade([["refined/0"]], lambda: False, grounds=1)
             time.sleep(2 * LOADED_SECONDS)
             counts.append(len(server.scene._handle_from_node_name))
     assert counts == [counts[0]] * 4

@@ -12,7 +12,7 @@ from typing import Any
 
 import click
 
-from ..errors import UsageError
+from ..errors import UsageError, counted
 from ..interrupts import signals_noted
 from ..shot.plain_json import to_json
 from ..solver.fabric import PRESETS
@@ -26,7 +26,7 @@ from .options import (
     shot_argument,
     together,
 )
-from .printing import outline, print_progress
+from .printing import print_progress, seam_lines
 from .refine import refine
 from .show_file import values_for
 from .structure import DONE, FAILED, imports_uncollected
@@ -72,24 +72,24 @@ session_options = together(
 def stitch(chunks: tuple[Path, ...], out: Path | None, *, check_seams: bool, seam_bound: float, **options: Any) -> None:
     """Join chunks of a shot, folders written by refine --preroll, into a layer and print the path of the layer.
 
-    A folder of chunks counts as all its chunks. The movement of each seam is printed on stderr. Exits with 3 if a frame
-    failed.
+    A folder of chunks counts as all its chunks. The movement of each seam is printed on stderr, with the bound. Exits
+    with 3 if a frame failed.
     """
     with signals_noted():
         with imports_uncollected():
             from ..shot import stitch as chunk
 
         if check_seams:
-            for seam in chunk.check_seams(chunks, seam_bound=seam_bound, shot=options["shot"]):
-                click.echo(seam, err=True)
-            return
-        if out is None:
+            report, seams = None, chunk.check_seams(chunks, seam_bound=seam_bound, shot=options["shot"])
+        elif out is None:
             raise UsageError("give a layer to write by -o, or --check-seams")
-        report, seams = chunk.stitch(chunks, out, seam_bound=seam_bound, **options)
-        for seam in seams:
-            click.echo(seam, err=True)
-    click.echo(out)
-    sys.exit(report.exit_code)
+        else:
+            report, seams = chunk.stitch(chunks, out, seam_bound=seam_bound, **options)
+        for line in seam_lines(seams, seam_bound):
+            click.echo(line, err=True)
+    if report is not None:
+        click.echo(out)
+        sys.exit(report.exit_code)
 
 
 @click.command()
@@ -102,19 +102,22 @@ def stitch(chunks: tuple[Path, ...], out: Path | None, *, check_seams: bool, sea
     is_flag=True,
     help="Also solve three frames; print the time for the whole shot, and the distance of the frames from rest.",
 )
+@click.option("--details", "detailed", is_flag=True, help="Also print every value and its source.")
 @json_option
 @click.pass_context
-def inspect(ctx: click.Context, shot: str, *, as_json: bool, timed: bool, **options: Any) -> None:
-    """Print the garments, bodies and values of SHOT, the source of each value, and every defect.
+def inspect(ctx: click.Context, shot: str, *, as_json: bool, timed: bool, detailed: bool, **options: Any) -> None:
+    """Print the garments and bodies of SHOT, every problem and warning, and the command to refine SHOT.
 
     Exits with 1 if SHOT cannot be refined with these options, with 2 if a named prim or file does not exist.
     """
     with imports_uncollected():
         from ..shot.refine import inspect_shot
+    from .inspected import details, summary
 
     values, _ = values_for(ctx, shot, refine)
     found = inspect_shot(shot, timed=timed, **{name: values[name] for name in options if name != "config"})
-    click.echo(to_json(found) if as_json else "\n".join(outline(found)))
+    lines = [*summary(found), *(["", *details(found)] if detailed else [])]
+    click.echo(to_json(found) if as_json else "\n".join(lines))
     sys.exit(found.get("exit_code", DONE))
 
 
@@ -201,16 +204,23 @@ def tune(shot: str, *, port: int, **options: Any) -> None:
 )
 @json_option
 def validate(layer: str, *, shot: str | None, as_json: bool) -> None:
-    """Check a refined LAYER by our rules and by USD's own validators; exit with 1 if a rule is broken."""
-    from ..usd.check.validate import validate_layer
+    """Check a refined LAYER by our rules and by USD's own validators, and print every problem.
+
+    A layer without errors ends with a line on what was checked. Exits with 1 if a rule is broken.
+    """
+    from ..usd.check.validate import validate_layer, what_was_checked
 
     problems = validate_layer(layer, shot)
+    is_valid = all(problem.severity != "error" for problem in problems)
     if as_json:
         click.echo(to_json([asdict(problem) for problem in problems]))
     else:
         for problem in problems:
             click.echo(problem)
-    sys.exit(FAILED if any(problem.severity == "error" for problem in problems) else DONE)
+        if is_valid:
+            warned = f", with {counted(len(problems), 'warning')}" if problems else ""
+            click.echo(f"{layer} is valid{warned}: {what_was_checked(layer, shot)}")
+    sys.exit(DONE if is_valid else FAILED)
 
 
 @click.command()

@@ -6,15 +6,18 @@ import logging
 import os
 import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TextIO
+from typing import TYPE_CHECKING, Any, TextIO
 
 import click
 
 from ..errors import NOTICE, PhysGraphError, UsageError, counted
+
+if TYPE_CHECKING:
+    from ..shot.stitch import Seam
 
 MOST_LISTED = 8
 """Longest list of numbers that is printed in full."""
@@ -180,6 +183,17 @@ def print_progress(part: float, seconds: float, what: str) -> None:
 
 def _left(seconds: float) -> str:
     return f"about {seconds / 60.0:.0f} min left" if seconds > 90.0 else f"about {seconds:.0f} s left"
+
+
+def seam_lines(seams: Iterable[Seam], bound: float) -> Iterator[str]:
+    """A line for each seam: its move, the bound, and the remedy where less than a third of the bound is left."""
+    from ..shot.stitch import SPARE
+
+    for seam in seams:
+        if seam.rms > (1 - SPARE) * bound:
+            yield f"{seam}; near the bound of {bound:g} RMS, and a longer --preroll moves the seam less"
+        else:
+            yield f"{seam}; the bound is {bound:g} RMS"
 
 
 def outline(value: Any, indent: str = "") -> Iterator[str]:

@@ -17,7 +17,7 @@ from ..errors import LayerError, PhysGraphError, UsageError, counted
 from ..interrupts import at_end, signals_noted
 from ..interrupts import exit_code_of as signal_code_of
 from .options import HEADINGS, out_option, run_options, together, under
-from .printing import LOGGER, Output, say
+from .printing import LOGGER, Output, say, seam_lines
 from .show_file import values_for
 from .structure import DONE, FAILED, GroupedCommand, errors_named, imports_uncollected, show_trace
 
@@ -72,9 +72,9 @@ def _check_seams(layers: Sequence[Path], bound: float | None, output: Output) ->
     from ..shot.stitch import check_seams
 
     for layer in filter(Path.exists, layers):
-        for seam in check_seams([layer.parent], of=layer, seam_bound=bound):
+        for line in seam_lines(check_seams([layer.parent], of=layer, seam_bound=bound), bound):
             if not output.quiet:
-                say(f"{'openjd_status: ' if output.openjd else ''}{seam}", err=True)
+                say(f"{'openjd_status: ' if output.openjd else ''}{line}", err=True)
 
 
 def _jobs(ctx: click.Context, shots: tuple[str, ...], out: Path) -> list[Job]:

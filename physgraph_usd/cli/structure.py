@@ -18,7 +18,7 @@ from ..interrupts import SIGNALLED, importing
 
 DONE, FAILED = 0, 1
 PACKAGES = {
-    "pxr": "'usd-core<27'",
+    "pxr": "'usd-core<28'",
     "PIL": "pillow",
     "matplotlib": "matplotlib",
     "plotly": "plotly",

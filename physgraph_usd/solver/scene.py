@@ -122,9 +122,15 @@ class Garment:
 
     @staticmethod
     def of(
-        path: str, faces: np.ndarray, rest: np.ndarray, *, level: int = 2, colliders: tuple[int, ...] = ()
+        path: str,
+        faces: np.ndarray,
+        rest: np.ndarray,
+        *,
+        level: int = 2,
+        colliders: tuple[int, ...] = (),
+        pin: np.ndarray | None = None,
     ) -> Garment:
-        """A garment without paint or pins, its hinges flat at rest.
+        """A garment without paint, its hinges flat at rest.
 
         Args:
             path: Its name.
@@ -132,10 +138,12 @@ class Garment:
             rest: Rest positions of the cage [m], shape (V, 3).
             level: Number of subdivisions.
             colliders: Numbers of the scene's colliders that it feels.
+            pin: 1 where the fine cloth follows the coarse cloth exactly, shape (V,); None pins no vertex.
         """
         one, corners = np.ones(len(rest)), np.asarray(faces)
         mesh = PolygonMesh(np.full(len(corners), corners.shape[1]), corners.ravel(), len(rest))
-        return Garment(path, mesh, np.asarray(rest, float), level, False, one, one, one, one, 0 * one, colliders)
+        held = 0 * one if pin is None else np.asarray(pin, float)
+        return Garment(path, mesh, np.asarray(rest, float), level, False, one, one, one, one, held, colliders)
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,7 @@ from trimesh.triangles import points_to_barycentric
 
 from ..solver.mesh.topology import PolygonMesh, adjacency
 
-PAINT, ERASE, SMOOTH = "paint", "erase", "smooth"
+PAINT, ERASE, SMOOTH, READ = "paint", "erase", "smooth", "read"
 
 
 @dataclass(frozen=True)

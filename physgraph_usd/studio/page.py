@@ -104,6 +104,7 @@ class TunePage(Watcher):
         rows = [f"| {name} | **{text}** |" for name, text in self._lines.items()]
         put(self._figures, content="\n".join(["| | |", "|:--|--:|", *rows]))
         self._values.update()
+        self._paint.update(session)
         self._view.update()
         self._time.update()
         history = session.history

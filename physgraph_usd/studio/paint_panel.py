@@ -7,16 +7,25 @@ from typing import Any
 import numpy as np
 
 from ..usd.schema import GARMENT
-from .brush import ERASE, PAINT, SMOOTH, Brush, Stroke, hit
+from .brush import ERASE, PAINT, READ, SMOOTH, Brush, Stroke, hit
 from .camera import Camera
-from .desk import Desk, in_order
+from .desk import Desk, in_order, put, small
 from .session import TuneSession
-from .values import MAPS
+from .values import MAPS, TUNABLES, on_fine
 from .view_panel import ViewPanel
 
 OFF = "off"
 MODES = {None: None, "shift": SMOOTH, "cmd/ctrl": ERASE}
 """The brush of a drag by the keys that are held; None is the brush chosen on the page."""
+
+MULTIPLIED = {
+    "stretchScale": ("stretchStiffness",),
+    "bendScale": ("bendStiffness",),
+    "detailScale": ("refine:detail",),
+    "guideScale": ("guide:stiffness",),
+    "easeScale": ("rest:weftEase", "rest:warpEase"),
+}
+"""Values that each map multiplies, by the schema's short names."""
 
 
 class PaintPanel:
@@ -33,15 +42,19 @@ class PaintPanel:
             "Paint", (OFF, *MAPS), hint="Drag on the refined cloth; drag beside it to turn the view."
         )
         self._choice = desk.on(choice, self.choose)
+        self._remark, self._read = gui.add_html(""), gui.add_html("")
         self._value = gui.add_number("Value", 0.0, step=0.01)
-        radius = gui.add_slider("Radius [m]", 0.005 * size, 0.3 * size, 0.001 * size, 0.05 * size)
+        least, first, most = (_short(1e3 * part * size) for part in (0.005, 0.05, 0.3))
+        radius = gui.add_slider("Radius [mm]", least, most, 10.0 ** np.floor(np.log10(least)), first)
         self._radius = desk.on(radius, lambda session, value: self._draw_rings())
         self._strength = gui.add_slider("Strength", 0.05, 1.0, 0.05, 0.5)
-        hint = "While dragging, shift smooths, and ctrl erases: paints the value that changes nothing."
-        self._mode = gui.add_dropdown("Brush", (PAINT, ERASE, SMOOTH), hint=hint)
+        hint = "Erase paints the value that changes nothing. While dragging, shift smooths, and ctrl erases."
+        self._mode = desk.on(gui.add_dropdown("Brush", (PAINT, ERASE, SMOOTH, READ), hint=hint), lambda *_: None)
         self._mirror = gui.add_checkbox("Mirror", False, hint="Paints the other side too, mirrored at rest.")
         flood = gui.add_button("Fill", hint="Gives every vertex the value.")
         desk.press(flood, self._fill)
+        hint = "Exchanges the value and the value that changes nothing, and those between."
+        desk.press(gui.add_button("Invert", hint=hint), self._invert)
         camera.on_click(self._clicked)
 
     def choose(self, session: TuneSession, name: str) -> None:
@@ -50,11 +63,23 @@ class PaintPanel:
         if name != OFF:
             row = GARMENT[name]
             self._value.value = float((row.soft or (0.0, 1.0))[1])
+            self._value.label = f"Value [{row.unit}]" if row.unit else "Value"
             self._view.set(map=name)
             eye, middle = self._camera.eye, self._desk.picture.framed.mean(axis=0)
             hits = (self._hit(session, k, eye, middle - eye) for k in range(len(session.garments)))
             self._at = next((at for at in hits if at is not None), None)
+        put(self._read, content="")
+        self.update(session)
         self._draw_rings()
+
+    def update(self, session: TuneSession) -> None:
+        """Say why the map that is painted changes nothing, if so."""
+        names = MULTIPLIED.get(self._name, ())
+        labels = " and ".join(TUNABLES[name].label for name in names)
+        idle = names and not any(session.value(self._desk.garment, name) for name in names)
+        verb = "which are 0: raise one of them" if len(names) > 1 else "which is 0: raise it"
+        remark = f"No effect yet: the map multiplies {labels}, {verb} under Values." if idle else ""
+        put(self._remark, content=small(remark, "remark") if remark else "")
 
     def attach(self) -> None:
         """Attach the brush to drags on the picture's targets, and only to them."""
@@ -100,11 +125,24 @@ class PaintPanel:
         if stroke is None or (stroke.garment, stroke.name) != (garment, self._name):
             stroke = Stroke(garment, self._name, session.painted(garment, self._name))
         mode = str(mode or self._mode.value)
+        if mode == READ:
+            self._stroke = None
+            self._say_value(session, index, at, stroke.values)
+            return
         value = float(GARMENT[self._name].fallback or 0.0) if mode == ERASE else self._limited()
-        brush = Brush(self._radius.value, value, self._strength.value, mode=mode, mirrored=self._mirror.value)
+        brush = Brush(1e-3 * self._radius.value, value, self._strength.value, mode=mode, mirrored=self._mirror.value)
         where = {"mesh": cage.mesh, "rest": cage.rest, "right": self._desk.picture.axes[0]}
         stroke.touch(brush, self._desk.picture.world(at), points[: cage.mesh.vertex_count], **where)
         self._stroke = self._desk.picture.stroke = stroke
+        self._say_value(session, index, at, stroke.values)
+
+    def _say_value(self, session: TuneSession, index: int, at: np.ndarray, values: np.ndarray) -> None:
+        """Draw the rings at a place in the scene [m], and write a map's value there."""
+        points = np.asarray(session.solve().points[index])
+        near = np.linalg.norm(points - self._desk.picture.world(at), axis=1).argmin()
+        found = on_fine(values, session.refinements[index])[near]
+        unit = GARMENT[self._name].unit
+        put(self._read, content=small(f"{self._name} under the brush: {found:.3g} {unit}".strip(), "read"))
         self._at = at
         self._draw_rings()
 
@@ -126,7 +164,7 @@ class PaintPanel:
 
     def _draw_rings(self) -> None:
         at = None if self._name == OFF else self._at
-        self._desk.picture.draw_rings(at, self._radius.value, eye=self._camera.eye)
+        self._desk.picture.draw_rings(at, 1e-3 * self._radius.value, eye=self._camera.eye)
 
     def _fill(self, session: TuneSession) -> None:
         if self._name != OFF:
@@ -134,7 +172,18 @@ class PaintPanel:
             values = np.full_like(session.painted(garment, self._name), self._limited())
             session.paint(garment, self._name, values)
 
+    def _invert(self, session: TuneSession) -> None:
+        if self._name != OFF:
+            row, values = GARMENT[self._name], session.painted(self._desk.garment, self._name)
+            mirrored = float(row.fallback or 0.0) + self._limited() - values
+            session.paint(self._desk.garment, self._name, np.clip(mirrored, row.minimum, row.maximum))
+
     def _limited(self) -> float:
         """The value to paint, within the map's limits."""
         row = GARMENT[self._name]
         return float(np.clip(self._value.value, row.minimum, row.maximum))
+
+
+def _short(number: float) -> float:
+    """A number rounded to two figures."""
+    return float(f"{number:.2g}")

@@ -133,7 +133,7 @@ class Picture:
 
     def shade(self, cancelled: Callable[[], bool]) -> None:
         """Draw the light and the soft shadows of what is drawn, unless ``cancelled`` meanwhile."""
-        self._skins.shade(self._columns, cancelled)
+        self._skins.shade(self._columns, cancelled, grounds=1 if self.view.wiped else len(self._columns))
 
     def move(self, points: Mapping[str, np.ndarray]) -> None:
         """Draw refined garments at new positions [m], by path; maps, wires and a wipe follow in `draw`."""

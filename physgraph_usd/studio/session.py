@@ -75,11 +75,12 @@ class TuneSession(Tuning):
         self._shown: tuple[Setting, Shown] | None = None
         self.takes = Takes()
         self.kept: Take | None = None
+        self._steps = Takes()  # Settled cloth of the settings looked at last, for undo.
 
     def close(self) -> None:
         """Let go of the stage and of all solvers; the session cannot be used afterwards."""
         self._tried.close()
-        self.takes, self.kept, self._shown = Takes(), None, None
+        self.takes, self.kept, self._shown, self._steps = Takes(), None, None, Takes()
         del self.solver
 
     @property
@@ -94,7 +95,14 @@ class TuneSession(Tuning):
             UsageError: The shot has no sample there.
         """
         self.time, self._shown = (time := self.sampled(time)), None
-        if take := self.takes.fresh(time, self.setting):
+        self._go_to(self.takes.fresh(time, self.setting))
+
+    def _go(self, way: int) -> None:
+        super()._go(way)
+        self._go_to(self._steps.fresh(self.time, self.setting))
+
+    def _go_to(self, take: Take | None) -> None:
+        if take is not None:
             self.solver, self._solves = copy(take.start.solver), take.setting
             self._shown = take.setting, take.shown
 
@@ -142,9 +150,7 @@ class TuneSession(Tuning):
 
         Args:
             span: First and last time code to solve in order into `takes`, with A's setting too; None solves none.
-            cancelled: As in `settle`.
-
-        Errors are those of `solve`.
+            cancelled: As in `settle`; errors are those of `solve`.
         """
         if self.kept is not None and self.kept_shown is None:
             take = self.kept.start.at(self.time, cancelled)
@@ -153,12 +159,10 @@ class TuneSession(Tuning):
         return self._solve_next(self.codes_in(span), cancelled) is not None
 
     def step(self, span: tuple[float, float] | None, cancelled: Callable[[], bool] = lambda: False) -> Shown | None:
-        """Go to the next frame of a range, in a cycle; arguments and errors as for `go_on`.
+        """Go to the next frame of a range, in a cycle, and return it; None if solving it was cancelled.
 
-        Before a missing or stale frame, the first such frame of the range is solved and shown.
-
-        Returns:
-            The frame; None if solving it was cancelled.
+        Before a missing or stale frame, the first such frame of the range is solved and shown. Arguments and errors are
+        those of `go_on`.
         """
         times = self.codes_in(span)
         if not times:
@@ -208,6 +212,8 @@ class TuneSession(Tuning):
         state = self.solver.solve(self.shot, self.time, rough=rough, seen=seen, cancelled=cancelled)
         shown = Shown.of(self.shot.frame(self.time), state, began=began, settled=not (rough or cancelled()))
         self._shown = self.setting, shown
+        if shown.settled:
+            self._steps.keep_last(Take(Start(self.setting, self.shot, copy(self.solver)), shown))
         return shown
 
     def _prepare(self) -> None:

@@ -97,8 +97,14 @@ class Skins:
         if (handle := self.meshes.pop(name, None)) is not None:
             handle.remove()
 
-    def shade(self, columns: Collection[Collection[str]], cancelled: Callable[[], bool]) -> None:
-        """Light the named meshes of each column and the ground below; without effect if ``cancelled`` meanwhile."""
+    def shade(self, columns: Collection[Collection[str]], cancelled: Callable[[], bool], *, grounds: int) -> None:
+        """Light the named meshes of each column and the ground below; without effect if ``cancelled`` meanwhile.
+
+        Args:
+            columns: Names of the meshes of each column.
+            cancelled: Asked before each map of light.
+            grounds: Number of columns whose ground is drawn, from the first; grounds at one place darken one another.
+        """
         if all(self._is_lit(name) for column in columns for name in column):
             return
         meshes = [[(self._placed[name].points, self._placed[name].whole) for name in column] for column in columns]
@@ -113,7 +119,9 @@ class Skins:
                     self.meshes[name].color = encode_color(tuple(self._placed[name].color * factor.mean()))
             for ground in self._grounds:
                 self._later(ground.remove, LOADED_SECONDS)
-            self._grounds = [self._scene.add_glb(f"ground-{next(self._serial)}", ground) for _, ground in found]
+            self._grounds = [
+                self._scene.add_glb(f"ground-{next(self._serial)}", ground) for _, ground in found[:grounds]
+            ]
 
     def _is_lit(self, name: str) -> bool:
         lit = self._light.get(name)

@@ -96,11 +96,17 @@ class Takes:
 
     def __init__(self) -> None:
         """Hold no take."""
-        self._kept: dict[Setting, dict[float, Take]] = {}
+        self._kept: dict[Setting, dict[float | None, Take]] = {}
 
     def fresh(self, time: float | None, setting: Setting) -> Take | None:
         """The take of a frame with a setting, or None."""
-        return None if time is None else self._kept.get(setting, {}).get(time)
+        return self._kept.get(setting, {}).get(time)
+
+    def keep_last(self, take: Take) -> None:
+        """Keep a take as the only one of its setting."""
+        self._kept.pop(take.setting, None)
+        self._kept[take.setting] = {take.shown.frame.time: take}
+        self._drop_settings()
 
     def states(self, times: Sequence[float], setting: Setting) -> list[str]:
         """For each frame: `FRESH`, `STALE` (solved with another setting only) or `MISSING`."""
@@ -131,9 +137,12 @@ class Takes:
             takes[time] = take
             for old in list(takes)[:-room]:
                 del takes[old]
-            for other in list(self._kept)[:-MOST_SETTINGS]:
-                del self._kept[other]
+            self._drop_settings()
         return time
+
+    def _drop_settings(self) -> None:
+        for other in list(self._kept)[:-MOST_SETTINGS]:
+            del self._kept[other]
 
     @staticmethod
     def _room(solver: FrameSolver) -> int:

@@ -23,8 +23,6 @@ MATERIAL = "physgraph:material:"
 AUTO_LEVEL = -1
 """Level value for automatic choice: as many subdivisions as the fabric's buckling wavelength needs."""
 
-SI = " SI, whatever the stage's metersPerUnit."
-"""End of the doc of every property with a unit."""
 REFINEMENT, FABRIC, REST = "Refinement", "Fabric", "Rest Shape"
 CONTACT, PAINTED, COLLISION = "Contact", "Painted Maps", "Collider"
 """Display groups."""
@@ -39,6 +37,8 @@ for other pieces the side of the coarse cloth.
 "start": the side of the coarse cloth, for every piece, closed or not.
 "front", "back": the named side of the authored faces of open pieces; outside of closed pieces.
 """
+PER_VERTEX = "Give one value for each vertex, or one for the whole garment."
+"""End of the doc of a painted map."""
 AXES = ("X", "Y", "Z", "-X", "-Y", "-Z")
 """Directions along the stage's axes."""
 RETIRED = {
@@ -101,25 +101,29 @@ _PULL, _BEND = ("N/m", (1e-3, 1e9), (1.0, 1e4)), ("N m", (0.0, 1e5), (1e-7, 1e-2
 _FABRIC_ROWS = (
     (
         "stretchStiffness", "Stretch Stiffness", _JERSEY.stretch, *_PULL,
-        "In-plane stiffness E h: Young's modulus of the sheet; along the warp if the weft has a separate value.",
+        "Resistance to stretching in the plane, E h: Young's modulus times thickness. Along the warp only, if the weft "
+        "has its own value.",
     ),
     (
         "weftStretchStiffness", "Weft Stretch Stiffness", None, *_PULL,
-        "Stretch stiffness along the weft, if different from the warp.",
+        "Stretch stiffness along the weft. Without a value, the same as along the warp.",
     ),
     (
         "shearStiffness", "Shear Stiffness", None, "N/m", (0.0, 1e9), (0.1, 1e4),
-        "Shear stiffness G h; without a value, 0.375 times the stretch stiffness.",
+        "Resistance to shear in the plane, G h: shear modulus times thickness. Without a value, 0.375 times the "
+        "stretch stiffness.",
     ),
     (
         "bendStiffness", "Bending Stiffness", _JERSEY.bend, *_BEND,
-        "Bending stiffness E h^3 / 12 (1 - nu^2); along the warp if the weft has a separate value.",
+        "Resistance to bending, E h^3 / 12 (1 - nu^2). Higher values make broader folds. Along the warp only, if "
+        "the weft has its own value.",
     ),
     (
         "weftBendStiffness", "Weft Bending Stiffness", None, *_BEND,
-        "Bending stiffness along the weft, if different from the warp; a quarter to four times the warp's.",
+        "Bending stiffness along the weft. Without a value, the same as along the warp. The solver uses at least a "
+        "quarter and at most four times the value along the warp.",
     ),
-    ("density", "Density", _JERSEY.density, "kg/m^2", (1e-4, 1e5), (0.01, 2.0), "Mass per area."),
+    ("density", "Density", _JERSEY.density, "kg/m^2", (1e-4, 1e5), (0.01, 2.0), "Mass of the cloth per area."),
     ("thickness", "Thickness", _JERSEY.thickness, "m", (1e-6, 1.0), (1e-4, 1e-2), "Thickness of the cloth."),
 )  # fmt: skip
 """Fabric values in documentation order: name, label, fallback, unit, limits, soft limits, doc."""
@@ -129,7 +133,7 @@ def _material(schema: str, fallbacks: bool) -> tuple[Property, ...]:
     """Rows of the fabric values; values missing in a material are looked up elsewhere for the garment."""
     limit = Property(
         schema, MATERIAL + "stretchLimit", "float", None, "%", 0.0, 1000.0,
-        "Strain along warp or weft above which the cloth is twenty times as stiff; without a value, no limit.",
+        "Strain along warp or weft above which the cloth is twenty times as stiff. Without a value, there is no limit.",
         "Stretch Limit", FABRIC, (1.0, 50.0),
     )  # fmt: skip
     rows = (
@@ -140,7 +144,7 @@ def _material(schema: str, fallbacks: bool) -> tuple[Property, ...]:
             fallback if fallbacks else None,
             unit,
             *ends,
-            doc + SI,
+            doc,
             label,
             FABRIC,
             soft,
@@ -152,7 +156,7 @@ def _material(schema: str, fallbacks: bool) -> tuple[Property, ...]:
 
 def _ease(way: str) -> Property:
     """Row of the length of cloth along warp or weft in excess of the rest shape."""
-    doc = f"Extra cloth length along the {way}, in percent of the rest shape; makes folds."
+    doc = f"Extra cloth length along the {way}, in percent of the rest shape. More length makes more folds."
     return Property(
         GARMENT_API, f"physgraph:rest:{way}Ease", "float", 0.0, "%", -50.0, 100.0, doc,
         f"{way.title()} Ease", REST, (0.0, 10.0),
@@ -174,39 +178,40 @@ PROPERTIES: tuple[Property, ...] = (
     ),
     Property(
         GARMENT_API, "physgraph:refine:level", "int", 2, "", -1, 5,
-        "Number of subdivisions; -1 chooses by the buckling wavelength.",
+        "Number of subdivisions. Each makes four faces of one. -1 chooses as many as the fabric's wrinkles need.",
         "Subdivisions", REFINEMENT, (-1, 4), uniform=True,
     ),
     Property(
-        GARMENT_API, "physgraph:refine:detail", "float", 1.0, "", 0.0, 2.0, "Gain of the added detail.",
+        GARMENT_API, "physgraph:refine:detail", "float", 1.0, "", 0.0, 2.0,
+        "Strength of the added detail: 0 shows the subdivided coarse cloth, 1 the solved cloth.",
         "Detail", REFINEMENT, (0.0, 2.0),
     ),
     Property(
         GARMENT_API, "physgraph:refine:raiseBending", "bool", True, "", None, None,
-        "Whether bending is raised on a level with edges too long for the fabric's folds.",
+        "Whether to raise the bending stiffness on a mesh with edges too long for the fabric's folds.",
         "Raise Bending", REFINEMENT, uniform=True,
     ),
     Property(
         GARMENT_API, "physgraph:gravity", "token", None, "", None, None,
-        "Axis of the stage along which gravity pulls, the same for all garments.",
+        "Axis of the stage along which gravity pulls. All garments must have the same axis.",
         "Gravity", REFINEMENT, uniform=True, tokens=AXES,
     ),
     *_material(GARMENT_API, fallbacks=True),
     Property(
         GARMENT_API, "physgraph:guide:stiffness", "float", 2000.0, "N/m^3", 0.0, 1e12,
-        "How firmly the mean of the fine cloth follows the coarse animation." + SI,
+        "Stiffness of the tie between the local average of the fine cloth and the coarse animation.",
         "Guide Stiffness", REFINEMENT, (10.0, 1e6),
     ),
     Property(
         GARMENT_API, "physgraph:inertia", "float", 1.0, "", 0.0, 1.0,
-        "Share of the animation's acceleration beyond gravity that the cloth feels; 0 for none.",
+        "Share of the animation's acceleration beyond gravity that the cloth feels. 0 leaves it out.",
         "Inertia", REFINEMENT, (0.0, 1.0),
     ),
     _ease("warp"),
     _ease("weft"),
     Property(
         GARMENT_API, "physgraph:contact:offset", "float", 0.002, "m", 0.0, 10.0,
-        "Distance kept from colliders." + SI, "Contact Offset", CONTACT, (1e-4, 3e-2),
+        "Distance that the cloth keeps from colliders.", "Contact Offset", CONTACT, (1e-4, 3e-2),
     ),
     Property(
         GARMENT_API, "physgraph:contact:selfCollision", "bool", True, "", None, None,
@@ -214,74 +219,79 @@ PROPERTIES: tuple[Property, ...] = (
     ),
     Property(
         GARMENT_API, "physgraph:colliders", "rel", None, "", None, None,
-        "Colliders of this garment; empty means every collider prim on the stage.", "Colliders", CONTACT,
+        "Colliders of this garment. If empty, every collider on the stage.", "Colliders", CONTACT,
     ),
     Property(
         GARMENT_API, "physgraph:contact:exclude", "rel", None, "", None, None,
-        "Colliders and garments that this garment never touches: prims, prims above them, or collections.",
+        "Colliders and garments that this garment does not collide with: the prims, their ancestors, or collections.",
         "Excluded Prims", CONTACT,
     ),
     Property(
         GARMENT_API, "physgraph:bind:targets", "rel", None, "", None, None,
-        "Meshes, curves, points and instancers that follow the refined cloth: render meshes, trims, piping, buttons.",
+        "Meshes, curves, points and instancers that follow the refined cloth, such as render meshes and buttons.",
         "Bound Prims", REFINEMENT,
     ),
     Property(
         GARMENT_API, "physgraph:shell:thickness", "float", 0.0, "m", 0.0, 1.0,
-        "Thickness of a closed shell, written instead of the refined sheet; 0 writes the sheet." + SI,
+        "Thickness of the closed shell that is written instead of the refined sheet. 0 writes the sheet.",
         "Shell Thickness", REFINEMENT, (0.0, 0.01), uniform=True,
     ),
     Property(
         GARMENT_API, "physgraph:seam:tolerance", "float", 0.0, "m", 0.0, 1.0,
-        "Largest distance between open borders that are sewn together; 0 sews only coincident borders." + SI,
+        "Largest distance between open borders that are sewn together. 0 sews only borders at the same place.",
         "Seam Tolerance", REST, (0.0, 5e-3), uniform=True,
     ),
     _scale(
         "stretchScale", "Stretch Stiffness Scale", 1.0, most=1e4, soft=10.0,
-        doc="Painted multiplier of the stretch stiffness; vertex or constant.",
+        doc="Painted multiplier of the stretch stiffness. " + PER_VERTEX,
     ),
     _scale(
         "bendScale", "Bending Stiffness Scale", 1.0, most=1e4, soft=10.0,
-        doc="Painted multiplier of the bending stiffness; vertex or constant.",
+        doc="Painted multiplier of the bending stiffness. " + PER_VERTEX,
     ),
     _scale(
         "detailScale", "Detail Scale", 1.0, most=10.0, soft=2.0,
-        doc="Painted multiplier of the added detail; vertex or constant.",
+        doc="Painted multiplier of the added detail. " + PER_VERTEX,
     ),
     _scale(
         "guideScale", "Guide Stiffness Scale", 1.0, most=1e4, soft=10.0,
-        doc="Painted multiplier of the guide stiffness; vertex or constant.",
+        doc="Painted multiplier of the guide stiffness. " + PER_VERTEX,
     ),
     _scale(
         "easeScale", "Ease Scale", 1.0, most=100.0, soft=10.0,
-        doc="Painted multiplier of the ease; vertex or constant.",
+        doc="Painted multiplier of the ease. " + PER_VERTEX,
     ),
     Property(
         GARMENT_API, "primvars:physgraph:gather", "float[]", 0.0, "%", -50.0, 400.0,
-        "Painted extra cloth length along the weft, as at a gathered seam; vertex or constant.",
+        "Painted extra cloth length along the weft, in percent of the rest shape, as at a gathered seam. " + PER_VERTEX,
         "Gather", PAINTED, (0.0, 100.0), interpolation="vertex",
     ),
     Property(
         GARMENT_API, "primvars:physgraph:grain", "float[]", 0.0, "degrees", -360.0, 360.0,
-        "Painted turn of the warp, counter-clockwise on the face, from v of the texture coordinates, or from "
-        "downwards if the texture coordinates are no pattern; vertex or constant.",
+        "Painted direction of the warp: angle, counter-clockwise on the face, from the v axis of the texture "
+        "coordinates. If the texture coordinates are not a sewing pattern, the angle is from straight down. "
+        + PER_VERTEX,
         "Grain", PAINTED, (-90.0, 90.0), interpolation="vertex",
     ),
-    _scale("pin", "Pin", 0.0, most=1.0, soft=1.0, doc="1 on vertices that follow the coarse cloth exactly, 0 if free."),
+    _scale(
+        "pin", "Pin", 0.0, most=1.0, soft=1.0,
+        doc="1 at vertices that follow the coarse cloth exactly, 0 at free vertices. " + PER_VERTEX,
+    ),
     Property(
         COLLIDER_API, "physgraph:collider:enabled", "bool", True, "", None, None,
-        "Whether garments collide with this prim; unless authored, while it is visible.",
+        "Whether garments collide with this prim. Without a value, they do while the prim is visible.",
         "Collide", COLLISION, uniform=True,
     ),
     Property(
         COLLIDER_API, "physgraph:collider:offset", "float", 0.0, "m", 0.0, 10.0,
-        "Distance kept from this collider, added to the garment's." + SI, "Collider Offset", COLLISION, (0.0, 3e-2),
+        "Distance from this collider in addition to the garment's contact offset.",
+        "Collider Offset", COLLISION, (0.0, 3e-2),
     ),
     Property(
         COLLIDER_API, "physgraph:collider:side", "token", "auto", "", None, None,
-        "Side for the cloth: auto, outside closed parts, and at open parts by shape and coarse cloth; winding, outside "
-        "by the winding number; start, the side of the coarse cloth; front or back, this side of the faces of open "
-        "parts.",
+        "Side of the surface on which cloth belongs. auto: outside of closed parts; for open parts, chosen by their "
+        "shape and by the coarse cloth. winding: outside by the winding number. start: the side of the coarse cloth. "
+        "front, back: this side of the faces of open parts.",
         "Side", COLLISION, uniform=True, tokens=SIDES,
     ),
     *_material(MATERIAL_API, fallbacks=False),

@@ -11,15 +11,17 @@ import json
 import sys
 from pathlib import Path
 
-from .schema import COLLIDER_API, GARMENT_API, MATERIAL, MATERIAL_API, PROPERTIES, SI, Property, schema_path
+from .schema import COLLIDER_API, GARMENT_API, MATERIAL, MATERIAL_API, PROPERTIES, Property, schema_path
 
 APPLIES_TO = {GARMENT_API: ["Mesh"], COLLIDER_API: ["Mesh", "Gprim"], MATERIAL_API: ["Material"]}
 """Prim types allowed for each schema."""
 DOCS = {
-    GARMENT_API: "A coarse animated garment that physgraph-usd refines. Values are SI, whatever the stage's units.",
-    COLLIDER_API: "A prim that garments collide with. Values are SI, whatever the stage's units.",
-    MATERIAL_API: "Fabric values of a material. Values are SI, whatever the stage's units.",
+    GARMENT_API: "A coarse animated garment to refine. Values are in SI units, whatever the units of the stage.",
+    COLLIDER_API: "A prim that garments collide with. Values are in SI units, whatever the units of the stage.",
+    MATERIAL_API: "Fabric values of a material. Values are in SI units, whatever the units of the stage.",
 }
+_RELATIVE, _FIXED = ("%", "degrees"), ", whatever the stage's metersPerUnit"
+"""Units without a length or a mass, and the remark on all other units."""
 _HEADER = """#usda 1.0
 (
     "Written from physgraph_usd/usd/schema.py by python -m physgraph_usd.usd.schema_files; edit the table, not this."
@@ -67,8 +69,9 @@ def _range(row: Property, name: str, low: float | None, high: float | None) -> s
 
 def _property(row: Property) -> str:
     """One property in usda, without a fallback: an editor would show it although the value comes from elsewhere."""
-    otherwise = f" Where nothing gives it: {_otherwise(row)}." if _otherwise(row) else ""
-    doc = f'        doc = "{row.doc}{f" [{row.unit}]" if row.unit else ""}{otherwise}"\n'
+    unit = f" Unit: {row.unit}{_FIXED if row.unit not in _RELATIVE else ''}." if row.unit else ""
+    otherwise = f" Default: {_otherwise(row)}." if _otherwise(row) else ""
+    doc = f'        doc = "{row.doc}{unit}{otherwise}"\n'
     shown = f'        displayGroup = "{row.group}"\n        displayName = "{row.label}"\n'
     if row.type == "rel":
         return f"    rel {row.name} (\n{shown}{doc}    )\n"
@@ -126,7 +129,7 @@ def _table_row(row: Property) -> str:
     kind = f"uniform {row.type}" if row.uniform else row.type
     unit = ", ".join(part for part in (row.unit, _ends(row, row.minimum, row.maximum) or ", ".join(row.tokens)) if part)
     soft = _ends(row, *(row.soft or (None, None)))
-    columns = (f"`{row.name}`", row.label, kind, _otherwise(row), unit, soft, row.doc.removesuffix(SI))
+    columns = (f"`{row.name}`", row.label, kind, _otherwise(row), unit, soft, row.doc)
     return f"| {' | '.join(columns)} |"
 
 

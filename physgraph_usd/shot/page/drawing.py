@@ -188,7 +188,9 @@ def _in_view(seen: np.ndarray, triangles: np.ndarray, picture: np.ndarray) -> np
     columns, rows = seen[:, 0][triangles.T], seen[:, 1][triangles.T]
     right, below = columns.min(axis=0) > picture.shape[1], rows.min(axis=0) > picture.shape[0]
     inside = (columns.max(axis=0) >= 0) & (rows.max(axis=0) >= 0) & ~right & ~below
-    return np.unique(triangles[inside])
+    found = np.zeros(len(seen), bool)
+    found[triangles[inside]] = True
+    return np.flatnonzero(found)
 
 
 def _shade(solid: Surface, ground: Surface, view: View, visible: np.ndarray) -> np.ndarray:
@@ -264,11 +266,13 @@ def ground_shadow(ground: Surface, light: SoftLight) -> np.ndarray:
 
 def _mean_of_neighbours(solid: Surface, width: float) -> sparse.csr_matrix:
     """Mean over each vertex and its neighbours, weighted by a Gaussian of their distance, shape (V, V)."""
-    count, sides = len(solid.points), ((0, 1), (1, 2), (2, 0), (1, 0), (2, 1), (0, 2))
-    ends = np.concatenate([solid.triangles[:, side] for side in sides]).T
-    far = np.linalg.norm(np.subtract(*solid.points[ends]), axis=1) / max(width, 1e-30)
-    beside = sparse.csr_matrix((np.exp(-(far**2)), ends), shape=(count, count)) + sparse.eye(count)
-    return sparse.csr_matrix(sparse.diags(1.0 / np.asarray(beside.sum(axis=1)).ravel()) @ beside)
+    count = len(solid.points)
+    ends = np.concatenate([solid.triangles[:, side] for side in ((0, 1), (1, 2), (2, 0))]).T
+    apart = np.subtract(*solid.points[ends]) / max(width, 1e-30)
+    half = sparse.csr_matrix((np.exp(-np.einsum("ek,ek->e", apart, apart)), ends), shape=(count, count))
+    beside = half + half.T + sparse.eye(count, format="csr")
+    beside.data /= np.repeat(np.asarray(beside.sum(axis=1)).ravel(), np.diff(beside.indptr))
+    return beside
 
 
 def _light(

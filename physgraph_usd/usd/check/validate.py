@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom
 
-from ...errors import LayerError
+from ...errors import LayerError, counted
 from ..provenance import read_record, recorded_shot
 from ..read.targets import FOLLOWERS
 from ..stage import USD_ERRORS, bad_rate, is_there, open_layer, paths_in, pxr_errors, quiet
@@ -70,6 +70,22 @@ def validate_layer(layer: str | Path | Sdf.Layer, shot: str | Path | Usd.Stage |
         elif view is not None and not any(problem.rule == "composition" for problem in problems):
             problems += _on_whole_stage(opened, view)
     return sorted(problems, key=lambda problem: problem.severity != "error")
+
+
+def what_was_checked(layer: str | Path, shot: str | Path | None = None) -> str:
+    """The prims, the samples and the rules that `validate_layer` goes through, in words.
+
+    Args:
+        layer: As for `validate_layer`, a file.
+        shot: As for `validate_layer`, a file.
+    """
+    opened = open_layer(layer)
+    below = shot or recorded_shot(opened)
+    times = {time for path in _refined(opened) for time in _times(opened, path, None) if time is not None}
+    samples = f"at {counted(len(times), 'time code')}" if times else "in one pose"
+    over = f"alone and over {below}" if below else "alone"
+    rules = "the rules of this package" + (" and USD's validators" if below and _usd_validation() else "")
+    return f"{counted(len(_refined(opened)), 'prim')} {samples}, {over}, by {rules}"
 
 
 def check_layer(layer: Sdf.Layer, shot: StageView | None, *, samples: int | None = None) -> list[Problem]:
@@ -143,6 +159,11 @@ def _garments(layer: Sdf.Layer) -> Sequence[str]:
     return sorted(str(path.GetPrimPath()) for path in paths_in(layer) if path.name == "points")
 
 
+def _refined(layer: Sdf.Layer) -> list[str]:
+    """Fine meshes, and prims that follow them."""
+    return [*_garments(layer), *(str(path) for path in (read_record(layer) or {}).get("bound") or ())]
+
+
 def _coarse_path(layer: Sdf.Layer, path: str) -> str:
     """The coarse mesh of a fine one: the prim itself, or the sibling's reference."""
     spec = layer.GetPrimAtPath(path)
@@ -152,23 +173,19 @@ def _coarse_path(layer: Sdf.Layer, path: str) -> str:
 
 def _on_whole_stage(layer: Sdf.Layer, shot: StageView) -> list[Problem]:
     """Problems of the composed stage: of meshes that reference or inherit refined meshes, and by USD's validators."""
-    refined = [*_garments(layer), *(str(path) for path in (read_record(layer) or {}).get("bound") or ())]
     alone, composed = shot.open(), shot.open(over=[layer])
     with quiet():
-        problems = [*_named("other_meshes", other_meshes(layer, composed, alone, refined=refined))]
+        problems = [*_named("other_meshes", other_meshes(layer, composed, alone, refined=_refined(layer)))]
     return problems + _own_validators(layer, alone, composed)
 
 
 def _own_validators(layer: Sdf.Layer, shot: Usd.Stage, composed: Usd.Stage) -> list[Problem]:
     """Problems found by USD's validators, as far as available, in the layer over its shot but not in the shot."""
-    try:
-        from pxr import UsdValidation  # type: ignore[attr-defined] # noqa: PLC0415 - not in every host
-    except ImportError:
-        return []
-    if not hasattr(UsdValidation, "ValidationContext"):
+    module = _usd_validation()
+    if module is None:
         return []
     # Both stages have an anonymous session layer; `_without_names` drops its name from the messages.
-    (before, after), missing = _findings(UsdValidation, [shot, composed])
+    (before, after), missing = _findings(module, [shot, composed])
     fine = {path: _coarse_path(layer, path) for path in _garments(layer)}
     sites = {key[:2] for key in before}
     new = [
@@ -178,6 +195,15 @@ def _own_validators(layer: Sdf.Layer, shot: Usd.Stage, composed: Usd.Stage) -> l
         and not (problem.rule.endswith(_COUNTS) and _on_coarse(key, fine)[:2] in sites)
     ]
     return missing + [problem for problem in new if not _is_meant(problem, fine)]
+
+
+def _usd_validation() -> Any:
+    """The module of USD's validators, or None."""
+    try:
+        from pxr import UsdValidation  # type: ignore[attr-defined] # noqa: PLC0415 - not in every host
+    except ImportError:
+        return None
+    return UsdValidation if hasattr(UsdValidation, "ValidationContext") else None
 
 
 def _on_coarse(key: tuple[str, ...], fine: Mapping[str, str]) -> tuple[str, ...]:
