@@ -107,14 +107,10 @@ def _open_closed_streams() -> None:
 
 @contextmanager
 def imports_uncollected() -> Iterator[None]:
-    """Keep the garbage collector from torch's million objects, which live as long as the process: 3 s become 2."""
-    gc.disable()
-    try:
-        with importing():
-            yield
-    finally:
-        gc.freeze()
-        gc.enable()
+    """Import modules without garbage collection, and freeze their objects and those of later `importing` blocks."""
+    gc.freeze()
+    with importing():
+        yield
 
 
 def _leave(ctx: click.Context, message: str, code: int) -> Never:

@@ -14,7 +14,6 @@ import numpy as np
 
 from ..errors import GarmentError, StageError, named_time
 from ..solver.fabric import Fabric
-from ..solver.integrate import LEARNED
 from ..solver.mesh.defects import defects, in_brief
 from ..solver.resolution import LevelChoice, choose_levels, sample_frames
 from ..solver.scene import Frame, Garment, GarmentFrame
@@ -29,7 +28,7 @@ from ..usd.times import within
 from ..usd.view import Stage
 from .estimate import cannot_fit, estimate
 from .notes import of_fabrics, of_slack, of_subsets, of_trims, preset_overrides
-from .options import RefineOptions, scene_words
+from .options import INTEGRATORS, RefineOptions, scene_words
 from .report import RefineReport, of_a_kind
 from .untagged import FAR, Candidate, find_candidates
 from .up_axis import across_gravity
@@ -98,12 +97,12 @@ def _say_who_integrated(report: RefineReport, entries: Sequence[dict[str, Any]])
     for entry in entries:
         for level in entry.get("levels", ()):
             movers.update(level["movers"])
-    asked = str(report.options["integrator"])
-    if movers[LEARNED]:
-        part = movers[LEARNED] / movers.total()
-        report.modelled["network"] = f"{LEARNED} made {part:.0%} of the steps (--integrator {asked})"
+    integrator, learned = str(report.options["integrator"]), INTEGRATORS[0]
+    if movers[learned]:
+        part = movers[learned] / movers.total()
+        report.modelled["network"] = f"{learned} made {part:.0%} of the steps (--integrator {integrator})"
     else:
-        report.left_out["network"] = f"--integrator {asked}"
+        report.left_out["network"] = f"--integrator {integrator}"
 
 
 def too_large(opened: Shot, report: RefineReport, options: RefineOptions) -> GarmentError | None:

@@ -6,6 +6,7 @@ The solver is imported on demand, so a batch skips finished shots without loadin
 from __future__ import annotations
 
 import dataclasses
+import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -221,7 +222,11 @@ class RefineOptions:
         Raises:
             UsageError: An option is wrong.
         """
-        if self.integrator != INTEGRATORS[0] or self.weights is not None:
+        others = "physgraph_usd.solver.integrate" in sys.modules  # Further methods register themselves there.
+        if self.integrator not in INTEGRATORS and not others:
+            known = ", ".join(INTEGRATORS)
+            raise UsageError(f"unknown integrator '{self.integrator}'; known integrators: {known}")
+        if self.integrator not in INTEGRATORS or self.weights is not None:
             from ..solver.integrate import method_named
 
             method_named(self.integrator, self.weights)

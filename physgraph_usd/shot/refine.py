@@ -1,4 +1,7 @@
-"""Public functions: open a shot, describe, solve frame by frame, write, and report."""
+"""Public functions: open a shot, describe, solve frame by frame, write, and report.
+
+The solver is imported only once a shot is open and described: torch and Warp take seconds.
+"""
 
 from __future__ import annotations
 
@@ -9,29 +12,28 @@ from contextlib import ExitStack, closing, contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ..errors import LayerError, PhysGraphError, StageError, UsageError
-from ..interrupts import SIGNALLED, exit_code_of, signals_noted
-from ..solver.integrate.factors import FACTOR
-from ..solver.mesh.kernels import cards_for
+from ..interrupts import SIGNALLED, exit_code_of, importing, signals_noted
 from ..usd.files import check_targets, files_of
 from ..usd.provenance import write_root
 from ..usd.read.reader import Shot
 from ..usd.stage import shot_name
 from ..usd.view import Layer, Stage
-from ..usd.write.atomic import check_place
+from ..usd.write.atomic import check_folder_of, check_place
 from .describe import begin_report, describe, describe_meshes, too_large
 from .farm import shots_at_once
 from .finished import Job, check_jobs, finished, results
 from .frames import kept_for
+from .opened import open_for
 from .options import RefineOptions, json_of
-from .page.report import write_folder
 from .processes import call_each, memory_is_named
 from .report import DONE, RefineReport, is_of_failure
-from .run import Run
-from .solve import open_for, time_frames
 from .warnings import WARNINGS
+
+if TYPE_CHECKING:
+    from .run import Run
 
 DEFAULTS = RefineOptions()
 
@@ -58,13 +60,14 @@ def refine_shot(shot: str | Path, out: str | Path, options: RefineOptions = DEFA
     if there := finished(shot, out, options):
         return there
     if not options.dry_run:
-        if not out.resolve().parent.is_dir():
-            raise UsageError(f"the folder {out.resolve().parent} does not exist; make it, or name another by -o")
+        check_folder_of(out)
         check_places(out, options)
     with running(str(shot), options, out=out) as (opened, report):
         if options.dry_run:
             return report
         _check_new(out, options)
+        with importing():
+            from .run import Run
         write_all(Run(opened, out, options, report), out)
     return report
 
@@ -119,6 +122,8 @@ def refine_stage(
     """
     _check_of_stage(stage, options)
     with running(stage, options, on_report=on_report) as (opened, report):
+        with importing():
+            from .run import Run
         layer = Run(opened, None, options, report).refine()
         if options.report is not None:
             _write_report(report, Path(options.report), opened)
@@ -146,6 +151,8 @@ def running(
             report.seconds["open"] = clock.perf_counter() - began
             if large := too_large(opened, report, options):
                 raise large
+            with importing():
+                from ..solver.integrate.factors import FACTOR
             report.warn(*warnings, *([] if FACTOR == "cholespy" else [WARNINGS["slower"]()]))
             yield opened, report
 
@@ -185,6 +192,8 @@ def refine_shots(
     Raises:
         UsageError: No job was begun: an option is wrong, or an output of a job is read or written by another job.
     """
+
+    from ..solver.mesh.kernels import cards_for
 
     def solve(left: Sequence[Job]) -> Generator[RefineReport | PhysGraphError, None, None]:
         options = left[0][2] if left else DEFAULTS
@@ -258,6 +267,8 @@ def inspect_shot(shot: str | Path | Stage, *, timed: bool = False, **given: Any)
         with closing(open_for(source, options)) as opened:
             found = describe(opened, options)
             if timed and "problem" not in found:
+                from .solve import time_frames
+
                 levels = [garment["level"] for garment in found["garments"]]
                 found |= time_frames(opened, options, levels)
             return found
@@ -270,6 +281,8 @@ def _write_report(report: RefineReport, path: Path, opened: Shot) -> None:
     if json_of(path) == path:
         report.write(path)
     else:
+        from .page.report import write_folder
+
         write_folder(report, path, opened)
 
 

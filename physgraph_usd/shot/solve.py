@@ -18,13 +18,12 @@ from ..solver.frame.lead_in import cages_walked
 from ..solver.frame.refiner import Refiner
 from ..solver.mesh.kernels import device_of, start_warp
 from ..usd.read.reader import Shot
-from ..usd.view import Stage
 from .frames import Outcome
 from .from_rest import FromRest
 from .joined import Mover, Positions, counts, worse
+from .opened import open_for
 from .options import RefineOptions
 from .processes import cores
-from .untagged import open_with_colliders
 
 Outcomes = Generator[Outcome, None, None]
 
@@ -37,21 +36,6 @@ def prepare_device(device: str) -> str:
     start_warp()
     torch.set_num_threads(1)
     return device_of(device)
-
-
-def open_for(shot: str | Stage, options: RefineOptions) -> Shot:
-    """Open a shot with the reading options."""
-    return open_with_colliders(
-        shot,
-        garments=options.garments,
-        colliders=options.colliders,
-        bind=options.bind,
-        frames=options.frames if options.preroll is None else None,
-        level=options.level,
-        overrides=options.overrides,
-        rest_frame=options.rest_frame,
-        gravity=options.gravity,
-    )
 
 
 class ShotSolver:

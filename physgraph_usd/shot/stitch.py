@@ -24,11 +24,12 @@ from .chunks import frames_in_order
 from .finished import check_jobs, made_from
 from .frames import CHUNK, Finished, Outcome, record_in
 from .joined import Both, Joint, between, join
+from .opened import open_for
 from .options import RefineOptions
 from .refine import check_places, running, write_all
 from .report import RefineReport
 from .run import Run, Stored, fine_meshes, numbers_in
-from .solve import ShotSolver, open_for
+from .solve import ShotSolver
 
 SEAM_BOUND = 0.05
 """Largest increase of a frame's move by a seam, RMS over a garment, in mean fine edges; figures in `docs/farm.md`."""

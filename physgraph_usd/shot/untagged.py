@@ -6,22 +6,21 @@ import os
 from collections.abc import Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
-from scipy.spatial import cKDTree
 
 from ..errors import StageError, counted
-from ..solver.colliders.mesh import MeshBody
 from ..solver.colliders.pose import Pose, bounds_of
-from ..solver.mesh.kernels import start_warp
 from ..solver.resolution import sample_frames
 from ..solver.scene import Garment
 from ..usd.read.other_bodies import OtherBody, other_bodies
 from ..usd.read.reader import Shot, open_shot
 from ..usd.stage import at_time
 from ..usd.view import Stage
+
+if TYPE_CHECKING:
+    from ..solver.colliders.mesh import MeshBody
 
 AUTO = "auto"
 """Pseudo-collider: all colliders named by the shot, and the bodies touched by garments."""
@@ -140,6 +139,9 @@ def _judged(body: OtherBody, cloth: _Cloth) -> Candidate | None:
 
     After a frame in which cloth and body are apart, frames are passed over while neither has moved far enough to meet.
     """
+    from ..solver.colliders.mesh import MeshBody
+    from ..solver.mesh.kernels import start_warp
+
     start_warp()
     solid = MeshBody(device="cpu", threads=1)
     apart: tuple[float, list[np.ndarray], np.ndarray] | None = None
@@ -202,6 +204,10 @@ def _moves_with(garment: Garment, frames: Sequence[tuple[np.ndarray, Pose]], *, 
         frames: Positions of the cage [m], shape (V, 3), and the body's pose.
         reach: Distance from the cage [m].
     """
+    import torch
+
+    from ..solver.colliders.mesh import MeshBody
+
     (cage, pose), *later = frames
     triangles = garment.mesh.triangulate(garment.rest).triangles
     surfaces = MeshBody(side="start", device="cpu", threads=1).pose(Pose(cage, triangles))
@@ -263,6 +269,9 @@ def _nearness(body: MeshBody, pose: Pose, cage: np.ndarray) -> tuple[float, floa
         The fraction, 0 without contact, and the distance, at most `LOOKED`. A room or a sky around the whole cage, with
         no walls nearby, counts as no contact.
     """
+    import torch
+    from scipy.spatial import cKDTree
+
     fraction, gap = 0.0, LOOKED
     if not len(pose.triangles):
         points = pose.points[np.isfinite(pose.points).all(axis=1)]

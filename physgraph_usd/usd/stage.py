@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from pxr import Ar, Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdUtils
 
-from ..errors import AbsentError, LayerError, PhysGraphError, StageError, named_time
+from ..errors import LayerError, PhysGraphError, StageError, named_time
+from .resolve import check_there
 from .view import StageView
 
 if TYPE_CHECKING:
@@ -322,21 +323,6 @@ def quiet() -> Iterator[UsdUtils.CoalescingDiagnosticDelegate]:
         yield delegate
     finally:
         delegate.TakeUncoalescedDiagnostics()
-
-
-def is_there(path: str | Path) -> bool:
-    """Whether the asset resolver finds a file; in-memory layers count as found."""
-    return Sdf.Layer.IsAnonymousLayerIdentifier(str(path)) or bool(Ar.GetResolver().Resolve(str(path)))
-
-
-def check_there(path: str | Path) -> None:
-    """Refuse a missing file (AbsentError), and a pipe or a folder (StageError)."""
-    if not is_there(path):
-        raise AbsentError(f"no such file: {path}")
-    if not Sdf.Layer.IsAnonymousLayerIdentifier(str(path)):
-        found = Path(str(Ar.GetResolver().Resolve(str(path))))
-        if found.exists() and not found.is_file():
-            raise StageError(f"{path} is no file" + (": it is a pipe, which has no end" if found.is_fifo() else ""))
 
 
 def is_sound(layer: Sdf.Layer) -> bool:

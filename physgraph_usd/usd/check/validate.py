@@ -13,7 +13,8 @@ from pxr import Sdf, Usd, UsdGeom
 from ...errors import LayerError
 from ..provenance import read_record, recorded_shot
 from ..read.targets import FOLLOWERS
-from ..stage import USD_ERRORS, bad_rate, is_there, open_layer, paths_in, pxr_errors, quiet
+from ..resolve import is_there
+from ..stage import USD_ERRORS, bad_rate, open_layer, paths_in, pxr_errors, quiet
 from ..view import StageView
 from .rules import (
     BOUND_INSTANCER_RULES,
