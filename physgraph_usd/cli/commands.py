@@ -19,6 +19,7 @@ from ..solver.fabric import PRESETS
 from .options import (
     config_option,
     json_option,
+    layer_argument,
     of_field,
     out_option,
     overwrite_option,
@@ -195,7 +196,7 @@ def tune(shot: str, *, port: int, **options: Any) -> None:
 
 
 @click.command()
-@click.argument("layer", type=click.Path(dir_okay=False))
+@layer_argument
 @click.option(
     "--shot", type=click.Path(dir_okay=False), help="The shot below the layer.  [default: the shot named in the layer]"
 )
@@ -225,7 +226,7 @@ def sample(name: str, out: Path, *, overwrite: bool) -> None:
 
 
 @click.command()
-@click.argument("layer", type=click.Path(dir_okay=False))
+@layer_argument
 @out_option("PNG|GIF", "Picture to write.")
 @click.option(
     "--shot", type=click.Path(dir_okay=False), help="The coarse shot.  [default: the shot named in the layer]"

@@ -30,6 +30,15 @@ def _words(ctx: click.Context, param: click.Parameter, values: tuple[str, ...]) 
     return tuple(word for value in values for word in value.split())
 
 
+def _existing(ctx: click.Context, param: click.Parameter, path: str) -> str:
+    """Refuse a missing file before the command imports its libraries; "-" is standard input."""
+    from ..usd.resolve import check_there
+
+    if path != "-":
+        check_there(path)
+    return path
+
+
 def _type_of(name: str) -> click.ParamType | type:
     """Function that turns text into the value of a field."""
     option, kind = OPTIONS[name], str(_FIELDS[name].type).removesuffix(" | None")
@@ -81,7 +90,8 @@ def under(heading: str) -> Decorator:
 _files, *_, _batch, _farm, _messages = (
     partial(click.option, cls=Option, heading=heading) for heading in (*HEADINGS, "Messages")
 )
-shot_argument = click.argument("shot", type=click.Path(dir_okay=False))
+shot_argument = click.argument("shot", type=click.Path(dir_okay=False), callback=_existing)
+layer_argument = click.argument("layer", type=click.Path(dir_okay=False), callback=_existing)
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 overwrite_option = of_field("overwrite")
 scene_options = under("Scene")

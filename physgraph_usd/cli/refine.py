@@ -47,10 +47,11 @@ def refine(
     printed last, on stderr. Exits with 0 if all is done, 1 if all failed, 2 for wrong usage, 3 if a part failed.
     """
     with signals_noted():
+        jobs = _jobs(ctx, shots, out)
+        _check_files(ctx, jobs, out)
         with imports_uncollected():
             from ..shot.finished import check_jobs
 
-        jobs = _jobs(ctx, shots, out)
         layers = [layer for _, layer, _ in jobs]
         verbose, log_file, in_lines = (ctx.params[name] for name in ("verbose", "log_file", "progress"))
         flags = {name: ctx.params[name] for name in ("openjd", "quiet", "as_json")}
@@ -94,6 +95,25 @@ def _jobs(ctx: click.Context, shots: tuple[str, ...], out: Path) -> list[Job]:
         options |= {"report": report, "root": root, "sources": sources}
         jobs.append((shot, layer, RefineOptions(**options)))
     return jobs
+
+
+def _check_files(ctx: click.Context, jobs: Sequence[Job], out: Path) -> None:
+    """Check the options, input file and output folder of a single shot before numpy, USD and torch are imported.
+
+    A run that records its failure in a file or as JSON makes the same checks later, and so does one of several shots.
+    """
+    for _, _, options in jobs:
+        options.check()
+    (shot, layer, options), *more = jobs
+    recorded = any(ctx.params[name] for name in ("report", "summary", "log_file", "as_json", "openjd"))
+    if more or recorded or (options.skip_existing and layer.is_file()):
+        return
+    from ..usd.resolve import check_there
+    from ..usd.write.atomic import check_folder_of
+
+    check_there(shot)
+    if layer == out and not options.dry_run:
+        check_folder_of(layer)
 
 
 def _each_or_none(shots: tuple[str, ...], to: Path | None, option: str, **known: Any) -> Sequence[Path | None]:
