@@ -114,9 +114,9 @@ def inspect(ctx: click.Context, shot: str, *, as_json: bool, timed: bool, **opti
         from ..shot.refine import inspect_shot
 
     values, _ = values_for(ctx, shot, refine)
-    found = inspect_shot(shot, timed=timed, **{name: values[name] for name in options if name != "config"})
-    click.echo(to_json(found) if as_json else "\n".join(outline(found)))
-    sys.exit(found.get("exit_code", DONE))
+    plan = inspect_shot(shot, timed=timed, **{name: values[name] for name in options if name != "config"})
+    click.echo(to_json(plan) if as_json else "\n".join(outline(plan)))
+    sys.exit(plan.get("exit_code", DONE))
 
 
 @click.command()

@@ -60,15 +60,15 @@ def of_field(name: str, **settings: Any) -> Decorator:
     """
     option, default = OPTIONS[name], _FIELDS[name].default
     flag = "--" + (option.flag or name.replace("_", "-"))
-    known: dict[str, Any] = {"help": option.help, "heading": option.heading, "default": default}
+    declaration: dict[str, Any] = {"help": option.help, "heading": option.heading, "default": default}
     if isinstance(default, bool):
         flag += f"/--no-{flag.removeprefix('--')}" if default else ""
-        known |= {"is_flag": True}
+        declaration |= {"is_flag": True}
     else:
-        known |= {"type": _type_of(name), "metavar": option.metavar, "multiple": default == ()}
+        declaration |= {"type": _type_of(name), "metavar": option.metavar, "multiple": default == ()}
     if name in ("garments", "colliders"):
-        known |= {"callback": _words}
-    return click.option(flag, name, cls=Option, **known | settings)
+        declaration |= {"callback": _words}
+    return click.option(flag, name, cls=Option, **declaration | settings)
 
 
 def together(*options: Decorator) -> Decorator:

@@ -50,9 +50,9 @@ class Output:
 
     def __post_init__(self) -> None:
         """Refuse (UsageError) to print more and less at once."""
-        more = {"--verbose": self.verbose > 0, "--progress": self.in_lines, "--openjd": self.openjd}
-        if self.quiet and any(more.values()):
-            raise UsageError(f"--quiet and {next(name for name in more if more[name])} exclude each other; give one")
+        wordy = {"--verbose": self.verbose > 0, "--progress": self.in_lines, "--openjd": self.openjd}
+        if self.quiet and any(wordy.values()):
+            raise UsageError(f"--quiet and {next(name for name in wordy if wordy[name])} exclude each other; give one")
 
     @contextmanager
     def logged(self) -> Iterator[None]:

@@ -56,7 +56,9 @@ def refine(
         verbose, log_file, in_lines = (ctx.params[name] for name in ("verbose", "log_file", "progress"))
         flags = {name: ctx.params[name] for name in ("openjd", "quiet", "as_json")}
         output = Output(verbose, log_file, in_lines, several=len(jobs) > 1, **flags)
-        also = [(what, file) for what, file in (("the summary", summary), ("the log", log_file)) if file is not None]
+        also = [
+            (result, file) for result, file in (("the summary", summary), ("the log", log_file)) if file is not None
+        ]
         if also:
             check_jobs(jobs, also=also)
         with _folder_of(layers, out, dry_run=dry_run), output.logged():
@@ -104,9 +106,9 @@ def _check_files(ctx: click.Context, jobs: Sequence[Job], out: Path) -> None:
     """
     for _, _, options in jobs:
         options.check()
-    (shot, layer, options), *more = jobs
+    (shot, layer, options), *further = jobs
     recorded = any(ctx.params[name] for name in ("report", "summary", "log_file", "as_json", "openjd"))
-    if more or recorded or (options.skip_existing and layer.is_file()):
+    if further or recorded or (options.skip_existing and layer.is_file()):
         return
     from ..usd.resolve import check_there
     from ..usd.write.atomic import check_folder_of
@@ -132,8 +134,8 @@ def _refine_each(jobs: Sequence[Job], output: Output, *, summary: Path | None) -
     failed: list[PhysGraphError] = []
 
     def interrupted(code: int) -> None:
-        left = [row_of(shot, layer, None) for shot, layer, _ in jobs[len(rows) :]]
-        _summarise([*rows, *left], output, summary, exit_code=code)
+        unfinished = [row_of(shot, layer, None) for shot, layer, _ in jobs[len(rows) :]]
+        _summarise([*rows, *unfinished], output, summary, exit_code=code)
 
     try:
         with at_end(interrupted):
@@ -226,8 +228,10 @@ def _one_each(shots: tuple[str, ...], to: Path, option: str, *, suffix: str, acc
             raise UsageError(f"{option} {to} is one file for {len(shots)} shots; give a folder")
         return [to]
     if to.suffix and not to.is_dir():
-        known = ", ".join(accepts)
-        raise UsageError(f"{option} {to}: unknown suffix '{to.suffix}'; known: {known}; or make a folder of that name")
+        suffixes = ", ".join(accepts)
+        raise UsageError(
+            f"{option} {to}: unknown suffix '{to.suffix}'; known: {suffixes}; or make a folder of that name"
+        )
     if not suffix and len(shots) == 1:
         return [to]
     files = [to / (Path(shot).stem + suffix) for shot in shots]
@@ -245,18 +249,18 @@ def _folder_of(layers: Sequence[Path], out: Path, *, dry_run: bool) -> Iterator[
     """
     from ..shot.frames import kept_for
 
-    made = [] if out in layers or dry_run else [each for each in (out, *out.parents) if not each.exists()]
+    missing = [] if out in layers or dry_run else [folder for folder in (out, *out.parents) if not folder.exists()]
 
     def leave(_code: int = DONE) -> None:
         for frames in filter(None, map(kept_for, layers)):
             say(str(frames), err=True)
-        for folder in made:
+        for folder in missing:
             with suppress(OSError):
                 folder.rmdir()
 
     try:
         try:
-            for folder in reversed(made):
+            for folder in reversed(missing):
                 folder.mkdir()
         except OSError as error:
             raise LayerError(f"cannot make the folder {out}: {error.strerror}") from error

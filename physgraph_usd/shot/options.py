@@ -53,9 +53,9 @@ class Option:
     result: bool = True
 
 
-def _option(heading: str, default: Any, help_text: str, **known: Any) -> Any:
+def _option(heading: str, default: Any, help_text: str, **properties: Any) -> Any:
     """A field of `RefineOptions`."""
-    return dataclasses.field(default=default, metadata={"option": Option(heading, help_text, **known)})
+    return dataclasses.field(default=default, metadata={"option": Option(heading, help_text, **properties)})
 
 
 _scene, _solver, _layer = (partial(_option, heading) for heading in ("Scene", "Solver", "Layer"))
@@ -222,10 +222,10 @@ class RefineOptions:
         Raises:
             UsageError: An option is wrong.
         """
-        others = "physgraph_usd.solver.integrate" in sys.modules  # Further methods register themselves there.
-        if self.integrator not in INTEGRATORS and not others:
-            known = ", ".join(INTEGRATORS)
-            raise UsageError(f"unknown integrator '{self.integrator}'; known integrators: {known}")
+        is_extended = "physgraph_usd.solver.integrate" in sys.modules  # Further methods register themselves there.
+        if self.integrator not in INTEGRATORS and not is_extended:
+            names = ", ".join(INTEGRATORS)
+            raise UsageError(f"unknown integrator '{self.integrator}'; known integrators: {names}")
         if self.integrator not in INTEGRATORS or self.weights is not None:
             from ..solver.integrate import method_named
 
@@ -253,7 +253,7 @@ class RefineOptions:
         return files
 
 
-OPTIONS: dict[str, Option] = {each.name: each.metadata["option"] for each in dataclasses.fields(RefineOptions)}
+OPTIONS: dict[str, Option] = {field.name: field.metadata["option"] for field in dataclasses.fields(RefineOptions)}
 """Each option by its field."""
 RefineOptions.__doc__ = f"{RefineOptions.__doc__}\n\nAttributes:\n" + "\n".join(
     f"    {name}: {option.help}" for name, option in OPTIONS.items()

@@ -57,8 +57,8 @@ def refine_shot(shot: str | Path, out: str | Path, options: RefineOptions = DEFA
     """
     out = Path(out)
     check_jobs([(shot, out, options)])
-    if there := finished(shot, out, options):
-        return there
+    if report_before := finished(shot, out, options):
+        return report_before
     if not options.dry_run:
         check_folder_of(out)
         check_places(out, options)
@@ -86,8 +86,13 @@ def write_all(run: Run, out: Path) -> None:
     run.refine()
     options = run.options
     if options.root is not None:
-        files = {"layer": out, "shot": Path(run.shot.path), "absolute": options.asset_paths == "absolute"}
-        write_root(Path(options.root), **files, overwrite=options.overwrite)
+        write_root(
+            Path(options.root),
+            layer=out,
+            shot=Path(run.shot.path),
+            absolute=options.asset_paths == "absolute",
+            overwrite=options.overwrite,
+        )
     if options.report is not None:
         _write_report(run.report, Path(options.report), run.shot)
 
@@ -169,8 +174,8 @@ def _record_end(
     if isinstance(error, Exception):
         report.fail(error)
     elif (code := exit_code_of(error)) is not None:
-        kept = None if out is None else kept_for(out)
-        report.signal, report.error = code - SIGNALLED, f"interrupted, {kept or 'no frame is kept'}"
+        folder_text = None if out is None else kept_for(out)
+        report.signal, report.error = code - SIGNALLED, f"interrupted, {folder_text or 'no frame is kept'}"
     else:
         return
     _write_failure(report, options)
@@ -200,8 +205,11 @@ def refine_shots(
         chunks, at_once = 1, workers
         if options.scheduler:
             chunks, at_once = workers, shots_at_once(options.scheduler, workers)
-        alone = [(shot, out, dataclasses.replace(own, workers=chunks, progress=None)) for shot, out, own in left]
-        return call_each(refine, alone, workers=at_once, cards=cards_for(options.device))
+        calls = [
+            (shot, out, dataclasses.replace(job_options, workers=chunks, progress=None))
+            for shot, out, job_options in left
+        ]
+        return call_each(refine, calls, workers=at_once, cards=cards_for(options.device))
 
     return results(jobs, solve)
 
@@ -242,14 +250,14 @@ def _check_of_stage(stage: Stage, options: RefineOptions) -> None:
         _check_none(report, options)
 
 
-def inspect_shot(shot: str | Path | Stage, *, timed: bool = False, **given: Any) -> dict[str, Any]:
+def inspect_shot(shot: str | Path | Stage, *, timed: bool = False, **reading: Any) -> dict[str, Any]:
     """Plan of a refinement: garments, values and their sources, and every defect found.
 
     Args:
         shot: The stage to read, a file or open.
         timed: Whether to solve three frames in the middle of the shot, to measure the time of a run on this machine and
             how far from rest frames end.
-        given: Options of `RefineOptions` for reading.
+        reading: Options of `RefineOptions` for reading.
 
     Returns:
         Plain values. If the shot cannot be refined as asked, ``problem`` gives the reason, ``meshes`` lists the stage's
@@ -260,21 +268,21 @@ def inspect_shot(shot: str | Path | Stage, *, timed: bool = False, **given: Any)
         StageError: The file cannot be opened at all.
         UsageError: An option is wrong.
     """
-    options = RefineOptions(**given)
+    options = RefineOptions(**reading)
     source = str(shot) if isinstance(shot, Path) else shot
     files_of(source)  # Raises an error for a pipe; opening a pipe would wait for ever.
     try:
         with closing(open_for(source, options)) as opened:
-            found = describe(opened, options)
-            if timed and "problem" not in found:
+            plan = describe(opened, options)
+            if timed and "problem" not in plan:
                 from .solve import time_frames
 
-                levels = [garment["level"] for garment in found["garments"]]
-                found |= time_frames(opened, options, levels)
-            return found
+                levels = [garment["level"] for garment in plan["garments"]]
+                plan |= time_frames(opened, options, levels)
+            return plan
     except StageError as error:
-        found = describe_meshes(source, str(error), options)
-        return found | {"exit_code": DONE if "command" in found else error.exit_code}
+        plan = describe_meshes(source, str(error), options)
+        return plan | {"exit_code": DONE if "command" in plan else error.exit_code}
 
 
 def _write_report(report: RefineReport, path: Path, opened: Shot) -> None:
