@@ -121,7 +121,7 @@ def check_place(target: Path) -> None:
         LayerError: The folder cannot be written.
     """
     check_no_link(target)
-    folder = next(each for each in target.absolute().parents if each.exists())
+    folder = next(parent for parent in target.absolute().parents if parent.exists())
     if target.is_dir() or not folder.is_dir():
         raise UsageError(f"cannot write {target}: it is a folder, or {folder} is none")
     try:
