@@ -195,8 +195,8 @@ class Chart:
 
     def times_to(self, gap: float) -> dict[str, float]:
         """Milliseconds to a gap of the methods that get there, the fastest first."""
-        found = {name: t for name in self.methods if name != DEFAULT and (t := self.time_to(name, gap)) is not None}
-        return dict(sorted(found.items(), key=lambda item: item[1]))
+        time_of = {name: t for name in self.methods if name != DEFAULT and (t := self.time_to(name, gap)) is not None}
+        return dict(sorted(time_of.items(), key=lambda item: item[1]))
 
     def default_place(self) -> dict[str, Any] | None:
         """Whether refine's default is on the front: its time over the least time to the same gap."""
@@ -205,8 +205,8 @@ class Chart:
             return None
         fastest, least = next(iter(self.times_to(default.gap).items()), (DEFAULT, default.ms))
         ratio = default.ms / least
-        place = {"gap": default.gap, "ms": default.ms, "fastest": fastest, "fastest_ms": least, "ratio": ratio}
-        return place | {"on_front": ratio <= TOLERANCE}
+        standing = {"gap": default.gap, "ms": default.ms, "fastest": fastest, "fastest_ms": least, "ratio": ratio}
+        return standing | {"on_front": ratio <= TOLERANCE}
 
     def to_dict(self) -> dict[str, Any]:
         """The chart as plain values."""
@@ -236,19 +236,19 @@ class Chart:
             cells = ["-" if t is None else f"{t:.0f}" for t in times]
             degrees = "-" if best.degrees is None else f"{best.degrees:.1f}"
             yield f"| {name} | {' | '.join(cells)} | {best.gap:.2%} | {degrees} | {best.ms:.1f} |"
-        place = self.default_place()
-        if place is not None:
-            where = "on the front" if place["on_front"] else "not on the front"
+        standing = self.default_place()
+        if standing is not None:
+            where = "on the front" if standing["on_front"] else "not on the front"
             yield ""
             yield (
-                f"refine's default: {place['gap']:.2%} in {place['ms']:.0f} ms, {place['ratio']:.2f} times the "
-                f"{place['fastest_ms']:.0f} ms of the fastest to that gap ({place['fastest']}): {where}"
+                f"refine's default: {standing['gap']:.2%} in {standing['ms']:.0f} ms, {standing['ratio']:.2f} times "
+                f"the {standing['fastest_ms']:.0f} ms of the fastest to that gap ({standing['fastest']}): {where}"
             )
         if words := self.words_of_degrees():
             yield words
-        for each in self.references:
-            where = "" if each["frame"] is None else f"frame {each['frame']:g}: "
-            yield f"{where}{Reference.of(each)}"
+        for reference in self.references:
+            where = "" if reference["frame"] is None else f"frame {reference['frame']:g}: "
+            yield f"{where}{Reference.of(reference)}"
         if self.busy:
             yield self.busy
         yield from (f"{name} was given {note}" for name, note in self.notes.items())
@@ -264,12 +264,12 @@ def typical(times: Sequence[float]) -> float:
 def collate(journal: Journal) -> Chart:
     """Put a journal's rows together."""
     cold, warm = journal.rows("point"), journal.rows("warm")
-    found = {row["frame"]: Reference.of(row) for row in journal.rows("reference")}
+    references_of = {row["frame"]: Reference.of(row) for row in journal.rows("reference")}
     for row in (*cold, *warm):
-        if row["frame"] in found and "energies" in row:
+        if row["frame"] in references_of and "energies" in row:
             by = f"{row['method']}, {counted(row['steps'], 'step')}" + (", warm" if row["row"] == "warm" else "")
-            found[row["frame"]] = found[row["frame"]].lowered(row["energies"], by)
-    last = {row["frame"]: found[row["frame"]] for row in warm if row["frame"] in found}
+            references_of[row["frame"]] = references_of[row["frame"]].lowered(row["energies"], by)
+    last = {row["frame"]: references_of[row["frame"]] for row in warm if row["frame"] in references_of}
     plan = journal.one("plan") or {}
     about = journal.rows("problem")[0]["problem"] | {name: plan.get(name) for name in ("plan", "long_minutes")}
     about["waited"] = sum(r.get("waited") or 0.0 for r in cold) / max(sum(r.get("elapsed", 0.0) for r in cold), TINY)
@@ -277,17 +277,17 @@ def collate(journal: Journal) -> Chart:
         tuple({name: value for name, value in row.items() if name != "row"} for row in journal.rows(kind))
         for kind in ("term", "failed")
     )
-    references = tuple({"frame": frame, **each.plain()} for frame, each in found.items())
+    references = tuple({"frame": frame, **reference.plain()} for frame, reference in references_of.items())
     in_rows = sorted(_points(warm, last), key=lambda point: (point.method, point.steps))
-    return Chart(about, tuple(_points(cold, found)), references, terms, failed, tuple(in_rows))
+    return Chart(about, tuple(_points(cold, references_of)), references, terms, failed, tuple(in_rows))
 
 
 def _points(rows: Sequence[dict[str, Any]], references: dict[Any, Reference]) -> Iterator[Point]:
     """The point of each method at each budget for which all frames were measured."""
     for key in dict.fromkeys((row["method"], row["steps"]) for row in rows):
-        own = [row for row in rows if (row["method"], row["steps"]) == key]
-        if {row["frame"] for row in own if "energies" in row} == set(references):
-            yield _point(own, references)
+        matching = [row for row in rows if (row["method"], row["steps"]) == key]
+        if {row["frame"] for row in matching if "energies" in row} == set(references):
+            yield _point(matching, references)
 
 
 def _point(rows: Sequence[dict[str, Any]], references: dict[Any, Reference]) -> Point:
@@ -295,7 +295,7 @@ def _point(rows: Sequence[dict[str, Any]], references: dict[Any, Reference]) -> 
     times = [[row["ms"] for row in rows if row["frame"] == frame] for frame in judged]
     first, values = rows[0], list(judged.values())
     energies = {name: statistics.fmean(v["energies"].get(name, 0.0) for v in values) for name in values[0]["energies"]}
-    least, start = (sum(getattr(each, name) for each in references.values()) for name in ("least", "start"))
+    least, start = (sum(getattr(reference, name) for reference in references.values()) for name in ("least", "start"))
     energy = sum(energies.values())
     return Point(
         method=first["method"],
@@ -304,10 +304,10 @@ def _point(rows: Sequence[dict[str, Any]], references: dict[Any, Reference]) -> 
         steps=first["steps"],
         made=statistics.fmean(v.get("made", v["steps"]) for v in values),
         tolerance=first.get("tolerance", 0.0),
-        ms=statistics.fmean(typical(each) for each in times),
-        ms_median=statistics.fmean(statistics.median(each) for each in times),
-        ms_least=statistics.fmean(min(each) for each in times),
-        ms_most=statistics.fmean(max(each) for each in times),
+        ms=statistics.fmean(typical(repeats) for repeats in times),
+        ms_median=statistics.fmean(statistics.median(repeats) for repeats in times),
+        ms_least=statistics.fmean(min(repeats) for repeats in times),
+        ms_most=statistics.fmean(max(repeats) for repeats in times),
         ms_prepared=statistics.fmean(row.get("prepared", 0.0) for row in values),
         gap=(len(values) * energy - least) / max(start - least, TINY),
         energy=energy,
@@ -315,7 +315,7 @@ def _point(rows: Sequence[dict[str, Any]], references: dict[Any, Reference]) -> 
         percent=statistics.fmean(v["percent"] for v in values),
         **over_frames(values),
         frames=len(values),
-        repeats=min(len(each) for each in times),
+        repeats=min(len(repeats) for repeats in times),
         note=first.get("note", ""),
         apart_mm=_mean_known(values, "apart_mm"),
         degrees=_mean_known(values, "degrees"),
@@ -324,5 +324,5 @@ def _point(rows: Sequence[dict[str, Any]], references: dict[Any, Reference]) -> 
 
 def _mean_known(values: Sequence[dict[str, Any]], name: str) -> float | None:
     """Mean of a value over the frames; None if some frame has none."""
-    known = [each for v in values if (each := v.get(name)) is not None]
-    return statistics.fmean(known) if len(known) == len(values) else None
+    values_known = [value for v in values if (value := v.get(name)) is not None]
+    return statistics.fmean(values_known) if len(values_known) == len(values) else None

@@ -52,6 +52,6 @@ def measure_warm(journal: Journal, problems: tuple[Problem, Problem], row: Seque
                 continue
             values: dict[str, Any] = {} if repeat else asdict(judge.judge(row[-1], solved[-1].points))
             values |= {} if name == AUTO else {"integrator": name, "nested": settings.method.nested}
-            spent = [each.milliseconds for each in solved[1:]]
-            made = {"made": solved[-1].steps, "tolerance": settings.tolerance}
-            journal.add("warm", repeat=repeat, ms=round(typical(spent), 3), **key, **made, **values)
+            spent = [frame.milliseconds for frame in solved[1:]]
+            record = {"made": solved[-1].steps, "tolerance": settings.tolerance}
+            journal.add("warm", repeat=repeat, ms=round(typical(spent), 3), **key, **record, **values)

@@ -34,10 +34,10 @@ class Newton:
     def step(self, system: System, carry: Carry) -> Carry:
         """One Newton step with a backtracking line search; the energy never rises."""
         direction = self._direction(system, carry)
-        found = backtrack(system, carry, direction, float((carry.force * direction).sum()))
-        if found is None:
+        move = backtrack(system, carry, direction, float((carry.force * direction).sum()))
+        if move is None:
             return carry.moved_by("stayed")
-        x, energy, force = found
+        x, energy, force = move
         return Carry(x, energy, force, system.apply_metric_inverse(force), self.name)
 
     def _direction(self, system: System, carry: Carry) -> Tensor:

@@ -99,7 +99,7 @@ class Solid:
 def rings(across: np.ndarray, height: np.ndarray, deep: np.ndarray, around: int) -> np.ndarray:
     """Ellipses about the Y axis from half axes and heights [m], shape (R,) each: points of shape (R, around, 3)."""
     a = 2 * np.pi * np.arange(around) / around
-    across, height, deep = (each[:, None] for each in (across, height, deep))
+    across, height, deep = (values[:, None] for values in (across, height, deep))
     return np.stack(np.broadcast_arrays(across * np.cos(a), height, deep * np.sin(a)), axis=-1)
 
 
@@ -109,12 +109,12 @@ def lathe(rings: np.ndarray, ends: np.ndarray) -> Solid:
     Seen from the first ring's end the rings run clockwise. The solid's points are the rings, then the two tips.
     """
     count, around = rings.shape[:2]
-    here = np.arange(around)
-    following = np.roll(here, -1)
+    ring = np.arange(around)
+    following = np.roll(ring, -1)
     first, last = count * around, (count - 1) * around
     fans = [
-        np.stack([np.full(around, first), following, here], axis=1),
-        np.stack([np.full(around, first + 1), last + here, last + following], axis=1),
+        np.stack([np.full(around, first), following, ring], axis=1),
+        np.stack([np.full(around, first + 1), last + ring, last + following], axis=1),
     ]
     quads = quad_grid(count, around, closed=True)
     return Solid(

@@ -39,9 +39,11 @@ def build(variant: str = "") -> PlainStage:
         fabric=PRESETS["silk"],
         left_handed=variant == "lefthanded",
     )
-    units = {"metres_per_unit": 1.0 / scale, "up_axis": "Z" if variant == "zup" else "Y"}
+    up_axis = "Z" if variant == "zup" else "Y"
     doc = "A hanging swatch whose top edge is gathered"
-    return PlainStage("SwatchShot", doc, (swatch,), np.arange(1.0, FRAMES + 1), **units)
+    return PlainStage(
+        "SwatchShot", doc, (swatch,), np.arange(1.0, FRAMES + 1), metres_per_unit=1.0 / scale, up_axis=up_axis
+    )
 
 
 def _pose(amount: float) -> np.ndarray:

@@ -125,7 +125,7 @@ def _sew(cells: Cells, upper: list[np.ndarray], start: int) -> tuple[np.ndarray,
         number = np.concatenate([upper[side], start + side * rows * ring + np.arange(rows * ring)])
         quads.append(number[quad_grid(rows + 1, ring, closed=True)])
         part = grid_uv(rows + 1, ring, closed=True)
-        corners.append(part.indices + sum(len(each) for each in values))
+        corners.append(part.indices + sum(len(array) for array in values))
         values.append(part.values * (0.48, 0.58) + (0.52 * side, 0.0))
     return np.concatenate(quads), FaceVarying(np.concatenate(values), np.concatenate(corners))
 

@@ -92,8 +92,8 @@ class _EnergyForce(torch.autograd.Function):
         largest = torch.zeros(system.garments, dtype=size.dtype, device=size.device)
         largest = largest.scatter_reduce(0, system.owner, size, "amax").clamp_min(1e-30)[system.owner].unsqueeze(1)
         nudge = NUDGE / largest * by_force
-        there, back = (system.field.energy_and_force((x + sign * nudge).contiguous())[1] for sign in (1.0, -1.0))
-        return gradient + (there - back) * (largest / (2.0 * NUDGE)), None
+        ahead, back = (system.field.energy_and_force((x + sign * nudge).contiguous())[1] for sign in (1.0, -1.0))
+        return gradient + (ahead - back) * (largest / (2.0 * NUDGE)), None
 
 
 class _MetricSolve(torch.autograd.Function):
@@ -167,7 +167,7 @@ class Twin:
 
 def _joined(positions: Sequence[Sequence[np.ndarray]], device: str) -> list[Tensor]:
     """Positions of each patch at each level [m] as one tensor a level."""
-    return [torch.as_tensor(np.concatenate(each), device=device) for each in zip(*positions, strict=True)]
+    return [torch.as_tensor(np.concatenate(arrays), device=device) for arrays in zip(*positions, strict=True)]
 
 
 class Bundle:
@@ -239,7 +239,7 @@ class RoundBundle(Bundle):
         """Build the system of all rounds."""
         self.systems = [JointSystem(system_of(rounds, device=device), through_forces=through_forces)]
         self._from_below = [None]
-        self._begin(_joined([[each.x] for each in rounds], device), [[each.least] for each in rounds])
+        self._begin(_joined([[round_.x] for round_ in rounds], device), [[round_.least] for round_ in rounds])
 
 
 Case = TypeVar("Case", Patch, Round)

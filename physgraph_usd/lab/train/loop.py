@@ -121,9 +121,13 @@ class Trainer:
         self._optimiser = torch.optim.Adam(self.network.parameters(), lr=config.rate)
         self.patches, rounds, rest, few = data or data_of(config)
         self._held_out = HeldOut(rest, few)
-        made = {"device": device, "through_forces": config.through_forces}
-        self._bundles = [Bundle(batch, **made) for batch in deal(self.patches, config.batch)]
-        self._round_bundles = [RoundBundle(batch, **made) for batch in deal(rounds, config.batch)]
+        through = config.through_forces
+        self._bundles = [
+            Bundle(batch, device=device, through_forces=through) for batch in deal(self.patches, config.batch)
+        ]
+        self._round_bundles = [
+            RoundBundle(batch, device=device, through_forces=through) for batch in deal(rounds, config.batch)
+        ]
         self._rng = np.random.default_rng(config.seed + 1)
         self.iteration, self.seconds = 0, 0.0
         self.curve: list[dict[str, Any]] = []

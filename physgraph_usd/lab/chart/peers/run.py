@@ -70,15 +70,15 @@ def parse_peers(values: Sequence[str]) -> list[tuple[Peer, str]]:
     Raises:
         UsageError: A name is unknown or there is no such Python.
     """
-    found = []
-    for each in values:
-        name, _, python = each.partition("=")
+    peers = []
+    for value in values:
+        name, _, python = value.partition("=")
         if name not in PEERS or not python:
-            raise UsageError(f"peer '{each}': write NAME=PYTHON; known names: {', '.join(PEERS)}")
+            raise UsageError(f"peer '{value}': write NAME=PYTHON; known names: {', '.join(PEERS)}")
         if not Path(python).is_file():
-            raise UsageError(f"peer '{each}': {python} is no program; give the Python that has {name}")
-        found.append((PEERS[name], python))
-    return found
+            raise UsageError(f"peer '{value}': {python} is no program; give the Python that has {name}")
+        peers.append((PEERS[name], python))
+    return peers
 
 
 def measure_peers(bench: CurveBench, peers: Sequence[tuple[Peer, str]], *, clock_name: str) -> None:
@@ -165,14 +165,14 @@ def _level(index: int, level: Level, module: ForceModule, base: torch.Tensor) ->
     springs = next((term for term in module.forces if isinstance(term, Stretch)), None)
     hinges = next(term for term in module.forces if isinstance(term, Bending))
     guide = next(term for term in module.forces if isinstance(term, Guide))
-    others = [term for term in module.forces if term not in (springs, hinges)]
-    if springs is None or len(others) != 2:
+    further = [term for term in module.forces if term not in (springs, hinges)]
+    if springs is None or len(further) != 2:
         raise SolveError("the peer has no membrane of triangles, which this garment asks for")
     load = torch.zeros_like(base)
-    for term in others:
+    for term in further:
         term.add_force(base, load)
     ends = level.hinges.long()
-    pairs = torch.stack([ends[:, [0, 1, k, other]] for k in (2, 3) for other in (4, 5)], dim=1)
+    pairs = torch.stack([ends[:, [0, 1, k, fourth]] for k in (2, 3) for fourth in (4, 5)], dim=1)
     owner = torch.arange(len(ends), device=ends.device).repeat_interleave(4)
     corners, count = torch.unique(torch.cat([owner[:, None], pairs.reshape(-1, 4)], dim=1), dim=0, return_counts=True)
     values = {
