@@ -1,4 +1,4 @@
-"""Options of commands as click takes them: those of `RefineOptions`, and those of runs of the command alone."""
+"""Options of commands as click declares them: the fields of `RefineOptions`, and options of the command line alone."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .structure import Option
 from .types import FRAME_RANGE, LEVEL, REST
 
 SHOW_HEADINGS = ("Scene", "Solver", "Layer")
-"""Headings of the options that a show's file may give, too: they belong to no single run."""
+"""Headings of the options also allowed in a show's file: options not tied to a single run."""
 HEADINGS = ("Files", *SHOW_HEADINGS, "Several shots, and runs that were interrupted", "Many machines")
 """Headings of the options of `RefineOptions`, in the order of the help."""
 Decorator = Callable[[Callable[..., None]], Callable[..., None]]
@@ -31,7 +31,7 @@ def _words(ctx: click.Context, param: click.Parameter, values: tuple[str, ...]) 
 
 
 def _existing(ctx: click.Context, param: click.Parameter, path: str) -> str:
-    """Refuse a missing file before the command imports its libraries; "-" is standard input."""
+    """Refuse a missing file before the command imports libraries; "-" is standard input."""
     from ..usd.resolve import check_there
 
     if path != "-":
@@ -40,7 +40,7 @@ def _existing(ctx: click.Context, param: click.Parameter, path: str) -> str:
 
 
 def _type_of(name: str) -> click.ParamType | type:
-    """Function that turns text into the value of a field."""
+    """Function to turn text into the value of a field."""
     option, kind = OPTIONS[name], str(_FIELDS[name].type).removesuffix(" | None")
     if name in _TYPES:
         return _TYPES[name]
@@ -56,7 +56,7 @@ def of_field(name: str, **settings: Any) -> Decorator:
 
     Args:
         name: The field.
-        settings: What click is told otherwise.
+        settings: Further arguments for `click.option`, replacing the field's.
     """
     option, default = OPTIONS[name], _FIELDS[name].default
     flag = "--" + (option.flag or name.replace("_", "-"))
@@ -72,7 +72,7 @@ def of_field(name: str, **settings: Any) -> Decorator:
 
 
 def together(*options: Decorator) -> Decorator:
-    """A decorator that declares several options in order."""
+    """A decorator to declare several options in order."""
 
     def apply(function: Callable[..., None]) -> Callable[..., None]:
         for option in reversed(options):
@@ -137,11 +137,11 @@ run_options = together(
 
 
 def out_option(metavar: str, help_text: str, *, required: bool = True) -> Decorator:
-    """Declare ``-o``, where a command writes.
+    """Declare ``-o``, the output of a command.
 
     Args:
-        metavar: What the help shows for the value.
+        metavar: Placeholder for the value in the help.
         help_text: The option's line in the help.
-        required: Whether it must be there.
+        required: Whether the option is required.
     """
     return _files("-o", "--out", required=required, type=_PATH, metavar=metavar, help=help_text)

@@ -1,4 +1,4 @@
-"""``refine``: one shot in this process, or several shots in a process each, with a summary of all."""
+"""``refine``: a single shot in this process, or several shots in a process each, with a summary of all."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 USD_SUFFIXES = (".usd", ".usda", ".usdc")
 RENAMED = {"run-up": "preroll"}
-"""Names that options had before, without dashes; they still work and are in no help."""
+"""Former names of options, without dashes; accepted, but not in the help."""
 
 
 @click.command(cls=GroupedCommand, context_settings={"token_normalize_func": lambda name: RENAMED.get(name, name)})
@@ -102,7 +102,7 @@ def _jobs(ctx: click.Context, shots: tuple[str, ...], out: Path) -> list[Job]:
 def _check_files(ctx: click.Context, jobs: Sequence[Job], out: Path) -> None:
     """Check the options, input file and output folder of a single shot before numpy, USD and torch are imported.
 
-    A run that records its failure in a file or as JSON makes the same checks later, and so does one of several shots.
+    A run recording a failure in a file or as JSON makes the same checks later, and so does a run of several shots.
     """
     for _, _, options in jobs:
         options.check()
@@ -124,7 +124,7 @@ def _each_or_none(shots: tuple[str, ...], to: Path | None, option: str, **known:
 
 
 def _refine_each(jobs: Sequence[Job], output: Output, *, summary: Path | None) -> int:
-    """Refine the jobs and say of each what became of it; returns the exit code."""
+    """Refine the jobs and report the result of each; returns the exit code."""
     from ..shot.finished import results
     from ..shot.summary import check_summary, exit_code_of, row_of
 
@@ -160,7 +160,7 @@ def _refine_each(jobs: Sequence[Job], output: Output, *, summary: Path | None) -
 
 
 def _summarise(rows: Sequence[Row], output: Output, summary: Path | None, *, exit_code: int) -> None:
-    """Print and write what became of all shots."""
+    """Print and write the results of all shots."""
     from ..shot.summary import json_of, table_of, write_summary
 
     if output.as_json:
@@ -172,7 +172,7 @@ def _summarise(rows: Sequence[Row], output: Output, summary: Path | None, *, exi
 
 
 def _print_failed(rows: Sequence[Row]) -> None:
-    """Print which shots failed and why."""
+    """Print the failed shots with the reasons."""
     failed = [row for row in rows if row.error]
     for row in failed:
         logging.getLogger(LOGGER).error(row.error, extra={"shot": row.shot})
@@ -181,7 +181,7 @@ def _print_failed(rows: Sequence[Row]) -> None:
 
 
 def _solved(jobs: Sequence[Job], output: Output) -> Generator[RefineReport | PhysGraphError, None, None]:
-    """Result of each job: one in this process, several in processes of their own."""
+    """Result of each job: a single job in this process, several in separate processes."""
     if not jobs:
         return
     from ..shot.processes import import_ahead
@@ -205,7 +205,7 @@ def _solved(jobs: Sequence[Job], output: Output) -> Generator[RefineReport | Phy
 
 
 def _refine_logged(*job: Any, output: Output, alone: bool) -> RefineReport:
-    """Refine a shot in a process of its own, which logs for itself."""
+    """Refine a shot in a separate process with a separate log."""
     with output.logged():
         return _refine_shown(*job, output=output, alone=alone)
 
@@ -213,7 +213,7 @@ def _refine_logged(*job: Any, output: Output, alone: bool) -> RefineReport:
 def _refine_shown(
     shot: str | Path, layer: Path, options: RefineOptions, *, output: Output, alone: bool = True
 ) -> RefineReport:
-    """Refine a shot, with a progress bar if no other shot is refined beside it."""
+    """Refine a shot, with a progress bar if no shots are refined in parallel."""
     with imports_uncollected():
         from ..shot.refine import refine_shot
 
@@ -245,7 +245,7 @@ def _one_each(shots: tuple[str, ...], to: Path, option: str, *, suffix: str, acc
 def _folder_of(layers: Sequence[Path], out: Path, *, dry_run: bool) -> Iterator[None]:
     """Create the layers' folder unless ``out`` names a layer, and remove the folder if no layer was written.
 
-    After an interruption or an error, print where finished frames are kept.
+    After an interruption or an error, print the folders of finished frames.
     """
     from ..shot.frames import kept_for
 

@@ -26,25 +26,25 @@ NAME, VARIABLE, TABLE = "physgraph.toml", "PHYSGRAPH_CONFIG", "refine"
 
 
 def find_show_file(shot: str, config: Path | None) -> Path | None:
-    """The file that was named, that the environment names, or the first one in the folders above a shot."""
+    """The file named by the option or by the environment, or else the first in the folders above a shot."""
     named = config or (Path(os.environ[VARIABLE]) if os.environ.get(VARIABLE) else None)
     above = (folder / NAME for folder in Path(shot).absolute().parents)
     return named or next((file for file in above if file.is_file()), None)
 
 
 def values_for(ctx: click.Context, shot: str, known: click.Command) -> tuple[dict[str, Any], dict[str, str]]:
-    """Values that a command was given for a shot: on the command line, else by the show's file, else by default.
+    """Values of a command's options for a shot: from the command line, the show's file, or the defaults, in this order.
 
     Args:
         ctx: The command's context.
         shot: The shot.
-        known: The command whose options the file may hold; options that ``ctx``'s command lacks are ignored.
+        known: Command defining the keys of the file; options missing in ``ctx``'s command are ignored.
 
     Returns:
-        Values by the options' names in Python, and where each is from.
+        Values by the options' names in Python, and the source of each.
 
     Raises:
-        UsageError: The file cannot be read, has a key that is no option, or a value that the option does not take.
+        UsageError: The file cannot be read, has an unknown key, or a value invalid for the option.
     """
     file = find_show_file(shot, ctx.params.get("config"))
     table = {} if file is None else _read(file, known)
@@ -66,7 +66,7 @@ def _key(param: click.Parameter) -> str:
 
 
 def _read(file: Path, command: click.Command) -> Mapping[str, Any]:
-    """The table of a file, whose keys are all options."""
+    """The table of a file, with option names as keys."""
     if file.exists() and not file.is_file():
         raise UsageError(f"cannot read {file}: it is a folder or a pipe, and no file")
     try:
@@ -94,7 +94,7 @@ def _check_names(file: Path, kind: str, names: Mapping[str, Any], allowed: list[
 
 
 def _converted(ctx: click.Context, param: click.Parameter, value: Any, *, file: Path) -> Any:
-    """A value of the file as the command line would give it; a path is seen from the file's folder."""
+    """A value of the file, converted like a command-line value; a path is relative to the file's folder."""
     key = _key(param)
     try:
         if isinstance(param, click.Option) and param.is_flag:
