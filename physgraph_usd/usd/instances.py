@@ -29,7 +29,7 @@ def instancer_above(prim: Usd.Prim, beside: Usd.Prim | None = None) -> Usd.Prim 
 
 
 def mover(stage: Usd.Stage, body: Sdf.Path, garment: Sdf.Path) -> Usd.Prim:
-    """The prim whose motion a body has beside a garment: the instancer that draws the body, else the body."""
+    """The prim moving a body beside a garment: the instancer of the body, or the body."""
     prim = stage.GetPrimAtPath(body)
     return instancer_above(prim, stage.GetPrimAtPath(garment)) or prim
 
@@ -41,7 +41,7 @@ def prototypes_of(instancer: Usd.Prim) -> list[Usd.Prim]:
 
 
 def instanced_gprims(instancer: Usd.Prim) -> list[Usd.Prim]:
-    """Gprims below the prototypes of an instancer, and below those of instancers nested there."""
+    """Gprims below the prototypes of an instancer and of nested instancers."""
     return [prim for prim in drawn_with(instancer) if not UsdGeom.PointInstancer(prim)]
 
 

@@ -164,7 +164,7 @@ def refuse_refined(stage: Usd.Stage, paths: Iterable[Sdf.Path] = ()) -> None:
 
 
 def selections(prims: Iterable[Usd.Prim]) -> tuple[str, ...]:
-    """Active variant selections on prims, their ancestors and their materials, sorted.
+    """Active variant selections on prims, ancestors and materials, sorted.
 
     Each is a path such as ``/World/coat{fit=loose}``; a variant set without selection has an empty selection.
     """

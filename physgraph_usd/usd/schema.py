@@ -45,7 +45,7 @@ RETIRED = {
     "physgraph:contact:layer": "the order of layers is found in the animation, not authored",
     "physgraph:rest:creaseTime": "folds are not remembered",
 }
-"""Attributes of earlier versions by full name, each with what replaced it."""
+"""Attributes of earlier versions by full name, each with the replacement."""
 _JERSEY = PRESETS["jersey"]
 
 

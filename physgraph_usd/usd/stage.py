@@ -124,7 +124,7 @@ def authored_topology(prim: Usd.Prim) -> tuple[np.ndarray, np.ndarray]:
 
 @dataclass(frozen=True, eq=False)
 class GarmentSource:
-    """The place of one garment on its stage; same order as ``Scene.garments``.
+    """The source of a garment on the stage; same order as ``Scene.garments``.
 
     Attributes:
         kept_faces: Authored faces kept by the garment (no holes, three corners or more), order kept, int32.

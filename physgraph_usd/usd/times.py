@@ -32,7 +32,7 @@ _SLOWEST, _FASTEST, _FRAME_RATE = 12.0, 120.0, 24.0
 _MOST = 10_000
 """Most whole frames between two keys: a key farther away is a stray one."""
 _HELD = "ExtrapHeld"
-"""Name of USD's extrapolation by which a spline keeps its first or last value."""
+"""Name of USD's extrapolation of a spline by a constant first or last value."""
 _ALIKE = 1e-6
 """Largest difference of two equal values, relative to the largest number: the rounding of single precision."""
 

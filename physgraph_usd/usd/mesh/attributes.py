@@ -65,7 +65,7 @@ def corner_values(
 
 
 def single_corners(counts: np.ndarray, indices: np.ndarray) -> np.ndarray:
-    """Whether each corner is at another vertex than the corner before it in its face, shape (C,)."""
+    """Whether each corner's vertex differs from the previous corner's in the face, shape (C,)."""
     counts = np.asarray(counts, np.int64)
     ends = np.cumsum(counts)
     before = np.arange(-1, len(indices) - 1)

@@ -27,7 +27,7 @@ from ...solver.mesh.topology import edges_of
 from ...solver.rigid import Rigid, best_motion
 
 NEAREST = 8
-"""Triangles that are tested for the closest point, nearest by their centroids."""
+"""Number of triangles tested for the closest point, nearest by centroid."""
 AT_ONCE = 50_000
 """Points searched at a time."""
 COLLINEAR = 1e-10
@@ -104,7 +104,7 @@ def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 class SurfaceFrames:
-    """Frames of a surface's vertices, which follow its deformation from a bind pose."""
+    """Frames of a surface's vertices, following the deformation from a bind pose."""
 
     def __init__(self, bind: Float[np.ndarray, "vertices 3"], triangles: Int[np.ndarray, "triangles 3"]) -> None:
         """Prepare the gradients along two tangents of each vertex in the bind pose."""
@@ -269,7 +269,7 @@ class Follower:
         return points
 
     def turned(self, vectors: np.ndarray, owner: np.ndarray) -> np.ndarray:
-        """Unit vectors that turn with points, such as normals.
+        """Unit vectors turning with points, such as normals.
 
         Args:
             vectors: Vectors in the bind pose, shape (M, 3).

@@ -23,7 +23,7 @@ of 53,000 take half as long again as over a body of 13,000: the body's hierarchy
 NEAR_PART = 0.95
 """Fraction of the surface required to be near enough: nostrils and fingertips would ask for more everywhere."""
 TO_LIMIT = 4.0 / 3.0
-"""Ratio of a vertex's distance to the limit surface to its move in one subdivision: 1 + 1/4 + 1/16 + ..."""
+"""Ratio of a vertex's distance to the limit surface to the move in a subdivision: 1 + 1/4 + 1/16 + ..."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +52,7 @@ class DrawnSurface:
 
 
 def to_limit(cage: ControlMesh) -> sparse.csr_matrix:
-    """The matrix that moves a cage's vertices to its limit surface, shape (V, V)."""
+    """The matrix moving a cage's vertices to the limit surface, shape (V, V)."""
     count = cage.mesh.vertex_count
     moved = cage.subdivided(subdivide(cage.mesh))[0][:count, :]
     same = sparse.identity(count, format="csr")

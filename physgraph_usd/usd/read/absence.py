@@ -28,7 +28,7 @@ class Samples:
     Attributes:
         times: Time codes with a shape that is visible, ascending.
         absent: All others, ascending, with the reason in words.
-        hidden: Those of them at which the garment is invisible.
+        hidden: Absent time codes of an invisible garment.
         own: Time codes with a shape that the garment itself has samples at, ascending.
     """
 
@@ -39,7 +39,7 @@ class Samples:
 
     @staticmethod
     def of(prim: Usd.Prim, times: Iterable[float], own: Iterable[float] = ()) -> Samples:
-        """Sort the time codes of a garment's mesh prim, among them its own."""
+        """Sort the time codes of a garment's mesh prim, including the garment's samples."""
         times = [*times]
         hidden = hidden_at(prim, times)
         reasons = {time: _INVISIBLE if time in hidden else absence(prim, time) for time in times}
@@ -58,7 +58,7 @@ class Samples:
 
 
 def hidden_at(prim: Usd.Prim, times: Sequence[float]) -> frozenset[float]:
-    """Time codes among a garment's samples, ascending, that no picture shows: it is invisible there.
+    """Time codes of a garment's samples, ascending, not shown in any picture: the garment is invisible.
 
     Shown is also an invisible sample beside a whole frame at which the garment is visible: it interpolates between
     them. A garment that is invisible at all of them hides none: it was named to be refined all the same.

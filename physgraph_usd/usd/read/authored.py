@@ -86,7 +86,7 @@ def _connection_fault(attribute: Usd.Attribute) -> str:
 
 
 def beyond_limits(prim: Usd.Prim, schema: str = GARMENT_API) -> Iterator[tuple[Usd.Attribute, str, bool]]:
-    """Out-of-limit values authored on a garment or collider, its ancestors or its material.
+    """Out-of-limit values authored on a garment or collider, or on ancestors or materials.
 
     Yields:
         The attribute, the fault with value and limits, and whether the limits are hard.

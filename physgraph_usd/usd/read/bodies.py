@@ -280,7 +280,7 @@ class ColliderReader:
 
 
 def authored_points(body: ColliderReader, time: float | None) -> np.ndarray:
-    """World positions of a mesh's authored points [m], shape (V, 3); of another body, those of its pose, if any."""
+    """World positions of a mesh's authored points [m], shape (V, 3); for other bodies points of the pose, if any."""
     if body.collider.kind != "mesh" or body.instancer is not None:
         pose = body.pose(time)[0]
         return np.zeros((0, 3)) if pose is None else pose.points
@@ -419,7 +419,7 @@ def sharpness_of(mesh: UsdGeom.Mesh, vertex_count: int) -> tuple[np.ndarray, np.
 
 
 def _surface_of_tets(body: ColliderReader, time: float | None) -> tuple[np.ndarray, ...]:
-    """Counts, corners and holes of a TetMesh's surface, as authored or else from its tetrahedra.
+    """Counts, corners and holes of a TetMesh's surface, as authored or from the tetrahedra.
 
     A surface from tetrahedra is cached while they stay the same: USD takes a second for 150,000.
     """

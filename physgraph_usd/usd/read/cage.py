@@ -217,7 +217,7 @@ class PointReader:
         return as_points(value_at(self._attribute, time), self.path, "points", time=time)
 
     def _good_sample(self, time: float | None) -> np.ndarray | None:
-        """The nearest earlier sample with only finite points, else the nearest later such sample."""
+        """The nearest earlier sample with only finite points, or the nearest later."""
         at = -np.inf if time is None else time
         earlier = [time for time in reversed(self._times) if time < at]
         for candidate in (*earlier, *(later for later in self._times if later > at)):

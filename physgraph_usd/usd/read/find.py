@@ -353,7 +353,7 @@ def read_apart(stage: Usd.Stage, garments: Sequence[Usd.Prim]) -> tuple[list[dic
 
 
 def _excluded_by(stage: Usd.Stage, prim: Usd.Prim) -> tuple[dict[Sdf.Path, str], list[Notice]]:
-    """Gprims at and below the targets of one garment, each with its target."""
+    """Gprims at and below the targets of a garment, each with the target."""
     excluded: dict[Sdf.Path, str] = {}
     notices = []
     message = f"<{prim.GetPath()}>.{EXCLUDE}"

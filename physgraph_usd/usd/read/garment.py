@@ -1,4 +1,4 @@
-"""Reads one garment from its mesh prim."""
+"""Reads a garment from a mesh prim."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ class GarmentReader:
         edges: Edges as authored, shape (E, 2).
         weld: The mesh as authored and as solved.
         notices: Warnings about the garment.
-        hidden: Time codes of its samples at which it is invisible.
+        hidden: Time codes of samples of the garment while invisible.
     """
 
     garment: Garment
@@ -288,7 +288,7 @@ def _pieces(
 def _folds(prim: Usd.Prim, weld: Weld, animation: Animation) -> dict[str, Any]:
     """Creases, corners, pressed vertices and the pose with the pressed folds, by field name.
 
-    Creases are pressed folds, unless an artist says that they are not.
+    Creases are pressed folds unless marked otherwise by the artist.
     """
     poses = [weld.joined(pose) for pose in animation.poses.values()]
     creases, fields = np.zeros((0, 2), np.int64), dict[str, Any]()
@@ -387,7 +387,7 @@ def _at_open_borders(prim: Usd.Prim, weld: Weld) -> np.ndarray:
 
 
 def _size_notices(prim: Usd.Prim, points: np.ndarray, matrix: np.ndarray, request: Request) -> list[Notice]:
-    """Notices of units: assumed ones, a size implausible for cloth, and layers with other units."""
+    """Notices of units: assumed units, a size implausible for cloth, and layers with different units."""
     notices, path = _unit_notices(prim, matrix, request), str(prim.GetPath())
     if request.assumed_units or not _SMALL <= float(np.ptp(points, axis=0).max()) <= _LARGE:
         notices.insert(0, Notice(path, None, f"{_measures(points, request.units.metres)}; check metersPerUnit"))

@@ -49,7 +49,7 @@ def read_grain(
         painted: Values of ``easeScale``, ``gather`` [%] and ``grain`` [degrees] at each point, each of shape (V,).
 
     Returns:
-        The grain, with the painted ease times `unevenness`, and where its direction comes from.
+        The grain, with the painted ease times `unevenness`, and the source of the direction.
     """
     mesh = weld.apart
     coordinates = _texture_coordinates(prim, mesh, kept)

@@ -129,13 +129,13 @@ class Values:
 def find_values(prim: Usd.Prim, units: Units, overrides: Sequence[Override]) -> Values:
     """Find the source of every fabric value, the guide's stiffness and the detail's gain.
 
-    What neither the garment nor its materials give is that of the materials of most of its faces.
+    Values given by neither the garment nor the garment's materials come from the materials of most faces.
     """
     return values_by(prim, prim, _materials_of_most(prim), units=units, overrides=overrides)
 
 
 def _materials_of_most(prim: Usd.Prim) -> list[Usd.Prim]:
-    """Materials bound to a garment, then those bound to most of its faces by subsets."""
+    """Materials bound to a garment, then materials bound to most of the garment's faces by subsets."""
     bound, counts = bound_materials(prim), Counter[tuple[Usd.Prim, ...]]()
     uncovered = len(first_value(UsdGeom.Mesh(prim).GetFaceVertexCountsAttr()) or ())
     for subset in UsdGeom.Subset.GetGeomSubsets(UsdGeom.Imageable(prim), UsdGeom.Tokens.face):

@@ -32,7 +32,7 @@ NEUTRAL = (0.55, 0.54, 0.52)
 
 @dataclass(frozen=True, eq=False)
 class DrawnMesh:
-    """One visible mesh at one time.
+    """A visible mesh at a time code.
 
     Polygons are drawn as renderers draw them, and as the solver solves refined cloth: as fans from the first corner.
 

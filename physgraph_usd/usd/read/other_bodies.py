@@ -1,4 +1,4 @@
-"""Finds bodies of a stage that are neither garments nor colliders, and the frames in which they may touch cloth."""
+"""Finds bodies other than garments and colliders on a stage, and the frames of possible contact with cloth."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class OtherBody:
     Attributes:
         why: Reason for no contact, or "".
         unread: Type of a prim whose shape is not read, or "".
-        frames: Numbers of the frames in which its bounds meet the cloth's.
+        frames: Numbers of the frames in which the body's bounds meet the cloth's.
         pose: Its pose in a frame by number; a shape that is not read has points and no exact triangles.
         hull: Points in a frame by number whose convex hull contains the shape [m], shape (N, 3). Between two frames no
             point of the shape moves farther than one of these.
@@ -102,7 +102,7 @@ def _bodies(stage: Usd.Stage) -> Iterator[Usd.Prim]:
 def _body(
     prim: Usd.Prim, shot: Shot, times: Sequence[float | None], *, skinned: _Skinning, near: Box
 ) -> OtherBody | None:
-    """A visible body; None for an instancer whose prototypes have no shapes that are read."""
+    """A visible body; None for an instancer without readable shapes in the prototypes."""
     metres, path, kind = shot.metres_per_unit, prim.GetPath(), kind_of(prim)
     reader = ColliderReader(prim, Collider(str(path), kind or "mesh"), metres)
     if kind == "instancer":
@@ -152,7 +152,7 @@ def _points(prim: Usd.Prim, metres: float, time: float | None) -> np.ndarray:
 
 
 def _rough(prim: Usd.Prim, metres: float, time: float | None) -> Pose:
-    """Points of a shape that is not read, or else corners of its bounds; and triangles of a control net, or none."""
+    """Points of an unread shape, or corners of the shape's bounds; and triangles of a control net, or none."""
     triangles = np.zeros((0, 3), np.int32)
     if UsdGeom.PointBased(prim):
         points = _points(prim, metres, time)
@@ -200,7 +200,7 @@ def _same_place(a: Pose | None, b: Pose | None) -> bool:
 
 
 class _Skinning:
-    """Meshes that are no colliders, as UsdSkel skins them at single time codes."""
+    """Meshes other than colliders, skinned by UsdSkel at single time codes."""
 
     def __init__(self, shot: Shot, paths: Sequence[Sdf.Path]) -> None:
         """Find the skeletons of the meshes."""

@@ -70,7 +70,7 @@ from .targets import Bound, Target, find_bound, points_attribute, read_targets
 from .timing import timing_notices
 
 _MARK = "physgraph:refined"
-"""Attribute authored for a moment on a garment, to find the prims that it reaches."""
+"""Attribute authored temporarily on a garment, to find the prims sharing the garment's opinions."""
 
 
 class Shot:
@@ -85,7 +85,7 @@ class Shot:
         sources: Place of each garment on the stage, in the scene's order.
         colliders: Paths of the collider prims found.
         selections: Active variant selections the garments depend on, as paths `/World/coat{fit=loose}`.
-        bound: Prims that are to follow the garments; `targets` reads them.
+        bound: Prims following the garments, read by `targets`.
         warnings: Warnings for the user; grows as frames are read.
         metres_per_unit: Length of one stage unit [m].
         gravity_source: Source of gravity's direction, in words.
@@ -163,7 +163,7 @@ class Shot:
 
     @cached_property
     def targets(self) -> list[Target]:
-        """Prims that follow the garments, in the bind pose, each after the prim that it is bound to.
+        """Prims following the garments, in the bind pose, each after the followed prim.
 
         Raises:
             GarmentError: A target lies too far from its garment, changes its topology, or cannot be placed.

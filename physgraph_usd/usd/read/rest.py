@@ -305,7 +305,7 @@ def median_shape(mesh: PolygonMesh, poses: Sequence[np.ndarray]) -> tuple[np.nda
 
     Args:
         mesh: The welded mesh.
-        poses: Positions of its vertices, each of shape (V, 3), at least one.
+        poses: Positions of the vertices, each of shape (V, 3); at least a single pose.
 
     Returns:
         The shape, (V, 3), and the index of the pose nearest to the medians; the fit starts from this pose.

@@ -54,7 +54,7 @@ class Skinned:
     def points(self, time: float | None) -> Vt.Vec3fArray | None:
         """Deformed points in the space of `space`; None where the mesh has no points or UsdSkel rejects its influences.
 
-        Read them before they are baked.
+        Read before baking.
         """
         code = timecode(time)
         points = UsdGeom.PointBased(self.query.GetPrim()).GetPointsAttr().Get(code)
@@ -117,7 +117,7 @@ class Bake:
         return motion_of(prim, skinned={path: skin.motion for path, skin in self.skinned.items()})
 
     def bake(self, times: Sequence[float]) -> list[Notice]:
-        """Bake the skinned prims at the time codes given and those of their motion; notices of what UsdSkel rejects."""
+        """Bake the skinned prims at given time codes and at samples of the motion; notices of UsdSkel's rejections."""
         notices = []
         for skinned in self.skinned.values():
             with quiet() as diagnostics:
@@ -134,7 +134,7 @@ class Bake:
         return notices
 
     def _local(self, skinned: Skinned, time: float | None) -> Vt.Vec3fArray | Sdf.ValueBlock:
-        """A mesh's deformed points in its own space; as authored where UsdSkel rejects the influences."""
+        """A mesh's deformed points in the mesh's space; as authored if UsdSkel rejects the influences."""
         code, prim = timecode(time), self._stage.GetPrimAtPath(skinned.path)
         points = skinned.points(time)
         if points is None:

@@ -24,7 +24,7 @@ _ROUNDING = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Subsets:
-    """A garment's subsets of faces, and their fabrics that are not the garment's own.
+    """A garment's subsets of faces, with the subsets' differing fabrics.
 
     Attributes:
         faces: Faces of the cage in each subset, by name.
@@ -40,7 +40,7 @@ class Subsets:
 
 
 def read_subsets(prim: Usd.Prim, cage_faces: np.ndarray, *, units: Units, time: float | None) -> Subsets:
-    """Read a garment's subsets, and compare their fabrics with its own.
+    """Read a garment's subsets, and compare the subsets' fabrics with the garment's.
 
     Fabrics are compared without ``--set``, which changes all in proportion.
 
@@ -89,7 +89,7 @@ def _fabrics(
 def _parts(
     prim: Usd.Prim, subsets: Mapping[str, np.ndarray], count: int, units: Units
 ) -> Iterator[tuple[str, np.ndarray, Values]]:
-    """Name, faces and values of each subset with a material or values of its own, then those of all other faces."""
+    """Name, faces and values of each subset with a separate material or values, then of all remaining faces."""
     bound, is_outside = bound_materials(prim), np.ones(count, bool)
     for name, faces in subsets.items():
         subset = prim.GetChild(name)

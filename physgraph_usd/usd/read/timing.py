@@ -1,4 +1,4 @@
-"""Compares samples of garments and their bodies: USD holds a prim still outside its samples."""
+"""Compares samples of garments and bodies: USD holds a prim still outside the prim's samples."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One table of the attributes that a refined layer writes, blocks, lowers or turns off; docs/layers.md shows it."""
+"""The table of attributes written, blocked, lowered or turned off in a refined layer; shown in docs/layers.md."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ RULES = (
 
 
 def rule_of(name: str) -> Rule | None:
-    """First rule that matches an attribute's name; None for attributes that stay as authored."""
+    """First rule matching an attribute's name; None for attributes kept as authored."""
     fits = (rule for rule in RULES if any(fnmatchcase(name.lower(), pattern.lower()) for pattern in rule.names))
     return next(fits, None)
 

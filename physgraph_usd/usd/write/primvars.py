@@ -74,7 +74,7 @@ def hide_influences(stream: LayerStream, target: Sdf.Path, prim: Usd.Prim) -> No
 
 
 def inherits_influences(prim: Usd.Prim) -> bool:
-    """Whether joint influences of an ancestor reach a prim that has none of its own."""
+    """Whether joint influences of an ancestor reach a prim without influences."""
     above = UsdGeom.PrimvarsAPI(prim.GetParent()).FindInheritablePrimvars()
     return any(primvar.GetAttr().GetName() in INFLUENCES for primvar in above)
 
@@ -324,7 +324,7 @@ class FineMap:
     def creases(self, ends: np.ndarray, sharpness: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Refine crease edges of the coarse mesh, shape (K, 2), with their sharpness, shape (K,).
 
-        A subdivision lowers a sharpness by one, except an infinite one. What falls to 0 is left out.
+        A subdivision lowers a finite sharpness by 1. Sharpness 0 is left out.
 
         Returns:
             Fine edges, shape (N, 2), int32, and the sharpness of each, float32; edges of a rim are infinitely sharp.

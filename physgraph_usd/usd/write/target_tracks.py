@@ -64,7 +64,7 @@ class TargetTracks:
         return [target.path for target in self._bindings.targets]
 
     def write(self, time: float | None, points: np.ndarray, *, changed: bool, cut: bool) -> None:
-        """Write one time code; points are those of the refined garment [m], world space, shape (V, 3)."""
+        """Write a time code, given points of the refined garment [m], world space, shape (V, 3)."""
         for track, placed in zip(self._tracks, self._bindings.at(time, points), strict=True):
             track.write(time, placed, changed=changed, cut=cut)
 
@@ -121,7 +121,7 @@ class _TargetTrack:
         self._bounds = BoundsAbove(stream, shot.stage, path, purpose=UsdGeom.Imageable(prim).ComputePurpose())
 
     def write(self, time: float | None, placed: PlacedTarget, *, changed: bool, cut: bool) -> None:
-        """Write one time code; ``changed`` and ``cut`` are those of the cloth, as in `PointTrack.write`."""
+        """Write a time code; ``changed`` and ``cut`` are the cloth's, as in `PointTrack.write`."""
         to_world = to_metres(self._prim, self._metres, time)
         normals = None if self._turned is None else self._turned.at(placed.follower, to_world)
         changed = changed or placed.target.detail

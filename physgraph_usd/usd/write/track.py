@@ -1,4 +1,4 @@
-"""Writes the animated opinions of one garment, one time code after another.
+"""Writes the animated opinions of a garment, time code by time code.
 
 Points, normals, extent and velocities; heat maps of depth inside bodies and of crossings; and the bounds authored on
 ancestors, possibly too small for the finer cloth.
@@ -332,7 +332,7 @@ def extent_of(points: np.ndarray) -> np.ndarray:
 
 
 class HeatTrack:
-    """Writes one garment's heat maps in order; an attribute is authored with its first values.
+    """Writes a garment's heat maps in order; an attribute is authored with the first values.
 
     Only the first and last of a run of equal samples are written.
     """

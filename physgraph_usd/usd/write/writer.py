@@ -121,7 +121,7 @@ class LayerWriter:
                 self.notes += mesh.notes
 
     def _absent_and_outside(self, source: GarmentSource) -> tuple[Sequence[float], Sequence[float]]:
-        """Time codes at which a garment is blocked, and those outside the layer's range, ascending."""
+        """Time codes of a blocked garment, and time codes outside the layer's range, ascending."""
         span = None if self._times is None else (self._times[0], self._times[-1])
         outside = {*source.times, *source.left_out}.difference(within(source.times, span))
         return within(source.absent, span), sorted(outside)
