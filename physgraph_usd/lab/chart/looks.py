@@ -26,11 +26,11 @@ FILE = "chart.looks.{}.png"
 
 
 def draw_looks(chart: Chart, problem: Problem, frame: Frame, best: Sequence[np.ndarray] | None, folder: Path) -> None:
-    """Draw a frame upsampled, at each of `GAPS` where a method came near it, and at its best.
+    """Draw a frame upsampled, at each of `GAPS` reached by a method, and at the best result.
 
     Args:
         problem: The problem in float32.
-        frame: One of the measured frames.
+        frame: A measured frame.
         best: Fine world positions [m] of each garment at Phi*, or None where they are not known.
     """
     shapes: dict[str, Sequence[np.ndarray]] = {"100": problem.upsampled(frame, smooth=False)}

@@ -31,7 +31,7 @@ JUDGED, NEARLY, FURTHER = 0.03, 0.1, 3.0
 """Ranking gap; gap that counts as nearly converged; time limit of such methods as a multiple of the plan's."""
 DEFAULT = "refine's default"
 UPSAMPLED, SMOOTH = "plain upsampling", "Loop subdivision"
-"""Curves of one point each."""
+"""Curves of a single point each."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Curve:
 
 
 def find_curves(names: Sequence[str] = ()) -> tuple[Curve, ...]:
-    """Every integrator as it is and, where that is not another's, with nesting switched over.
+    """Every integrator unchanged and, unless equal to a second integrator, with nesting switched.
 
     What chooses between others frame by frame is none of them: it is refine's default.
 
@@ -52,7 +52,7 @@ def find_curves(names: Sequence[str] = ()) -> tuple[Curve, ...]:
         names: Names of `METHODS` to take; all when empty.
 
     Raises:
-        UsageError: No integrator has one of the names.
+        UsageError: A name is no integrator's.
     """
     unknown = [name for name in names if name not in METHODS]
     if unknown:

@@ -183,7 +183,7 @@ def _trace(chart: Chart, name: str, style: Style, points: Sequence[Point], *, fi
 
 
 def _legend(chart: Chart) -> str:
-    """A button for each method, which hides and shows its lines in every plot."""
+    """A button for each method, to hide and show the method's lines in every plot."""
     style = styles(chart)
     buttons = []
     for name in chart.methods:

@@ -47,7 +47,7 @@ RULES: dict[Any, Any] = {
     "svg.fonttype": "none",
 }
 ONE_POINT = {DEFAULT: "*", UPSAMPLED: "s", SMOOTH: "D"}
-"""Signs of the curves of one point."""
+"""Markers of curves with a single point."""
 
 
 def draw_chart(chart: Chart, folder: Path) -> None:
@@ -84,7 +84,7 @@ def _figure(chart: Chart) -> Figure:
 
 
 def _curves(axes: Axes, chart: Chart, style: dict[str, Style]) -> None:
-    """Gap against time, the front behind it."""
+    """Gap against time, with the front in the background."""
     front = chart.front
     axes.step(
         [max(p.ms, 1e-2) for p in front],

@@ -41,7 +41,7 @@ class Judgement:
         energies: Energy of each term [J].
         strain: Largest over the garments of the edges' 99th percentile.
         inside: Vertices inside closed bodies.
-        percent: Their fraction of all vertices [%].
+        percent: Fraction of all vertices [%].
         deepest_mm: Depth of the deepest [mm].
         crossings: Edges of cloth through faces of bodies and the other way round.
         tangles: Edges of cloth through faces of cloth.
@@ -68,10 +68,10 @@ class Solved:
     Attributes:
         points: Fine world positions [m] of each garment.
         milliseconds: Time of preparing and solving the frame, without reading, writing and telemetry.
-        prepared: The part of it in which the frame was prepared.
-        elapsed: Wall time of all of it [ms].
+        prepared: Time of preparing the frame, included in `milliseconds`.
+        elapsed: Wall time of the whole frame [ms].
         steps: Steps made at the finest levels.
-        waited: Milliseconds that its threads waited for a core that others had, or None where that is not known.
+        waited: Milliseconds of waiting for a busy core, or None if unknown.
     """
 
     points: tuple[np.ndarray, ...]
@@ -130,7 +130,7 @@ class Problem:
         return self.next(frame)
 
     def next(self, frame: Frame) -> Solved:
-        """Solve a frame from where the last one ended, with the settings in use."""
+        """Solve a frame from the previous result, with the settings in use."""
         before, began, worked = _waited(), time.perf_counter(), time.process_time()
         state = self.refiner.solve(frame)
         after, elapsed, worked = _waited(), time.perf_counter() - began, time.process_time() - worked
@@ -151,7 +151,7 @@ class Problem:
     def go_on(
         self, frame: Frame, settings: SolveSettings, states: Sequence[FrameState | None]
     ) -> tuple[tuple[np.ndarray, ...], list[FrameState]]:
-        """Solve a frame on from the state of each part; cold where that is None.
+        """Continue a frame from the state of each part; cold for a state None.
 
         Returns:
             Fine world positions [m] of each garment, and the new state of each part.
@@ -238,7 +238,7 @@ def over_frames(judged: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def plain_detail(frame: Frame) -> Frame:
-    """A frame whose result is the solution itself, whatever gain an artist gave its detail."""
+    """A frame with the solution itself as the result, ignoring the artist's gain of the detail."""
     return replace(frame, garments=tuple(replace(garment, detail=1.0) for garment in frame.garments))
 
 

@@ -38,7 +38,7 @@ STARTS = (
 SHORT, LEAST = 3, 2
 """Number of integrators in a short search, and after the time limit: a single result has no estimate of its error."""
 ON, ROUNDS, MORE = ("quasi-newton-flat", 100), 2, 10
-"""How a start goes on, how often at most, and how often more where it is one of the finalists."""
+"""Method and steps of continuing a start, most repetitions, and further repetitions for finalists."""
 NEWTON, POLISHES = ("newton", 8), 6
 FINALISTS = 2
 """How many starts of a search, and of each beginning of it, Newton goes on from."""
@@ -57,10 +57,10 @@ class Reference:
         start: Energy of the upsampled cage [J].
         least: The least energy [J].
         energies: The least energy by term [J].
-        by: Who found it.
-        apart: How far the least of the other starts lies above it, over the whole fall; None where there was no other.
+        by: Name of the start or method with the least energy.
+        apart: Distance to the second-best start, as a fraction of the whole fall; None with a single start.
         seconds: Time spent [s].
-        points: Fine world positions [m] of each garment that have it.
+        points: Fine world positions [m] of each garment at the least energy.
     """
 
     start: float
@@ -73,7 +73,7 @@ class Reference:
 
     @staticmethod
     def of(plain: dict[str, Any]) -> Reference:
-        """The values that `plain` gave."""
+        """The inverse of `plain`."""
         return Reference(**{field_.name: plain[field_.name] for field_ in fields(Reference) if field_.name in plain})
 
     def plain(self) -> dict[str, Any]:
@@ -156,7 +156,7 @@ def rms_mm(a: Sequence[np.ndarray], b: Sequence[np.ndarray]) -> float:
 
 
 class _Descent:
-    """Ever longer runs from one start, of which the best is remembered."""
+    """Ever longer runs from a start; the best is stored."""
 
     def __init__(self, problem: Problem, frame: Frame, settings: SolveSettings, *, start: float) -> None:
         self._problem, self._frame, self._settings, self._start = problem, frame, settings, start
@@ -189,7 +189,7 @@ def find_reference(
     Args:
         problem: The problem in float64.
         frame: The frame.
-        settings: Its potential and contact.
+        settings: Potential and contact of the problem.
         seconds: Time to spend; one run may take longer. Without an end the answer depends on no machine's speed.
         short: Whether to try fewer starts.
     """

@@ -49,7 +49,7 @@ def chart_shot(shot: str | Path, folder: str | Path, options: ChartOptions = DEF
 
     Args:
         shot: The stage to read; never edited.
-        folder: Where `WRITTEN` and the rows of all measurements go; a chart that was begun there goes on.
+        folder: Folder for `WRITTEN` and the rows of all measurements; an unfinished chart in the folder is continued.
 
     Raises:
         UsageError: An option is wrong, or the folder holds the chart of another shot.
@@ -93,7 +93,7 @@ def _check_folder(folder: Path, shot: str | Path, *, overwrite: bool) -> None:
 
 
 def _measure(opened: Shot, folder: Path, options: ChartOptions) -> Chart:
-    """Measure all that is not yet in the folder, and draw what gaps look like."""
+    """Measure the missing rows of the folder, and draw pictures of gaps."""
     clock = Clock(options.size().minutes, options.progress)
     clock.say("reading and building")
     levels = tuple(
@@ -162,7 +162,7 @@ def _plan(
 
 
 def _about(opened: Shot, levels: Sequence[int], options: ChartOptions) -> dict[str, Any]:
-    """The problem that is measured: rows of any other do not belong to this chart."""
+    """The measured problem: rows of a different problem do not belong to the chart."""
     device = options.device
     name = torch.cuda.get_device_name(device) if device.startswith("cuda") else platform.processor()
     return {
@@ -185,7 +185,7 @@ def _frame(opened: Shot, time: float | None) -> Frame:
 
 
 def _times(opened: Shot, count: int) -> list[float | None]:
-    """Frames spread over the shot, the last one always among them."""
+    """Frames spread over the shot, always including the last."""
     times = opened.scene.times
     if not times:
         return [None]

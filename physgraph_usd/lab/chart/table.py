@@ -19,11 +19,11 @@ from .problem import over_frames
 from .reference import Reference
 
 GAPS = (0.1, 0.03, 0.01)
-"""Gaps to which the time is given."""
+"""Gaps with times in the table."""
 TOLERANCE = 1.1
 """Times that differ by less than this factor count as equal: medians of a few runs are no better."""
 BUSY = 0.1
-"""Time waited for a core, over the time measured, from which there is a warning."""
+"""Least fraction of time waiting for a core for a warning."""
 TINY = 1e-12
 CONTACT = {
     "percent": "vertices inside bodies [%]",
@@ -32,20 +32,20 @@ CONTACT = {
 }
 SEEN = {"degrees": "angle of the folds to the converged frame [degrees]"}
 LIKENESS = {"strain": "edge strain, 99th percentile", "apart_mm": "distance from Phi*'s shape [mm]"}
-"""Fields of points, and their titles."""
+"""Fields of points, with titles."""
 
 
 @dataclass(frozen=True)
 class Point:
-    """A method with one budget, on frames that start cold or in a row of frames, each begun where the last one ended.
+    """A method with a budget, on frames started cold, or on consecutive frames, each started from the previous result.
 
     Attributes:
         method: The curve's name.
         integrator: Name of the integrator, "" where none was asked for by name.
         nested: Whether coarse levels are solved first.
-        steps: Steps at the finest level that it had.
-        made: Steps that it made there, mean over the frames.
-        tolerance: Remaining move at which it was to stop [edge lengths]; 0 where it took all its steps.
+        steps: Budget of steps at the finest level.
+        made: Steps made at the finest level, mean over the frames.
+        tolerance: Remaining move for stopping [edge lengths]; 0 to make all steps.
         ms: Milliseconds a frame: `typical` over the repeats, mean over the frames.
         ms_median: Milliseconds by the median of all repeats.
         ms_least: Milliseconds of the fastest repeats.
@@ -55,7 +55,7 @@ class Point:
         energy: Phi, mean over the frames [J].
         energies: Phi by term [J].
         strain, inside, percent, deepest_mm, crossings, tangles: As for `Judgement`, over the frames by `OVER_FRAMES`.
-        frames: Number of frames that are judged: all of them, or the last of a row.
+        frames: Number of judged frames: all, or the last of a row.
         repeats: Number of times that the time was taken.
         note: How much of the problem a solver outside was given, "" for ours.
         degrees: Median angle between the vertex normals and the reference's [degrees], mean over the frames; None where
@@ -97,10 +97,10 @@ class Chart:
     Attributes:
         about: The shot, the machine, the plan and refine's default.
         points: Every method with every budget, curve by curve, in the order of the budgets.
-        references: Per frame, Phi0, Phi*, who found it and how far the next best ended above it.
+        references: Per frame, Phi0, Phi*, the method behind Phi* and the distance to the second best.
         terms: What each term, the last frame's detail and each level cost and buy.
-        failed: Runs that ended in an error.
-        warm: Methods in rows of frames that begin where the last one ended.
+        failed: Runs with an error.
+        warm: Methods on consecutive frames, each started from the previous result.
     """
 
     about: dict[str, Any]
@@ -118,7 +118,7 @@ class Chart:
 
     @property
     def busy(self) -> str:
-        """Warning that other programs used the cores during measurement; "" if none did."""
+        """Warning of programs using the cores during measurement; "" without any."""
         waited = self.about["waited"]
         if waited < BUSY or self.about.get("clock") == "cpu":
             return ""
@@ -137,7 +137,7 @@ class Chart:
 
     @property
     def prepared(self) -> float:
-        """Milliseconds of a cold frame that refine's default takes to prepare it; 0 if unknown."""
+        """Milliseconds of preparing a cold frame by refine's default; 0 if unknown."""
         return next((point.ms_prepared for point in self.curve(DEFAULT)), 0.0)
 
     @property
@@ -194,7 +194,7 @@ class Chart:
         return None
 
     def times_to(self, gap: float) -> dict[str, float]:
-        """Milliseconds to a gap of the methods that get there, the fastest first."""
+        """Milliseconds to a gap of the methods reaching the gap, the fastest first."""
         time_of = {name: t for name in self.methods if name != DEFAULT and (t := self.time_to(name, gap)) is not None}
         return dict(sorted(time_of.items(), key=lambda item: item[1]))
 
@@ -227,7 +227,7 @@ class Chart:
             writer.writerows(rows)
 
     def lines(self) -> Iterator[str]:
-        """The summary that the command prints: a table in Markdown, and where the default stands."""
+        """The printed summary: a table in Markdown, and the default's standing."""
         yield "| method | " + " | ".join(f"ms to {gap:.0%}" for gap in GAPS) + " | least gap | degrees | at ms |"
         yield "|" + "---|" * (len(GAPS) + 4)
         for name in self.methods:

@@ -24,7 +24,7 @@ from .table import typical
 
 REPEATS = 5
 RUN = 8
-"""Frames in a row on which the effect of one frame on the next is measured."""
+"""Number of consecutive frames for measuring a frame's effect on the next."""
 Points = tuple[np.ndarray, ...]
 """Fine world positions [m] of each garment, shape (V, 3)."""
 
@@ -57,7 +57,7 @@ class TermBench:
     Attributes:
         timed: The problem in float32.
         judge: The problem in float64.
-        frames: Frames that stand alone.
+        frames: Separate frames.
         row: Frames in a row, oldest first.
         build: Makes a problem in float32 from a scene and levels.
     """
@@ -72,7 +72,7 @@ class TermBench:
 
     @property
     def terms(self) -> tuple[Without, ...]:
-        """Those that the scene has."""
+        """Terms present in the scene."""
         sheared = any(garment.fabric.has_membrane for garment in self.frames[0].garments)
         absent = {"membrane": not sheared, "contact": not any(garment.colliders for garment in self.scene.garments)}
         absent["gravity"] = not self.scene.gravity.any()

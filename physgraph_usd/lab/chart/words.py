@@ -25,10 +25,10 @@ class Change:
     """Cost and gain of a part of the model.
 
     Attributes:
-        cost_ms: Time of a frame with it less that without [ms].
-        fraction: That cost over the time with it.
+        cost_ms: Time of a frame with the term minus time without [ms].
+        fraction: Cost over the time with the term.
         moved_mm: RMS distance between the results [mm].
-        buys: What is worse without it, in words.
+        buys: Worsening without the term, in words.
     """
 
     name: str
@@ -74,7 +74,7 @@ def title(chart: Chart) -> str:
 
 
 def percent(value: float, *, digits: int = 3) -> str:
-    """A fraction with as many digits as it needs; a large one as a factor."""
+    """A fraction with the needed digits; a large fraction as a factor."""
     if abs(value) >= 10.0:
         return f"{value:,.0f}x"
     return f"{100.0 * value:.{max(digits, 3) if abs(value) >= 0.995 else digits}g}%"
@@ -86,7 +86,7 @@ ABOVE = "energy above the best known, percent of what solving gains"
 
 
 def advice(chart: Chart) -> str:
-    """Which method to take, in a sentence."""
+    """The recommended method, in a sentence."""
     standing = chart.default_place()
     if standing is None:
         return ""
@@ -124,7 +124,7 @@ def warm_advice(chart: Chart) -> str:
 
 
 def settings(point: Point) -> str:
-    """Settings that a point was solved with."""
+    """Settings of a point's solve."""
     if point.tolerance:
         words = (
             f"at most {counted(point.steps, 'step')} at the finest level, tolerance {point.tolerance:g} edge lengths"
@@ -139,7 +139,7 @@ def settings(point: Point) -> str:
 
 
 def figures(point: Point, *, touches: bool) -> list[str]:
-    """Figures that a point reached."""
+    """Figures of a point's result."""
     lines = [
         f"gap {percent(point.gap)}, energy {point.energy:.4g} J",
         f"{point.ms:.1f} ms a frame (median {point.ms_median:.1f}, least {point.ms_least:.1f}; "

@@ -66,7 +66,7 @@ def _blocks(count: int) -> tuple[int]:
 
 
 def _laid_out(perceptron: nn.Sequential, latent: int) -> list[Any]:
-    """Weights as the kernels read them, and what LayerNorm adds to a variance."""
+    """Weights in the kernels' layout, and LayerNorm's addition to a variance."""
     first, second, third, norm = (cast(Any, perceptron[k]) for k in (0, 2, 4, 5))
     weights = [layer.weight[:, -latent:].T.half().contiguous() for layer in (first, second, third)]
     return [*weights, first.bias, second.bias, third.bias, norm.weight, norm.bias, norm.eps]
@@ -104,7 +104,7 @@ def _update_vertices(
 
 @triton.jit
 def _layers(inputs, h, w1, w2, w3, b1, b2, b3, gain, shift, eps, L: tl.constexpr):
-    """Three layers and a LayerNorm; ``h`` is what the first one has made of everything else."""
+    """Three layers and a LayerNorm; ``h`` is the first layer's output for all remaining inputs."""
     columns = tl.arange(0, L)
     square = columns[:, None] * L + columns[None, :]
     h += tl.dot(inputs.to(tl.float16), tl.load(w1 + square)) + tl.load(b1 + columns)[None, :]

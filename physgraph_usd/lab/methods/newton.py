@@ -1,7 +1,7 @@
 """Truncated Newton: the reference that polishes Phi*. Meant for float64.
 
 Solves H d = F by conjugate gradients preconditioned by the metric; H v is a difference of forces,
-(F(x) - F(x + h v)) / h, so the reference needs nothing of the physics that the others do not have.
+(F(x) - F(x + h v)) / h: the reference needs no more of the physics than the rest.
 Negative curvature ends the inner loop (Nocedal and Wright, Numerical Optimization, algorithm 7.1).
 """
 

@@ -45,12 +45,12 @@ def spin(points: np.ndarray, angle: np.ndarray | float) -> np.ndarray:
 
 
 def at_height(table: np.ndarray, height: np.ndarray) -> list[np.ndarray]:
-    """The columns of a table at heights, between its rows; its first column is the height, which falls."""
+    """The columns of a table at heights, interpolated between rows; the first column is the falling height."""
     return [np.interp(-height, -table[:, 0], column) for column in table[:, 1:].T]
 
 
 def flipped(uv: FaceVarying) -> FaceVarying:
-    """UVs of quads whose corners run the other way round."""
+    """UVs of quads with reversed corners."""
     return FaceVarying(uv.values, uv.indices.reshape(-1, 4)[:, ::-1].ravel())
 
 
@@ -79,7 +79,7 @@ def ease(t: np.ndarray | float) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Solid:
-    """A mesh that is closed, or several of them that overlap.
+    """A closed mesh, or several overlapping ones.
 
     Attributes:
         points: Positions [m], shape (V, 3).
@@ -151,7 +151,7 @@ def torus(major: float, minor: float, cells: tuple[int, int]) -> Solid:
 
 
 def ellipsoid(axes: np.ndarray, middle: np.ndarray, cells: tuple[int, int]) -> Solid:
-    """An ellipsoid of quads with a fan at its top and at its bottom.
+    """An ellipsoid of quads with a fan at the top and at the bottom.
 
     Half axes and centre [m] have shape (3,); ``cells`` are the faces around and from top to bottom.
     """

@@ -33,7 +33,7 @@ PROFILE = np.array(
 
 
 def build() -> PlainStage:
-    """A triangulated skirt over a collider that moves by its transform."""
+    """A triangulated skirt over a collider moved by a transform."""
     rest = _rest()
     quads = quad_grid(ROWS, AROUND, closed=True)[:, ::-1]
     uv = grid_uv(ROWS, AROUND, closed=True)

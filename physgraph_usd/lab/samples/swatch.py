@@ -17,7 +17,7 @@ TO_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 
 def build(variant: str = "") -> PlainStage:
-    """One garment whose top edge is gathered by a quarter while it turns a little.
+    """A slightly turning garment with the top edge gathered by a quarter.
 
     Args:
         variant: Empty, ``cm``, ``zup`` or ``lefthanded``; all show the same cloth in the same place.

@@ -41,7 +41,7 @@ LEG = np.array(
 CROTCH, HIP, KNEE = 0.768, 0.86, 0.47
 """Heights of the crotch and of the joints [m]."""
 WAIST, LARGER = 1.02, (1.04, 1.08, 1.04)
-"""Height of the waist [m], and size of what is pushed together at rest over the size in which it is worn."""
+"""Height of the waist [m], and ratio of rest size to worn size for cloth pushed together."""
 PERIOD = 1.25
 """Time of two steps [s]."""
 
@@ -196,7 +196,7 @@ def walk(points: np.ndarray, time: np.ndarray | float) -> np.ndarray:
 
     Args:
         points: Positions round the standing body [m], shape (V, 3).
-        time: Time since it stood still [s], one for all or one each, shape (V,); cloth may lag.
+        time: Time since standing still [s], a number or an array of shape (V,); cloth may lag.
     """
     x, y, z = points.T
     stride = ease(np.asarray(time) / 0.35)

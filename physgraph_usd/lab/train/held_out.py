@@ -71,7 +71,7 @@ def nested_gap(patch: Patch, integrator: Integrator, steps: Sequence[int]) -> fl
 
 
 def _round_gap(each: Round, system: System, integrator: Integrator, evaluations: int) -> float:
-    """Gap of a round after so many force evaluations, that at its start not counted."""
+    """Gap of a round after a number of force evaluations; the evaluation at the start is not counted."""
     before = system.evaluations
     carry = integrator.start(system, torch.as_tensor(each.x))
     while system.evaluations - before <= evaluations and carry.mover != "stayed":

@@ -46,9 +46,9 @@ class RoundConfig:
     Attributes:
         scenes: Number of scenes.
         held_out: Number of scenes to measure on.
-        share: Part of the iterations that descend rounds.
+        share: Fraction of iterations on rounds.
         reference_steps: Quasi-Newton steps behind the least energies known.
-        most_vertices: Fine vertices beyond which a scene has one subdivision, not two.
+        most_vertices: Number of fine vertices beyond which a scene has a single subdivision, not two.
     """
 
     scenes: int = 0
@@ -60,20 +60,20 @@ class RoundConfig:
 
 @dataclass(frozen=True, eq=False)
 class Round:
-    """One round of the finest level of garments that are solved together, as its integrator sees it.
+    """A round of the finest level of garments solved together, from the integrator's view.
 
     Attributes:
         words: Name for logs.
-        garments: Their cages, all with as many subdivisions.
-        frames: Their materials.
+        garments: Cages, all with the same number of subdivisions.
+        frames: Materials of the garments.
         gravity: [m/s^2], shape (3,).
         aim: The cage that the cloth follows, recentred [m], shape (C, 3).
         pairs: The fields of `PairConstraints`, of cloth and bodies; empty without contact.
-        tie: Stiffness [1/s^2] of the tether; 0 without one.
-        predicted: Where it ties [m], shape (V, 3); the start without one.
+        tie: Stiffness [1/s^2] of the tether; 0 without a tether.
+        predicted: Positions tied to [m], shape (V, 3); the start without a tether.
         stiff: K of the metric [N/m], shape (V,).
-        x: Where the steps begin [m], shape (V, 3).
-        start: Energy there [J].
+        x: Positions at the start of the steps [m], shape (V, 3).
+        start: Energy at the start [J].
         least: Least energy known [J].
     """
 
@@ -105,7 +105,7 @@ class Watch:
     """An integrator that records the system and the start of each round."""
 
     def __init__(self, inner: Integrator) -> None:
-        """Wrap the integrator whose steps are made."""
+        """Wrap the stepping integrator."""
         self.name, self._inner = inner.name, inner
         self.seen: list[tuple[System, Tensor]] = []
 
@@ -204,7 +204,7 @@ def make_rounds(config: RoundConfig, *, seed: int, workers: int = 1) -> list[Rou
 
 
 def _scene_rounds(config: RoundConfig, seed: int, number: int) -> list[Round]:
-    """Some rounds of the scene of a number: of its first frame and of warm ones."""
+    """Rounds of the scene of a number: of the first frame and of warm frames."""
     rng = np.random.default_rng([seed, number])
     kind = KINDS[number % len(KINDS)]
     moving = moving_scene(rng, kind=kind, frames=3, most_vertices=config.most_vertices)

@@ -43,7 +43,7 @@ def moving_scene(rng: np.random.Generator, *, kind: str, frames: int, most_verti
     """A scene of a kind out of `KINDS`.
 
     Args:
-        most_vertices: Fine vertices beyond which cloth has one subdivision, not two.
+        most_vertices: Number of fine vertices beyond which cloth has a single subdivision, not two.
     """
     if kind == "free":
         return _free(rng, frames, most_vertices)
@@ -151,7 +151,7 @@ def _fold(rng: np.random.Generator, frames: int) -> Motion:
 
 
 def _free(rng: np.random.Generator, frames: int, most_vertices: int) -> Moving:
-    """A patch that moves from a random pose towards a second one."""
+    """A patch moving from a random pose towards a second pose."""
     config = PatchConfig(levels=(1, 2), most_vertices=most_vertices, skinned=0.3, pulled=0.2)
     patch = patch_of(config, rng)
     goal = posed(patch.garment.rest, rng, config)

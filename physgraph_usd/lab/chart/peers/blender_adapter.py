@@ -46,7 +46,7 @@ TIP = 30.0
 
 
 class Finest:
-    """The finest level: the arrays that were handed over, and values made of them."""
+    """The finest level: the received arrays, and values derived from the arrays."""
 
     def __init__(self, problem: Any) -> None:
         """Take it from a problem."""

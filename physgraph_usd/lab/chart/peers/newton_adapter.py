@@ -55,7 +55,7 @@ def pull(
 
 @dataclass
 class Level:
-    """One level's problem, built once; ``pulled`` is what `pull` takes before the positions."""
+    """A level's problem, built once; ``pulled`` holds the arguments of `pull` before the positions."""
 
     solver: Any
     states: tuple[Any, Any]
@@ -76,7 +76,7 @@ class Level:
         return here.particle_q.numpy().astype(np.float64)
 
     def step(self) -> None:
-        """One step, back into the state that it began in."""
+        """Make a step, with the result in the state of the start."""
         here, there = self.states
         here.particle_qd.zero_()
         inputs = [*self.pulled, here.particle_q, here.particle_f]

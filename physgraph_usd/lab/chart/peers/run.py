@@ -36,10 +36,10 @@ class Peer:
     """A solver outside.
 
     Attributes:
-        name: Its name in the chart.
-        adapter: The script that its Python runs, with options.
+        name: Name in the chart.
+        adapter: The script run by the solver's Python, with options.
         note: How much of the problem it is given, in words.
-        follows: Whether it computes where we do; otherwise on the CPU.
+        follows: Whether the solver computes on our device; otherwise on the CPU.
     """
 
     name: str
@@ -61,14 +61,14 @@ PEERS = {
         "compare its strain and its shape",
     ),
 }
-"""Peers by the name that ``--peer`` takes."""
+"""Peers by the name for ``--peer``."""
 
 
 def parse_peers(values: Sequence[str]) -> list[tuple[Peer, str]]:
     """Peers with the Python of each, from ``NAME=PYTHON``.
 
     Raises:
-        UsageError: A name is unknown or there is no such Python.
+        UsageError: A name is unknown or the Python does not exist.
     """
     peers = []
     for value in values:
@@ -142,7 +142,7 @@ def _results(
 
 
 def _problem(problem: Problem, frame: Frame, part: tuple[int, ...]) -> Iterator[tuple[str, Any]]:
-    """The arrays of every level, under names that end in its number."""
+    """The arrays of every level, under names ending in the level's number."""
     group, chains = problem.refiner.group_of(part), [problem.refiner.refinements[index] for index in part]
     modules, coarse = group.modules([frame.garments[index] for index in part])
     yield "levels", np.array(len(group.levels))
