@@ -234,7 +234,11 @@ def _motion(
     def read(time: float) -> np.ndarray:
         return weld.joined(place(points.read(time)[0], to_metres(prim, metres, time)))
 
-    pace = {"frame": FrameGrid.of(stage).length, "seconds": 1.0 / stage.GetTimeCodesPerSecond()}
+    pace: dict[str, Any] = {
+        "edges": weld.mesh.half_edges.edges,
+        "frame": FrameGrid.of(stage).length,
+        "seconds": 1.0 / stage.GetTimeCodesPerSecond(),
+    }
     return CageMotion(times, read, **pace) if times else None
 
 
