@@ -398,7 +398,8 @@ def paired_row(scene: str, fabric: str, *, frames: int, guide: float) -> list[st
     truth = np.array(list(simulated(stage, values, LEVEL, frames=frames)))
     cages = truth[:, kept_from_cage(level.from_coarse)]
     refiner = Refiner(Scene((garment_of(stage, LEVEL),), GRAVITY), SolveSettings())
-    motion = CageMotion([*map(float, range(len(cages)))], lambda n: cages[int(n)], frame=1.0, seconds=1.0 / RATE)
+    times, edges = [*map(float, range(len(cages)))], garment_of(stage, LEVEL).mesh.half_edges.edges
+    motion = CageMotion(times, lambda time: cages[int(time)], edges=edges, frame=1.0, seconds=1.0 / RATE)
     felt = [motion.felt(float(n), cage) for n, cage in enumerate(cages)]
     each = zip(cages, felt, strict=True)
     given = [Frame(float(n), (GarmentFrame(c, values, guide=guide, acceleration=a),)) for n, (c, a) in enumerate(each)]

@@ -8,6 +8,7 @@ takes seconds, nothing can be asked; the handler ends the process there.
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import sys
@@ -106,13 +107,23 @@ def leave_if_asked() -> None:
 
 @contextmanager
 def importing() -> Iterator[None]:
-    """Let a noted signal end the process inside the block: imports take too long to wait for, and break when left."""
+    """Let a noted signal end the process inside the block: imports take too long to wait for, and break when left.
+
+    The garbage collector waits meanwhile. If the program froze its objects before, as the command does, it freezes the
+    imported ones too: torch has a million objects, which live as long as the process.
+    """
     leave_if_asked()
     _SIGNALS.importing += 1
+    collects = gc.isenabled()
+    gc.disable()
     try:
         yield
     finally:
         _SIGNALS.importing -= 1
+        if gc.get_freeze_count():
+            gc.freeze()
+        if collects:
+            gc.enable()
 
 
 @contextmanager

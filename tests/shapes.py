@@ -59,10 +59,12 @@ def _promise_of(function: FunctionType) -> tuple[Callable[..., Any], list[Any]]:
     signature = inspect.signature(function)
     bare = [each.replace(annotation=empty, default=empty) for each in signature.parameters.values()]
     bare = signature.replace(parameters=bare, return_annotation=inspect.Signature.empty)
-    scope: dict[str, Any] = {**function.__globals__, "results": (results := [])}
+    # A module that the start of a command pays for imports Tensor for type checkers alone.
+    scope: dict[str, Any] = {"Tensor": Tensor, **function.__globals__, "results": (results := [])}
     exec(f"def promise{bare}: return results.pop()", scope)
     promise = scope["promise"]
-    promise.__annotations__, promise.__qualname__ = function.__annotations__, function.__qualname__
+    promise.__annotations__ = {name: hint for name, hint in function.__annotations__.items() if "Tensor" in str(hint)}
+    promise.__qualname__ = function.__qualname__
     promise.__defaults__, promise.__kwdefaults__ = function.__defaults__, function.__kwdefaults__
     return jaxtyped(typechecker=beartype)(promise), results
 

@@ -259,6 +259,8 @@ def test_a_missing_library_is_told_with_its_package(monkeypatch: pytest.MonkeyPa
     for name in [name for name in sys.modules if name.startswith("physgraph_usd.lab.chart")]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, missing, None)
-    result = CliRunner().invoke(cli.main, ["chart", "shot.usda", "-o", str(tmp_path / "out")])
+    shot = tmp_path / "shot.usda"
+    shot.touch()
+    result = CliRunner().invoke(cli.main, ["chart", str(shot), "-o", str(tmp_path / "out")])
     assert result.exit_code == 1
     assert result.stderr == f"error: {missing} is not installed: pip install {missing}\n"

@@ -252,7 +252,9 @@ class TestErrors:
     def test_missing_package_is_named(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
         monkeypatch.delitem(sys.modules, "physgraph_usd.shot.page.preview", raising=False)
         monkeypatch.setitem(sys.modules, "PIL", None)
-        result = run("preview", "a.usdc", "-o", tmp_path / "x.png")
+        layer = tmp_path / "a.usdc"
+        layer.touch()
+        result = run("preview", layer, "-o", tmp_path / "x.png")
         assert result.exit_code == 1
         assert "pip install pillow" in result.stderr
 

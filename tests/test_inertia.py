@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,7 +23,7 @@ from physgraph_usd.solver.scene import Frame
 from physgraph_usd.usd.read.motion import FRAMES, CageMotion
 from physgraph_usd.usd.read.reader import open_shot
 
-PACE = {"frame": 1.0, "seconds": 1.0 / 24.0}
+PACE: dict[str, Any] = {"edges": np.zeros((0, 2), np.int64), "frame": 1.0, "seconds": 1.0 / 24.0}
 
 
 def along_x(*sizes: float) -> np.ndarray:
@@ -99,6 +100,24 @@ def test_a_broken_sample_is_not_felt_beside_it() -> None:
     assert all(at(motion, path, time) is None for time in range(13))
 
 
+def test_a_cage_that_has_stopped_is_not_felt() -> None:
+    """It is slowed by 30 m/s^2 until frame 6, and stands from there on."""
+    path = -15.0 * (np.maximum(6.0 - np.arange(13.0), 0.0) * PACE["seconds"]) ** 2
+    motion = motion_of(path)
+    times = [time for time in range(13) if at(motion, path, time) is not None]
+    assert times[:4] == [0, 1, 2, 3]
+    assert times[-1] <= 6
+
+
+def test_single_vertices_that_shake_are_not_felt() -> None:
+    """A cage of 21 x 21 vertices, one of which shakes with a period of four frames, at 35 m/s^2."""
+    mesh, flat = sheet(20, 20)
+    shaken = [flat + 0.06 * np.sin(0.5 * np.pi * time) * (np.arange(len(flat)) == 220)[:, None] for time in range(13)]
+    given: dict[str, Any] = PACE | {"edges": mesh.half_edges.edges}
+    motion = CageMotion([*map(float, range(13))], lambda time: shaken[int(time)], **given)
+    assert all(motion.felt(float(time), points) is None for time, points in enumerate(shaken))
+
+
 def test_samples_of_motion_blur_do_not_amplify_noise() -> None:
     times = np.sort(np.concatenate([np.arange(9.0), np.arange(9.0) + 0.1]))
     path = 1e-3 * np.random.default_rng(0).normal(size=len(times))
@@ -170,18 +189,18 @@ def radius(layer: Path, time: float) -> float:
 
 
 def test_a_fast_spin_draws_cloth_outwards_and_the_report_says_so(tmp_path: Path) -> None:
-    """Two turns a second at 0.3 m are 4.8 times gravity, 4.4 over chords of two frames."""
+    """Two turns a second at 0.3 m are 4.8 times gravity, 4.2 over chords and neighbours."""
     found = {}
     for name, overrides, inertia in (("on", (), 1.0), ("half", ("inertia=0.5",), 1.0), ("off", (), 0.0)):
         shot = spinning(tmp_path / f"{name}.usda", 2.0, inertia=inertia)
         given = RefineOptions(level=1, overrides=overrides)
         found[name] = refine_shot(shot, tmp_path / f"{name}.usdc", given), radius(tmp_path / f"{name}.usdc", 5.0)
-    free = 3.4 * GRAVITY * 0.187 / 2000.0  # The ring's own tension holds it back.
+    free = 3.2 * GRAVITY * 0.187 / 2000.0  # The ring's own tension holds it back.
     assert 0.2 * free < found["on"][1] - found["off"][1] < free
     assert found["off"][1] < found["half"][1] < found["on"][1]
     notes = [note for note in found["on"][0].notes if note.startswith("inertia")]
     assert len(notes) == 1
-    assert "3.4 times gravity" in notes[0]
+    assert "3.2 times gravity" in notes[0]
     assert not [note for note in found["off"][0].notes if note.startswith("inertia")]
 
 

@@ -141,13 +141,13 @@ def test_a_prim_that_is_not_there_is_reported_too(tmp_path: Path):
 
 @pytest.mark.parametrize("debug", [True, False])
 @pytest.mark.parametrize("command", ["inspect", "validate"])
-def test_every_command_ends_with_a_line(monkeypatch: pytest.MonkeyPatch, command: str, debug: bool):
+def test_every_command_ends_with_a_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str, debug: bool):
     def fail(*_: object, **__: object) -> None:
         raise KeyError("a bug")
 
     monkeypatch.setattr("physgraph_usd.shot.refine.inspect_shot", fail)
     monkeypatch.setattr("physgraph_usd.usd.check.validate.validate_layer", fail)
-    done = run(command, "shot.usda", *["--debug"] * debug)
+    done = run(command, cloth_shot(tmp_path / "shot.usda"), *["--debug"] * debug)
     assert (done.exit_code, done.stdout) == (1, "")
     assert done.stderr.splitlines()[-1].startswith("error: unexpected KeyError: 'a bug' (cli/commands.py, line ")
     assert ("Traceback" in done.stderr, len(done.stderr.splitlines()) > 1) == (debug, debug)

@@ -1,4 +1,4 @@
-"""The console command: each subcommand declares its options, imports its work and makes one call.
+"""The console command: each subcommand declares options, imports the work and makes a single call.
 
 Data goes to stdout; progress, warnings and errors go to stderr.
 Exit codes: 0 done, 1 the work failed, 2 wrong usage, 3 done in part, 130 interrupted, 143 terminated.

@@ -19,6 +19,7 @@ from ..solver.fabric import PRESETS
 from .options import (
     config_option,
     json_option,
+    layer_argument,
     of_field,
     out_option,
     overwrite_option,
@@ -115,10 +116,10 @@ def inspect(ctx: click.Context, shot: str, *, as_json: bool, timed: bool, detail
     from .inspected import details, summary
 
     values, _ = values_for(ctx, shot, refine)
-    found = inspect_shot(shot, timed=timed, **{name: values[name] for name in options if name != "config"})
-    lines = [*summary(found), *(["", *details(found)] if detailed else [])]
-    click.echo(to_json(found) if as_json else "\n".join(lines))
-    sys.exit(found.get("exit_code", DONE))
+    plan = inspect_shot(shot, timed=timed, **{name: values[name] for name in options if name != "config"})
+    lines = [*summary(plan), *(["", *details(plan)] if detailed else [])]
+    click.echo(to_json(plan) if as_json else "\n".join(lines))
+    sys.exit(plan.get("exit_code", DONE))
 
 
 @click.command()
@@ -198,7 +199,7 @@ def tune(shot: str, *, port: int, **options: Any) -> None:
 
 
 @click.command()
-@click.argument("layer", type=click.Path(dir_okay=False))
+@layer_argument
 @click.option(
     "--shot", type=click.Path(dir_okay=False), help="The shot below the layer.  [default: the shot named in the layer]"
 )
@@ -235,7 +236,7 @@ def sample(name: str, out: Path, *, overwrite: bool) -> None:
 
 
 @click.command()
-@click.argument("layer", type=click.Path(dir_okay=False))
+@layer_argument
 @out_option("PNG|GIF", "Picture to write.")
 @click.option(
     "--shot", type=click.Path(dir_okay=False), help="The coarse shot.  [default: the shot named in the layer]"

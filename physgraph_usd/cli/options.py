@@ -1,4 +1,4 @@
-"""Options of commands as click takes them: those of `RefineOptions`, and those of runs of the command alone."""
+"""Options of commands as click declares them: the fields of `RefineOptions`, and options of the command line alone."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .structure import Option
 from .types import FRAME_RANGE, LEVEL, REST
 
 SHOW_HEADINGS = ("Scene", "Solver", "Layer")
-"""Headings of the options that a show's file may give, too: they belong to no single run."""
+"""Headings of the options also allowed in a show's file: options not tied to a single run."""
 HEADINGS = ("Files", *SHOW_HEADINGS, "Several shots, and runs that were interrupted", "Many machines")
 """Headings of the options of `RefineOptions`, in the order of the help."""
 Decorator = Callable[[Callable[..., None]], Callable[..., None]]
@@ -30,8 +30,17 @@ def _words(ctx: click.Context, param: click.Parameter, values: tuple[str, ...]) 
     return tuple(word for value in values for word in value.split())
 
 
+def _existing(ctx: click.Context, param: click.Parameter, path: str) -> str:
+    """Refuse a missing file before the command imports libraries; "-" is standard input."""
+    from ..usd.resolve import check_there
+
+    if path != "-":
+        check_there(path)
+    return path
+
+
 def _type_of(name: str) -> click.ParamType | type:
-    """Function that turns text into the value of a field."""
+    """Function to turn text into the value of a field."""
     option, kind = OPTIONS[name], str(_FIELDS[name].type).removesuffix(" | None")
     if name in _TYPES:
         return _TYPES[name]
@@ -47,23 +56,23 @@ def of_field(name: str, **settings: Any) -> Decorator:
 
     Args:
         name: The field.
-        settings: What click is told otherwise.
+        settings: Further arguments for `click.option`, replacing the field's.
     """
     option, default = OPTIONS[name], _FIELDS[name].default
     flag = "--" + (option.flag or name.replace("_", "-"))
-    known: dict[str, Any] = {"help": option.help, "heading": option.heading, "default": default}
+    declaration: dict[str, Any] = {"help": option.help, "heading": option.heading, "default": default}
     if isinstance(default, bool):
         flag += f"/--no-{flag.removeprefix('--')}" if default else ""
-        known |= {"is_flag": True}
+        declaration |= {"is_flag": True}
     else:
-        known |= {"type": _type_of(name), "metavar": option.metavar, "multiple": default == ()}
+        declaration |= {"type": _type_of(name), "metavar": option.metavar, "multiple": default == ()}
     if name in ("garments", "colliders"):
-        known |= {"callback": _words}
-    return click.option(flag, name, cls=Option, **known | settings)
+        declaration |= {"callback": _words}
+    return click.option(flag, name, cls=Option, **declaration | settings)
 
 
 def together(*options: Decorator) -> Decorator:
-    """A decorator that declares several options in order."""
+    """A decorator to declare several options in order."""
 
     def apply(function: Callable[..., None]) -> Callable[..., None]:
         for option in reversed(options):
@@ -81,7 +90,8 @@ def under(heading: str) -> Decorator:
 _files, *_, _batch, _farm, _messages = (
     partial(click.option, cls=Option, heading=heading) for heading in (*HEADINGS, "Messages")
 )
-shot_argument = click.argument("shot", type=click.Path(dir_okay=False))
+shot_argument = click.argument("shot", type=click.Path(dir_okay=False), callback=_existing)
+layer_argument = click.argument("layer", type=click.Path(dir_okay=False), callback=_existing)
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 overwrite_option = of_field("overwrite")
 scene_options = under("Scene")
@@ -127,11 +137,11 @@ run_options = together(
 
 
 def out_option(metavar: str, help_text: str, *, required: bool = True) -> Decorator:
-    """Declare ``-o``, where a command writes.
+    """Declare ``-o``, the output of a command.
 
     Args:
-        metavar: What the help shows for the value.
+        metavar: Placeholder for the value in the help.
         help_text: The option's line in the help.
-        required: Whether it must be there.
+        required: Whether the option is required.
     """
     return _files("-o", "--out", required=required, type=_PATH, metavar=metavar, help=help_text)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from ..shot.stitch import Seam
 
 MOST_LISTED = 8
-"""Longest list of numbers that is printed in full."""
+"""Longest list of numbers printed in full."""
 LOGGER = "physgraph_usd"
 _LEVELS = (NOTICE, logging.INFO, logging.DEBUG)
 _CLEAR_LINE = "\r\033[K"
@@ -31,16 +31,16 @@ _LOGGED = re.compile(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d,\d{3} [A-Z]+ .*: ")
 
 @dataclass(frozen=True)
 class Output:
-    """How much a command prints, and where.
+    """Output of a command: amount, form and destination.
 
     Attributes:
-        verbose: 0 warnings, 1 each frame too, 2 what was measured in it too.
+        verbose: 0 warnings, 1 each frame too, 2 the frame's measurements too.
         log_file: A file to append to, with each frame at least, or None.
         in_lines: Print progress in lines, into files and pipes too.
         several: Name the shot in each line.
-        openjd: Print progress in the lines that OpenJD reads.
+        openjd: Print progress in lines for OpenJD.
         quiet: Print errors alone on stderr.
-        as_json: Print one summary of all shots as JSON on stdout, in place of the layers' paths.
+        as_json: Print a summary of all shots as JSON on stdout, in place of the layers' paths.
     """
 
     verbose: int = 0
@@ -53,17 +53,17 @@ class Output:
 
     def __post_init__(self) -> None:
         """Refuse (UsageError) to print more and less at once."""
-        more = {"--verbose": self.verbose > 0, "--progress": self.in_lines, "--openjd": self.openjd}
-        if self.quiet and any(more.values()):
-            raise UsageError(f"--quiet and {next(name for name in more if more[name])} exclude each other; give one")
+        wordy = {"--verbose": self.verbose > 0, "--progress": self.in_lines, "--openjd": self.openjd}
+        if self.quiet and any(wordy.values()):
+            raise UsageError(f"--quiet and {next(name for name in wordy if wordy[name])} exclude each other; give one")
 
     @contextmanager
     def logged(self) -> Iterator[None]:
-        """Bring what the package logs to stderr and into the file; an error that ends the block only into the file.
+        """Send the package's log to stderr and into the file; an error ending the block goes only into the file.
 
         Raises:
             OSError: The file cannot be written.
-            UsageError: The file is a link, or there already and no log.
+            UsageError: The file is a link, or exists and is no log.
         """
         from ..usd.write.atomic import check_no_link
 
@@ -97,7 +97,7 @@ class Output:
 
     @contextmanager
     def progress(self, label: str) -> Iterator[Callable[[int, int], None]]:
-        """A bar of finished frames, on a terminal alone, or lines of them."""
+        """A bar of finished frames, only on a terminal, or progress in lines."""
         hidden = self.quiet or self.in_lines or self.openjd or self.verbose > 0 or not sys.stderr.isatty()
         with click.progressbar(length=1, label=label, file=sys.stderr, hidden=hidden) as bar:
 
@@ -114,7 +114,7 @@ class Output:
 
 
 class _OnStderr(logging.Handler):
-    """Warnings and errors by their names, the rest as it is."""
+    """Warnings and errors with the level's name, other messages unchanged."""
 
     def __init__(self, level: int, several: bool) -> None:
         super().__init__(level)
@@ -128,24 +128,24 @@ class _OnStderr(logging.Handler):
 
 
 class _IntoFile(logging.FileHandler):
-    """The log; a disk that fills up ends the log and not the run."""
+    """The log; a full disk ends the log, not the run."""
 
     _full = False
 
     def handleError(self, record: logging.LogRecord) -> None:
-        """Say once that the log ends here; called by `logging`."""
+        """Report once the end of the log; called by `logging`."""
         if not self._full:
             self._full = True
             say(f"warning: cannot write {self.baseFilename}: {sys.exc_info()[1]}; the log ends here", err=True)
 
     def close(self) -> None:
-        """Close the file, whatever became of it."""
+        """Close the file, after an error too."""
         with suppress(OSError):
             super().close()
 
 
 def _check_log(file: Path) -> None:
-    """Refuse (UsageError) to append to a file that does not begin with a line of a log."""
+    """Refuse (UsageError) to append to a file without a log line at the beginning."""
     if not file.is_file() or not file.stat().st_size:
         return
     with file.open(encoding="utf-8", errors="replace") as stream:
@@ -154,7 +154,7 @@ def _check_log(file: Path) -> None:
 
 
 def say(text: str, *, err: bool = False) -> None:
-    """Print a line, on a terminal in place of a progress bar that is there; one that is gone costs the line alone."""
+    """Print a line, on a terminal over the progress bar, if any; a closed stream loses the line only."""
     if err and sys.stderr.isatty():
         text = _CLEAR_LINE + text
     try:
@@ -164,19 +164,19 @@ def say(text: str, *, err: bool = False) -> None:
 
 
 def _to_nowhere(stream: TextIO) -> None:
-    """Let what is still to be printed go nowhere, so that Python's own flush at the end does not fail either."""
+    """Discard pending output: Python's own flush at the end would fail too."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, stream.fileno())
     os.close(nowhere)
 
 
 def print_progress(part: float, seconds: float, what: str) -> None:
-    """One line of progress on stderr.
+    """Print a line of progress on stderr.
 
     Args:
-        part: How much is done, 1 for all.
-        seconds: How long the rest may take [s].
-        what: What is done.
+        part: Finished fraction, 1 for all.
+        seconds: Estimated remaining time [s].
+        what: Name of the work.
     """
     say(f"{part:4.0%}  {_left(seconds):20s}  {what}", err=True)
 

@@ -1,4 +1,4 @@
-"""``refine``: one shot in this process, or several shots in a process each, with a summary of all."""
+"""``refine``: a single shot in this process, or several shots in a process each, with a summary of all."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 USD_SUFFIXES = (".usd", ".usda", ".usdc")
 RENAMED = {"run-up": "preroll"}
-"""Names that options had before, without dashes; they still work and are in no help."""
+"""Former names of options, without dashes; accepted, but not in the help."""
 
 
 @click.command(cls=GroupedCommand, context_settings={"token_normalize_func": lambda name: RENAMED.get(name, name)})
@@ -47,15 +47,18 @@ def refine(
     printed last, on stderr. Exits with 0 if all is done, 1 if all failed, 2 for wrong usage, 3 if a part failed.
     """
     with signals_noted():
+        jobs = _jobs(ctx, shots, out)
+        _check_files(ctx, jobs, out)
         with imports_uncollected():
             from ..shot.finished import check_jobs
 
-        jobs = _jobs(ctx, shots, out)
         layers = [layer for _, layer, _ in jobs]
         verbose, log_file, in_lines = (ctx.params[name] for name in ("verbose", "log_file", "progress"))
         flags = {name: ctx.params[name] for name in ("openjd", "quiet", "as_json")}
         output = Output(verbose, log_file, in_lines, several=len(jobs) > 1, **flags)
-        also = [(what, file) for what, file in (("the summary", summary), ("the log", log_file)) if file is not None]
+        also = [
+            (result, file) for result, file in (("the summary", summary), ("the log", log_file)) if file is not None
+        ]
         if also:
             check_jobs(jobs, also=also)
         with _folder_of(layers, out, dry_run=dry_run), output.logged():
@@ -96,13 +99,32 @@ def _jobs(ctx: click.Context, shots: tuple[str, ...], out: Path) -> list[Job]:
     return jobs
 
 
+def _check_files(ctx: click.Context, jobs: Sequence[Job], out: Path) -> None:
+    """Check the options, input file and output folder of a single shot before numpy, USD and torch are imported.
+
+    A run recording a failure in a file or as JSON makes the same checks later, and so does a run of several shots.
+    """
+    for _, _, options in jobs:
+        options.check()
+    (shot, layer, options), *further = jobs
+    recorded = any(ctx.params[name] for name in ("report", "summary", "log_file", "as_json", "openjd"))
+    if further or recorded or (options.skip_existing and layer.is_file()):
+        return
+    from ..usd.resolve import check_there
+    from ..usd.write.atomic import check_folder_of
+
+    check_there(shot)
+    if layer == out and not options.dry_run:
+        check_folder_of(layer)
+
+
 def _each_or_none(shots: tuple[str, ...], to: Path | None, option: str, **known: Any) -> Sequence[Path | None]:
     """One output file per shot, as in `_one_each`; None for each shot without the option."""
     return [None] * len(shots) if to is None else _one_each(shots, to, option, **known)
 
 
 def _refine_each(jobs: Sequence[Job], output: Output, *, summary: Path | None) -> int:
-    """Refine the jobs and say of each what became of it; returns the exit code."""
+    """Refine the jobs and report the result of each; returns the exit code."""
     from ..shot.finished import results
     from ..shot.summary import check_summary, exit_code_of, row_of
 
@@ -112,8 +134,8 @@ def _refine_each(jobs: Sequence[Job], output: Output, *, summary: Path | None) -
     failed: list[PhysGraphError] = []
 
     def interrupted(code: int) -> None:
-        left = [row_of(shot, layer, None) for shot, layer, _ in jobs[len(rows) :]]
-        _summarise([*rows, *left], output, summary, exit_code=code)
+        unfinished = [row_of(shot, layer, None) for shot, layer, _ in jobs[len(rows) :]]
+        _summarise([*rows, *unfinished], output, summary, exit_code=code)
 
     try:
         with at_end(interrupted):
@@ -138,7 +160,7 @@ def _refine_each(jobs: Sequence[Job], output: Output, *, summary: Path | None) -
 
 
 def _summarise(rows: Sequence[Row], output: Output, summary: Path | None, *, exit_code: int) -> None:
-    """Print and write what became of all shots."""
+    """Print and write the results of all shots."""
     from ..shot.summary import json_of, table_of, write_summary
 
     if output.as_json:
@@ -150,7 +172,7 @@ def _summarise(rows: Sequence[Row], output: Output, summary: Path | None, *, exi
 
 
 def _print_failed(rows: Sequence[Row]) -> None:
-    """Print which shots failed and why."""
+    """Print the failed shots with the reasons."""
     failed = [row for row in rows if row.error]
     for row in failed:
         logging.getLogger(LOGGER).error(row.error, extra={"shot": row.shot})
@@ -159,7 +181,7 @@ def _print_failed(rows: Sequence[Row]) -> None:
 
 
 def _solved(jobs: Sequence[Job], output: Output) -> Generator[RefineReport | PhysGraphError, None, None]:
-    """Result of each job: one in this process, several in processes of their own."""
+    """Result of each job: a single job in this process, several in separate processes."""
     if not jobs:
         return
     from ..shot.processes import import_ahead
@@ -183,7 +205,7 @@ def _solved(jobs: Sequence[Job], output: Output) -> Generator[RefineReport | Phy
 
 
 def _refine_logged(*job: Any, output: Output, alone: bool) -> RefineReport:
-    """Refine a shot in a process of its own, which logs for itself."""
+    """Refine a shot in a separate process with a separate log."""
     with output.logged():
         return _refine_shown(*job, output=output, alone=alone)
 
@@ -191,7 +213,7 @@ def _refine_logged(*job: Any, output: Output, alone: bool) -> RefineReport:
 def _refine_shown(
     shot: str | Path, layer: Path, options: RefineOptions, *, output: Output, alone: bool = True
 ) -> RefineReport:
-    """Refine a shot, with a progress bar if no other shot is refined beside it."""
+    """Refine a shot, with a progress bar if no shots are refined in parallel."""
     with imports_uncollected():
         from ..shot.refine import refine_shot
 
@@ -206,8 +228,10 @@ def _one_each(shots: tuple[str, ...], to: Path, option: str, *, suffix: str, acc
             raise UsageError(f"{option} {to} is one file for {len(shots)} shots; give a folder")
         return [to]
     if to.suffix and not to.is_dir():
-        known = ", ".join(accepts)
-        raise UsageError(f"{option} {to}: unknown suffix '{to.suffix}'; known: {known}; or make a folder of that name")
+        suffixes = ", ".join(accepts)
+        raise UsageError(
+            f"{option} {to}: unknown suffix '{to.suffix}'; known: {suffixes}; or make a folder of that name"
+        )
     if not suffix and len(shots) == 1:
         return [to]
     files = [to / (Path(shot).stem + suffix) for shot in shots]
@@ -221,22 +245,22 @@ def _one_each(shots: tuple[str, ...], to: Path, option: str, *, suffix: str, acc
 def _folder_of(layers: Sequence[Path], out: Path, *, dry_run: bool) -> Iterator[None]:
     """Create the layers' folder unless ``out`` names a layer, and remove the folder if no layer was written.
 
-    After an interruption or an error, print where finished frames are kept.
+    After an interruption or an error, print the folders of finished frames.
     """
     from ..shot.frames import kept_for
 
-    made = [] if out in layers or dry_run else [each for each in (out, *out.parents) if not each.exists()]
+    missing = [] if out in layers or dry_run else [folder for folder in (out, *out.parents) if not folder.exists()]
 
     def leave(_code: int = DONE) -> None:
         for frames in filter(None, map(kept_for, layers)):
             say(str(frames), err=True)
-        for folder in made:
+        for folder in missing:
             with suppress(OSError):
                 folder.rmdir()
 
     try:
         try:
-            for folder in reversed(made):
+            for folder in reversed(missing):
                 folder.mkdir()
         except OSError as error:
             raise LayerError(f"cannot make the folder {out}: {error.strerror}") from error

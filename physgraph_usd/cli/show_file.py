@@ -26,30 +26,30 @@ NAME, VARIABLE, TABLE = "physgraph.toml", "PHYSGRAPH_CONFIG", "refine"
 
 
 def find_show_file(shot: str, config: Path | None) -> Path | None:
-    """The file that was named, that the environment names, or the first one in the folders above a shot."""
+    """The file named by the option or by the environment, or else the first in the folders above a shot."""
     named = config or (Path(os.environ[VARIABLE]) if os.environ.get(VARIABLE) else None)
     above = (folder / NAME for folder in Path(shot).absolute().parents)
     return named or next((file for file in above if file.is_file()), None)
 
 
 def values_for(ctx: click.Context, shot: str, known: click.Command) -> tuple[dict[str, Any], dict[str, str]]:
-    """Values that a command was given for a shot: on the command line, else by the show's file, else by default.
+    """Values of a command's options for a shot: from the command line, the show's file, or the defaults, in this order.
 
     Args:
         ctx: The command's context.
         shot: The shot.
-        known: The command whose options the file may hold; those that ``ctx``'s command has not are left alone.
+        known: Command defining the keys of the file; options missing in ``ctx``'s command are ignored.
 
     Returns:
-        Values by the options' names in Python, and where each is from.
+        Values by the options' names in Python, and the source of each.
 
     Raises:
-        UsageError: The file cannot be read, has a key that is no option, or a value that the option does not take.
+        UsageError: The file cannot be read, has an unknown key, or a value invalid for the option.
     """
     file = find_show_file(shot, ctx.params.get("config"))
     table = {} if file is None else _read(file, known)
     values, sources = {}, {}
-    for param in (each for each in ctx.command.params if each.expose_value):
+    for param in (parameter for parameter in ctx.command.params if parameter.expose_value):
         name, key = str(param.name), _key(param)
         if ctx.get_parameter_source(name) not in (ParameterSource.DEFAULT, None):
             values[name], sources[name] = ctx.params[name], "command line"
@@ -65,8 +65,8 @@ def _key(param: click.Parameter) -> str:
     return max(param.opts, key=len).lstrip("-")
 
 
-def _read(file: Path, known: click.Command) -> Mapping[str, Any]:
-    """The table of a file, whose keys are all options."""
+def _read(file: Path, command: click.Command) -> Mapping[str, Any]:
+    """The table of a file, with option names as keys."""
     if file.exists() and not file.is_file():
         raise UsageError(f"cannot read {file}: it is a folder or a pipe, and no file")
     try:
@@ -77,34 +77,34 @@ def _read(file: Path, known: click.Command) -> Mapping[str, Any]:
     table = tables.get(TABLE, {})
     if not isinstance(table, dict):
         raise UsageError(f"{file}: {TABLE} is no table; write [{TABLE}]")
-    options = [each for each in known.params if isinstance(each, Option)]
-    names = [_key(each) for each in options if each.heading in SHOW_HEADINGS]
-    for key in sorted({_key(each) for each in options if each.heading not in SHOW_HEADINGS} & set(table)):
+    options = [parameter for parameter in command.params if isinstance(parameter, Option)]
+    names = [_key(option) for option in options if option.heading in SHOW_HEADINGS]
+    for key in sorted({_key(option) for option in options if option.heading not in SHOW_HEADINGS} & set(table)):
         raise UsageError(f"{file}: {key} is of one run; give it on the command line")
     _check_names(file, "key", table, names)
     return table
 
 
-def _check_names(file: Path, what: str, found: Mapping[str, Any], known: list[str]) -> None:
-    for name in found:
-        if name not in known:
-            near = difflib.get_close_matches(name, known, n=1)
-            meant = f"did you mean {near[0]}?" if near else f"known: {', '.join(sorted(known))}"
-            raise UsageError(f"{file}: unknown {what} '{name}'; {meant}")
+def _check_names(file: Path, kind: str, names: Mapping[str, Any], allowed: list[str]) -> None:
+    for name in names:
+        if name not in allowed:
+            near = difflib.get_close_matches(name, allowed, n=1)
+            meant = f"did you mean {near[0]}?" if near else f"known: {', '.join(sorted(allowed))}"
+            raise UsageError(f"{file}: unknown {kind} '{name}'; {meant}")
 
 
 def _converted(ctx: click.Context, param: click.Parameter, value: Any, *, file: Path) -> Any:
-    """A value of the file as the command line would give it; a path is seen from the file's folder."""
+    """A value of the file, converted like a command-line value; a path is relative to the file's folder."""
     key = _key(param)
     try:
         if isinstance(param, click.Option) and param.is_flag:
             return _checked(value, bool, "true or false")
         if param.multiple:
-            return param.type_cast_value(ctx, [str(each) for each in _checked(value, list, "a list")])
-        found = param.type_cast_value(ctx, str(_checked(value, (str, int, float), "a text or a number")))
+            return param.type_cast_value(ctx, [str(item) for item in _checked(value, list, "a list")])
+        converted = param.type_cast_value(ctx, str(_checked(value, (str, int, float), "a text or a number")))
     except (click.BadParameter, TypeError) as error:
         raise UsageError(f"{file}: {key}: {getattr(error, 'message', error)}") from error
-    return file.parent / found if isinstance(found, Path) else found
+    return file.parent / converted if isinstance(converted, Path) else converted
 
 
 def _checked(value: Any, kind: type | tuple[type, ...], words: str) -> Any:

@@ -1,4 +1,4 @@
-"""Common parts of commands: exit codes, errors as one line on stderr, help in groups."""
+"""Common parts of commands: exit codes, errors as a line on stderr, help in groups."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ DEBUG = "physgraph_usd.debug"
 
 
 class Commands(click.Group):
-    """A group whose commands end with ``error: ...`` and the error's exit code; a traceback only with ``--debug``."""
+    """A group of commands ending with ``error: ...`` and the error's exit code; a traceback only with ``--debug``."""
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run the chosen command; whatever it raises becomes one line on stderr."""
+        """Run the chosen command; an exception becomes a line on stderr."""
         _open_closed_streams()
         try:
             with errors_named():
@@ -69,7 +69,7 @@ def _debug_option() -> click.Option:
 
 @contextmanager
 def errors_named() -> Iterator[None]:
-    """Convert exceptions, other than click's and that of a closed pipe, to errors with one line for the user.
+    """Convert exceptions, except click's and a closed pipe's, to errors with a line for the user.
 
     Raises:
         PhysGraphError: The block raised an exception.
@@ -107,14 +107,10 @@ def _open_closed_streams() -> None:
 
 @contextmanager
 def imports_uncollected() -> Iterator[None]:
-    """Keep the garbage collector from torch's million objects, which live as long as the process: 3 s become 2."""
-    gc.disable()
-    try:
-        with importing():
-            yield
-    finally:
-        gc.freeze()
-        gc.enable()
+    """Import modules without garbage collection, and freeze the imported objects, in later `importing` blocks too."""
+    gc.freeze()
+    with importing():
+        yield
 
 
 def _leave(ctx: click.Context, message: str, code: int) -> Never:
@@ -123,20 +119,20 @@ def _leave(ctx: click.Context, message: str, code: int) -> Never:
 
 
 class Option(click.Option):
-    """An option that the help shows under a heading.
+    """An option with a heading in the help.
 
     Attributes:
         heading: The heading.
     """
 
     def __init__(self, *args: Any, heading: str = "Options", **settings: Any) -> None:
-        """Declare it, as `click.Option` is declared."""
+        """Declare the option, as in `click.Option`."""
         super().__init__(*args, **settings)
         self.heading = heading
 
 
 class GroupedCommand(click.Command):
-    """A command with help that groups options by heading, in order of declaration."""
+    """A command with options grouped by heading in the help, in order of declaration."""
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the options into the help."""

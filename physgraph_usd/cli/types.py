@@ -1,4 +1,4 @@
-"""Values of the command line's options that click has no type for."""
+"""Types of command-line values missing in click."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ _RANGE = re.compile(r"(-?[\d.]+)-(-?[\d.]+)")
 
 
 class Text(click.ParamType):
-    """A parameter parsed by a function, whose ValueError is the message to the user."""
+    """A parameter parsed by a function; the function's ValueError is the message to the user."""
 
     def __init__(self, name: str, read: Callable[[str], Any]) -> None:
         """Take the type's name and the function."""
         self.name, self._read = name, read
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Turn the text into the value; what is no text is one already."""
+        """Turn a text into a value; other values are returned unchanged."""
         try:
             return self._read(value) if isinstance(value, str) else value
         except ValueError as error:
@@ -39,7 +39,7 @@ def _frame_range(text: str) -> tuple[float, float]:
 
 
 def _level(text: str) -> int | None:
-    """A number of subdivisions; -1 for ``auto``, None, the default, for a farm's parameter that was left empty."""
+    """A number of subdivisions; -1 for ``auto``; None, the default, for a farm's empty parameter."""
     if text in ("", "auto"):
         return -1 if text else None
     if not text.isdecimal():

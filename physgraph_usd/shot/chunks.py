@@ -135,8 +135,8 @@ def solve_in_chunks(
         return _await(stored, times[index], call=calls.get(index if seam is None else seam), solved=solved)
 
     def joined(own: Movers, seam: int, both: Both) -> Sequence[Outcome]:
-        known = result_of(calls[seam - 1]).get(seam) if seam - 1 in calls else None
-        joint = known or join(both, own)
+        finished = result_of(calls[seam - 1]).get(seam) if seam - 1 in calls else None
+        joint = finished or join(both, own)
         warn(*joint.warnings)
         return joint.frames
 
@@ -162,17 +162,19 @@ def _work(job: tuple[Any, ...], seams: Mapping[int, int], movers: Movers | None)
     if movers is None:
         return joints
     _, times, chunk, frames, _ = job
-    own, given = {index for part in chunk for index in part}, movers
+    numbers, chunk_movers = {index for part in chunk for index in part}, movers
 
     def read(index: int, seam: int | None) -> Any:
         return frames.read(index, times[index], seam=seam)
 
     def joined(seam: int, both: Both) -> Sequence[Outcome]:
-        joints[seam] = join(both, given)
+        joints[seam] = join(both, chunk_movers)
         return joints[seam].frames
 
     before = [
-        each for seam, each in _joined_at(seams).items() if own.issuperset(each) and all(read(k, seam) for k in each)
+        frames
+        for seam, frames in _joined_at(seams).items()
+        if numbers.issuperset(frames) and all(read(k, seam) for k in frames)
     ]
     deque(frames_in_order(read, chain(*before), seams, join=joined), maxlen=0)
     return joints

@@ -41,13 +41,13 @@ class Cuts:
 
     def __call__(self, records: Sequence[Mapping[str, Any]]) -> list[bool]:
         """For each garment, whether the cloth jumps to the last telemetry record, or was solved anew there."""
-        before, now = (list(record.get("garments", ())) for record in ({}, *records)[-2:])
+        before, current = (list(record.get("garments", ())) for record in ({}, *records)[-2:])
         return [
             records[-1]["time"] in jumps
             or _STARTED_ANEW in str(entry.get("start", ""))
             or "broken_before" in entry
-            or any("collapsed" in each or "not_solved" in each for each in (earlier, entry))
-            for jumps, earlier, entry in zip_longest(self._jumps, before[: len(now)], now, fillvalue={})
+            or any("collapsed" in telemetry or "not_solved" in telemetry for telemetry in (earlier, entry))
+            for jumps, earlier, entry in zip_longest(self._jumps, before[: len(current)], current, fillvalue={})
         ]
 
 
@@ -58,16 +58,16 @@ def jumps(opened: Shot, index: int) -> frozenset[float]:
     motion is no jump at any speed. If a shot has only two steps, the larger step is the jump.
     """
     ends, lasted, lengths, away = _steps(_samples(opened, index))
-    found = {end for end, time in zip(ends, lasted, strict=True) if time <= SAME_TIME}
+    jump_ends = {end for end, time in zip(ends, lasted, strict=True) if time <= SAME_TIME}
     if len(ends) < 2:
-        return frozenset(found)
+        return frozenset(jump_ends)
     least = JUMP * _mean_edge(opened, index)
     for step, end in enumerate(ends):
-        beside = [other for other in (step - 1, step + 1) if 0 <= other < len(ends)]
-        departs = lasted[step] * min(away[min(step, other)] for other in beside) > least
+        beside = [neighbour for neighbour in (step - 1, step + 1) if 0 <= neighbour < len(ends)]
+        departs = lasted[step] * min(away[min(step, neighbour)] for neighbour in beside) > least
         if departs and (len(beside) > 1 or lengths[step] > lengths[beside[0]]):
-            found.add(end)
-    return frozenset(found)
+            jump_ends.add(end)
+    return frozenset(jump_ends)
 
 
 def _samples(opened: Shot, index: int) -> Iterator[tuple[float, np.ndarray]]:
@@ -129,19 +129,19 @@ class Loop:
         if len(self._times) < _LEAST or not all(outcome.points for outcome in self._ends):
             return {}
         frames = [self._shot.frame(outcome.time) for outcome in self._ends]
-        found = {}
+        closing = {}
         for index, garment in enumerate(self._shot.scene.garments):
             gap = _apart(*(outcome.points[index] for outcome in self._ends))
             if gap > OPEN * mean_edge(garment) / 2 ** self._levels[index] and self._is_loop(index, frames):
-                found[garment.path] = gap
-        return found
+                closing[garment.path] = gap
+        return closing
 
     def _is_loop(self, index: int, frames: Sequence[Frame]) -> bool:
         """Whether a garment, by number, and its bodies are the same in the first and last frame and move on alike."""
         numbers = self._shot.scene.garments[index].colliders
         poses = [[frame.colliders[number] for number in numbers] for frame in frames]
-        ends = [[pose.points for pose in each if pose is not None] for each in poses]
-        ends = [[frame.garments[index].points, *each] for frame, each in zip(frames, ends, strict=True)]
+        ends = [[pose.points for pose in pair if pose is not None] for pair in poses]
+        ends = [[frame.garments[index].points, *bodies] for frame, bodies in zip(frames, ends, strict=True)]
         if len(ends[0]) != len(ends[1]) or not all(map(_is_closed, *ends)):
             return False
         second, last_but_one = (self._shot.cage(index, self._times[number]) for number in (1, -2))

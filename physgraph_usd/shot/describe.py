@@ -14,7 +14,6 @@ import numpy as np
 
 from ..errors import GarmentError, StageError, named_time
 from ..solver.fabric import Fabric
-from ..solver.integrate import LEARNED
 from ..solver.mesh.defects import defects, in_brief
 from ..solver.resolution import LevelChoice, choose_levels, sample_frames
 from ..solver.scene import Frame, Garment, GarmentFrame
@@ -29,7 +28,7 @@ from ..usd.times import within
 from ..usd.view import Stage
 from .estimate import cannot_fit, estimate
 from .notes import of_fabrics, of_slack, of_subsets, of_trims, preset_overrides
-from .options import RefineOptions, scene_words
+from .options import INTEGRATORS, RefineOptions, scene_words
 from .report import RefineReport, of_a_kind
 from .untagged import FAR, Candidate, find_candidates
 from .up_axis import across_gravity
@@ -61,25 +60,25 @@ def begin_report(report: RefineReport, opened: Shot, options: RefineOptions) -> 
     ]
     bound = sum(len(target.points) for target in opened.targets)
     report.estimate = estimate(opened.scene.garments, **_run(opened, report, options), bound=bound).plain()
-    known = _strained(opened, report, frames)
+    warnings = _strained(opened, report, frames)
     candidates = find_candidates(opened)
     report.candidates = {
-        each.path: f"{'taken' if each.is_taken else 'left'}: {each.reason}"
-        for each in candidates
-        if not each.reason.startswith(FAR)
+        candidate.path: f"{'taken' if candidate.is_taken else 'left'}: {candidate.reason}"
+        for candidate in candidates
+        if not candidate.reason.startswith(FAR)
     }
-    beside = [each for each in candidates if each.is_taken]
-    known += _unfelt(report, beside) if options.contact != "off" else []
-    known += of_unread(candidates) if options.contact != "off" else []
-    known += _across(opened, frames, beside)
-    follow = {each.path: each.follows for each in candidates if each.follows}
+    beside = [candidate for candidate in candidates if candidate.is_taken]
+    warnings += _unfelt(report, beside) if options.contact != "off" else []
+    warnings += of_unread(candidates) if options.contact != "off" else []
+    warnings += _across(opened, frames, beside)
+    follow = {candidate.path: candidate.follows for candidate in candidates if candidate.follows}
     slack = of_slack([garment.path for garment in opened.scene.garments], choices)
     report.note(*slack, *of_fabrics(opened.sources), *of_subsets(opened.sources), *of_trims(follow))
     report.modelled = _modelled(opened, report, options)
     report.left_out = _left_out(opened, report)
     report.variants = list(opened.selections)
     refined = {None, *opened.scene.times}  # Frames outside the run may be broken.
-    return [str(notice) for notice in opened.warnings if notice.time in refined] + known
+    return [str(notice) for notice in opened.warnings if notice.time in refined] + warnings
 
 
 def say_what_was(report: RefineReport) -> None:
@@ -98,12 +97,12 @@ def _say_who_integrated(report: RefineReport, entries: Sequence[dict[str, Any]])
     for entry in entries:
         for level in entry.get("levels", ()):
             movers.update(level["movers"])
-    asked = str(report.options["integrator"])
-    if movers[LEARNED]:
-        part = movers[LEARNED] / movers.total()
-        report.modelled["network"] = f"{LEARNED} made {part:.0%} of the steps (--integrator {asked})"
+    integrator, learned = str(report.options["integrator"]), INTEGRATORS[0]
+    if movers[learned]:
+        part = movers[learned] / movers.total()
+        report.modelled["network"] = f"{learned} made {part:.0%} of the steps (--integrator {integrator})"
     else:
-        report.left_out["network"] = f"--integrator {asked}"
+        report.left_out["network"] = f"--integrator {integrator}"
 
 
 def too_large(opened: Shot, report: RefineReport, options: RefineOptions) -> GarmentError | None:
@@ -124,7 +123,7 @@ def describe(opened: Shot, options: RefineOptions) -> dict[str, Any]:
     warnings = begin_report(report, opened, options)
     large = too_large(opened, report, options)
     unfelt = dict.fromkeys(path for garment in report.garments for path in garment.get("unfelt", ()))
-    felt = dataclasses.replace(options, colliders=[*opened.colliders, *unfelt]) if unfelt else options
+    with_bodies = dataclasses.replace(options, colliders=[*opened.colliders, *unfelt]) if unfelt else options
     return {
         "shot": opened.path,
         **({"problem": str(large)} if large else {}),
@@ -140,16 +139,16 @@ def describe(opened: Shot, options: RefineOptions) -> dict[str, Any]:
         "defects": {garment.path: in_brief(defects(garment.mesh, garment.rest)) for garment in opened.scene.garments},
         "warnings": [*of_a_kind(warnings)],
         "notes": report.notes,
-        "command": _command(opened, opened.sources, felt, warnings),
+        "command": _command(opened, opened.sources, with_bodies, warnings),
     }
 
 
 def _command(opened: Shot, garments: Sequence[GarmentSource], options: RefineOptions, warnings: Iterable[str]) -> str:
     """The command to refine garments of a shot with some options, those of the warnings, and the presets named."""
-    mended = {name: value for each in warnings for name, value in getattr(each, "options", {}).items()}
-    given = dataclasses.replace(options, overrides=[*options.overrides, *preset_overrides(garments)], **mended)
+    mended = {name: value for warning in warnings for name, value in getattr(warning, "options", {}).items()}
+    complete = dataclasses.replace(options, overrides=[*options.overrides, *preset_overrides(garments)], **mended)
     out = str(Path(opened.path).with_suffix(".refined.usdc"))
-    return join(["physgraph-usd", "refine", opened.path, "-o", out, *scene_words(given)])
+    return join(["physgraph-usd", "refine", opened.path, "-o", out, *scene_words(complete)])
 
 
 def _proposal(shot: str | Stage, meshes: Sequence[str], options: RefineOptions) -> str:
@@ -160,18 +159,22 @@ def _proposal(shot: str | Stage, meshes: Sequence[str], options: RefineOptions) 
     "" if no garment is found or the meshes cannot be read together.
     """
     try:
-        asked = {name: getattr(options, name) for name in ("frames", "gravity", "rest_frame")}
-        with closing(open_shot(shot, garments=meshes[:MOST_ASKED], **asked)) as opened:
+        reading = {name: getattr(options, name) for name in ("frames", "gravity", "rest_frame")}
+        with closing(open_shot(shot, garments=meshes[:MOST_ASKED], **reading)) as opened:
             sampled = sample_frames(opened.every_time, opened.frame)
-            found = [each for each in find_candidates(opened) if each.is_taken]
-            lying = {path for each in found for path in each.shares}
+            touching = [candidate for candidate in find_candidates(opened) if candidate.is_taken]
+            lying = {path for body in touching for path in body.shares}
             moving = {str(source.path) for source in opened.sources if len(source.times) > 1}
             garments = [source for source in opened.sources if str(source.path) in (lying or moving)]
             strained = _strained_parts(opened, sampled)
-            named = {"garments": [str(source.path) for source in garments], "colliders": [each.path for each in found]}
-            warnings = of_strain({path: strained[path] for path in named["garments"]}, _rests(garments))
-            warnings += _across(opened, sampled, found)
-            return _command(opened, garments, dataclasses.replace(options, **named), warnings) if garments else ""
+            paths, bodies = [str(source.path) for source in garments], [body.path for body in touching]
+            warnings = of_strain({path: strained[path] for path in paths}, _rests(garments))
+            warnings += _across(opened, sampled, touching)
+            return (
+                _command(opened, garments, dataclasses.replace(options, garments=paths, colliders=bodies), warnings)
+                if garments
+                else ""
+            )
     except StageError:
         return ""
 
@@ -182,15 +185,15 @@ def describe_meshes(shot: str | Stage, problem: str, options: RefineOptions) -> 
     Raises:
         StageError: The file cannot be opened at all.
     """
-    found, command = survey(shot), ""
-    if not options.garments and not any(mesh.garment for mesh in found.meshes):
-        cloth = [mesh for mesh in found.meshes if mesh.looks_like_cloth and not mesh.problem]
+    overview, command = survey(shot), ""
+    if not options.garments and not any(mesh.garment for mesh in overview.meshes):
+        cloth = [mesh for mesh in overview.meshes if mesh.looks_like_cloth and not mesh.problem]
         cloth = [mesh for mesh in cloth if mesh.deforms] or cloth
         cloth.sort(key=lambda mesh: -mesh.faces)
         command = _proposal(shot, [mesh.path for mesh in cloth], options)
     return {
-        "shot": found.path,
-        "metres_per_unit": found.metres_per_unit,
+        "shot": overview.path,
+        "metres_per_unit": overview.metres_per_unit,
         "problem": problem,
         **({"command": command} if command else {}),
         "meshes": [
@@ -204,9 +207,9 @@ def describe_meshes(shot: str | Stage, problem: str, options: RefineOptions) -> 
                 "problem": mesh.problem or "none",
                 "notices": [str(notice) for notice in mesh.notices],
             }
-            for mesh in found.meshes
+            for mesh in overview.meshes
         ],
-        "warnings": [str(notice) for notice in found.notices],
+        "warnings": [str(notice) for notice in overview.notices],
     }
 
 
@@ -216,8 +219,8 @@ def _first_frame(opened: Shot) -> Frame:
     Raises:
         StageError: No frame can be read.
     """
-    *others, last = opened.scene.times or (None,)
-    for time in others:
+    *earlier, last = opened.scene.times or (None,)
+    for time in earlier:
         try:
             return opened.frame(time)
         except StageError:
@@ -266,23 +269,23 @@ def _bound(target: Target) -> dict[str, Any]:
 def _unfelt(report: RefineReport, beside: Sequence[Candidate]) -> list[str]:
     """Add to the report the bodies touched by garments but not used as colliders; returns a warning."""
     for garment in report.garments:
-        garment["unfelt"] = [each.path for each in beside if garment["path"] in each.shares]
+        garment["unfelt"] = [body.path for body in beside if garment["path"] in body.shares]
     return of_unfelt(beside)
 
 
 def _across(opened: Shot, frames: Sequence[Frame], beside: Sequence[Candidate]) -> list[str]:
     """A warning if bodies and garments stand across gravity and nobody chose the gravity axis."""
     chosen = opened.gravity_source == GRAVITY_OPTION or opened.gravity_source.endswith(GARMENT["gravity"].name)
-    found = None if chosen else across_gravity(opened.scene, frames, beside)
-    return [] if found is None else [of_gravity(*found, pull=_pull(opened.scene.gravity), source=opened.gravity_source)]
+    axes = None if chosen else across_gravity(opened.scene, frames, beside)
+    return [] if axes is None else [of_gravity(*axes, pull=_pull(opened.scene.gravity), source=opened.gravity_source)]
 
 
 def _strained(opened: Shot, report: RefineReport, frames: Sequence[Frame]) -> list[str]:
     """Add to the report the garment parts not sized like their rest shape; returns a warning."""
-    found = _strained_parts(opened, frames)
-    for garment, parts in zip(report.garments, found.values(), strict=True):
+    parts_of = _strained_parts(opened, frames)
+    for garment, parts in zip(report.garments, parts_of.values(), strict=True):
         garment["strained"] = [dataclasses.asdict(part) for part in parts]
-    return of_strain(found, _rests(opened.sources))
+    return of_strain(parts_of, _rests(opened.sources))
 
 
 def _rests(garments: Iterable[GarmentSource]) -> dict[str, str]:
@@ -314,8 +317,8 @@ def _modelled(opened: Shot, report: RefineReport, options: RefineOptions) -> dic
         bodies = ", ".join(_touching(opened))
         modelled["contact"] = f"{options.contact} form, with {bodies}, in frames where it is near"
     if options.self_contact != "off":
-        where = "where parts come near one another; garments that do are solved together"
-        modelled["self contact"] = f"pairs of points, {where}"
+        condition = "where parts come near one another; garments that do are solved together"
+        modelled["self contact"] = f"pairs of points, {condition}"
     if options.temporal == "tether" and len(opened.scene.times) > 1:
         modelled["tether"] = "ties each frame to the last one's detail"
     return modelled
@@ -335,8 +338,8 @@ def _pull(gravity: np.ndarray) -> str:
 
 def _in_plane(report: RefineReport) -> dict[str, str]:
     """Garments modelled by edge springs, garments modelled by triangles, and garments with ease."""
-    known = {each.name for each in dataclasses.fields(Fabric)}
-    woven = {g["path"]: Fabric(**{k: v for k, v in g["fabric"].items() if k in known}) for g in report.garments}
+    fields = {field.name for field in dataclasses.fields(Fabric)}
+    woven = {g["path"]: Fabric(**{k: v for k, v in g["fabric"].items() if k in fields}) for g in report.garments}
     springs = [path for path, fabric in woven.items() if not fabric.has_membrane]
     triangles = [path for path, fabric in woven.items() if fabric.has_membrane]
     modelled = {"stretch": "edge springs" + (f" for {', '.join(springs)}" if triangles else "")} if springs else {}
@@ -351,11 +354,11 @@ def _in_plane(report: RefineReport) -> dict[str, str]:
 
 def _touching(opened: Shot) -> list[str]:
     """Paths of the colliders felt by some garment, each with the chosen side, if any."""
-    felt = {path for garment in opened.scene.garments for path in _felt(opened, garment)}
+    colliding = {path for garment in opened.scene.garments for path in _felt(opened, garment)}
     return [
         collider.path + ("" if collider.side == "auto" else f" (side: {collider.side})")
         for collider in opened.scene.colliders
-        if collider.path in felt
+        if collider.path in colliding
     ]
 
 
@@ -375,9 +378,11 @@ def _left_out(opened: Shot, report: RefineReport) -> dict[str, str]:
     left_out = {
         "friction": "out of scope: shapes at rest under pressure alone; the guide and the tether hold cloth in place",
     }
-    held = [f"{source.path}: {source.left_out_words}" for source in opened.sources if source.left_out]
-    if held:
-        left_out["samples"] = f"outside the frame range, where the layer holds the cloth still: {'; '.join(held)}"
+    held_samples = [f"{source.path}: {source.left_out_words}" for source in opened.sources if source.left_out]
+    if held_samples:
+        left_out["samples"] = (
+            f"outside the frame range, where the layer holds the cloth still: {'; '.join(held_samples)}"
+        )
     if "self contact" not in report.modelled:
         left_out["self contact"] = "switched off by --self-contact"
     if "contact" not in report.modelled:

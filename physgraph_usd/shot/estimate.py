@@ -80,24 +80,25 @@ def cannot_fit(
         workers: Processes that share the frames.
         memory: Memory of the machine [bytes]; measured if None.
     """
-    there = memory_there() if memory is None else memory
-    whole = estimate(garments, levels, frames=frames, workers=workers)
-    if whole.memory <= there:
+    available = memory_there() if memory is None else memory
+    size = estimate(garments, levels, frames=frames, workers=workers)
+    if size.memory <= available:
         return None
     largest = max(range(len(garments)), key=lambda index: fine_count(garments[index].mesh, levels[index]))
     fits = (
         level
         for level in range(max(levels) - 1, -1, -1)
-        if estimate(garments, [min(level, each) for each in levels], frames=frames, workers=workers).memory <= there
+        if estimate(garments, [min(level, chosen) for chosen in levels], frames=frames, workers=workers).memory
+        <= available
     )
     level = next(fits, None)
     problem = (
-        f"level {levels[largest]} makes {whole.vertices:,} fine vertices, which need about {whole.memory / 1e9:.3g} GB"
+        f"level {levels[largest]} makes {size.vertices:,} fine vertices, which need about {size.memory / 1e9:.3g} GB"
     )
     remedy = "reduce the cage" if level is None else f"use --level {level}"
     fewer = " or fewer --workers" if workers > 1 else ""
     return GarmentError(
-        garments[largest].path, f"{problem} of memory; this machine has {there / 1e9:.3g} GB", remedy=remedy + fewer
+        garments[largest].path, f"{problem} of memory; this machine has {available / 1e9:.3g} GB", remedy=remedy + fewer
     )
 
 

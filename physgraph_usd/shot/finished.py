@@ -50,8 +50,8 @@ def finished(shot: str | Path, out: Path, options: RefineOptions) -> RefineRepor
         LOG.info("skipped: %s is there", out, extra={"shot": report.shot})
         report.out, report.skipped = out, True
         return report
-    made = options.resume and all(path.is_file() for _, path in options.targets(out))
-    if options.dry_run or not made or frames_folder(out).exists():
+    complete = options.resume and all(path.is_file() for _, path in options.targets(out))
+    if options.dry_run or not complete or frames_folder(out).exists():
         return None
     try:
         wanted = made_from(_Opened(report.shot), out, options)
@@ -91,14 +91,14 @@ def check_jobs(jobs: Sequence[Job], *, also: Sequence[Target] = ()) -> None:
     inputs: set[Path] = set()
     for shot, out, options in jobs:
         options.check()
-        for what, path in (("the layer", out), ("the root", options.root)):
+        for result, path in (("the layer", out), ("the root", options.root)):
             if path is not None and (options.preroll is None or path is not out):
-                check_suffix(what, Path(path), LAYER_SUFFIXES)
+                check_suffix(result, Path(path), LAYER_SUFFIXES)
         if options.preroll is not None and out.suffix in LAYER_SUFFIXES:
             raise UsageError(f"{out} is a layer's name, and a chunk is a folder of finished frames; name one by -o")
         targets += options.targets(out)
-        left = options.skip_existing and out.is_file()  # Skipped: no file is opened or replaced.
-        inputs |= ({Path(shot)} if left else files_of(shot)) | {Path(file) for file in (options.weights,) if file}
+        skipped = options.skip_existing and out.is_file()  # Skipped: no file is opened or replaced.
+        inputs |= ({Path(shot)} if skipped else files_of(shot)) | {Path(file) for file in (options.weights,) if file}
     check_targets(targets, inputs)
 
 
@@ -115,12 +115,12 @@ def results(
         UsageError: As in `check_jobs`; no job was begun.
     """
     check_jobs(jobs)
-    found = [finished(*job) for job in jobs]
-    solved = solve([job for job, there in zip(jobs, found, strict=True) if there is None])
+    reports = [finished(*job) for job in jobs]
+    solved = solve([job for job, report in zip(jobs, reports, strict=True) if report is None])
 
     def each() -> Generator[RefineReport | PhysGraphError, None, None]:
         with closing(solved):
-            for there in found:
-                yield next(solved) if there is None else there
+            for report in reports:
+                yield next(solved) if report is None else report
 
     return each()

@@ -121,10 +121,10 @@ def _is_locked(folder: Path) -> bool:
 def record_in(folder: Path) -> dict[str, Any]:
     """The record of the run that wrote a folder; empty if missing."""
     try:
-        found = json.loads((folder / RUN).read_text(encoding="utf-8"))
+        record = json.loads((folder / RUN).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return {}
-    return found if isinstance(found, dict) else {}
+    return record if isinstance(record, dict) else {}
 
 
 class Finished:
@@ -143,14 +143,14 @@ class Finished:
 
     def _list(self) -> None:
         names = [match for file in self.folder.glob("*") if (match := _NAME.fullmatch(file.name))]
-        whole = [match for match in names if zipfile.is_zipfile(self.folder / match[0])]
-        self.kept = frozenset(int(match[1]) for match in whole if not match[2] and not match[3])
-        self.failed = frozenset(int(match[1]) for match in whole if not match[2] and match[3])
-        found: dict[int, int] = {}
-        for seam, index in sorted(((int(match[2]), int(match[1])) for match in whole if match[2]), reverse=True):
-            if index + 1 == found.get(seam, seam):
-                found[seam] = index
-        self.seams = {seam: first for seam, first in found.items() if seam in self.kept}
+        readable = [match for match in names if zipfile.is_zipfile(self.folder / match[0])]
+        self.kept = frozenset(int(match[1]) for match in readable if not match[2] and not match[3])
+        self.failed = frozenset(int(match[1]) for match in readable if not match[2] and match[3])
+        preroll_ends: dict[int, int] = {}
+        for seam, index in sorted(((int(match[2]), int(match[1])) for match in readable if match[2]), reverse=True):
+            if index + 1 == preroll_ends.get(seam, seam):
+                preroll_ends[seam] = index
+        self.seams = {seam: first for seam, first in preroll_ends.items() if seam in self.kept}
 
     def _file(self, index: int, seam: int | None, suffix: str) -> Path:
         return self.folder / (f"{index}" + ("" if seam is None else f".before{seam}") + suffix)
@@ -162,7 +162,7 @@ class Finished:
             LayerError: The file is damaged.
         """
         files = (self._file(index, seam, suffix) for suffix in (_DONE, _FAILED))
-        file = next((each for each in files if each.exists()), None)
+        file = next((candidate for candidate in files if candidate.exists()), None)
         if file is None:
             return None
         try:
@@ -181,9 +181,11 @@ class Finished:
         """Refuse (ValueError) points of the wrong shape: kernels index points by face corners, without checks."""
         if points and self.counts and len(points) != len(self.counts):
             raise ValueError(f"points of {len(points)} garments, not of {len(self.counts)}")
-        for each, count in zip(points, self.counts, strict=False):
-            if each is not None and (each.shape != (count, 3) or each.dtype.kind != "f" or not np.isfinite(each).all()):
-                raise ValueError(f"points of shape {each.shape}, not {count} finite positions")
+        for positions, count in zip(points, self.counts, strict=False):
+            if positions is not None and (
+                positions.shape != (count, 3) or positions.dtype.kind != "f" or not np.isfinite(positions).all()
+            ):
+                raise ValueError(f"points of shape {positions.shape}, not {count} finite positions")
 
 
 class FrameFolder(Finished):
@@ -241,12 +243,14 @@ class FrameFolder(Finished):
             lock.acquire()
             with suppress(OSError):  # Windows refuses to write a locked file.
                 file.write_text(f"process {os.getpid()} on {HOST}", encoding="utf-8")
-        except Timeout as held:
-            who = "another run"
+        except Timeout as timeout:
+            owner = "another run"
             with suppress(OSError, ValueError):
-                who = file.read_text(encoding="utf-8") or who
+                owner = file.read_text(encoding="utf-8") or owner
             layer = self.folder.with_name(self.folder.name.removesuffix(_FRAMES))
-            raise LayerError(f"{layer} is being made by {who}; wait for it, end it, or name another layer") from held
+            raise LayerError(
+                f"{layer} is being made by {owner}; wait for it, end it, or name another layer"
+            ) from timeout
         except OSError as error:
             if error.errno not in _NO_LOCKS:
                 raise
@@ -263,15 +267,15 @@ class FrameFolder(Finished):
     def _take(self, wanted: dict[str, Any], *, resume: bool, drop: bool) -> None:
         """Use or drop existing frames; frames that failed, or whose files a crash cut short, are solved again."""
         self._list()
-        found, holds = len(self.kept), f"{self.folder} holds {counted(len(self.kept), 'finished frame')}"
-        different = sorted(differences(record_in(self.folder), wanted)) if found else []
+        finished, holds = len(self.kept), f"{self.folder} holds {counted(len(self.kept), 'finished frame')}"
+        different = sorted(differences(record_in(self.folder), wanted)) if finished else []
         if different and (resume or not drop):
             remedy = "refine as then, or drop them by --overwrite without --resume"
             raise UsageError(f"{holds} of a run with other {', '.join(different[:3])}; {remedy}")
-        if found and self._stays and not (resume or drop):
+        if finished and self._stays and not (resume or drop):
             raise UsageError(f"{holds}; go on by --resume, or drop them by --overwrite")
-        self.dropped = 0 if resume or different else found
-        if not (found and resume):
+        self.dropped = 0 if resume or different else finished
+        if not (finished and resume):
             self._clear()
         for file in self.folder.glob(f"*{_DONE}"):
             if file.name.endswith(_FAILED) or not zipfile.is_zipfile(file):
@@ -283,10 +287,12 @@ class FrameFolder(Finished):
     def _check_ours(self) -> None:
         """Refuse a folder with foreign files, because the folder is emptied once the layer is complete."""
         names = {file.name for file in self.folder.glob("*")}
-        others = sorted(name for name in names if name not in (RUN, LOCK) and not _OURS.fullmatch(name))
-        if others or (names and not names & {RUN, LOCK}):
-            other = f"; {others[0]} is not a file of ours" if others else ""
-            raise UsageError(f"{self.folder} is no folder of finished frames{other}; choose another name for the layer")
+        foreign = sorted(name for name in names if name not in (RUN, LOCK) and not _OURS.fullmatch(name))
+        if foreign or (names and not names & {RUN, LOCK}):
+            example = f"; {foreign[0]} is not a file of ours" if foreign else ""
+            raise UsageError(
+                f"{self.folder} is no folder of finished frames{example}; choose another name for the layer"
+            )
 
     def __getstate__(self) -> dict[str, Any]:
         """Store the absolute path, for processes with a different working directory."""
@@ -348,8 +354,12 @@ def _heat_of(data: Mapping[str, np.ndarray], index: int) -> dict[str, np.ndarray
     return {name.removeprefix(prefix): data[name] for name in data if name.startswith(prefix)}
 
 
-def differences(there: Any, wanted: Any, name: str = "") -> list[str]:
+def differences(stored: Any, wanted: Any, name: str = "") -> list[str]:
     """Names of the entries in which two records differ."""
-    if isinstance(there, dict) and isinstance(wanted, dict):
-        return [each for key in {*there, *wanted} for each in differences(there.get(key), wanted.get(key), key)]
-    return [] if there == wanted else [name]
+    if isinstance(stored, dict) and isinstance(wanted, dict):
+        return [
+            difference
+            for key in {*stored, *wanted}
+            for difference in differences(stored.get(key), wanted.get(key), key)
+        ]
+    return [] if stored == wanted else [name]

@@ -55,7 +55,7 @@ class FromRest:
         """Degrees within which half and nine tenths of the cloth end, and in words; empty without a solve."""
         if not self._angles:
             return {}
-        half, most = (float(f"{each:.2g}") for each in np.percentile(np.concatenate(self._angles), (50.0, 90.0)))
+        half, most = (float(f"{angle:.2g}") for angle in np.percentile(np.concatenate(self._angles), (50.0, 90.0)))
         so_far = ", so far as they were followed" if self._late else ""
         return {
             "degrees_half": half,

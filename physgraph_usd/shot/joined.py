@@ -64,18 +64,18 @@ def join(both: Both, movers: Movers) -> Joint:
         movers: Asked for a mover if any frame differs.
     """
     frames, mover = list[Outcome](), cache(movers)
-    for k, (own, after) in enumerate(both, start=1):
-        pairs, weight = list(zip(own.points, after.points, strict=False)), k / (len(both) + 1)
+    for k, (earlier, after) in enumerate(both, start=1):
+        pairs, weight = list(zip(earlier.points, after.points, strict=False)), k / (len(both) + 1)
         if all(a is None or b is None or np.array_equal(a, b) for a, b in pairs):
-            frames.append(own)
+            frames.append(earlier)
             continue
         wanted = [a if a is None or b is None else between(a, b, weight) for a, b in pairs]
         near, far = [a for a, _ in pairs], [b for _, b in pairs]
-        points, why = mover()(own.time, *((near, far) if weight < 0.5 else (far, near)), wanted)
+        points, why = mover()(earlier.time, *((near, far) if weight < 0.5 else (far, near)), wanted)
         leave_if_asked()  # A signal may have cut the move short.
         if why:
-            return Joint([own for own, _ in both], why)
-        frames.append(replace(own, points=tuple(points), reused=(False,) * len(points)))
+            return Joint([earlier for earlier, _ in both], why)
+        frames.append(replace(earlier, points=tuple(points), reused=(False,) * len(points)))
     return Joint(frames, "")
 
 
@@ -85,23 +85,23 @@ def between(before: np.ndarray, after: np.ndarray, weight: float) -> np.ndarray:
     return start + weight * (after.astype(np.float64) - start)
 
 
-def worse(paths: Sequence[str], found: Sequence[Mapping[str, Any]], *sides: Sequence[Mapping[str, Any]]) -> str:
+def worse(paths: Sequence[str], contacts: Sequence[Mapping[str, Any]], *sides: Sequence[Mapping[str, Any]]) -> str:
     """The first garment with more crossings than in all compared solutions, in words, or "".
 
     Args:
         paths: Paths of the garments.
-        found: Contact telemetry of each garment.
+        contacts: Contact telemetry of each garment.
         sides: The same of each compared solution.
     """
-    for path, contact, *others in zip(paths, found, *sides, strict=True):
-        before = [counts(each) for each in others]
+    for path, contact, *contacts_beside in zip(paths, contacts, *sides, strict=True):
+        before = [counts(side) for side in contacts_beside]
         for name, count in counts(contact).items():
-            if count > max((each.get(name, 0) for each in before), default=0):
+            if count > max((side_counts.get(name, 0) for side_counts in before), default=0):
                 return f"joined, <{path}> would have {count:,} {name}"
     return ""
 
 
 def counts(contact: Mapping[str, Any]) -> dict[str, int]:
     """Numbers of crossing edges and of vertices in bodies, from contact telemetry."""
-    bodies = {f"vertices inside <{path}>": each["after"]["inside"] for path, each in contact.get("bodies", {}).items()}
+    bodies = {f"vertices inside <{path}>": body["after"]["inside"] for path, body in contact.get("bodies", {}).items()}
     return {"edges through cloth": contact.get("cloth", {}).get("after", {}).get("crossings", 0)} | bodies

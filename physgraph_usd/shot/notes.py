@@ -39,17 +39,17 @@ def of_slack(garments: Sequence[str], choices: Sequence[LevelChoice]) -> list[st
     return [f"{', '.join(tight)}: {words}"]
 
 
-def of_trims(found: Mapping[str, str]) -> list[str]:
+def of_trims(garment_of: Mapping[str, str]) -> list[str]:
     """A note of meshes that could follow garments.
 
     Args:
-        found: For each mesh that lies on a garment and moves with it, the garment.
+        garment_of: For each mesh that lies on a garment and moves with it, the garment.
     """
-    if not found:
+    if not garment_of:
         return []
-    cloth = ", ".join(f"<{path}>" for path in dict.fromkeys(found.values()))
-    stay, them = ("stays as it is", "it") if len(found) == 1 else ("stay as they are", "them")
-    listed, options = ", ".join(f"<{path}>" for path in found), join(options_of("--bind", found))
+    cloth = ", ".join(f"<{path}>" for path in dict.fromkeys(garment_of.values()))
+    stay, them = ("stays as it is", "it") if len(garment_of) == 1 else ("stay as they are", "them")
+    listed, options = ", ".join(f"<{path}>" for path in garment_of), join(options_of("--bind", garment_of))
     return [f"{listed} {stay} beside the refined {cloth}; {options} carries {them} along"]
 
 
@@ -63,10 +63,10 @@ def of_fabrics(sources: Iterable[GarmentSource]) -> list[str]:
     for source, word, preset in _named(sources):
         named.setdefault(preset, []).append((source, word))
     notes = []
-    for preset, found in named.items():
-        listed = ", ".join(f"<{source.path}> ({word})" for source, word in found)
-        options = join(options_of("--set", preset_overrides(source for source, _ in found)))
-        notes.append(f"named like {preset}: {listed}; {options} refines {'it' if len(found) == 1 else 'them'} so")
+    for preset, matches in named.items():
+        listed = ", ".join(f"<{source.path}> ({word})" for source, word in matches)
+        options = join(options_of("--set", preset_overrides(source for source, _ in matches)))
+        notes.append(f"named like {preset}: {listed}; {options} refines {'it' if len(matches) == 1 else 'them'} so")
     return notes
 
 
@@ -87,7 +87,7 @@ def preset_overrides(sources: Iterable[GarmentSource]) -> list[str]:
 def _named(sources: Iterable[GarmentSource]) -> Iterator[tuple[GarmentSource, str, str]]:
     """The garments without authored fabric values and named like a preset, with the word and the preset."""
     for source in sources:
-        named = ((word, known[word]) for known in (NAMED, WORN) for word in source.words if word in known)
+        named = ((word, table[word]) for table in (NAMED, WORN) for word in source.words if word in table)
         word, preset = next(named, ("", ""))
         if preset and PRESETS[preset] != Fabric() and all(source.sources[name] == "fallback" for name in MATERIALS):
             yield source, word, preset
@@ -104,8 +104,8 @@ def of_rest(unsettled: Sequence[Mapping[str, Any]], frames: int) -> list[str]:
     if not moving:
         return []
     worst = max(moving, key=lambda entry: entry["remaining_move"])
-    count, place = len({entry["time"] for entry in moving}), f"<{worst['path']}>{at_time(worst['time'])}"
-    return [f"{count} of {counted(frames, 'frame')} did not settle, {place} the least: {in_words(worst)}"]
+    count, location = len({entry["time"] for entry in moving}), f"<{worst['path']}>{at_time(worst['time'])}"
+    return [f"{count} of {counted(frames, 'frame')} did not settle, {location} the least: {in_words(worst)}"]
 
 
 def of_energy(garments: Sequence[Mapping[str, Any]], frames: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -127,10 +127,10 @@ def of_energy(garments: Sequence[Mapping[str, Any]], frames: Sequence[Mapping[st
                 above.append((after - before, garment["path"], frame["time"], before, after))
     if not above:
         return []
-    _, path, time, before, after = max(above, key=lambda each: each[0])
-    count, energies = len({each[2] for each in above}), f"{after:.3g} J, the cage's {before:.3g} J"
-    more = f"{counted(count, 'frame')} ended with more energy than the upsampled cage"
-    return [f"{more}, <{path}>{at_time(time)}: {energies}"]
+    _, path, time, before, after = max(above, key=lambda entry: entry[0])
+    count, energies = len({entry[2] for entry in above}), f"{after:.3g} J, the cage's {before:.3g} J"
+    text = f"{counted(count, 'frame')} ended with more energy than the upsampled cage"
+    return [f"{text}, <{path}>{at_time(time)}: {energies}"]
 
 
 def of_folds(garments: Sequence[Mapping[str, Any]], frames: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -140,18 +140,18 @@ def of_folds(garments: Sequence[Mapping[str, Any]], frames: Sequence[Mapping[str
         garments: A report's garments.
         frames: A report's frames.
     """
-    found = [
+    folded = [
         (entry.get("sharp_folds", 0.0), frame["time"], garment)
         for frame in frames
         for garment, entry in zip(garments, frame.get("garments", ()), strict=False)
     ]
-    share, time, worst = max(found, key=lambda each: each[0], default=(0.0, None, {}))
+    share, time, worst = max(folded, key=lambda entry: entry[0], default=(0.0, None, {}))
     if share <= SHARP_FRACTION:
         return []
-    others = len({id(garment) for each, _, garment in found if each > SHARP_FRACTION}) - 1
-    level, place = worst["level"], f"<{worst['path']}>{at_time(time)}"
-    text = f"level: {share:.0%} of the edges of {place} fold by more than 45 degrees, so the mesh shows"
-    text += f", and in {counted(others, 'other garment')}" if others else ""
+    further = len({id(garment) for fraction, _, garment in folded if fraction > SHARP_FRACTION}) - 1
+    level, location = worst["level"], f"<{worst['path']}>{at_time(time)}"
+    text = f"level: {share:.0%} of the edges of {location} fold by more than 45 degrees, so the mesh shows"
+    text += f", and in {counted(further, 'other garment')}" if further else ""
     finer = f"--level {level + 1} halves the edges of {worst['fine_edge_mm']:.1f} mm, for up to 4 times the time"
     return [text + (f"; {finer}" if level < (GARMENT["refine:level"].maximum or 0) else "")]
 
@@ -163,17 +163,17 @@ def of_following(garments: Sequence[Mapping[str, Any]], frames: Sequence[Mapping
         garments: A report's garments.
         frames: A report's frames.
     """
-    found = [
+    pushed = [
         (entry["follows_cage"], garment["path"], frame["time"])
         for frame in frames
         for garment, entry in zip(garments, frame.get("garments", ()), strict=False)
         if entry.get("follows_cage") and is_first(garment["path"], entry)
     ]
-    if not found:
+    if not pushed:
         return []
-    part, path, time = max(found, key=lambda each: each[0]["vertices"])
+    part, path, time = max(pushed, key=lambda entry: entry[0]["vertices"])
     when, vertices = (
-        counted(len({each[2] for each in found}), "frame"),
+        counted(len({entry[2] for entry in pushed}), "frame"),
         counted(part["vertices"], "vertex", "vertices"),
     )
     text = f"in {when} part of the cloth follows its subdivided cage, where the solution crosses more often: "

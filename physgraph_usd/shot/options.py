@@ -6,6 +6,7 @@ The solver is imported on demand, so a batch skips finished shots without loadin
 from __future__ import annotations
 
 import dataclasses
+import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -52,9 +53,9 @@ class Option:
     result: bool = True
 
 
-def _option(heading: str, default: Any, help_text: str, **known: Any) -> Any:
+def _option(heading: str, default: Any, help_text: str, **properties: Any) -> Any:
     """A field of `RefineOptions`."""
-    return dataclasses.field(default=default, metadata={"option": Option(heading, help_text, **known)})
+    return dataclasses.field(default=default, metadata={"option": Option(heading, help_text, **properties)})
 
 
 _scene, _solver, _layer = (partial(_option, heading) for heading in ("Scene", "Solver", "Layer"))
@@ -221,7 +222,11 @@ class RefineOptions:
         Raises:
             UsageError: An option is wrong.
         """
-        if self.integrator != INTEGRATORS[0] or self.weights is not None:
+        is_extended = "physgraph_usd.solver.integrate" in sys.modules  # Further methods register themselves there.
+        if self.integrator not in INTEGRATORS and not is_extended:
+            names = ", ".join(INTEGRATORS)
+            raise UsageError(f"unknown integrator '{self.integrator}'; known integrators: {names}")
+        if self.integrator not in INTEGRATORS or self.weights is not None:
             from ..solver.integrate import method_named
 
             method_named(self.integrator, self.weights)
@@ -248,7 +253,7 @@ class RefineOptions:
         return files
 
 
-OPTIONS: dict[str, Option] = {each.name: each.metadata["option"] for each in dataclasses.fields(RefineOptions)}
+OPTIONS: dict[str, Option] = {field.name: field.metadata["option"] for field in dataclasses.fields(RefineOptions)}
 """Each option by its field."""
 RefineOptions.__doc__ = f"{RefineOptions.__doc__}\n\nAttributes:\n" + "\n".join(
     f"    {name}: {option.help}" for name, option in OPTIONS.items()

@@ -27,7 +27,7 @@ PATIENCE_SECONDS = 10.0
 _MEMORY = re.compile(r"out of memory|n.t allocate|to allocate|bad_alloc", re.IGNORECASE)
 
 _THREADS = "OMP_NUM_THREADS"
-_PRELOAD = "physgraph_usd.shot.refine"
+_PRELOAD = ["physgraph_usd.shot.refine", "physgraph_usd.shot.run"]
 """Imported once for all processes, on Linux: torch, Warp and the solver take 3 s."""
 
 Start = Callable[..., Future[Any]]
@@ -55,7 +55,7 @@ def _context() -> BaseContext:
     if sys.platform != "linux":
         return multiprocessing.get_context("spawn")
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload([_PRELOAD])
+    context.set_forkserver_preload(_PRELOAD)
     importlib.import_module("multiprocessing.resource_tracker").ensure_running()  # Would unblock the signal.
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:

@@ -1,4 +1,7 @@
-"""Public functions: open a shot, describe, solve frame by frame, write, and report."""
+"""Public functions: open a shot, describe, solve frame by frame, write, and report.
+
+The solver is imported only once a shot is open and described: torch and Warp take seconds.
+"""
 
 from __future__ import annotations
 
@@ -9,29 +12,28 @@ from contextlib import ExitStack, closing, contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ..errors import LayerError, PhysGraphError, StageError, UsageError
-from ..interrupts import SIGNALLED, exit_code_of, signals_noted
-from ..solver.integrate.factors import FACTOR
-from ..solver.mesh.kernels import cards_for
+from ..interrupts import SIGNALLED, exit_code_of, importing, signals_noted
 from ..usd.files import check_targets, files_of
 from ..usd.provenance import write_root
 from ..usd.read.reader import Shot
 from ..usd.stage import shot_name
 from ..usd.view import Layer, Stage
-from ..usd.write.atomic import check_place
+from ..usd.write.atomic import check_folder_of, check_place
 from .describe import begin_report, describe, describe_meshes, too_large
 from .farm import shots_at_once
 from .finished import Job, check_jobs, finished, results
 from .frames import kept_for
+from .opened import open_for
 from .options import RefineOptions, json_of
-from .page.report import write_folder
 from .processes import call_each, memory_is_named
 from .report import DONE, RefineReport, is_of_failure
-from .run import Run
-from .solve import open_for, time_frames
 from .warnings import WARNINGS
+
+if TYPE_CHECKING:
+    from .run import Run
 
 DEFAULTS = RefineOptions()
 
@@ -55,16 +57,17 @@ def refine_shot(shot: str | Path, out: str | Path, options: RefineOptions = DEFA
     """
     out = Path(out)
     check_jobs([(shot, out, options)])
-    if there := finished(shot, out, options):
-        return there
+    if report_before := finished(shot, out, options):
+        return report_before
     if not options.dry_run:
-        if not out.resolve().parent.is_dir():
-            raise UsageError(f"the folder {out.resolve().parent} does not exist; make it, or name another by -o")
+        check_folder_of(out)
         check_places(out, options)
     with running(str(shot), options, out=out) as (opened, report):
         if options.dry_run:
             return report
         _check_new(out, options)
+        with importing():
+            from .run import Run
         write_all(Run(opened, out, options, report), out)
     return report
 
@@ -83,8 +86,13 @@ def write_all(run: Run, out: Path) -> None:
     run.refine()
     options = run.options
     if options.root is not None:
-        files = {"layer": out, "shot": Path(run.shot.path), "absolute": options.asset_paths == "absolute"}
-        write_root(Path(options.root), **files, overwrite=options.overwrite)
+        write_root(
+            Path(options.root),
+            layer=out,
+            shot=Path(run.shot.path),
+            absolute=options.asset_paths == "absolute",
+            overwrite=options.overwrite,
+        )
     if options.report is not None:
         _write_report(run.report, Path(options.report), run.shot)
 
@@ -119,6 +127,8 @@ def refine_stage(
     """
     _check_of_stage(stage, options)
     with running(stage, options, on_report=on_report) as (opened, report):
+        with importing():
+            from .run import Run
         layer = Run(opened, None, options, report).refine()
         if options.report is not None:
             _write_report(report, Path(options.report), opened)
@@ -146,6 +156,8 @@ def running(
             report.seconds["open"] = clock.perf_counter() - began
             if large := too_large(opened, report, options):
                 raise large
+            with importing():
+                from ..solver.integrate.factors import FACTOR
             report.warn(*warnings, *([] if FACTOR == "cholespy" else [WARNINGS["slower"]()]))
             yield opened, report
 
@@ -162,8 +174,8 @@ def _record_end(
     if isinstance(error, Exception):
         report.fail(error)
     elif (code := exit_code_of(error)) is not None:
-        kept = None if out is None else kept_for(out)
-        report.signal, report.error = code - SIGNALLED, f"interrupted, {kept or 'no frame is kept'}"
+        folder_text = None if out is None else kept_for(out)
+        report.signal, report.error = code - SIGNALLED, f"interrupted, {folder_text or 'no frame is kept'}"
     else:
         return
     _write_failure(report, options)
@@ -186,13 +198,18 @@ def refine_shots(
         UsageError: No job was begun: an option is wrong, or an output of a job is read or written by another job.
     """
 
+    from ..solver.mesh.kernels import cards_for
+
     def solve(left: Sequence[Job]) -> Generator[RefineReport | PhysGraphError, None, None]:
         options = left[0][2] if left else DEFAULTS
         chunks, at_once = 1, workers
         if options.scheduler:
             chunks, at_once = workers, shots_at_once(options.scheduler, workers)
-        alone = [(shot, out, dataclasses.replace(own, workers=chunks, progress=None)) for shot, out, own in left]
-        return call_each(refine, alone, workers=at_once, cards=cards_for(options.device))
+        calls = [
+            (shot, out, dataclasses.replace(job_options, workers=chunks, progress=None))
+            for shot, out, job_options in left
+        ]
+        return call_each(refine, calls, workers=at_once, cards=cards_for(options.device))
 
     return results(jobs, solve)
 
@@ -233,14 +250,14 @@ def _check_of_stage(stage: Stage, options: RefineOptions) -> None:
         _check_none(report, options)
 
 
-def inspect_shot(shot: str | Path | Stage, *, timed: bool = False, **given: Any) -> dict[str, Any]:
+def inspect_shot(shot: str | Path | Stage, *, timed: bool = False, **reading: Any) -> dict[str, Any]:
     """Plan of a refinement: garments, values and their sources, and every defect found.
 
     Args:
         shot: The stage to read, a file or open.
         timed: Whether to solve three frames in the middle of the shot, to measure the time of a run on this machine and
             how far from rest frames end.
-        given: Options of `RefineOptions` for reading.
+        reading: Options of `RefineOptions` for reading.
 
     Returns:
         Plain values. If the shot cannot be refined as asked, ``problem`` gives the reason, ``meshes`` lists the stage's
@@ -251,25 +268,29 @@ def inspect_shot(shot: str | Path | Stage, *, timed: bool = False, **given: Any)
         StageError: The file cannot be opened at all.
         UsageError: An option is wrong.
     """
-    options = RefineOptions(**given)
+    options = RefineOptions(**reading)
     source = str(shot) if isinstance(shot, Path) else shot
     files_of(source)  # Raises an error for a pipe; opening a pipe would wait for ever.
     try:
         with closing(open_for(source, options)) as opened:
-            found = describe(opened, options)
-            if timed and "problem" not in found:
-                levels = [garment["level"] for garment in found["garments"]]
-                found |= time_frames(opened, options, levels)
-            return found
+            plan = describe(opened, options)
+            if timed and "problem" not in plan:
+                from .solve import time_frames
+
+                levels = [garment["level"] for garment in plan["garments"]]
+                plan |= time_frames(opened, options, levels)
+            return plan
     except StageError as error:
-        found = describe_meshes(source, str(error), options)
-        return found | {"exit_code": DONE if "command" in found else error.exit_code}
+        plan = describe_meshes(source, str(error), options)
+        return plan | {"exit_code": DONE if "command" in plan else error.exit_code}
 
 
 def _write_report(report: RefineReport, path: Path, opened: Shot) -> None:
     if json_of(path) == path:
         report.write(path)
     else:
+        from .page.report import write_folder
+
         write_folder(report, path, opened)
 
 

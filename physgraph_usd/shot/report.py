@@ -119,8 +119,8 @@ class RefineReport:
     @property
     def crossings(self) -> int | None:
         """Edges through faces in the result, of cloth and of bodies, in all frames; None if not measured."""
-        found = self._crossed("after")
-        return sum(found) if found else None
+        crossings = self._crossed("after")
+        return sum(crossings) if crossings else None
 
     @property
     def leaves_crossings(self) -> bool:
@@ -129,26 +129,30 @@ class RefineReport:
 
     def _crossed(self, side: str) -> list[int]:
         """Edges through faces of each measurement, "before" or "after"."""
-        found = [contact for frame in self.frames for contact in self.measured(frame)]
-        measured = [each for contact in found for each in (contact.get("cloth"), *contact.get("bodies", {}).values())]
-        return [each[side]["crossings"] for each in measured if each]
+        contacts = [contact for frame in self.frames for contact in self.measured(frame)]
+        measured = [
+            contact_part
+            for contact in contacts
+            for contact_part in (contact.get("cloth"), *contact.get("bodies", {}).values())
+        ]
+        return [contact_part[side]["crossings"] for contact_part in measured if contact_part]
 
     def measured(self, frame: Mapping[str, Any]) -> list[dict[str, Any]]:
         """Measurements of contact in a frame: one per garment or group of garments solved together."""
         paths = [garment["path"] for garment in self.garments]
         entries = list(zip(paths, frame.get("garments", ()), strict=False))
-        alone = [entry for path, entry in entries if is_first(path, entry)]
-        return [entry["contact"] for entry in alone if entry.get("contact")]
+        first_entries = [entry for path, entry in entries if is_first(path, entry)]
+        return [entry["contact"] for entry in first_entries if entry.get("contact")]
 
     def fail(self, error: Exception) -> None:
         """Record the error that ends the run."""
-        ours, place = named(error), place_of(error)
+        ours, location = named(error), place_of(error)
         self.error = str(ours)
         self.failure = {
             "kind": getattr(ours, "kind", type(error).__name__),
-            "prims": list(place.prims),
-            "time": place.time,
-            "code": place.code,
+            "prims": list(location.prims),
+            "time": location.time,
+            "code": location.code,
             "exit_code": ours.exit_code,
         }
 
@@ -206,19 +210,19 @@ def of_a_kind(warnings: Iterable[str]) -> dict[str, list[str]]:
     for warning in dict.fromkeys(warnings):
         kind = getattr(warning, "kind", "") or _DIFFERS.sub("#", _ALSO.sub("", warning))
         kinds.setdefault(kind if _OF_PRIM.match(warning) else warning, []).append(warning)
-    found: dict[str, list[str]] = {}
+    paths_of: dict[str, list[str]] = {}
     for alike in kinds.values():
         paths = list(dict.fromkeys(match[1] for match in map(_OF_PRIM.match, alike) if match))
-        found |= {str(warning): [] for warning in alike} if len(paths) <= 1 else {_for_all(alike, paths): paths}
-    return found
+        paths_of |= {str(warning): [] for warning in alike} if len(paths) <= 1 else {_for_all(alike, paths): paths}
+    return paths_of
 
 
 def _for_all(alike: Sequence[str], paths: Sequence[str]) -> str:
     """One warning for several of a kind, with the figures of the first."""
     texts = [warning.partition(">")[2] for warning in alike]
     figures = "" if len(set(texts)) == 1 else " (the figures are those of the first)"
-    named, more = ", ".join(f"<{path}>" for path in paths[:MOST_NAMED]), len(paths) - MOST_NAMED
-    return f"{named}{f' and {more:,} more' if more > 0 else ''}{texts[0]}{figures}"
+    named, unnamed = ", ".join(f"<{path}>" for path in paths[:MOST_NAMED]), len(paths) - MOST_NAMED
+    return f"{named}{f' and {unnamed:,} more' if unnamed > 0 else ''}{texts[0]}{figures}"
 
 
 def _whole_frame(frame: Mapping[str, Any]) -> dict[str, Any]:
@@ -227,14 +231,14 @@ def _whole_frame(frame: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _whole_garment(entry: Mapping[str, Any]) -> dict[str, Any]:
-    whole = {**_fields("garment_frame"), **entry}
-    return whole | {"contact": _fields("contact") | entry["contact"]} if "contact" in entry else whole
+    complete = {**_fields("garment_frame"), **entry}
+    return complete | {"contact": _fields("contact") | entry["contact"]} if "contact" in entry else complete
 
 
 @cache
 def _schema() -> dict[str, Any]:
-    found: dict[str, Any] = json.loads(SCHEMA.read_text(encoding="utf-8"))
-    return found
+    schema: dict[str, Any] = json.loads(SCHEMA.read_text(encoding="utf-8"))
+    return schema
 
 
 def _fields(name: str) -> dict[str, Any]:

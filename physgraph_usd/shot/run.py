@@ -99,25 +99,20 @@ class Run:
         """Solve all frames and write the layer or the chunk; returns the layer if in memory."""
         began, options = clock.perf_counter(), self.options
         provenance = made_from(self.shot, self.out, options) | dict(self.stored.record if self.stored else {})
-        known = len(self.shot.warnings)  # Warnings about the shot itself are already reported.
-        part = [time for time in (self._times[k] for k in self._numbers) if time is not None]
-        made = {"mode": options.mode, "scheme": options.scheme, "velocities": options.velocities}
-        made["overwrite"] = options.overwrite
-        made["times"] = part if len(part) < len(self.shot.scene.times) else None
+        reported = len(self.shot.warnings)  # Warnings about the shot itself are already reported.
         refinements = refine_garments(self.shot.scene.garments, self.solver.levels)
         with ExitStack() as stack:
             frames = writer = None
             if self.out is not None and self.stored is None:
                 frames = stack.enter_context(self._folder(self.out, provenance, refinements))
             if not self._is_chunk:
-                how = {"provenance": provenance, **made}
-                writer = stack.enter_context(LayerWriter(self.shot, refinements, self.out, **how))
+                writer = stack.enter_context(_layer_writer(self, provenance, refinements))
             solved = stack.enter_context(closing(self._solved(frames)))
             self._write_frames(writer, solved, len(self._numbers))
             layer = writer.layer if writer is not None and self.out is None else None
         self.report.strict = options.strict
         self.report.seconds["frames"] = clock.perf_counter() - began
-        self.report.warn(*map(str, self.shot.warnings[known:]))
+        self.report.warn(*map(str, self.shot.warnings[reported:]))
         return layer
 
     def _folder(
@@ -130,8 +125,15 @@ class Run:
             decides[CHUNK] = [self._numbers.start, self._numbers.stop]
         meshes = fine_meshes(self.shot.scene.garments, refinements)
         counts = [mesh.vertex_count for mesh in meshes]
-        settings = {"resume": options.resume, "drop": options.overwrite, "keep": options.keep_frames, "stays": chunk}
-        return FrameFolder(out if chunk else frames_folder(out), provenance | decides, counts=counts, **settings)
+        return FrameFolder(
+            out if chunk else frames_folder(out),
+            provenance | decides,
+            counts=counts,
+            resume=options.resume,
+            drop=options.overwrite,
+            keep=options.keep_frames,
+            stays=chunk,
+        )
 
     @property
     def _is_chunk(self) -> bool:
@@ -172,8 +174,8 @@ class Run:
     @property
     def _preroll(self) -> int:
         """Frames solved before a chunk if frames depend on their predecessors."""
-        asked = PREROLL if self.options.preroll is None else self.options.preroll
-        return 0 if self.options.temporal == "off" else asked
+        preroll = PREROLL if self.options.preroll is None else self.options.preroll
+        return 0 if self.options.temporal == "off" else preroll
 
     def _solved(self, frames: FrameFolder | None) -> Outcomes:
         """Frames in order, including reused frames of an interrupted run, joined if solved by several processes."""
@@ -183,35 +185,32 @@ class Run:
         if frames is None:
             yield from self.solver(self._times)
             return
-        self._warn_of_finished(frames, len(self._numbers))
+        _warn_of_finished(self, frames, len(self._numbers))
         with _processes(self.options) as start:
-            how = {"workers": self.options.workers, "only": self._numbers, "preroll": self._preroll, "start": start}
-            movers = None if self._is_chunk else self.solver.mover
-            how |= {"movers": movers, "warn": self.report.warn}
-            with closing(solve_in_chunks(self.solver, self._times, frames, **how)) as solved:
+            chunks = solve_in_chunks(
+                self.solver,
+                self._times,
+                frames,
+                workers=self.options.workers,
+                only=self._numbers,
+                preroll=self._preroll,
+                start=start,
+                movers=None if self._is_chunk else self.solver.mover,
+                warn=self.report.warn,
+            )
+            with closing(chunks) as solved:
                 yield from solved
-
-    def _warn_of_finished(self, frames: FrameFolder, count: int) -> None:
-        """Warn if frames of an earlier run are used, or could have been."""
-        if frames.dropped:
-            are, them = ("is", "it") if frames.dropped == 1 else ("are", "them")
-            dropped = counted(frames.dropped, "finished frame")
-            self.report.warn(WARNINGS["solved_anew"](dropped=dropped, are=are, them=them))
-        elif frames.kept:
-            again = f", each stretch after {counted(self._preroll, 'frame')} solved again" if self._preroll else ""
-            kept = f"{len(frames.kept)} of {counted(count, 'frame')}"
-            self.report.warn(WARNINGS["resumed"](kept=kept, again=again))
 
     def _write_frames(self, writer: LayerWriter | None, solved: Outcomes, count: int) -> None:
         """Write each frame as soon as solved, then close the layer; a chunk's frames are already in its folder."""
         report, options = self.report, self.options
         written, first, shot, began = 0.0, 0.0, {"shot": report.shot}, clock.perf_counter()
         compared = frames_compared(count if options.contact != "off" else 0)
-        shown, entered = list[Shown](), dict[float | None, dict[str, float]]()
+        drawn_through, entered = list[Shown](), dict[float | None, dict[str, float]]()
         drawn = DrawnCloth(self.shot, self.solver.levels if options.report and options.scheme == "keep" else ())
         for done, outcome in enumerate(solved, start=1):
             written += self._write_frame(writer, outcome)
-            shown += shown_through(self.shot, outcome) if done - 1 in compared else []
+            drawn_through += shown_through(self.shot, outcome) if done - 1 in compared else []
             entered[outcome.time] = drawn.depths(outcome) if done - 1 in compared else {}
             LOG.info("frame %d of %d: time code %s", done, count, named_time(outcome.time), extra=shot)
             spent = clock.perf_counter() - began
@@ -238,9 +237,9 @@ class Run:
         report.seconds["close"] = clock.perf_counter() - start
         report.seconds["write"] = written
         report.warn(*of_frames(report), *of_drawn(entered), *of_loops(self._loop.gaps()))
-        found = report.garments, report.frames
-        report.note(*of_following(*found), *of_inertia(*found), *of_folds(*found), *of_energy(*found))
-        report.note(*of_polygons(shown))
+        telemetry = report.garments, report.frames
+        report.note(*of_following(*telemetry), *of_inertia(*telemetry), *of_folds(*telemetry), *of_energy(*telemetry))
+        report.note(*of_polygons(drawn_through))
         (report.warn if options.strict else report.note)(*of_rest(report.unsettled, len(report.frames)))
         say_what_was(report)
 
@@ -256,9 +255,38 @@ class Run:
         if writer is None:
             return 0.0
         start, records = clock.perf_counter(), self.report.frames
-        how = {"changed": [not reused for reused in outcome.reused], "cuts": self._cuts(records[-2:])}
-        writer.write(outcome.time, outcome.points, heat=outcome.heat, **how)
+        changed = [not reused for reused in outcome.reused]
+        writer.write(outcome.time, outcome.points, heat=outcome.heat, changed=changed, cuts=self._cuts(records[-2:]))
         return clock.perf_counter() - start
+
+
+def _layer_writer(run: Run, provenance: dict[str, Any], refinements: Sequence[Sequence[Refinement]]) -> LayerWriter:
+    """The writer of the layer."""
+    options = run.options
+    part = [time for time in (run._times[k] for k in run._numbers) if time is not None]
+    return LayerWriter(
+        run.shot,
+        refinements,
+        run.out,
+        provenance=provenance,
+        mode=options.mode,
+        scheme=options.scheme,
+        velocities=options.velocities,
+        overwrite=options.overwrite,
+        times=part if len(part) < len(run.shot.scene.times) else None,
+    )
+
+
+def _warn_of_finished(run: Run, frames: FrameFolder, count: int) -> None:
+    """Warn if frames of an earlier run are used, or could have been."""
+    if frames.dropped:
+        are, them = ("is", "it") if frames.dropped == 1 else ("are", "them")
+        dropped = counted(frames.dropped, "finished frame")
+        run.report.warn(WARNINGS["solved_anew"](dropped=dropped, are=are, them=them))
+    elif frames.kept:
+        again = f", each stretch after {counted(run._preroll, 'frame')} solved again" if run._preroll else ""
+        reused = f"{len(frames.kept)} of {counted(count, 'frame')}"
+        run.report.warn(WARNINGS["resumed"](kept=reused, again=again))
 
 
 def _processes(options: RefineOptions) -> AbstractContextManager[Start | None]:
@@ -305,12 +333,12 @@ def ending(seconds: float, first: float, count: int, workers: int) -> str:
         workers: Processes sharing the frames; the first frames to arrive are the first process's.
     """
     frames = -(-count // workers) - TIMED_FRAMES
-    left = frames * (seconds - first) / (TIMED_FRAMES - 1)
-    if left < LONG_RUN:
+    remaining = frames * (seconds - first) / (TIMED_FRAMES - 1)
+    if remaining < LONG_RUN:
         return ""
-    at = clock.strftime("%H:%M", clock.localtime(clock.time() + left))
-    about = f"{left / 60.0:.0f} min" if left < 5400.0 else f"{left / 3600.0:.1f} h"
-    return f"{TIMED_FRAMES} of {count} frames in {seconds:.0f} s: all in about {about} more, at {at}"
+    at = clock.strftime("%H:%M", clock.localtime(clock.time() + remaining))
+    duration = f"{remaining / 60.0:.0f} min" if remaining < 5400.0 else f"{remaining / 3600.0:.1f} h"
+    return f"{TIMED_FRAMES} of {count} frames in {seconds:.0f} s: all in about {duration} more, at {at}"
 
 
 def peak_memory_mb() -> float | None:

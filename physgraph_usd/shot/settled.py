@@ -34,13 +34,13 @@ class Unsettled:
             return self.error
         if self.size is not None:
             return f"the cage has shrunk to {100.0 * self.size:.2g}% of its rest shape's size"
-        why = "no step lowers the energy" if self.stopped == "stalled" else f"stopped by {self.stopped}"
-        return f"level {self.level} would still move by {self.remaining_move:.2g} edges ({why})"
+        reason = "no step lowers the energy" if self.stopped == "stalled" else f"stopped by {self.stopped}"
+        return f"level {self.level} would still move by {self.remaining_move:.2g} edges ({reason})"
 
 
 def in_words(entry: Mapping[str, Any]) -> str:
     """An entry of `unsettled_frames` in words."""
-    return str(Unsettled(**{each.name: entry[each.name] for each in fields(Unsettled)}))
+    return str(Unsettled(**{field.name: entry[field.name] for field in fields(Unsettled)}))
 
 
 def unsettled(entry: Mapping[str, Any], tolerance: float) -> Unsettled | None:
@@ -57,7 +57,7 @@ def unsettled(entry: Mapping[str, Any], tolerance: float) -> Unsettled | None:
         return Unsettled(0, None, UNSOLVED, error=str(entry["not_solved"]))
     if "collapsed" in entry:
         return Unsettled(0, None, COLLAPSED, float(entry["collapsed"]))
-    last = {each["level"]: each for each in entry.get("levels", ())}
+    last = {level["level"]: level for level in entry.get("levels", ())}
     if "time_limit" in entry:
         level = max(last, default=0)
         return Unsettled(level, float(last[level]["remaining_move"]) if last else None, LIMITED)
@@ -84,8 +84,8 @@ def unsettled_frames(
         Plain values: path, time and the fields of `Unsettled`.
     """
     return [
-        {"path": garment["path"], "time": frame["time"], **asdict(found)}
+        {"path": garment["path"], "time": frame["time"], **asdict(garment_unsettled)}
         for index, garment in enumerate(garments)
         for frame in frames
-        if "garments" in frame and (found := unsettled(frame["garments"][index], tolerance))
+        if "garments" in frame and (garment_unsettled := unsettled(frame["garments"][index], tolerance))
     ]

@@ -70,25 +70,25 @@ class DrawnCloth:
 
         The surface is measured at the vertices of the refined cloth. Depths up to `DEEP` are left out.
         """
-        found = dict[str, float]()
+        deepest = dict[str, float]()
         if not self._limits or not outcome.points:
-            return found
+            return deepest
         self._bodies.pose(self._shot.frame(outcome.time).colliders)
         for garment, cloth, limit in zip(self._shot.scene.garments, outcome.points, self._limits, strict=False):
             if cloth is None or limit is None:
                 continue
             near = self._bodies.near(garment, bounds_of(cloth), 0.0)
-            surfaces = [each.surface for each in self._bodies.touching(near, [[0.0] * len(near)])]
-            solved, drawn = (1e-3 * penetration_map(surfaces, each) for each in (cloth, limit @ cloth))
+            surfaces = [body.surface for body in self._bodies.touching(near, [[0.0] * len(near)])]
+            solved, drawn = (1e-3 * penetration_map(surfaces, positions) for positions in (cloth, limit @ cloth))
             depth = float(drawn[solved <= DEEP].max(initial=0.0))
             if depth > DEEP:
-                found[garment.path] = depth
-        return found
+                deepest[garment.path] = depth
+        return deepest
 
 
 def shown_through(shot: Shot, outcome: Outcome) -> list[Shown]:
     """Bodies whose polygons stand above refined cloth by more than a body's surface may be off."""
-    found, bodies = [], shot.polygons(outcome.time) if outcome.points else []
+    surfaces, bodies = [], shot.polygons(outcome.time) if outcome.points else []
     for index, (garment, cloth) in enumerate(zip(shot.scene.garments, outcome.points, strict=False)):
         for number in garment.colliders:
             body, collider = bodies[number], shot.scene.colliders[number]
@@ -97,8 +97,8 @@ def shown_through(shot: Shot, outcome: Outcome) -> list[Shown]:
             height, lift = _height(body, cloth, kept=shot.offset(index, outcome.time) + collider.offset)
             if height > DRAWN_WITHIN:
                 offset = STEP * math.ceil((lift - collider.offset) / STEP)
-                found.append(Shown(garment.path, collider.path, outcome.time, height, offset))
-    return found
+                surfaces.append(Shown(garment.path, collider.path, outcome.time, height, offset))
+    return surfaces
 
 
 def _height(body: Polygons, cloth: np.ndarray, *, kept: float) -> tuple[float, float]:
@@ -118,16 +118,20 @@ def _height(body: Polygons, cloth: np.ndarray, *, kept: float) -> tuple[float, f
     np.maximum.at(reach, faces, 0.5 * sides.max(axis=1, keepdims=True))  # Beyond, the other corner is as near.
     reach = (reach + lift)[raised]
     tree = cKDTree(cloth, balanced_tree=False)
-    beside = [np.asarray(each, np.int64) for each in tree.query_ball_point(body.points[raised], reach)]
+    beside = [np.asarray(indices, np.int64) for indices in tree.query_ball_point(body.points[raised], reach)]
     near = cloth[np.unique(np.concatenate(beside))]
-    faces = faces[np.isin(faces, raised[[len(each) > 0 for each in beside]]).any(axis=1)]
+    faces = faces[np.isin(faces, raised[[len(neighbours) > 0 for neighbours in beside]]).any(axis=1)]
     if not len(faces):
         return 0.0, 0.0
-    found = closest(near, body.points, faces)
-    corners = faces[found.triangle]
-    place, smooth = (np.einsum("nk,nkd->nd", found.weights, each[corners]) for each in (body.points, body.limit))
-    above = (np.einsum("nd,nd->n", place - near, near - smooth) > 0.0) & (found.distance < lift[corners].max(axis=1))
-    return float(found.distance[above].max(initial=0.0)), float(lift[corners[above]].max(initial=0.0))
+    nearest = closest(near, body.points, faces)
+    corners = faces[nearest.triangle]
+    polygon, smooth = (
+        np.einsum("nk,nkd->nd", nearest.weights, vertices[corners]) for vertices in (body.points, body.limit)
+    )
+    above = (np.einsum("nd,nd->n", polygon - near, near - smooth) > 0.0) & (
+        nearest.distance < lift[corners].max(axis=1)
+    )
+    return float(nearest.distance[above].max(initial=0.0)), float(lift[corners[above]].max(initial=0.0))
 
 
 def frames_compared(count: int) -> range:
@@ -135,16 +139,16 @@ def frames_compared(count: int) -> range:
     return range(0, count, max(EVERY, math.ceil(count / MOST_FRAMES)))
 
 
-def of_polygons(found: Sequence[Shown]) -> list[str]:
+def of_polygons(surfaces: Sequence[Shown]) -> list[str]:
     """A note of the bodies that viewports without subdivision show through garments, with offsets that hide them."""
-    if not found:
+    if not surfaces:
         return []
-    worst = max(found, key=lambda each: each.height)
+    worst = max(surfaces, key=lambda surface: surface.height)
     offsets: dict[str, float] = {}
-    for each in found:
-        offsets[each.garment] = max(offsets.get(each.garment, 0.0), each.offset)
-    others = len(offsets) - 1
-    through = f"<{worst.garment}>" + (f" and {counted(others, 'other garment')}" if others else "")
+    for surface in surfaces:
+        offsets[surface.garment] = max(offsets.get(surface.garment, 0.0), surface.offset)
+    further = len(offsets) - 1
+    through = f"<{worst.garment}>" + (f" and {counted(further, 'other garment')}" if further else "")
     shows = f"viewports that draw <{worst.body}> unsubdivided show it through {through}"
     return [f"{shows} by up to {1e3 * worst.height:.1f} mm{at_time(worst.time)}; {_options(offsets.items())} hides it"]
 

@@ -18,13 +18,12 @@ from ..solver.frame.lead_in import cages_walked
 from ..solver.frame.refiner import Refiner
 from ..solver.mesh.kernels import device_of, start_warp
 from ..usd.read.reader import Shot
-from ..usd.view import Stage
 from .frames import Outcome
 from .from_rest import FromRest
 from .joined import Mover, Positions, counts, worse
+from .opened import open_for
 from .options import RefineOptions
 from .processes import cores
-from .untagged import open_with_colliders
 
 Outcomes = Generator[Outcome, None, None]
 
@@ -37,21 +36,6 @@ def prepare_device(device: str) -> str:
     start_warp()
     torch.set_num_threads(1)
     return device_of(device)
-
-
-def open_for(shot: str | Stage, options: RefineOptions) -> Shot:
-    """Open a shot with the reading options."""
-    return open_with_colliders(
-        shot,
-        garments=options.garments,
-        colliders=options.colliders,
-        bind=options.bind,
-        frames=options.frames if options.preroll is None else None,
-        level=options.level,
-        overrides=options.overrides,
-        rest_frame=options.rest_frame,
-        gravity=options.gravity,
-    )
 
 
 class ShotSolver:
@@ -113,8 +97,8 @@ class ShotSolver:
         frame = shot.frame(time)
 
         def moved(start: Positions, end: Positions) -> tuple[Positions, list[dict[str, Any]]]:
-            found = refiner.moved_safely(frame, start, end)
-            return [points for points, _ in found], [contact for _, contact in found]
+            moves = refiner.moved_safely(frame, start, end)
+            return [points for points, _ in moves], [contact for _, contact in moves]
 
         points, contacts = moved(near, wanted)
         crosses = any(any(counts(contact).values()) for contact in contacts)
@@ -125,17 +109,29 @@ class ShotSolver:
         """The shot, opened if necessary, and a new refiner."""
         device = prepare_device(self._options.device)
         self._opened = self._opened or open_for(self._shot, self._options)
-        options = {"device": device, "threads": self._threads, "heat_map": self._options.heat_map}
-        settings = self._options.solve_settings()
-        return self._opened, Refiner(self._opened.scene, settings, levels=self.levels, **options)
+        refiner = Refiner(
+            self._opened.scene,
+            self._options.solve_settings(),
+            levels=self.levels,
+            device=device,
+            threads=self._threads,
+            heat_map=self._options.heat_map,
+        )
+        return self._opened, refiner
 
     def _begin(self, shot: Shot, refiner: Refiner, times: Sequence[float | None]) -> None:
         """Start a shot in the middle, if its cage crosses itself, with the cage advanced from an earlier frame."""
         earlier = [] if not times or times[0] is None else shot.times_until(times[0])
-        settings = {"times": earlier, "device": device_of(self._options.device), "threads": self._threads}
-        found = cages_walked(shot.scene, self._options.solve_settings(), shot.frame, **settings)
-        if found is not None:
-            refiner.begin_at(found[0], since=found[1])
+        advanced = cages_walked(
+            shot.scene,
+            self._options.solve_settings(),
+            shot.frame,
+            times=earlier,
+            device=device_of(self._options.device),
+            threads=self._threads,
+        )
+        if advanced is not None:
+            refiner.begin_at(advanced[0], since=advanced[1])
 
 
 def sampled_at(shot: Shot, time: float | None) -> list[bool]:
@@ -167,6 +163,6 @@ def time_frames(shot: Shot, options: RefineOptions, levels: list[int]) -> dict[s
         spent.append(clock.perf_counter() - began)
         from_rest.measure()
     warm = mean(spent[1:] or spent)
-    whole = spent[0] + warm * (len(times) - 1)
-    seconds = {"first_frame_seconds": spent[0], "seconds_a_frame": warm, "whole_shot_seconds": whole}
+    total = spent[0] + warm * (len(times) - 1)
+    seconds = {"first_frame_seconds": spent[0], "seconds_a_frame": warm, "whole_shot_seconds": total}
     return {"timed": {name: float(f"{value:.3g}") for name, value in seconds.items()}, "from_rest": from_rest.plain()}

@@ -24,11 +24,12 @@ from .chunks import frames_in_order
 from .finished import check_jobs, made_from
 from .frames import CHUNK, Finished, Outcome, record_in
 from .joined import Both, Joint, between, join
+from .opened import open_for
 from .options import RefineOptions
 from .refine import check_places, running, write_all
 from .report import RefineReport
 from .run import Run, Stored, fine_meshes, numbers_in
-from .solve import ShotSolver, open_for
+from .solve import ShotSolver
 
 SEAM_BOUND = 0.05
 """Largest increase of a frame's move by a seam, RMS over a garment, in mean fine edges; figures in `docs/farm.md`."""
@@ -59,9 +60,9 @@ class Seam:
 
     def __str__(self) -> str:
         """Position and distance in one line."""
-        how = f"a frame, over {counted(self.frames, 'frame')}" if self.frames else "at once"
+        extent = f"a frame, over {counted(self.frames, 'frame')}" if self.frames else "at once"
         move = f"seam at {self.after:g}: <{self.path}> moves {self.rms:.3g} fine edges RMS, {self.largest:.3g} at most"
-        return f"{move}, {how}" + (f" ({self.why})" if self.why else "")
+        return f"{move}, {extent}" + (f" ({self.why})" if self.why else "")
 
 
 class _Chunk(Finished):
@@ -101,8 +102,8 @@ class _Chunk(Finished):
 
     def options(self, **more: Any) -> RefineOptions:
         """Options for joining: without weights and on the CPU, because the frames are already solved."""
-        left = ("frames", "preroll", "weights", "device")
-        plain = {name: value for name, value in self.run["options"].items() if name not in left}
+        ignored = ("frames", "preroll", "weights", "device")
+        plain = {name: value for name, value in self.run["options"].items() if name not in ignored}
         paths = "absolute" if Path(self.run["shot"]).is_absolute() else "relative"
         return RefineOptions(**plain, asset_paths=paths, **more)
 
@@ -164,10 +165,10 @@ class _Joins:
             again = f"refine the chunk from {named_time(worst.after)} on with {longer}"
             remedy = f"{again}, or all with --temporal off, or allow more by --seam-bound"
             raise LayerError(f"{worst}; at most {self.bound:g} RMS is allowed: {remedy}")
-        known = {seam.after for seam in self.seams}
-        alone = self.run["options"].get("temporal") == "off" or not np.isfinite(self.bound)
-        for part in () if alone else self.parts:
-            if part.numbers[0] - 1 in self.chunks and part.times[0] not in known:
+        measured = {seam.after for seam in self.seams}
+        independent = self.run["options"].get("temporal") == "off" or not np.isfinite(self.bound)
+        for part in () if independent else self.parts:
+            if part.numbers[0] - 1 in self.chunks and part.times[0] not in measured:
                 unknown = f"nothing tells how far the seam at {named_time(part.times[0])} moves"
                 remedy = "refine it with --preroll 1 or more, or give --seam-bound inf"
                 raise LayerError(
@@ -211,8 +212,8 @@ def stitch(
     out, parts = Path(out), _opened(chunks)
     _check_alike(parts, one_shot=shot is None)
     numbers = _check_frames(parts, frames)
-    files = {"root": root and Path(root), "report": report_to and Path(report_to)}
-    options, source = parts[0].options(overwrite=overwrite, **files), Path(shot or parts[0].shot)
+    options = parts[0].options(overwrite=overwrite, root=root and Path(root), report=report_to and Path(report_to))
+    source = Path(shot or parts[0].shot)
     check_jobs([(source, out, options)])
     check_places(out, options)
     with running(str(source), options, out=out) as (opened, report):
@@ -252,8 +253,8 @@ def check_seams(
     """
     parts = _opened(chunks)
     if of is not None:
-        (own,) = _opened([of])
-        parts = [part for part in parts if part.shot == own.shot and part.is_whole]
+        (chunk,) = _opened([of])
+        parts = [part for part in parts if part.shot == chunk.shot and part.is_whole]
     pairs = [pair for pair in pairwise(parts) if pair[0].numbers[-1] + 1 == pair[1].numbers[0]]
     if of is not None:
         pairs = [pair for pair in pairs if of.resolve() in [part.folder.resolve() for part in pair]]
@@ -279,16 +280,16 @@ def _make_folder(folder: Path) -> None:
 
 def _opened(chunks: Sequence[str | Path]) -> list[_Chunk]:
     """The chunks sorted by frames; unrelated entries in a folder of chunks are ignored."""
-    found: dict[Path, _Chunk] = {}
+    chunks_in: dict[Path, _Chunk] = {}
     for place in map(Path, chunks):
         run = record_in(place)
-        inside = [] if run or not place.is_dir() else [each for each in sorted(place.iterdir()) if record_in(each)]
+        inside = [] if run or not place.is_dir() else [child for child in sorted(place.iterdir()) if record_in(child)]
         if not inside and not _is_of_chunk(run):
             raise UsageError(f"{place} is no chunk of a shot, nor a folder of chunks; refine with --preroll makes one")
         for folder in inside or [place]:
             if _is_of_chunk(record := record_in(folder)):
-                found[folder.resolve()] = _Chunk(folder, record)
-    parts = [part for part in found.values() if part.numbers]
+                chunks_in[folder.resolve()] = _Chunk(folder, record)
+    parts = [part for part in chunks_in.values() if part.numbers]
     if not parts:
         raise UsageError(f"there are no frames to stitch in {', '.join(map(str, chunks)) or 'no folders'}")
     return sorted(parts, key=lambda part: part.numbers)
@@ -304,8 +305,10 @@ def _check_alike(parts: Sequence[_Chunk], *, one_shot: bool) -> None:
     """Refuse chunks of different shots, versions or options."""
     first = parts[0]
     for part in parts[1:]:
-        one, other = first.decisive(), part.decisive()
-        if names := sorted(name for name in {*one, *other} if one.get(name) != other.get(name)):
+        first_record, part_record = first.decisive(), part.decisive()
+        if names := sorted(
+            name for name in {*first_record, *part_record} if first_record.get(name) != part_record.get(name)
+        ):
             raise UsageError(
                 f"{part.folder} and {first.folder} were made with other {', '.join(names)}; refine one anew"
             )
@@ -315,11 +318,11 @@ def _check_alike(parts: Sequence[_Chunk], *, one_shot: bool) -> None:
             )
 
 
-def _check_same_shot(part: _Chunk, made: Mapping[str, Any]) -> None:
+def _check_same_shot(part: _Chunk, record: Mapping[str, Any]) -> None:
     """Refuse a shot changed since the chunk was refined, and a chunk of a different version of this package."""
-    if _hashes(made) != _hashes(part.run):
+    if _hashes(record) != _hashes(part.run):
         raise UsageError(f"the shot has changed since {part.folder} was refined from it; refine the chunks anew")
-    if names := [name for name in ("version", "code") if made[name] != part.run.get(name)]:
+    if names := [name for name in ("version", "code") if record[name] != part.run.get(name)]:
         remedy = "stitch with the physgraph-usd that refined it, or refine the chunks anew"
         raise UsageError(f"{part.folder} was made with other {' and '.join(names)}; {remedy}")
 
@@ -344,9 +347,9 @@ def _check_frames(parts: Sequence[_Chunk], frames: tuple[float, float] | None) -
     wanted = numbers_in([time for time in every if time is not None], frames)
     missing = [every[number] for number in wanted if number not in owners]
     if missing:
-        there = ", ".join(f"{part.folder} ({_span(part.times)})" for part in parts)
+        spans = ", ".join(f"{part.folder} ({_span(part.times)})" for part in parts)
         remedy = "refine them, or go on by --resume"
-        raise UsageError(f"frames {_spans(missing, every)} are in no chunk; those there: {there}; {remedy}")
+        raise UsageError(f"frames {_spans(missing, every)} are in no chunk; those there: {spans}; {remedy}")
     for part in parts:
         if not set(part.numbers) <= set(wanted):
             outside = f"{part.folder} holds the frames {_span(part.times)}, of which some lie outside --frames"
@@ -378,8 +381,8 @@ def _moves(both: Both, joint: Joint, index: int, edges: np.ndarray) -> list[tupl
     """
     moves, lag = [], np.zeros(1)
     jump: tuple[float, float] | None = None
-    for k, ((own, after), frame) in enumerate(zip(both, joint.frames, strict=True), start=1):
-        points = [each.points[index] if each.points else None for each in (own, after, frame)]
+    for k, ((earlier, after), frame) in enumerate(zip(both, joint.frames, strict=True), start=1):
+        points = [outcome.points[index] if outcome.points else None for outcome in (earlier, after, frame)]
         jump, (a, b, x) = None, points
         if a is None or b is None or x is None:
             continue
@@ -388,7 +391,7 @@ def _moves(both: Both, joint: Joint, index: int, edges: np.ndarray) -> list[tupl
         before, lag = lag, x - between(a, b, k / (len(both) + 1))
         part, jump = (b - a) / (len(both) + 1), _size(b - a, edge)
         moves.append(_size(part + lag - before, edge))
-        if own is both[-1][0]:
+        if earlier is both[-1][0]:
             moves.append(_size(part - lag, edge))
     if jump is None:
         return None

@@ -54,9 +54,13 @@ def row_of(shot: str | Path, layer: Path, done: RefineReport | PhysGraphError | 
         done: The report, the error, or None if the batch was interrupted.
     """
     if done is None:
-        kept = kept_for(layer)
-        left = Row(str(shot), str(layer))
-        return replace(left, state="interrupted", frames=kept.frames, error=f"interrupted, {kept}") if kept else left
+        folder_text = kept_for(layer)
+        row = Row(str(shot), str(layer))
+        return (
+            replace(row, state="interrupted", frames=folder_text.frames, error=f"interrupted, {folder_text}")
+            if folder_text
+            else row
+        )
     if isinstance(done, PhysGraphError):
         return Row(str(shot), str(layer), "failed", done.exit_code, error=str(done))
     frames = len(done.frames)
@@ -137,10 +141,10 @@ def table_of(rows: Sequence[Row]) -> list[str]:
 
 
 def _cells(row: Row) -> tuple[str, ...]:
-    made = row.frames - len(row.failed_frames)
-    frames = "" if not row.frames else str(made) if made == row.frames else f"{made} of {row.frames}"
+    written = row.frames - len(row.failed_frames)
+    frames = "" if not row.frames else str(written) if written == row.frames else f"{written} of {row.frames}"
     numbers = [
         "" if row.seconds_a_frame is None else f"{row.seconds_a_frame:.2f}",
-        *("" if each is None else str(each) for each in (row.crossings, len(row.warnings), row.exit_code)),
+        *("" if cell is None else str(cell) for cell in (row.crossings, len(row.warnings), row.exit_code)),
     ]
     return (Path(row.shot).name, row.state, frames, *numbers)

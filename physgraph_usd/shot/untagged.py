@@ -6,22 +6,21 @@ import os
 from collections.abc import Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
-from scipy.spatial import cKDTree
 
 from ..errors import StageError, counted
-from ..solver.colliders.mesh import MeshBody
 from ..solver.colliders.pose import Pose, bounds_of
-from ..solver.mesh.kernels import start_warp
 from ..solver.resolution import sample_frames
 from ..solver.scene import Garment
 from ..usd.read.other_bodies import OtherBody, other_bodies
 from ..usd.read.reader import Shot, open_shot
 from ..usd.stage import at_time
 from ..usd.view import Stage
+
+if TYPE_CHECKING:
+    from ..solver.colliders.mesh import MeshBody
 
 AUTO = "auto"
 """Pseudo-collider: all colliders named by the shot, and the bodies touched by garments."""
@@ -96,9 +95,9 @@ def find_candidates(shot: Shot) -> list[Candidate]:
     if cloth is None:
         return []
     bodies = other_bodies(shot, cloth.times, cloth.boxes)
-    found = [Candidate(body.path, body.why) if body.why else _judged(body, cloth) for body in bodies]
-    shown = [each for each in found if each is not None]
-    return sorted(shown, key=lambda each: -max(each.shares.values(), default=0.0))
+    candidates = [Candidate(body.path, body.why) if body.why else _judged(body, cloth) for body in bodies]
+    judged = [candidate for candidate in candidates if candidate is not None]
+    return sorted(judged, key=lambda candidate: -max(candidate.shares.values(), default=0.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,6 +139,9 @@ def _judged(body: OtherBody, cloth: _Cloth) -> Candidate | None:
 
     After a frame in which cloth and body are apart, frames are passed over while neither has moved far enough to meet.
     """
+    from ..solver.colliders.mesh import MeshBody
+    from ..solver.mesh.kernels import start_warp
+
     start_warp()
     solid = MeshBody(device="cpu", threads=1)
     apart: tuple[float, list[np.ndarray], np.ndarray] | None = None
@@ -167,19 +169,19 @@ def _touched(body: OtherBody, solid: MeshBody, cloth: _Cloth, first: tuple[int, 
     frames = [index, *(later[pick] for pick in picks)]
     pairs = ((cloth.cages(number)[most], body.pose(number)) for number in frames)
     if _moves_with(garment, [(cage, pose) for cage, pose in pairs if pose is not None], reach=cloth.along[most]):
-        why = f"it lies on <{garment.path}> and moves with it: a trim, or the garment's own skin"
-        return Candidate(body.path, why, follows=garment.path)
+        reason = f"it lies on <{garment.path}> and moves with it: a trim, or the garment's own skin"
+        return Candidate(body.path, reason, follows=garment.path)
     if body.unread:
         return Candidate(body.path, UNREAD, unread=body.unread)
     for number in frames[1:] if fractions[most] < LITTLE else ():
         pose = body.pose(number)
-        other = [0.0 if pose is None else _nearness(solid, pose, cage)[0] for cage in cloth.cages(number)]
-        index, fractions = max((index, fractions), (number, other), key=lambda each: max(each[1]))
+        later_fractions = [0.0 if pose is None else _nearness(solid, pose, cage)[0] for cage in cloth.cages(number)]
+        index, fractions = max((index, fractions), (number, later_fractions), key=lambda entry: max(entry[1]))
     most = int(np.argmax(fractions))
     garment = cloth.shot.scene.garments[most]
-    where = f"{percent(fractions[most])} of <{garment.path}> is inside or within {1e3 * NEAR:.0f} mm"
+    share_text = f"{percent(fractions[most])} of <{garment.path}> is inside or within {1e3 * NEAR:.0f} mm"
     shares = {g.path: part for g, part in zip(cloth.shot.scene.garments, fractions, strict=True) if part}
-    return Candidate(body.path, where + at_time(cloth.times[index]), shares, body.pose(index))
+    return Candidate(body.path, share_text + at_time(cloth.times[index]), shares, body.pose(index))
 
 
 def percent(fraction: float) -> str:
@@ -202,6 +204,10 @@ def _moves_with(garment: Garment, frames: Sequence[tuple[np.ndarray, Pose]], *, 
         frames: Positions of the cage [m], shape (V, 3), and the body's pose.
         reach: Distance from the cage [m].
     """
+    import torch
+
+    from ..solver.colliders.mesh import MeshBody
+
     (cage, pose), *later = frames
     triangles = garment.mesh.triangulate(garment.rest).triangles
     surfaces = MeshBody(side="start", device="cpu", threads=1).pose(Pose(cage, triangles))
@@ -210,17 +216,17 @@ def _moves_with(garment: Garment, frames: Sequence[tuple[np.ndarray, Pose]], *, 
     used = np.unique(pose.triangles) if len(pose.triangles) else np.arange(len(pose.points))
     used = used[:: max(1, len(used) // MOST_POINTS)]
     points = torch.as_tensor(pose.points[used] - surfaces[0].origin)
-    found = surfaces[0].closest(points, torch.full_like(points[:, 0], reach))
-    near = found.distance.isfinite().numpy()
+    nearest = surfaces[0].closest(points, torch.full_like(points[:, 0], reach))
+    near = nearest.distance.isfinite().numpy()
     if near.mean() < MOST_OF:
         return False
-    corners = surfaces[0].triangles[found.face.numpy()[near]]
-    weights = _weights(cage[corners], found.point.numpy()[near] + surfaces[0].origin)
-    for other, moved in later:
+    corners = surfaces[0].triangles[nearest.face.numpy()[near]]
+    weights = _weights(cage[corners], nearest.point.numpy()[near] + surfaces[0].origin)
+    for later_cage, moved in later:
         if moved.points.shape != pose.points.shape:
             return False
-        places = np.einsum("nk,nkd->nd", weights, other[corners])
-        away = np.linalg.norm(moved.points[used][near] - places, axis=1)
+        attached = np.einsum("nk,nkd->nd", weights, later_cage[corners])
+        away = np.linalg.norm(moved.points[used][near] - attached, axis=1)
         if np.quantile(away, MOST_OF) > reach:
             return False
     return True
@@ -247,8 +253,8 @@ def open_with_colliders(shot: str | os.PathLike[str] | Stage, *, colliders: Sequ
     """
     if AUTO not in colliders:
         return open_shot(shot, colliders=colliders, **options)
-    with closing(open_shot(shot, colliders=[each for each in colliders if each != AUTO], **options)) as first:
-        named = [*first.colliders, *(each.path for each in find_candidates(first) if each.is_taken)]
+    with closing(open_shot(shot, colliders=[path for path in colliders if path != AUTO], **options)) as first:
+        named = [*first.colliders, *(candidate.path for candidate in find_candidates(first) if candidate.is_taken)]
     return open_shot(shot, colliders=named, **options)
 
 
@@ -263,6 +269,9 @@ def _nearness(body: MeshBody, pose: Pose, cage: np.ndarray) -> tuple[float, floa
         The fraction, 0 without contact, and the distance, at most `LOOKED`. A room or a sky around the whole cage, with
         no walls nearby, counts as no contact.
     """
+    import torch
+    from scipy.spatial import cKDTree
+
     fraction, gap = 0.0, LOOKED
     if not len(pose.triangles):
         points = pose.points[np.isfinite(pose.points).all(axis=1)]

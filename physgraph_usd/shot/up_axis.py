@@ -38,7 +38,11 @@ def across_gravity(scene: Scene, frames: Sequence[Frame], beside: Sequence[Candi
     for index, garment in enumerate(scene.garments):
         cages = [frame.garments[index].points for frame in frames]
         rest, moving = _faces(garment, garment.rest), sum((_faces(garment, points) for points in cages), np.zeros(3))
-        bodies = [(each.path, [each.pose]) for each in beside if each.pose and garment.path in each.shares]
+        bodies = [
+            (candidate.path, [candidate.pose])
+            for candidate in beside
+            if candidate.pose and garment.path in candidate.shares
+        ]
         bodies += [(collider.path, _around(frames, index, number)) for number, collider in enumerate(scene.colliders)]
         for axis in {1, 2} - {down}:
             if all(ROUND * faced[axis] < faced[down] for faced in (rest, moving)):
@@ -58,10 +62,10 @@ def _faces(garment: Garment, points: np.ndarray) -> np.ndarray:
 
 def _around(frames: Sequence[Frame], garment: int, collider: int) -> list[Pose]:
     """A collider's poses in the frames in which its bounds contain the garment's centre."""
-    found = []
+    standing = []
     for frame in frames:
         pose, middle = frame.colliders[collider], frame.garments[garment].points.mean(axis=0)
         corners = np.zeros((0, 3)) if pose is None else pose.corners()
         if pose and len(corners) and (corners.min(axis=0) < middle).all() and (middle < corners.max(axis=0)).all():
-            found.append(pose)
-    return found
+            standing.append(pose)
+    return standing

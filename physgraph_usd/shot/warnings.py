@@ -61,10 +61,10 @@ class Kind:
             times: The time code of the figures, then other affected time codes.
             figures: Values for the sentence and the remedy.
         """
-        first, *others = times or (None,)
-        place = (f"<{path}>" if path else "") + at_time(first)
-        parts = [self.sentence.format(**figures), self.remedy.format(**figures), _also(others)]
-        warning = Warned((f"{place}: " if place else "") + "; ".join(filter(None, parts)))
+        first, *later = times or (None,)
+        location = (f"<{path}>" if path else "") + at_time(first)
+        parts = [self.sentence.format(**figures), self.remedy.format(**figures), _also(later)]
+        warning = Warned((f"{location}: " if location else "") + "; ".join(filter(None, parts)))
         warning.kind = self.title
         warning.options = {name: value.format(**figures) for name, value in self.options.items()}
         return warning
@@ -180,17 +180,17 @@ def advice_table() -> str:
     return "\n".join(["| it says | do |", "|---|---|", *rows]) + "\n"
 
 
-def of_strain(found: Mapping[str, Sequence[StrainedPart]], sources: Mapping[str, str]) -> list[str]:
+def of_strain(parts_of: Mapping[str, Sequence[StrainedPart]], sources: Mapping[str, str]) -> list[str]:
     """A warning of parts larger than their rest shape in most frames, or far smaller, unless the shape is fitted.
 
     Parts of `MOST_STRETCHED` of a garment or less are passed over.
 
     Args:
-        found: Strained parts of each garment, largest first, by path.
+        parts_of: Strained parts of each garment, largest first, by path.
         sources: Source of each garment's rest shape, by path.
     """
     named = []
-    for path, parts in found.items():
+    for path, parts in parts_of.items():
         large = [part for part in parts if part.needs_rest and not sources[path].startswith(FITTED)]
         for part in large[: sum(part.share for part in large) > MOST_STRETCHED]:
             size = f"{part.area_ratio:.0%} of its area on {counted(part.faces, 'face')} {part.where}"
@@ -203,28 +203,31 @@ def of_gravity(garment: str, body: str, axis: str, *, pull: str, source: str) ->
     return WARNINGS["gravity"](garment, body=body, axis=axis, pull=pull, source=source)
 
 
-def of_unfelt(found: Sequence[Candidate]) -> list[str]:
+def of_unfelt(touching: Sequence[Candidate]) -> list[str]:
     """A warning of bodies touched by cloth but not used as colliders, with the options to type."""
-    if not found:
+    if not touching:
         return []
-    named = [f"<{each.path}> ({percent(each.shares[each.garment])} of <{each.garment}>)" for each in found[:MOST_NAMED]]
-    named += [f"{len(found) - MOST_NAMED} more"] if len(found) > MOST_NAMED else []
-    options = join(options_of("--collider", [each.path for each in found[:MOST_NAMED]]))
-    one = len(found) == 1
-    bodies, why = ("a body", "it is no collider") if one else ("bodies", "they are no colliders")
-    figures = {"named": ", ".join(named), "options": options, "near": 1e3 * NEAR, "auto": AUTO}
-    return [WARNINGS["unfelt"](bodies=bodies, why=why, **figures)]
+    named = [
+        f"<{body.path}> ({percent(body.shares[body.garment])} of <{body.garment}>)" for body in touching[:MOST_NAMED]
+    ]
+    named += [f"{len(touching) - MOST_NAMED} more"] if len(touching) > MOST_NAMED else []
+    options = join(options_of("--collider", [body.path for body in touching[:MOST_NAMED]]))
+    single = len(touching) == 1
+    bodies, reason = ("a body", "it is no collider") if single else ("bodies", "they are no colliders")
+    warning = WARNINGS["unfelt"](
+        bodies=bodies, why=reason, named=", ".join(named), options=options, near=1e3 * NEAR, auto=AUTO
+    )
+    return [warning]
 
 
-def of_unread(found: Sequence[Candidate]) -> list[str]:
+def of_unread(candidates: Sequence[Candidate]) -> list[str]:
     """A warning of shapes near cloth that are not read."""
-    named = [f"<{each.path}> ({each.unread})" for each in found if each.unread]
+    named = [f"<{candidate.path}> ({candidate.unread})" for candidate in candidates if candidate.unread]
     if not named:
         return []
-    more = [f"{len(named) - MOST_NAMED} more"] if len(named) > MOST_NAMED else []
-    words = ("is", "it", "its") if len(named) == 1 else ("are", "them", "their")
-    figures = dict(zip(("are", "them", "their"), words, strict=True))
-    return [WARNINGS["unread"](named=", ".join([*named[:MOST_NAMED], *more]), **figures)]
+    unnamed = [f"{len(named) - MOST_NAMED} more"] if len(named) > MOST_NAMED else []
+    are, them, their = ("is", "it", "its") if len(named) == 1 else ("are", "them", "their")
+    return [WARNINGS["unread"](named=", ".join([*named[:MOST_NAMED], *unnamed]), are=are, them=them, their=their)]
 
 
 def of_frames(report: RefineReport) -> list[str]:
@@ -234,8 +237,8 @@ def of_frames(report: RefineReport) -> list[str]:
         for index, garment in enumerate(report.garments)
     ]
     checks = (_of_jumps, of_contact)
-    found = [warning for check in checks for garment, entries in by_garment for warning in check(garment, entries)]
-    return [*found, *_of_unsolved(report.unsettled)]
+    warnings = [warning for check in checks for garment, entries in by_garment for warning in check(garment, entries)]
+    return [*warnings, *_of_unsolved(report.unsettled)]
 
 
 def _of_jumps(garment: Mapping[str, Any], entries: Entries) -> Iterator[str]:
@@ -248,31 +251,31 @@ def _of_jumps(garment: Mapping[str, Any], entries: Entries) -> Iterator[str]:
 
 def of_contact(garment: Mapping[str, Any], entries: Entries) -> Iterator[str]:
     """A warning if a garment's result crosses cloth or bodies, or is inside a body, with the worst frame."""
-    left = {
-        time: [each for each in _measured(entry.get("contact", {})) if each[1]]
+    remaining = {
+        time: [measure for measure in _measured(entry.get("contact", {})) if measure[1]]
         for time, entry in entries.items()
         if is_first(garment["path"], entry)
     }
-    left = {time: counts for time, counts in left.items() if counts}
-    if left:
-        times = sorted(left, key=lambda time: -sum(after for _, after, _ in left[time]))  # The worst first.
-        named = [f"{what} ({before:,} in the cage)" for what, _, before in left[times[0]]]
+    remaining = {time: counts for time, counts in remaining.items() if counts}
+    if remaining:
+        times = sorted(remaining, key=lambda time: -sum(after for _, after, _ in remaining[time]))  # The worst first.
+        named = [f"{text} ({before:,} in the cage)" for text, _, before in remaining[times[0]]]
         yield WARNINGS["contact"](garment["path"], times, left=", ".join(named))
 
 
-def of_drawn(found: Mapping[float | None, Mapping[str, float]]) -> list[str]:
+def of_drawn(depths_at: Mapping[float | None, Mapping[str, float]]) -> list[str]:
     """A warning for each garment whose drawn surface enters a body, given depths [m] by time code and path."""
     warnings = []
-    for path in dict.fromkeys(path for depths in found.values() for path in depths):
-        depths = {time: each[path] for time, each in found.items() if path in each}
+    for path in dict.fromkeys(path for depths in depths_at.values() for path in depths):
+        depths = {time: depth_of[path] for time, depth_of in depths_at.items() if path in depth_of}
         times = sorted(depths, key=lambda time: -depths[time])  # The worst first.
         warnings.append(WARNINGS["drawn"](path, times, depth=1e3 * depths[times[0]]))
     return warnings
 
 
-def of_loops(found: Mapping[str, float]) -> list[str]:
+def of_loops(gaps: Mapping[str, float]) -> list[str]:
     """A warning for each garment whose loop does not close, given the distance between its ends [m] by path."""
-    return [WARNINGS["open_loop"](path, gap=1e3 * gap) for path, gap in found.items()]
+    return [WARNINGS["open_loop"](path, gap=1e3 * gap) for path, gap in gaps.items()]
 
 
 def _measured(contact: Mapping[str, Any]) -> Iterator[tuple[str, int, int]]:
@@ -281,20 +284,20 @@ def _measured(contact: Mapping[str, Any]) -> Iterator[tuple[str, int, int]]:
     for body, measured in contact.get("bodies", {}).items():
         measures.append(("crossing", "crossings", f"with <{body}>", measured, "crossings"))
         measures.append(("vertex", "vertices", f"inside <{body}>", measured, "inside"))
-    for noun, plural, where, measured, name in measures:
+    for noun, plural, location, measured, name in measures:
         after, before = (int(measured.get(side, {}).get(name, 0)) for side in ("after", "before"))
-        yield f"{counted(after, noun, plural)} {where}", after, before
+        yield f"{counted(after, noun, plural)} {location}", after, before
 
 
-def _of_unsolved(found: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+def _of_unsolved(unsettled: Sequence[Mapping[str, Any]]) -> Iterator[str]:
     """Warnings of frames stopped by the time limit, and of unsolved frames, by garment."""
     kinds = {LIMITED: LIMITED, COLLAPSED: UNSOLVED, UNSOLVED: UNSOLVED}
-    known = [(str(entry["path"]), kinds[entry["stopped"]], entry) for entry in found if entry["stopped"] in kinds]
-    for path, kind in dict.fromkeys((path, kind) for path, kind, _ in known):
-        entries = [entry for *of, entry in known if of == [path, kind]]
-        how = in_words(entries[0])
-        place = f"<{path}>{at_time(entries[0]['time'])}: "
-        yield WARNINGS[kind](path, [entry["time"] for entry in entries], how=how.removeprefix(place))
+    stopped = [(str(entry["path"]), kinds[entry["stopped"]], entry) for entry in unsettled if entry["stopped"] in kinds]
+    for path, kind in dict.fromkeys((path, kind) for path, kind, _ in stopped):
+        entries = [entry for *of, entry in stopped if of == [path, kind]]
+        reason = in_words(entries[0])
+        prefix = f"<{path}>{at_time(entries[0]['time'])}: "
+        yield WARNINGS[kind](path, [entry["time"] for entry in entries], how=reason.removeprefix(prefix))
 
 
 def _also(times: Sequence[float | None]) -> str:

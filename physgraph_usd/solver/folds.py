@@ -19,17 +19,19 @@ the least stiffness, so that coarse levels keep the folds of settled cloth.
 from __future__ import annotations
 
 import math
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from jaxtyping import Float
-from torch import Tensor
 
 from .fabric import Fabric
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 EDGES_PER_WAVE = 5.0
 FOLDING = 1e-3
 """Compression at which cloth begins to fold; smaller compressions stay in its plane."""
-Edge = TypeVar("Edge", float, Float[Tensor, " hinges"])
+Edge = TypeVar("Edge", float, "Float[Tensor, ' hinges']")
 
 
 def carried_bend(fabric: Fabric, edge: Edge) -> Edge:

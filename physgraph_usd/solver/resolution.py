@@ -12,17 +12,21 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
-from torch import Tensor
 
 from ..errors import StageError
 from .folds import EDGES_PER_WAVE, raised_by
-from .level import Level
 from .mesh.subdivide import fine_count
 from .mesh.topology import edges_of
 from .scene import Frame, Garment, GarmentFrame, Scene
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from .level import Level
 
 AUTO = -1
 MOST = 4

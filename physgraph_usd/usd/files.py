@@ -32,7 +32,7 @@ def files_of(shot: str | Path | Usd.Stage) -> set[Path]:
     Raises:
         StageError: A file is a pipe; USD would wait for ever.
     """
-    found: set[Path] = set()
+    files: set[Path] = set()
     if isinstance(shot, Usd.Stage):
         waiting = [layer.realPath for layer in shot.GetUsedLayers() if layer.realPath]
     else:
@@ -42,10 +42,10 @@ def files_of(shot: str | Path | Usd.Stage) -> set[Path]:
             file = Path(Ar.SplitPackageRelativePathOuter(waiting.pop())[0])
             if file.is_fifo():
                 raise StageError(f"{file} is no file: it is a pipe, which has no end")
-            if file not in found and not (found and _is_result(file)):
-                found.add(file)
+            if file not in files and not (files and _is_result(file)):
+                files.add(file)
                 waiting += _named_in(file)
-    return found
+    return files
 
 
 def _layer_of(file: Path) -> Sdf.Layer | None:
@@ -85,24 +85,24 @@ def check_targets(targets: Sequence[Target], inputs: Iterable[Path]) -> None:
     """Refuse (UsageError) to write over an input, or two results into one file; links are resolved."""
     read = {_identity(file): file for file in inputs}
     written: dict[object, str] = {}
-    for what, path in targets:
+    for result, path in targets:
         key = _identity(path)
         if key in read:
             same = "" if path == read[key] else f" ({read[key]})"
-            raise UsageError(f"{what} {path} is part of the shot{same}; inputs are never edited, choose another name")
+            raise UsageError(f"{result} {path} is part of the shot{same}; inputs are never edited, choose another name")
         if key in written:
-            raise UsageError(f"{what} {path} is also {written[key]}; give each a name of its own")
-        written[key] = what
+            raise UsageError(f"{result} {path} is also {written[key]}; give each a name of its own")
+        written[key] = result
 
 
 def _identity(path: Path) -> object:
     """A key equal for two paths to the same file, whether the file exists or not."""
     try:
-        found = os.stat(path)
+        status = os.stat(path)
     except (OSError, ValueError):  # ValueError: a name with a null byte, in a damaged file.
-        whole = path.absolute()
-        return (_identity(whole.parent), whole.name) if whole.parent != whole else whole
-    return found.st_dev, found.st_ino
+        absolute = path.absolute()
+        return (_identity(absolute.parent), absolute.name) if absolute.parent != absolute else absolute
+    return status.st_dev, status.st_ino
 
 
 def check_suffix(what: str, path: Path, known: Sequence[str]) -> None:

@@ -23,13 +23,13 @@ def instancer_above(prim: Usd.Prim, beside: Usd.Prim | None = None) -> Usd.Prim 
     Args:
         beside: A garment; instancers above the garment too do not count.
     """
-    shared = {each.GetPath() for each in with_ancestors(beside)} if beside else set()
-    above = [each for each in with_ancestors(prim.GetParent()) if UsdGeom.PointInstancer(each)]
-    return next((each for each in reversed(above) if each.GetPath() not in shared), None)
+    shared = {ancestor.GetPath() for ancestor in with_ancestors(beside)} if beside else set()
+    above = [ancestor for ancestor in with_ancestors(prim.GetParent()) if UsdGeom.PointInstancer(ancestor)]
+    return next((instancer for instancer in reversed(above) if instancer.GetPath() not in shared), None)
 
 
 def mover(stage: Usd.Stage, body: Sdf.Path, garment: Sdf.Path) -> Usd.Prim:
-    """The prim whose motion a body has beside a garment: the instancer that draws the body, else the body."""
+    """The prim moving a body beside a garment: the instancer of the body, or the body."""
     prim = stage.GetPrimAtPath(body)
     return instancer_above(prim, stage.GetPrimAtPath(garment)) or prim
 
@@ -41,30 +41,30 @@ def prototypes_of(instancer: Usd.Prim) -> list[Usd.Prim]:
 
 
 def instanced_gprims(instancer: Usd.Prim) -> list[Usd.Prim]:
-    """Gprims below the prototypes of an instancer, and below those of instancers nested there."""
+    """Gprims below the prototypes of an instancer and of nested instancers."""
     return [prim for prim in drawn_with(instancer) if not UsdGeom.PointInstancer(prim)]
 
 
 def drawn_with(prim: Usd.Prim) -> list[Usd.Prim]:
     """A prim and, of an instancer, all gprims and nested instancers below its prototypes."""
-    found, open_prims = dict[Sdf.Path, Usd.Prim](), [prim]
+    prototypes, open_prims = dict[Sdf.Path, Usd.Prim](), [prim]
     while open_prims:
-        each = open_prims.pop()
-        if each.GetPath() not in found:  # Else drawn twice, or a prototype that contains its instancer.
-            found[each.GetPath()] = each
-            roots = prototypes_of(each) if UsdGeom.PointInstancer(each) else []
+        current = open_prims.pop()
+        if current.GetPath() not in prototypes:  # Else drawn twice, or a prototype that contains its instancer.
+            prototypes[current.GetPath()] = current
+            roots = prototypes_of(current) if UsdGeom.PointInstancer(current) else []
             open_prims += [shape for root in reversed(roots) for shape in reversed([*_shapes(root)])]
-    return [*found.values()]
+    return [*prototypes.values()]
 
 
 def _shapes(root: Usd.Prim) -> Iterator[Usd.Prim]:
     """Gprims and point instancers at and below a prototype."""
     if not root:
         return
-    found = iter(Usd.PrimRange(root, _PROTOTYPES))
-    for prim in found:
+    prims = iter(Usd.PrimRange(root, _PROTOTYPES))
+    for prim in prims:
         if UsdGeom.PointInstancer(prim):
-            found.PruneChildren()
+            prims.PruneChildren()
             yield prim
         elif UsdGeom.Gprim(prim):
             yield prim
@@ -79,30 +79,34 @@ def placements(instancer: Usd.Prim, time: float | None) -> dict[Sdf.Path, np.nda
         By path of the gprim, shape (N, 4, 4), float64; None if arrays of the instancer do not fit together.
     """
     world = np.array(UsdGeom.XformCache(timecode(time)).GetLocalToWorldTransform(instancer))
-    found: dict[Sdf.Path, list[np.ndarray]] = {}
+    matrices_of: dict[Sdf.Path, list[np.ndarray]] = {}
     with quiet(), np.errstate(all="ignore"):
-        fits = _place(instancer, world[None], time, found, ())
+        fits = _place(instancer, world[None], time, matrices_of, ())
     if not fits:
         return None
-    return {path: np.concatenate(each).swapaxes(1, 2) for path, each in found.items()}
+    return {path: np.concatenate(matrices).swapaxes(1, 2) for path, matrices in matrices_of.items()}
 
 
 def _place(
     instancer: Usd.Prim,
     bases: np.ndarray,
     time: float | None,
-    found: dict[Sdf.Path, list[np.ndarray]],
+    matrices_of: dict[Sdf.Path, list[np.ndarray]],
     above: tuple[Sdf.Path, ...],
 ) -> bool:
     """Add the matrices, for row vectors, of an instancer placed by some matrices; False if its arrays do not fit."""
-    shape, code, own = UsdGeom.PointInstancer(instancer), code_of(instancer, time), own_transforms(instancer, time)
-    if own is None or instancer.GetPath() in above:
-        return own is not None
+    shape, code, instancer_matrices = (
+        UsdGeom.PointInstancer(instancer),
+        code_of(instancer, time),
+        own_transforms(instancer, time),
+    )
+    if instancer_matrices is None or instancer.GetPath() in above:
+        return instancer_matrices is not None
     kinds, mask = np.asarray(_kinds(instancer, code), np.int64), shape.ComputeMaskAtTime(code)
     visible = np.asarray(mask, bool) if len(mask) == len(kinds) else np.ones(len(kinds), bool)
     cache, fits = UsdGeom.XformCache(code), True
     for number, root in enumerate(prototypes_of(instancer)):
-        mine = own[visible & (kinds == number)]
+        mine = instancer_matrices[visible & (kinds == number)]
         if not len(mine) or not root:
             continue
         placed = (mine[None] @ bases[:, None]).reshape(-1, 4, 4)
@@ -111,9 +115,9 @@ def _place(
                 continue
             matrices = np.array(cache.ComputeRelativeTransform(prim, root)[0])[None] @ placed
             if UsdGeom.PointInstancer(prim):
-                fits &= _place(prim, matrices, time, found, (*above, instancer.GetPath()))
+                fits &= _place(prim, matrices, time, matrices_of, (*above, instancer.GetPath()))
             else:
-                found.setdefault(prim.GetPath(), []).append(matrices)
+                matrices_of.setdefault(prim.GetPath(), []).append(matrices)
     return fits
 
 
@@ -125,8 +129,8 @@ def own_transforms(instancer: Usd.Prim, time: float | None) -> np.ndarray | None
     shape, code = UsdGeom.PointInstancer(instancer), code_of(instancer, time)
     count = len(_kinds(instancer, code))
     with_prototype, all_instances = UsdGeom.PointInstancer.IncludeProtoXform, UsdGeom.PointInstancer.IgnoreMask
-    found = shape.ComputeInstanceTransformsAtTime(code, code, with_prototype, all_instances) if count else ()
-    return np.array(found, np.float64).reshape(-1, 4, 4) if len(found) == count else None
+    transforms = shape.ComputeInstanceTransformsAtTime(code, code, with_prototype, all_instances) if count else ()
+    return np.array(transforms, np.float64).reshape(-1, 4, 4) if len(transforms) == count else None
 
 
 def _kinds(instancer: Usd.Prim, code: Usd.TimeCode) -> Sequence[int]:
@@ -145,10 +149,10 @@ def instance_reach(instancer: Usd.Prim) -> float:
     """Greatest distance along an axis of the instances' bounds beyond the positions' [units of the instancer]."""
     code, stage = code_of(instancer, None), instancer.GetStage()
     value = UsdGeom.PointInstancer(instancer).GetPositionsAttr().Get(code)
-    places = np.array(value if isinstance(value, Vt.Vec3fArray) else [], float).reshape(-1, 3)
+    positions = np.array(value if isinstance(value, Vt.Vec3fArray) else [], float).reshape(-1, 3)
     world = np.array(UsdGeom.XformCache(code).GetLocalToWorldTransform(instancer)).T
     inverse = np.linalg.pinv(np.where(np.isfinite(world), world, 0.0))
-    corners = [places]
+    corners = [positions]
     for path, matrices in (placements(instancer, None) or {}).items():
         shape = UsdGeom.Boundable(stage.GetPrimAtPath(path))
         ends = np.array(UsdGeom.Boundable.ComputeExtentFromPlugins(shape, code) or [], float).reshape(-1, 3)
@@ -156,17 +160,19 @@ def instance_reach(instancer: Usd.Prim) -> float:
             eight = np.array([[*point, 1.0] for point in product(*ends.T)])
             corners.append(np.einsum("nxy,cy->ncx", inverse @ matrices, eight)[:, :, :3].reshape(-1, 3))
     every = np.concatenate(corners)
-    if not len(places) or not np.isfinite(every).all():
+    if not len(positions) or not np.isfinite(every).all():
         return 0.0
-    return float(max((places.min(axis=0) - every.min(axis=0)).max(), (every.max(axis=0) - places.max(axis=0)).max()))
+    return float(
+        max((positions.min(axis=0) - every.min(axis=0)).max(), (every.max(axis=0) - positions.max(axis=0)).max())
+    )
 
 
 def _is_hidden(prim: Usd.Prim, root: Usd.Prim, code: Usd.TimeCode) -> bool:
     """Whether a prim or an ancestor up to its prototype's root is invisible."""
-    for each in with_ancestors(prim):
-        shape = UsdGeom.Imageable(each)
+    for ancestor in with_ancestors(prim):
+        shape = UsdGeom.Imageable(ancestor)
         if shape and shape.GetVisibilityAttr().Get(code) == UsdGeom.Tokens.invisible:
             return True
-        if each == root:
+        if ancestor == root:
             break
     return False

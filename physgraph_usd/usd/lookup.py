@@ -123,8 +123,8 @@ def check_overrides(
     for override in overrides:
         kind, paths = ("collider", colliders) if override.row.short in COLLIDER else ("garment", garments)
         if not any(path.HasPrefix(override.prim) for path in paths):
-            there = ", ".join(map(str, paths)) or "none"
-            raise UsageError(f"--set {override.prim}.{override.row.name}: no such {kind}; {kind}s: {there}")
+            listed = ", ".join(map(str, paths)) or "none"
+            raise UsageError(f"--set {override.prim}.{override.row.name}: no such {kind}; {kind}s: {listed}")
 
 
 def family_of(subset: UsdGeom.Subset) -> str:
@@ -156,24 +156,24 @@ def authored(prim: Usd.Prim, name: str) -> Usd.Attribute | None:
 def connected(attribute: Usd.Attribute) -> Usd.Attribute | None:
     """Return the source attribute of a single, one-step connection if the source has a value, else None."""
     sources = attribute.GetConnections() if attribute else []
-    found = attribute.GetStage().GetAttributeAtPath(sources[0]) if len(sources) == 1 else None
-    return found if found and found.HasAuthoredValue() and not found.HasAuthoredConnections() else None
+    source = attribute.GetStage().GetAttributeAtPath(sources[0]) if len(sources) == 1 else None
+    return source if source and source.HasAuthoredValue() and not source.HasAuthoredConnections() else None
 
 
 def nearest(prim: Usd.Prim, name: str) -> Usd.Attribute | None:
     """Return the authored attribute on the prim or the nearest ancestor."""
-    return next((found for each in with_ancestors(prim) if (found := authored(each, name))), None)
+    return next((attribute for ancestor in with_ancestors(prim) if (attribute := authored(ancestor, name))), None)
 
 
 def bound_materials(prim: Usd.Prim) -> tuple[Usd.Prim, ...]:
     """Materials bound to a prim, the physics purpose first, without repeats."""
     binding = UsdShade.MaterialBindingAPI(prim)
-    found: list[Usd.Prim] = []
+    materials: list[Usd.Prim] = []
     for purpose in ("physics", UsdShade.Tokens.allPurpose):
         material = binding.ComputeBoundMaterial(purpose)[0]
-        if material and material.GetPrim() not in found:
-            found.append(material.GetPrim())
-    return tuple(found)
+        if material and material.GetPrim() not in materials:
+            materials.append(material.GetPrim())
+    return tuple(materials)
 
 
 def find_value(
@@ -189,7 +189,9 @@ def find_value(
     attribute = nearest(prim, row.name)
     if attribute is None and row.name.startswith(MATERIAL):
         materials = bound_materials(prim) if materials is None else materials
-        attribute = next((found for each in materials if (found := authored(each, row.name))), None)
+        attribute = next(
+            (material_value for material in materials if (material_value := authored(material, row.name))), None
+        )
     if attribute is not None:
         return Found(row, source_name(attribute), attribute)
     return Found(row, "fallback", None, None if row.fallback is None else float(row.fallback))
@@ -197,8 +199,10 @@ def find_value(
 
 def _override(prim: Usd.Prim, row: Property, overrides: Sequence[Override]) -> Override | None:
     """The ``--set`` nearest to a prim for an attribute, the last if several name the same prim; None without any."""
-    matching = [each for each in overrides if each.row.name == row.name and prim.GetPath().HasPrefix(each.prim)]
-    return max(reversed(matching), key=lambda each: each.prim.pathElementCount, default=None)
+    matching = [
+        override for override in overrides if override.row.name == row.name and prim.GetPath().HasPrefix(override.prim)
+    ]
+    return max(reversed(matching), key=lambda override: override.prim.pathElementCount, default=None)
 
 
 def find_token(prim: Usd.Prim, row: Property, overrides: Sequence[Override] = ()) -> tuple[str, str]:

@@ -73,8 +73,8 @@ def author_record(layer: Sdf.Layer, record: Mapping[str, Any]) -> None:
 def _contents(layer: Sdf.Layer) -> str:
     """Digest of a layer's specs and sample times, without values; includes the other layer data."""
     digest = hashlib.sha256()
-    others = sorted(set(layer.customLayerData) - {RECORD})
-    digest.update(repr((str(layer.subLayerPaths), others)).encode())
+    foreign = sorted(set(layer.customLayerData) - {RECORD})
+    digest.update(repr((str(layer.subLayerPaths), foreign)).encode())
     for path in sorted(map(str, paths_in(layer))):
         spec = layer.GetObjectAtPath(path)
         if isinstance(spec, Sdf.PrimSpec):
@@ -133,8 +133,8 @@ def recorded_shot(layer: Sdf.Layer) -> str | None:
 
 def refined_layers(stage: Usd.Stage) -> list[Sdf.Layer]:
     """Layers of a stage with refined garments; muting the layers shows the coarse shot below."""
-    found = (layer for layer in stage.GetUsedLayers() if (read_record(layer) or {}).get("garments"))
-    return sorted(found, key=lambda layer: layer.identifier)
+    layers = (layer for layer in stage.GetUsedLayers() if (read_record(layer) or {}).get("garments"))
+    return sorted(layers, key=lambda layer: layer.identifier)
 
 
 def mute_refined(stage: Usd.Stage) -> list[str]:
@@ -142,8 +142,8 @@ def mute_refined(stage: Usd.Stage) -> list[str]:
 
     Layers with additional contents, and the root layer, are not muted. Returns the identifiers of the muted layers.
     """
-    found = (layer for layer in refined_layers(stage) if layer != stage.GetRootLayer())
-    identifiers = [layer.identifier for layer in found if is_only_ours(layer)]
+    layers = (layer for layer in refined_layers(stage) if layer != stage.GetRootLayer())
+    identifiers = [layer.identifier for layer in layers if is_only_ours(layer)]
     for identifier in identifiers:
         stage.MuteLayer(identifier)
     return identifiers
@@ -164,17 +164,17 @@ def refuse_refined(stage: Usd.Stage, paths: Iterable[Sdf.Path] = ()) -> None:
 
 
 def selections(prims: Iterable[Usd.Prim]) -> tuple[str, ...]:
-    """Active variant selections on prims, their ancestors and their materials, sorted.
+    """Active variant selections on prims, ancestors and materials, sorted.
 
     Each is a path such as ``/World/coat{fit=loose}``; a variant set without selection has an empty selection.
     """
-    found = set()
+    files = set()
     for prim in prims:
-        for each in (other for start in (prim, *bound_materials(prim)) for other in with_ancestors(start)):
-            sets = each.GetVariantSets()
-            path = each.GetPath()
-            found |= {path.AppendVariantSelection(name, sets.GetVariantSelection(name)) for name in sets.GetNames()}
-    return tuple(sorted(str(path) for path in found))
+        for source in (ancestor for start in (prim, *bound_materials(prim)) for ancestor in with_ancestors(start)):
+            sets = source.GetVariantSets()
+            path = source.GetPath()
+            files |= {path.AppendVariantSelection(name, sets.GetVariantSelection(name)) for name in sets.GetNames()}
+    return tuple(sorted(str(path) for path in files))
 
 
 def unsaved_layers(stage: Usd.Stage) -> tuple[str, ...]:
@@ -193,8 +193,8 @@ def file_hashes(stage: Usd.Stage, folder: Path | None, *, absolute: bool = False
     for prim in Usd.PrimRange.Stage(stage, TRAVERSAL):
         if prim.HasAuthoredMetadata("clips"):
             clips = Usd.ClipsAPI(prim)
-            named = [found for name in clips.GetClips() for found in clips.ComputeClipAssetPaths(name)]
-            files |= {Path(found.resolvedPath) for found in named if found.resolvedPath}
+            named = [asset for name in clips.GetClips() for asset in clips.ComputeClipAssetPaths(name)]
+            files |= {Path(asset.resolvedPath) for asset in named if asset.resolvedPath}
     paths = sorted(path for path in files if path.is_file())
     hashes = {}
     for path in paths:

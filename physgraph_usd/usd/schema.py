@@ -45,7 +45,7 @@ RETIRED = {
     "physgraph:contact:layer": "the order of layers is found in the animation, not authored",
     "physgraph:rest:creaseTime": "folds are not remembered",
 }
-"""Attributes of earlier versions by full name, each with what replaced it."""
+"""Attributes of earlier versions by full name, each with the replacement."""
 _JERSEY = PRESETS["jersey"]
 
 
@@ -154,12 +154,12 @@ def _material(schema: str, fallbacks: bool) -> tuple[Property, ...]:
     return (*rows, limit)
 
 
-def _ease(way: str) -> Property:
+def _ease(direction: str) -> Property:
     """Row of the length of cloth along warp or weft in excess of the rest shape."""
-    doc = f"Extra cloth length along the {way}, in percent of the rest shape. More length makes more folds."
+    doc = f"Extra cloth length along the {direction}, in percent of the rest shape. More length makes more folds."
     return Property(
-        GARMENT_API, f"physgraph:rest:{way}Ease", "float", 0.0, "%", -50.0, 100.0, doc,
-        f"{way.title()} Ease", REST, (0.0, 10.0),
+        GARMENT_API, f"physgraph:rest:{direction}Ease", "float", 0.0, "%", -50.0, 100.0, doc,
+        f"{direction.title()} Ease", REST, (0.0, 10.0),
     )  # fmt: skip
 
 

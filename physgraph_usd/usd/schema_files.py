@@ -72,12 +72,12 @@ def _property(row: Property) -> str:
     unit = f" Unit: {row.unit}{_FIXED if row.unit not in _RELATIVE else ''}." if row.unit else ""
     otherwise = f" Default: {_otherwise(row)}." if _otherwise(row) else ""
     doc = f'        doc = "{row.doc}{unit}{otherwise}"\n'
-    shown = f'        displayGroup = "{row.group}"\n        displayName = "{row.label}"\n'
+    display = f'        displayGroup = "{row.group}"\n        displayName = "{row.label}"\n'
     if row.type == "rel":
-        return f"    rel {row.name} (\n{shown}{doc}    )\n"
+        return f"    rel {row.name} (\n{display}{doc}    )\n"
     kind = f"{'uniform ' if row.uniform else ''}{row.type}"
     painted = f'        interpolation = "{row.interpolation}"\n' if row.interpolation else ""
-    return f"    {kind} {row.name} (\n{shown}{doc}{painted}{_limits(row)}    )\n"
+    return f"    {kind} {row.name} (\n{display}{doc}{painted}{_limits(row)}    )\n"
 
 
 def _class(schema: str, *, generated: bool) -> str:

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from pxr import Ar, Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdUtils
 
-from ..errors import AbsentError, LayerError, PhysGraphError, StageError, named_time
+from ..errors import LayerError, PhysGraphError, StageError, named_time
+from .resolve import check_there
 from .view import StageView
 
 if TYPE_CHECKING:
@@ -91,8 +92,8 @@ def value_at(attribute: Usd.Attribute, time: float | None) -> Any:
 def first_value(attribute: Usd.Attribute) -> Any:
     """An attribute's first sample neither blocked nor empty, or the default without samples."""
     first = attribute.Get(Usd.TimeCode.EarliestTime())
-    others = attribute.GetTimeSamples()[1:] if first is None or np.size(first) == 0 else ()
-    later = (attribute.Get(time) for time in others)
+    later_codes = attribute.GetTimeSamples()[1:] if first is None or np.size(first) == 0 else ()
+    later = (attribute.Get(time) for time in later_codes)
     return next((value for value in later if value is not None and np.size(value)), first)
 
 
@@ -123,7 +124,7 @@ def authored_topology(prim: Usd.Prim) -> tuple[np.ndarray, np.ndarray]:
 
 @dataclass(frozen=True, eq=False)
 class GarmentSource:
-    """The place of one garment on its stage; same order as ``Scene.garments``.
+    """The source of a garment on the stage; same order as ``Scene.garments``.
 
     Attributes:
         kept_faces: Authored faces kept by the garment (no holes, three corners or more), order kept, int32.
@@ -167,7 +168,7 @@ class GarmentSource:
         """Number and range of samples outside the frame range; "" without any."""
         before, after = ([t for t in self.left_out if (t < self.times[0]) == early] for early in (True, False))
         ends = [dict.fromkeys([span[0], span[-1]]) for span in (before, after) if span]
-        spans = " and ".join(" to ".join(map(named_time, each)) for each in ends)
+        spans = " and ".join(" to ".join(map(named_time, span)) for span in ends)
         return f"{len(self.left_out)} of {len(self.left_out) + len(self.times)} samples, {spans}" if spans else ""
 
 
@@ -211,11 +212,11 @@ def root_metadata(stage: Usd.Stage, key: str) -> object | None:
 
 def check_metadata(stage: Usd.Stage) -> None:
     """Refuse (StageError) invalid units and time range, because the refined layer copies the metadata."""
-    for key, (what, positive) in _NUMBERS.items():
+    for key, (kind, positive) in _NUMBERS.items():
         value = root_metadata(stage, key)
         number = float(value) if isinstance(value, int | float) else math.nan
         if value is not None and not (1.0 / _HUGE < number < _HUGE if positive else math.isfinite(number)):
-            raise StageError(f"{key} of the stage is {in_brief(value)}, which is no {what}, in its root layer")
+            raise StageError(f"{key} of the stage is {in_brief(value)}, which is no {kind}, in its root layer")
 
 
 def bad_rate(stage: Usd.Stage) -> str:
@@ -268,10 +269,10 @@ def read_units(stage: Usd.Stage) -> tuple[Units, list[Notice]]:
     metres, notices = metres_per_unit(stage)
     mass = root_metadata(stage, "kilogramsPerUnit")
     kilograms = float(mass) if isinstance(mass, int | float) and math.isfinite(mass) and mass > 0 else 1.0
-    up, odd = _up_vector(stage)
+    up, up_notices = _up_vector(stage)
     pull, source, odd_pull = gravity(stage, up, metres)
     strength = float(np.linalg.norm(pull))
-    return Units(metres, kilograms, -pull / strength if strength else up, pull, source), notices + odd + odd_pull
+    return Units(metres, kilograms, -pull / strength if strength else up, pull, source), notices + up_notices + odd_pull
 
 
 def _up_vector(stage: Usd.Stage) -> tuple[np.ndarray, list[Notice]]:
@@ -300,10 +301,10 @@ def gravity(stage: Usd.Stage, up: np.ndarray, metres: float) -> tuple[np.ndarray
         if 0 < length < math.inf:
             direction, source = np.array(towards, dtype=np.float64) / length, f"<{physics.GetPath()}>"
         magnitude = number * metres if 0 <= number * metres <= MOST_GRAVITY else magnitude
-        odd = {"Direction": (towards, length < math.inf), "Magnitude": (strength, number * metres <= MOST_GRAVITY)}
+        invalid = {"Direction": (towards, length < math.inf), "Magnitude": (strength, number * metres <= MOST_GRAVITY)}
         notices = [
             Notice(str(physics.GetPath()), None, f"physics:gravity{name} is {in_brief(value)}; the earth's is assumed")
-            for name, (value, usable) in odd.items()
+            for name, (value, usable) in invalid.items()
             if not usable and value is not None
         ]
     return direction * magnitude, source, notices
@@ -322,21 +323,6 @@ def quiet() -> Iterator[UsdUtils.CoalescingDiagnosticDelegate]:
         yield delegate
     finally:
         delegate.TakeUncoalescedDiagnostics()
-
-
-def is_there(path: str | Path) -> bool:
-    """Whether the asset resolver finds a file; in-memory layers count as found."""
-    return Sdf.Layer.IsAnonymousLayerIdentifier(str(path)) or bool(Ar.GetResolver().Resolve(str(path)))
-
-
-def check_there(path: str | Path) -> None:
-    """Refuse a missing file (AbsentError), and a pipe or a folder (StageError)."""
-    if not is_there(path):
-        raise AbsentError(f"no such file: {path}")
-    if not Sdf.Layer.IsAnonymousLayerIdentifier(str(path)):
-        found = Path(str(Ar.GetResolver().Resolve(str(path))))
-        if found.exists() and not found.is_file():
-            raise StageError(f"{path} is no file" + (": it is a pipe, which has no end" if found.is_fifo() else ""))
 
 
 def is_sound(layer: Sdf.Layer) -> bool:
@@ -417,14 +403,14 @@ def composition_problems(stage: Usd.Stage, warnings: Sequence[str]) -> list[tupl
         texts = [match.groups() for text in warnings if (match := _WARNED.match(" ".join(text.split())))]
     else:
         texts = [(str(error.rootSite.path) if error.rootSite else "/", str(error)) for error in errors()]
-    found = {}
+    notice_of = {}
     for path, text in texts:
         message = " ".join(text.split()).removesuffix(" .")
         asset = re.search(r"(?:load sublayer|open asset) @([^@]+)@", message)
         exists = asset is not None and bool(Ar.GetResolver().Resolve(asset.group(1)))
-        place = "" if path == "/" else path or ""
-        found[message] = Notice(place, None, in_brief(message)), not (exists or "ycle" in message)
-    return list(found.values())
+        location = "" if path == "/" else path or ""
+        notice_of[message] = Notice(location, None, in_brief(message)), not (exists or "ycle" in message)
+    return list(notice_of.values())
 
 
 def refuse_missing_arcs(prim: Usd.Prim, notices: Sequence[Notice]) -> None:

@@ -32,7 +32,7 @@ _SLOWEST, _FASTEST, _FRAME_RATE = 12.0, 120.0, 24.0
 _MOST = 10_000
 """Most whole frames between two keys: a key farther away is a stray one."""
 _HELD = "ExtrapHeld"
-"""Name of USD's extrapolation by which a spline keeps its first or last value."""
+"""Name of USD's extrapolation of a spline by a constant first or last value."""
 _ALIKE = 1e-6
 """Largest difference of two equal values, relative to the largest number: the rounding of single precision."""
 
@@ -57,7 +57,7 @@ class FrameGrid:
         rate, start, played = stage.GetTimeCodesPerSecond(), stage.GetStartTimeCode(), stage.GetFramesPerSecond()
         is_multiple = stage.HasAuthoredMetadata("framesPerSecond") and abs(rate / played % 1.0) <= _ALIKE
         rates = (played, rate) if is_multiple else (rate, played)
-        frames = next((each for each in rates if _SLOWEST <= each <= _FASTEST), _FRAME_RATE)
+        frames = next((rate for rate in rates if _SLOWEST <= rate <= _FASTEST), _FRAME_RATE)
         return FrameGrid(rate / frames, float(round(start)) if abs(start) <= FARTHEST else 0.0)
 
     def inside(self, start: float, end: float) -> list[float]:
@@ -100,8 +100,10 @@ def motion_of(prim: Usd.Prim, *, skinned: Mapping[Sdf.Path, Motion] | None = Non
         prim: A mesh, shape, instancer or transform.
         skinned: Motion of skinned prims by path, used instead of the motion of the prims' authored points.
     """
-    known = skinned or {}
-    return Motion.joined(known.get(each.GetPath()) or motion_alone(each) for each in drawn_with(prim))
+    motions = skinned or {}
+    return Motion.joined(
+        motions.get(drawn_prim.GetPath()) or motion_alone(drawn_prim) for drawn_prim in drawn_with(prim)
+    )
 
 
 def motion_alone(prim: Usd.Prim, *, shape: bool = True) -> Motion:
@@ -148,7 +150,10 @@ def _spline_times(spline: Any, stage: Usd.Stage) -> tuple[float, ...]:
     if not knots or not stage.HasAuthoredTimeCodeRange():
         return tuple(sorted({*knots}))
     start, end = stage.GetStartTimeCode(), stage.GetEndTimeCode()
-    moves = [each.mode.name != _HELD for each in (spline.GetPreExtrapolation(), spline.GetPostExtrapolation())]
+    moves = [
+        extrapolation.mode.name != _HELD
+        for extrapolation in (spline.GetPreExtrapolation(), spline.GetPostExtrapolation())
+    ]
     knots += [start] * (moves[0] and start < min(knots)) + [end] * (moves[1] and max(knots) < end)
     return tuple(sorted({*knots}))
 
@@ -163,18 +168,18 @@ def solve_times(cloth: Motion, bodies: Iterable[Motion], frames: FrameGrid) -> t
     if moves and not any(frames.inside(*span) for span in pairwise(cloth.times)):
         return cloth.times
     moving = [body for body in bodies if len(body.times) > 1]
-    own = cloth.times if moves else merge(cloth.times, *(body.times for body in moving))
-    between = [time for span in pairwise(own) for time in frames.inside(*span)]
+    solve_times = cloth.times if moves else merge(cloth.times, *(body.times for body in moving))
+    between = [time for span in pairwise(solve_times) for time in frames.inside(*span)]
     arcs = [arc for motion in (cloth, *moving) for arc in motion.arcs]
     sampled = merge(*(body.times for body in moving))
     wanted = [time for time in between if is_among(time, sampled) or any(a < time < b for a, b in arcs)]
-    return merge(own, wanted)
+    return merge(solve_times, wanted)
 
 
 def found_among(time: float, times: Sequence[float]) -> float | None:
     """The nearest of several ascending time codes to a time code, within `SAME_TIME`; None if all are farther."""
     same = times[bisect_left(times, time - SAME_TIME) : bisect_right(times, time + SAME_TIME)]
-    return min(same, key=lambda each: abs(each - time), default=None)
+    return min(same, key=lambda candidate: abs(candidate - time), default=None)
 
 
 def is_among(time: float, times: Sequence[float]) -> bool:
@@ -185,8 +190,8 @@ def is_among(time: float, times: Sequence[float]) -> bool:
 def transform_chain(prim: Usd.Prim) -> list[UsdGeom.Xformable]:
     """The transforms placing a prim, nearest first, up to a reset of the transform stack."""
     chain = []
-    for each in with_ancestors(prim):
-        transform = UsdGeom.Xformable(each)
+    for ancestor in with_ancestors(prim):
+        transform = UsdGeom.Xformable(ancestor)
         if transform:
             chain.append(transform)
             if transform.GetResetXformStack():
@@ -200,14 +205,14 @@ def merge(*sources: Iterable[float]) -> tuple[float, ...]:
     Of a source with two, which are the sides of a jump, both are kept.
     """
     ranked = sorted({(time, rank) for rank, source in enumerate(sources) for time in source})
-    kept, start = list[float](), 0
+    merged, start = list[float](), 0
     while start < len(ranked):
         end = bisect_right(ranked, ranked[start][0] + SAME_TIME, key=itemgetter(0))
         same = sorted(ranked[start:end], key=itemgetter(1))
-        each = [[time for time, _ in group] for _, group in groupby(same, key=itemgetter(1))]
-        kept += next((times for times in each if len(times) > 1), each[0])
+        group_times = [[time for time, _ in group] for _, group in groupby(same, key=itemgetter(1))]
+        merged += next((times for times in group_times if len(times) > 1), group_times[0])
         start = end
-    return tuple(kept)
+    return tuple(merged)
 
 
 def none_within(every: Sequence[float], frames: tuple[float, float]) -> AbsentError:
@@ -227,8 +232,8 @@ def none_within(every: Sequence[float], frames: tuple[float, float]) -> AbsentEr
 
 def snap(times: Iterable[float], merged: Sequence[float]) -> tuple[float, ...]:
     """Replace each time code by the nearest time code kept by ``merge``, once each."""
-    known = np.asarray(merged)
-    return tuple(dict.fromkeys(float(known[np.abs(known - time).argmin()]) for time in times))
+    codes = np.asarray(merged)
+    return tuple(dict.fromkeys(float(codes[np.abs(codes - time).argmin()]) for time in times))
 
 
 def within(times: Iterable[float], frames: tuple[float, float] | None) -> tuple[float, ...]:

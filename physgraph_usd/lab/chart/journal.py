@@ -1,4 +1,4 @@
-"""The rows of a chart in a file that grows: a run that was stopped goes on where it was."""
+"""The rows of a chart in a growing file: a stopped run continues from the last row."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ REMEDY = "take that line out, or measure anew with --overwrite"
 
 
 class Journal:
-    """Rows of plain values, one a line, each written the moment it is known."""
+    """Rows of plain values, a row per line, written immediately after measurement."""
 
     def __init__(self, folder: Path, problem: dict[str, Any], *, overwrite: bool) -> None:
-        """Open the rows of a folder; those of another problem are dropped where ``overwrite`` is set.
+        """Open the rows of a folder; rows of a different problem are dropped with ``overwrite``.
 
         Raises:
             UsageError: The folder holds the rows of another problem, or a row is damaged.
@@ -37,7 +37,7 @@ class Journal:
             )
 
     def add(self, kind: str, /, **values: Any) -> dict[str, Any]:
-        """Write one row and return it."""
+        """Write a row and return the row."""
         row = {"row": kind, **values}
         with self._file.open("a", encoding="utf-8") as file:
             file.write(json.dumps(row) + "\n")
@@ -49,7 +49,7 @@ class Journal:
         return [r for r in self._rows if r["row"] == kind and all(r.get(k) == v for k, v in where.items())]
 
     def one(self, kind: str, /, **where: Any) -> dict[str, Any] | None:
-        """The first such row, or None."""
+        """The first matching row, or None."""
         return next(iter(self.rows(kind, **where)), None)
 
     def _read(self) -> Iterator[dict[str, Any]]:

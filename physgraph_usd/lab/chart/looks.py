@@ -26,11 +26,11 @@ FILE = "chart.looks.{}.png"
 
 
 def draw_looks(chart: Chart, problem: Problem, frame: Frame, best: Sequence[np.ndarray] | None, folder: Path) -> None:
-    """Draw a frame upsampled, at each of `GAPS` where a method came near it, and at its best.
+    """Draw a frame upsampled, at each of `GAPS` reached by a method, and at the best result.
 
     Args:
         problem: The problem in float32.
-        frame: One of the measured frames.
+        frame: A measured frame.
         best: Fine world positions [m] of each garment at Phi*, or None where they are not known.
     """
     shapes: dict[str, Sequence[np.ndarray]] = {"100": problem.upsampled(frame, smooth=False)}
@@ -41,13 +41,13 @@ def draw_looks(chart: Chart, problem: Problem, frame: Frame, best: Sequence[np.n
         shapes["0"] = best
     up = -problem.scene.gravity if problem.scene.gravity.any() else np.array([0.0, 1.0, 0.0])
     turn = upright(up / np.linalg.norm(up))
-    cloud = np.concatenate([np.concatenate(list(each)) for each in shapes.values()]) @ turn.T
+    cloud = np.concatenate([np.concatenate(list(frames)) for frames in shapes.values()]) @ turn.T
     view, floor = fit_view(cloud, SIZE[0] / SIZE[1]), float(cloud[:, 1].min() - 0.03 * np.ptp(cloud, axis=0).max())
     meshes = [chain[-1].mesh for chain in problem.refiner.refinements if chain]
     for name, points in shapes.items():
         surfaces = [
-            Surface(each @ turn.T, triangles, np.tile(COLOUR, (len(triangles), 1)))
-            for each, mesh in zip(points, meshes, strict=False)
+            Surface(positions @ turn.T, triangles, np.tile(COLOUR, (len(triangles), 1)))
+            for positions, mesh in zip(points, meshes, strict=False)
             for triangles in [mesh.triangulate().triangles]
         ]
         Image.fromarray(draw(surfaces, view, size=SIZE, floor=floor)).save(folder / FILE.format(name), optimize=True)
@@ -67,10 +67,10 @@ def looks_of(chart: Chart, folder: Path) -> list[tuple[Path, str]]:
 
 def _nearest(chart: Chart, gap: float) -> Point | None:
     """The point of a method of ours that lies nearest to a gap, or None where none lies near."""
-    there = [each for each in chart.points if each.integrator in METHODS and gap / NEAR <= each.gap <= gap * NEAR]
-    return min(there, key=lambda each: abs(np.log(each.gap / gap)), default=None)
+    near = [point for point in chart.points if point.integrator in METHODS and gap / NEAR <= point.gap <= gap * NEAR]
+    return min(near, key=lambda point: abs(np.log(point.gap / gap)), default=None)
 
 
 def _solved(problem: Problem, frame: Frame, point: Point) -> tuple[np.ndarray, ...]:
-    [curve] = [each for each in find_curves() if each.name == point.method] or find_curves([point.integrator])[:1]
+    [curve] = [curve_ for curve_ in find_curves() if curve_.name == point.method] or find_curves([point.integrator])[:1]
     return problem.solve(frame, replace(COLD, method=curve.method, steps=point.steps, tolerance=0.0)).points

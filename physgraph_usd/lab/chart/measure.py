@@ -31,7 +31,7 @@ JUDGED, NEARLY, FURTHER = 0.03, 0.1, 3.0
 """Ranking gap; gap that counts as nearly converged; time limit of such methods as a multiple of the plan's."""
 DEFAULT = "refine's default"
 UPSAMPLED, SMOOTH = "plain upsampling", "Loop subdivision"
-"""Curves of one point each."""
+"""Curves of a single point each."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Curve:
 
 
 def find_curves(names: Sequence[str] = ()) -> tuple[Curve, ...]:
-    """Every integrator as it is and, where that is not another's, with nesting switched over.
+    """Every integrator unchanged and, unless equal to a second integrator, with nesting switched.
 
     What chooses between others frame by frame is none of them: it is refine's default.
 
@@ -52,7 +52,7 @@ def find_curves(names: Sequence[str] = ()) -> tuple[Curve, ...]:
         names: Names of `METHODS` to take; all when empty.
 
     Raises:
-        UsageError: No integrator has one of the names.
+        UsageError: A name is no integrator's.
     """
     unknown = [name for name in names if name not in METHODS]
     if unknown:
@@ -62,9 +62,9 @@ def find_curves(names: Sequence[str] = ()) -> tuple[Curve, ...]:
     known = {(method.build, method.nested) for method in METHODS.values()}
     curves = [Curve(name, name, method) for name, method in chosen.items()]
     for name, method in chosen.items():
-        other = replace(method, nested=not method.nested)
-        if (other.build, other.nested) not in known:
-            curves.append(Curve(f"{name}, {'nested' if other.nested else 'flat'}", name, other))
+        opposite = replace(method, nested=not method.nested)
+        if (opposite.build, opposite.nested) not in known:
+            curves.append(Curve(f"{name}, {'nested' if opposite.nested else 'flat'}", name, opposite))
     return tuple(curves)
 
 
@@ -169,7 +169,7 @@ class CurveBench:
         longest = self.plan.most_ms * (FURTHER if JUDGED < gap < NEARLY else 1.0)
         if _expected_ms(rows, budgets[-2:], self.plan.growth) > longest:
             return True
-        totals = [_energy([row for row in rows if row["steps"] == each]) for each in budgets]
+        totals = [_energy([row for row in rows if row["steps"] == budget]) for budget in budgets]
         fall = max(_energy(self.journal.rows("point", method=UPSAMPLED)) - totals[-1], 1e-30)
         flat = all(math.isfinite(total) and abs(total - totals[-1]) < FLAT * fall for total in totals)
         return len(budgets) == 3 and flat
@@ -184,7 +184,7 @@ def _energy(rows: list[dict[str, Any]]) -> float:
 
 def _expected_ms(rows: list[dict[str, Any]], budgets: Sequence[int], growth: float) -> float:
     """Time of the next budget [ms], on the line through the last two: some of a frame's time grows with no steps."""
-    means = [statistics.fmean(row["ms"] for row in rows if row["steps"] == each) for each in budgets]
+    means = [statistics.fmean(row["ms"] for row in rows if row["steps"] == budget) for budget in budgets]
     if len(means) < 2:
         return means[-1]
     slope = max(means[1] - means[0], 0.0) / (budgets[1] - budgets[0])

@@ -17,21 +17,21 @@ LONGEST_SHORT = 15.0
 """Minutes up to which a chart has the short form's size."""
 CLOCKS = ("wall", "cpu")
 SLOW = (PAPER,)
-"""Integrators of which one step takes longer on the CPU than a frame of any other: 4 s at 26,000 vertices."""
+"""Integrators with steps longer on the CPU than a whole frame of the rest: 4 s at 26,000 vertices."""
 FOR_REFERENCE, FOR_CURVES = 0.25, 0.5
 """Fractions of the time."""
 PARTS = {"reference": (0.0, 0.25), "curves": (0.25, 0.75), "warm": (0.75, 0.85), "terms": (0.85, 1.0)}
-"""Parts of a chart, in their order, and between which fractions of the time each lies."""
+"""Parts of a chart in order, each with the fractions of the time at the part's beginning and end."""
 LATEST = 1.1
 """Fraction of the time after which nothing more is begun; a rerun goes on."""
 LEAST_REACH = 2.5
 """Least `Size.reach` that a plan comes down to."""
 REFERENCE_SECONDS = 300.0
-"""Time for a frame's Phi* where there is no limit."""
+"""Time for a frame's Phi* without a limit."""
 TERM_SOLVES = 30
 """Solves at refine's default that the terms take, about."""
 BUDGETS = 10
-"""Budgets of a method that double, about."""
+"""Approximate number of doubling budgets of a method."""
 SPARSE = 4.0
 """Growth of the budgets where even short curves would take too long."""
 
@@ -43,8 +43,8 @@ class Size:
     Attributes:
         minutes: Time to plan with, or None for as long as it takes.
         repeats: Measurements of each time, at least.
-        more: Measurements of each time where there is time left.
-        growth: Steps of a budget over those of the one before; 2 or 1.5.
+        more: Measurements of each time if time is left.
+        growth: Ratio of a budget's steps to the previous budget's; 2 or 1.5.
         reach: Longest time measured, in times of refine's default.
         frames: Most frames.
     """
@@ -71,14 +71,14 @@ class ChartOptions:
         level: Subdivisions; -1 chooses, None takes the stage's.
         overrides: "</Prim>.attribute=value" or "attribute=value".
         rest_frame: Time code whose points are the rest shape, "auto" for one fitted to the shot, or None.
-        clock: "wall", or "cpu" to count one core's own time, which other programs do not change.
+        clock: "wall", or "cpu" for the processor time of a core, independent of other programs.
         methods: Names of `METHODS` to measure; empty takes all, on the CPU's short form but `SLOW`.
         peers: "NAME=PYTHON" for each solver outside to measure; see `peers.run.PEERS`.
         count: Frames to measure, or None for the size's own number.
         short: Whether to take the short size.
         budget_minutes: Minutes to plan with, or None.
         repeats: Measurements of each time, or None for as many as there is time for.
-        overwrite: Whether to begin anew where another chart is.
+        overwrite: Whether to replace a chart of a different problem.
         progress: Called with (fraction done, seconds left, what is being measured), or None.
     """
 
@@ -149,7 +149,7 @@ class Plan:
     Attributes:
         most_ms: Time of a frame beyond which a method takes no larger budget.
         reference_seconds: Time for the least energy of one frame.
-        minutes: Time that all of it takes, about.
+        minutes: Approximate time of the whole chart.
     """
 
     frames: int
@@ -168,7 +168,7 @@ def make_plan(
     Args:
         curves: Number of methods.
         default_ms: Time of a frame by refine's default, as the chart counts it [ms].
-        elapsed_ms: Wall time of such a frame and of all that goes with it [ms].
+        elapsed_ms: Wall time of the frame, including the work around the solve [ms].
         judge_ms: Time of judging a result [ms].
         least_ms: Wall time of a solve of a single step, which fewer steps do not save [ms].
     """
@@ -201,7 +201,7 @@ class Clock:
     goes by that, else by the time it should take; a part that takes longer slows the bar down and never stops it.
 
     Attributes:
-        expected: Time that the chart should take [s].
+        expected: Expected time of the chart [s].
     """
 
     def __init__(self, minutes: float | None, progress: Callable[[float, float, str], None] | None) -> None:

@@ -102,9 +102,9 @@ def _figure(chart: Chart) -> go.Figure:
         for name in chart.methods:
             figure.add_trace(_trace(chart, name, style[name], chart.curve(name), field=field), row=row, col=1)
         figure.update_yaxes(title_text=words, row=row, col=1)
-    for name in dict.fromkeys(each.method for each in chart.warm):
-        own, points = style.get(name, Style(BASELINE, dashed=False)), [p for p in chart.warm if p.method == name]
-        figure.add_trace(_trace(chart, name, own, points, field="gap"), row=2, col=1)
+    for name in dict.fromkeys(point.method for point in chart.warm):
+        line_style, points = style.get(name, Style(BASELINE, dashed=False)), [p for p in chart.warm if p.method == name]
+        figure.add_trace(_trace(chart, name, line_style, points, field="gap"), row=2, col=1)
     figure.update_xaxes(type="log", dtick=1, minor={"dtick": "D1", "showgrid": True})
     figure.update_xaxes(title_text="milliseconds a frame", row=1, col=1)
     figure.update_xaxes(title_text="milliseconds a frame", row=len(panels) + warm, col=1)
@@ -161,8 +161,8 @@ def _add_front(figure: go.Figure, chart: Chart) -> None:
 def _trace(chart: Chart, name: str, style: Style, points: Sequence[Point], *, field: str) -> go.Scatter:
     """Plot line of a method, in the legend group of the method's name."""
     ms = [max(p.ms, 1e-2) for p in points]
-    most = [max(p.ms_most, own) - own for p, own in zip(points, ms, strict=True)]
-    least = [own - min(max(p.ms_least, 1e-2), own) for p, own in zip(points, ms, strict=True)]
+    most = [max(p.ms_most, median) - median for p, median in zip(points, ms, strict=True)]
+    least = [median - min(max(p.ms_least, 1e-2), median) for p, median in zip(points, ms, strict=True)]
     bars = {"type": "data", "symmetric": False, "array": most, "arrayminus": least, "thickness": 1.5, "width": 3}
     return go.Scatter(
         x=ms,
@@ -183,14 +183,14 @@ def _trace(chart: Chart, name: str, style: Style, points: Sequence[Point], *, fi
 
 
 def _legend(chart: Chart) -> str:
-    """A button for each method, which hides and shows its lines in every plot."""
+    """A button for each method, to hide and show the method's lines in every plot."""
     style = styles(chart)
     buttons = []
     for name in chart.methods:
-        own, shown = style[name], html.escape(name)
-        look = f"border-top:3px {'dashed' if own.dashed else 'solid'} {own.colour}"
-        drawn = f"<i style='{look}'></i>{shown}"
-        buttons.append(f"<button type=button aria-pressed=true data-method='{shown}'>{drawn}</button>")
+        line_style, label = style[name], html.escape(name)
+        look = f"border-top:3px {'dashed' if line_style.dashed else 'solid'} {line_style.colour}"
+        drawn = f"<i style='{look}'></i>{label}"
+        buttons.append(f"<button type=button aria-pressed=true data-method='{label}'>{drawn}</button>")
     words = "A click hides a method, another shows it again. Bars reach from the fastest turn to the slowest."
     return f"<div id='methods'>{''.join(buttons)}</div><p class='note'>{words}</p>"
 
@@ -206,8 +206,8 @@ def _looks(chart: Chart, folder: Path) -> str:
 
 
 def _lead(chart: Chart) -> str:
-    found = advice(chart), chart.words_of_degrees(), warm_advice(chart), contact_words(chart)
-    sentences = [each for each in found if each]
+    paragraphs = advice(chart), chart.words_of_degrees(), warm_advice(chart), contact_words(chart)
+    sentences = [paragraph for paragraph in paragraphs if paragraph]
     times = chart.times_to(JUDGED)
     if times:
         order = ", ".join(f"{name} {ms:.0f} ms" for name, ms in list(times.items())[:4])
@@ -218,18 +218,18 @@ def _lead(chart: Chart) -> str:
 
 
 def _terms(chart: Chart) -> str:
-    found = changes(chart)
-    if not found:
+    effects = changes(chart)
+    if not effects:
         return ""
     rows = [
         (
-            each.name,
-            f"{each.cost_ms:.1f}",
-            percent(each.fraction),
-            "-" if each.moved_mm > FAR else f"{each.moved_mm:.3f}",
-            each.buys,
+            effect.name,
+            f"{effect.cost_ms:.1f}",
+            percent(effect.fraction),
+            "-" if effect.moved_mm > FAR else f"{effect.moved_mm:.3f}",
+            effect.buys,
         )
-        for each in found
+        for effect in effects
     ]
     return (
         "<h2>What each part of the model costs and buys</h2>"

@@ -47,7 +47,7 @@ RULES: dict[Any, Any] = {
     "svg.fonttype": "none",
 }
 ONE_POINT = {DEFAULT: "*", UPSAMPLED: "s", SMOOTH: "D"}
-"""Signs of the curves of one point."""
+"""Markers of curves with a single point."""
 
 
 def draw_chart(chart: Chart, folder: Path) -> None:
@@ -60,7 +60,7 @@ def draw_chart(chart: Chart, folder: Path) -> None:
 
 def _figure(chart: Chart) -> Figure:
     steps = changes(chart)
-    rows = [each for each in (chart.seen, chart.panels, chart.likeness) if each]
+    rows = [row for row in (chart.seen, chart.panels, chart.likeness) if row]
     heights = [4.2, *[2.6] * len(rows), *([0.6 + 0.28 * len(steps)] if steps else [])]
     figure = Figure(figsize=(10.6, sum(heights) + 1.0), layout="constrained")
     words = textwrap.fill(f"{advice(chart)} {contact_words(chart)}", 120)
@@ -84,7 +84,7 @@ def _figure(chart: Chart) -> Figure:
 
 
 def _curves(axes: Axes, chart: Chart, style: dict[str, Style]) -> None:
-    """Gap against time, the front behind it."""
+    """Gap against time, with the front in the background."""
     front = chart.front
     axes.step(
         [max(p.ms, 1e-2) for p in front],
@@ -110,7 +110,7 @@ def _curves(axes: Axes, chart: Chart, style: dict[str, Style]) -> None:
         color="#444444",
     )
     least = min((p.gap for p in chart.points), default=FLOOR)
-    highest = max((p.gap for each in ONE_POINT for p in chart.curve(each)), default=0.0)
+    highest = max((p.gap for name in ONE_POINT for p in chart.curve(name)), default=0.0)
     axes.set_ylim(max(FLOOR, min(0.5 * least, 0.01)) if least > 0 else FLOOR, max(CEILING, 1.3 * highest))
     if chart.prepared:
         left, right = axes.get_xlim()
@@ -123,8 +123,8 @@ def _curves(axes: Axes, chart: Chart, style: dict[str, Style]) -> None:
 
 def _warm(axes: Axes, chart: Chart, style: dict[str, Style]) -> None:
     """Gap against time of warm frames."""
-    for name in dict.fromkeys(each.method for each in chart.warm):
-        points = [each for each in chart.warm if each.method == name]
+    for name in dict.fromkeys(point.method for point in chart.warm):
+        points = [point for point in chart.warm if point.method == name]
         _gaps(axes, name, points, style.get(name, Style(BASELINE, dashed=False)))
     axes.set(xscale="log", yscale="log", xlabel="milliseconds a frame", title="Warm frames")
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
@@ -138,7 +138,7 @@ def _gaps(axes: Axes, name: str, points: Sequence[Point], style: Style) -> None:
     """Gaps of a method against time, with the fastest and the slowest turn of each point."""
     _line(axes, name, points, style, [max(p.gap, FLOOR) for p in points])
     for point in points:
-        ends = [max(each, 1e-2) for each in (point.ms_least, max(point.ms_most, point.ms_least))]
+        ends = [max(milliseconds, 1e-2) for milliseconds in (point.ms_least, max(point.ms_most, point.ms_least))]
         axes.plot(ends, [max(point.gap, FLOOR)] * 2, color=style.colour, linewidth=3.2, alpha=0.3, zorder=1.5)
 
 
@@ -164,8 +164,8 @@ def _measure(axes: Axes, name: str, words: str, *, chart: Chart, style: dict[str
         _line(axes, method, points, style[method], [float(getattr(p, name)) for p in points])
     axes.set(xscale="log", xlabel="milliseconds a frame", title=words[0].upper() + words[1:])
     if name in chart.likeness or name in chart.seen:
-        alone = [getattr(point, name) or 0.0 for each in ONE_POINT for point in chart.curve(each)]
-        axes.set_ylim(0, 1.5 * max(alone, default=0.0) or None)
+        heights = [getattr(point, name) or 0.0 for method in ONE_POINT for point in chart.curve(method)]
+        axes.set_ylim(0, 1.5 * max(heights, default=0.0) or None)
         for line in axes.lines:  # A solver that flew apart flies out of the picture.
             line.set_clip_on(True)
     else:
@@ -176,26 +176,26 @@ def _measure(axes: Axes, name: str, words: str, *, chart: Chart, style: dict[str
 
 
 def _terms(panels: Any, steps: list[Change]) -> None:
-    places = list(range(len(steps)))[::-1]
+    positions = list(range(len(steps)))[::-1]
     cost, buys, words = panels
     for axes, values, colour, digits in (
-        (cost, [each.cost_ms for each in steps], "#0072b2", 0),
-        (buys, [min(each.moved_mm, FAR) for each in steps], "#009e73", 2),
+        (cost, [step.cost_ms for step in steps], "#0072b2", 0),
+        (buys, [min(step.moved_mm, FAR) for step in steps], "#009e73", 2),
     ):
-        axes.barh(places, values, color=colour, height=0.6)
+        axes.barh(positions, values, color=colour, height=0.6)
         axes.grid(visible=False, axis="y")
         axes.xaxis.set_major_locator(MaxNLocator(4) if axes is cost else SymmetricalLogLocator(base=10, linthresh=1))
-        for place, value in zip(places, values, strict=True):
+        for position, value in zip(positions, values, strict=True):
             label = f" over {value:.0f}" if value == FAR else f" {value:.{digits}f}"
-            axes.text(max(value, 0.0), place, label, va="center", fontsize=7.5, color="#444444")
-    cost.set(yticks=places, title="Costs [ms a frame]")
-    cost.set_yticklabels([each.name for each in steps])
+            axes.text(max(value, 0.0), position, label, va="center", fontsize=7.5, color="#444444")
+    cost.set(yticks=positions, title="Costs [ms a frame]")
+    cost.set_yticklabels([step.name for step in steps])
     cost.margins(x=0.25)
     cost.axvline(0.0, color="#888888", linewidth=0.8)
     buys.set(title="Moves the result [mm]", xscale="symlog")
-    buys.set_xlim(0, 8.0 * max(1.0, *(min(each.moved_mm, FAR) for each in steps)))
+    buys.set_xlim(0, 8.0 * max(1.0, *(min(step.moved_mm, FAR) for step in steps)))
     buys.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     words.set(title="Buys")
     words.axis("off")
-    for place, each in zip(places, steps, strict=True):
-        words.text(0.0, place, each.buys, va="center", fontsize=7.5, color="#444444", in_layout=False)
+    for position, step in zip(positions, steps, strict=True):
+        words.text(0.0, position, step.buys, va="center", fontsize=7.5, color="#444444", in_layout=False)

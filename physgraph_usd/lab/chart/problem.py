@@ -41,7 +41,7 @@ class Judgement:
         energies: Energy of each term [J].
         strain: Largest over the garments of the edges' 99th percentile.
         inside: Vertices inside closed bodies.
-        percent: Their fraction of all vertices [%].
+        percent: Fraction of all vertices [%].
         deepest_mm: Depth of the deepest [mm].
         crossings: Edges of cloth through faces of bodies and the other way round.
         tangles: Edges of cloth through faces of cloth.
@@ -68,10 +68,10 @@ class Solved:
     Attributes:
         points: Fine world positions [m] of each garment.
         milliseconds: Time of preparing and solving the frame, without reading, writing and telemetry.
-        prepared: The part of it in which the frame was prepared.
-        elapsed: Wall time of all of it [ms].
+        prepared: Time of preparing the frame, included in `milliseconds`.
+        elapsed: Wall time of the whole frame [ms].
         steps: Steps made at the finest levels.
-        waited: Milliseconds that its threads waited for a core that others had, or None where that is not known.
+        waited: Milliseconds of waiting for a busy core, or None if unknown.
     """
 
     points: tuple[np.ndarray, ...]
@@ -105,7 +105,9 @@ class Problem:
             clock: "wall", or "cpu" to count the processor's time alone.
         """
         self._clock = clock
-        garments = tuple(replace(each, detail_scale=np.ones_like(each.detail_scale)) for each in scene.garments)
+        garments = tuple(
+            replace(garment, detail_scale=np.ones_like(garment.detail_scale)) for garment in scene.garments
+        )
         scene = replace(scene, garments=garments)
         self.scene = scene
         self.refiner = Refiner(scene, DEFAULT, levels=levels, dtype=dtype, device=device, threads=threads)
@@ -114,13 +116,13 @@ class Problem:
     def vertex_count(self) -> int:
         """Number of fine vertices."""
         chains = zip(self.scene.garments, self.refiner.refinements, strict=True)
-        return sum(chain[-1].mesh.vertex_count if chain else each.mesh.vertex_count for each, chain in chains)
+        return sum(chain[-1].mesh.vertex_count if chain else garment.mesh.vertex_count for garment, chain in chains)
 
     @cached_property
     def triangles(self) -> tuple[np.ndarray, ...]:
         """Vertices of each fine triangle, shape (T, 3), one array a garment."""
         chains = zip(self.scene.garments, self.refiner.refinements, strict=True)
-        return tuple((chain[-1].mesh if chain else each.mesh).triangulate().triangles for each, chain in chains)
+        return tuple((chain[-1].mesh if chain else garment.mesh).triangulate().triangles for garment, chain in chains)
 
     def solve(self, frame: Frame, settings: SolveSettings) -> Solved:
         """Solve a frame from a cold start."""
@@ -128,17 +130,18 @@ class Problem:
         return self.next(frame)
 
     def next(self, frame: Frame) -> Solved:
-        """Solve a frame from where the last one ended, with the settings in use."""
+        """Solve a frame from the previous result, with the settings in use."""
         before, began, worked = _waited(), time.perf_counter(), time.process_time()
         state = self.refiner.solve(frame)
         after, elapsed, worked = _waited(), time.perf_counter() - began, time.process_time() - worked
         entries: list[Any] = list({id(entry): entry for entry in state.telemetry}.values())
         spent = {
-            name: sum(each.get("milliseconds", {}).get(name, 0.0) for each in entries) for name in ("prepare", "solve")
+            name: sum(entry.get("milliseconds", {}).get(name, 0.0) for entry in entries)
+            for name in ("prepare", "solve")
         }
-        reports = [each for entry in entries for each in entry.get("levels", [])]
-        last = max((each["level"] for each in reports), default=0)
-        steps = sum(each["steps"] for each in reports if each["level"] == last)
+        reports = [report for entry in entries for report in entry.get("levels", [])]
+        last = max((report["level"] for report in reports), default=0)
+        steps = sum(report["steps"] for report in reports if report["level"] == last)
         waited = None if before is None or after is None else after - before
         busy = worked / elapsed if self._clock == "cpu" else 1.0
         points = tuple(p for p in state.points if p is not None)
@@ -148,7 +151,7 @@ class Problem:
     def go_on(
         self, frame: Frame, settings: SolveSettings, states: Sequence[FrameState | None]
     ) -> tuple[tuple[np.ndarray, ...], list[FrameState]]:
-        """Solve a frame on from the state of each part; cold where that is None.
+        """Continue a frame from the state of each part; cold for a state None.
 
         Returns:
             Fine world positions [m] of each garment, and the new state of each part.
@@ -181,12 +184,12 @@ class Problem:
 
     def _of_finest(self, frame: Frame, measure: Callable[[Level, np.ndarray], np.ndarray]) -> tuple[np.ndarray, ...]:
         """A value per fine vertex from the finest levels and the cages' points, one array a garment."""
-        found: dict[int, np.ndarray] = {}
+        points_at: dict[int, np.ndarray] = {}
         for part in self.refiner.parts_of(frame):
             finest = self.refiner.group_of(part).levels[-1]
             values = measure(finest, np.concatenate([frame.garments[index].points for index in part]))
-            found.update((index, values[span]) for index, span in zip(part, finest.spans, strict=True))
-        return tuple(found[index] for index in sorted(found))
+            points_at.update((index, values[span]) for index, span in zip(part, finest.spans, strict=True))
+        return tuple(points_at[index] for index in sorted(points_at))
 
 
 def judge(refiner: Refiner, frame: Frame, points: Sequence[np.ndarray]) -> Judgement:
@@ -231,11 +234,11 @@ OVER_FRAMES: dict[str, Callable[..., Any]] = {
 
 def over_frames(judged: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """The measures of `OVER_FRAMES` of several frames' judgements."""
-    return {name: join(each[name] for each in judged) for name, join in OVER_FRAMES.items()}
+    return {name: join(measures[name] for measures in judged) for name, join in OVER_FRAMES.items()}
 
 
 def plain_detail(frame: Frame) -> Frame:
-    """A frame whose result is the solution itself, whatever gain an artist gave its detail."""
+    """A frame with the solution itself as the result, ignoring the artist's gain of the detail."""
     return replace(frame, garments=tuple(replace(garment, detail=1.0) for garment in frame.garments))
 
 

@@ -38,7 +38,7 @@ STARTS = (
 SHORT, LEAST = 3, 2
 """Number of integrators in a short search, and after the time limit: a single result has no estimate of its error."""
 ON, ROUNDS, MORE = ("quasi-newton-flat", 100), 2, 10
-"""How a start goes on, how often at most, and how often more where it is one of the finalists."""
+"""Method and steps of continuing a start, most repetitions, and further repetitions for finalists."""
 NEWTON, POLISHES = ("newton", 8), 6
 FINALISTS = 2
 """How many starts of a search, and of each beginning of it, Newton goes on from."""
@@ -57,10 +57,10 @@ class Reference:
         start: Energy of the upsampled cage [J].
         least: The least energy [J].
         energies: The least energy by term [J].
-        by: Who found it.
-        apart: How far the least of the other starts lies above it, over the whole fall; None where there was no other.
+        by: Name of the start or method with the least energy.
+        apart: Distance to the second-best start, as a fraction of the whole fall; None with a single start.
         seconds: Time spent [s].
-        points: Fine world positions [m] of each garment that have it.
+        points: Fine world positions [m] of each garment at the least energy.
     """
 
     start: float
@@ -73,8 +73,8 @@ class Reference:
 
     @staticmethod
     def of(plain: dict[str, Any]) -> Reference:
-        """The values that `plain` gave."""
-        return Reference(**{each.name: plain[each.name] for each in fields(Reference) if each.name in plain})
+        """The inverse of `plain`."""
+        return Reference(**{field_.name: plain[field_.name] for field_ in fields(Reference) if field_.name in plain})
 
     def plain(self) -> dict[str, Any]:
         """Values for JSON, without the positions."""
@@ -94,8 +94,10 @@ class Reference:
 
     def __str__(self) -> str:
         """Phi* [mJ], the method that found Phi*, and the gap to the next best method."""
-        other = "nobody else looked" if self.apart is None else f"the next best ends {self.apart:.2%} of the fall above"
-        return f"Phi* {1e3 * self.least:.5g} mJ by {self.by}; {other}"
+        second = (
+            "nobody else looked" if self.apart is None else f"the next best ends {self.apart:.2%} of the fall above"
+        )
+        return f"Phi* {1e3 * self.least:.5g} mJ by {self.by}; {second}"
 
 
 class Solutions:
@@ -129,11 +131,11 @@ class Solutions:
         Returns:
             None where no reference is stored.
         """
-        known = self.points(frame.time)
-        if known is None:
+        points_known = self.points(frame.time)
+        if points_known is None:
             return None
-        found = [normal_angles(*each) for each in zip(points, known, triangles, strict=True)]
-        return float(np.median(np.concatenate(found)))
+        angles = [normal_angles(*arrays) for arrays in zip(points, points_known, triangles, strict=True)]
+        return float(np.median(np.concatenate(angles)))
 
     def points(self, time: float | None) -> tuple[np.ndarray, ...] | None:
         """Fine world positions [m] of the reference of a time code, one array a garment; None where none is stored."""
@@ -154,7 +156,7 @@ def rms_mm(a: Sequence[np.ndarray], b: Sequence[np.ndarray]) -> float:
 
 
 class _Descent:
-    """Ever longer runs from one start, of which the best is remembered."""
+    """Ever longer runs from a start; the best is stored."""
 
     def __init__(self, problem: Problem, frame: Frame, settings: SolveSettings, *, start: float) -> None:
         self._problem, self._frame, self._settings, self._start = problem, frame, settings, start
@@ -170,11 +172,11 @@ class _Descent:
                 break
             settings = replace(self._settings, method=METHODS[method[0]], steps=method[1], tolerance=0.0)
             points, states = self._problem.go_on(self._frame, settings, self._states)
-            found, before = self._problem.judge(self._frame, points, self._settings), self.energy
-            if found.energy < before:
+            judged, before = self._problem.judge(self._frame, points, self._settings), self.energy
+            if judged.energy < before:
                 self.by += name if not self.by.endswith(name) else ""
-                self.energy, self.energies, self.points, self._states = found.energy, found.energies, points, states
-            if not before - found.energy > SETTLED * (self._start - found.energy):
+                self.energy, self.energies, self.points, self._states = judged.energy, judged.energies, points, states
+            if not before - judged.energy > SETTLED * (self._start - judged.energy):
                 break
         return self
 
@@ -187,7 +189,7 @@ def find_reference(
     Args:
         problem: The problem in float64.
         frame: The frame.
-        settings: Its potential and contact.
+        settings: Potential and contact of the problem.
         seconds: Time to spend; one run may take longer. Without an end the answer depends on no machine's speed.
         short: Whether to try fewer starts.
     """
@@ -201,11 +203,11 @@ def find_reference(
         descent.go_on(f"{method[0]}, {counted(method[1], 'step')}", method, most=1)
         runs.append(descent.go_on(", and on", ON, most=ROUNDS, until=began + DESCENT * seconds))
     # The best of all and the best of each beginning: what a search that ends earlier goes on from is among them.
-    led = (run for k, run in enumerate(runs) if sum(each.energy < run.energy for each in runs[:k]) < FINALISTS)
-    for each in sorted(led, key=lambda run: run.energy):
-        each.go_on(", and on", ON, most=MORE, until=began + seconds)
-        each.go_on(", and Newton", NEWTON, most=POLISHES, until=began + seconds)
-    best, *others = sorted(runs, key=lambda run: run.energy)
-    apart = (others[0].energy - best.energy) / max(start - best.energy, 1e-30) if others else None
+    led = (run for k, run in enumerate(runs) if sum(earlier.energy < run.energy for earlier in runs[:k]) < FINALISTS)
+    for finalist in sorted(led, key=lambda run: run.energy):
+        finalist.go_on(", and on", ON, most=MORE, until=began + seconds)
+        finalist.go_on(", and Newton", NEWTON, most=POLISHES, until=began + seconds)
+    best, *further = sorted(runs, key=lambda run: run.energy)
+    apart = (further[0].energy - best.energy) / max(start - best.energy, 1e-30) if further else None
     spent = round(time.perf_counter() - began, 3)
     return Reference(start, best.energy, best.energies, best.by, apart, spent, best.points)

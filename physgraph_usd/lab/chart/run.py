@@ -49,7 +49,7 @@ def chart_shot(shot: str | Path, folder: str | Path, options: ChartOptions = DEF
 
     Args:
         shot: The stage to read; never edited.
-        folder: Where `WRITTEN` and the rows of all measurements go; a chart that was begun there goes on.
+        folder: Folder for `WRITTEN` and the rows of all measurements; an unfinished chart in the folder is continued.
 
     Raises:
         UsageError: An option is wrong, or the folder holds the chart of another shot.
@@ -85,15 +85,15 @@ def _check_folder(folder: Path, shot: str | Path, *, overwrite: bool) -> None:
     """Refuse to write over the shot's files, and over a chart whose rows are gone."""
     files = [folder / name for name in (*WRITTEN, JOURNAL)]
     check_targets([("the chart", file) for file in files], files_of(shot))
-    there = next((file for file in files if file.exists()), None)
-    if there is not None and not overwrite and not files[-1].exists():
-        raise UsageError(f"{there} exists; choose another folder or replace it by --overwrite")
+    existing = next((file for file in files if file.exists()), None)
+    if existing is not None and not overwrite and not files[-1].exists():
+        raise UsageError(f"{existing} exists; choose another folder or replace it by --overwrite")
     for file in files:
         check_place(file)
 
 
 def _measure(opened: Shot, folder: Path, options: ChartOptions) -> Chart:
-    """Measure all that is not yet in the folder, and draw what gaps look like."""
+    """Measure the missing rows of the folder, and draw pictures of gaps."""
     clock = Clock(options.size().minutes, options.progress)
     clock.say("reading and building")
     levels = tuple(
@@ -115,9 +115,9 @@ def _measure(opened: Shot, folder: Path, options: ChartOptions) -> Chart:
     for frame in frames:
         if not journal.one("reference", frame=frame.time):
             clock.say("the least energy of a frame")
-            found = find_reference(problems[1], frame, seconds=plan.reference_seconds)
-            solutions.keep(frame.time, found.points)
-            journal.add("reference", frame=frame.time, **found.plain())
+            reference = find_reference(problems[1], frame, seconds=plan.reference_seconds)
+            solutions.keep(frame.time, reference.points)
+            journal.add("reference", frame=frame.time, **reference.plain())
     bench = CurveBench(journal, problems, frames, plan=plan, clock=clock, solutions=solutions)
     bench.measure(curves)
     measure_peers(bench, parse_peers(options.peers), clock_name=options.clock)
@@ -142,8 +142,8 @@ def _plan(
     options: ChartOptions,
 ) -> Plan:
     """The plan of a chart that was begun, or a new one from a probe of a frame."""
-    if known := journal.one("plan"):
-        return Plan(**known["plan"])
+    if stored := journal.one("plan"):
+        return Plan(**stored["plan"])
     timed, judge = problems
     spent = [timed.solve(frame, COLD) for _ in range(3)]
     judge.judge(frame, spent[-1].points)
@@ -151,8 +151,8 @@ def _plan(
     judge.judge(frame, spent[-1].points)
     costs = {
         "curves": len(curves),
-        "default_ms": statistics.median(each.milliseconds for each in spent[1:]),
-        "elapsed_ms": statistics.median(each.elapsed for each in spent[1:]),
+        "default_ms": statistics.median(frame.milliseconds for frame in spent[1:]),
+        "elapsed_ms": statistics.median(frame.elapsed for frame in spent[1:]),
         "judge_ms": 1e3 * (time.perf_counter() - began),
         "least_ms": timed.solve(frame, replace(COLD, steps=1, tolerance=0.0)).elapsed,
     }
@@ -162,7 +162,7 @@ def _plan(
 
 
 def _about(opened: Shot, levels: Sequence[int], options: ChartOptions) -> dict[str, Any]:
-    """The problem that is measured: rows of any other do not belong to this chart."""
+    """The measured problem: rows of a different problem do not belong to the chart."""
     device = options.device
     name = torch.cuda.get_device_name(device) if device.startswith("cuda") else platform.processor()
     return {
@@ -185,7 +185,7 @@ def _frame(opened: Shot, time: float | None) -> Frame:
 
 
 def _times(opened: Shot, count: int) -> list[float | None]:
-    """Frames spread over the shot, the last one always among them."""
+    """Frames spread over the shot, always including the last."""
     times = opened.scene.times
     if not times:
         return [None]

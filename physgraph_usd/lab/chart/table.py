@@ -19,11 +19,11 @@ from .problem import over_frames
 from .reference import Reference
 
 GAPS = (0.1, 0.03, 0.01)
-"""Gaps to which the time is given."""
+"""Gaps with times in the table."""
 TOLERANCE = 1.1
 """Times that differ by less than this factor count as equal: medians of a few runs are no better."""
 BUSY = 0.1
-"""Time waited for a core, over the time measured, from which there is a warning."""
+"""Least fraction of time waiting for a core for a warning."""
 TINY = 1e-12
 CONTACT = {
     "percent": "vertices inside bodies [%]",
@@ -32,20 +32,20 @@ CONTACT = {
 }
 SEEN = {"degrees": "angle of the folds to the converged frame [degrees]"}
 LIKENESS = {"strain": "edge strain, 99th percentile", "apart_mm": "distance from Phi*'s shape [mm]"}
-"""Fields of points, and their titles."""
+"""Fields of points, with titles."""
 
 
 @dataclass(frozen=True)
 class Point:
-    """A method with one budget, on frames that start cold or in a row of frames, each begun where the last one ended.
+    """A method with a budget, on frames started cold, or on consecutive frames, each started from the previous result.
 
     Attributes:
         method: The curve's name.
         integrator: Name of the integrator, "" where none was asked for by name.
         nested: Whether coarse levels are solved first.
-        steps: Steps at the finest level that it had.
-        made: Steps that it made there, mean over the frames.
-        tolerance: Remaining move at which it was to stop [edge lengths]; 0 where it took all its steps.
+        steps: Budget of steps at the finest level.
+        made: Steps made at the finest level, mean over the frames.
+        tolerance: Remaining move for stopping [edge lengths]; 0 to make all steps.
         ms: Milliseconds a frame: `typical` over the repeats, mean over the frames.
         ms_median: Milliseconds by the median of all repeats.
         ms_least: Milliseconds of the fastest repeats.
@@ -55,7 +55,7 @@ class Point:
         energy: Phi, mean over the frames [J].
         energies: Phi by term [J].
         strain, inside, percent, deepest_mm, crossings, tangles: As for `Judgement`, over the frames by `OVER_FRAMES`.
-        frames: Number of frames that are judged: all of them, or the last of a row.
+        frames: Number of judged frames: all, or the last of a row.
         repeats: Number of times that the time was taken.
         note: How much of the problem a solver outside was given, "" for ours.
         degrees: Median angle between the vertex normals and the reference's [degrees], mean over the frames; None where
@@ -97,10 +97,10 @@ class Chart:
     Attributes:
         about: The shot, the machine, the plan and refine's default.
         points: Every method with every budget, curve by curve, in the order of the budgets.
-        references: Per frame, Phi0, Phi*, who found it and how far the next best ended above it.
+        references: Per frame, Phi0, Phi*, the method behind Phi* and the distance to the second best.
         terms: What each term, the last frame's detail and each level cost and buy.
-        failed: Runs that ended in an error.
-        warm: Methods in rows of frames that begin where the last one ended.
+        failed: Runs with an error.
+        warm: Methods on consecutive frames, each started from the previous result.
     """
 
     about: dict[str, Any]
@@ -118,7 +118,7 @@ class Chart:
 
     @property
     def busy(self) -> str:
-        """Warning that other programs used the cores during measurement; "" if none did."""
+        """Warning of programs using the cores during measurement; "" without any."""
         waited = self.about["waited"]
         if waited < BUSY or self.about.get("clock") == "cpu":
             return ""
@@ -137,7 +137,7 @@ class Chart:
 
     @property
     def prepared(self) -> float:
-        """Milliseconds of a cold frame that refine's default takes to prepare it; 0 if unknown."""
+        """Milliseconds of preparing a cold frame by refine's default; 0 if unknown."""
         return next((point.ms_prepared for point in self.curve(DEFAULT)), 0.0)
 
     @property
@@ -194,9 +194,9 @@ class Chart:
         return None
 
     def times_to(self, gap: float) -> dict[str, float]:
-        """Milliseconds to a gap of the methods that get there, the fastest first."""
-        found = {name: t for name in self.methods if name != DEFAULT and (t := self.time_to(name, gap)) is not None}
-        return dict(sorted(found.items(), key=lambda item: item[1]))
+        """Milliseconds to a gap of the methods reaching the gap, the fastest first."""
+        time_of = {name: t for name in self.methods if name != DEFAULT and (t := self.time_to(name, gap)) is not None}
+        return dict(sorted(time_of.items(), key=lambda item: item[1]))
 
     def default_place(self) -> dict[str, Any] | None:
         """Whether refine's default is on the front: its time over the least time to the same gap."""
@@ -205,8 +205,8 @@ class Chart:
             return None
         fastest, least = next(iter(self.times_to(default.gap).items()), (DEFAULT, default.ms))
         ratio = default.ms / least
-        place = {"gap": default.gap, "ms": default.ms, "fastest": fastest, "fastest_ms": least, "ratio": ratio}
-        return place | {"on_front": ratio <= TOLERANCE}
+        standing = {"gap": default.gap, "ms": default.ms, "fastest": fastest, "fastest_ms": least, "ratio": ratio}
+        return standing | {"on_front": ratio <= TOLERANCE}
 
     def to_dict(self) -> dict[str, Any]:
         """The chart as plain values."""
@@ -227,7 +227,7 @@ class Chart:
             writer.writerows(rows)
 
     def lines(self) -> Iterator[str]:
-        """The summary that the command prints: a table in Markdown, and where the default stands."""
+        """The printed summary: a table in Markdown, and the default's standing."""
         yield "| method | " + " | ".join(f"ms to {gap:.0%}" for gap in GAPS) + " | least gap | degrees | at ms |"
         yield "|" + "---|" * (len(GAPS) + 4)
         for name in self.methods:
@@ -236,19 +236,19 @@ class Chart:
             cells = ["-" if t is None else f"{t:.0f}" for t in times]
             degrees = "-" if best.degrees is None else f"{best.degrees:.1f}"
             yield f"| {name} | {' | '.join(cells)} | {best.gap:.2%} | {degrees} | {best.ms:.1f} |"
-        place = self.default_place()
-        if place is not None:
-            where = "on the front" if place["on_front"] else "not on the front"
+        standing = self.default_place()
+        if standing is not None:
+            where = "on the front" if standing["on_front"] else "not on the front"
             yield ""
             yield (
-                f"refine's default: {place['gap']:.2%} in {place['ms']:.0f} ms, {place['ratio']:.2f} times the "
-                f"{place['fastest_ms']:.0f} ms of the fastest to that gap ({place['fastest']}): {where}"
+                f"refine's default: {standing['gap']:.2%} in {standing['ms']:.0f} ms, {standing['ratio']:.2f} times "
+                f"the {standing['fastest_ms']:.0f} ms of the fastest to that gap ({standing['fastest']}): {where}"
             )
         if words := self.words_of_degrees():
             yield words
-        for each in self.references:
-            where = "" if each["frame"] is None else f"frame {each['frame']:g}: "
-            yield f"{where}{Reference.of(each)}"
+        for reference in self.references:
+            where = "" if reference["frame"] is None else f"frame {reference['frame']:g}: "
+            yield f"{where}{Reference.of(reference)}"
         if self.busy:
             yield self.busy
         yield from (f"{name} was given {note}" for name, note in self.notes.items())
@@ -264,12 +264,12 @@ def typical(times: Sequence[float]) -> float:
 def collate(journal: Journal) -> Chart:
     """Put a journal's rows together."""
     cold, warm = journal.rows("point"), journal.rows("warm")
-    found = {row["frame"]: Reference.of(row) for row in journal.rows("reference")}
+    references_of = {row["frame"]: Reference.of(row) for row in journal.rows("reference")}
     for row in (*cold, *warm):
-        if row["frame"] in found and "energies" in row:
+        if row["frame"] in references_of and "energies" in row:
             by = f"{row['method']}, {counted(row['steps'], 'step')}" + (", warm" if row["row"] == "warm" else "")
-            found[row["frame"]] = found[row["frame"]].lowered(row["energies"], by)
-    last = {row["frame"]: found[row["frame"]] for row in warm if row["frame"] in found}
+            references_of[row["frame"]] = references_of[row["frame"]].lowered(row["energies"], by)
+    last = {row["frame"]: references_of[row["frame"]] for row in warm if row["frame"] in references_of}
     plan = journal.one("plan") or {}
     about = journal.rows("problem")[0]["problem"] | {name: plan.get(name) for name in ("plan", "long_minutes")}
     about["waited"] = sum(r.get("waited") or 0.0 for r in cold) / max(sum(r.get("elapsed", 0.0) for r in cold), TINY)
@@ -277,17 +277,17 @@ def collate(journal: Journal) -> Chart:
         tuple({name: value for name, value in row.items() if name != "row"} for row in journal.rows(kind))
         for kind in ("term", "failed")
     )
-    references = tuple({"frame": frame, **each.plain()} for frame, each in found.items())
+    references = tuple({"frame": frame, **reference.plain()} for frame, reference in references_of.items())
     in_rows = sorted(_points(warm, last), key=lambda point: (point.method, point.steps))
-    return Chart(about, tuple(_points(cold, found)), references, terms, failed, tuple(in_rows))
+    return Chart(about, tuple(_points(cold, references_of)), references, terms, failed, tuple(in_rows))
 
 
 def _points(rows: Sequence[dict[str, Any]], references: dict[Any, Reference]) -> Iterator[Point]:
     """The point of each method at each budget for which all frames were measured."""
     for key in dict.fromkeys((row["method"], row["steps"]) for row in rows):
-        own = [row for row in rows if (row["method"], row["steps"]) == key]
-        if {row["frame"] for row in own if "energies" in row} == set(references):
-            yield _point(own, references)
+        matching = [row for row in rows if (row["method"], row["steps"]) == key]
+        if {row["frame"] for row in matching if "energies" in row} == set(references):
+            yield _point(matching, references)
 
 
 def _point(rows: Sequence[dict[str, Any]], references: dict[Any, Reference]) -> Point:
@@ -295,7 +295,7 @@ def _point(rows: Sequence[dict[str, Any]], references: dict[Any, Reference]) -> 
     times = [[row["ms"] for row in rows if row["frame"] == frame] for frame in judged]
     first, values = rows[0], list(judged.values())
     energies = {name: statistics.fmean(v["energies"].get(name, 0.0) for v in values) for name in values[0]["energies"]}
-    least, start = (sum(getattr(each, name) for each in references.values()) for name in ("least", "start"))
+    least, start = (sum(getattr(reference, name) for reference in references.values()) for name in ("least", "start"))
     energy = sum(energies.values())
     return Point(
         method=first["method"],
@@ -304,10 +304,10 @@ def _point(rows: Sequence[dict[str, Any]], references: dict[Any, Reference]) -> 
         steps=first["steps"],
         made=statistics.fmean(v.get("made", v["steps"]) for v in values),
         tolerance=first.get("tolerance", 0.0),
-        ms=statistics.fmean(typical(each) for each in times),
-        ms_median=statistics.fmean(statistics.median(each) for each in times),
-        ms_least=statistics.fmean(min(each) for each in times),
-        ms_most=statistics.fmean(max(each) for each in times),
+        ms=statistics.fmean(typical(repeats) for repeats in times),
+        ms_median=statistics.fmean(statistics.median(repeats) for repeats in times),
+        ms_least=statistics.fmean(min(repeats) for repeats in times),
+        ms_most=statistics.fmean(max(repeats) for repeats in times),
         ms_prepared=statistics.fmean(row.get("prepared", 0.0) for row in values),
         gap=(len(values) * energy - least) / max(start - least, TINY),
         energy=energy,
@@ -315,7 +315,7 @@ def _point(rows: Sequence[dict[str, Any]], references: dict[Any, Reference]) -> 
         percent=statistics.fmean(v["percent"] for v in values),
         **over_frames(values),
         frames=len(values),
-        repeats=min(len(each) for each in times),
+        repeats=min(len(repeats) for repeats in times),
         note=first.get("note", ""),
         apart_mm=_mean_known(values, "apart_mm"),
         degrees=_mean_known(values, "degrees"),
@@ -324,5 +324,5 @@ def _point(rows: Sequence[dict[str, Any]], references: dict[Any, Reference]) -> 
 
 def _mean_known(values: Sequence[dict[str, Any]], name: str) -> float | None:
     """Mean of a value over the frames; None if some frame has none."""
-    known = [each for v in values if (each := v.get(name)) is not None]
-    return statistics.fmean(known) if len(known) == len(values) else None
+    values_known = [value for v in values if (value := v.get(name)) is not None]
+    return statistics.fmean(values_known) if len(values_known) == len(values) else None

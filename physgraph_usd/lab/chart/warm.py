@@ -1,4 +1,4 @@
-"""Warm frames: frames in a row, each begun where the last one ended, by refine's default and by what it chooses from.
+"""Warm frames: consecutive frames, each started from the previous result, by refine's default and the default's parts.
 
 Each run begins with a cold frame of its own. The last frame is judged, which is one of those whose Phi* is known; the
 time is that of the frames after the first.
@@ -22,14 +22,14 @@ from .table import typical
 METHODS_OF_WARM = ("quasi-newton", "physgraph")
 """The methods that refine's default chooses from, frame by frame."""
 STEPS = (12, 6, 24, 3, 48)
-"""Most steps of a frame, those that tell most first."""
+"""Step limits of a frame, the most informative first."""
 ROW = 4
-"""Frames in a row, the cold one included."""
+"""Number of consecutive frames, including the cold frame."""
 REPEATS = 3
 
 
 def measure_warm(journal: Journal, problems: tuple[Problem, Problem], row: Sequence[Frame], clock: Clock) -> None:
-    """Measure what is not yet in the journal, as long as there is time."""
+    """Measure rows missing in the journal, within the time."""
     if len(row) < 2:
         return
     timed, judge = problems
@@ -52,6 +52,6 @@ def measure_warm(journal: Journal, problems: tuple[Problem, Problem], row: Seque
                 continue
             values: dict[str, Any] = {} if repeat else asdict(judge.judge(row[-1], solved[-1].points))
             values |= {} if name == AUTO else {"integrator": name, "nested": settings.method.nested}
-            spent = [each.milliseconds for each in solved[1:]]
-            made = {"made": solved[-1].steps, "tolerance": settings.tolerance}
-            journal.add("warm", repeat=repeat, ms=round(typical(spent), 3), **key, **made, **values)
+            spent = [frame.milliseconds for frame in solved[1:]]
+            record = {"made": solved[-1].steps, "tolerance": settings.tolerance}
+            journal.add("warm", repeat=repeat, ms=round(typical(spent), 3), **key, **record, **values)

@@ -25,10 +25,10 @@ class Change:
     """Cost and gain of a part of the model.
 
     Attributes:
-        cost_ms: Time of a frame with it less that without [ms].
-        fraction: That cost over the time with it.
+        cost_ms: Time of a frame with the term minus time without [ms].
+        fraction: Cost over the time with the term.
         moved_mm: RMS distance between the results [mm].
-        buys: What is worse without it, in words.
+        buys: Worsening without the term, in words.
     """
 
     name: str
@@ -55,11 +55,11 @@ def styles(chart: Chart) -> dict[str, Style]:
     outside = names & set(chart.notes)
     colours = {name: PALETTE[i % len(PALETTE)] for i, name in enumerate(sorted(names - outside))}
     colours |= {name: OUTSIDE[i % len(OUTSIDE)] for i, name in enumerate(sorted(outside))}
-    found = {
+    sentences = {
         name: Style(colours.get(family[name], BASELINE), nested[name] is False, family[name] in outside)
         for name in chart.methods
     }
-    return found | {DEFAULT: Style("#111111", False)}
+    return sentences | {DEFAULT: Style("#111111", False)}
 
 
 def title(chart: Chart) -> str:
@@ -74,7 +74,7 @@ def title(chart: Chart) -> str:
 
 
 def percent(value: float, *, digits: int = 3) -> str:
-    """A fraction with as many digits as it needs; a large one as a factor."""
+    """A fraction with the needed digits; a large fraction as a factor."""
     if abs(value) >= 10.0:
         return f"{value:,.0f}x"
     return f"{100.0 * value:.{max(digits, 3) if abs(value) >= 0.995 else digits}g}%"
@@ -86,18 +86,20 @@ ABOVE = "energy above the best known, percent of what solving gains"
 
 
 def advice(chart: Chart) -> str:
-    """Which method to take, in a sentence."""
-    place = chart.default_place()
-    if place is None:
+    """The recommended method, in a sentence."""
+    standing = chart.default_place()
+    if standing is None:
         return ""
-    left = f"{percent(place['gap'], digits=2)} above the best known in {place['ms']:.0f} ms a frame"
-    if place["on_front"]:
-        return f"Take refine's default, which you have without asking: it comes to {left}; nothing gets as low sooner."
-    known = {point.method: point for point in chart.points}[place["fastest"]]
+    excess = f"{percent(standing['gap'], digits=2)} above the best known in {standing['ms']:.0f} ms a frame"
+    if standing["on_front"]:
+        return (
+            f"Take refine's default, which you have without asking: it comes to {excess}; nothing gets as low sooner."
+        )
+    known = {point.method: point for point in chart.points}[standing["fastest"]]
     asked = f" (--integrator {known.integrator})" if known.method == known.integrator in INTEGRATORS else ""
     return (
-        f"Take {place['fastest']}{asked} for single frames like these: refine's default comes to {left}, "
-        f"{place['ratio']:.1f} times the {place['fastest_ms']:.0f} ms in which that gets as low."
+        f"Take {standing['fastest']}{asked} for single frames like these: refine's default comes to {excess}, "
+        f"{standing['ratio']:.1f} times the {standing['fastest_ms']:.0f} ms in which that gets as low."
     )
 
 
@@ -108,19 +110,21 @@ def contact_words(chart: Chart) -> str:
 
 def warm_advice(chart: Chart) -> str:
     """The cost of frames after the first, in a sentence."""
-    own = next((each for each in chart.warm if each.method == DEFAULT), None)
-    if own is None:
+    default = next((point for point in chart.warm if point.method == DEFAULT), None)
+    if default is None:
         return ""
-    rest = [each for each in chart.warm if each.method != DEFAULT and each.gap <= own.gap]
-    best = min(rest, key=lambda each: each.ms, default=None)
-    words = f"Frames begun where the last one ended take it {own.ms:.0f} ms and end at {percent(own.gap, digits=2)}"
-    if best is None or best.ms * TOLERANCE >= own.ms:
+    rest = [point for point in chart.warm if point.method != DEFAULT and point.gap <= default.gap]
+    best = min(rest, key=lambda point: point.ms, default=None)
+    words = (
+        f"Frames begun where the last one ended take it {default.ms:.0f} ms and end at {percent(default.gap, digits=2)}"
+    )
+    if best is None or best.ms * TOLERANCE >= default.ms:
         return f"{words}; nothing else is as low sooner."
     return f"{words}; {best.method} with {best.steps} steps is as low in {best.ms:.0f} ms."
 
 
 def settings(point: Point) -> str:
-    """Settings that a point was solved with."""
+    """Settings of a point's solve."""
     if point.tolerance:
         words = (
             f"at most {counted(point.steps, 'step')} at the finest level, tolerance {point.tolerance:g} edge lengths"
@@ -135,7 +139,7 @@ def settings(point: Point) -> str:
 
 
 def figures(point: Point, *, touches: bool) -> list[str]:
-    """Figures that a point reached."""
+    """Figures of a point's result."""
     lines = [
         f"gap {percent(point.gap)}, energy {point.energy:.4g} J",
         f"{point.ms:.1f} ms a frame (median {point.ms_median:.1f}, least {point.ms_least:.1f}; "
@@ -155,34 +159,34 @@ def figures(point: Point, *, touches: bool) -> list[str]:
 
 def changes(chart: Chart) -> list[Change]:
     """Changes of the energy by each measured part of the model, and by each level."""
-    fall = max(sum(each["start"] - each["least"] for each in chart.references), 1e-12)
-    least = sum(each["least"] for each in chart.references)
-    found, levels, before, apart = list[Change](), list[Change](), 0.0, None
-    for row in (each for each in chart.terms if "failed" not in each):
+    fall = max(sum(reference["start"] - reference["least"] for reference in chart.references), 1e-12)
+    least = sum(reference["least"] for reference in chart.references)
+    changes, levels, before, apart = list[Change](), list[Change](), 0.0, None
+    for row in (term for term in chart.terms if "failed" not in term):
         without = row["without"]
         gap = f"gap {percent((without['energy'] - least) / fall)}"
         if row["kind"] != "level":
-            found.append(_term(row, gap))
+            changes.append(_term(row, gap))
             continue
         cost = without["ms"] - before
         moved = 0.0 if apart is None else max(apart - row["moved_mm"], 0.0)
         name = f"{row['term']} ({without['vertices']:,} vertices)"
         levels.append(Change(name, cost, cost / max(without["ms"], 1e-9), moved, f"as the last one {gap}"))
         before, apart = without["ms"], row["moved_mm"]
-    return found + levels
+    return changes + levels
 
 
 def _term(row: dict[str, Any], gap: str) -> Change:
-    full, other = row["with"], row["without"]
+    full, without = row["with"], row["without"]
     name, worse = row["term"], [gap]
     if row["kind"] == "time":
         name = {"tether": "tether to the last frame", "warm": "start from the last frame"}[name]
-        worse = [f"jerk {other['jerk']:.3g} edges (with it {full['jerk']:.3g})"]
+        worse = [f"jerk {without['jerk']:.3g} edges (with it {full['jerk']:.3g})"]
     worse += [
-        f"{key} {other[key]} ({full[key]})" for key in ("inside", "crossings", "tangles") if full[key] != other[key]
+        f"{key} {without[key]} ({full[key]})" for key in ("inside", "crossings", "tangles") if full[key] != without[key]
     ]
-    cost = full["ms"] - other["ms"]
-    if other["ms"] > TOLERANCE * full["ms"]:
+    cost = full["ms"] - without["ms"]
+    if without["ms"] > TOLERANCE * full["ms"]:
         worse.append("and a frame takes longer")
     if row["moved_mm"] > FAR:
         worse = ["the cloth falls away"]

@@ -1,4 +1,4 @@
-"""Methods that only charts, training and benchmarks compare: importing this adds them to the solver's registries."""
+"""Methods compared in charts, training and benchmarks only; the import adds the methods to the solver's registries."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ class GradientDescent:
         return Carry(x, energy, force, mover=self.name, memory=self._rate / stiffest)
 
     def step(self, system: System, carry: Carry) -> Carry:
-        """One step of fixed length."""
+        """A step of fixed length."""
         x = carry.x + carry.memory * carry.force
         energy, force = system.energy_and_force(x)
         return Carry(x, energy, force, mover=self.name, memory=carry.memory)
@@ -56,7 +56,7 @@ class Adam:
         return Carry(x, energy, force, mover=self.name, memory=moments)
 
     def step(self, system: System, carry: Carry) -> Carry:
-        """One Adam update."""
+        """An Adam update."""
         m: _Moments = carry.memory
         count = m.count + 1
         first = torch.lerp(carry.force, m.first, self._decay)

@@ -64,5 +64,5 @@ class Lbfgs:
         if carry.memory.secants:
             return begun
         direction = begun.memory.inverse * carry.force
-        found = backtrack(system, carry, direction, dot(carry.force, direction))
-        return carry.moved_by("stayed") if found is None else self._begun(system, *found)
+        move = backtrack(system, carry, direction, dot(carry.force, direction))
+        return carry.moved_by("stayed") if move is None else self._begun(system, *move)

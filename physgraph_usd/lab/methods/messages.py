@@ -66,7 +66,7 @@ def _blocks(count: int) -> tuple[int]:
 
 
 def _laid_out(perceptron: nn.Sequential, latent: int) -> list[Any]:
-    """Weights as the kernels read them, and what LayerNorm adds to a variance."""
+    """Weights in the kernels' layout, and LayerNorm's addition to a variance."""
     first, second, third, norm = (cast(Any, perceptron[k]) for k in (0, 2, 4, 5))
     weights = [layer.weight[:, -latent:].T.half().contiguous() for layer in (first, second, third)]
     return [*weights, first.bias, second.bias, third.bias, norm.weight, norm.bias, norm.eps]
@@ -80,13 +80,13 @@ def _update_edges(
     rows = tl.program_id(0) * ROWS + tl.arange(0, ROWS)
     columns = tl.arange(0, L)
     inside = (rows < count)[:, None]
-    place = rows.to(tl.int64)[:, None] * L + columns[None, :]
+    offsets = rows.to(tl.int64)[:, None] * L + columns[None, :]
     to = tl.load(receiver + rows, mask=rows < count, other=0)[:, None] * L + columns[None, :]
     by = tl.load(sender + rows, mask=rows < count, other=0)[:, None] * L + columns[None, :]
-    before = tl.load(edge + place, mask=inside, other=0.0)
+    before = tl.load(edge + offsets, mask=inside, other=0.0)
     h = tl.load(receive + to) + tl.load(send + by)
     h = _layers(before, h, w1, w2, w3, b1, b2, b3, gain, shift, eps, L)
-    tl.store(edge + place, before + h, mask=inside)
+    tl.store(edge + offsets, before + h, mask=inside)
 
 
 @triton.jit
@@ -95,16 +95,16 @@ def _update_vertices(
 ):
     rows = tl.program_id(0) * ROWS + tl.arange(0, ROWS)
     inside = (rows < count)[:, None]
-    place = rows.to(tl.int64)[:, None] * L + tl.arange(0, L)[None, :]
-    inputs = tl.load(gathered + place, mask=inside, other=0.0)
-    h = tl.load(from_vertex + place, mask=inside, other=0.0)
+    offsets = rows.to(tl.int64)[:, None] * L + tl.arange(0, L)[None, :]
+    inputs = tl.load(gathered + offsets, mask=inside, other=0.0)
+    h = tl.load(from_vertex + offsets, mask=inside, other=0.0)
     h = _layers(inputs, h, w1, w2, w3, b1, b2, b3, gain, shift, eps, L)
-    tl.store(gathered + place, h, mask=inside)
+    tl.store(gathered + offsets, h, mask=inside)
 
 
 @triton.jit
 def _layers(inputs, h, w1, w2, w3, b1, b2, b3, gain, shift, eps, L: tl.constexpr):
-    """Three layers and a LayerNorm; ``h`` is what the first one has made of everything else."""
+    """Three layers and a LayerNorm; ``h`` is the first layer's output for all remaining inputs."""
     columns = tl.arange(0, L)
     square = columns[:, None] * L + columns[None, :]
     h += tl.dot(inputs.to(tl.float16), tl.load(w1 + square)) + tl.load(b1 + columns)[None, :]

@@ -1,7 +1,7 @@
 """Truncated Newton: the reference that polishes Phi*. Meant for float64.
 
 Solves H d = F by conjugate gradients preconditioned by the metric; H v is a difference of forces,
-(F(x) - F(x + h v)) / h, so the reference needs nothing of the physics that the others do not have.
+(F(x) - F(x + h v)) / h: the reference needs no more of the physics than the rest.
 Negative curvature ends the inner loop (Nocedal and Wright, Numerical Optimization, algorithm 7.1).
 """
 
@@ -34,10 +34,10 @@ class Newton:
     def step(self, system: System, carry: Carry) -> Carry:
         """One Newton step with a backtracking line search; the energy never rises."""
         direction = self._direction(system, carry)
-        found = backtrack(system, carry, direction, float((carry.force * direction).sum()))
-        if found is None:
+        move = backtrack(system, carry, direction, float((carry.force * direction).sum()))
+        if move is None:
             return carry.moved_by("stayed")
-        x, energy, force = found
+        x, energy, force = move
         return Carry(x, energy, force, system.apply_metric_inverse(force), self.name)
 
     def _direction(self, system: System, carry: Carry) -> Tensor:

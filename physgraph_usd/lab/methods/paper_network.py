@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 LATENTS = (32, 64, 128)
-"""Latent sizes that the kernels of `messages` cover."""
+"""Latent sizes supported by the kernels of `messages`."""
 PIECE = 4096
 """Edges that are updated at once on a CPU: what lies between the layers of more does not stay in its cache, and from
 32 MB on the system hands out fresh pages each time."""
@@ -23,8 +23,8 @@ class DirectedEdges:
     """The edges in both directions, sorted by their receiver.
 
     Attributes:
-        sender: Vertex that each starts from, shape (2E,).
-        receiver: Vertex that it ends at, shape (2E,).
+        sender: Start vertex, shape (2E,).
+        receiver: End vertex, shape (2E,).
         degree: How many end at each vertex, shape (V,).
     """
 
@@ -90,7 +90,7 @@ class PaperNetwork(nn.Module):
         Args:
             vertex: Past displacements and forces.
             edge: Present and rest spans and their lengths, of each edge in both directions.
-            fixed: 1 where a vertex may not move.
+            fixed: 1 for a fixed vertex.
             edges: The edges in both directions.
         """
         v = self.encode_vertex(torch.cat([self.vertex_scale(vertex), fixed], dim=1))  # V L
@@ -144,12 +144,12 @@ def _vertex_update(perceptron: nn.Sequential, v: Tensor, gathered: Tensor, *, ke
 
 @functools.cache
 def has_triton() -> bool:
-    """Whether Triton is there; it comes with torch's CUDA builds."""
+    """Whether Triton is installed; torch's CUDA builds include Triton."""
     return importlib.util.find_spec("triton") is not None
 
 
 class Normaliser(nn.Module):
-    """Scales features by their mean and deviation, gathered while training until it is frozen."""
+    """Scales features by mean and deviation, gathered in training until frozen."""
 
     def __init__(self, width: int, *, most: int = 1000) -> None:
         """Start with nothing gathered.

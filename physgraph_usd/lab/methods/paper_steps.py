@@ -47,7 +47,7 @@ class LearnedPaper:
         return Carry(x, energy, force, None, self.name, _History(stiffness, (force,)))
 
     def step(self, system: System, carry: Carry) -> Carry:
-        """One step of the network."""
+        """A step of the network."""
         memory: _History = carry.memory
         move = self.propose(system, carry)
         x = carry.x + move

@@ -1,4 +1,4 @@
-"""Networks with random weights, which stress the guard."""
+"""Networks with random weights, to stress the guard."""
 
 from __future__ import annotations
 

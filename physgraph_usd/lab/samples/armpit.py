@@ -58,7 +58,7 @@ def build() -> PlainStage:
         shirt.quads,
         rest,
         Look("Body", (0.36, 0.22, 0.40)),
-        samples=np.stack([_lower(level, *each) for each in angles]),
+        samples=np.stack([_lower(level, *pair) for pair in angles]),
         uv=shirt.uv,
         subsets=((Look("Trim", (0.74, 0.70, 0.62)), trim(shirt)),),
         pin=((np.abs(shirt.points[:, 0]) < 0.12) & (shirt.points[:, 1] > 0.56)).astype(float),
@@ -66,8 +66,8 @@ def build() -> PlainStage:
     )
     moving = join(_torso(), _arm(1.0), _arm(-1.0))
     neck = ellipsoid(np.array([0.050, 0.130, 0.048]), np.array([0.0, 0.60, -0.005]), (24, 14))
-    places = [_lower(moving.points, *each, below=(-95.0, 2.5)) for each in pressed]
-    solids = [join(Solid(place, moving.counts, moving.indices), neck) for place in places]
+    poses = [_lower(moving.points, *pair, below=(-95.0, 2.5)) for pair in pressed]
+    solids = [join(Solid(pose, moving.counts, moving.indices), neck) for pose in poses]
     samples = np.stack([solid.points for solid in solids])
     body = solids[0].collider("Form", CANVAS, samples=samples)
     doc = "A T-shirt pinched between a hanging arm and the side"

@@ -1,4 +1,4 @@
-"""Two sheets on two rods whose lower ends start on the wrong sides of one another: something to untangle."""
+"""Two sheets on two rods, with the lower ends crossed at the start, to be untangled."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from .shapes import flipped, grid_uv, mesh, quad_grid
 CELL = 0.021
 """Side of a quad at rest [m]."""
 APART, THROUGH = 0.028, 0.016
-"""Half the distance between the rods, and half of that by which the lower edges have passed one another [m]."""
+"""Half the distance between the rods, and half the overlap of the lower edges [m]."""
 FRAMES = 12
 
 
 def build() -> PlainStage:
-    """Two garments that cross along a line some 5 cm above their lower edges."""
+    """Two garments crossing along a line some 5 cm above the lower edges."""
     times = np.arange(FRAMES) / 24.0
     front = _sheet("Front", (26, 25), 1.0, times=times, look=Look("Silk", (0.55, 0.16, 0.14), 0.5))
     back = _sheet("Back", (25, 21), -1.0, times=times, look=Look("Cotton", (0.16, 0.30, 0.45)))
@@ -25,7 +25,7 @@ def build() -> PlainStage:
 
 
 def _sheet(name: str, size: tuple[int, int], side: float, *, times: np.ndarray, look: Look) -> PlainMesh:
-    """One sheet of rows and columns of vertices, the top row first; it hangs on its own side of z = 0."""
+    """A sheet of rows and columns of vertices, the top row first, hanging on a single side of z = 0."""
     rows, columns = size
     v, u = np.meshgrid(np.linspace(0.0, 1.0, rows), np.linspace(-0.5, 0.5, columns), indexing="ij")
     u, v = u.ravel(), v.ravel()

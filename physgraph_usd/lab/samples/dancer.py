@@ -53,7 +53,7 @@ BLEND = 0.016
 CELL = 0.02
 """Size of the body's faces [m]."""
 DRESS = Cut(0.196, 1.285, 1.470, 0.56, 0.15, 0.078, (22, 5, 23, 7), depth=(0.70, 0.90))
-"""The dress before it is shaped [m]."""
+"""The unshaped dress [m]."""
 WAIST, SHOULDER, GAP = 1.075, (0.165, 1.385), 0.012
 """Height of the waist, where a sleeve turns, and distance of the coarse dress from the body [m]."""
 GIRTH, HEM, LENGTH, FOLDS = (0.146, 0.108), 0.37, 0.515, 6
@@ -274,7 +274,7 @@ def move_out(points: np.ndarray, cones: np.ndarray, radii: np.ndarray, *, gap: f
 
 
 def skin(points: np.ndarray, body: Rig) -> np.ndarray:
-    """Skinning weights of points at rest, shape (V, J): those of near cones, whose ends share them by place."""
+    """Skinning weights of points at rest, shape (V, J), from nearby cones, split between a cone's ends by position."""
     distance, along, _ = apart(points, body.cones, body.radii)
     near = np.exp((distance.min(axis=1, keepdims=True) - distance) / 0.02)
     weights = np.zeros((len(points), len(body.names)))
@@ -297,7 +297,7 @@ def posed_cones(body: Rig, matrices: np.ndarray) -> np.ndarray:
 
 
 def surface(body: Rig) -> Solid:
-    """The body at rest as quads: surface nets of the level set (one vertex a cell that it crosses).
+    """The body at rest as quads: surface nets of the level set (a vertex in each crossed cell).
 
     Source: Gibson, "Constrained Elastic Surface Nets", 1998.
     """

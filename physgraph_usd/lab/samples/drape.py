@@ -66,7 +66,7 @@ class Drape:
         Args:
             rest: Rest positions [m], shape (V, 3).
             faces: Triangles or quads, shape (F, 3) or (F, 4).
-            pinned: Vertices that follow targets, shape (K,).
+            pinned: Vertices following targets, shape (K,).
             project: Moves positions out of colliders at a time, in place of contact forces; or None.
             start: Positions at the beginning when they differ from ``rest``.
         """
@@ -144,7 +144,7 @@ class Drape:
 def _smoothing(rest: np.ndarray, faces: np.ndarray) -> sparse.csr_matrix:
     """Distance of each vertex from its neighbours' mean; along the border only from its two border neighbours.
 
-    Rows that do not vanish at rest, at corners for example, are dropped, so that nothing curls by itself.
+    Rows not vanishing at rest, at corners for example, are dropped: flat cloth must not curl.
     """
     size, count = faces.shape[1], len(rest)
     sides = np.sort(np.concatenate([faces[:, [i, (i + 1) % size]] for i in range(size)]), axis=1)

@@ -17,7 +17,7 @@ SAILCLOTH = Fabric(stretch=60.0, bend=60e-6, density=0.18)
 
 
 def build() -> PlainStage:
-    """One garment whose first column is pinned."""
+    """A garment with the first column pinned."""
     down, across = np.meshgrid(np.linspace(0, 1, ROWS), np.linspace(0, 1, COLUMNS), indexing="ij")
     rest = np.stack([WIDTH * across.ravel(), HEIGHT * (down.ravel() - 0.5), 0.0 * across.ravel()], axis=1)
     quads = quad_grid(ROWS, COLUMNS)

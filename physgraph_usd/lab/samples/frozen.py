@@ -12,12 +12,12 @@ from .shapes import Solid, mesh, quad_grid, rings, square
 SIDE, CELLS = 1.1, 36
 """Side of the cloth [m] and its quads along a side."""
 TABLE_RADIUS, ROUND, TABLE_HEIGHT, THICK = 0.30, 0.02, 0.55, 0.16
-"""Radius of the table, of its rounded edge, height and thickness of its top [m]."""
+"""Radius of the table and of the rounded edge, height and thickness of the top [m]."""
 FRAMES, SETTLE = 12, 50
 
 
 def build() -> PlainStage:
-    """One garment whose 12 samples are equal, over a static collider."""
+    """A garment with 12 equal samples, over a static collider."""
     rest, quads, uv = square(SIDE, CELLS, TABLE_HEIGHT + 0.004)
     ring = np.minimum(np.arange(CELLS), np.arange(CELLS)[::-1])
     border = np.flatnonzero(np.minimum(ring[:, None], ring[None, :]).ravel() == 2)

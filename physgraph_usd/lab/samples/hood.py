@@ -62,7 +62,7 @@ def _hull(folded: float, height: float, larger: float) -> np.ndarray:
     """
     j, k = np.meshgrid(np.arange(DEEP + 1), np.arange(2 * UP + 1) - UP, indexing="ij")
     back, step = j / DEEP, UP - np.abs(k)
-    (wide, z), (across, behind) = (each.T[:, j] for each in _neckline())
+    (wide, z), (across, behind) = (curve.T[:, j] for curve in _neckline())
     first, second = FOLD
     angle = FOLDED * folded * ease(back / 0.75)
     cell = height / UP
@@ -98,11 +98,11 @@ def _neckline() -> tuple[np.ndarray, np.ndarray]:
     curve = np.stack([0.112 * np.cos(t) ** 0.5, 0.085 - 0.235 * np.sin(t) ** 0.9], axis=1)
     length = _lengths(curve)
     even = np.linspace(0.0, length[-1], DEEP + 1)
-    place = np.stack([np.interp(even, length, curve[:, i]) for i in (0, 1)], axis=1)
-    along = np.gradient(place, axis=0)
+    resampled = np.stack([np.interp(even, length, curve[:, i]) for i in (0, 1)], axis=1)
+    along = np.gradient(resampled, axis=0)
     along[-1] = -1.0, 0.0  # the other side goes on from here
     normal = np.stack([-along[:, 1], along[:, 0]], axis=1)
-    return place, normal / np.linalg.norm(normal, axis=1, keepdims=True)
+    return resampled, normal / np.linalg.norm(normal, axis=1, keepdims=True)
 
 
 def _angles(time: float) -> tuple[float, float]:

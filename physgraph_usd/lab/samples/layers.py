@@ -12,7 +12,7 @@ from .walker import WAIST, Cells, form, garment, trousers, tube, walk
 
 FRAMES, RATE = 30, 24.0
 GAPS = (0.005, 0.010, 0.0152)
-"""Distance of trousers, shirt and belt from the body, where all three lie over one another [m]."""
+"""Distance of trousers, shirt and belt from the body, where all three overlap [m]."""
 
 
 def build() -> PlainStage:
@@ -45,7 +45,7 @@ def _shirt(times: np.ndarray) -> PlainMesh:
 
 
 def _belt(times: np.ndarray) -> PlainMesh:
-    """A belt of leather, as long as it is worn, that nothing holds."""
+    """A leather belt of the worn length, without support."""
     cage = tube(WAIST + np.linspace(0.0225, -0.0225, 4), 44, lambda height: np.full_like(height, GAPS[2]))
     samples = np.stack([walk(cage.points, time) for time in times])
     return replace(garment("Belt", cage, samples, Look("Leather", (0.16, 0.09, 0.05), 0.5)), pin=None)

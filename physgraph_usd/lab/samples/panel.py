@@ -67,8 +67,8 @@ def sew(cut: Cut) -> Pillow:
     seam = used & _seams(cut, rows, columns, x)
     number = np.where(used, np.cumsum(used).reshape(used.shape) - 1, -1)
     corners = np.stack([number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]], axis=-1)
-    whole = (corners >= 0).all(axis=-1)
-    cells, quads = np.argwhere(whole), corners[whole]
+    is_whole = (corners >= 0).all(axis=-1)
+    cells, quads = np.argwhere(is_whole), corners[is_whole]
     flat = np.stack([x[columns[used]], y[rows[used]]], axis=1)
     t = np.clip((np.abs(flat[:, 0]) / cut.half_width - 0.75) / 0.5, 0.0, 1.0)
     depth = cut.depth[0] + (cut.depth[1] - cut.depth[0]) * t * t * (3.0 - 2.0 * t)

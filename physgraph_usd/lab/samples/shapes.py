@@ -45,12 +45,12 @@ def spin(points: np.ndarray, angle: np.ndarray | float) -> np.ndarray:
 
 
 def at_height(table: np.ndarray, height: np.ndarray) -> list[np.ndarray]:
-    """The columns of a table at heights, between its rows; its first column is the height, which falls."""
+    """The columns of a table at heights, interpolated between rows; the first column is the falling height."""
     return [np.interp(-height, -table[:, 0], column) for column in table[:, 1:].T]
 
 
 def flipped(uv: FaceVarying) -> FaceVarying:
-    """UVs of quads whose corners run the other way round."""
+    """UVs of quads with reversed corners."""
     return FaceVarying(uv.values, uv.indices.reshape(-1, 4)[:, ::-1].ravel())
 
 
@@ -79,7 +79,7 @@ def ease(t: np.ndarray | float) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Solid:
-    """A mesh that is closed, or several of them that overlap.
+    """A closed mesh, or several overlapping ones.
 
     Attributes:
         points: Positions [m], shape (V, 3).
@@ -99,7 +99,7 @@ class Solid:
 def rings(across: np.ndarray, height: np.ndarray, deep: np.ndarray, around: int) -> np.ndarray:
     """Ellipses about the Y axis from half axes and heights [m], shape (R,) each: points of shape (R, around, 3)."""
     a = 2 * np.pi * np.arange(around) / around
-    across, height, deep = (each[:, None] for each in (across, height, deep))
+    across, height, deep = (values[:, None] for values in (across, height, deep))
     return np.stack(np.broadcast_arrays(across * np.cos(a), height, deep * np.sin(a)), axis=-1)
 
 
@@ -109,12 +109,12 @@ def lathe(rings: np.ndarray, ends: np.ndarray) -> Solid:
     Seen from the first ring's end the rings run clockwise. The solid's points are the rings, then the two tips.
     """
     count, around = rings.shape[:2]
-    here = np.arange(around)
-    following = np.roll(here, -1)
+    ring = np.arange(around)
+    following = np.roll(ring, -1)
     first, last = count * around, (count - 1) * around
     fans = [
-        np.stack([np.full(around, first), following, here], axis=1),
-        np.stack([np.full(around, first + 1), last + here, last + following], axis=1),
+        np.stack([np.full(around, first), following, ring], axis=1),
+        np.stack([np.full(around, first + 1), last + ring, last + following], axis=1),
     ]
     quads = quad_grid(count, around, closed=True)
     return Solid(
@@ -151,7 +151,7 @@ def torus(major: float, minor: float, cells: tuple[int, int]) -> Solid:
 
 
 def ellipsoid(axes: np.ndarray, middle: np.ndarray, cells: tuple[int, int]) -> Solid:
-    """An ellipsoid of quads with a fan at its top and at its bottom.
+    """An ellipsoid of quads with a fan at the top and at the bottom.
 
     Half axes and centre [m] have shape (3,); ``cells`` are the faces around and from top to bottom.
     """

@@ -33,11 +33,11 @@ PROFILE = np.array(
 
 
 def build() -> PlainStage:
-    """A triangulated skirt over a collider that moves by its transform."""
+    """A triangulated skirt over a collider moved by a transform."""
     rest = _rest()
     quads = quad_grid(ROWS, AROUND, closed=True)[:, ::-1]
     uv = grid_uv(ROWS, AROUND, closed=True)
-    triangles, corners = (_split(each) for each in (quads, uv.indices.reshape(-1, 4)[:, ::-1]))
+    triangles, corners = (_split(faces) for faces in (quads, uv.indices.reshape(-1, 4)[:, ::-1]))
     garment = mesh(
         "Skirt",
         triangles,
@@ -66,8 +66,8 @@ def _rest() -> np.ndarray:
 
 def _split(quads: np.ndarray) -> np.ndarray:
     """Quads, or their UV corners, as triangles with alternating diagonals."""
-    odd = (np.arange(len(quads)) // AROUND + np.arange(len(quads)) % AROUND) % 2 == 1
-    turned = np.where(odd[:, None], np.roll(quads, 1, axis=1), quads)
+    is_odd = (np.arange(len(quads)) // AROUND + np.arange(len(quads)) % AROUND) % 2 == 1
+    turned = np.where(is_odd[:, None], np.roll(quads, 1, axis=1), quads)
     return np.stack([turned[:, [0, 1, 2]], turned[:, [0, 2, 3]]], axis=1).reshape(-1, 3)
 
 

@@ -17,7 +17,7 @@ FRAMES = 24
 
 
 def build() -> PlainStage:
-    """One garment: over the shot its length falls by 20% and its cuff turns by 70 degrees."""
+    """A garment: over the shot the length falls by 20% and the cuff turns by 70 degrees."""
     flat = _scatter()
     triangles, corners = _triangulate(flat)
     samples = np.stack([_pose(flat, float(ease(i / (FRAMES - 1)))) for i in range(FRAMES)])
@@ -68,7 +68,7 @@ def _relax(flat: np.ndarray, fixed: np.ndarray) -> np.ndarray:
 
 
 def _triangulate(flat: np.ndarray) -> tuple[np.ndarray, FaceVarying]:
-    """Delaunay triangles on the unrolled tube, and their UVs, which have a seam."""
+    """Delaunay triangles on the unrolled tube, and UVs with a seam."""
     scale = np.array([2 * np.pi * 0.5 * (RADIUS_TOP + RADIUS_CUFF), LENGTH])
     count = len(flat)
     tiled = np.concatenate([flat + np.array([shift, 0.0]) for shift in (-1.0, 0.0, 1.0)])

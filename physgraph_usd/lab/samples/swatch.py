@@ -17,7 +17,7 @@ TO_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 
 def build(variant: str = "") -> PlainStage:
-    """One garment whose top edge is gathered by a quarter while it turns a little.
+    """A slightly turning garment with the top edge gathered by a quarter.
 
     Args:
         variant: Empty, ``cm``, ``zup`` or ``lefthanded``; all show the same cloth in the same place.
@@ -39,9 +39,11 @@ def build(variant: str = "") -> PlainStage:
         fabric=PRESETS["silk"],
         left_handed=variant == "lefthanded",
     )
-    units = {"metres_per_unit": 1.0 / scale, "up_axis": "Z" if variant == "zup" else "Y"}
+    up_axis = "Z" if variant == "zup" else "Y"
     doc = "A hanging swatch whose top edge is gathered"
-    return PlainStage("SwatchShot", doc, (swatch,), np.arange(1.0, FRAMES + 1), **units)
+    return PlainStage(
+        "SwatchShot", doc, (swatch,), np.arange(1.0, FRAMES + 1), metres_per_unit=1.0 / scale, up_axis=up_axis
+    )
 
 
 def _pose(amount: float) -> np.ndarray:

@@ -12,7 +12,7 @@ from .shapes import ease, mesh, off_torus, square, torus
 SIDE, CELLS = 0.66, 30
 """Side of the sheet [m] and its quads along a side."""
 MAJOR, MINOR, GAP = 0.135, 0.045, 0.005
-"""Radius of the torus' circle and of its tube, and the distance that the coarse sheet keeps from it [m]."""
+"""Radii of the torus' circle and tube, and the distance of the coarse sheet from the torus [m]."""
 PULL = 0.24
 """How far the grip goes down [m]."""
 FRAMES, STEPS = 28, 3

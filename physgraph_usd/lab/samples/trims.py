@@ -53,8 +53,8 @@ def _normals(faces: np.ndarray, points: np.ndarray) -> np.ndarray:
 def _rims(faces: np.ndarray) -> list[np.ndarray]:
     """Vertices of each open border in order, along the border's faces."""
     sides = np.concatenate([faces[:, [k, (k + 1) % 4]] for k in range(4)])
-    whole = {tuple(side) for side in sides.tolist()}
-    after = {a: b for a, b in sides.tolist() if (b, a) not in whole}
+    side_set = {tuple(side) for side in sides.tolist()}
+    after = {a: b for a, b in sides.tolist() if (b, a) not in side_set}
     loops = []
     while after:
         start, loop = next(iter(after)), []
@@ -79,17 +79,17 @@ def _buttons(faces: np.ndarray, points: np.ndarray) -> PlainMesh:
     """Buttons down the middle of the chest, as one mesh of closed pieces."""
     triangles = np.concatenate([faces[:, :3], faces[:, [0, 2, 3]]])
     wanted = np.column_stack([np.zeros(BUTTONS), np.linspace(0.14, 0.42, BUTTONS), np.full(BUTTONS, 0.3)])
-    found = closest(wanted, points, triangles)
-    corners = triangles[found.triangle]
-    places = np.einsum("nk,nkx->nx", found.weights, points[corners])
-    directions = np.einsum("nk,nkx->nx", found.weights, _normals(faces, points)[corners])
-    discs = join(*map(_button, places, directions))
+    nearest = closest(wanted, points, triangles)
+    corners = triangles[nearest.triangle]
+    positions = np.einsum("nk,nkx->nx", nearest.weights, points[corners])
+    directions = np.einsum("nk,nkx->nx", nearest.weights, _normals(faces, points)[corners])
+    discs = join(*map(_button, positions, directions))
     return PlainMesh(
         "Buttons", discs.counts, discs.indices, discs.points, Look("Horn", (0.30, 0.20, 0.12), 0.4), "trim"
     )
 
 
-def _button(place: np.ndarray, normal: np.ndarray) -> Solid:
+def _button(centre: np.ndarray, normal: np.ndarray) -> Solid:
     """A disc that lies on the shirt's outer face."""
     normal = normal / np.linalg.norm(normal)
     side = np.cross(normal, [0.0, 1.0, 0.0])
@@ -99,7 +99,7 @@ def _button(place: np.ndarray, normal: np.ndarray) -> Solid:
     radius = ACROSS * np.array([0.8, 1.0, 1.0, 0.8])
     disc = lathe(rings(radius, heights, radius, 16), np.array([[0.0, low + TALL, 0.0], [0.0, low, 0.0]]))
     axes = np.stack([side, normal, np.cross(side, normal)])
-    return replace(disc, points=disc.points @ axes + place)
+    return replace(disc, points=disc.points @ axes + centre)
 
 
 def _piping(faces: np.ndarray, points: np.ndarray) -> PlainMesh:

@@ -72,7 +72,7 @@ def _round(t: np.ndarray) -> np.ndarray:
 
 
 def _slope(points: np.ndarray) -> np.ndarray:
-    """Lower the level arms to their bind pose by bending them about the shoulders."""
+    """Lower the level arms to the bind pose by bending about the shoulders."""
     reach = (np.abs(points[:, 0]) - 0.125).clip(0.0)
     angle = SLOPE * ease(reach / 0.16) * _above(points)
     side, height = np.sign(points[:, 0]), points[:, 1] - SHOULDER[1]
@@ -109,7 +109,7 @@ def trim(shirt: Pillow) -> np.ndarray:
 
 
 def _weights(points: np.ndarray) -> Skin:
-    """Weights of hips, chest and one arm; points are those with level arms."""
+    """Weights of hips, chest and an arm, from points with level arms."""
     arm = ease((np.abs(points[:, 0]) - 0.10) / 0.15) * _above(points)
     chest = ease((points[:, 1] - SPINE + 0.14) / 0.28)
     count = len(points)
@@ -118,7 +118,7 @@ def _weights(points: np.ndarray) -> Skin:
 
 
 def _skeleton(times: np.ndarray) -> Skeleton:
-    """One arm rises, the other falls and the chest leans and turns; then all change sides."""
+    """The left and right arms rise and fall in turn, and the chest leans and turns with the arms."""
     bind = np.tile(np.eye(4), (4, 1, 1))
     bind[1, 1, 3] = SPINE
     bind[2, :2, 3] = SHOULDER

@@ -41,7 +41,7 @@ LEG = np.array(
 CROTCH, HIP, KNEE = 0.768, 0.86, 0.47
 """Heights of the crotch and of the joints [m]."""
 WAIST, LARGER = 1.02, (1.04, 1.08, 1.04)
-"""Height of the waist [m], and size of what is pushed together at rest over the size in which it is worn."""
+"""Height of the waist [m], and ratio of rest size to worn size for cloth pushed together."""
 PERIOD = 1.25
 """Time of two steps [s]."""
 
@@ -125,7 +125,7 @@ def _sew(cells: Cells, upper: list[np.ndarray], start: int) -> tuple[np.ndarray,
         number = np.concatenate([upper[side], start + side * rows * ring + np.arange(rows * ring)])
         quads.append(number[quad_grid(rows + 1, ring, closed=True)])
         part = grid_uv(rows + 1, ring, closed=True)
-        corners.append(part.indices + sum(len(each) for each in values))
+        corners.append(part.indices + sum(len(array) for array in values))
         values.append(part.values * (0.48, 0.58) + (0.52 * side, 0.0))
     return np.concatenate(quads), FaceVarying(np.concatenate(values), np.concatenate(corners))
 
@@ -196,7 +196,7 @@ def walk(points: np.ndarray, time: np.ndarray | float) -> np.ndarray:
 
     Args:
         points: Positions round the standing body [m], shape (V, 3).
-        time: Time since it stood still [s], one for all or one each, shape (V,); cloth may lag.
+        time: Time since standing still [s], a number or an array of shape (V,); cloth may lag.
     """
     x, y, z = points.T
     stride = ease(np.asarray(time) / 0.35)

@@ -1,4 +1,4 @@
-"""Patches that are stepped as one: a system that torch can differentiate, and the starts and least energies of each.
+"""Patches stepped together: a system differentiable by torch, and the starts and least energies of each patch.
 
 All patches of a batch are garments of one group, so forces, metric and network each run once for all of them, and each
 patch's energy is known. A `Twin` unrolls the steps from a start that differs by noise.
@@ -36,7 +36,7 @@ class JointSystem(System):
     """
 
     def __init__(self, system: System, *, through_forces: bool) -> None:
-        """Take over a system that has a level.
+        """Take over a system with a level.
 
         Args:
             through_forces: Let gradients flow through forces into the positions they were evaluated at; else only
@@ -60,7 +60,7 @@ class JointSystem(System):
     def apply_metric_inverse(
         self, force: Float[Tensor, "vertices 3"], solver: Solver | None = None
     ) -> Float[Tensor, "vertices 3"]:
-        """H0^-1 F [m], with gradients; without them where another solver is to be used in place of H0^-1."""
+        """H0^-1 F [m], with gradients unless a different solver replaces H0^-1."""
         if solver is not None:
             return super().apply_metric_inverse(force, solver)
         return cast(Tensor, _MetricSolve.apply(force, self, False))
@@ -92,8 +92,8 @@ class _EnergyForce(torch.autograd.Function):
         largest = torch.zeros(system.garments, dtype=size.dtype, device=size.device)
         largest = largest.scatter_reduce(0, system.owner, size, "amax").clamp_min(1e-30)[system.owner].unsqueeze(1)
         nudge = NUDGE / largest * by_force
-        there, back = (system.field.energy_and_force((x + sign * nudge).contiguous())[1] for sign in (1.0, -1.0))
-        return gradient + (there - back) * (largest / (2.0 * NUDGE)), None
+        ahead, back = (system.field.energy_and_force((x + sign * nudge).contiguous())[1] for sign in (1.0, -1.0))
+        return gradient + (ahead - back) * (largest / (2.0 * NUDGE)), None
 
 
 class _MetricSolve(torch.autograd.Function):
@@ -167,14 +167,14 @@ class Twin:
 
 def _joined(positions: Sequence[Sequence[np.ndarray]], device: str) -> list[Tensor]:
     """Positions of each patch at each level [m] as one tensor a level."""
-    return [torch.as_tensor(np.concatenate(each), device=device) for each in zip(*positions, strict=True)]
+    return [torch.as_tensor(np.concatenate(arrays), device=device) for arrays in zip(*positions, strict=True)]
 
 
 class Bundle:
     """Patches of equally many levels under the same gravity, on one device.
 
     Attributes:
-        systems: One system a level, cage first.
+        systems: A system per level, cage first.
         least: Least energy known of each patch at each level [J], shape (levels, patches), float64.
     """
 
@@ -224,11 +224,11 @@ class Bundle:
         self._known[index] |= better
 
     def state(self) -> dict[str, Any]:
-        """Values that training changed, for a checkpoint."""
+        """Values changed by training, for a checkpoint."""
         return {"kept": self._ends, "known": self._known, "least": self.least}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Take back what `state` gave."""
+        """Restore the values from `state`."""
         self._ends, self._known, self.least = state["kept"], state["known"], state["least"]
 
 
@@ -239,7 +239,7 @@ class RoundBundle(Bundle):
         """Build the system of all rounds."""
         self.systems = [JointSystem(system_of(rounds, device=device), through_forces=through_forces)]
         self._from_below = [None]
-        self._begin(_joined([[each.x] for each in rounds], device), [[each.least] for each in rounds])
+        self._begin(_joined([[round_.x] for round_ in rounds], device), [[round_.least] for round_ in rounds])
 
 
 Case = TypeVar("Case", Patch, Round)

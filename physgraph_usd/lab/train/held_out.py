@@ -27,7 +27,7 @@ class HeldOut:
 
     def __init__(self, patches: Sequence[Patch], rounds: Sequence[Round]) -> None:
         """Build the systems of the rounds; quasi-Newton is measured when it is first needed."""
-        self._patches, self._rounds = patches, [(each, system_of([each], device="cpu")) for each in rounds]
+        self._patches, self._rounds = patches, [(round_, system_of([round_], device="cpu")) for round_ in rounds]
         self._known: dict[str, list[float]] = {}
 
     def ratios(self, integrator: Integrator) -> dict[str, float]:
@@ -37,9 +37,9 @@ class HeldOut:
             table[str(schedule)] = self._ratio(str(schedule), integrator, self._patches, schedule)
         for most in EVALUATIONS:
             for name, touches in (("contact", True), ("warm", False)):
-                some = [each for each in self._rounds if each[0].touches == touches]
-                if some:
-                    table[f"{name}, {most}"] = self._ratio(f"{name}, {most}", Guard(integrator), some, most)
+                matching = [case for case in self._rounds if case[0].touches == touches]
+                if matching:
+                    table[f"{name}, {most}"] = self._ratio(f"{name}, {most}", Guard(integrator), matching, most)
         return table
 
     def _ratio(self, name: str, ours: Integrator, cases: Sequence[Any], steps: Any) -> float:
@@ -52,7 +52,7 @@ class HeldOut:
     def _gaps(self, integrator: Integrator, cases: Sequence[Any], steps: Any) -> list[float]:
         if cases is self._patches:
             return [nested_gap(case, integrator, steps) for case in cases]
-        return [_round_gap(each, system, integrator, steps) for each, system in cases]
+        return [_round_gap(round_, system, integrator, steps) for round_, system in cases]
 
 
 def nested_gap(patch: Patch, integrator: Integrator, steps: Sequence[int]) -> float:
@@ -71,7 +71,7 @@ def nested_gap(patch: Patch, integrator: Integrator, steps: Sequence[int]) -> fl
 
 
 def _round_gap(each: Round, system: System, integrator: Integrator, evaluations: int) -> float:
-    """Gap of a round after so many force evaluations, that at its start not counted."""
+    """Gap of a round after a number of force evaluations; the evaluation at the start is not counted."""
     before = system.evaluations
     carry = integrator.start(system, torch.as_tensor(each.x))
     while system.evaluations - before <= evaluations and carry.mover != "stayed":

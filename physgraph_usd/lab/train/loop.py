@@ -49,8 +49,8 @@ class TrainConfig:
         minutes: How long to train, patches not counted.
         iterations: Most iterations, or None.
         batch: Most patches an iteration; they are dealt into batches once, and a batch is stepped as one.
-        unroll: Steps that gradients flow through.
-        segments: Most unrolls one after another on a patch; later ones start where the last one ended.
+        unroll: Steps with gradient flow.
+        segments: Most consecutive unrolls on a patch; each starts from the previous result.
         through_forces: Gradients flow through forces too, by differences; else through displacements only.
         loss: "ratio" or "log" of the gap, averaged over the steps.
         late: Weight of step k in that average, as the power of k: 0 counts all alike, more counts where an unroll ends.
@@ -58,7 +58,7 @@ class TrainConfig:
             logarithm. Without, rounding decides where cloth folds.
         raw: Fraction of the starts that are the upsampled cage.
         middle: Fraction of the starts where an earlier unroll ended; the others come from a solved level below.
-        own: Fraction of those that the network itself has solved; quasi-Newton the others.
+        own: Fraction of starts from a level below solved by the network itself; quasi-Newton solves the rest.
         turn: Turn each start at random; only where neither gravity nor guide has a direction.
         rate: Adam's first rate; it falls to a hundredth along a cosine.
         average: Decay of the weights' running mean, which is the result.
@@ -96,7 +96,7 @@ class Trainer:
 
     Attributes:
         iteration: Iterations made.
-        seconds: Time they took [s].
+        seconds: Time taken [s].
         curve: Measurements on held-out patches and rounds.
     """
 
@@ -105,7 +105,7 @@ class Trainer:
 
         Raises:
             UsageError: The weights to begin with are of another size.
-            WeightsError: They cannot be read.
+            WeightsError: The weights cannot be read.
         """
         self.config, self.device = config, device
         torch.manual_seed(config.seed)
@@ -121,9 +121,13 @@ class Trainer:
         self._optimiser = torch.optim.Adam(self.network.parameters(), lr=config.rate)
         self.patches, rounds, rest, few = data or data_of(config)
         self._held_out = HeldOut(rest, few)
-        made = {"device": device, "through_forces": config.through_forces}
-        self._bundles = [Bundle(batch, **made) for batch in deal(self.patches, config.batch)]
-        self._round_bundles = [RoundBundle(batch, **made) for batch in deal(rounds, config.batch)]
+        through = config.through_forces
+        self._bundles = [
+            Bundle(batch, device=device, through_forces=through) for batch in deal(self.patches, config.batch)
+        ]
+        self._round_bundles = [
+            RoundBundle(batch, device=device, through_forces=through) for batch in deal(rounds, config.batch)
+        ]
         self._rng = np.random.default_rng(config.seed + 1)
         self.iteration, self.seconds = 0, 0.0
         self.curve: list[dict[str, Any]] = []
@@ -154,12 +158,12 @@ class Trainer:
 
     @property
     def progress(self) -> float:
-        """Fraction of the run that is done."""
+        """Finished fraction of the run."""
         by_time, most = self.seconds / (60.0 * self.config.minutes), self.config.iterations
         return by_time if most is None else max(by_time, self.iteration / most)
 
     def iterate(self) -> float:
-        """One iteration; returns the mean loss."""
+        """Run an iteration; returns the mean loss."""
         config, done = self.config, self.progress
         for group in self._optimiser.param_groups:
             group["lr"] = config.rate * (0.01 + 0.99 * 0.5 * (1.0 + math.cos(math.pi * min(done, 1.0))))

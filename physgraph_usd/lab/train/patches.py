@@ -48,10 +48,10 @@ class PatchConfig:
         levels: Least and most subdivisions.
         edges: Least and most cage edges along a side.
         elastic: Stretch and bending only, the border fixed, as in the paper; else gravity and guide too.
-        most_vertices: Finest vertices beyond which a patch has one level less.
+        most_vertices: Number of finest vertices beyond which a patch loses a level.
         reference_steps: Quasi-Newton steps a level behind the least energy known.
         skinned: Fraction of the poses that are bent as linear blend skinning bends, sharply and losing length.
-        pulled: Fraction of the poses that are stretched along one direction.
+        pulled: Fraction of poses stretched along a single direction.
     """
 
     count: int = 64
@@ -66,14 +66,14 @@ class PatchConfig:
 
 @dataclass(eq=False)
 class Patch:
-    """One patch in one pose, on the CPU.
+    """A patch in a pose, on the CPU.
 
     Attributes:
-        frame: Its pose, about the origin, and fabric.
+        frame: Pose about the origin, and fabric.
         gravity: [m/s^2], shape (3,).
-        words: Its shape, mesh, border and levels.
+        words: Shape, mesh, border and levels in words.
         raw: Upsampled cage at each level [m], float32; a flat one, a saddle of the energy, is bent a little.
-        start: Its energy without leaving the saddle [J].
+        start: Energy without leaving the saddle [J].
         least: Least energy known at each level [J].
         solved: Positions after some steps of nested quasi-Newton at each level [m], float32.
     """
@@ -89,7 +89,7 @@ class Patch:
 
     @property
     def level(self) -> int:
-        """Subdivisions of its cage."""
+        """Subdivisions of the cage."""
         return self.garment.level
 
     @cached_property
@@ -99,7 +99,7 @@ class Patch:
 
     @cached_property
     def systems(self) -> list[System]:
-        """One system a level, cage first."""
+        """A system per level, cage first."""
         return self.group.systems([self.frame])[0]
 
     def __getstate__(self) -> dict[str, Any]:
@@ -153,7 +153,7 @@ def _numbered(config: PatchConfig, seed: int, number: int) -> Patch:
 
 
 def group_of(garments: Sequence[Garment], gravity: np.ndarray, level: int, *, device: str = "cpu") -> Group:
-    """The levels of garments that are all subdivided so many times, under a gravity [m/s^2]."""
+    """The levels of garments with equal numbers of subdivisions, under a gravity [m/s^2]."""
     chains, settings = refine_garments(garments, [level] * len(garments)), SolveSettings(METHODS["quasi-newton"])
     return Group.of(garments, chains, gravity, settings, dtype=torch.float32, device=device)
 
@@ -203,7 +203,7 @@ def _mesh(config: PatchConfig, rng: np.random.Generator) -> tuple[PolygonMesh, n
 
 
 def _quads(columns: int, rows: int, rng: np.random.Generator, *, closed: bool) -> tuple[PolygonMesh, np.ndarray]:
-    """A grid of quads, or of triangles whose diagonals alternate; joined to a tube where closed."""
+    """A grid of quads, or of triangles with alternating diagonals; joined to a tube if closed."""
     columns = max(columns, 8) if closed else columns
     width = columns if closed else columns + 1
     v, u = np.meshgrid(np.arange(rows + 1.0), np.arange(float(width)), indexing="ij")
@@ -286,5 +286,5 @@ def _material(config: PatchConfig, rng: np.random.Generator, *, free: bool) -> t
 
 
 def describe(patches: Sequence[Patch]) -> list[str]:
-    """One line a patch."""
+    """A line per patch."""
     return [f"{p.words}, {p.group.levels[-1].vertex_count} vertices" for p in patches]

@@ -38,7 +38,7 @@ def run_training(
     """Train a network and write its weights and card.
 
     Args:
-        config_file: TOML whose keys are those of `TrainConfig`, with tables ``network``, ``patches`` and ``rounds``.
+        config_file: TOML with the keys of `TrainConfig` and tables ``network``, ``patches`` and ``rounds``.
         out: Folder for the log, the checkpoint, the weights and the card; created when missing.
         resume: Go on from the folder's checkpoint.
         minutes: In place of the configuration's.
@@ -78,7 +78,7 @@ def run_training(
 
 
 def read_config(file: Path) -> TrainConfig:
-    """Read a configuration; a file that training is to start with lies beside it or where its path says.
+    """Read a configuration; the path of the weights to start from is absolute or relative to the configuration.
 
     Raises:
         UsageError: The file is missing, is not TOML or has an unknown key or value.

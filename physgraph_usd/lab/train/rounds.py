@@ -46,9 +46,9 @@ class RoundConfig:
     Attributes:
         scenes: Number of scenes.
         held_out: Number of scenes to measure on.
-        share: Part of the iterations that descend rounds.
+        share: Fraction of iterations on rounds.
         reference_steps: Quasi-Newton steps behind the least energies known.
-        most_vertices: Fine vertices beyond which a scene has one subdivision, not two.
+        most_vertices: Number of fine vertices beyond which a scene has a single subdivision, not two.
     """
 
     scenes: int = 0
@@ -60,20 +60,20 @@ class RoundConfig:
 
 @dataclass(frozen=True, eq=False)
 class Round:
-    """One round of the finest level of garments that are solved together, as its integrator sees it.
+    """A round of the finest level of garments solved together, from the integrator's view.
 
     Attributes:
         words: Name for logs.
-        garments: Their cages, all with as many subdivisions.
-        frames: Their materials.
+        garments: Cages, all with the same number of subdivisions.
+        frames: Materials of the garments.
         gravity: [m/s^2], shape (3,).
         aim: The cage that the cloth follows, recentred [m], shape (C, 3).
         pairs: The fields of `PairConstraints`, of cloth and bodies; empty without contact.
-        tie: Stiffness [1/s^2] of the tether; 0 without one.
-        predicted: Where it ties [m], shape (V, 3); the start without one.
+        tie: Stiffness [1/s^2] of the tether; 0 without a tether.
+        predicted: Positions tied to [m], shape (V, 3); the start without a tether.
         stiff: K of the metric [N/m], shape (V,).
-        x: Where the steps begin [m], shape (V, 3).
-        start: Energy there [J].
+        x: Positions at the start of the steps [m], shape (V, 3).
+        start: Energy at the start [J].
         least: Least energy known [J].
     """
 
@@ -105,7 +105,7 @@ class Watch:
     """An integrator that records the system and the start of each round."""
 
     def __init__(self, inner: Integrator) -> None:
-        """Wrap the integrator whose steps are made."""
+        """Wrap the stepping integrator."""
         self.name, self._inner = inner.name, inner
         self.seen: list[tuple[System, Tensor]] = []
 
@@ -135,8 +135,8 @@ def _rounds_of(moving: Moving, method: str) -> list[Round]:
         for part in refiner.parts_of(frame):
             group, frames = refiner.group_of(part), [frame.garments[index] for index in part]
             finest = group.levels[-1].index, group.levels[-1].vertex_count
-            own = [(s, x) for s, x in watch.seen if s.level and (s.level.index, s.level.vertex_count) == finest]
-            for place, (system, x) in enumerate(own):
+            finest_seen = [(s, x) for s, x in watch.seen if s.level and (s.level.index, s.level.vertex_count) == finest]
+            for place, (system, x) in enumerate(finest_seen):
                 rounds.append(_noted(f"{moving.words}, frame {number}, round {place}", group, frames, system, x))
     return rounds
 
@@ -155,33 +155,33 @@ def _noted(words: str, group: Group, frames: Sequence[GarmentFrame], system: Sys
     assert aim is not None
     stiff = system.metric.stiff if isinstance(system.metric, HeldMetric) else torch.zeros_like(x[:, 0])
     plain = [replace(garment, level=len(group.levels) - 1) for garment in group.garments]
-    predicted, stiff, x = (each.clone() for each in (predicted, stiff, x))
-    together = reduce(PairConstraints.with_more, gaps) if gaps else None
-    pairs = () if together is None else tuple(getattr(together, each.name).numpy() for each in fields(together))
-    about = (words, tuple(plain), tuple(frames), group.gravity, aim.clone().numpy())
-    return Round(*about, pairs, float(tie), predicted.numpy(), stiff.numpy(), x.numpy())
+    predicted, stiff, x = (tensor.clone() for tensor in (predicted, stiff, x))
+    gap_pairs = reduce(PairConstraints.with_more, gaps) if gaps else None
+    pairs = () if gap_pairs is None else tuple(getattr(gap_pairs, each.name).numpy() for each in fields(gap_pairs))
+    description = (words, tuple(plain), tuple(frames), group.gravity, aim.clone().numpy())
+    return Round(*description, pairs, float(tie), predicted.numpy(), stiff.numpy(), x.numpy())
 
 
 def system_of(rounds: Sequence[Round], *, device: str) -> System:
     """One system of rounds of equally many levels under the same gravity."""
-    garments = [garment for each in rounds for garment in each.garments]
-    frames = [frame for each in rounds for frame in each.frames]
+    garments = [garment for round_ in rounds for garment in round_.garments]
+    frames = [frame for round_ in rounds for frame in round_.frames]
     group = group_of(garments, rounds[0].gravity, rounds[0].level, device=device)
     lasting, level = group.forces_for(frames)[-1], group.levels[-1]
 
     def joined(arrays: Sequence[np.ndarray]) -> Tensor:
         return torch.as_tensor(np.concatenate(arrays), device=device)
 
-    starts = np.cumsum([0, *(len(each.x) for each in rounds)])[:-1].astype(np.int32)
-    forces: list[Force] = [*lasting.terms, lasting.guide.retarget(joined([each.aim for each in rounds]))]
-    if any(each.tie for each in rounds):
-        ties = torch.tensor([each.tie for each in rounds for _ in each.garments], device=device)
-        forces.append(Tether(level, lasting.density * ties, 1.0, joined([each.predicted for each in rounds])))
-    paired = [(each, start) for each, start in zip(rounds, starts, strict=True) if each.pairs]
+    starts = np.cumsum([0, *(len(round_.x) for round_ in rounds)])[:-1].astype(np.int32)
+    forces: list[Force] = [*lasting.terms, lasting.guide.retarget(joined([round_.aim for round_ in rounds]))]
+    if any(round_.tie for round_ in rounds):
+        ties = torch.tensor([round_.tie for round_ in rounds for _ in round_.garments], device=device)
+        forces.append(Tether(level, lasting.density * ties, 1.0, joined([round_.predicted for round_ in rounds])))
+    paired = [(round_, start) for round_, start in zip(rounds, starts, strict=True) if round_.pairs]
     if paired:
-        shifted = [(each.pairs[0] + start, *each.pairs[1:]) for each, start in paired]
+        shifted = [(round_.pairs[0] + start, *round_.pairs[1:]) for round_, start in paired]
         forces.append(SelfContact(level, PairConstraints(*map(joined, zip(*shifted, strict=True)))))
-    stiff, metric = joined([each.stiff for each in rounds]), lasting.metric
+    stiff, metric = joined([round_.stiff for round_ in rounds]), lasting.metric
     assert isinstance(metric, Metric)
     held = HeldMetric(metric, stiff) if bool((stiff > 0).any()) else metric
     return System(ForceModule(forces), held, free=level.free, spacing=level.spacing, level=level)
@@ -199,12 +199,12 @@ def _measured(each: Round, steps: int) -> Round | None:
 
 def make_rounds(config: RoundConfig, *, seed: int, workers: int = 1) -> list[Round]:
     """Rounds of scenes out of `scenes`, a few of each; the same for a seed with any number of processes."""
-    found = made_of_numbers(_scene_rounds, config, seed, config.scenes, workers=workers)
-    return [each for rounds in found for each in rounds]
+    made = made_of_numbers(_scene_rounds, config, seed, config.scenes, workers=workers)
+    return [round_ for rounds in made for round_ in rounds]
 
 
 def _scene_rounds(config: RoundConfig, seed: int, number: int) -> list[Round]:
-    """Some rounds of the scene of a number: of its first frame and of warm ones."""
+    """Rounds of the scene of a number: of the first frame and of warm frames."""
     rng = np.random.default_rng([seed, number])
     kind = KINDS[number % len(KINDS)]
     moving = moving_scene(rng, kind=kind, frames=3, most_vertices=config.most_vertices)
@@ -214,4 +214,6 @@ def _scene_rounds(config: RoundConfig, seed: int, number: int) -> list[Round]:
     except PhysGraphError:  # Cloth that starts wholly in a body.
         return []
     chosen = sorted(rng.permutation(len(rounds))[:4]) if len(rounds) > 4 else range(len(rounds))
-    return [each for place in chosen if (each := _measured(rounds[place], config.reference_steps)) is not None]
+    return [
+        measured for number in chosen if (measured := _measured(rounds[number], config.reference_steps)) is not None
+    ]

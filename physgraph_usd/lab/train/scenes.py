@@ -43,7 +43,7 @@ def moving_scene(rng: np.random.Generator, *, kind: str, frames: int, most_verti
     """A scene of a kind out of `KINDS`.
 
     Args:
-        most_vertices: Fine vertices beyond which cloth has one subdivision, not two.
+        most_vertices: Number of fine vertices beyond which cloth has a single subdivision, not two.
     """
     if kind == "free":
         return _free(rng, frames, most_vertices)
@@ -77,7 +77,7 @@ Motion = tuple[np.ndarray, np.ndarray, list[np.ndarray], list[Solid]]
 def _ball(rng: np.random.Generator, frames: int) -> Motion:
     cells = int(rng.integers(7, 12))
     line = np.arange(cells + 1.0) - 0.5 * cells
-    x, y = (each.ravel() for each in np.meshgrid(line, line))
+    x, y = (coordinate.ravel() for coordinate in np.meshgrid(line, line))
     x, y = x + rng.uniform(-0.15, 0.15, x.shape), y + rng.uniform(-0.15, 0.15, y.shape)
     axes = cells * rng.uniform(0.25, 0.45, 3)
     sheets, gap = int(rng.integers(1, 4)), rng.uniform(0.08, 0.25)
@@ -134,7 +134,7 @@ def _bent(points: np.ndarray, turn: float, radius: float) -> np.ndarray:
 
 def _fold(rng: np.random.Generator, frames: int) -> Motion:
     length, width = int(rng.integers(12, 18)), int(rng.integers(5, 9))
-    x, y = (each.ravel() for each in np.meshgrid(np.arange(length + 1.0), np.arange(width + 1.0)))
+    x, y = (coordinate.ravel() for coordinate in np.meshgrid(np.arange(length + 1.0), np.arange(width + 1.0)))
     faces, rest = quad_grid(width + 1, length + 1), np.stack([x, y, 0.0 * x], axis=1)
     first, last = sorted(rng.uniform(0.05, 0.8, 2))[::-1]
     middle, wave = length * rng.uniform(0.3, 0.5), 0.15 * rng.normal(size=2)
@@ -151,19 +151,19 @@ def _fold(rng: np.random.Generator, frames: int) -> Motion:
 
 
 def _free(rng: np.random.Generator, frames: int, most_vertices: int) -> Moving:
-    """A patch that moves from a random pose towards a second one."""
+    """A patch moving from a random pose towards a second pose."""
     config = PatchConfig(levels=(1, 2), most_vertices=most_vertices, skinned=0.3, pulled=0.2)
-    one = patch_of(config, rng)
-    goal = posed(one.garment.rest, rng, config)
+    patch = patch_of(config, rng)
+    goal = posed(patch.garment.rest, rng, config)
     goal = goal - goal.mean(axis=0)
-    apart = np.linalg.norm(goal - one.frame.points, axis=1).mean()
-    corners = one.garment.mesh.indices[:2]
-    edge = float(np.linalg.norm(np.diff(one.garment.rest[corners], axis=0)))
+    apart = np.linalg.norm(goal - patch.frame.points, axis=1).mean()
+    corners = patch.garment.mesh.indices[:2]
+    edge = float(np.linalg.norm(np.diff(patch.garment.rest[corners], axis=0)))
     share = edge * 10 ** rng.uniform(*np.log10(MOVES)) / max(apart, 1e-9)
-    points = [one.frame.points + min(share * number, 1.0) * (goal - one.frame.points) for number in range(frames)]
-    made = tuple(Frame(float(n), (replace(one.frame, points=each),)) for n, each in enumerate(points))
+    points = [patch.frame.points + min(share * number, 1.0) * (goal - patch.frame.points) for number in range(frames)]
+    made = tuple(Frame(float(n), (replace(patch.frame, points=cage),)) for n, cage in enumerate(points))
     times = tuple(float(number) for number in range(frames))
-    return Moving(f"free {one.words}", Scene((one.garment,), one.gravity, times), made)
+    return Moving(f"free {patch.words}", Scene((patch.garment,), patch.gravity, times), made)
 
 
 def _triangles(solid: Solid) -> np.ndarray:

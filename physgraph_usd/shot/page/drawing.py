@@ -140,7 +140,7 @@ def draw(surfaces: Sequence[Surface | DrawnMesh], view: View, *, size: tuple[int
         sRGB picture, shape (height, width, 3) uint8.
     """
     start_warp()
-    surfaces = [each for each in surfaces if len(each.triangles)]
+    surfaces = [surface for surface in surfaces if len(surface.triangles)]
     picture = np.tile(BACKGROUND.astype(np.float32), (2 * size[1], 2 * size[0], 1))  # Four samples a pixel.
     if surfaces:
         solid = _joined(surfaces)
@@ -163,9 +163,9 @@ def encode_color(color: tuple[float, float, float]) -> tuple[int, int, int]:
 
 
 def _joined(surfaces: Sequence[Surface | DrawnMesh]) -> Surface:
-    starts = np.cumsum([0] + [len(each.points) for each in surfaces])
-    triangles = [each.triangles + start for each, start in zip(surfaces, starts, strict=False)]
-    parts = [each.points for each in surfaces], triangles, [each.colors for each in surfaces]
+    starts = np.cumsum([0] + [len(surface.points) for surface in surfaces])
+    triangles = [surface.triangles + start for surface, start in zip(surfaces, starts, strict=False)]
+    parts = [surface.points for surface in surfaces], triangles, [surface.colors for surface in surfaces]
     return Surface(*(np.concatenate(part) for part in parts))
 
 
@@ -177,7 +177,7 @@ def ground_below(points: np.ndarray, floor: float | None) -> Surface:
     x, z = 0.5 * (low + high)[:, None, None] + np.meshgrid(side, side, indexing="ij")
     nodes = np.stack([x, np.full_like(x, floor or 0.0), z], axis=2)
     number = np.arange(x.size).reshape(x.shape)
-    a, b, c, d = (each.ravel() for each in (number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]))
+    a, b, c, d = (corner.ravel() for corner in (number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]))
     triangles = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
     triangles = triangles[: 0 if floor is None else None]
     return Surface(nodes.reshape(-1, 3), triangles, np.tile(BACKGROUND, (len(triangles), 1)))
@@ -196,15 +196,15 @@ def _in_view(seen: np.ndarray, triangles: np.ndarray, picture: np.ndarray) -> np
 def _shade(solid: Surface, ground: Surface, view: View, visible: np.ndarray) -> np.ndarray:
     """Shading factors at each vertex of the surfaces and the ground: all fronts, then all backs, shape (2 N, 3)."""
     towards = _unit(KEY) @ view.axes
-    found = soft_light(solid, ground, visible=visible, towards=towards)
-    facing, sky, key = np.concatenate([found.normals, -found.normals]), found.sky.ravel(), found.key.ravel()
+    lit = soft_light(solid, ground, visible=visible, towards=towards)
+    facing, sky, key = np.concatenate([lit.normals, -lit.normals]), lit.sky.ravel(), lit.key.ravel()
     spots = np.tile(np.concatenate([solid.points, ground.points]), (2, 1))
     front = np.einsum("vk,vk->v", facing, _unit(view.eye - spots)).clip(0, 1)
     warm, cool = np.array([1.04, 1.0, 0.95]), np.array([0.95, 1.0, 1.06])
     shade = (0.98 * (facing @ towards).clip(0, 1) * key)[:, None] * warm
     shade += (sky * (0.36 * (0.75 + 0.25 * facing[:, 1]) + 0.10 * front))[:, None] * cool
-    shade[len(found.normals) :] *= 0.72
-    shade[len(solid.points) : len(found.normals)] = 1.0 - ground_shadow(ground, found)[:, None]
+    shade[len(lit.normals) :] *= 0.72
+    shade[len(solid.points) : len(lit.normals)] = 1.0 - ground_shadow(ground, lit)[:, None]
     return shade
 
 
@@ -245,7 +245,7 @@ def soft_light(
     normals = np.concatenate([vertex_normals(solid), up])
     spots, facing = np.tile(points, (2, 1)), np.concatenate([normals, -normals])
     found = _light(solid, spots, facing, visible=visible, towards=towards, cancelled=cancelled)
-    sky, key = (each.reshape(2, -1) for each in found)
+    sky, key = (values.reshape(2, -1) for values in found)
     mean = _mean_of_neighbours(solid, LIGHT_WIDTH * float(np.ptp(visible, axis=0).max()))
     for light in (sky, key):
         for _ in range(0 if cancelled() else LIGHT_BLUR):
@@ -289,7 +289,7 @@ def _light(
     The maps cover the visible points; everything outside is lit.
     """
     light = np.zeros((len(spots), 3), np.float32)
-    places, normals, found = (_vectors(each) for each in (spots, facing, light))
+    points, normals, light_at = (_vectors(vectors) for vectors in (spots, facing, light))
     across = _frame(towards)[:2]
     key = [_unit(towards + KEY_WIDTH * offset @ across) for offset in _disk(KEY_MAPS)]
     for is_key, directions, size in ((0, _hemisphere(SKY_MAPS), SKY_SIZE), (1, key, KEY_SIZE)):
@@ -303,7 +303,7 @@ def _light(
             shift = np.append(area.min(axis=1) / pixel, 0.0)
             depths = _depths(size, size)
             _rasterize(solid.points @ turn.T - shift, solid.triangles, depths)
-            inputs = [places, normals, wp.mat33(turn), wp.vec3(shift), pixel, is_key, *map(_map, depths), found]
+            inputs = [points, normals, wp.mat33(turn), wp.vec3(shift), pixel, is_key, *map(_map, depths), light_at]
             run(_add_light, len(spots), inputs, device="cpu")
     return light[:, 0] / np.maximum(light[:, 2], 1e-9), light[:, 1] / KEY_MAPS
 

@@ -66,25 +66,25 @@ def plot(name: str, title: str, times: Sequence[float], lines: Mapping[str, Sequ
         times: Time codes, ascending.
         lines: For each line, a value per time code, None if missing.
     """
-    shown = {label: [_finite(value) for value in values] for label, values in lines.items()}
-    shown = {label: values for label, values in shown.items() if any(value is not None for value in values)}
-    if not shown or not times:
+    curves = {label: [_finite(value) for value in values] for label, values in lines.items()}
+    curves = {label: values for label, values in curves.items() if any(value is not None for value in values)}
+    if not curves or not times:
         return ""
-    known = [value for values in shown.values() for value in values if value is not None]
-    ticks = _ticks(min(0.0, *known), max(known))
+    finite = [value for values in curves.values() for value in values if value is not None]
+    ticks = _ticks(min(0.0, *finite), max(finite))
     across = Axis(times[0], times[-1], LEFT, WIDTH - RIGHT)
     up = Axis(ticks[0], ticks[-1], HEIGHT - BOTTOM, TOP)
     drawn = "".join(
-        _line(values, times, across, up, colour=COLOURS[i % len(COLOURS)]) for i, values in enumerate(shown.values())
+        _line(values, times, across, up, colour=COLOURS[i % len(COLOURS)]) for i, values in enumerate(curves.values())
     )
     data = {
         "width": WIDTH,
         "times": [*map(named_time, times)],
         "at": [round(across.at(time), 2) for time in times],
-        "values": [[None if v is None else f"{v:.4g}" for v in values] for values in shown.values()],
+        "values": [[None if v is None else f"{v:.4g}" for v in values] for values in curves.values()],
     }
     return (
-        f"<h3>{html.escape(title)}</h3>{_legend(name, list(shown))}"
+        f"<h3>{html.escape(title)}</h3>{_legend(name, list(curves))}"
         f"<svg class='plot' id='{name}' viewBox='0 0 {WIDTH} {HEIGHT}' role='img' aria-label='{html.escape(title)}' "
         f"data-plot='{html.escape(json.dumps(data))}'>{_frame(ticks, times, across, up)}{drawn}"
         f"<line class='cursor' y1='{TOP}' y2='{HEIGHT - BOTTOM}'/></svg>"
@@ -134,9 +134,9 @@ def _line(values: Sequence[float | None], times: Sequence[float], across: Axis, 
     )
     every = len(times) <= MARKED
     dots = "".join(
-        f"<circle cx='{place.partition(',')[0]}' cy='{place.partition(',')[2]}' r='2.2' fill='{colour}'/>"
+        f"<circle cx='{point.partition(',')[0]}' cy='{point.partition(',')[2]}' r='2.2' fill='{colour}'/>"
         for part in parts
-        for place in part
+        for point in part
         if every or len(part) == 1
     )
     return lines + dots

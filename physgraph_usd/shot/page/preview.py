@@ -116,8 +116,8 @@ class Pictures:
         Raises:
             StageError: A stage cannot be opened.
         """
-        shown = DrawnStage(layer) if shot is None else DrawnStage(shot, layer)
-        self._stages = [shown] if shot is None else [DrawnStage(shot, beside=shown), shown]
+        drawn = DrawnStage(layer) if shot is None else DrawnStage(shot, layer)
+        self._stages = [drawn] if shot is None else [DrawnStage(shot, beside=drawn), drawn]
         self._refined = () if shot is None else refined_in(layer)
         named = set(self._refined) & set(self._stages[0].paths())
         self._garments = tuple(sorted(named)) or self._stages[0].garments()
@@ -135,8 +135,8 @@ class Pictures:
         Raises:
             StageError: A stage shows no mesh.
         """
-        some = [self.times[i] for i in np.linspace(0, len(self.times) - 1, 5).astype(int)] if self.times else []
-        spread = codes if len(codes) > 1 else [*codes, *some]  # Stills of one shot share their framing.
+        sampled = [self.times[i] for i in np.linspace(0, len(self.times) - 1, 5).astype(int)] if self.times else []
+        spread = codes if len(codes) > 1 else [*codes, *sampled]  # Stills of one shot share their framing.
         clouds = [self._in_picture(self._stages[0].meshes(code, cages=self._cages)) for code in spread]
         if not any(map(len, clouds)):
             raise StageError("nothing to draw: the stage shows no mesh")
@@ -152,16 +152,16 @@ class Pictures:
             StageError: The stage does not show the mesh.
         """
         sides = self._sides(close.time)
-        mesh = next((each for each in sides[-1] if each.path == close.path), None)
+        mesh = next((drawn_mesh for drawn_mesh in sides[-1] if drawn_mesh.path == close.path), None)
         if mesh is None:
             raise StageError(f"nothing to draw: <{close.path}> is not shown")
         radius = CLOSE * float(np.linalg.norm(np.ptp(mesh.points, axis=0)))
         normals = vertex_normals(mesh)
         views = [(mesh.points[vertex], _angles(mesh.points, vertex, normals[vertex])) for vertex in close.vertices]
-        place, angles = next((each for each in views if _is_open(sides[-1], *each, radius=radius)), views[0])
-        ball = place + radius * np.concatenate([np.eye(3), -np.eye(3)])
+        centre, angles = next((view for view in views if _is_open(sides[-1], *view, radius=radius)), views[0])
+        ball = centre + radius * np.concatenate([np.eye(3), -np.eye(3)])
         view = fit_view(ball, self._panel[0] / self._panel[1], azimuth=angles[0], elevation=angles[1])
-        view = replace(view, nearest=float(np.linalg.norm(place - view.eye)) - 2.0 * radius)
+        view = replace(view, nearest=float(np.linalg.norm(centre - view.eye)) - 2.0 * radius)
         return self._compose(sides, close.time, view, -np.inf)
 
     def _in_picture(self, meshes: Sequence[DrawnMesh]) -> np.ndarray:
@@ -192,12 +192,12 @@ class Pictures:
         for i, (title, meshes) in enumerate(zip(self._titles, sides, strict=True)):
             pixels = draw(meshes, view, size=self._panel, floor=floor)
             picture.paste(Image.fromarray(pixels), (i * self._panel[0], 0))
-            shown = [mesh for mesh in meshes if mesh.path in (*self._garments, *self._refined)] or meshes
-            count = f"{sum(mesh.authored for mesh in shown):,} vertices"
+            visible = [mesh for mesh in meshes if mesh.path in (*self._garments, *self._refined)] or meshes
+            count = f"{sum(mesh.authored for mesh in visible):,} vertices"
             label(pen, (i * self._panel[0], 0), self._panel[1], lines=[title, count])
         if code is not None:
-            place = (self._size[0] - self._size[1] // 36, self._size[1] - self._size[1] // 24)
-            pen.text(place, f"{code:g}", FAINT, ImageFont.load_default(max(self._size[1] // 40, 8)), anchor="rs")
+            corner = (self._size[0] - self._size[1] // 36, self._size[1] - self._size[1] // 24)
+            pen.text(corner, f"{code:g}", FAINT, ImageFont.load_default(max(self._size[1] // 40, 8)), anchor="rs")
         return picture
 
 
@@ -208,7 +208,7 @@ def _angles(points: np.ndarray, vertex: int, normal: np.ndarray) -> tuple[float,
     return float(np.degrees(np.arctan2(outward[0], outward[2]))), float(np.clip(elevation, *ELEVATIONS))
 
 
-def _is_open(meshes: Sequence[DrawnMesh], place: np.ndarray, angles: tuple[float, float], *, radius: float) -> bool:
+def _is_open(meshes: Sequence[DrawnMesh], centre: np.ndarray, angles: tuple[float, float], *, radius: float) -> bool:
     """Whether no vertex beside the line of sight, and no face across it, stands before a place.
 
     Args:
@@ -216,10 +216,10 @@ def _is_open(meshes: Sequence[DrawnMesh], place: np.ndarray, angles: tuple[float
         radius: Radius of the picture [m]; what stands less than a quarter of it before the place belongs to the place.
     """
     azimuth, elevation = np.radians(angles)
-    way = np.array([np.sin(azimuth) * np.cos(elevation), np.sin(elevation), np.cos(azimuth) * np.cos(elevation)])
+    direction = np.array([np.sin(azimuth) * np.cos(elevation), np.sin(elevation), np.cos(azimuth) * np.cos(elevation)])
     right = np.array([np.cos(azimuth), 0.0, -np.sin(azimuth)])
     for mesh in meshes:
-        x, y, before = np.stack([right, np.cross(way, right), way]) @ (mesh.points - place).T
+        x, y, before = np.stack([right, np.cross(direction, right), direction]) @ (mesh.points - centre).T
         hides = before > 0.25 * radius
         if (hides & (np.hypot(x, y) < 0.5 * radius)).any():
             return False
@@ -247,8 +247,8 @@ def label(pen: ImageDraw.ImageDraw, corner: tuple[int, int], height: int, *, lin
         pen.text((left, top + 2 * unit), title, INK, ImageFont.load_default(max(int(1.25 * unit), 9)), anchor="ls")
     font = ImageFont.load_default(max(int(0.9 * unit), 8))
     for row, line in enumerate(below):
-        place = top + int((3.3 + 1.2 * row) * unit if title else (2.0 + 1.2 * row) * unit)
-        pen.text((left, place), line, FAINT, font, anchor="ls")
+        baseline = top + int((3.3 + 1.2 * row) * unit if title else (2.0 + 1.2 * row) * unit)
+        pen.text((left, baseline), line, FAINT, font, anchor="ls")
 
 
 def _save_loop(pictures: list[Image.Image], stream: BinaryIO, rate: float, codes: Sequence[float | None]) -> None:

@@ -88,17 +88,17 @@ def _head(report: RefineReport) -> str:
 
 def _largest_remaining(report: RefineReport) -> str:
     """A sentence on the frame whose solve was ended farthest from rest; "" if no frame was solved."""
-    left = [
-        (each["remaining_mm"], frame["time"])
+    remaining = [
+        (garment["remaining_mm"], frame["time"])
         for frame in report.frames
-        for each in frame.get("garments", ())
-        if each.get("remaining_mm") is not None
+        for garment in frame.get("garments", ())
+        if garment.get("remaining_mm") is not None
     ]
-    if not left:
+    if not remaining:
         return ""
-    most, time = max(left, key=lambda each: each[0])
-    place = "the only frame" if time is None else f"time code {named_time(time)}"
-    return f" The end of a frame's solve leaves a move of at most {most:.2g} mm (RMS over the cloth), in {place}."
+    most, time = max(remaining, key=lambda entry: entry[0])
+    frame_name = "the only frame" if time is None else f"time code {named_time(time)}"
+    return f" The end of a frame's solve leaves a move of at most {most:.2g} mm (RMS over the cloth), in {frame_name}."
 
 
 def _warnings(report: RefineReport) -> str:
@@ -122,10 +122,10 @@ def _pictures(report: RefineReport, shot: Shot) -> str:
     kind = importlib.import_module(".preview", __package__).Pictures  # Needs an optional extra.
     written = [frame["time"] for frame in report.frames if "garments" in frame]
     times = [written[0], written[-1]][: len(written)]
-    place = close_up(report, shot)
+    picture = close_up(report, shot)
     try:
         pictures = kind(report.out, Path(report.shot), SIZE, codes=[time for time in written if time is not None])
-        close = "" if place is None else _figure(pictures.draw_close(place), place.caption)
+        close = "" if picture is None else _figure(pictures.draw_close(picture), picture.caption)
         drawn = pictures.draw(times) if times else []
     except (StageError, LayerError) as error:
         return f"{title}<p class='note'>No pictures: {html.escape(str(error))}</p>"

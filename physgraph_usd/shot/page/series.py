@@ -22,22 +22,22 @@ Series = dict[str, dict[str, Line]]
 
 def read_series(report: RefineReport, index: int) -> Series:
     """One garment's lines from a report's frames."""
-    found: Series = {}
-    for place, frame in enumerate(report.frames):
+    series: Series = {}
+    for position, frame in enumerate(report.frames):
         entry = frame["garments"][index] if "garments" in frame else {}
         for name, values in _series_of(entry, frame).items():
             for label, value in values.items():
-                found.setdefault(name, {}).setdefault(label, [None] * len(report.frames))[place] = value
-    return found
+                series.setdefault(name, {}).setdefault(label, [None] * len(report.frames))[position] = value
+    return series
 
 
 def _series_of(entry: dict[str, Any], frame: dict[str, Any]) -> dict[str, dict[str, float]]:
     """One frame's figures of a garment, by field and line."""
     lines_of: dict[str, dict[str, float]] = {"time": _milliseconds(entry, frame)}
     if "energy_joules" in entry:
-        output, given = entry["energy_joules"]["output"], entry["energy_joules"]["input"]
+        output, start = entry["energy_joules"]["output"], entry["energy_joules"]["input"]
         lines_of["energy"] = {name: 1e3 * value for name, value in output.items()}
-        lines_of["energy"] |= {"total": 1e3 * sum(output.values()), "upsampled input": 1e3 * sum(given.values())}
+        lines_of["energy"] |= {"total": 1e3 * sum(output.values()), "upsampled input": 1e3 * sum(start.values())}
     if "strain" in entry:
         lines_of["strain"] = {name: 100.0 * value for name, value in entry["strain"].items()}
     if entry.get("remaining_mm") is not None:
@@ -68,16 +68,18 @@ def add_jerk(series: Sequence[Series], report: RefineReport, shot: Shot, layer: 
     """
     written = RefinedLayer(layer)
     chains = refine_garments(shot.scene.garments, [garment["level"] for garment in report.garments])
-    for index, own in enumerate(series):
+    for index, garment_series in enumerate(series):
         garment, steps = shot.scene.garments[index], chains[index]
         edge = 1e-3 * report.garments[index]["fine_edge_mm"]
         recent: list[np.ndarray | None] = []
         line: Line = []
         for frame in report.frames:
             recent = [*recent[-3:], _detail(written, shot, frame["time"], index=index, steps=steps)]
-            known = [each for each in recent if each is not None and len(each) >= len(garment.rest)]
-            line.append(third_difference(known) / edge if len(known) == 4 and edge > 0 else None)
-        own["jerk"] = {"jerk": line}
+            complete = [
+                positions for positions in recent if positions is not None and len(positions) >= len(garment.rest)
+            ]
+            line.append(third_difference(complete) / edge if len(complete) == 4 and edge > 0 else None)
+        garment_series["jerk"] = {"jerk": line}
 
 
 def _detail(

@@ -51,14 +51,18 @@ def verdict(report: RefineReport) -> str:
     wrong = [f"{failed} of {count} frames could not be solved"] if failed else []
     right = [f"{counted(count - failed, 'frame')} refined"]
     for name, nothing in ((CROSSINGS, "nothing crosses"), (INSIDE, "nothing is inside a body")):
-        found = [(left[name], frame["time"]) for frame in report.frames if name in (left := _left(report, frame))]
-        most, time = max(found, key=lambda each: each[0], default=(0, None))
+        remaining = [
+            (counts_left[name], frame["time"])
+            for frame in report.frames
+            if name in (counts_left := _left(report, frame))
+        ]
+        most, time = max(remaining, key=lambda entry: entry[0], default=(0, None))
         if most:
             wrong.append(f"{most:,} {name}{at_time(time)}, the worst frame")
-        elif found:
+        elif remaining:
             right.append(nothing)
     if report.unsettled:
-        wrong.append(f"{counted(len({each['time'] for each in report.unsettled}), 'frame')} did not settle")
+        wrong.append(f"{counted(len({frame['time'] for frame in report.unsettled}), 'frame')} did not settle")
     pace = [f"{seconds_as_text(report.seconds.get('frames', 0.0) / count)} of wall time per frame"] if count else []
     sentence = "; ".join([*wrong, ", ".join([*right, *pace])])
     return f"{sentence[:1].upper()}{sentence[1:]}."
@@ -79,45 +83,45 @@ def close_up(report: RefineReport, shot: Shot) -> CloseUp | None:
     frames = [frame for frame in report.frames if frame.get("garments")]
     if not frames or report.out is None:
         return None
-    frame = max(frames, key=lambda each: sum(_left(report, each).values()))
-    left = {name: count for name, count in _left(report, frame).items() if count}
-    frame = frame if left else max(frames, key=_bending)
+    frame = max(frames, key=lambda candidate: sum(_left(report, candidate).values()))
+    remaining = {name: count for name, count in _left(report, frame).items() if count}
+    frame = frame if remaining else max(frames, key=_bending)
     layer, time = RefinedLayer(report.out), frame["time"]
     welds = [source.weld.subdivided(level)[1] for source, level in zip(shot.sources, _levels(report), strict=True)]
     points = [layer.points(shot, index, time) for index in range(len(welds))]
-    if any(each is None for each in points):
+    if any(positions is None for positions in points):
         return None
     pairs = zip(welds, points, strict=True)  # A shell's outer side comes first.
-    cloth = [weld.joined(each[: len(weld.number)]) for weld, each in pairs if each is not None]
-    marks = _faults(report, shot, time, cloth) if left else []
-    caption = "The worst place: " + "; ".join(f"{count:,} {name}" for name, count in left.items())
-    if not any(each.any() for each in marks):
-        marks, caption = _folds(report, shot, time, cloth), caption if left else "The best fold"
-    places = [_densest(each, weight) for each, weight in zip(cloth, marks, strict=True)]
-    index = max(range(len(places)), key=lambda each: places[each][1])
-    most = 1 if left else MOST_TRIED
+    cloth = [weld.joined(positions[: len(weld.number)]) for weld, positions in pairs if positions is not None]
+    marks = _faults(report, shot, time, cloth) if remaining else []
+    caption = "The worst place: " + "; ".join(f"{count:,} {name}" for name, count in remaining.items())
+    if not any(mark.any() for mark in marks):
+        marks, caption = _folds(report, shot, time, cloth), caption if remaining else "The best fold"
+    densest = [_densest(positions, weight) for positions, weight in zip(cloth, marks, strict=True)]
+    index = max(range(len(densest)), key=lambda number: densest[number][1])
+    most = 1 if remaining else MOST_TRIED
     path = layer.target(shot, index)
-    vertices = [int(np.flatnonzero(welds[index].number == each)[0]) for each in places[index][0][:most]]
+    vertices = [int(np.flatnonzero(welds[index].number == welded)[0]) for welded in densest[index][0][:most]]
     return None if path is None else CloseUp(time, path, vertices, f"{caption}{at_time(time)}")
 
 
 def _left(report: RefineReport, frame: dict[str, Any]) -> dict[str, int]:
     """Faults remaining in a frame, as far as measured."""
-    found: dict[str, int] = {}
+    total: dict[str, int] = {}
     for contact in report.measured(frame):
-        bodies = [each["after"] for each in (contact.get("bodies") or {}).values()]
+        bodies = [body["after"] for body in (contact.get("bodies") or {}).values()]
         cloth = [contact["cloth"]["after"]] if contact.get("cloth") else []
         if bodies or cloth:
-            found[CROSSINGS] = found.get(CROSSINGS, 0) + sum(each["crossings"] for each in (*bodies, *cloth))
+            total[CROSSINGS] = total.get(CROSSINGS, 0) + sum(measured["crossings"] for measured in (*bodies, *cloth))
         if bodies:
-            found[INSIDE] = found.get(INSIDE, 0) + sum(each["inside"] for each in bodies)
-    return found
+            total[INSIDE] = total.get(INSIDE, 0) + sum(body["inside"] for body in bodies)
+    return total
 
 
 def _bending(frame: dict[str, Any]) -> float:
     """Largest bending energy of a garment in a frame [J]."""
     energies = [(entry.get("energy_joules") or {}).get("output", {}) for entry in frame["garments"]]
-    return max(each.get("bending", 0.0) for each in energies)
+    return max(terms.get("bending", 0.0) for terms in energies)
 
 
 def _faults(report: RefineReport, shot: Shot, time: float | None, points: Sequence[np.ndarray]) -> list[np.ndarray]:
@@ -126,14 +130,16 @@ def _faults(report: RefineReport, shot: Shot, time: float | None, points: Sequen
     cloth.bodies.pose(shot.frame(time).colliders)
     level, origin = _finest(report, shot), np.concatenate(points).mean(axis=0)
     every = np.ones((len(points), len(points)), bool)
-    found = crossings(Parts(level, every), torch.as_tensor(np.concatenate(points) - origin, dtype=torch.float32))
+    crossing_pairs = crossings(
+        Parts(level, every), torch.as_tensor(np.concatenate(points) - origin, dtype=torch.float32)
+    )
     crossing = np.zeros(level.vertex_count, bool)
-    crossing[level.edges.numpy()[found.edge.numpy()]] = True
+    crossing[level.edges.numpy()[crossing_pairs.edge.numpy()]] = True
     heat = [
-        cloth.heat(i, each, crossing[span], SolveSettings())
-        for i, (each, span) in enumerate(zip(points, level.spans, strict=True))
+        cloth.heat(i, positions, crossing[span], SolveSettings())
+        for i, (positions, span) in enumerate(zip(points, level.spans, strict=True))
     ]
-    return [(each["penetration"] > 0) + 1.0 * (each["crossing"] > 0) for each in heat]
+    return [(maps["penetration"] > 0) + 1.0 * (maps["crossing"] > 0) for maps in heat]
 
 
 def _folds(report: RefineReport, shot: Shot, time: float | None, points: Sequence[np.ndarray]) -> list[np.ndarray]:
@@ -141,17 +147,17 @@ def _folds(report: RefineReport, shot: Shot, time: float | None, points: Sequenc
 
     Folds of the smoothly subdivided input are subtracted: the input's own corners and hems are no folds of the cloth.
     """
-    found, cages = [], shot.frame(time).garments
+    folds, cages = [], shot.frame(time).garments
     for garment, level, fine, cage in zip(shot.scene.garments, _levels(report), points, cages, strict=True):
-        control, given = garment.control, cage.points
+        control, coarse = garment.control, cage.points
         for step in refine_garments([garment], [level])[0]:
             smooth, control = control.subdivided(step)
-            given = smooth @ given
+            coarse = smooth @ coarse
         hinges = hinges_of(control.mesh.triangulate().triangles)
-        squares, before = (hinge_geometry(each, hinges)[0] ** 2 for each in (fine, given))
-        more = np.maximum(squares - before, 0.0)
-        found.append(np.bincount(hinges[:, :2].ravel(), np.repeat(more, 2), minlength=len(fine)))
-    return found
+        squares, before = (hinge_geometry(pose, hinges)[0] ** 2 for pose in (fine, coarse))
+        added = np.maximum(squares - before, 0.0)
+        folds.append(np.bincount(hinges[:, :2].ravel(), np.repeat(added, 2), minlength=len(fine)))
+    return folds
 
 
 def _densest(points: np.ndarray, weights: np.ndarray) -> tuple[list[int], float]:
@@ -159,7 +165,9 @@ def _densest(points: np.ndarray, weights: np.ndarray) -> tuple[list[int], float]
     size = CLOSE * float(np.linalg.norm(np.ptp(points, axis=0)))
     cell = np.unique(np.floor(points / max(size, 1e-9)), axis=0, return_inverse=True)[1].reshape(-1)
     sums = np.bincount(cell, weights)
-    heaviest = [int(np.where(cell == each, weights, -1.0).argmax()) for each in np.argsort(-sums)[:MOST_TRIED]]
+    heaviest = [
+        int(np.where(cell == cell_number, weights, -1.0).argmax()) for cell_number in np.argsort(-sums)[:MOST_TRIED]
+    ]
     return heaviest, float(sums.max())
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from functools import reduce
 
 import numpy as np
-import torch
 
 
 def at_corners(x: np.ndarray, elements: np.ndarray) -> np.ndarray:
@@ -36,6 +35,8 @@ def norm(a: np.ndarray) -> np.ndarray:
 
 def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Products of small matrices, shapes (I, J, N) and (J, K, N), rounded as by BLAS, in fused additions."""
+    import torch  # noqa: PLC0415  stages are read without torch
+
     left, right = torch.as_tensor(a), torch.as_tensor(b)
     total = left[:, 0, None] * right[0]
     for j in range(1, len(b)):

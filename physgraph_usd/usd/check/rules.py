@@ -192,8 +192,8 @@ def _normals_outward(fine: Fine, array: np.ndarray, time: float | None) -> Itera
     positions, counts, indices = (fine.entries(name, time) for name in TOGETHER[:3])
     if len(positions) != len(array) or fine.topology_fault(time):
         return
-    left = fine.value("orientation", None) == UsdGeom.Tokens.leftHanded
-    expected = VertexNormals(PolygonMesh(counts, indices, len(positions)), left_handed=left)(positions)
+    is_left_handed = fine.value("orientation", None) == UsdGeom.Tokens.leftHanded
+    expected = VertexNormals(PolygonMesh(counts, indices, len(positions)), left_handed=is_left_handed)(positions)
     agreement = np.einsum("ij,ij->i", expected, array)
     if len(agreement) and np.median(agreement) < 0.5:
         yield fine.problem("normals", "point away from the side that winding and orientation call outside", time)
@@ -221,7 +221,7 @@ def primvars(fine: Fine) -> Iterator[Problem]:
         name, interpolation = primvar.GetAttr().GetName(), primvar.GetInterpolation()
         if action_on(primvar.GetAttr()) == BLOCKED or not primvar.GetTypeName().isArray or interpolation not in sizes:
             continue
-        for time in (each for each in fine.times if each is None or each in primvar.GetTimeSamples()):
+        for time in (code for code in fine.times if code is None or code in primvar.GetTimeSamples()):
             if fault := _primvar_fault(primvar, time, sizes[interpolation]):
                 # A constant array may have any length by elementSize, but not by the coarse mesh's elements.
                 yield fine.problem(name, fault, time, severity="warning" if interpolation == "constant" else "error")
@@ -395,10 +395,10 @@ def _error(message: str, path: str = "/", time: float | None = None) -> Problem:
 
 def record(layer: Sdf.Layer) -> Iterator[Problem]:
     """The record names garments and shot."""
-    found = read_record(layer)
-    if found is None:
+    record = read_record(layer)
+    if record is None:
         yield _error('has no customLayerData["physgraph"]; is it a refined layer?')
-    elif not found.get("garments") or not (found.get("shot") or found.get("unsaved")):
+    elif not record.get("garments") or not (record.get("shot") or record.get("unsaved")):
         yield _error("its record names no garments or no shot")
 
 
@@ -441,9 +441,9 @@ def same_metadata(layer: Sdf.Layer, shot: Usd.Stage) -> Iterator[Problem]:
     part = (read_record(layer) or {}).get("left_out")
     for key in (key for key in METADATA if not (part and key in RANGE)):
         expected = root_metadata(shot, key)
-        found = layer.pseudoRoot.GetInfo(key) if layer.pseudoRoot.HasInfo(key) else None
-        if expected is not None and found != expected:
-            yield _error(f"{key} is {found!r}; the shot has {expected!r}")
+        value = layer.pseudoRoot.GetInfo(key) if layer.pseudoRoot.HasInfo(key) else None
+        if expected is not None and value != expected:
+            yield _error(f"{key} is {value!r}; the shot has {expected!r}")
 
 
 def prim_fault(path: str, composed: Usd.Stage, kinds: Sequence[type] = (UsdGeom.Mesh,)) -> str:
@@ -467,7 +467,7 @@ def other_meshes(
             continue
         samples = prim.GetAttribute("points").GetTimeSamples()
         times = (samples[0], samples[-1]) if samples else (None,)
-        fine, coarse = (Fine(each, layer, times) for each in (prim, shot.GetPrimAtPath(path)))
+        fine, coarse = (Fine(side, layer, times) for side in (prim, shot.GetPrimAtPath(path)))
         for time in times:
             fault = fine.topology_fault(time)
             if fault and not (coarse.prim and coarse.topology_fault(time)):
@@ -500,7 +500,7 @@ def against_shot(layer: Sdf.Layer, coarse: Usd.Prim, target: Sdf.Path) -> Iterat
             with np.errstate(invalid="ignore", over="ignore"):
                 used = np.unique(authored_topology(coarse)[1])
                 cage = np.asarray(below, np.float64)[used[(used >= 0) & (used < len(below))]]
-                fine, cage = (np.asarray(each, np.float64) @ to_world[:3, :3] for each in (value, cage))
+                fine, cage = (np.asarray(cloud, np.float64) @ to_world[:3, :3] for cloud in (value, cage))
             clouds.append((fine, cage, time))
     yield from _compare(clouds, name)
 
@@ -513,10 +513,10 @@ def _compare(clouds: Sequence[tuple[np.ndarray, np.ndarray, float | None]], name
     A sample may be broken, for example with all points at the same place: a size between the coarse mesh's smallest and
     largest, within a factor of 4, is accepted.
     """
-    whole = [(fine, below[np.isfinite(below).all(axis=1)], time) for fine, below, time in clouds]
-    whole = [each for each in whole if len(each[1]) and np.isfinite(each[0]).all()]
-    sizes = [_size(below) for _, below, _ in whole]
-    for fine, below, time in whole if max(sizes, default=0.0) > 0 else ():
+    finite = [(fine, below[np.isfinite(below).all(axis=1)], time) for fine, below, time in clouds]
+    finite = [entry for entry in finite if len(entry[1]) and np.isfinite(entry[0]).all()]
+    sizes = [_size(below) for _, below, _ in finite]
+    for fine, below, time in finite if max(sizes, default=0.0) > 0 else ():
         least, most = min(sizes), max(sizes)
         away = float(np.linalg.norm(fine.mean(axis=0) - below.mean(axis=0)))
         if not least / 4 <= _size(fine) <= 4 * most:
@@ -538,14 +538,16 @@ def same_variants(layer: Sdf.Layer, shot: StageView, garments: Sequence[str]) ->
     """
     recorded = [Sdf.Path(text) for text in (read_record(layer) or {}).get("variants", ())]
     mask = Usd.StagePopulationMask([*garments, *dict.fromkeys(path.GetPrimPath() for path in recorded)])
-    now = _coarse(shot, mask, ()) if recorded else None
-    changed = {path: _selected(now, path) for path in recorded if now and _selected(now, path) != path}
-    then = _coarse(shot, mask, tuple(changed)) if changed else None
-    others = [path for path in garments if then and now and _cloth(now, path) != _cloth(then, path)]
+    present = _coarse(shot, mask, ()) if recorded else None
+    changed = {path: _selected(present, path) for path in recorded if present and _selected(present, path) != path}
+    recorded_cage = _coarse(shot, mask, tuple(changed)) if changed else None
+    differing = [
+        path for path in garments if recorded_cage and present and _cloth(present, path) != _cloth(recorded_cage, path)
+    ]
     for path, selected in changed.items():
         message = f"was refined with {_words(path)} and shows that; the shot has {_words(selected)} now"
-        if others:
-            meshes = ", ".join(f"<{other}>" for other in others)
+        if differing:
+            meshes = ", ".join(f"<{path}>" for path in differing)
             message += f", where {meshes} is another mesh; refine it into its own layer"
             yield Problem("error", str(path.GetPrimPath()), None, message, "")
         else:

@@ -13,7 +13,8 @@ from pxr import Sdf, Usd, UsdGeom
 from ...errors import LayerError, counted
 from ..provenance import read_record, recorded_shot
 from ..read.targets import FOLLOWERS
-from ..stage import USD_ERRORS, bad_rate, is_there, open_layer, paths_in, pxr_errors, quiet
+from ..resolve import is_there
+from ..stage import USD_ERRORS, bad_rate, open_layer, paths_in, pxr_errors, quiet
 from ..view import StageView
 from .rules import (
     BOUND_INSTANCER_RULES,
@@ -54,9 +55,9 @@ def validate_layer(layer: str | Path | Sdf.Layer, shot: str | Path | Usd.Stage |
     """
     opened = layer if isinstance(layer, Sdf.Layer) else open_layer(layer)
     below = shot if shot is not None else recorded_shot(opened)
-    lost = isinstance(below, str) and shot is None and not is_there(below)
+    is_missing = isinstance(below, str) and shot is None and not is_there(below)
     view = None
-    if below is not None and not lost:
+    if below is not None and not is_missing:
         view = StageView.of(below) if isinstance(below, Usd.Stage) else StageView.of_layer(open_layer(below))
     with pxr_errors(f"cannot read {layer} over {below}", LayerError):
         nothing = Usd.StagePopulationMask()
@@ -64,7 +65,7 @@ def validate_layer(layer: str | Path | Sdf.Layer, shot: str | Path | Usd.Stage |
         if fault := next(filter(None, map(bad_rate, stages)), ""):
             return [Problem("error", "/", None, fault, "time_scale")]
         problems = check_layer(opened, view)
-        if lost:
+        if is_missing:
             message = f"the shot that its record names is not at {below}; give it with --shot, or bring the layer back"
             problems.append(Problem("error", "/", None, message, "record"))
         elif view is not None and not any(problem.rule == "composition" for problem in problems):
@@ -104,14 +105,14 @@ def check_layer(layer: Sdf.Layer, shot: StageView | None, *, samples: int | None
     mask = Usd.StagePopulationMask([*bound, *(path for name in paths for path in {name, _coarse_path(layer, name)})])
     with quiet():
         problems += _named("same_variants", same_variants(layer, shot, [_coarse_path(layer, name) for name in paths]))
-        composed, alone = shot.open(over=[layer], mask=mask), shot.open(mask=mask)
-    problems += _named("same_metadata", same_metadata(layer, alone))
+        composed, shot_stage = shot.open(over=[layer], mask=mask), shot.open(mask=mask)
+    problems += _named("same_metadata", same_metadata(layer, shot_stage))
     for path in paths:
         fault = prim_fault(path, composed)
         if fault:
             problems.append(Problem("error", path, None, fault, "composition"))
             continue
-        coarse = alone.GetPrimAtPath(_coarse_path(layer, path))
+        coarse = shot_stage.GetPrimAtPath(_coarse_path(layer, path))
         problems += _check_garment(composed.GetPrimAtPath(path), layer, samples, coarse=coarse)
         if coarse:
             problems += _named("against_shot", against_shot(layer, coarse, Sdf.Path(path)))
@@ -173,10 +174,10 @@ def _coarse_path(layer: Sdf.Layer, path: str) -> str:
 
 def _on_whole_stage(layer: Sdf.Layer, shot: StageView) -> list[Problem]:
     """Problems of the composed stage: of meshes that reference or inherit refined meshes, and by USD's validators."""
-    alone, composed = shot.open(), shot.open(over=[layer])
+    shot_stage, composed = shot.open(), shot.open(over=[layer])
     with quiet():
-        problems = [*_named("other_meshes", other_meshes(layer, composed, alone, refined=_refined(layer)))]
-    return problems + _own_validators(layer, alone, composed)
+        problems = [*_named("other_meshes", other_meshes(layer, composed, shot_stage, refined=_refined(layer)))]
+    return problems + _own_validators(layer, shot_stage, composed)
 
 
 def _own_validators(layer: Sdf.Layer, shot: Usd.Stage, composed: Usd.Stage) -> list[Problem]:
@@ -225,32 +226,32 @@ def _findings(
 
     Some builds of USD lack libraries or data of validators, so each validator runs separately.
     """
-    registry, found, failed = module.ValidationRegistry(), [{} for _ in stages], []
+    registry, results, failed = module.ValidationRegistry(), [{} for _ in stages], []
     names = (str(metadata.name) for metadata in registry.GetAllValidatorMetadata())
     for name in sorted(name for name in names if not name.startswith(f"{PLUGIN}:")):  # Our own rules have already run.
         try:
             context = module.ValidationContext([registry.GetOrLoadValidatorByName(name)])
-            reports = [[_as_problem(module, each) for each in context.Validate(stage)] for stage in stages]
+            reports = [[_as_problem(module, error) for error in context.Validate(stage)] for stage in stages]
         except USD_ERRORS:
             failed.append(name)
             continue
-        for findings, problems in zip(found, reports, strict=True):
+        for findings, problems in zip(results, reports, strict=True):
             findings.update({(p.rule, p.path, _without_names(p.message)): p for p in problems})
     message = f"{len(failed)} of USD's own validators do not run with this USD: {', '.join(failed)}"
-    return found, [Problem("warning", "/", None, message, "validators")] if failed else []
+    return results, [Problem("warning", "/", None, message, "validators")] if failed else []
 
 
-def _as_problem(module: Any, found: Any) -> Problem:
-    sites = found.GetSites()
+def _as_problem(module: Any, error: Any) -> Problem:
+    sites = error.GetSites()
     path = str(sites[0].GetProperty().GetPath() if sites and sites[0].IsProperty() else "")
     if sites and not path and sites[0].IsPrim():
         path = str(sites[0].GetPrim().GetPath())
-    severity = "error" if found.GetType() == module.ValidationErrorType.Error else "warning"
+    severity = "error" if error.GetType() == module.ValidationErrorType.Error else "warning"
     try:
-        message = found.GetMessage()
+        message = error.GetMessage()
     except UnicodeDecodeError:
         message = "a name in the shot is no text; its file is damaged"
-    return Problem(severity, path or "/", None, message, str(found.GetIdentifier()))
+    return Problem(severity, path or "/", None, message, str(error.GetIdentifier()))
 
 
 def _without_names(message: str) -> str:

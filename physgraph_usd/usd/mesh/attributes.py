@@ -65,7 +65,7 @@ def corner_values(
 
 
 def single_corners(counts: np.ndarray, indices: np.ndarray) -> np.ndarray:
-    """Whether each corner is at another vertex than the corner before it in its face, shape (C,)."""
+    """Whether each corner's vertex differs from the previous corner's in the face, shape (C,)."""
     counts = np.asarray(counts, np.int64)
     ends = np.cumsum(counts)
     before = np.arange(-1, len(indices) - 1)
@@ -111,8 +111,8 @@ def edge_subset(refinements: Sequence[Refinement], edges: np.ndarray) -> np.ndar
     """
     edges = np.asarray(edges, np.int32).reshape(-1, 2)
     for refinement in refinements:
-        found = find_edges(refinement.edges, edges)
-        edges = edges[found >= 0]
-        middle = (refinement.parent_vertex_count + found[found >= 0]).astype(np.int32)
+        edge_numbers = find_edges(refinement.edges, edges)
+        edges = edges[edge_numbers >= 0]
+        middle = (refinement.parent_vertex_count + edge_numbers[edge_numbers >= 0]).astype(np.int32)
         edges = np.stack([edges[:, 0], middle, middle, edges[:, 1]], axis=1).reshape(-1, 2)
     return edges

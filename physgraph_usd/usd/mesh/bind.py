@@ -27,7 +27,7 @@ from ...solver.mesh.topology import edges_of
 from ...solver.rigid import Rigid, best_motion
 
 NEAREST = 8
-"""Triangles that are tested for the closest point, nearest by their centroids."""
+"""Number of triangles tested for the closest point, nearest by centroid."""
 AT_ONCE = 50_000
 """Points searched at a time."""
 COLLINEAR = 1e-10
@@ -58,10 +58,10 @@ def closest(
     """The closest point of a surface for each of some points, among the triangles with the nearest centroids."""
     corners = surface[triangles]
     tree = cKDTree(corners.mean(axis=1))
-    found = [_closest_of(points[start : start + AT_ONCE], corners, tree) for start in range(0, len(points), AT_ONCE)]
-    if not found:
+    blocks = [_closest_of(points[start : start + AT_ONCE], corners, tree) for start in range(0, len(points), AT_ONCE)]
+    if not blocks:
         return Closest(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0))
-    return Closest(*(np.concatenate(each) for each in zip(*found, strict=True)))
+    return Closest(*(np.concatenate(block) for block in zip(*blocks, strict=True)))
 
 
 def _closest_of(points: np.ndarray, corners: np.ndarray, tree: cKDTree) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -85,13 +85,13 @@ def _weights(point: np.ndarray, corners: np.ndarray) -> np.ndarray:
     inside = np.stack([1.0 - v - w, v, w], axis=-1)
     # On the sides: the closest of three segments where the foot of the perpendicular is outside.
     sides, aways = [], []
-    for here, there in ((0, 1), (1, 2), (2, 0)):
-        start, way = corners[..., here, :], corners[..., there, :] - corners[..., here, :]
-        part = np.clip(_dot(point - start, way) / np.maximum(_dot(way, way), _TINY), 0.0, 1.0)
+    for tail, head in ((0, 1), (1, 2), (2, 0)):
+        start, side = corners[..., tail, :], corners[..., head, :] - corners[..., tail, :]
+        part = np.clip(_dot(point - start, side) / np.maximum(_dot(side, side), _TINY), 0.0, 1.0)
         weights = np.zeros_like(inside)
-        weights[..., here], weights[..., there] = 1.0 - part, part
+        weights[..., tail], weights[..., head] = 1.0 - part, part
         sides.append(weights)
-        gap = start + part[..., None] * way - point
+        gap = start + part[..., None] * side - point
         aways.append(_dot(gap, gap))
     best = np.stack(aways).argmin(axis=0)
     on_side = np.take_along_axis(np.stack(sides), best[None, ..., None], axis=0)[0]
@@ -104,7 +104,7 @@ def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 class SurfaceFrames:
-    """Frames of a surface's vertices, which follow its deformation from a bind pose."""
+    """Frames of a surface's vertices, following the deformation from a bind pose."""
 
     def __init__(self, bind: Float[np.ndarray, "vertices 3"], triangles: Int[np.ndarray, "triangles 3"]) -> None:
         """Prepare the gradients along two tangents of each vertex in the bind pose."""
@@ -113,15 +113,15 @@ class SurfaceFrames:
         axis = np.eye(3)[np.abs(normals).argmin(axis=1)]
         first = _unit(np.cross(normals, axis))
         tangents = np.stack([first, np.cross(normals, first)], axis=1)
-        one = edges_of(triangles, count).vertices
-        here, there = np.concatenate([one, one[:, ::-1]]).T
-        flat = np.einsum("ntx,nx->nt", tangents[here], bind[there] - bind[here])
+        directed = edges_of(triangles, count).vertices
+        start, end = np.concatenate([directed, directed[:, ::-1]]).T
+        flat = np.einsum("ntx,nx->nt", tangents[start], bind[end] - bind[start])
         squares = np.zeros((count, 2, 2))
-        np.add.at(squares, here, flat[:, :, None] * flat[:, None])
+        np.add.at(squares, start, flat[:, :, None] * flat[:, None])
         trace = np.einsum("ntt->n", squares)
         squares += (COLLINEAR * trace + (trace <= 0))[:, None, None] * np.eye(2)
-        slopes = np.linalg.solve(squares[here], flat[:, :, None])[:, :, 0]
-        self._gradients = [_gradient(here, there, slope, count) for slope in slopes.T]
+        slopes = np.linalg.solve(squares[start], flat[:, :, None])[:, :, 0]
+        self._gradients = [_gradient(start, end, slope, count) for slope in slopes.T]
 
     def __call__(self, points: Float[np.ndarray, "vertices 3"]) -> Float[np.ndarray, "vertices 3 3"]:
         """Frames at positions: rows are the two tangents and the normal, orthonormal."""
@@ -190,13 +190,13 @@ class Binding:
         rigid: Int[np.ndarray, " points"] | None = None,
     ) -> Binding:
         """Bind points to a surface, both in the bind pose; ``rigid`` as the attribute, None without rigid parts."""
-        found, frames = closest(points, surface, triangles), SurfaceFrames(surface, triangles)
-        corners, turned = triangles[found.triangle], frames(surface)
-        base = np.einsum("nk,nkx->nx", found.weights, surface[corners])
+        nearest, frames = closest(points, surface, triangles), SurfaceFrames(surface, triangles)
+        corners, turned = triangles[nearest.triangle], frames(surface)
+        base = np.einsum("nk,nkx->nx", nearest.weights, surface[corners])
         within = 0.5 * np.einsum("nkax,nkx->nka", turned[corners], base[:, None] - surface[corners])
         offsets = np.einsum("nkax,nx->nka", turned[corners], points - base)
         parts = np.full(len(points), -1) if rigid is None else np.asarray(rigid)
-        return cls(points, corners, found.weights, within, offsets, frames, turned, parts, found.distance)
+        return cls(points, corners, nearest.weights, within, offsets, frames, turned, parts, nearest.distance)
 
     def at(self, surface: Float[np.ndarray, "vertices 3"]) -> Follower:
         """The binding with the surface at other positions."""
@@ -205,11 +205,11 @@ class Binding:
     @cached_property
     def blend(self) -> sparse.csr_matrix:
         """The closest points by the surface's positions, then the axes of its frames, shape (N, 4 V)."""
-        places = sparse.csr_matrix(
+        attachment = sparse.csr_matrix(
             (self.weights.ravel(), self.corners.ravel(), 3 * np.arange(len(self.bind) + 1)),
             shape=(len(self.bind), len(self.turned)),
         )
-        return sparse.hstack([places, self._by_axes(self.within)]).tocsr()
+        return sparse.hstack([attachment, self._by_axes(self.within)]).tocsr()
 
     @cached_property
     def blend_offset(self) -> sparse.csr_matrix:
@@ -249,8 +249,8 @@ class Follower:
     @cached_property
     def _motions(self) -> list[tuple[np.ndarray, Rigid]]:
         """Points and motion of each rigid part, by the best fit of the bound points."""
-        before, now = self.binding.bind, self._soft
-        return [(part, best_motion(before[part], now[part])) for part in self.binding.parts]
+        before, current = self.binding.bind, self._soft
+        return [(part, best_motion(before[part], current[part])) for part in self.binding.parts]
 
     @cached_property
     def _soft(self) -> np.ndarray:
@@ -269,19 +269,19 @@ class Follower:
         return points
 
     def turned(self, vectors: np.ndarray, owner: np.ndarray) -> np.ndarray:
-        """Unit vectors that turn with points, such as normals.
+        """Unit vectors turning with points, such as normals.
 
         Args:
             vectors: Vectors in the bind pose, shape (M, 3).
             owner: The point of each, shape (M,).
         """
-        bound, given = self.binding, np.asarray(vectors, float)
-        total = np.zeros_like(given)
+        bound, coarse = self.binding, np.asarray(vectors, float)
+        total = np.zeros_like(coarse)
         for k in range(3):
             corner = bound.corners[owner, k]
-            local = np.einsum("nax,nx->na", bound.turned[corner], given)
+            local = np.einsum("nax,nx->na", bound.turned[corner], coarse)
             total += bound.weights[owner, k, None] * np.einsum("nax,na->nx", self.frames[corner], local)
         for part, motion in self._motions:
             mine = np.isin(owner, part)
-            total[mine] = given[mine] @ motion.turn.T
+            total[mine] = coarse[mine] @ motion.turn.T
         return _unit(total)

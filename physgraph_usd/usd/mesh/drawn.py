@@ -23,7 +23,7 @@ of 53,000 take half as long again as over a body of 13,000: the body's hierarchy
 NEAR_PART = 0.95
 """Fraction of the surface required to be near enough: nostrils and fingertips would ask for more everywhere."""
 TO_LIMIT = 4.0 / 3.0
-"""Ratio of a vertex's distance to the limit surface to its move in one subdivision: 1 + 1/4 + 1/16 + ..."""
+"""Ratio of a vertex's distance to the limit surface to the move in a subdivision: 1 + 1/4 + 1/16 + ..."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +52,7 @@ class DrawnSurface:
 
 
 def to_limit(cage: ControlMesh) -> sparse.csr_matrix:
-    """The matrix that moves a cage's vertices to its limit surface, shape (V, V)."""
+    """The matrix moving a cage's vertices to the limit surface, shape (V, V)."""
     count = cage.mesh.vertex_count
     moved = cage.subdivided(subdivide(cage.mesh))[0][:count, :]
     same = sparse.identity(count, format="csr")
@@ -74,8 +74,8 @@ def drawn_surface(
     """
     parents = np.arange(cage.mesh.face_count)
     if scheme not in ("catmullClark", "loop") or not cage.mesh.face_count:
-        kept = ~np.isin(parents, holes)
-        return DrawnSurface(_some_faces(cage.mesh, kept), parents[kept])
+        drawn_faces = ~np.isin(parents, holes)
+        return DrawnSurface(_some_faces(cage.mesh, drawn_faces), parents[drawn_faces])
     cage = replace(cage, mesh=replace(cage.mesh, least_polygon=3 if scheme == "catmullClark" else 4))
     error = flatness(cage, points)
     wanted = 0 if error <= within else math.ceil(math.log(error / within, 4.0))
@@ -87,9 +87,11 @@ def drawn_surface(
         stencil, cage = cage.subdivided(step)
         stencils.append(stencil)
         parents = parents[step.parent_face]
-    stencil = reduce(lambda product, each: each @ product, [*stencils, to_limit(cage)])
-    kept = ~np.isin(parents, holes)
-    return DrawnSurface(_some_faces(cage.mesh, kept), parents[kept], sparse.csr_matrix(stencil), error / 4.0**levels)
+    stencil = reduce(lambda product, matrix: matrix @ product, [*stencils, to_limit(cage)])
+    drawn_faces = ~np.isin(parents, holes)
+    return DrawnSurface(
+        _some_faces(cage.mesh, drawn_faces), parents[drawn_faces], sparse.csr_matrix(stencil), error / 4.0**levels
+    )
 
 
 def flatness(cage: ControlMesh, points: np.ndarray) -> float:
@@ -110,7 +112,7 @@ def flatness(cage: ControlMesh, points: np.ndarray) -> float:
     return float(np.quantile(away, NEAR_PART)) if len(away) else 0.0
 
 
-def _some_faces(mesh: PolygonMesh, kept: np.ndarray) -> PolygonMesh:
-    if kept.all():
+def _some_faces(mesh: PolygonMesh, selected: np.ndarray) -> PolygonMesh:
+    if selected.all():
         return mesh
-    return PolygonMesh(mesh.counts[kept], mesh.indices[kept[mesh.corner_face]], mesh.vertex_count)
+    return PolygonMesh(mesh.counts[selected], mesh.indices[selected[mesh.corner_face]], mesh.vertex_count)

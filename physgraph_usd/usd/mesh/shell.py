@@ -33,12 +33,12 @@ class Shell:
     def of(cls, sheet: PolygonMesh, welded: Int[np.ndarray, " vertices"]) -> Shell:
         """Make the shell of a sheet; vertices with equal numbers in ``welded`` are joined, and have no rim between."""
         count, corners = sheet.vertex_count, np.arange(len(sheet.indices))
-        here, there = sheet.indices, sheet.indices[sheet.next_corner]
-        ends = np.sort(np.stack([welded[here], welded[there]], axis=1), axis=1)
+        start, end = sheet.indices, sheet.indices[sheet.next_corner]
+        ends = np.sort(np.stack([welded[start], welded[end]], axis=1), axis=1)
         _, edge, times = np.unique(ends, axis=0, return_inverse=True, return_counts=True)
         rim = np.flatnonzero((times[edge.reshape(-1)] == 1) & (ends[:, 0] != ends[:, 1]))
         after, turned = sheet.next_corner[rim], sheet.mirrored_corners
-        sides = np.stack([there[rim], here[rim], here[rim] + count, there[rim] + count], axis=1)
+        sides = np.stack([end[rim], start[rim], start[rim] + count, end[rim] + count], axis=1)
         indices = np.concatenate([sheet.indices, sheet.indices[turned] + count, sides.ravel()])
         counts = np.concatenate([sheet.counts, sheet.counts, np.full(len(rim), 4)])
         faces = np.arange(sheet.face_count)

@@ -28,7 +28,7 @@ class Samples:
     Attributes:
         times: Time codes with a shape that is visible, ascending.
         absent: All others, ascending, with the reason in words.
-        hidden: Those of them at which the garment is invisible.
+        hidden: Absent time codes of an invisible garment.
         own: Time codes with a shape that the garment itself has samples at, ascending.
     """
 
@@ -39,26 +39,26 @@ class Samples:
 
     @staticmethod
     def of(prim: Usd.Prim, times: Iterable[float], own: Iterable[float] = ()) -> Samples:
-        """Sort the time codes of a garment's mesh prim, among them its own."""
+        """Sort the time codes of a garment's mesh prim, including the garment's samples."""
         times = [*times]
         hidden = hidden_at(prim, times)
         reasons = {time: _INVISIBLE if time in hidden else absence(prim, time) for time in times}
-        there = tuple(time for time, reason in reasons.items() if not reason)
+        present = tuple(time for time, reason in reasons.items() if not reason)
         absent = {time: reason for time, reason in reasons.items() if reason}
-        return Samples(there, absent, tuple(time for time in own if time in there), hidden)
+        return Samples(present, absent, tuple(time for time in own if time in present), hidden)
 
     def notices(self, path: str, times: Sequence[float]) -> list[Notice]:
         """Notices of the garment's absences among some time codes, one for each reason but invisibility."""
-        found = []
+        notices = []
         for reason in dict.fromkeys(self.absent[time] for time in times if time not in self.hidden):
             named = named_times([time for time in times if self.absent[time] == reason])
             message = f"is not there at {named}: {reason}; left out, and blocked in the layer"
-            found.append(Notice(path, None, message))
-        return found
+            notices.append(Notice(path, None, message))
+        return notices
 
 
 def hidden_at(prim: Usd.Prim, times: Sequence[float]) -> frozenset[float]:
-    """Time codes among a garment's samples, ascending, that no picture shows: it is invisible there.
+    """Time codes of a garment's samples, ascending, not shown in any picture: the garment is invisible.
 
     Shown is also an invisible sample beside a whole frame at which the garment is visible: it interpolates between
     them. A garment that is invisible at all of them hides none: it was named to be refined all the same.
@@ -76,8 +76,8 @@ def hidden_at(prim: Usd.Prim, times: Sequence[float]) -> frozenset[float]:
 
     visible = [is_visible(time) for time in times]
     beside = pairwise(any(map(is_visible, frames.inside(*span))) for span in spans)
-    shown = [here or any(both) for here, both in zip(visible, beside, strict=True)]
-    return frozenset(time for time, is_shown in zip(times, shown, strict=True) if not is_shown and any(shown))
+    drawn = [is_visible or any(neighbours) for is_visible, neighbours in zip(visible, beside, strict=True)]
+    return frozenset(time for time, is_shown in zip(times, drawn, strict=True) if not is_shown and any(drawn))
 
 
 def visibility_varies(prim: Usd.Prim) -> bool:

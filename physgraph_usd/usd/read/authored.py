@@ -27,13 +27,14 @@ def authored_faults(garments: Sequence[Usd.Prim], colliders: Sequence[Usd.Prim])
     """
     notices: dict[Notice, None] = {}
     for prim in (*garments, *colliders):
-        for each in with_ancestors(prim):
-            notices |= dict.fromkeys(_unread_on(each, material=False))
+        for ancestor in with_ancestors(prim):
+            notices |= dict.fromkeys(_unread_on(ancestor, material=False))
         subsets = UsdGeom.Subset.GetAllGeomSubsets(UsdGeom.Imageable(prim))
-        for each in (found for part in (prim, *(s.GetPrim() for s in subsets)) for found in bound_materials(part)):
-            notices |= dict.fromkeys(_unread_on(each, material=True))
+        for part in (prim, *(subset.GetPrim() for subset in subsets)):
+            for material in bound_materials(part):
+                notices |= dict.fromkeys(_unread_on(material, material=True))
     for schema, prims in ((GARMENT_API, garments), (COLLIDER_API, colliders)):
-        for attribute, fault, _ in (each for prim in prims for each in beyond_limits(prim, schema)):
+        for attribute, fault, _ in (beyond for prim in prims for beyond in beyond_limits(prim, schema)):
             notices[Notice(str(attribute.GetPrim().GetPath()), None, f"{attribute.GetName()} {fault}")] = None
         for prim in prims:
             for attribute in _animated_in_vain(prim, schema):
@@ -85,7 +86,7 @@ def _connection_fault(attribute: Usd.Attribute) -> str:
 
 
 def beyond_limits(prim: Usd.Prim, schema: str = GARMENT_API) -> Iterator[tuple[Usd.Attribute, str, bool]]:
-    """Out-of-limit values authored on a garment or collider, its ancestors or its material.
+    """Out-of-limit values authored on a garment or collider, or on ancestors or materials.
 
     Yields:
         The attribute, the fault with value and limits, and whether the limits are hard.
@@ -116,7 +117,7 @@ def _extremes(attribute: Usd.Attribute) -> list[float]:
     codes = [Usd.TimeCode(time) for time in attribute.GetTimeSamples()] or [Usd.TimeCode.Default()]
     arrays = [np.asarray(attribute.Get(code)).ravel() for code in codes]
     numbers = [array for array in arrays if array.size and array.dtype.kind in "biuf"]
-    return [float(pick(each)) for pick in (np.min, np.max) for each in numbers]
+    return [float(pick(values)) for pick in (np.min, np.max) for values in numbers]
 
 
 def _fault_of(row: Property, value: float, kind: str, ends: tuple[float | None, float | None]) -> str:

@@ -126,15 +126,15 @@ class ColliderReader:
             message = f"no collider where it is invisible, unless {COLLIDER['collider:enabled'].name} is set to true"
             return None, (Notice(self.collider.path, None, message),)
         if self.instancer is not None:
-            pose, odd = self._instances(self.instancer, time)
-        elif time is not None and (why := missing_value(self.prim, time)):
-            return None, (self._out(time, why),)
+            pose, notices = self._instances(self.instancer, time)
+        elif time is not None and (reason := missing_value(self.prim, time)):
+            return None, (self._out(time, reason),)
         else:
-            pose, odd = self._placed(self._matrix(timecode(time)), time, skinned)
+            pose, notices = self._placed(self._matrix(timecode(time)), time, skinned)
         if pose is None:
-            return None, odd
+            return None, notices
         pose, beyond = self._bounded(pose, time)
-        return pose, (*odd, *beyond)
+        return pose, (*notices, *beyond)
 
     def _placed(
         self, matrix: np.ndarray, time: float | None, skinned: np.ndarray | None = None
@@ -150,23 +150,23 @@ class ColliderReader:
 
     def _instances(self, instancer: Usd.Prim, time: float | None) -> tuple[Pose | None, tuple[Notice, ...]]:
         """The triangles of all instances near the cloth; an instance of scale 0 is not drawn."""
-        found = placements(instancer, time)
-        if found is None:
+        matrices = placements(instancer, time)
+        if matrices is None:
             return None, (self._out(time, f"arrays of <{instancer.GetPath()}> do not fit together"),)
         notices: dict[Notice, None] = {}
         poses: list[Pose] = []
         count = 0
         for path, part in self.parts.items():
-            for matrix in part._near(found.get(path, np.zeros((0, 4, 4))), time, self.near):
-                pose, odd = part._placed(matrix, time)
-                notices |= dict.fromkeys(odd)
+            for matrix in part._near(matrices.get(path, np.zeros((0, 4, 4))), time, self.near):
+                pose, part_notices = part._placed(matrix, time)
+                notices |= dict.fromkeys(part_notices)
                 poses += [] if pose is None else [pose]
                 count += 0 if pose is None else len(pose.points)
                 if count > MOST_INSTANCED:
-                    why = (
+                    reason = (
                         f"its instances near the cloth have over {MOST_INSTANCED:,} vertices; hide those that no cloth"
                     )
-                    return None, (self._out(time, f"{why} touches by invisibleIds, or refine with less of them"),)
+                    return None, (self._out(time, f"{reason} touches by invisibleIds, or refine with less of them"),)
         if not poses:
             return None, tuple(notices)
         firsts = np.cumsum([0, *(len(pose.points) for pose in poses[:-1])])
@@ -272,15 +272,15 @@ class ColliderReader:
             return None, (self._out(time, message),)
         near = np.asarray((np.abs(pose.points) <= FARTHEST).all(axis=1))
         message = f"{message}; faces with it, and with {(~near).sum() - 1} more such, are left out"
-        whole = Pose(np.where(near[:, None], pose.points, np.nan), pose.triangles)
-        return whole, (Notice(self.collider.path, time, message),)
+        near_pose = Pose(np.where(near[:, None], pose.points, np.nan), pose.triangles)
+        return near_pose, (Notice(self.collider.path, time, message),)
 
-    def _out(self, time: float | None, why: str) -> Notice:
-        return Notice(self.collider.path, time, f"this collider is left out here: {why}")
+    def _out(self, time: float | None, reason: str) -> Notice:
+        return Notice(self.collider.path, time, f"this collider is left out here: {reason}")
 
 
 def authored_points(body: ColliderReader, time: float | None) -> np.ndarray:
-    """World positions of a mesh's authored points [m], shape (V, 3); of another body, those of its pose, if any."""
+    """World positions of a mesh's authored points [m], shape (V, 3); for other bodies points of the pose, if any."""
     if body.collider.kind != "mesh" or body.instancer is not None:
         pose = body.pose(time)[0]
         return np.zeros((0, 3)) if pose is None else pose.points
@@ -313,15 +313,17 @@ def read_collider(
         return None, (Notice(path, None, f"{unread(prim)}; left out"),)
     own = find_value(prim, COLLIDER["collider:offset"], overrides).at(None) or 0.0
     side, _ = find_token(prim, COLLIDER["collider:side"], overrides)
-    odd = (Notice(path, None, "a plane has no start side; its front is used"),) if (kind, side) == _PLANE_START else ()
+    notices = (
+        (Notice(path, None, "a plane has no start side; its front is used"),) if (kind, side) == _PLANE_START else ()
+    )
     within = DRAWN_NEAR * max(offset + own, _LEAST_OFFSET)
     always = find_value(prim, COLLIDER["collider:enabled"], overrides).source != "fallback"
     collider = Collider(path, kind if instancer is None else "mesh", own, side)
     reader = ColliderReader(prim, collider, metres, within, always, instancer, near=near)
     if instancer is None:
-        return reader, odd
-    reader.parts, left = parts_of(reader, instancer, overrides)
-    return (reader if reader.parts else None), (*odd, *left)
+        return reader, notices
+    reader.parts, unread_parts = parts_of(reader, instancer, overrides)
+    return (reader if reader.parts else None), (*notices, *unread_parts)
 
 
 def parts_of(
@@ -331,11 +333,13 @@ def parts_of(
     gprims = instanced_gprims(reader.prim) if UsdGeom.PointInstancer(reader.prim) else [reader.prim]
     gprims = [prim for prim in gprims if is_on(prim, COLLIDER["collider:enabled"], overrides)]
     parts, notices = {}, []
-    for prim in [each for each in gprims if is_drawn(each)] or gprims:
+    for prim in [gprim for gprim in gprims if is_drawn(gprim)] or gprims:
         kind = kind_of(prim)
         if kind is None or kind == "plane":
-            why = "a Plane is endless; put a Mesh in its place" if kind else unread(prim)
-            notices.append(Notice(reader.collider.path, None, f"instances of <{prim.GetPath()}> are left out: {why}"))
+            reason = "a Plane is endless; put a Mesh in its place" if kind else unread(prim)
+            notices.append(
+                Notice(reader.collider.path, None, f"instances of <{prim.GetPath()}> are left out: {reason}")
+            )
             continue
         collider = replace(reader.collider, kind=kind)
         parts[prim.GetPath()] = ColliderReader(prim, collider, reader.metres, reader.within, unit=reader.metres)
@@ -395,25 +399,27 @@ def sharpness_of(mesh: UsdGeom.Mesh, vertex_count: int) -> tuple[np.ndarray, np.
     """
     ends, sharpness = np.zeros((0, 2), np.int32), np.zeros(0)
     attributes = (mesh.GetCreaseIndicesAttr(), mesh.GetCreaseLengthsAttr(), mesh.GetCreaseSharpnessesAttr())
-    indices, lengths, given = map(_numbers, attributes, ("iu", "iu", "iuf"))
+    indices, lengths, sharpnesses = map(_numbers, attributes, ("iu", "iu", "iuf"))
     if len(lengths) and lengths.min() >= 2 and lengths.sum() == len(indices):
         chain = np.repeat(np.arange(len(lengths)), lengths)
         along = np.flatnonzero(chain[1:] == chain[:-1])
-        given = given[chain[along]] if len(given) == len(lengths) else given  # One value per crease, or one per edge.
-        if len(given) == len(along):
+        sharpnesses = (
+            sharpnesses[chain[along]] if len(sharpnesses) == len(lengths) else sharpnesses
+        )  # One value per crease, or one per edge.
+        if len(sharpnesses) == len(along):
             ends = np.stack([indices[along], indices[along + 1]], axis=1)
             inside = ((ends >= 0) & (ends < vertex_count)).all(axis=1)
-            ends, sharpness = ends[inside], given[inside]
+            ends, sharpness = ends[inside], sharpnesses[inside]
     corners = np.zeros(vertex_count)
-    places, given = map(_numbers, (mesh.GetCornerIndicesAttr(), mesh.GetCornerSharpnessesAttr()), ("iu", "iuf"))
-    if len(places) == len(given):
+    places, sharpnesses = map(_numbers, (mesh.GetCornerIndicesAttr(), mesh.GetCornerSharpnessesAttr()), ("iu", "iuf"))
+    if len(places) == len(sharpnesses):
         inside = (places >= 0) & (places < len(corners))
-        corners[places[inside]] = given[inside]
+        corners[places[inside]] = sharpnesses[inside]
     return ends, sharpness, corners
 
 
 def _surface_of_tets(body: ColliderReader, time: float | None) -> tuple[np.ndarray, ...]:
-    """Counts, corners and holes of a TetMesh's surface, as authored or else from its tetrahedra.
+    """Counts, corners and holes of a TetMesh's surface, as authored or from the tetrahedra.
 
     A surface from tetrahedra is cached while they stay the same: USD takes a second for 150,000.
     """

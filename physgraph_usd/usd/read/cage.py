@@ -69,10 +69,10 @@ def read_cage(prim: Usd.Prim, vertex_count: int, times: Sequence[float]) -> Cage
     if not keep.any():
         raise GarmentError(path, f"every one of its {len(counts)} faces is a hole", remedy="clear holeIndices")
     _refuse_large_faces(path, counts, indices, keep)
-    kept = np.flatnonzero(keep).astype(np.int32)
-    kept_indices = indices[kept_corners(counts, indices, kept)]
+    kept_faces = np.flatnonzero(keep).astype(np.int32)
+    kept_indices = indices[kept_corners(counts, indices, kept_faces)]
     mesh = PolygonMesh(sizes[keep].astype(np.int32), kept_indices, vertex_count)
-    return Cage(mesh, kept, (*notices, *_odd_controls(usd)))
+    return Cage(mesh, kept_faces, (*notices, *_odd_controls(usd)))
 
 
 def read_integers(attribute: Usd.Attribute, time: float | None) -> np.ndarray:
@@ -205,9 +205,11 @@ class PointReader:
                 f"points[{broken.argmax()}] is NaN or infinite, with no neighbour or other sample to repair it from"
             )
             raise GarmentError(self.path, message, time=time, remedy="cache that frame again")
-        which = ", ".join(f"points[{index}]" for index in np.flatnonzero(broken)[:3])
-        more = " ..." if broken.sum() > 3 else ""
-        message = f"{which}{more} NaN or infinite: {broken.sum()} repaired from neighbours and the nearest good sample"
+        listed = ", ".join(f"points[{index}]" for index in np.flatnonzero(broken)[:3])
+        ellipsis = " ..." if broken.sum() > 3 else ""
+        message = (
+            f"{listed}{ellipsis} NaN or infinite: {broken.sum()} repaired from neighbours and the nearest good sample"
+        )
         return repaired, (Notice(self.path, time, message),)
 
     def _raw(self, time: float | None) -> np.ndarray:
@@ -215,11 +217,13 @@ class PointReader:
         return as_points(value_at(self._attribute, time), self.path, "points", time=time)
 
     def _good_sample(self, time: float | None) -> np.ndarray | None:
-        """The nearest earlier sample with only finite points, else the nearest later such sample."""
+        """The nearest earlier sample with only finite points, or the nearest later."""
         at = -np.inf if time is None else time
-        earlier = [each for each in reversed(self._times) if each < at]
-        for each in (*earlier, *(later for later in self._times if later > at)):
-            points = self._raw(each) if self._attribute.Get(each) else np.zeros((0, 3))  # The sample may be blocked.
+        earlier = [time for time in reversed(self._times) if time < at]
+        for candidate in (*earlier, *(later for later in self._times if later > at)):
+            points = (
+                self._raw(candidate) if self._attribute.Get(candidate) else np.zeros((0, 3))
+            )  # The sample may be blocked.
             if len(points) == self.count and np.isfinite(points).all():
                 return points
         return None
@@ -255,18 +259,18 @@ def repair(points: np.ndarray, edges: np.ndarray, reference: np.ndarray | None) 
     """
     base = np.zeros_like(points) if reference is None else reference
     out = points.copy()
-    both = np.concatenate([edges, edges[:, ::-1]]).astype(np.int64) if len(edges) else np.zeros((0, 2), np.int64)
+    directed = np.concatenate([edges, edges[:, ::-1]]).astype(np.int64) if len(edges) else np.zeros((0, 2), np.int64)
     while True:
         finite = np.asarray(np.isfinite(out).all(axis=1))
-        use = both[~finite[both[:, 0]] & finite[both[:, 1]]]
+        use = directed[~finite[directed[:, 0]] & finite[directed[:, 1]]]
         if len(use) == 0:
             break
         total, count = np.zeros_like(out), np.zeros(len(out))
         np.add.at(total, use[:, 0], out[use[:, 1]] - base[use[:, 1]])
         np.add.at(count, use[:, 0], 1.0)
-        some = count > 0
-        out[some] = base[some] + total[some] / count[some, None]
-    left = np.flatnonzero(~np.isfinite(out).all(axis=1))
+        has_neighbours = count > 0
+        out[has_neighbours] = base[has_neighbours] + total[has_neighbours] / count[has_neighbours, None]
+    unfilled = np.flatnonzero(~np.isfinite(out).all(axis=1))
     if reference is not None:
-        out[left] = reference[left]
+        out[unfilled] = reference[unfilled]
     return out

@@ -48,17 +48,17 @@ def find_garments(stage: Usd.Stage, wanted: Sequence[str] = ()) -> list[Usd.Prim
     if wanted:
         chosen = {path for item in wanted for path in find_paths(stage, item, (UsdGeom.Mesh,))}
         return [prim for prim in traverse(stage) if prim.GetPath() in chosen]
-    found = [prim for prim in traverse(stage) if has_schema(prim, GARMENT_API) and not _hidden_level(prim)]
-    if not found:
+    garments = [prim for prim in traverse(stage) if has_schema(prim, GARMENT_API) and not _hidden_level(prim)]
+    if not garments:
         raise StageError(
             f"no prim has {GARMENT_API} and no garment was named; --garment PATH names one; {_mesh_list(stage)}"
         )
-    for prim in found:
+    for prim in garments:
         if not UsdGeom.Mesh(prim):
             kind = prim.GetTypeName() or "prim without a type"
             remedy = "apply the schema to the meshes themselves"
             raise GarmentError(str(prim.GetPath()), f"has {GARMENT_API} but is a {kind}, not a Mesh", remedy=remedy)
-    return found
+    return garments
 
 
 def find_colliders(
@@ -82,8 +82,10 @@ def find_colliders(
     Raises:
         AbsentError: When a named collider does not exist.
     """
-    felt = [_colliders_named(stage, wanted, overrides)] if wanted else felt_by(stage, garments, overrides=overrides)
-    chosen = {path for paths in felt for path in paths} - {*without, *(prim.GetPath() for prim in garments)}
+    collider_lists = (
+        [_colliders_named(stage, wanted, overrides)] if wanted else felt_by(stage, garments, overrides=overrides)
+    )
+    chosen = {path for paths in collider_lists for path in paths} - {*without, *(prim.GetPath() for prim in garments)}
     return [prim for prim in traverse(stage) if prim.GetPath() in chosen]
 
 
@@ -100,26 +102,26 @@ def felt_by(
         AbsentError: When a collider in ``wanted`` does not exist.
         StageError: When a target of the garment's ``physgraph:colliders`` does not exist.
     """
-    found: dict[tuple[str, ...], frozenset[Sdf.Path]] = {}  # Many garments name the same colliders, or none.
-    each = []
+    paths_of: dict[tuple[str, ...], frozenset[Sdf.Path]] = {}  # Many garments name the same colliders, or none.
+    path_sets = []
     for garment in garments:
         named = tuple(wanted or map(str, targets_of(garment, _COLLIDERS_RELATIONSHIP)))
-        if named not in found:
+        if named not in paths_of:
             try:
-                found[named] = _colliders_named(stage, named, overrides)
+                paths_of[named] = _colliders_named(stage, named, overrides)
             except AbsentError as error:
                 if wanted:
                     raise
                 raise StageError(f"<{garment.GetPath()}>.{_COLLIDERS_RELATIONSHIP}: {error}") from error
-        each.append(found[named])
-    return each
+        path_sets.append(paths_of[named])
+    return path_sets
 
 
 def _colliders_named(stage: Usd.Stage, named: Sequence[str], overrides: Sequence[Override]) -> frozenset[Sdf.Path]:
     """Named gprims, or else all colliders of the stage, without disabled gprims."""
     enabled = COLLIDER["collider:enabled"]
-    found = _named_or_marked(stage, named)
-    return frozenset(path for path in found if is_on(stage.GetPrimAtPath(path), enabled, overrides))
+    marked = _named_or_marked(stage, named)
+    return frozenset(path for path in marked if is_on(stage.GetPrimAtPath(path), enabled, overrides))
 
 
 def _named_or_marked(stage: Usd.Stage, named: Sequence[str]) -> list[Sdf.Path]:
@@ -127,7 +129,7 @@ def _named_or_marked(stage: Usd.Stage, named: Sequence[str]) -> list[Sdf.Path]:
     if named:
         return list(dict.fromkeys(path for item in named for path in find_paths(stage, item, BODIES)))
     marked = (prim for prim in traverse(stage) if _collides(prim) and not _hidden_level(prim))
-    return [each.GetPath() for prim in marked for each in _drawn(_below(prim, BODIES))]
+    return [body.GetPath() for prim in marked for body in _drawn(_below(prim, BODIES))]
 
 
 def purpose_notices(prims: Iterable[Usd.Prim], named: Sequence[str]) -> list[Notice]:
@@ -149,13 +151,13 @@ def disabled_colliders(
 
     Arguments are those of `find_colliders`.
     """
-    row, found = COLLIDER["collider:enabled"], {}
+    row, disabled = COLLIDER["collider:enabled"], {}
     for path in _named_or_marked(stage, [*wanted] or colliders_of(garments)):
         prim = stage.GetPrimAtPath(path)
         enabled = find_value(prim, row, overrides)
         if not enabled.at(None):
-            found[prim] = Notice(str(path), None, f"no collider, for {row.name} is off, by {enabled.source}")
-    return found
+            disabled[prim] = Notice(str(path), None, f"no collider, for {row.name} is off, by {enabled.source}")
+    return disabled
 
 
 def colliders_of(garments: Sequence[Usd.Prim]) -> list[str]:
@@ -200,7 +202,7 @@ def shown_level(root: Usd.Prim) -> Usd.Prim | None:
 
 def instance_roots(prim: Usd.Prim) -> tuple[Sdf.Path, ...]:
     """Instances containing a prim, outermost first; an override of the prim requires the instances to be editable."""
-    return tuple(each.GetPath() for each in reversed([*with_ancestors(prim)]) if each.IsInstance())
+    return tuple(ancestor.GetPath() for ancestor in reversed([*with_ancestors(prim)]) if ancestor.IsInstance())
 
 
 def traverse(stage: Usd.Stage) -> Iterator[Usd.Prim]:
@@ -214,23 +216,23 @@ def targets_of(prim: Usd.Prim, name: str) -> list[Sdf.Path]:
     return relationship.GetForwardedTargets() if relationship else []
 
 
-def with_gravity(units: Units, garments: Sequence[Usd.Prim], asked: str | None) -> Units:
+def with_gravity(units: Units, garments: Sequence[Usd.Prim], axis_option: str | None) -> Units:
     """Units with gravity along the requested axis, or along the axis authored on garments; unchanged without either.
 
     Args:
         units: The stage's units.
-        asked: One of `AXES`, or None.
+        axis_option: One of `AXES`, or None.
 
     Raises:
         SchemaError: An attribute is no axis, or two garments have different axes.
     """
-    if asked is not None:
-        return units.pulled(asked, GRAVITY_OPTION)
-    found = [(axis, source) for axis, source in (find_token(prim, GARMENT["gravity"]) for prim in garments) if axis]
-    if len({axis for axis, _ in found}) > 1:
-        listed = ", ".join(f"{source} is {axis}" for axis, source in dict.fromkeys(found))
+    if axis_option is not None:
+        return units.pulled(axis_option, GRAVITY_OPTION)
+    axes = [(axis, source) for axis, source in (find_token(prim, GARMENT["gravity"]) for prim in garments) if axis]
+    if len({axis for axis, _ in axes}) > 1:
+        listed = ", ".join(f"{source} is {axis}" for axis, source in dict.fromkeys(axes))
         raise SchemaError(f"{listed}: a shot has one gravity")
-    return units.pulled(*found[0]) if found else units
+    return units.pulled(*axes[0]) if axes else units
 
 
 def _collides(prim: Usd.Prim) -> bool:
@@ -253,34 +255,34 @@ def find_paths(stage: Usd.Stage, item: str, kinds: Kinds, *, drawn: bool = True)
     """
     pick = _drawn if drawn else list
     if _COLLECTION in item:  # Members only, not prims below: excluded prims stay out.
-        found = pick([prim for prim in _collection(stage, item) if _is_a(prim, kinds)])
+        members = pick([prim for prim in _collection(stage, item) if _is_a(prim, kinds)])
     elif any(letter in item for letter in "*?["):
         matching = (prim for prim in traverse(stage) if fnmatch.fnmatchcase(str(prim.GetPath()), item))
-        found = pick([prim for root in matching for prim in _below(root, kinds)])
+        members = pick([prim for root in matching for prim in _below(root, kinds)])
     else:
         named = [_at_path(stage, item)] if item.startswith("/") else _named(stage, item)
-        found = [prim for root in named for prim in pick(_below(root, kinds))]
-    if not found:
+        members = [prim for root in named for prim in pick(_below(root, kinds))]
+    if not members:
         raise AbsentError(f"{item!r} names no {' or '.join(kind.__name__ for kind in kinds)}; {_mesh_list(stage)}")
-    return [prim.GetPath() for prim in found]
+    return [prim.GetPath() for prim in members]
 
 
 def _named(stage: Usd.Stage, name: str) -> list[Usd.Prim]:
-    found = [prim for prim in traverse(stage) if prim.GetName() == name]
-    return [prim for prim in found if not _hidden_level(prim)] or found
+    same_name = [prim for prim in traverse(stage) if prim.GetName() == name]
+    return [prim for prim in same_name if not _hidden_level(prim)] or same_name
 
 
 def _below(root: Usd.Prim, kinds: Kinds) -> list[Usd.Prim]:
     """The prim itself if of the kinds, else all prims of the kinds below."""
     if _is_a(root, kinds):
         return [root]
-    found, prims = [], iter(Usd.PrimRange(root, TRAVERSAL))
+    inside, prims = [], iter(Usd.PrimRange(root, TRAVERSAL))
     for prim in prims:
         if _is_a(prim, kinds):
-            found.append(prim)
+            inside.append(prim)
             if UsdGeom.PointInstancer(prim):
                 prims.PruneChildren()
-    return found
+    return inside
 
 
 def _is_a(prim: Usd.Prim, kinds: Kinds) -> bool:
@@ -305,9 +307,9 @@ def _at_path(stage: Usd.Stage, item: str) -> Usd.Prim:
         "inside a prototype": prim.IsInPrototype(),
         "only an over, defined nowhere,": not prim.IsDefined(),
     }
-    found = [name for name, holds in states.items() if holds]
-    if found:
-        raise AbsentError(f"<{item}> is {found[0]} and does not exist for refining; {_mesh_list(stage)}")
+    conditions = [name for name, holds in states.items() if holds]
+    if conditions:
+        raise AbsentError(f"<{item}> is {conditions[0]} and does not exist for refining; {_mesh_list(stage)}")
     return prim
 
 
@@ -316,17 +318,17 @@ def _collection(stage: Usd.Stage, item: str) -> list[Usd.Prim]:
     path, name = item.split(_COLLECTION, 1)
     prim = _at_path(stage, path)
     collection = Usd.CollectionAPI.Get(prim, name)
-    names = [each.GetName() for each in Usd.CollectionAPI.GetAllCollections(prim)]
+    names = [collection.GetName() for collection in Usd.CollectionAPI.GetAllCollections(prim)]
     if name not in names:
         raise AbsentError(f"<{path}> has no collection {name!r}; collections: {', '.join(names) or 'none'}")
     included = collection.ComputeIncludedObjects(collection.ComputeMembershipQuery(), stage, TRAVERSAL)
-    return sorted((each for each in included if isinstance(each, Usd.Prim)), key=lambda each: each.GetPath())
+    return sorted((member for member in included if isinstance(member, Usd.Prim)), key=lambda member: member.GetPath())
 
 
 def _mesh_list(stage: Usd.Stage) -> str:
     meshes = list_meshes(stage)
-    more = f" and {len(meshes) - _SHOWN} more" if len(meshes) > _SHOWN else ""
-    return f"meshes: {', '.join(meshes[:_SHOWN]) or 'none'}{more}"
+    unlisted = f" and {len(meshes) - _SHOWN} more" if len(meshes) > _SHOWN else ""
+    return f"meshes: {', '.join(meshes[:_SHOWN]) or 'none'}{unlisted}"
 
 
 def read_apart(stage: Usd.Stage, garments: Sequence[Usd.Prim]) -> tuple[list[dict[Sdf.Path, str]], list[Notice]]:
@@ -339,9 +341,9 @@ def read_apart(stage: Usd.Stage, garments: Sequence[Usd.Prim]) -> tuple[list[dic
     """
     excluded, notices = [], []
     for prim in garments:
-        targets, odd = _excluded_by(stage, prim)
+        targets, new_notices = _excluded_by(stage, prim)
         excluded.append(targets)
-        notices += odd
+        notices += new_notices
     numbers = {prim.GetPath(): index for index, prim in enumerate(garments)}
     for garment, targets in zip(numbers, excluded, strict=True):
         targets.pop(garment, None)
@@ -351,8 +353,8 @@ def read_apart(stage: Usd.Stage, garments: Sequence[Usd.Prim]) -> tuple[list[dic
 
 
 def _excluded_by(stage: Usd.Stage, prim: Usd.Prim) -> tuple[dict[Sdf.Path, str], list[Notice]]:
-    """Gprims at and below the targets of one garment, each with its target."""
-    found: dict[Sdf.Path, str] = {}
+    """Gprims at and below the targets of a garment, each with the target."""
+    excluded: dict[Sdf.Path, str] = {}
     notices = []
     message = f"<{prim.GetPath()}>.{EXCLUDE}"
     for target in targets_of(prim, EXCLUDE):
@@ -362,5 +364,5 @@ def _excluded_by(stage: Usd.Stage, prim: Usd.Prim) -> tuple[dict[Sdf.Path, str],
             notices.append(Notice(str(prim.GetPath()), None, f"{EXCLUDE} excludes nothing by <{target}>: {error}"))
             continue
         for path in paths:
-            found.setdefault(path, message if path == target else f"{message} = <{target}>")
-    return found, notices
+            excluded.setdefault(path, message if path == target else f"{message} = <{target}>")
+    return excluded, notices

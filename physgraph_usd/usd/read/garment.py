@@ -1,4 +1,4 @@
-"""Reads one garment from its mesh prim."""
+"""Reads a garment from a mesh prim."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ class GarmentReader:
         values: Sources of the animated values.
         weld: The mesh as authored and as solved.
         notices: Warnings about the garment.
-        hidden: Time codes of its samples at which it is invisible.
+        hidden: Time codes of samples of the garment while invisible.
         motion: Acceleration of its cage; None for a still one.
     """
 
@@ -151,25 +151,27 @@ class GarmentReader:
 
     def contact_notices(self) -> list[Notice]:
         """A notice of a thickness, and an offset from bodies that it feels, large for the garment when it begins."""
-        found, time, most = [], next(iter(self.source.times), None), 1e3 * self.fitting
+        notices, time, most = [], next(iter(self.source.times), None), 1e3 * self.fitting
         for row in (GARMENT[name] for name in ("thickness", "contact:offset")[: 2 if self.garment.colliders else 1]):
-            value, kept = (1e3 * each for each in (self.values.number(row.short, time), self.kept(row.short, time)))
-            if kept < value:
-                found.append(f"{row.name} is taken as {kept:.2g} mm, not {value:g}; author it for another")
+            value, limited = (
+                1e3 * metres for metres in (self.values.number(row.short, time), self.kept(row.short, time))
+            )
+            if limited < value:
+                notices.append(f"{row.name} is taken as {limited:.2g} mm, not {value:g}; author it for another")
             elif value > _STANDS_OFF * most:
-                found.append(f"{row.name} of {value:.3g} mm hides its folds; at most {most:.2g} mm suits it")
-        small = f"its edges are of {1e3 * mean_edge(self.garment):.2g} mm: {'; '.join(found)}"
-        return [Notice(self.garment.path, None, small)] if found else []
+                notices.append(f"{row.name} of {value:.3g} mm hides its folds; at most {most:.2g} mm suits it")
+        small = f"its edges are of {1e3 * mean_edge(self.garment):.2g} mm: {'; '.join(notices)}"
+        return [Notice(self.garment.path, None, small)] if notices else []
 
 
-def samples_of(prim: Usd.Prim, own: Sequence[float], times: Sequence[float]) -> Samples:
+def samples_of(prim: Usd.Prim, own_times: Sequence[float], times: Sequence[float]) -> Samples:
     """Time codes of a garment's samples and of its solve, without time codes where the garment has no shape.
 
     Raises:
         GarmentError: When the garment has a shape at none of its own time codes.
     """
-    samples = Samples.of(prim, times, own)
-    if own and not samples.times:
+    samples = Samples.of(prim, times, own_times)
+    if own_times and not samples.times:
         time, reason = next(iter(samples.absent.items()))
         message, remedy = f"{reason}; it is there at no time code", "give it points and a scale other than zero"
         raise GarmentError(str(prim.GetPath()), message, time=time, remedy=remedy)
@@ -190,8 +192,8 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], samples: Samples, re
     matrix = to_metres(prim, request.units.metres, every[0] if every else None)
     animation = _animation(prim, points, request, every=samples.own, times=times)
     rest, weld = _rest_and_weld(prim, cage.mesh, animation, request, matrix=matrix)
-    (bent, odd), absent = rests_bent(prim), within(samples.absent, request.frames)
-    notices = [*samples.notices(str(prim.GetPath()), absent), *cage.notices, *odd, *placement]
+    (bent, bent_notices), absent = rests_bent(prim), within(samples.absent, request.frames)
+    notices = [*samples.notices(str(prim.GetPath()), absent), *cage.notices, *bent_notices, *placement]
     values = find_values(prim, request.units, request.overrides)
     constants, of_constants = _constants(prim, request)
     painted, cut = _painted(prim, weld, notices, values=values, overrides=request.overrides)
@@ -232,7 +234,11 @@ def _motion(
     def read(time: float) -> np.ndarray:
         return weld.joined(place(points.read(time)[0], to_metres(prim, metres, time)))
 
-    pace = {"frame": FrameGrid.of(stage).length, "seconds": 1.0 / stage.GetTimeCodesPerSecond()}
+    pace: dict[str, Any] = {
+        "edges": weld.mesh.half_edges.edges,
+        "frame": FrameGrid.of(stage).length,
+        "seconds": 1.0 / stage.GetTimeCodesPerSecond(),
+    }
     return CageMotion(times, read, **pace) if times else None
 
 
@@ -260,13 +266,13 @@ def _constants(prim: Usd.Prim, request: Request) -> tuple[dict[str, Any], dict[s
     self_contact, raises, level = (find_value(prim, GARMENT[name], request.overrides) for name in names)
     if request.level is not None and level.source != "--set":
         level = Found(level.row, "--level", None, request.level)
-    found = {
+    values = {
         "self_contact": bool(self_contact.at(None)),
         "raises_bending": bool(raises.at(None)),
         "level": round(level.at(None) or 0.0),
     }
-    each = zip(names, (self_contact, raises, level), strict=True)
-    return found, {name: value.source for name, value in each}
+    entries = zip(names, (self_contact, raises, level), strict=True)
+    return values, {name: value.source for name, value in entries}
 
 
 def _has_velocities(prim: Usd.Prim, count: int) -> bool:
@@ -280,12 +286,12 @@ def _pieces(
     prim: Usd.Prim, weld: Weld, rest: np.ndarray, subsets: dict[str, np.ndarray], notices: list[Notice]
 ) -> dict[str, Any]:
     """Closed pieces and rigid parts by field name; adds to the notices."""
-    asked = np.zeros(weld.mesh.face_count, bool)
+    rigid_faces = np.zeros(weld.mesh.face_count, bool)
     for name, faces in subsets.items():
         attribute = prim.GetChild(name).GetAttribute(RIGID)
-        asked[faces] |= bool(attribute and attribute.Get())
-    found, path = sort_pieces(weld.mesh, weld.joined(rest), asked), str(prim.GetPath())
-    if count := int(found.rigid.max(initial=-1)) + 1:
+        rigid_faces[faces] |= bool(attribute and attribute.Get())
+    pieces, path = sort_pieces(weld.mesh, weld.joined(rest), rigid_faces), str(prim.GetPath())
+    if count := int(pieces.rigid.max(initial=-1)) + 1:
         message = f"{counted(count, 'piece')} of it moved rigidly with the cloth under, as buttons are"
         notices.append(Notice(path, None, message))
     if weld.across is not None:
@@ -294,19 +300,19 @@ def _pieces(
             f"a closed shell, {thick:.2g} mm thick: the sheet in its middle is refined, and given its thickness again"
         )
         notices.append(Notice(path, None, message))
-    if found.closed.any():
+    if pieces.closed.any():
         message = "a closed shell: both skins are refined, and its sharp edges stay sharp; a sheet makes better folds"
         notices.append(Notice(path, None, message))
-    if found.joined:
+    if pieces.joined:
         message = f"{RIGID} is for pieces that share no vertices with cloth; paint bendScale to stiffen the others"
         notices.append(Notice(path, None, message))
-    return {"closed": found.closed if found.closed.any() else None, "rigid": found.rigid if count else None}
+    return {"closed": pieces.closed if pieces.closed.any() else None, "rigid": pieces.rigid if count else None}
 
 
 def _folds(prim: Usd.Prim, weld: Weld, animation: Animation) -> dict[str, Any]:
     """Creases, corners, pressed vertices and the pose with the pressed folds, by field name.
 
-    Creases are pressed folds, unless an artist says that they are not.
+    Creases are pressed folds unless marked otherwise by the artist.
     """
     poses = [weld.joined(pose) for pose in animation.poses.values()]
     creases, fields = np.zeros((0, 2), np.int64), dict[str, Any]()
@@ -319,8 +325,8 @@ def _folds(prim: Usd.Prim, weld: Weld, animation: Animation) -> dict[str, Any]:
             fields["corners"] = weld.largest(corners)
     pressed, flat = (_marked_edges(prim, weld, pressed=value) for value in (True, False))
     pressed = np.concatenate([pressed, creases[find_edges(flat, creases) < 0]])
-    found = pressed_folds(weld.mesh, poses, np.unique(pressed, axis=0), flat)
-    return fields if found is None else fields | {"pressed": found[0], "folded": found[1]}
+    folds = pressed_folds(weld.mesh, poses, np.unique(pressed, axis=0), flat)
+    return fields if folds is None else fields | {"pressed": folds[0], "folded": folds[1]}
 
 
 def _marked_edges(prim: Usd.Prim, weld: Weld, *, pressed: bool) -> np.ndarray:
@@ -342,7 +348,7 @@ def _words(prim: Usd.Prim, subsets: Sequence[str]) -> tuple[str, ...]:
     prims = [prim, prim.GetParent(), *bound_materials(prim)]
     for subset in (prim.GetChild(name) for name in subsets):
         prims += [subset, *bound_materials(subset)]
-    return tuple(word.lower() for each in prims for word in WORD.findall(each.GetName()))
+    return tuple(word.lower() for named_prim in prims for word in WORD.findall(named_prim.GetName()))
 
 
 def _rest_and_weld(
@@ -350,12 +356,12 @@ def _rest_and_weld(
 ) -> tuple[Rest, Weld]:
     """Rest shape as authored or fitted, and the weld of the borders coincident in the rest shape and over the shot."""
     poses = [*animation.poses.values()] or [animation.first]
-    if (found := weld_skins(mesh, poses)) is not None:
-        return _rest(prim, found.without_rims, animation, request, matrix=matrix), found
+    if (welded := weld_skins(mesh, poses)) is not None:
+        return _rest(prim, welded.without_rims, animation, request, matrix=matrix), welded
     within = seam_reach(mesh, poses[0], seam_tolerance(prim, request.overrides))
-    found = weld(mesh, poses, within)
-    rest = _rest(prim, found, animation, request, matrix=matrix)
-    return rest, found if found.is_none else weld(mesh, [*poses, rest.points], within)
+    welded = weld(mesh, poses, within)
+    rest = _rest(prim, welded, animation, request, matrix=matrix)
+    return rest, welded if welded.is_none else weld(mesh, [*poses, rest.points], within)
 
 
 def seam_tolerance(prim: Usd.Prim, overrides: Sequence[Override]) -> float:
@@ -385,8 +391,8 @@ def _painted(
     cut = ("easeScale", "gather", "grain")
     arrays = {}
     for name, short in (names | dict(zip(cut, cut, strict=True))).items():
-        arrays[name], odd = read_painted(prim, short, weld.apart.vertex_count, overrides=overrides)
-        notices.extend(odd)
+        arrays[name], new_notices = read_painted(prim, short, weld.apart.vertex_count, overrides=overrides)
+        notices.extend(new_notices)
     if find_value(prim, GARMENT["gather"], overrides).source == "--set":
         arrays["gather"] *= _at_open_borders(prim, weld)
     arrays["stretch_scale"] = arrays["stretch_scale"] * values.thickness_scale("stretchStiffness")
@@ -405,7 +411,7 @@ def _at_open_borders(prim: Usd.Prim, weld: Weld) -> np.ndarray:
 
 
 def _size_notices(prim: Usd.Prim, points: np.ndarray, matrix: np.ndarray, request: Request) -> list[Notice]:
-    """Notices of units: assumed ones, a size implausible for cloth, and layers with other units."""
+    """Notices of units: assumed units, a size implausible for cloth, and layers with different units."""
     notices, path = _unit_notices(prim, matrix, request), str(prim.GetPath())
     if request.assumed_units or not _SMALL <= float(np.ptp(points, axis=0).max()) <= _LARGE:
         notices.insert(0, Notice(path, None, f"{_measures(points, request.units.metres)}; check metersPerUnit"))
@@ -467,30 +473,30 @@ def read_painted(
         SchemaError: When the interpolation, type, number or limits of the values are wrong.
     """
     row = GARMENT[short]
-    found = find_value(prim, row, overrides)
-    if found.source == "--set":
-        return np.full(count, found.constant), ()
+    value = find_value(prim, row, overrides)
+    if value.source == "--set":
+        return np.full(count, value.constant), ()
     primvar = _primvar(prim, row.name.removeprefix("primvars:"))
     flat = flattened(primvar, Usd.TimeCode.EarliestTime()) if primvar else None
     if primvar is None or flat is None:
         return np.full(count, float(row.fallback or 0.0)), ()
     values = np.atleast_1d(np.asarray(flat))
-    where = f"<{prim.GetPath()}>.{primvar.GetAttr().GetName()}"
+    location = f"<{prim.GetPath()}>.{primvar.GetAttr().GetName()}"
     if values.ndim != 1 or not (np.issubdtype(values.dtype, np.number) or values.dtype == bool):
-        raise SchemaError(f"{where} is {type(flat).__name__}; author float[]")
+        raise SchemaError(f"{location} is {type(flat).__name__}; author float[]")
     values = values.astype(np.float64)
     interpolation = primvar.GetInterpolation()
     if len(values) == 1 and (interpolation not in _PER_VERTEX or count == 1):
         values = np.full(count, values[0])
     elif interpolation not in _PER_VERTEX or len(values) != count:
         message = f"{len(values)} values with {interpolation} interpolation on {count} points"
-        raise SchemaError(f"{where} has {message}; author one value per point (vertex) or one for all (constant)")
+        raise SchemaError(f"{location} has {message}; author one value per point (vertex) or one for all (constant)")
     notices: tuple[Notice, ...] = ()
     if row is GARMENT["pin"] and (values > 1.0).any():  # Painted weights may exceed 1 by rounding.
         message = f"{row.name} goes up to {values.max():g}; values over 1 are taken as 1"
         values, notices = np.minimum(values, 1.0), (Notice(str(prim.GetPath()), None, message),)
     for index in (int(values.argmin()), int(values.argmax())) if count else ():  # Both find NaN first.
-        check_limits(row, float(values[index]), f"{where}[{index}]")
+        check_limits(row, float(values[index]), f"{location}[{index}]")
     return values, notices
 
 

@@ -49,16 +49,16 @@ def read_grain(
         painted: Values of ``easeScale``, ``gather`` [%] and ``grain`` [degrees] at each point, each of shape (V,).
 
     Returns:
-        The grain, with the painted ease times `unevenness`, and where its direction comes from.
+        The grain, with the painted ease times `unevenness`, and the source of the direction.
     """
     mesh = weld.apart
     coordinates = _texture_coordinates(prim, mesh, kept)
-    found = None if coordinates is None else _along_v(mesh, rest, coordinates[1])
+    along = None if coordinates is None else _along_v(mesh, rest, coordinates[1])
     source = "the rest shape, downwards"
-    if coordinates is not None and found is not None:
+    if coordinates is not None and along is not None:
         source = f"v of primvars:{coordinates[0]}"
     normal = face_normals(mesh, rest)
-    warp = _down(normal, up) if found is None else found
+    warp = _down(normal, up) if along is None else along
     turn = np.radians(np.add.reduceat(painted["grain"][mesh.indices], mesh.starts[: mesh.face_count]) / mesh.counts)
     warp = np.cos(turn)[:, None] * warp + np.sin(turn)[:, None] * np.cross(normal, warp)
     if turn.any():
@@ -97,8 +97,8 @@ def _down(normal: np.ndarray, up: np.ndarray) -> np.ndarray:
 def _texture_coordinates(prim: Usd.Prim, mesh: PolygonMesh, kept: np.ndarray) -> tuple[str, np.ndarray] | None:
     """Name, and values at the kept faces' corners, shape (C, 2), of the first valid texture coordinates."""
     api = UsdGeom.PrimvarsAPI(prim)
-    every = [each.GetPrimvarName() for each in api.GetPrimvars() if "texCoord2" in str(each.GetTypeName())]
-    for name in dict.fromkeys([each for each in _NAMES if each in every] + every):
+    every = [primvar.GetPrimvarName() for primvar in api.GetPrimvars() if "texCoord2" in str(primvar.GetTypeName())]
+    for name in dict.fromkeys([preferred for preferred in _NAMES if preferred in every] + every):
         primvar = api.GetPrimvar(name)
         try:
             flat = flattened(primvar, Usd.TimeCode.EarliestTime())

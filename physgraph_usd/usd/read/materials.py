@@ -88,12 +88,12 @@ class Values:
     @property
     def sources(self) -> dict[str, str]:
         """The source of each value in words, by short name."""
-        return {name: found.source for name, found in self.found.items()}
+        return {name: value.source for name, value in self.found.items()}
 
     @property
     def animated(self) -> frozenset[str]:
         """Short names of the values with an animated source."""
-        return frozenset(name for name, found in self.found.items() if found.animated)
+        return frozenset(name for name, value in self.found.items() if value.animated)
 
     def fabric(self, time: float | None) -> Fabric:
         """Fabric at a time code, SI; SchemaError for an invalid value."""
@@ -117,7 +117,7 @@ class Values:
         The painted stretch multiplier also scales shear: the factor is used if both are derived from the thickness.
         """
         names = ("bendStiffness",) if name == "bendStiffness" else ("stretchStiffness", "shearStiffness")
-        if self.thickness is None or not all(self.found[each].compute for each in names):
+        if self.thickness is None or not all(self.found[short].compute for short in names):
             return 1.0
         return self.thickness ** (3 if name == "bendStiffness" else 1)
 
@@ -129,40 +129,42 @@ class Values:
 def find_values(prim: Usd.Prim, units: Units, overrides: Sequence[Override]) -> Values:
     """Find the source of every fabric value, the guide's stiffness and the detail's gain.
 
-    What neither the garment nor its materials give is that of the materials of most of its faces.
+    Values given by neither the garment nor the garment's materials come from the materials of most faces.
     """
     return values_by(prim, prim, _materials_of_most(prim), units=units, overrides=overrides)
 
 
 def _materials_of_most(prim: Usd.Prim) -> list[Usd.Prim]:
-    """Materials bound to a garment, then those bound to most of its faces by subsets."""
+    """Materials bound to a garment, then materials bound to most of the garment's faces by subsets."""
     bound, counts = bound_materials(prim), Counter[tuple[Usd.Prim, ...]]()
-    left = len(first_value(UsdGeom.Mesh(prim).GetFaceVertexCountsAttr()) or ())
+    uncovered = len(first_value(UsdGeom.Mesh(prim).GetFaceVertexCountsAttr()) or ())
     for subset in UsdGeom.Subset.GetGeomSubsets(UsdGeom.Imageable(prim), UsdGeom.Tokens.face):
-        own = tuple(each for each in bound_materials(subset.GetPrim()) if each not in bound)
-        size = len(subset.GetIndicesAttr().Get(Usd.TimeCode.EarliestTime()) or ()) if own else 0
-        counts[own] += size
-        left -= size
+        subset_materials = tuple(material for material in bound_materials(subset.GetPrim()) if material not in bound)
+        size = len(subset.GetIndicesAttr().Get(Usd.TimeCode.EarliestTime()) or ()) if subset_materials else 0
+        counts[subset_materials] += size
+        uncovered -= size
     most, count = counts.most_common(1)[0] if counts else ((), 0)
-    return [*bound, *(most if count > left else ())]
+    return [*bound, *(most if count > uncovered else ())]
 
 
 def values_by(
     prim: Usd.Prim, mesh: Usd.Prim, materials: Sequence[Usd.Prim], *, units: Units, overrides: Sequence[Override] = ()
 ) -> Values:
     """Fabric values of a garment or a subset of faces; the first material with a value gives the value."""
-    found = {name: find_value(prim, GARMENT[name], overrides, materials=materials) for name in _FRAME_VALUES}
-    open_rows = [name for name in _FRAME_VALUES if found[name].source == "fallback"]
+    values_by_name = {name: find_value(prim, GARMENT[name], overrides, materials=materials) for name in _FRAME_VALUES}
+    open_rows = [name for name in _FRAME_VALUES if values_by_name[name].source == "fallback"]
     relative, notices = None, ()
     if "thickness" in open_rows and (thick := read_thickness(mesh, materials, GARMENT["thickness"], units=units)):
-        found["thickness"], relative, notices = thick
+        values_by_name["thickness"], relative, notices = thick
     for name in STIFFNESSES:
         if name in open_rows:
-            found[name] = stiffness(materials, GARMENT[name], found["thickness"], units=units) or found[name]
+            values_by_name[name] = (
+                stiffness(materials, GARMENT[name], values_by_name["thickness"], units=units) or values_by_name[name]
+            )
     volume = density(materials, GARMENT["density"], units) if "density" in open_rows else None
     if volume is not None:
-        found["density"] = volume
-    return Values(found, volume is not None, relative, notices)
+        values_by_name["density"] = volume
+    return Values(values_by_name, volume is not None, relative, notices)
 
 
 def has_value(attribute: Usd.Attribute | None) -> bool:
@@ -217,7 +219,7 @@ def is_elastic(material: Usd.Prim) -> bool:
 def _from_youngs(material: Usd.Prim, row: Property, thickness: Found, *, units: Units) -> Found:
     """A stiffness by the formulas at the top of this file."""
     attributes = (authored(material, YOUNGS), authored(material, POISSONS))
-    modulus, ratio = (each if has_value(each) else None for each in attributes)
+    modulus, ratio = (attribute if has_value(attribute) else None for attribute in attributes)
     per_pascal = units.kilograms / units.metres
 
     def compute(time: float | None) -> float:
@@ -234,32 +236,34 @@ def _from_youngs(material: Usd.Prim, row: Property, thickness: Found, *, units: 
         return sheet
 
     source = source_name(modulus) if modulus is not None else f"<{material.GetPath()}>: fallback of {YOUNGS}, 1e6 Pa"
-    animated = thickness.animated or any(each.ValueMightBeTimeVarying() for each in (modulus, ratio) if each)
+    animated = thickness.animated or any(
+        attribute.ValueMightBeTimeVarying() for attribute in (modulus, ratio) if attribute
+    )
     return Found(row, f"{source}, with the thickness", compute=compute, varies=animated)
 
 
 def _on_mesh(prim: Usd.Prim, attribute: Usd.Attribute, row: Property, *, units: Units) -> Thickness:
-    code, where = Usd.TimeCode.EarliestTime(), source_name(attribute)
+    code, source = Usd.TimeCode.EarliestTime(), source_name(attribute)
     values = np.asarray(attribute.Get(code))
     if values.ndim != 1 or not np.issubdtype(values.dtype, np.number):
-        raise SchemaError(f"{where} is {attribute.GetTypeName()}; author float[]")
+        raise SchemaError(f"{source} is {attribute.GetTypeName()}; author float[]")
     values = values.astype(np.float64)
     mesh = UsdGeom.Mesh(prim)
     topology = (mesh.GetFaceVertexCountsAttr(), mesh.GetFaceVertexIndicesAttr())
-    counts, indices = (np.asarray(first_value(each)) for each in topology)
+    counts, indices = (np.asarray(first_value(attribute)) for attribute in topology)
     count = len(first_value(mesh.GetPointsAttr()) or ())
     element = prim.GetAttribute(f"{THICKNESSES}:elementType").Get()
     expected = {"constant": 1, "face": len(counts), "point": count}.get(str(element))
     if len(values) != expected:
         message = f"{len(values)} values, and {THICKNESSES}:elementType is {element!r}"
         message += f", which takes {expected or 'none'}; author constant (one), face or point"
-        raise SchemaError(f"{where} has {message}")
+        raise SchemaError(f"{source} has {message}")
     for index in (int(values.argmin()), int(values.argmax())):
-        check_limits(row, float(values[index]) * units.metres, f"{where}[{index}]")
+        check_limits(row, float(values[index]) * units.metres, f"{source}[{index}]")
     mean = float(values.mean())
-    found = Found(row, where if len(values) == 1 else f"{where}, mean of {len(values)}", None, mean * units.metres)
+    result = Found(row, source if len(values) == 1 else f"{source}, mean of {len(values)}", None, mean * units.metres)
     if values.min() == values.max():
-        return found, None, ()
+        return result, None, ()
     if element == "face":
         faces = np.bincount(indices, minlength=count)
         sums = np.bincount(indices, np.repeat(values, counts), minlength=count)
@@ -267,4 +271,4 @@ def _on_mesh(prim: Usd.Prim, attribute: Usd.Attribute, row: Property, *, units: 
     low, high = 1e3 * values.min() * units.metres, 1e3 * values.max() * units.metres
     message = f"{THICKNESSES} goes from {low:.3g} to {high:.3g} mm: stiffnesses derived from {YOUNGS} follow it,"
     notice = Notice(str(prim.GetPath()), None, f"{message} contact and mass take the mean")
-    return found, values / mean, (notice,)
+    return result, values / mean, (notice,)

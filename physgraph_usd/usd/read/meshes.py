@@ -32,7 +32,7 @@ NEUTRAL = (0.55, 0.54, 0.52)
 
 @dataclass(frozen=True, eq=False)
 class DrawnMesh:
-    """One visible mesh at one time.
+    """A visible mesh at a time code.
 
     Polygons are drawn as renderers draw them, and as the solver solves refined cloth: as fans from the first corner.
 
@@ -65,14 +65,14 @@ class DrawnMesh:
 
     def subdivided(self, faces: int) -> DrawnMesh:
         """Smooth subdivision into at least ``faces`` polygons; coincident vertices are merged."""
-        places, label = np.unique(self.points, axis=0, return_inverse=True)
-        mesh = PolygonMesh(self.mesh.counts, label.reshape(-1)[self.mesh.indices], len(places))
-        found = replace(self, points=places, mesh=mesh)
-        while 0 < found.mesh.face_count < faces:
-            step = subdivide(found.mesh)
-            points = smooth(found.mesh, step) @ found.points
-            found = replace(found, points=points, mesh=step.mesh, face_colors=found.face_colors[step.parent_face])
-        return found
+        positions, label = np.unique(self.points, axis=0, return_inverse=True)
+        mesh = PolygonMesh(self.mesh.counts, label.reshape(-1)[self.mesh.indices], len(positions))
+        merged = replace(self, points=positions, mesh=mesh)
+        while 0 < merged.mesh.face_count < faces:
+            step = subdivide(merged.mesh)
+            points = smooth(merged.mesh, step) @ merged.points
+            merged = replace(merged, points=points, mesh=step.mesh, face_colors=merged.face_colors[step.parent_face])
+        return merged
 
 
 class DrawnStage:
@@ -111,14 +111,14 @@ class DrawnStage:
 
         Under a refined layer, only time codes from its first to its last sample: outside, the layer holds still.
         """
-        found: list[Iterable[float]] = []
+        times: list[Iterable[float]] = []
         for prim in traverse(self.stage):
             if (UsdGeom.Mesh(prim) and not paths) or str(prim.GetPath()) in paths:
-                found.append(motion_of(prim).times)
+                times.append(motion_of(prim).times)
             elif animation := UsdSkel.Animation(prim):
                 for attribute in (animation.GetRotationsAttr(), animation.GetTranslationsAttr()):
-                    found.append(attribute.GetTimeSamples())
-        return within(merge(*found), (self._refined[0], self._refined[-1]) if self._refined else None)
+                    times.append(attribute.GetTimeSamples())
+        return within(merge(*times), (self._refined[0], self._refined[-1]) if self._refined else None)
 
     def bake(self, times: tuple[float, ...]) -> None:
         """Skin the skinned meshes at the given times, in an anonymous layer of the session."""
@@ -164,15 +164,15 @@ class DrawnStage:
     def _surface(self, mesh: UsdGeom.Mesh, polygons: PolygonMesh, points: np.ndarray, scale: float) -> DrawnSurface:
         """A mesh's faces as drawn; cached while the topology stays the same."""
         path = str(mesh.GetPath())
-        known = self._surfaces.get(path)
-        if known is None or not (
-            np.array_equal(known[0].counts, polygons.counts) and np.array_equal(known[0].indices, polygons.indices)
+        cached = self._surfaces.get(path)
+        if cached is None or not (
+            np.array_equal(cached[0].counts, polygons.counts) and np.array_equal(cached[0].indices, polygons.indices)
         ):
             holes = np.asarray(mesh.GetHoleIndicesAttr().Get() or [], np.int64)
             within, levels = DRAWN_WITHIN / (scale * self._scale), 1 if path in self._fine else None
-            found = surface_of(mesh.GetPrim(), polygons, points, holes=holes, within=within, levels=levels)
-            known = self._surfaces[path] = polygons, found
-        return known[1]
+            surface = surface_of(mesh.GetPrim(), polygons, points, holes=holes, within=within, levels=levels)
+            cached = self._surfaces[path] = polygons, surface
+        return cached[1]
 
 
 def upright(up: np.ndarray) -> np.ndarray:
@@ -205,8 +205,8 @@ def limit_of(shot: Shot, index: int, levels: int) -> sparse.csr_matrix | None:
 def _gravity_of(layer: Sdf.Layer) -> str | None:
     """The gravity axis in a refined layer's recorded options; None if not set."""
     options = (read_record(layer) or {}).get("options")
-    asked = options.get("gravity") if isinstance(options, dict) else None
-    return asked if asked in AXES else None
+    recorded = options.get("gravity") if isinstance(options, dict) else None
+    return recorded if recorded in AXES else None
 
 
 def shot_of(layer: Path) -> Path | None:
@@ -242,9 +242,9 @@ def _read(
     if surface is not None and matrix[:3, :3].any():
         drawn = surface(mesh, polygons, positions, float(np.linalg.norm(matrix[:3, :3], 2)))
         polygons, positions, colors = drawn.mesh, drawn.place(positions), colors[drawn.parents]
-    left = mesh.GetOrientationAttr().Get(code) == "leftHanded"
+    is_left_handed = mesh.GetOrientationAttr().Get(code) == "leftHanded"
     # Use the determinant's sign only: the cube of a scale can overflow.
-    if left != (np.linalg.slogdet(matrix[:3, :3])[0] < 0):
+    if is_left_handed != (np.linalg.slogdet(matrix[:3, :3])[0] < 0):
         polygons = replace(polygons, indices=polygons.indices[polygons.mirrored_corners])
     return DrawnMesh(str(mesh.GetPath()), positions, polygons, colors, len(points))
 
@@ -266,9 +266,9 @@ def _colors(mesh: UsdGeom.Mesh, code: Usd.TimeCode, faces: int) -> np.ndarray:
     if shown:
         values = np.asarray(shown, dtype=float)
         colors[:] = values if len(values) == faces else values.mean(axis=0)
-    whole = _material_color(mesh.GetPrim())
-    if whole is not None:
-        colors[:] = whole
+    material_color = _material_color(mesh.GetPrim())
+    if material_color is not None:
+        colors[:] = material_color
     for subset in UsdShade.MaterialBindingAPI(mesh).GetMaterialBindSubsets():
         color = _material_color(subset.GetPrim())
         members = np.asarray(subset.GetIndicesAttr().Get(code) or [], dtype=int)
@@ -304,12 +304,12 @@ class RefinedLayer:
         if layer is None or record is None:
             raise LayerError(f"{path} is no refined layer")
         self._layer = layer
-        self.targets = tuple(str(each) for each in record.get("garments", ()))
+        self.targets = tuple(str(path) for path in record.get("garments", ()))
 
     def target(self, shot: Shot, index: int) -> str | None:
         """Path of a garment's fine mesh by number; None if the layer does not contain the garment."""
         coarse = str(shot.sources[index].path)
-        return next((each for each in self.targets if each in (coarse, f"{coarse}_refined")), None)
+        return next((target for target in self.targets if target in (coarse, f"{coarse}_refined")), None)
 
     def points(self, shot: Shot, index: int, time: float | None) -> np.ndarray | None:
         """World positions [m] of a garment's fine mesh by number, shape (V, 3), or None without a sample."""

@@ -13,6 +13,10 @@ from ..times import SAME_TIME
 
 MOST = 3
 """Most frames whose accelerations are compared."""
+STANDS = 1e-4
+"""Motion in a frame below which a cage stands still [m]."""
+ROUNDS = 4
+"""Number of times that vertices take the mean of themselves and their neighbours."""
 FRAMES = 2
 """Frames from a time code to the samples before and after."""
 _KEPT = 2 * FRAMES + 4
@@ -25,20 +29,28 @@ class CageMotion:
     It comes from the nearest samples at least two frames before and after, in which what alternates from frame to
     frame cancels out. Of the accelerations of three frames in a row each vertex takes the one nearest to the others:
     a single broken sample has no effect. At the shot's ends these are the nearest frames with samples on both sides.
+    Then each vertex takes the mean over its surroundings: what single vertices of a cage do is no motion of the cloth.
     """
 
     def __init__(
-        self, times: Sequence[float], read: Callable[[float], np.ndarray], *, frame: float, seconds: float
+        self,
+        times: Sequence[float],
+        read: Callable[[float], np.ndarray],
+        *,
+        edges: np.ndarray,
+        frame: float,
+        seconds: float,
     ) -> None:
         """Take the time codes of the garment's samples, also those that are not solved.
 
         Args:
             times: Time codes with a shape, in any order.
             read: Gives the cage's positions in world space at a time code [m], shape (V, 3).
+            edges: Edges of the cage, shape (E, 2).
             frame: Length of a frame in time codes.
             seconds: Length of a time code [s].
         """
-        self._times, self._read = sorted(times), read
+        self._times, self._read, self._edges = sorted(times), read, edges
         self._frame, self._seconds = frame, seconds
         self._known: dict[float, np.ndarray] = {}
 
@@ -51,9 +63,19 @@ class CageMotion:
         if time is None:
             return None
         self._keep(time, points)
+        if self._stands(time, points):
+            return None
         found = [self._acceleration(*three) for three in self._around(time)]
         known = [each for each in found if each is not None]
-        return felt(_agreed(known)) if known else None
+        return felt(self._mean(_agreed(known))) if known else None
+
+    def _stands(self, time: float, points: np.ndarray) -> bool:
+        """Whether the cage is where it was a frame before: it may have stopped since the samples before that."""
+        before = self._beside(time, -self._frame)
+        try:
+            return before is not None and float(np.abs(points - self._at(before)).max(initial=0.0)) < STANDS
+        except GarmentError:
+            return False
 
     def _around(self, time: float) -> list[tuple[float, float, float]]:
         """Time codes before, at and after each of up to three frames: this one and those around it."""
@@ -82,6 +104,17 @@ class CageMotion:
         except GarmentError:  # A broken sample beside this one has its own error, at its own time code.
             return None
         return acceleration_of(poses, [each * self._seconds for each in three])
+
+    def _mean(self, field: np.ndarray) -> np.ndarray:
+        """A field with the mean over the neighbours mixed in, `ROUNDS` times, shape (V, 3)."""
+        count, (one, other) = len(field), self._edges.T
+        neighbours = np.bincount(self._edges.ravel(), minlength=count)[:, None]
+        for _ in range(ROUNDS):
+            gathered = [
+                np.bincount(one, field[other, k], count) + np.bincount(other, field[one, k], count) for k in range(3)
+            ]
+            field = np.where(neighbours > 0, 0.5 * (field + np.stack(gathered, 1) / np.maximum(neighbours, 1)), field)
+        return field
 
     def _at(self, time: float) -> np.ndarray:
         return self._known[time] if time in self._known else self._keep(time, self._read(time))

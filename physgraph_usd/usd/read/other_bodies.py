@@ -1,4 +1,4 @@
-"""Finds bodies of a stage that are neither garments nor colliders, and the frames in which they may touch cloth."""
+"""Finds bodies other than garments and colliders on a stage, and the frames of possible contact with cloth."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class OtherBody:
     Attributes:
         why: Reason for no contact, or "".
         unread: Type of a prim whose shape is not read, or "".
-        frames: Numbers of the frames in which its bounds meet the cloth's.
+        frames: Numbers of the frames in which the body's bounds meet the cloth's.
         pose: Its pose in a frame by number; a shape that is not read has points and no exact triangles.
         hull: Points in a frame by number whose convex hull contains the shape [m], shape (N, 3). Between two frames no
             point of the shape moves farther than one of these.
@@ -66,27 +66,27 @@ def other_bodies(shot: Shot, times: Sequence[float | None], boxes: Sequence[Box]
     """
     in_shot = {*shot.colliders, *(garment.path for garment in shot.scene.garments)}
     in_shot |= {path for source in shot.sources for path in source.apart_from}
-    in_shot |= {str(each.path) for each in shot.bound}
+    in_shot |= {str(target.path) for target in shot.bound}
     with pxr_errors(f"cannot read {shot.path}"), quiet():
         unfit = {prim: _why_left(prim, times) for prim in _bodies(shot.stage) if str(prim.GetPath()) not in in_shot}
-        prims = [prim for prim, why in unfit.items() if not why]
+        prims = [prim for prim, reason in unfit.items() if not reason]
         skinned = _Skinning(shot, [prim.GetPath() for prim in prims if _is_skinned(prim)])
         posed = zip(shot.scene.colliders, shot.frame(times[0]).colliders, strict=True) if prims else ()
         seen = [(collider.path, pose) for collider, pose in posed]
         near = np.stack([np.min([box[0] for box in boxes], axis=0), np.max([box[1] for box in boxes], axis=0)])
-        for prim, why in unfit.items():
+        for prim, reason in unfit.items():
             path = str(prim.GetPath())
-            found = OtherBody(path, why) if why else _body(prim, shot, times, skinned=skinned, near=near)
-            if why or found is None:
-                yield found or OtherBody(path)
+            body = OtherBody(path, reason) if reason else _body(prim, shot, times, skinned=skinned, near=near)
+            if reason or body is None:
+                yield body or OtherBody(path)
                 continue
-            found = replace(found, frames=[k for k, box in enumerate(boxes) if _meets(found.hull(k), box)])
-            if found.frames and not found.unread:
-                first = found.pose(0)
-                copied = next((other for other, pose in seen if _same_place(first, pose)), "")
+            body = replace(body, frames=[k for k, box in enumerate(boxes) if _meets(body.hull(k), box)])
+            if body.frames and not body.unread:
+                first = body.pose(0)
+                copied = next((original for original, pose in seen if _same_place(first, pose)), "")
                 seen.append((path, first))
-                found = OtherBody(path, f"a copy of <{copied}>") if copied else found
-            yield found
+                body = OtherBody(path, f"a copy of <{copied}>") if copied else body
+            yield body
 
 
 def _bodies(stage: Usd.Stage) -> Iterator[Usd.Prim]:
@@ -102,7 +102,7 @@ def _bodies(stage: Usd.Stage) -> Iterator[Usd.Prim]:
 def _body(
     prim: Usd.Prim, shot: Shot, times: Sequence[float | None], *, skinned: _Skinning, near: Box
 ) -> OtherBody | None:
-    """A visible body; None for an instancer whose prototypes have no shapes that are read."""
+    """A visible body; None for an instancer without readable shapes in the prototypes."""
     metres, path, kind = shot.metres_per_unit, prim.GetPath(), kind_of(prim)
     reader = ColliderReader(prim, Collider(str(path), kind or "mesh"), metres)
     if kind == "instancer":
@@ -138,9 +138,9 @@ def _moves(prim: Usd.Prim, reader: ColliderReader) -> bool:
     shapes = [prim, *(part.prim for part in reader.parts.values())]
     times = set[float]()
     for shape in shapes:
-        times |= {time for each in shape.GetAuthoredAttributes() for time in each.GetTimeSamples()}
+        times |= {time for attribute in shape.GetAuthoredAttributes() for time in attribute.GetTimeSamples()}
         times |= {*motion_of(shape).times}
-    return len(times) > 1 or any(visibility_varies(each) for each in shapes)
+    return len(times) > 1 or any(visibility_varies(shape) for shape in shapes)
 
 
 def _points(prim: Usd.Prim, metres: float, time: float | None) -> np.ndarray:
@@ -152,7 +152,7 @@ def _points(prim: Usd.Prim, metres: float, time: float | None) -> np.ndarray:
 
 
 def _rough(prim: Usd.Prim, metres: float, time: float | None) -> Pose:
-    """Points of a shape that is not read, or else corners of its bounds; and triangles of a control net, or none."""
+    """Points of an unread shape, or corners of the shape's bounds; and triangles of a control net, or none."""
     triangles = np.zeros((0, 3), np.int32)
     if UsdGeom.PointBased(prim):
         points = _points(prim, metres, time)
@@ -160,7 +160,7 @@ def _rough(prim: Usd.Prim, metres: float, time: float | None) -> Pose:
         shape = (net.GetVVertexCountAttr().Get() or 0, net.GetUVertexCountAttr().Get() or 0) if net else (0, 0)
         if np.prod(shape) == len(points) and min(shape) > 1:
             ids = np.arange(len(points), dtype=np.int32).reshape(shape)
-            a, b, c, d = (each.ravel() for each in (ids[:-1, :-1], ids[:-1, 1:], ids[1:, 1:], ids[1:, :-1]))
+            a, b, c, d = (corner.ravel() for corner in (ids[:-1, :-1], ids[:-1, 1:], ids[1:, 1:], ids[1:, :-1]))
             triangles = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
         return Pose(points, triangles)
     bound = UsdGeom.BBoxCache(timecode(time), _PURPOSES).ComputeWorldBound(prim).ComputeAlignedRange()
@@ -173,13 +173,13 @@ def _rough(prim: Usd.Prim, metres: float, time: float | None) -> Pose:
 
 def _why_left(prim: Usd.Prim, times: Sequence[float | None]) -> str:
     """The reason for no contact with a body: a deciding schema, the purpose or the visibility; or ""."""
-    for each in with_ancestors(prim):
-        if mark := next((mark for mark in MARKS if has_schema(each, mark)), None):
-            return f"{mark} on <{each.GetPath()}> marks it, and this run does not have it"
+    for ancestor in with_ancestors(prim):
+        if mark := next((mark for mark in MARKS if has_schema(ancestor, mark)), None):
+            return f"{mark} on <{ancestor.GetPath()}> marks it, and this run does not have it"
     if reason := why_not_drawn(prim):
         return f"{reason}, which no final render shows"
-    known = [time for time in times if time is not None]
-    visible = is_visible(prim, known if visibility_varies(prim) else known[:1])
+    codes = [time for time in times if time is not None]
+    visible = is_visible(prim, codes if visibility_varies(prim) else codes[:1])
     return "" if visible else "invisible"
 
 
@@ -200,7 +200,7 @@ def _same_place(a: Pose | None, b: Pose | None) -> bool:
 
 
 class _Skinning:
-    """Meshes that are no colliders, as UsdSkel skins them at single time codes."""
+    """Meshes other than colliders, skinned by UsdSkel at single time codes."""
 
     def __init__(self, shot: Shot, paths: Sequence[Sdf.Path]) -> None:
         """Find the skeletons of the meshes."""

@@ -80,6 +80,8 @@ def is_flipped(prim: Usd.Prim, matrix: np.ndarray) -> bool:
 def check_placement(prim: Usd.Prim, metres: float, times: Sequence[float]) -> tuple[Notice, ...]:
     """A notice of a switch in mirroring; GarmentError for an invalid transform."""
     mirrored = [bool(np.linalg.det(to_metres(prim, metres, time)[:3, :3]) < 0) for time in times]
-    switches = [time for time, now, then in zip(times[1:], mirrored[1:], mirrored, strict=False) if now != then]
+    switches = [
+        time for time, current, previous in zip(times[1:], mirrored[1:], mirrored, strict=False) if current != previous
+    ]
     message = "its transform starts or stops mirroring here; the winding of its first time code is used throughout"
     return tuple(Notice(str(prim.GetPath()), time, message) for time in switches[:1])

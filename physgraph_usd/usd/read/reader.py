@@ -70,7 +70,7 @@ from .targets import Bound, Target, find_bound, points_attribute, read_targets
 from .timing import timing_notices
 
 _MARK = "physgraph:refined"
-"""Attribute authored for a moment on a garment, to find the prims that it reaches."""
+"""Attribute authored temporarily on a garment, to find the prims sharing the garment's opinions."""
 
 
 class Shot:
@@ -85,7 +85,7 @@ class Shot:
         sources: Place of each garment on the stage, in the scene's order.
         colliders: Paths of the collider prims found.
         selections: Active variant selections the garments depend on, as paths `/World/coat{fit=loose}`.
-        bound: Prims that are to follow the garments; `targets` reads them.
+        bound: Prims following the garments, read by `targets`.
         warnings: Warnings for the user; grows as frames are read.
         metres_per_unit: Length of one stage unit [m].
         gravity_source: Source of gravity's direction, in words.
@@ -149,21 +149,21 @@ class Shot:
     def composed_from(self, path: Sdf.Path) -> list[Usd.Prim]:
         """Other meshes that get the opinions at a prim's path, by references, payloads, inherits or specializes."""
         layer = self._request.bake.layer
-        made = layer.GetPrimAtPath(path) is None
+        is_new = layer.GetPrimAtPath(path) is None
         spec = Sdf.CreatePrimInLayer(layer, path)
         mark = Sdf.AttributeSpec(spec, _MARK, Sdf.ValueTypeNames.Bool)
         meshes = (prim for prim in traverse(self.stage) if prim.GetPath() != path and UsdGeom.Mesh(prim))
-        found = [prim.GetPath() for prim in meshes if prim.HasAttribute(_MARK)]
+        paths = [prim.GetPath() for prim in meshes if prim.HasAttribute(_MARK)]
         spec.RemoveProperty(mark)
-        if made:
+        if is_new:
             edit = Sdf.BatchNamespaceEdit()
             edit.Add(path, Sdf.Path.emptyPath)
             layer.Apply(edit)
-        return [self.stage.GetPrimAtPath(each) for each in found]
+        return [self.stage.GetPrimAtPath(path) for path in paths]
 
     @cached_property
     def targets(self) -> list[Target]:
-        """Prims that follow the garments, in the bind pose, each after the prim that it is bound to.
+        """Prims following the garments, in the bind pose, each after the followed prim.
 
         Raises:
             GarmentError: A target lies too far from its garment, changes its topology, or cannot be placed.
@@ -173,9 +173,15 @@ class Shot:
         # The first sample of the whole shot: the pose must not depend on the frame range.
         firsts = [min((*source.times, *source.left_out), default=None) for source in self.sources]
         garments = [(source.path, garment.mesh, first) for (source, garment), first in zip(pairs, firsts, strict=True)]
-        given = {"metres": self.metres_per_unit, "skinned": [*self._request.bake.skinned]}
         with pxr_errors(f"cannot read {self.path}"):
-            return read_targets(self.stage, self.bound, garments, cage=self.cage, **given)
+            return read_targets(
+                self.stage,
+                self.bound,
+                garments,
+                cage=self.cage,
+                metres=self.metres_per_unit,
+                skinned=[*self._request.bake.skinned],
+            )
 
     def times_until(self, last: float) -> list[float]:
         """Time codes with a sample of any garment, including outside the frame range, up to ``last``, in order."""
@@ -199,14 +205,14 @@ class Shot:
         with pxr_errors(f"cannot read {self.path}" + at_time(time)):
             for index, reader in enumerate(self._readers):
                 prim = self.stage.GetPrimAtPath(self.sources[index].path)
-                garment, odd = reader.frame(prim, self.metres_per_unit, time)
+                garment, new_notices = reader.frame(prim, self.metres_per_unit, time)
                 garments.append(garment)
-                notices += odd
+                notices += new_notices
             poses = []
             for body in self._bodies:
-                pose, odd = body.pose(time)
+                pose, new_notices = body.pose(time)
                 poses.append(pose)
-                notices += odd
+                notices += new_notices
         earlier = set(self.warnings) if notices else set()
         self.warnings.extend(notice for notice in dict.fromkeys(notices) if notice not in earlier)
         frame = Frame(time, tuple(garments), tuple(poses))
@@ -233,20 +239,20 @@ class Shot:
         Raises:
             UsageError: When a text is invalid, or has no matching garment.
         """
-        asked = parse_overrides(overrides)
-        check_overrides(asked, [source.path for source in self.sources], [Sdf.Path(path) for path in self.colliders])
-        other = copy(self)
-        found = [
-            find_values(self.stage.GetPrimAtPath(source.path), self._request.units, asked) for source in self.sources
+        parsed = parse_overrides(overrides)
+        check_overrides(parsed, [source.path for source in self.sources], [Sdf.Path(path) for path in self.colliders])
+        changed = copy(self)
+        lookups = [
+            find_values(self.stage.GetPrimAtPath(source.path), self._request.units, parsed) for source in self.sources
         ]
-        other._readers = tuple(
-            replace(reader, values=values) for reader, values in zip(self._readers, found, strict=True)
+        changed._readers = tuple(
+            replace(reader, values=values) for reader, values in zip(self._readers, lookups, strict=True)
         )
-        other.sources = tuple(
+        changed.sources = tuple(
             replace(source, sources=source.sources | values.sources, animated=values.animated)
-            for source, values in zip(self.sources, found, strict=True)
+            for source, values in zip(self.sources, lookups, strict=True)
         )
-        return other
+        return changed
 
     def close(self) -> None:
         """Release the stage; nothing can be read afterwards."""
@@ -294,7 +300,7 @@ def open_shot(
         GarmentError: When a garment is broken.
         SchemaError: When an attribute is invalid.
     """
-    asked = parse_overrides(overrides)
+    parsed = parse_overrides(overrides)
     _check_options(frames, level, rest_frame)
     source = shot if isinstance(shot, Usd.Stage) else os.fspath(shot)
     path = shot_name(source)
@@ -308,49 +314,48 @@ def open_shot(
         prims = _find(stage, garments, notices)
         refuse_refined(stage, [prim.GetPath() for prim in prims])
         bound = find_bound(stage, prims, bind)
-        found = find_colliders(stage, prims, colliders, without=[each.path for each in bound], overrides=asked)
-        disabled = disabled_colliders(stage, prims, colliders, overrides=asked)
-        check_overrides(asked, *([prim.GetPath() for prim in each] for each in (prims, [*found, *disabled])))
-        for prim in (*prims, *found):
+        bodies = find_colliders(stage, prims, colliders, without=[target.path for target in bound], overrides=parsed)
+        disabled = disabled_colliders(stage, prims, colliders, overrides=parsed)
+        check_overrides(parsed, *([prim.GetPath() for prim in group] for group in (prims, [*bodies, *disabled])))
+        for prim in (*prims, *bodies):
             refuse_missing_arcs(prim, notices)
-        notices += _of_prims(prims, found, disabled, named=[garments, [*colliders] or colliders_of(prims)])
-        units, odd = read_units(stage)
+        notices += _of_prims(prims, bodies, disabled, named=[garments, [*colliders] or colliders_of(prims)])
+        units, unit_notices = read_units(stage)
         units = with_gravity(units, prims, gravity)
         assumed = root_metadata(stage, "metersPerUnit") is None
-        request = Request(units, Bake(stage), frames, level, asked, rest_frame, assumed)
-        bodies = [prim.GetPath() for prim in found]
-        moved = [*bodies, *_instanced(found), *(each.path for each in bound)]
+        request = Request(units, Bake(stage), frames, level, parsed, rest_frame, assumed)
+        body_paths = [prim.GetPath() for prim in bodies]
+        moved = [*body_paths, *_instanced(bodies), *(target.path for target in bound)]
         contacts = _contacts(stage, prims, colliders, request, notices=notices)
-        given = {"request": request, "contacts": contacts, "notices": notices}
-        readers = _read(stage, moved, skip_invisible=skip_invisible, **given)
-        readers, solids = _link(stage, readers, bodies, **given)
+        readers = _read(stage, moved, contacts, request=request, notices=notices, skip_invisible=skip_invisible)
+        readers, solids = _link(stage, readers, body_paths, request=request, contacts=contacts, notices=notices)
         opened = Shot(path, stage, view, request=request, readers=readers, bodies=_with_sides(stage, readers, solids))
         opened.bound = tuple(bound)
         notices += [*_timing(stage, readers, solids, bake=request.bake), *face_number_notices(stage, readers)]
         read = [*(source.path for source in opened.sources), *moved, *request.bake.prims()]
         opened.selections = selections(map(stage.GetPrimAtPath, read))
-    opened.unsaved, opened.colliders = unsaved, tuple(map(str, bodies))
+    opened.unsaved, opened.colliders = unsaved, tuple(map(str, body_paths))
     read_notices = [notice for reader in readers for notice in reader.notices]
-    opened.warnings.extend(dict.fromkeys([*notices, *odd, *read_notices]))
+    opened.warnings.extend(dict.fromkeys([*notices, *unit_notices, *read_notices]))
     return opened
 
 
 def _instanced(prims: Iterable[Usd.Prim]) -> list[Sdf.Path]:
     """Paths of the gprims drawn by the point instancers among some prims."""
-    return [each.GetPath() for prim in prims if UsdGeom.PointInstancer(prim) for each in instanced_gprims(prim)]
+    return [gprim.GetPath() for prim in prims if UsdGeom.PointInstancer(prim) for gprim in instanced_gprims(prim)]
 
 
 def _of_prims(
     prims: Sequence[Usd.Prim],
-    found: Sequence[Usd.Prim],
+    colliders: Sequence[Usd.Prim],
     disabled: Mapping[Usd.Prim, Notice],
     *,
     named: Sequence[Sequence[str]],
 ) -> list[Notice]:
     """Notices of garments and colliders; named are the garments and the colliders named."""
     notices = [*(disabled.values() if named[1] else ())]
-    notices += purpose_notices([*prims, *found], [each for names in named for each in names])
-    return notices + authored_faults(prims, found)
+    notices += purpose_notices([*prims, *colliders], [name for names in named for name in names])
+    return notices + authored_faults(prims, colliders)
 
 
 def _check_options(frames: tuple[float, float] | None, level: int | None, rest_frame: float | str | None) -> None:
@@ -394,10 +399,10 @@ def _contacts(
 ) -> dict[Sdf.Path, _Contact]:
     """The bodies of each enabled garment, by its path; adds notices of the others and of missing targets."""
     on = [prim for prim in prims if is_on(prim, GARMENT["enabled"], request.overrides)]
-    near, (excluded, odd) = felt_by(stage, on, wanted, overrides=request.overrides), read_apart(stage, on)
-    notices += [*(_left_out(prim, "is disabled") for prim in prims if prim not in on), *odd]
+    near, (excluded, new_notices) = felt_by(stage, on, wanted, overrides=request.overrides), read_apart(stage, on)
+    notices += [*(_left_out(prim, "is disabled") for prim in prims if prim not in on), *new_notices]
     pairs = zip(on, near, excluded, strict=True)
-    return {prim.GetPath(): _Contact(felt, targets) for prim, felt, targets in pairs}
+    return {prim.GetPath(): _Contact(bodies, targets) for prim, bodies, targets in pairs}
 
 
 def _link(
@@ -414,23 +419,30 @@ def _link(
     cloth = dict.fromkeys(reader.source.path for reader in readers)
     times = [reader.source.times[0] if reader.source.times else None for reader in readers]
     offset = min(reader.kept("contact:offset", time) for reader, time in zip(readers, times, strict=True))
-    given = {"overrides": request.overrides, "offset": offset, "near": _swept(stage, readers, paths, request)}
+    near = _swept(stage, readers, paths, request)
     bodies = []
     for path in paths:
-        by = next((each for each in cloth if path in contacts[each].felt), None)
+        by = next((garment_path for garment_path in cloth if path in contacts[garment_path].felt), None)
         if by is not None:
             beside = stage.GetPrimAtPath(by)
-            body, odd = read_collider(stage.GetPrimAtPath(path), request.units.metres, beside=beside, **given)
-            notices += odd
+            body, new_notices = read_collider(
+                stage.GetPrimAtPath(path),
+                request.units.metres,
+                beside=beside,
+                overrides=request.overrides,
+                offset=offset,
+                near=near,
+            )
+            notices += new_notices
             bodies += [body] if body is not None else []
     numbers = {body.prim.GetPath(): number for number, body in enumerate(bodies)}
     linked = []
     for reader in readers:
-        each = contacts[reader.source.path]
-        apart = {str(path): target for path, target in each.excluded.items() if path in each.near | cloth.keys()}
-        others = tuple(str(path) for path in each.excluded if path in cloth)
-        colliders = tuple(sorted(numbers[path] for path in each.felt & numbers.keys()))
-        garment = replace(reader.garment, colliders=colliders, apart_from=others)
+        contact = contacts[reader.source.path]
+        apart = {str(path): target for path, target in contact.excluded.items() if path in contact.near | cloth.keys()}
+        excluded = tuple(str(path) for path in contact.excluded if path in cloth)
+        colliders = tuple(sorted(numbers[path] for path in contact.felt & numbers.keys()))
+        garment = replace(reader.garment, colliders=colliders, apart_from=excluded)
         linked.append(replace(reader, garment=garment, source=replace(reader.source, apart_from=apart)))
         notices += [*worn_notices(garment, request.units.metres), *linked[-1].contact_notices()]
     return linked, bodies
@@ -470,8 +482,8 @@ def _sewn(
                 yield [points if np.ptp(points, axis=0).any() else None for points in cages]
 
     tolerances = [seam_tolerance(prim, request.overrides) for prim in prims]
-    garments, odd = sewn_garments([reader.garment for reader in readers], tolerances, poses)
-    notices += odd
+    garments, seam_notices = sewn_garments([reader.garment for reader in readers], tolerances, poses)
+    notices += seam_notices
     return [replace(reader, garment=garment) for reader, garment in zip(readers, garments, strict=True)]
 
 
@@ -489,17 +501,19 @@ def _with_sides(
     stage: Usd.Stage, readers: Sequence[GarmentReader], bodies: Sequence[ColliderReader]
 ) -> list[ColliderReader]:
     """Colliders, with sides chosen for open meshes on "auto" from the cloth's position in the shot's first frame."""
-    asked = [body for body in bodies if (body.collider.kind, body.collider.side) == ("mesh", "auto")]
-    time, cages = _first_cages(stage, readers, asked[0].metres) if asked else (None, [])
-    found = [*bodies]
+    automatic = [body for body in bodies if (body.collider.kind, body.collider.side) == ("mesh", "auto")]
+    time, cages = _first_cages(stage, readers, automatic[0].metres) if automatic else (None, [])
+    sided = [*bodies]
     for number, body in enumerate(bodies):
-        if body in asked:
+        if body in automatic:
             front = body.on_side("front")  # On side "front", faces are wound as seen in world space.
             pose, _ = front.pose(time)
-            felt = [cage for reader, cage in zip(readers, cages, strict=True) if number in reader.garment.colliders]
-            side = choose_side(pose.points, pose.triangles, felt) if pose is not None else "auto"
-            found[number] = front.on_side(side)
-    return found
+            cages_touching = [
+                cage for reader, cage in zip(readers, cages, strict=True) if number in reader.garment.colliders
+            ]
+            side = choose_side(pose.points, pose.triangles, cages_touching) if pose is not None else "auto"
+            sided[number] = front.on_side(side)
+    return sided
 
 
 def _first_cages(
@@ -527,28 +541,28 @@ def _timing(
 def _read(
     stage: Usd.Stage,
     moved: Sequence[Sdf.Path],
+    contacts: Mapping[Sdf.Path, _Contact],
     *,
     request: Request,
-    contacts: Mapping[Sdf.Path, _Contact],
     notices: list[Notice],
     skip_invisible: bool,
 ) -> list[GarmentReader]:
     """Bake the skinning of garments, bodies and bound prims, and read every garment."""
     roots = {path: instance_roots(stage.GetPrimAtPath(path)) for path in contacts}
     notices += request.bake.bind([*roots, *moved])
-    own, solved = _times(stage, contacts, moved, bake=request.bake)
+    garment_times, solved = _times(stage, contacts, moved, bake=request.bake)
     # Bake the whole shot: the chosen level and the plan must not depend on the frame range.
     notices += request.bake.bake(every_time := merge(*solved.values()))
     readers, every = [], []
     for path, instances in roots.items():
         prim = stage.GetPrimAtPath(path)
-        samples = samples_of(prim, snap(own[path], every_time), snap(solved[path], every_time))
+        samples = samples_of(prim, snap(garment_times[path], every_time), snap(solved[path], every_time))
         times = samples.times
         every += times
         if samples.own and not within(times, request.frames):
-            why = "is invisible" if within(samples.hidden, request.frames) else "has no sample"
+            reason = "is invisible" if within(samples.hidden, request.frames) else "has no sample"
             span = f"its time codes run from {named_time(times[0])} to {named_time(times[-1])}"
-            notices.append(_left_out(prim, f"{why} in the frame range; {span}; give --frames that hold one"))
+            notices.append(_left_out(prim, f"{reason} in the frame range; {span}; give --frames that hold one"))
         elif skip_invisible and not is_visible(prim, within(times, request.frames)):
             notices.append(_left_out(prim, "is invisible"))
         else:
@@ -565,19 +579,19 @@ def _times(
     stage: Usd.Stage, contacts: Mapping[Sdf.Path, _Contact], bodies: Sequence[Sdf.Path], *, bake: Bake
 ) -> tuple[dict[Sdf.Path, tuple[float, ...]], dict[Sdf.Path, tuple[float, ...]]]:
     """Sample time codes and solved time codes of each garment, by path."""
-    frames, known = FrameGrid.of(stage), {*bodies}
+    frames, body_paths = FrameGrid.of(stage), {*bodies}
 
     @cache
     def motion(path: Sdf.Path) -> Motion:
         return bake.motion(stage.GetPrimAtPath(path))
 
-    felt = {
-        path: [motion(mover(stage, body, path).GetPath()) for body in sorted(each.felt & known)]
-        for path, each in contacts.items()
+    bodies_of = {
+        path: [motion(mover(stage, body, path).GetPath()) for body in sorted(contact.felt & body_paths)]
+        for path, contact in contacts.items()
     }
-    solved = {path: solve_times(motion(path), bodies, frames) for path, bodies in felt.items()}
+    solved = {path: solve_times(motion(path), bodies, frames) for path, bodies in bodies_of.items()}
     return {path: motion(path).times for path in contacts}, solved
 
 
-def _left_out(prim: Usd.Prim, why: str) -> Notice:
-    return Notice(str(prim.GetPath()), None, f"left out: it {why}")
+def _left_out(prim: Usd.Prim, reason: str) -> Notice:
+    return Notice(str(prim.GetPath()), None, f"left out: it {reason}")

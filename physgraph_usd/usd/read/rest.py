@@ -164,10 +164,10 @@ def _from_default(prim: Usd.Prim, edges: np.ndarray, points: np.ndarray, *, firs
 def _fitted(weld: Weld, animation: Animation, *, by: str = "") -> Rest:
     """Rest shape fitted to the median lengths of the edges over the whole shot; ``by`` ends its source."""
     poses = animation.poses
-    found = [weld.joined(pose) for pose in poses.values()]
-    if len(found) < 2:
-        return Rest(weld.split(found[0]) if found else animation.first, f"the only sample of points{by}")
-    shape, nearest = median_shape(weld.mesh, found)
+    poses_joined = [weld.joined(pose) for pose in poses.values()]
+    if len(poses_joined) < 2:
+        return Rest(weld.split(poses_joined[0]) if poses_joined else animation.first, f"the only sample of points{by}")
+    shape, nearest = median_shape(weld.mesh, poses_joined)
     message = f"median edge lengths of {len(poses)} time codes, from the points at {named_time([*poses][nearest])}"
     return Rest(weld.split(shape), f"{FITTED}: {message}{by}")
 
@@ -199,8 +199,8 @@ def _checked(prim: Usd.Prim, edges: np.ndarray, rest: Rest, *, first: np.ndarray
         edge = "edge has" if len(short) == 1 else "edges have"
         message = f"{len(short)} {edge} no length in the rest shape ({rest.source}), the first between points[{low}]"
         notices = (*notices, Notice(path, None, f"{message} and points[{high}]: points at one place are taken for one"))
-    now = float(np.linalg.norm(first[edges[:, 0]] - first[edges[:, 1]], axis=1).mean()) if len(edges) else 0.0
-    ratio = mean / now if now > 0 else 1.0
+    mean_edge = float(np.linalg.norm(first[edges[:, 0]] - first[edges[:, 1]], axis=1).mean()) if len(edges) else 0.0
+    ratio = mean / mean_edge if mean_edge > 0 else 1.0
     if 1 / _MOST_SCALED <= ratio <= _MOST_SCALED:
         return Rest(rest.points, rest.source, notices)
     message = f"the rest shape ({rest.source}) has edges {ratio:.3g} times as long as the animation's; check its units"
@@ -270,9 +270,11 @@ def _default_points(prim: Usd.Prim, baked: Sdf.Layer) -> np.ndarray | None:
     attribute = UsdGeom.Mesh(prim).GetPointsAttr()
     value, spec = attribute.Get(Usd.TimeCode.Default()), baked.GetAttributeAtPath(attribute.GetPath())
     if spec is not None and spec.HasDefaultValue():  # Blocks of samples and edits of arrays have no length.
-        stack = [each for each in attribute.GetPropertyStack(Usd.TimeCode.Default()) if each.layer != baked]
-        values = [each.default for each in stack if each.HasDefaultValue()]
-        value = next((each for each in values if isinstance(each, Sdf.ValueBlock) or hasattr(each, "__len__")), None)
+        stack = [spec for spec in attribute.GetPropertyStack(Usd.TimeCode.Default()) if spec.layer != baked]
+        values = [spec.default for spec in stack if spec.HasDefaultValue()]
+        value = next(
+            (opinion for opinion in values if isinstance(opinion, Sdf.ValueBlock) or hasattr(opinion, "__len__")), None
+        )
     return (
         None if value is None or isinstance(value, Sdf.ValueBlock) else as_points(value, str(prim.GetPath()), "points")
     )
@@ -303,15 +305,15 @@ def median_shape(mesh: PolygonMesh, poses: Sequence[np.ndarray]) -> tuple[np.nda
 
     Args:
         mesh: The welded mesh.
-        poses: Positions of its vertices, each of shape (V, 3), at least one.
+        poses: Positions of the vertices, each of shape (V, 3); at least a single pose.
 
     Returns:
         The shape, (V, 3), and the index of the pose nearest to the medians; the fit starts from this pose.
     """
     edges = _braced(mesh)
     lengths = np.array([np.linalg.norm(np.subtract(*pose[edges.T]), axis=1) for pose in poses])
-    whole = _are_whole(lengths)
-    median = np.median(lengths[whole] if whole.any() else lengths, axis=0)
+    are_whole = _are_whole(lengths)
+    median = np.median(lengths[are_whole] if are_whole.any() else lengths, axis=0)
     nearest = int(np.abs(lengths - median).sum(axis=1).argmin())
     shape = np.array(poses[nearest], np.float64)
     if not median.any():
@@ -369,21 +371,21 @@ def pressed_folds(
     """
     edges = mesh.half_edges.edges
     if poses:
-        whole = _are_whole(np.array([np.linalg.norm(np.subtract(*pose[edges.T]), axis=1) for pose in poses]))
-        poses = [pose for pose, is_whole in zip(poses, whole, strict=True) if is_whole]
+        are_whole = _are_whole(np.array([np.linalg.norm(np.subtract(*pose[edges.T]), axis=1) for pose in poses]))
+        poses = [pose for pose, is_whole in zip(poses, are_whole, strict=True) if is_whole]
     if not poses:
         return None
     elements = elastic_elements(mesh, mesh.triangulate(poses[0]), poses[0])
     hinges = elements.hinges[~elements.twists]
-    wanted, unwanted = (find_edges(each, np.sort(hinges[:, :2], axis=1)) >= 0 for each in (asked, refused))
+    wanted, unwanted = (find_edges(folds, np.sort(hinges[:, :2], axis=1)) >= 0 for folds in (asked, refused))
     hinges, wanted, unwanted = (
-        each[wanted | (np.abs(hinge_geometry(poses[0], hinges)[0]) > (1.0 - KEPT) * SHARP)]
-        for each in (hinges, wanted, unwanted)
+        selection[wanted | (np.abs(hinge_geometry(poses[0], hinges)[0]) > (1.0 - KEPT) * SHARP)]
+        for selection in (hinges, wanted, unwanted)
     )
     angles = np.array([hinge_geometry(pose, hinges)[0] for pose in poses])
     median = np.median(angles, axis=0)
-    kept = (np.abs(angles - median) <= KEPT * np.abs(median)).all(axis=0) & (np.abs(median) > SHARP)
-    pressed = wanted | (kept & ~unwanted & (len(poses) > 1))
+    is_kept = (np.abs(angles - median) <= KEPT * np.abs(median)).all(axis=0) & (np.abs(median) > SHARP)
+    pressed = wanted | (is_kept & ~unwanted & (len(poses) > 1))
     if not pressed.any():
         return None
     nearest = np.abs(angles - median)[:, pressed].sum(axis=1).argmin()

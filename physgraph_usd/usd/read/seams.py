@@ -73,7 +73,7 @@ class _Cloth:
     def together(self, cages: Cages) -> np.ndarray:
         """World positions of all vertices [m], NaN for absent garments."""
         none = [np.full((len(garment.rest), 3), np.nan) for garment in self._garments]
-        return np.concatenate([blank if each is None else each for each, blank in zip(cages, none, strict=True)])
+        return np.concatenate([blank if cage is None else cage for cage, blank in zip(cages, none, strict=True)])
 
     def reach(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
         """Distance within which pairs of vertices are sewn [m]."""
@@ -89,12 +89,12 @@ class _Cloth:
     def look(self, points: np.ndarray) -> tuple[np.ndarray, OnEdge, OnEdge]:
         """Pairs of coincident vertices, border vertices on an edge of another border, and those beside an edge."""
         pairs = pairs_within([points], self._used, float(self._reach.max(initial=0.0)))
-        together = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1) <= self.reach(*pairs.T)
-        pairs = pairs[together & self._rest_together(pairs)]
-        there = np.asarray(np.isfinite(points).all(axis=1))
-        borders = self._borders[there[self._borders].all(axis=1)]
-        alone = np.setdiff1d(borders, pairs)
-        near = nearest_edges(points, alone, borders, BESIDE * self.edge_at(points, alone))
+        are_near = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1) <= self.reach(*pairs.T)
+        pairs = pairs[are_near & self._rest_together(pairs)]
+        is_finite = np.asarray(np.isfinite(points).all(axis=1))
+        borders = self._borders[is_finite[self._borders].all(axis=1)]
+        unpaired = np.setdiff1d(borders, pairs)
+        near = nearest_edges(points, unpaired, borders, BESIDE * self.edge_at(points, unpaired))
         on = near.distance <= self.reach(near.vertex, near.edge[:, 0])
         return pairs, near.where(on & self._rest_on(near)), near.where(~on)
 
@@ -123,28 +123,27 @@ class _Cloth:
         out[between.vertex] = between.place(closed)
         spans = [out[a:b] for a, b in zip(self._starts[:-1], self._starts[1:], strict=True)]
         pieces = zip(self._garments, spans, strict=True)
-        return [replace(each, sewn_at=at) if np.isfinite(at).any() else each for each, at in pieces]
+        return [replace(piece, sewn_at=at) if np.isfinite(at).any() else piece for piece, at in pieces]
 
     def notices(self, points: np.ndarray, beside: OnEdge) -> list[Notice]:
         """A notice of each garment with a border adjacent to another border and not sewn."""
-        found = []
-        known = np.zeros(len(points), bool)
-        known[beside.vertex] = True
+        matches = []
+        is_matched = np.zeros(len(points), bool)
+        is_matched[beside.vertex] = True
         distance = np.zeros(len(points))
         distance[beside.vertex] = beside.distance
-        other = np.full(len(points), -1)
-        other[beside.vertex] = self._owner[beside.edge[:, 0]]
-        along = self._borders[known[self._borders].all(axis=1)]
+        partner = np.full(len(points), -1)
+        partner[beside.vertex] = self._owner[beside.edge[:, 0]]
+        along = self._borders[is_matched[self._borders].all(axis=1)]
         for garment, index in zip(self._garments, range(len(self._garments)), strict=True):
-            own = along[self._owner[along[:, 0]] == index]
-            if len(own) < LONG:
+            own_edges = along[self._owner[along[:, 0]] == index]
+            if len(own_edges) < LONG:
                 continue
-            length = float(np.linalg.norm(points[own[:, 0]] - points[own[:, 1]], axis=1).sum())
-            gap = float(distance[own].max())
-            others = {self._garments[each].path for each in other[own].ravel().tolist()} - {garment.path}
-            whose = "one another" if not others else " and ".join(f"<{path}>" for path in sorted(others))
-            message = (
-                f"borders run along {whose} for {length:.3g} m, at most {1e3 * gap:.2g} mm apart, and are not sewn"
-            )
-            found.append(Notice(garment.path, None, f"{message}; sew them with --set seam:tolerance={1.5 * gap:.2g}"))
-        return found
+            length = float(np.linalg.norm(points[own_edges[:, 0]] - points[own_edges[:, 1]], axis=1).sum())
+            gap = float(distance[own_edges].max())
+            partners = {self._garments[number].path for number in partner[own_edges].ravel().tolist()} - {garment.path}
+            partner_names = "one another" if not partners else " and ".join(f"<{path}>" for path in sorted(partners))
+            message = f"borders run along {partner_names} for {length:.3g} m, at most {1e3 * gap:.2g} mm apart"
+            message += ", and are not sewn"
+            matches.append(Notice(garment.path, None, f"{message}; sew them with --set seam:tolerance={1.5 * gap:.2g}"))
+        return matches

@@ -54,7 +54,7 @@ class Skinned:
     def points(self, time: float | None) -> Vt.Vec3fArray | None:
         """Deformed points in the space of `space`; None where the mesh has no points or UsdSkel rejects its influences.
 
-        Read them before they are baked.
+        Read before baking.
         """
         code = timecode(time)
         points = UsdGeom.PointBased(self.query.GetPrim()).GetPointsAttr().Get(code)
@@ -114,16 +114,16 @@ class Bake:
 
     def motion(self, prim: Usd.Prim) -> Motion:
         """Motion of a prim as by `motion_of`, with that of skinned prims by their skeletons."""
-        return motion_of(prim, skinned={path: each.motion for path, each in self.skinned.items()})
+        return motion_of(prim, skinned={path: skin.motion for path, skin in self.skinned.items()})
 
     def bake(self, times: Sequence[float]) -> list[Notice]:
-        """Bake the skinned prims at the time codes given and those of their motion; notices of what UsdSkel rejects."""
+        """Bake the skinned prims at given time codes and at samples of the motion; notices of UsdSkel's rejections."""
         notices = []
         for skinned in self.skinned.values():
             with quiet() as diagnostics:
                 every = merge(times, skinned.motion.times) or (None,)
                 poses = {time: self._local(skinned, time) for time in every}
-                texts = [each.commentary for each in diagnostics.TakeUncoalescedDiagnostics()]
+                texts = [diagnostic.commentary for diagnostic in diagnostics.TakeUncoalescedDiagnostics()]
                 default = self._local(skinned, None)
             self.defaults[skinned.path] = None if isinstance(default, Sdf.ValueBlock) else default
             notices += _diagnosed(skinned, texts)
@@ -134,7 +134,7 @@ class Bake:
         return notices
 
     def _local(self, skinned: Skinned, time: float | None) -> Vt.Vec3fArray | Sdf.ValueBlock:
-        """A mesh's deformed points in its own space; as authored where UsdSkel rejects the influences."""
+        """A mesh's deformed points in the mesh's space; as authored if UsdSkel rejects the influences."""
         code, prim = timecode(time), self._stage.GetPrimAtPath(skinned.path)
         points = skinned.points(time)
         if points is None:
@@ -150,8 +150,8 @@ class Bake:
 
     def prims(self) -> list[Sdf.Path]:
         """Paths of the skeletons and animations of the baked meshes."""
-        found = [path for skinned in self.skinned.values() for path in (skinned.skeleton, skinned.animation)]
-        return [path for path in dict.fromkeys(found) if path is not None]
+        paths = [path for skinned in self.skinned.values() for path in (skinned.skeleton, skinned.animation)]
+        return [path for path in dict.fromkeys(paths) if path is not None]
 
     def rest_transform(self, path: Sdf.Path, time: float | None) -> Gf.Matrix4d:
         """Matrix (row vectors) from a skinned mesh's rest points to world: its bind transform, then the skeleton's."""
@@ -162,26 +162,28 @@ class Bake:
 
 def skel_root(prim: Usd.Prim) -> Usd.Prim | None:
     """The skel root above a prim; None if UsdSkel does not affect the prim."""
-    return next((each for each in with_ancestors(prim) if UsdSkel.Root(each)), None)
+    return next((ancestor for ancestor in with_ancestors(prim) if UsdSkel.Root(ancestor)), None)
 
 
 def find_skinned(stage: Usd.Stage, paths: Iterable[Sdf.Path]) -> tuple[dict[Sdf.Path, Skinned], list[Notice]]:
     """The meshes that UsdSkel deforms, by path, and notices of bindings that UsdSkel rejects or ignores."""
-    found, notices, wanted = dict[Sdf.Path, Skinned](), list[Notice](), dict.fromkeys(paths)
+    skins, notices, wanted = dict[Sdf.Path, Skinned](), list[Notice](), dict.fromkeys(paths)
     for root in dict.fromkeys(root for path in wanted if (root := skel_root(stage.GetPrimAtPath(path)))):
         cache = UsdSkel.Cache()
         with quiet() as diagnostics:
             cache.Populate(UsdSkel.Root(root), TRAVERSAL)
             bindings = cache.ComputeSkelBindings(UsdSkel.Root(root), TRAVERSAL)
-            texts = [each.commentary for each in diagnostics.TakeUncoalescedDiagnostics()]
-        targets = [(query, each.GetSkeleton()) for each in bindings for query in each.GetSkinningTargets()]
+            texts = [diagnostic.commentary for diagnostic in diagnostics.TakeUncoalescedDiagnostics()]
+        targets = [
+            (query, binding_of.GetSkeleton()) for binding_of in bindings for query in binding_of.GetSkinningTargets()
+        ]
         for query, skeleton in targets:
             if query.GetPrim().GetPath() in wanted and (query.HasJointInfluences() or query.HasBlendShapes()):
                 skinned = _skinned(query, cache.GetSkelQuery(skeleton))
                 fault = _rejected(skinned)
-                found |= {} if fault else {skinned.path: skinned}
+                skins |= {} if fault else {skinned.path: skinned}
                 notices += [*fault, *_diagnosed(skinned, texts), *_ignored_animation(stage, skinned)]
-    return found, notices
+    return skins, notices
 
 
 def _skinned(query: UsdSkel.SkinningQuery, joints: UsdSkel.SkeletonQuery) -> Skinned:
@@ -191,7 +193,7 @@ def _skinned(query: UsdSkel.SkinningQuery, joints: UsdSkel.SkeletonQuery) -> Ski
     bones = prim.GetStage().GetPrimAtPath(skeleton)
     values = [played.GetPrim().GetAttribute(name) for name in _ANIMATED] if played else []
     bent = {"rotations", "scales"} | ({"blendShapeWeights"} if _has_inbetweens(prim) else set())
-    by = [motion_by(each, turns=each.GetName() in bent) for each in values if each]
+    by = [motion_by(attribute, turns=attribute.GetName() in bent) for attribute in values if attribute]
     motion = Motion.joined([*by, motion_alone(bones), motion_alone(prim)])
     shapes = UsdSkel.BlendShapeQuery(UsdSkel.BindingAPI(prim)) if query.HasBlendShapes() else None
     animation = _target(_binder(bones, _ANIMATION), _ANIMATION) if played else None
@@ -213,10 +215,10 @@ def _binder(prim: Usd.Prim, name: str, *, applied: bool = True) -> Usd.Prim | No
         name: Name of the relationship.
         applied: Whether prims without SkelBindingAPI are passed over, as UsdSkel does.
     """
-    for each in with_ancestors(prim):
-        if each.GetRelationship(name).HasAuthoredTargets() and (not applied or each.HasAPI(_API)):
-            return each
-        if UsdSkel.Root(each):
+    for ancestor in with_ancestors(prim):
+        if ancestor.GetRelationship(name).HasAuthoredTargets() and (not applied or ancestor.HasAPI(_API)):
+            return ancestor
+        if UsdSkel.Root(ancestor):
             break
     return None
 
@@ -233,19 +235,19 @@ def _rejected(skinned: Skinned) -> list[Notice]:
     with quiet() as diagnostics:
         if not points or skinned.points(time) is not None:
             return []
-        texts = [in_brief(each.commentary).rstrip(".") for each in diagnostics.TakeUncoalescedDiagnostics()]
+        texts = [in_brief(diagnostic.commentary).rstrip(".") for diagnostic in diagnostics.TakeUncoalescedDiagnostics()]
     indices, size = skinned.query.GetJointIndicesPrimvar(), skinned.query.GetNumInfluencesPerComponent()
     count, remainder = divmod(len(value_at(indices.GetAttr(), time) or ()), len(points))
-    why = f"UsdSkel rejects its joint influences: {texts[0]}" if texts else "UsdSkel rejects them"
+    reason = f"UsdSkel rejects its joint influences: {texts[0]}" if texts else "UsdSkel rejects them"
     remedy = (
         "bind it again" if remainder or count in (0, size) else f"set elementSize of its joint influences to {count}"
     )
     if not skinned.joints.HasBindPose():
-        why, remedy = (
+        reason, remedy = (
             f"<{skinned.skeleton}> has no bind pose",
             "author one bindTransform for each of its joints",
         )
-    message = f"is not skinned and stays in its bind pose, because {why}; {remedy}"
+    message = f"is not skinned and stays in its bind pose, because {reason}; {remedy}"
     return [Notice(str(skinned.path), None, message)]
 
 
@@ -260,14 +262,14 @@ def _diagnosed(skinned: Skinned, texts: Iterable[str]) -> list[Notice]:
     if played and skinned.animation:
         remedy = "author one translation, one rotation and one scale for each of its joints"
         prims[str(played.GetPrim().GetPath())] = skinned.animation, remedy
-    found = dict[Sdf.Path, Notice]()
+    notices_at = dict[Sdf.Path, Notice]()
     for text in texts:
-        where, _, reason = text.partition(" -- ")
-        path, remedy = prims.get(where.partition(".")[0], (None, ""))
+        location, _, reason = text.partition(" -- ")
+        path, remedy = prims.get(location.partition(".")[0], (None, ""))
         if path is not None and not (played and not partial and "restTransforms" in reason):
             message = f"UsdSkel rejects a part of it: {in_brief(reason).rstrip('.')}; {remedy}"
-            found.setdefault(path, Notice(str(path), None, message))
-    return [*found.values()]
+            notices_at.setdefault(path, Notice(str(path), None, message))
+    return [*notices_at.values()]
 
 
 def _ignored_animation(stage: Usd.Stage, skinned: Skinned) -> list[Notice]:
@@ -283,7 +285,9 @@ def _ignored_animation(stage: Usd.Stage, skinned: Skinned) -> list[Notice]:
 def _unskinned(prim: Usd.Prim) -> list[Notice]:
     """A notice of joint influences not used by UsdSkel, with the remedy."""
     binding = UsdSkel.BindingAPI(prim)
-    if not any(each.HasAuthoredValue() for each in (binding.GetJointIndicesAttr(), binding.GetJointWeightsAttr())):
+    if not any(
+        attribute.HasAuthoredValue() for attribute in (binding.GetJointIndicesAttr(), binding.GetJointWeightsAttr())
+    ):
         return []
     return [Notice(str(prim.GetPath()), None, f"has joint influences but is not skinned: {_why_unskinned(prim)}")]
 
@@ -293,13 +297,15 @@ def _why_unskinned(prim: Usd.Prim) -> str:
     root, binder = skel_root(prim), _binder(prim, _SKELETON, applied=False)
     if root is None:
         return "it has no SkelRoot above it; make a prim above mesh and Skeleton a SkelRoot"
-    between = [each for each in with_ancestors(prim.GetParent()) if each.GetPath().HasPrefix(root.GetPath())]
-    if folder := next((each for each in reversed(between) if not UsdGeom.Imageable(each)), None):
+    between = [
+        ancestor for ancestor in with_ancestors(prim.GetParent()) if ancestor.GetPath().HasPrefix(root.GetPath())
+    ]
+    if folder := next((ancestor for ancestor in reversed(between) if not UsdGeom.Imageable(ancestor)), None):
         kind = f"is a {folder.GetTypeName()}" if folder.GetTypeName() else "has no type"
         return f"<{folder.GetPath()}> {kind}, and UsdSkel skins nothing below it; make it a Scope"
     if binder is None:
         return f"it is bound to no skeleton; author {_SKELETON} on it or above it"
-    if bare := next((each for each in (binder, prim) if not each.HasAPI(_API)), None):
+    if bare := next((bound_prim for bound_prim in (binder, prim) if not bound_prim.HasAPI(_API)), None):
         return f"<{bare.GetPath()}> has no {_API}, without which UsdSkel ignores its binding; apply {_API} to it"
     target = _target(binder, _SKELETON) or Sdf.Path.emptyPath
     if not UsdSkel.Skeleton(prim.GetStage().GetPrimAtPath(target)):

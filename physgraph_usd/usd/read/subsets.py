@@ -24,7 +24,7 @@ _ROUNDING = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Subsets:
-    """A garment's subsets of faces, and their fabrics that are not the garment's own.
+    """A garment's subsets of faces, with the subsets' differing fabrics.
 
     Attributes:
         faces: Faces of the cage in each subset, by name.
@@ -40,7 +40,7 @@ class Subsets:
 
 
 def read_subsets(prim: Usd.Prim, cage_faces: np.ndarray, *, units: Units, time: float | None) -> Subsets:
-    """Read a garment's subsets, and compare their fabrics with its own.
+    """Read a garment's subsets, and compare the subsets' fabrics with the garment's.
 
     Fabrics are compared without ``--set``, which changes all in proportion.
 
@@ -65,47 +65,53 @@ def _fabrics(
     prim: Usd.Prim, subsets: Mapping[str, np.ndarray], count: int, *, units: Units, time: float | None
 ) -> tuple[np.ndarray | None, dict[str, str], dict[str, str]]:
     """`Subsets.scale`, ``words`` and ``sources`` of a garment with a number of faces."""
-    own, scale, words, sources = find_values(prim, units, ()), np.ones((count, 3)), {}, {}
-    fabric = own.fabric(time)
-    for name, faces, found in _parts(prim, subsets, count, units):
-        asked = [short for short in every_fabric_value(fabric) if found.sources[short] != own.sources[short]]
-        if asked and len(faces):
-            other = found.fabric(time)
-            scale[faces] = ratios = [_ratio(getattr(other, each), getattr(fabric, each)) for each in SCALED.values()]
-            held = [short for short in asked if found.found[short].animated]
-            place = "" if name else " of no such subset"
-            words[name] = f"{counted(len(faces), 'face')}{place} of another fabric: {_in_words(fabric, other, ratios)}"
-            words[name] += f"; {', '.join(held)} as at the first time code" if held else ""
-            sources |= {f"{short} of {name or 'other faces'}": found.sources[short] for short in asked}
+    whole_fabric, scale, words, sources = find_values(prim, units, ()), np.ones((count, 3)), {}, {}
+    fabric = whole_fabric.fabric(time)
+    for name, faces, values in _parts(prim, subsets, count, units):
+        differing = [
+            short for short in every_fabric_value(fabric) if values.sources[short] != whole_fabric.sources[short]
+        ]
+        if differing and len(faces):
+            subset_fabric = values.fabric(time)
+            scale[faces] = ratios = [
+                _ratio(getattr(subset_fabric, short), getattr(fabric, short)) for short in SCALED.values()
+            ]
+            animated = [short for short in differing if values.found[short].animated]
+            suffix = "" if name else " of no such subset"
+            words[name] = (
+                f"{counted(len(faces), 'face')}{suffix} of another fabric: {_in_words(fabric, subset_fabric, ratios)}"
+            )
+            words[name] += f"; {', '.join(animated)} as at the first time code" if animated else ""
+            sources |= {f"{short} of {name or 'other faces'}": values.sources[short] for short in differing}
     return scale if (scale != 1.0).any() else None, words, sources
 
 
 def _parts(
     prim: Usd.Prim, subsets: Mapping[str, np.ndarray], count: int, units: Units
 ) -> Iterator[tuple[str, np.ndarray, Values]]:
-    """Name, faces and values of each subset with a material or values of its own, then those of all other faces."""
-    bound, others = bound_materials(prim), np.ones(count, bool)
+    """Name, faces and values of each subset with a separate material or values, then of all remaining faces."""
+    bound, is_outside = bound_materials(prim), np.ones(count, bool)
     for name, faces in subsets.items():
         subset = prim.GetChild(name)
         materials = bound_materials(subset)
         if {*materials} - {*bound} or any(
             authored(subset, GARMENT[short].name) for short in every_fabric_value(Fabric())
         ):
-            others[faces] = False
+            is_outside[faces] = False
             yield name, faces, values_by(subset, prim, [*materials, *bound], units=units)
-    if not others.all():
-        yield "", np.flatnonzero(others), values_by(prim, prim, bound, units=units)
+    if not is_outside.all():
+        yield "", np.flatnonzero(is_outside), values_by(prim, prim, bound, units=units)
 
 
-def _ratio(value: float, own: float) -> float:
+def _ratio(value: float, whole_value: float) -> float:
     """A subset's value over the garment's; 1 where the garment has none to multiply."""
-    return 1.0 if own <= 0.0 or math.isclose(value, own, rel_tol=_ROUNDING) else value / own
+    return 1.0 if whole_value <= 0.0 or math.isclose(value, whole_value, rel_tol=_ROUNDING) else value / whole_value
 
 
-def _in_words(fabric: Fabric, other: Fabric, ratios: list[float]) -> str:
+def _in_words(fabric: Fabric, subset_fabric: Fabric, ratios: list[float]) -> str:
     """Multiples of the garment's stretch, bending and density, and the unused values, in words."""
     stretch, bend, density = ratios
-    shear, weft_stretch = (None if each is None else stretch * each for each in (fabric.shear, fabric.weft_stretch))
+    shear, weft_stretch = (None if ratio is None else stretch * ratio for ratio in (fabric.shear, fabric.weft_stretch))
     scaled = replace(
         fabric,
         stretch=stretch * fabric.stretch,
@@ -115,7 +121,7 @@ def _in_words(fabric: Fabric, other: Fabric, ratios: list[float]) -> str:
         weft_bend=None if fabric.weft_bend is None else bend * fabric.weft_bend,
         density=density * fabric.density,
     )
-    used, wanted = every_fabric_value(scaled), every_fabric_value(other)
+    used, wanted = every_fabric_value(scaled), every_fabric_value(subset_fabric)
     unused = [name for name in used if not math.isclose(used[name] or 0.0, wanted[name] or 0.0, rel_tol=_ROUNDING)]
     times = [f"{name} times {ratio:.3g}" for name, ratio in zip(SCALED, ratios, strict=True) if ratio != 1.0]
     return ", ".join(times or ["none of its values differ"]) + (

@@ -82,9 +82,9 @@ def survey(shot: str | Usd.Stage) -> Survey:
     path = shot_name(shot)
     stage, notices = open_stage(shot)
     with pxr_errors(f"cannot read {path}"), quiet():
-        units, odd = read_units(stage)
+        units, unit_notices = read_units(stage)
         meshes = tuple(_survey_mesh(stage.GetPrimAtPath(mesh), units.metres) for mesh in list_meshes(stage))
-    return Survey(path, units.metres, meshes, (*notices, *odd))
+    return Survey(path, units.metres, meshes, (*notices, *unit_notices))
 
 
 def _survey_mesh(prim: Usd.Prim, metres: float) -> MeshReport:
@@ -102,11 +102,11 @@ def _survey_mesh(prim: Usd.Prim, metres: float) -> MeshReport:
             points.edges = cage.mesh.half_edges.edges
             placed = points.read(first)[0]
             pieces = pieces_of(placed, cage.mesh.triangulate(placed).triangles)
-            odd = check_placement(prim, metres, times)
+            placement_notices = check_placement(prim, metres, times)
     except StageError as error:
         return MeshReport(path, garment, points=count, problem=str(error))
     is_open = len(pieces.open) > len(pieces.closed)
-    notices = (*samples.notices(path, tuple(samples.absent)), *cage.notices, *odd)
+    notices = (*samples.notices(path, tuple(samples.absent)), *cage.notices, *placement_notices)
     skinned = UsdSkel.BindingAPI(prim).GetJointIndicesAttr().HasAuthoredValue()
     deforms = skinned or UsdGeom.Mesh(prim).GetPointsAttr().ValueMightBeTimeVarying()
     return MeshReport(path, garment, count, len(cage.kept_faces), is_open, deforms, times, notices=notices)

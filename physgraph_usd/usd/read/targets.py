@@ -95,21 +95,21 @@ def find_bound(stage: Usd.Stage, garments: Sequence[Usd.Prim], wanted: Sequence[
         GarmentError: A prim is bound twice, or is a garment.
     """
     cloth = {prim.GetPath() for prim in garments}
-    found = [each for prim in garments for each in _below(stage, prim)]
-    listed = {each.path for each in found}
-    asked = dict.fromkeys(path for item in wanted for path in find_paths(stage, item, FOLLOWERS))
-    found += [Bound(path, None) for path in asked if path not in listed | cloth]
+    bound = [follower for prim in garments for follower in _below(stage, prim)]
+    listed = {follower.path for follower in bound}
+    requested = dict.fromkeys(path for item in wanted for path in find_paths(stage, item, FOLLOWERS))
+    bound += [Bound(path, None) for path in requested if path not in listed | cloth]
     seen: dict[Sdf.Path, Sdf.Path | None] = {}
-    for each in found:
-        if each.path in cloth:
-            remedy = f"take it out of {TARGETS} on <{each.on}>, or refine without it"
-            raise GarmentError(str(each.path), f"is a garment, and bound to <{each.on}>", remedy=remedy)
-        if each.path in seen:
-            message = f"is bound to <{seen[each.path]}> and to <{each.on}>"
-            raise GarmentError(str(each.path), message, remedy=f"leave it in one {TARGETS}")
-        seen[each.path] = each.on
-        found += _below(stage, stage.GetPrimAtPath(each.path))  # The loop reaches them too.
-    return found
+    for follower in bound:
+        if follower.path in cloth:
+            remedy = f"take it out of {TARGETS} on <{follower.on}>, or refine without it"
+            raise GarmentError(str(follower.path), f"is a garment, and bound to <{follower.on}>", remedy=remedy)
+        if follower.path in seen:
+            message = f"is bound to <{seen[follower.path]}> and to <{follower.on}>"
+            raise GarmentError(str(follower.path), message, remedy=f"leave it in one {TARGETS}")
+        seen[follower.path] = follower.on
+        bound += _below(stage, stage.GetPrimAtPath(follower.path))  # The loop reaches them too.
+    return bound
 
 
 def _below(stage: Usd.Stage, prim: Usd.Prim) -> list[Bound]:
@@ -141,24 +141,26 @@ def read_targets(
         SchemaError: An attribute is invalid.
     """
     numbers = {path: number for number, (path, _, _) in enumerate(garments)}
-    found: dict[Sdf.Path, Target] = {}
-    for each in bound:
-        prim = stage.GetPrimAtPath(each.path)
+    targets: dict[Sdf.Path, Target] = {}
+    for follower in bound:
+        prim = stage.GetPrimAtPath(follower.path)
         _check_topology(prim)
-        if each.on is not None and each.on in found:
-            found[each.path] = _on_target(prim, found[each.on], metres, skinned=each.path in skinned)
+        if follower.on is not None and follower.on in targets:
+            targets[follower.path] = _on_target(prim, targets[follower.on], metres, skinned=follower.path in skinned)
             continue
-        named = [number for path, number in numbers.items() if path == each.on]
-        nearest = range(len(garments)) if each.on is None else named
+        named = [number for path, number in numbers.items() if path == follower.on]
+        nearest = range(len(garments)) if follower.on is None else named
         poses = [pose for number in nearest for pose in _poses(prim, number, garments, cage=cage, metres=metres)]
         if not poses and nearest:
             remedy = "author its points, or leave it out of the bound prims"
-            raise GarmentError(str(each.path), "has no points where the garment has its first sample", remedy=remedy)
+            raise GarmentError(
+                str(follower.path), "has no points where the garment has its first sample", remedy=remedy
+            )
         if not poses:
             continue
         best = min(poses, key=lambda pose: pose.away)
-        found[each.path] = _placed(prim, best, None, skinned=each.path in skinned)
-    return [*found.values()]
+        targets[follower.path] = _placed(prim, best, None, skinned=follower.path in skinned)
+    return [*targets.values()]
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,8 +195,8 @@ def _poses(
             continue
         surface = cage(number, time)
         triangles = mesh.triangulate(surface).triangles
-        some = points[:: max(len(points) // ASKED, 1)]
-        away = float(closest(some, surface, triangles).distance.mean())
+        sampled = points[:: max(len(points) // ASKED, 1)]
+        away = float(closest(sampled, surface, triangles).distance.mean())
         size = float(np.linalg.norm(np.ptp(surface, axis=0)))
         away *= UNLIKELY if moves == (time is None) else 1.0
         yield _Pose(number, time, points, surface, triangles, size, away)
@@ -276,26 +278,26 @@ def _mesh_of(prim: Usd.Prim) -> PolygonMesh | None:
     """The faces of a mesh with a polygon or more, else None."""
     mesh, first = UsdGeom.Mesh(prim), Usd.TimeCode.EarliestTime()
     topology = (mesh.GetFaceVertexCountsAttr(), mesh.GetFaceVertexIndicesAttr(), mesh.GetPointsAttr())
-    counts, indices, points = (each.Get(first) if mesh else None for each in topology)
+    counts, indices, points = (attribute.Get(first) if mesh else None for attribute in topology)
     if not counts or not indices or not points:
         return None
-    made = PolygonMesh(np.asarray(counts, np.int32), np.asarray(indices, np.int32), len(points))
-    return made if (made.counts > 2).any() else None
+    mesh_read = PolygonMesh(np.asarray(counts, np.int32), np.asarray(indices, np.int32), len(points))
+    return mesh_read if (mesh_read.counts > 2).any() else None
 
 
 def _rigid_parts(prim: Usd.Prim, mesh: PolygonMesh | None, points: np.ndarray, small: float) -> np.ndarray:
     """Number of the rigid part of each point, or -1: connected pieces; unasked, those small [m] and closed."""
-    asked = prim.GetAttribute(RIGID).Get()
-    if asked not in (None, True, False):
-        raise SchemaError(f"<{prim.GetPath()}>.{RIGID} is {asked!r}; give true or false")
+    rigid = prim.GetAttribute(RIGID).Get()
+    if rigid not in (None, True, False):
+        raise SchemaError(f"<{prim.GetPath()}>.{RIGID} is {rigid!r}; give true or false")
     none = np.full(len(points), -1)
-    if asked is False or (mesh is None and not asked):
+    if rigid is False or (mesh is None and not rigid):
         return none
     if mesh is None:
         return np.zeros(len(points), np.int64)
     edges = edges_of(mesh.triangulate(points).triangles, len(points))
     piece = joined_by(edges.vertices, len(points))
-    if asked:
+    if rigid:
         return piece
     count = int(piece.max()) + 1
     ends = np.zeros((2, count, 3))

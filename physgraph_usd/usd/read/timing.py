@@ -1,4 +1,4 @@
-"""Compares samples of garments and their bodies: USD holds a prim still outside its samples."""
+"""Compares samples of garments and bodies: USD holds a prim still outside the prim's samples."""
 
 from __future__ import annotations
 
@@ -28,33 +28,34 @@ def timing_notices(
         bodies: Readers of bodies, and for each the numbers of the garments in contact.
         bake: Baked skinning.
     """
-    found: dict[Sdf.Path, list[str]] = {prim.GetPath(): _rates(prim, bake) for prim, _ in garments}
+    rates_of: dict[Sdf.Path, list[str]] = {prim.GetPath(): _rates(prim, bake) for prim, _ in garments}
     for body, felt_by in bodies:
         faults = [fault for number in felt_by for fault in _misses(body, garments[number][1], bake)]
-        found[body.prim.GetPath()] = [*faults[:1], *_rates(body.prim, bake)]
-    return [Notice(str(path), None, "; ".join(faults)) for path, faults in found.items() if faults]
+        rates_of[body.prim.GetPath()] = [*faults[:1], *_rates(body.prim, bake)]
+    return [Notice(str(path), None, "; ".join(faults)) for path, faults in rates_of.items() if faults]
 
 
 def _misses(reader: ColliderReader, garment: GarmentSource, bake: Bake) -> Iterator[str]:
     """Faults of a body's sample times compared with a garment's, in words."""
     body = reader.prim
-    own = bake.motion(mover(body.GetStage(), body.GetPath(), garment.path)).times
+    body_times = bake.motion(mover(body.GetStage(), body.GetPath(), garment.path)).times
     cloth, every = garment.times, tuple(sorted([*garment.times, *garment.left_out]))
-    if not cloth and UsdGeom.PointBased(body) and UsdGeom.PointBased(body).GetPointsAttr().Get() is None and own:
-        yield f"has no points by default, at which still garments are read; its sample at {named_time(own[0])} is used"
-    if len(own) < 2 or not cloth:
+    if not cloth and UsdGeom.PointBased(body) and UsdGeom.PointBased(body).GetPointsAttr().Get() is None and body_times:
+        first = named_time(body_times[0])
+        yield f"has no points by default, at which still garments are read; its sample at {first} is used"
+    if len(body_times) < 2 or not cloth:
         return
-    first, last = ([named_time(times[end]) for times in (own, every)] for end in (0, -1))
+    first, last = ([named_time(times[end]) for times in (body_times, every)] for end in (0, -1))
     spans = f"its samples run from {first[0]} to {last[0]}, those of <{garment.path}> from {first[1]} to {last[1]}"
-    late, early = own[0] - cloth[0] > SAME_TIME, cloth[-1] - own[-1] > SAME_TIME
+    late, early = body_times[0] - cloth[0] > SAME_TIME, cloth[-1] - body_times[-1] > SAME_TIME
     still = " and ".join([f"before {first[0]}"] * late + [f"after {last[0]}"] * early)
-    held = f"; it stands still {still}" if still else "; its poses are interpolated"
+    stillness = f"; it stands still {still}" if still else "; its poses are interpolated"
     remedy = f"; export its samples at the time codes from {named_time(cloth[0])} to {named_time(cloth[-1])}"
-    unsolved = [time for time in own if cloth[0] < time < cloth[-1] and not is_among(time, cloth)]
-    if not any(is_among(time, every) for time in own):
-        yield f"{spans}, and share no time{held}{remedy}"
+    unsolved = [time for time in body_times if cloth[0] < time < cloth[-1] and not is_among(time, cloth)]
+    if not any(is_among(time, every) for time in body_times):
+        yield f"{spans}, and share no time{stillness}{remedy}"
     elif still:
-        yield f"{spans}{held}{remedy}"
+        yield f"{spans}{stillness}{remedy}"
     elif any(_is_off_line(reader, time, cloth) for time in unsolved):
         message = f"has {counted(len(unsolved), 'sample')} at time codes at which <{garment.path}> is not solved"
         yield f"{message}, the first at {named_time(unsolved[0])}; sample the garment there, too"
@@ -64,11 +65,11 @@ def _is_off_line(body: ColliderReader, time: float, cloth: Sequence[float]) -> b
     """Whether a body leaves the straight line between the two solved time codes around a time code, by `within`."""
     number = bisect_left(cloth, time)
     before, after = cloth[number - 1], cloth[number]
-    first, here, last = (authored_points(body, each) for each in (before, time, after))
-    if not len(here) == len(first) == len(last):
+    first, middle, last = (authored_points(body, code) for code in (before, time, after))
+    if not len(middle) == len(first) == len(last):
         return True
     share = (time - before) / (after - before)
-    away = np.linalg.norm(here - (1.0 - share) * first - share * last, axis=1)
+    away = np.linalg.norm(middle - (1.0 - share) * first - share * last, axis=1)
     return not bool((away <= body.within).all())
 
 

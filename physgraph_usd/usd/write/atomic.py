@@ -82,6 +82,17 @@ def check_no_link(target: Path) -> None:
         raise UsageError(f"{target} is a link to {os.readlink(target)}; name that, or remove the link")
 
 
+def check_folder_of(target: Path) -> None:
+    """Check that the folder of a file to be written exists.
+
+    Raises:
+        UsageError: The folder is missing.
+    """
+    folder = target.resolve().parent
+    if not folder.is_dir():
+        raise UsageError(f"the folder {folder} does not exist; make it, or name another by -o")
+
+
 def make_file(path: Path) -> BinaryIO:
     """Open a file for writing, truncated; OSError for a link or an unwritable file."""
     return os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | NO_LINK, 0o666), "wb")
@@ -110,7 +121,7 @@ def check_place(target: Path) -> None:
         LayerError: The folder cannot be written.
     """
     check_no_link(target)
-    folder = next(each for each in target.absolute().parents if each.exists())
+    folder = next(parent for parent in target.absolute().parents if parent.exists())
     if target.is_dir() or not folder.is_dir():
         raise UsageError(f"cannot write {target}: it is a folder, or {folder} is none")
     try:

@@ -1,4 +1,4 @@
-"""One table of the attributes that a refined layer writes, blocks, lowers or turns off; docs/layers.md shows it."""
+"""The table of attributes written, blocked, lowered or turned off in a refined layer; shown in docs/layers.md."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ RULES = (
 
 
 def rule_of(name: str) -> Rule | None:
-    """First rule that matches an attribute's name; None for attributes that stay as authored."""
+    """First rule matching an attribute's name; None for attributes kept as authored."""
     fits = (rule for rule in RULES if any(fnmatchcase(name.lower(), pattern.lower()) for pattern in rule.names))
     return next(fits, None)
 
@@ -101,8 +101,8 @@ def action_on(attribute: Usd.Attribute) -> str:
 
 def with_action(prim: Usd.Prim, action: str) -> list[Usd.Attribute]:
     """The authored attributes of a prim with one action."""
-    own = (attribute for attribute in prim.GetAuthoredAttributes() if attribute.HasAuthoredValue())
-    return [each for each in own if action_on(each) == action]
+    attributes = (attribute for attribute in prim.GetAuthoredAttributes() if attribute.HasAuthoredValue())
+    return [attribute for attribute in attributes if action_on(attribute) == action]
 
 
 def render_values(prim: Usd.Prim, levels: int | None) -> Iterator[tuple[Usd.Attribute, object]]:
@@ -112,9 +112,9 @@ def render_values(prim: Usd.Prim, levels: int | None) -> Iterator[tuple[Usd.Attr
         prim: The coarse mesh.
         levels: Number of subdivisions of the layer; None where the scheme is none, and renderers must not subdivide.
     """
-    inherited = [each.GetAttr() for each in UsdGeom.PrimvarsAPI(prim).FindPrimvarsWithInheritance()]
+    inherited = [primvar.GetAttr() for primvar in UsdGeom.PrimvarsAPI(prim).FindPrimvarsWithInheritance()]
     authored = [*inherited, *with_action(prim, LOWERED), *with_action(prim, OFF)]
-    for attribute in {each.GetName(): each for each in authored}.values():
+    for attribute in {item.GetName(): item for item in authored}.values():
         rule, action = rule_of(attribute.GetName()), action_on(attribute)
         if rule is None or action not in (LOWERED, OFF):
             continue
@@ -137,13 +137,13 @@ def limit_renderers(stream: LayerStream, target: Sdf.Path, prim: Usd.Prim, level
 def notes_of(prim: Usd.Prim, levels: int | None) -> list[Notice]:
     """A note for each rule that is noted, with the names of the attributes of a coarse mesh; as `render_values`."""
     attributes = [*(attribute for attribute, _ in render_values(prim, levels)), *with_action(prim, BLOCKED)]
-    found: dict[Rule, list[str]] = {}
+    names_of: dict[Rule, list[str]] = {}
     for name in (attribute.GetName() for attribute in attributes):
         rule = rule_of(name)
         if rule is not None and rule.noted:
-            found.setdefault(rule, []).append(name)
+            names_of.setdefault(rule, []).append(name)
     path = str(prim.GetPath())
-    return [Notice(path, None, f"{', '.join(names)}: {_words(rule)}") for rule, names in found.items()]
+    return [Notice(path, None, f"{', '.join(names)}: {_words(rule)}") for rule, names in names_of.items()]
 
 
 def _words(rule: Rule) -> str:
@@ -153,4 +153,4 @@ def _words(rule: Rule) -> str:
 def rules_table() -> str:
     """All rules, as a table in Markdown."""
     rows = ((" ".join(f"`{name}`" for name in rule.names), _words(rule)) for rule in RULES)
-    return "| attribute | in the layer |\n|---|---|\n" + "".join(f"| {names} | {what} |\n" for names, what in rows)
+    return "| attribute | in the layer |\n|---|---|\n" + "".join(f"| {names} | {action} |\n" for names, action in rows)

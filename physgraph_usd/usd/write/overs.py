@@ -211,9 +211,9 @@ def make_sibling(stream: LayerStream, prim: Usd.Prim) -> Sdf.Path:
     spec = stream.prim(path)
     spec.specifier, spec.typeName = Sdf.SpecifierDef, "Mesh"
     spec.referenceList.Prepend(Sdf.Reference(primPath=coarse))
-    for where, purpose in ((coarse, "proxy"), (path, "render")):
-        stream.attribute(where.AppendProperty("purpose"), _TYPES.Token, uniform=True)
-        stream.set(where.AppendProperty("purpose"), purpose)
+    for prim_path, purpose in ((coarse, "proxy"), (path, "render")):
+        stream.attribute(prim_path.AppendProperty("purpose"), _TYPES.Token, uniform=True)
+        stream.set(prim_path.AppendProperty("purpose"), purpose)
     relationship = Sdf.RelationshipSpec(spec, "proxyPrim", False)
     relationship.targetPathList.explicitItems = [coarse]
     edit_schemas(stream, path, deleted=[GARMENT_API])

@@ -74,7 +74,7 @@ def hide_influences(stream: LayerStream, target: Sdf.Path, prim: Usd.Prim) -> No
 
 
 def inherits_influences(prim: Usd.Prim) -> bool:
-    """Whether joint influences of an ancestor reach a prim that has none of its own."""
+    """Whether joint influences of an ancestor reach a prim without influences."""
     above = UsdGeom.PrimvarsAPI(prim.GetParent()).FindInheritablePrimvars()
     return any(primvar.GetAttr().GetName() in INFLUENCES for primvar in above)
 
@@ -221,11 +221,11 @@ class FineMap:
     @cached_property
     def stencil(self) -> sparse.csr_matrix | None:
         """Stencil from coarse to fine vertices; None if these are the same."""
-        found = compose(self._refinements) if self._refinements else None
+        composed = compose(self._refinements) if self._refinements else None
         if self._shell is None:
-            return found
-        whole = sparse.identity(self.cage.vertex_count, format="csr") if found is None else found
-        return whole[self._shell.vertex]
+            return composed
+        vertex_matrix = sparse.identity(self.cage.vertex_count, format="csr") if composed is None else composed
+        return vertex_matrix[self._shell.vertex]
 
     def _on_shell(self, element: str, values: np.ndarray) -> np.ndarray:
         """Values on the vertices, faces or corners of the fine mesh, from values on the refined sheet's."""
@@ -234,14 +234,14 @@ class FineMap:
     @cached_property
     def nearest_vertex(self) -> np.ndarray:
         """Coarse vertex of each fine vertex, shape (V_fine,)."""
-        found = vertex_values(self._refinements, np.arange(self.cage.vertex_count))
-        return self._on_shell("vertex", found)
+        fine_values = vertex_values(self._refinements, np.arange(self.cage.vertex_count))
+        return self._on_shell("vertex", fine_values)
 
     @cached_property
     def parent_face(self) -> np.ndarray:
         """Authored face of each fine face, shape (F_fine,)."""
-        found = self._kept[uniform_values(self._refinements, np.arange(self.cage.face_count))]
-        return self._on_shell("face", found)
+        fine_values = self._kept[uniform_values(self._refinements, np.arange(self.cage.face_count))]
+        return self._on_shell("face", fine_values)
 
     @cached_property
     def kept_corners(self) -> np.ndarray:
@@ -253,8 +253,8 @@ class FineMap:
         """Authored corner of each fine corner, shape (C_fine,)."""
         corners = np.arange(len(self.kept_corners))
         indices, values = corner_values(self._refinements, self.cage.counts, corners, corners)
-        found = self.kept_corners[values[indices]]
-        return self._on_shell("corner", found)
+        fine_values = self.kept_corners[values[indices]]
+        return self._on_shell("corner", fine_values)
 
     def count(self, interpolation: str) -> int:
         """Number of authored elements of an interpolation; ValueError for an interpolation independent of topology."""
@@ -324,27 +324,28 @@ class FineMap:
     def creases(self, ends: np.ndarray, sharpness: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Refine crease edges of the coarse mesh, shape (K, 2), with their sharpness, shape (K,).
 
-        A subdivision lowers a sharpness by one, except an infinite one. What falls to 0 is left out.
+        A subdivision lowers a finite sharpness by 1. Sharpness 0 is left out.
 
         Returns:
             Fine edges, shape (N, 2), int32, and the sharpness of each, float32; edges of a rim are infinitely sharp.
         """
-        left = lowered(sharpness, self.levels)
-        sharp = (left > 0) & (find_edges(self.cage.half_edges.edges, ends) >= 0)
-        fine, left = edge_subset(self._refinements, ends[sharp]), np.repeat(left[sharp], 2**self.levels)
+        reduced = lowered(sharpness, self.levels)
+        sharp = (reduced > 0) & (find_edges(self.cage.half_edges.edges, ends) >= 0)
+        fine, reduced = edge_subset(self._refinements, ends[sharp]), np.repeat(reduced[sharp], 2**self.levels)
         if self._shell is None:
-            return fine, left
+            return fine, reduced
         rims = self._shell.rims
         fine = np.concatenate([fine, fine + self.sheet.vertex_count, rims]).astype(np.int32)
-        return fine, np.concatenate([left, left, np.full(len(rims), INFINITE, np.float32)])
+        return fine, np.concatenate([reduced, reduced, np.full(len(rims), INFINITE, np.float32)])
 
     def corners(self, sharpness: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Sharp fine vertices, shape (N,), int32, and their sharpness, from that of each coarse vertex, shape (V,)."""
-        left = lowered(sharpness, self.levels)
-        sharp = np.flatnonzero(left > 0)
+        reduced = lowered(sharpness, self.levels)
+        sharp = np.flatnonzero(reduced > 0)
         if self._shell is not None:
-            return np.concatenate([sharp, sharp + self.sheet.vertex_count]).astype(np.int32), np.tile(left[sharp], 2)
-        return sharp.astype(np.int32), left[sharp]
+            both_sides = np.concatenate([sharp, sharp + self.sheet.vertex_count]).astype(np.int32)
+            return both_sides, np.tile(reduced[sharp], 2)
+        return sharp.astype(np.int32), reduced[sharp]
 
     def subset(self, element: str, indices: np.ndarray, *, exclusive: bool = False) -> np.ndarray:
         """Fine indices of a subset, ascending, int32.
@@ -367,16 +368,16 @@ class FineMap:
         if len(indices) and not 0 <= indices.min() <= indices.max() < limit:
             raise ValueError(f"has {element} indices from {indices.min()} to {indices.max()}; the mesh has {limit}")
         if element == "face":
-            found = face_subset(self._refinements, np.flatnonzero(np.isin(self._kept, indices)))
-            return found if self._shell is None else _behind(self._shell.face, found)
+            fine = face_subset(self._refinements, np.flatnonzero(np.isin(self._kept, indices)))
+            return fine if self._shell is None else _behind(self._shell.face, fine)
         if element == "point" and exclusive:
             return np.flatnonzero(np.isin(self.nearest_vertex, indices)).astype(np.int32)
         if element == "point":
-            found = vertex_subset(self._refinements, indices)
-            return found if self._shell is None else _behind(self._shell.vertex, found)
+            fine = vertex_subset(self._refinements, indices)
+            return fine if self._shell is None else _behind(self._shell.vertex, fine)
         if element == "edge":
-            found = edge_subset(self._refinements, indices.reshape(-1, 2)).reshape(-1)
-            return found if self._shell is None else np.concatenate([found, found + self.sheet.vertex_count])
+            fine = edge_subset(self._refinements, indices.reshape(-1, 2)).reshape(-1)
+            return fine if self._shell is None else np.concatenate([fine, fine + self.sheet.vertex_count])
         raise ValueError(f"has elements of type {element!r}; known: edge, face, point")
 
 

@@ -159,7 +159,7 @@ class LayerStream:
         """An error with the reason of a failed save, in one line."""
         reasons = reason_of(error).split("; ")
         # Some versions report unrelated trouble first, such as a plugin that failed to load.
-        reason = next((each for each in reasons if "writ" in each.lower()), reasons[0])
+        reason = next((text for text in reasons if "writ" in text.lower()), reasons[0])
         return LayerError(f"cannot write {self.target}: {reason}; nothing was left under that name")
 
     def __enter__(self) -> LayerStream:

@@ -66,9 +66,9 @@ def tag(
     """
     if not garments and not colliders and not bind and preset is None:
         raise UsageError("nothing to tag; name a garment or a collider")
-    asked = [("preset", preset, sorted(PRESETS)), ("side", side, SIDES)]
-    for what, word, known in [each for each in asked if each[1] is not None]:
-        check_known(what, word, known)
+    requested = [("preset", preset, sorted(PRESETS)), ("side", side, SIDES)]
+    for kind, word, allowed in [entry for entry in requested if entry[1] is not None]:
+        check_known(kind, word, allowed)
     check_known("asset path", asset_paths, ASSET_PATHS)
     if side is not None and not colliders:
         raise UsageError("a side is for colliders; name one")
@@ -87,8 +87,8 @@ def tag(
     for prim in cloth:
         spec = _applied(root, prim, GARMENT_API)
         _author_values(root, prim, {} if preset is None else every_fabric_value(PRESETS[preset]))
-        for each in (prim, *prim.GetChildren()):
-            _author_values(root, each, (values or {}).get(str(each.GetPath()), {}))
+        for candidate in (prim, *prim.GetChildren()):
+            _author_values(root, candidate, (values or {}).get(str(candidate.GetPath()), {}))
         author_painted(spec, prim, (painted or {}).get(str(prim.GetPath()), {}))
         if prim.GetPath() in targets:
             Sdf.RelationshipSpec(spec, TARGETS, False).targetPathList.prependedItems = targets[prim.GetPath()]
@@ -101,12 +101,12 @@ def tag(
 
 def _targets(shot: str, garments: Sequence[str], bind: Sequence[str]) -> dict[Sdf.Path, list[Sdf.Path]]:
     """Paths of all targets bound to the cloth, authored ones included, by garment."""
-    found: dict[Sdf.Path, list[Sdf.Path]] = {}
+    paths_of: dict[Sdf.Path, list[Sdf.Path]] = {}
     with closing(open_shot(shot, garments=garments, bind=bind)) as opened:
         for target in opened.targets:
             if target.on is None:
-                found.setdefault(opened.sources[target.garment].path, []).append(target.path)
-    return found
+                paths_of.setdefault(opened.sources[target.garment].path, []).append(target.path)
+    return paths_of
 
 
 def _check_values(values: Mapping[str, Mapping[str, float]]) -> None:

@@ -51,8 +51,11 @@ class TargetTracks:
             velocities: Whether velocities are authored for all.
         """
         self._bindings = GarmentBindings(shot, index, steps)
-        given = {"still": shot.sources[index].still, "absent": absent, "outside": outside, "velocities": velocities}
-        self._tracks = [_TargetTrack(stream, shot, target, **given) for target in self._bindings.targets]
+        still = shot.sources[index].still
+        self._tracks = [
+            _TargetTrack(stream, shot, target, still=still, absent=absent, outside=outside, velocities=velocities)
+            for target in self._bindings.targets
+        ]
         self.notices = [notice for track in self._tracks for notice in track.notices]
 
     @property
@@ -61,7 +64,7 @@ class TargetTracks:
         return [target.path for target in self._bindings.targets]
 
     def write(self, time: float | None, points: np.ndarray, *, changed: bool, cut: bool) -> None:
-        """Write one time code; points are those of the refined garment [m], world space, shape (V, 3)."""
+        """Write a time code, given points of the refined garment [m], world space, shape (V, 3)."""
         for track, placed in zip(self._tracks, self._bindings.at(time, points), strict=True):
             track.write(time, placed, changed=changed, cut=cut)
 
@@ -96,22 +99,33 @@ class _TargetTrack:
         for name in ("accelerations", "angularVelocities"):
             if prim.GetAttribute(name).HasAuthoredValue():
                 stream.block(path.AppendProperty(name), Sdf.ValueTypeNames.Vector3fArray)
-        moves = {"rate": rate, "absent": absent, "outside": outside, "still": still, "margin": _half_width(prim)}
         turned = _Orientations if UsdGeom.PointInstancer(prim) else _TurnedNormals
         self._turned = turned.of(stream, shot, target)
-        given, points = None if self._turned is None else self._turned.path, points_attribute(prim)
+        turned_path, points = None if self._turned is None else self._turned.path, points_attribute(prim)
         default = None if still else shot.default_points(path)
         fits = default is not None and len(default) == len(target.points)
         rest = np.asarray(default, np.float32) if fits else None
-        self._track = PointTrack(stream, path, None, rest=rest, turned=given, points=points.GetName(), **moves)
+        self._track = PointTrack(
+            stream,
+            path,
+            None,
+            rest=rest,
+            turned=turned_path,
+            points=points.GetName(),
+            rate=rate,
+            absent=absent,
+            outside=outside,
+            still=still,
+            margin=_half_width(prim),
+        )
         self._bounds = BoundsAbove(stream, shot.stage, path, purpose=UsdGeom.Imageable(prim).ComputePurpose())
 
     def write(self, time: float | None, placed: PlacedTarget, *, changed: bool, cut: bool) -> None:
-        """Write one time code; ``changed`` and ``cut`` are those of the cloth, as in `PointTrack.write`."""
+        """Write a time code; ``changed`` and ``cut`` are the cloth's, as in `PointTrack.write`."""
         to_world = to_metres(self._prim, self._metres, time)
         normals = None if self._turned is None else self._turned.at(placed.follower, to_world)
-        moves = {"changed": changed or placed.target.detail, "cut": cut}
-        self._track.write(time, placed.points, to_world, normals=normals, **moves)
+        changed = changed or placed.target.detail
+        self._track.write(time, placed.points, to_world, normals=normals, changed=changed, cut=cut)
         self._bounds.write(time, self._track.box)
 
     def finish(self) -> None:
@@ -177,12 +191,12 @@ class _Orientations:
         names = "orientationsf", "orientations"
         name = next((name for name in names if prim.GetAttribute(name).HasAuthoredValue()), names[1])
         values = prim.GetAttribute(name).Get(code)
-        known = (
+        orientations = (
             values if isinstance(values, Vt.QuathArray | Vt.QuatfArray) and len(values) == len(target.points) else ()
         )
-        given = [[*each.GetImaginary(), each.GetReal()] for each in known]
-        fits = len(given) > 0 and np.isfinite(given).all() and np.linalg.norm(given, axis=1).all()
-        local = Rotation.from_quat(given).as_matrix() if fits else np.tile(np.eye(3), (len(target.points), 1, 1))
+        quaternions = [[*orientation.GetImaginary(), orientation.GetReal()] for orientation in orientations]
+        fits = len(quaternions) > 0 and np.isfinite(quaternions).all() and np.linalg.norm(quaternions, axis=1).all()
+        local = Rotation.from_quat(quaternions).as_matrix() if fits else np.tile(np.eye(3), (len(target.points), 1, 1))
         single = name == names[0]
         path, types = target.path.AppendProperty(name), Sdf.ValueTypeNames
         stream.attribute(path, types.QuatfArray if single else types.QuathArray)
@@ -197,10 +211,10 @@ class _Orientations:
         local = np.linalg.inv(to_world[:3, :3]) @ turned.reshape(-1, 3, 3).swapaxes(1, 2)
         u, _, v = np.linalg.svd(local)
         u[:, :, 2] *= np.linalg.det(u @ v)[:, None]
-        found = Rotation.from_matrix(u @ v).as_quat()
-        found *= np.where(np.einsum("nq,nq->n", found, self._last) < 0.0, -1.0, 1.0)[:, None]
-        self._last = found
-        return found.astype(self._kind)
+        rotations = Rotation.from_matrix(u @ v).as_quat()
+        rotations *= np.where(np.einsum("nq,nq->n", rotations, self._last) < 0.0, -1.0, 1.0)[:, None]
+        self._last = rotations
+        return rotations.astype(self._kind)
 
 
 def _owners(target: Target, interpolation: str) -> np.ndarray | None:

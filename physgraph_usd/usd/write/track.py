@@ -1,4 +1,4 @@
-"""Writes the animated opinions of one garment, one time code after another.
+"""Writes the animated opinions of a garment, time code by time code.
 
 Points, normals, extent and velocities; heat maps of depth inside bodies and of crossings; and the bounds authored on
 ancestors, possibly too small for the finer cloth.
@@ -228,7 +228,7 @@ class PointTrack:
             self._last = self._matrix = None
             blocked = self._absent.pop(0)
             optional = {"normals": self._has_normals, "velocities": self._rate is not None}
-            for name in ("points", "extent", *(name for name, there in optional.items() if there)):
+            for name in ("points", "extent", *(name for name, is_wanted in optional.items() if is_wanted)):
                 self._block(name, blocked)
 
     def _block(self, name: str, time: float) -> None:
@@ -332,7 +332,7 @@ def extent_of(points: np.ndarray) -> np.ndarray:
 
 
 class HeatTrack:
-    """Writes one garment's heat maps in order; an attribute is authored with its first values.
+    """Writes a garment's heat maps in order; an attribute is authored with the first values.
 
     Only the first and last of a run of equal samples are written.
     """
@@ -350,11 +350,11 @@ class HeatTrack:
     def check(self, heat: Mapping[str, np.ndarray], time: float | None) -> None:
         """Refuse arrays without exactly one number per vertex."""
         for name, values in heat.items():
-            place = f"<{self._path(name)}>" + at_time(time)
+            location = f"<{self._path(name)}>" + at_time(time)
             if name not in HEAT:
-                raise LayerError(f"{place}: no such heat map; known: {', '.join(HEAT)}")
+                raise LayerError(f"{location}: no such heat map; known: {', '.join(HEAT)}")
             if values.shape != (self._count,):
-                raise LayerError(f"{place}: needs {self._count} values, got shape {values.shape}")
+                raise LayerError(f"{location}: needs {self._count} values, got shape {values.shape}")
 
     def write(self, time: float | None, heat: Mapping[str, np.ndarray]) -> None:
         """Write the maps of a time code by name, each of shape (V,); an omitted map gets no sample."""
@@ -398,8 +398,8 @@ class BoundsAbove:
         bounds = [prim.GetAttribute(ATTRIBUTE) for prim in (self._prim, *above)]
         # A skel root is an Xform while its skinning is baked; a gprim's extent is that of its own points.
         bounds += [prim.GetAttribute("extent") for prim in above if not UsdGeom.Gprim(prim)]
-        authored = (each for each in bounds if each and each.HasAuthoredValue())
-        self._bounds = [each for each in authored if isinstance(each.Get(_FIRST), Vt.Vec3fArray)]
+        authored = (attribute for attribute in bounds if attribute and attribute.HasAuthoredValue())
+        self._bounds = [attribute for attribute in authored if isinstance(attribute.Get(_FIRST), Vt.Vec3fArray)]
 
     def write(self, time: float | None, box: np.ndarray) -> None:
         """Enlarge the bounds by the local extent of the fine mesh, shape (2, 3), at a time code."""
@@ -415,11 +415,13 @@ class BoundsAbove:
 
     def _in_world(self, bound: Usd.Attribute, time: float | None, corners: np.ndarray) -> np.ndarray:
         """Local corners of the garment in the world, shape (N, 4), at each instance that a bound holds."""
-        held = [each for each in self._instancers if each.GetPath().HasPrefix(bound.GetPrim().GetPath())]
-        places = (placements(held[-1], time) or {}).get(self._prim.GetPath()) if held else None
-        if places is None:
+        instancers = [
+            instancer for instancer in self._instancers if instancer.GetPath().HasPrefix(bound.GetPrim().GetPath())
+        ]
+        transforms = (placements(instancers[-1], time) or {}).get(self._prim.GetPath()) if instancers else None
+        if transforms is None:
             return corners @ np.array(UsdGeom.XformCache(timecode(time)).GetLocalToWorldTransform(self._prim))
-        return np.concatenate([corners @ place.T for place in places])
+        return np.concatenate([corners @ transform.T for transform in transforms])
 
     def finish(self) -> None:
         """Enlarge the bounds at their other samples by the cloth at the time codes written on either side."""

@@ -58,9 +58,9 @@ def _takes_any(attribute: Usd.Attribute, source: Usd.Attribute) -> bool:
 
 def _attributes(layer: Sdf.Layer, path: Sdf.Path) -> Iterator[Sdf.AttributeSpec]:
     """Attributes of a layer at and below a prim."""
-    found: list[Sdf.Path | str] = []
-    layer.Traverse(path, found.append)
-    specs = (layer.GetAttributeAtPath(each) for each in found if Sdf.Path(each).IsPropertyPath())
+    twins: list[Sdf.Path | str] = []
+    layer.Traverse(path, twins.append)
+    specs = (layer.GetAttributeAtPath(path) for path in twins if Sdf.Path(path).IsPropertyPath())
     return (spec for spec in specs if spec is not None)
 
 

@@ -102,8 +102,8 @@ class LayerWriter:
         """Author metadata and the topology-dependent opinions of each garment."""
         times = self._times or self._shot.scene.times
         span = (times[0], times[-1]) if times else None
-        whole = self._times is None and not any(source.left_out for source in self._shot.sources)
-        provenance.copy_stage_metadata(self._shot.stage, self._stream.layer, span=span, whole=whole)
+        writes_all = self._times is None and not any(source.left_out for source in self._shot.sources)
+        provenance.copy_stage_metadata(self._shot.stage, self._stream.layer, span=span, whole=writes_all)
         stream, shot = self._stream, self._shot
         options, velocities = {"sibling": self._mode == "sibling", "keep": self._keep_scheme}, self._velocities
         with pxr_errors(f"cannot read {self._shot.path}"):
@@ -121,7 +121,7 @@ class LayerWriter:
                 self.notes += mesh.notes
 
     def _absent_and_outside(self, source: GarmentSource) -> tuple[Sequence[float], Sequence[float]]:
-        """Time codes at which a garment is blocked, and those outside the layer's range, ascending."""
+        """Time codes of a blocked garment, and time codes outside the layer's range, ascending."""
         span = None if self._times is None else (self._times[0], self._times[-1])
         outside = {*source.times, *source.left_out}.difference(within(source.times, span))
         return within(source.absent, span), sorted(outside)
@@ -161,9 +161,9 @@ class LayerWriter:
         for index, mesh in self._meshes.items():
             if (array := points[index]) is not None:
                 different = True if changed is None else bool(changed[index])
-                how = {"changed": different, "cut": bool(cuts) and cuts[index]}
-                mesh.write(time, array, (heat[index] if heat else None) or {}, **how)
-                self._bound[index].write(time, array, **how)
+                cut = bool(cuts) and cuts[index]
+                mesh.write(time, array, (heat[index] if heat else None) or {}, changed=different, cut=cut)
+                self._bound[index].write(time, array, changed=different, cut=cut)
         self._time = np.inf if time is None else time
 
     @property
@@ -284,13 +284,15 @@ class _RefinedMesh:
         self.notices += carry_primvars(stream, target, prim, fine, span=span)
         self.notices += carry_subsets(stream, target, prim, fine, span=span)
         self.notices += overs.author_rest_points(stream, target, prim, fine)
-        left = UsdGeom.Mesh(prim).GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded
+        is_left_handed = UsdGeom.Mesh(prim).GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded
         still = source.still or self._shell is not None
         rest = None if still else fine.vectors(shot.default_points(source.path))
-        self._sheet_normals = VertexNormals(sheet, left_handed=left, welded=sides)
+        self._sheet_normals = VertexNormals(sheet, left_handed=is_left_handed, welded=sides)
         normals, self._middle_normals = self._sheet_normals, VertexNormals(self._weld.mesh)
         if self._shell is not None:
-            normals = VertexNormals(fine.fine, left_handed=left, welded=np.concatenate([sides, sides + len(sides)]))
+            normals = VertexNormals(
+                fine.fine, left_handed=is_left_handed, welded=np.concatenate([sides, sides + len(sides)])
+            )
         rate = shot.stage.GetTimeCodesPerSecond() if velocities or source.velocities else None
         self.notices += overs.speed_notices(prim, written=rate is not None)
         own, drawn = partial(_own_velocities, prim, fine), normals if polygonal else None
@@ -322,8 +324,8 @@ class _RefinedMesh:
         """Refuse points and heat maps of the wrong shape."""
         count = self._weld.mesh.vertex_count
         if points is not None and points.shape != (count, 3):
-            place = f"<{self.target}>" + at_time(time)
-            raise LayerError(f"{place}: points have shape {points.shape}; the fine mesh has {count} vertices")
+            location = f"<{self.target}>" + at_time(time)
+            raise LayerError(f"{location}: points have shape {points.shape}; the fine mesh has {count} vertices")
         self._heat.check(heat, time)
 
     def finish(self) -> list[Notice]:

@@ -1,1 +1,1 @@
-"""Foreign solvers of the same problem, each behind an adapter that runs in its own environment."""
+"""Foreign solvers of the same problem, each behind an adapter run in a separate environment."""

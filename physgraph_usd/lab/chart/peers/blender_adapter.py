@@ -46,7 +46,7 @@ TIP = 30.0
 
 
 class Finest:
-    """The finest level: the arrays that were handed over, and values made of them."""
+    """The finest level: the received arrays, and values derived from the arrays."""
 
     def __init__(self, problem: Any) -> None:
         """Take it from a problem."""
@@ -143,7 +143,7 @@ def weigh(thing: Any, name: str, weights: np.ndarray) -> None:
 
 def run(thing: Any, budgets: list[int], *, clock: Any, most_ms: float) -> dict[int, tuple[np.ndarray, float]]:
     """Positions [m] and milliseconds after each number of frames, one run for all."""
-    scene, found, spent = bpy.context.scene, dict[int, tuple[np.ndarray, float]](), 0.0
+    scene, results, spent = bpy.context.scene, dict[int, tuple[np.ndarray, float]](), 0.0
     cache = thing.modifiers["cloth"].point_cache
     cache.frame_start, cache.frame_end = 1, max(budgets) + 1
     scene.frame_end = max(budgets) + 1
@@ -158,10 +158,10 @@ def run(thing: Any, budgets: list[int], *, clock: Any, most_ms: float) -> dict[i
                 raise SystemExit("Blender made another number of vertices")
             x = np.empty(3 * len(seen.vertices), np.float32)
             seen.vertices.foreach_get("co", x)
-            found[frame] = x.reshape(-1, 3).astype(np.float64), spent
+            results[frame] = x.reshape(-1, 3).astype(np.float64), spent
             if 2.0 * spent > most_ms:
                 break
-    return found
+    return results
 
 
 def main() -> None:
@@ -178,11 +178,11 @@ def main() -> None:
     level = Finest(np.load(arguments.problem))
     budgets = [int(steps) for steps in arguments.steps.split(",")]
     runs = [run(build(level), budgets, clock=clock, most_ms=arguments.most_ms) for _ in range(arguments.repeats)]
-    found: dict[str, Any] = {}
-    for steps in set.intersection(*(set(each) for each in runs)):
-        found[f"x_0_{steps}"] = runs[-1][steps][0]
-        found[f"ms_0_{steps}"] = np.array([each[steps][1] for each in runs])
-    np.savez(arguments.result, **found)
+    results: dict[str, Any] = {}
+    for steps in set.intersection(*(set(run) for run in runs)):
+        results[f"x_0_{steps}"] = runs[-1][steps][0]
+        results[f"ms_0_{steps}"] = np.array([run[steps][1] for run in runs])
+    np.savez(arguments.result, **results)
 
 
 if __name__ == "__main__":

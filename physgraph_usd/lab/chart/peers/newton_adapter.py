@@ -55,7 +55,7 @@ def pull(
 
 @dataclass
 class Level:
-    """One level's problem, built once; ``pulled`` is what `pull` takes before the positions."""
+    """A level's problem, built once; ``pulled`` holds the arguments of `pull` before the positions."""
 
     solver: Any
     states: tuple[Any, Any]
@@ -76,7 +76,7 @@ class Level:
         return here.particle_q.numpy().astype(np.float64)
 
     def step(self) -> None:
-        """One step, back into the state that it began in."""
+        """Make a step, with the result in the state of the start."""
         here, there = self.states
         here.particle_qd.zero_()
         inputs = [*self.pulled, here.particle_q, here.particle_f]
@@ -117,11 +117,11 @@ def build(problem: Any, index: int, solver: str, device: str) -> Level:
     builder.color(include_bending=True)
     model = builder.finalize(device=device)
     solvers = {"vbd": newton.solvers.SolverVBD, "xpbd": newton.solvers.SolverXPBD}
-    made = solvers[solver](model, iterations=ITERATIONS)
+    solver_made = solvers[solver](model, iterations=ITERATIONS)
     pulled = [wp.array(array(name), dtype=wp.int32, device=device) for name in ("starts", "columns")]
     pulled.append(wp.array(array("values"), dtype=wp.float32, device=device))
     pulled += [wp.array(array(name), dtype=wp.vec3, device=device) for name in ("load", "base")]
-    level = Level(made, (model.state(), model.state()), model.control(), base, pulled)
+    level = Level(solver_made, (model.state(), model.state()), model.control(), base, pulled)
     if wp.get_device(device).is_cuda:
         level.record()
     return level
@@ -159,7 +159,7 @@ def main() -> None:
         sp.csr_matrix((problem[f"map_values{i}"], problem[f"map_columns{i}"], problem[f"map_starts{i}"]))
         for i in range(1, count)
     ]
-    found: dict[str, Any] = {}
+    results: dict[str, Any] = {}
     for nested in (False, True):
         solve(levels, maps, 1, nested=nested)
         for steps in map(int, arguments.steps.split(",")):
@@ -168,10 +168,10 @@ def main() -> None:
                 began = clock()
                 x = solve(levels, maps, steps, nested=nested)
                 spent.append(1e3 * (clock() - began))
-            found[f"x_{nested:d}_{steps}"], found[f"ms_{nested:d}_{steps}"] = x, np.array(spent)
+            results[f"x_{nested:d}_{steps}"], results[f"ms_{nested:d}_{steps}"] = x, np.array(spent)
             if 2.0 * min(spent) > arguments.most_ms:
                 break
-    np.savez(arguments.result, **found)
+    np.savez(arguments.result, **results)
 
 
 if __name__ == "__main__":

@@ -36,10 +36,10 @@ class Peer:
     """A solver outside.
 
     Attributes:
-        name: Its name in the chart.
-        adapter: The script that its Python runs, with options.
+        name: Name in the chart.
+        adapter: The script run by the solver's Python, with options.
         note: How much of the problem it is given, in words.
-        follows: Whether it computes where we do; otherwise on the CPU.
+        follows: Whether the solver computes on our device; otherwise on the CPU.
     """
 
     name: str
@@ -61,24 +61,24 @@ PEERS = {
         "compare its strain and its shape",
     ),
 }
-"""Peers by the name that ``--peer`` takes."""
+"""Peers by the name for ``--peer``."""
 
 
 def parse_peers(values: Sequence[str]) -> list[tuple[Peer, str]]:
     """Peers with the Python of each, from ``NAME=PYTHON``.
 
     Raises:
-        UsageError: A name is unknown or there is no such Python.
+        UsageError: A name is unknown or the Python does not exist.
     """
-    found = []
-    for each in values:
-        name, _, python = each.partition("=")
+    peers = []
+    for value in values:
+        name, _, python = value.partition("=")
         if name not in PEERS or not python:
-            raise UsageError(f"peer '{each}': write NAME=PYTHON; known names: {', '.join(PEERS)}")
+            raise UsageError(f"peer '{value}': write NAME=PYTHON; known names: {', '.join(PEERS)}")
         if not Path(python).is_file():
-            raise UsageError(f"peer '{each}': {python} is no program; give the Python that has {name}")
-        found.append((PEERS[name], python))
-    return found
+            raise UsageError(f"peer '{value}': {python} is no program; give the Python that has {name}")
+        peers.append((PEERS[name], python))
+    return peers
 
 
 def measure_peers(bench: CurveBench, peers: Sequence[tuple[Peer, str]], *, clock_name: str) -> None:
@@ -142,7 +142,7 @@ def _results(
 
 
 def _problem(problem: Problem, frame: Frame, part: tuple[int, ...]) -> Iterator[tuple[str, Any]]:
-    """The arrays of every level, under names that end in its number."""
+    """The arrays of every level, under names ending in the level's number."""
     group, chains = problem.refiner.group_of(part), [problem.refiner.refinements[index] for index in part]
     modules, coarse = group.modules([frame.garments[index] for index in part])
     yield "levels", np.array(len(group.levels))
@@ -165,14 +165,14 @@ def _level(index: int, level: Level, module: ForceModule, base: torch.Tensor) ->
     springs = next((term for term in module.forces if isinstance(term, Stretch)), None)
     hinges = next(term for term in module.forces if isinstance(term, Bending))
     guide = next(term for term in module.forces if isinstance(term, Guide))
-    others = [term for term in module.forces if term not in (springs, hinges)]
-    if springs is None or len(others) != 2:
+    further = [term for term in module.forces if term not in (springs, hinges)]
+    if springs is None or len(further) != 2:
         raise SolveError("the peer has no membrane of triangles, which this garment asks for")
     load = torch.zeros_like(base)
-    for term in others:
+    for term in further:
         term.add_force(base, load)
     ends = level.hinges.long()
-    pairs = torch.stack([ends[:, [0, 1, k, other]] for k in (2, 3) for other in (4, 5)], dim=1)
+    pairs = torch.stack([ends[:, [0, 1, k, fourth]] for k in (2, 3) for fourth in (4, 5)], dim=1)
     owner = torch.arange(len(ends), device=ends.device).repeat_interleave(4)
     corners, count = torch.unique(torch.cat([owner[:, None], pairs.reshape(-1, 4)], dim=1), dim=0, return_counts=True)
     values = {
