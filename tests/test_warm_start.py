@@ -19,9 +19,10 @@ from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.refine import refine_shot
 from physgraph_usd.solver.contact.settings import ContactSettings
 from physgraph_usd.solver.frame.group import Group
-from physgraph_usd.solver.frame.solve import solve_frame, solve_soundly
+from physgraph_usd.solver.frame.solve import WorseStartError, solve_frame, solve_soundly
 from physgraph_usd.solver.frame.start import STILL, Start, start_of
 from physgraph_usd.solver.frame.values import Cage, FrameInput, FrameState, Solved
+from physgraph_usd.solver.integrate.stop import UNTANGLINGS, WARM_UNTANGLINGS
 from physgraph_usd.solver.level import refine_garments
 from physgraph_usd.solver.scene import GarmentFrame
 from physgraph_usd.solver.seen import normal_angles
@@ -211,3 +212,36 @@ def test_cloth_caught_on_the_wrong_side_is_started_anew(
     assert mended.telemetry["start"].startswith(f"cold: started anew, since {why}")
     energies = [sum(each.telemetry["energy_joules"]["output"].values()) for each in (mended, alone)]
     assert energies[0] < 0.1 * energies[1]
+
+
+@pytest.fixture(scope="module")
+def stuck() -> tuple[Group, FrameInput]:
+    """Two pressed sheets, held at their borders, that stand in one another: nothing can take them apart."""
+    flat = square(16)
+    _, rest = flat
+    away = np.abs(rest - rest.mean(axis=0)).max(axis=1)
+    pins = {"pin": (away > 0.99 * away.max()).astype(float)}
+    garments = [named(flat, name, **pins) for name in ("Level", "Upright")]
+    settings = settings_of(contact=ContactSettings(), integrator="physgraph", steps=24)
+    chains = refine_garments(garments, [1, 1])
+    group = Group.of(garments, chains, DOWN, settings, dtype=torch.float32, device="cpu")
+    edge = 2.0 * away.max() / 16
+    cages = rest, rest[:, [0, 2, 1]] * [1.0, -1.0, 1.0] + edge * np.array([0.2, 0.3, 0.4])
+    return group, FrameInput([GarmentFrame(cage * [0.92, 1.0, 1.0], FABRIC, GUIDE) for cage in cages])
+
+
+def test_a_level_ends_early_where_crossings_do_not_become_fewer(stuck: tuple[Group, FrameInput]):
+    """Beside the rounds that untangle, of 4 steps, 25 at the cage and 4 at each level, a level makes 24 steps."""
+    group, frame = stuck
+    solved = solve_frame(group, frame, None)
+    steps = [sum(report["steps"] for report in solved.telemetry["levels"] if report["level"] == n) for n in (0, 1)]
+    assert crossings(solved) > 0
+    assert steps[0] <= 24 + 4 * (UNTANGLINGS + WARM_UNTANGLINGS)
+    assert steps[1] <= 24 + 4 * WARM_UNTANGLINGS
+
+
+def test_a_start_from_a_cage_that_crosses_as_often_is_dropped(stuck: tuple[Group, FrameInput]):
+    """Finer levels only cross more often: a result with a single crossing is not to be had from there."""
+    group, frame = stuck
+    with pytest.raises(WorseStartError):
+        solve_frame(group, frame, None, fewer_than=1)

@@ -44,7 +44,7 @@ MOST_WAIT = 64
 little in a shot with cloth impossible to pull apart."""
 
 
-class _MoreCrossingsError(Exception):
+class WorseStartError(Exception):
     """A coarse level crosses as often as the result to be replaced: finer levels cross more often still."""
 
 
@@ -58,7 +58,7 @@ def solve_frame(group: Group, frame: FrameInput, last: FrameState | None, *, few
 
     Raises:
         SolveError: A term of the potential is not finite, or cloth lies wholly in a body.
-        _MoreCrossingsError: A coarse level has ``fewer_than`` crossings or more.
+        WorseStartError: A coarse level has ``fewer_than`` crossings or more.
     """
     problem = begin(group, frame, last)
     refuse_swallowed(problem)
@@ -76,7 +76,7 @@ def solve_frame(group: Group, frame: FrameInput, last: FrameState | None, *, few
             if index < problem.finest:
                 made[-1].energies = module.energies(x)
                 if level.view is not None and level.view.look(x).hopeful.count >= fewer_than:
-                    raise _MoreCrossingsError
+                    raise WorseStartError
             reports += made
     except SolveError as error:
         broken = blame(group.garments, problem.forces[-1], problem.cage.points, error=error, at=frame.at)
@@ -208,7 +208,7 @@ def _with_cage_untangled(problem: Problem, *, since: float, fewer_than: float) -
     assert view is not None
     x, reports = _untangle(level, view, Placed(view.closed(start)), view.drawn, most=UNTANGLINGS)
     if view.look(x).hopeful.count >= fewer_than:
-        raise _MoreCrossingsError
+        raise WorseStartError
     return replace(problem, contact=contact.after_cage(x), walked=x), reports
 
 
@@ -282,12 +282,10 @@ def solve_soundly(group: Group, frame: FrameInput, last: FrameState | None) -> S
     again = replace(frame, moved=np.inf, walked=None, elapsed=0.0, given_up=given_up)
     failures = 1 if last is None else last.failures + 1
     wait = min(2**failures - 1, MOST_WAIT)
-    fewer_than = _crossings(solved.telemetry, given_up=True) or math.inf
+    crossings = 0 if "follows_cage" in solved.telemetry else _crossings(solved.telemetry, given_up=True)
     try:
-        fresh = solve_frame(
-            group, again, None, fewer_than=math.inf if "follows_cage" in solved.telemetry else fewer_than
-        )
-    except _MoreCrossingsError:
+        fresh = solve_frame(group, again, None, fewer_than=crossings or math.inf)
+    except WorseStartError:
         return _waiting(solved, failures, wait)
     if _is_better(fresh.telemetry, solved.telemetry):
         return replace(fresh, telemetry=fresh.telemetry | {"start": f"cold: started anew, since {why}"})
