@@ -17,6 +17,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 UPGRADE :=
 PIP := $(BIN)/python -m pip install --disable-pip-version-check --quiet --quiet $(UPGRADE)
+TESTED := $(if $(UPGRADE),,-c constraints.txt)
 DEMO := out/demo
 ADDON := build/physgraph_usd-blender.zip
 # A process begins with tests of its own files, so that what a file solves once is solved once, and helps out at the end.
@@ -97,16 +98,16 @@ else
 	@echo "installing the $(TORCH) build of torch from torch's own index"
 	@index=$${PIP_INDEX_URL:-$$($(BIN)/python -m pip config get global.index-url 2>/dev/null)}; \
 	{ $(PIP) uv && $(BIN)/uv pip install --quiet --python $(BIN)/python --torch-backend $(TORCH) \
-		$(if $(UPGRADE),--upgrade) $${index:+--default-index "$$index"} -r pyproject.toml; } 2>$(VENV)/uv.log || \
+		$(if $(UPGRADE),--upgrade,-c constraints.txt) $${index:+--default-index "$$index"} -r pyproject.toml; } 2>$(VENV)/uv.log || \
 	echo "not available here ($(VENV)/uv.log says why): installing torch from pip's index, on Linux 5.6 GB instead of 1.8"
 endif
 	@touch $@
 
 $(VENV)/.demo: pyproject.toml $(VENV)/.torch
-	$(PIP) -e '.[usd,preview]'
+	$(PIP) $(TESTED) -e '.[usd,preview]'
 	@touch $@
 
 $(VENV)/.dev: pyproject.toml $(VENV)/.torch
-	$(PIP) -e '.[dev]'
+	$(PIP) $(TESTED) -e '.[dev]'
 	$(PIP) --upgrade --no-deps --target $(VENV)/pyblish 'pyblish-base>=1.8,<2'
 	@touch $@ $(VENV)/.demo

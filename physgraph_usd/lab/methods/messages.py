@@ -7,7 +7,7 @@ passes from round to round stays float32.
 """
 
 # Triton is not installed where there is no GPU, and its language is typed by values that only Triton reads.
-# pyright: reportMissingImports=false, reportIndexIssue=false, reportCallIssue=false
+# pyright: reportMissingImports=false, reportIndexIssue=false, reportCallIssue=false, reportArgumentType=false
 from __future__ import annotations
 
 from typing import Any, cast
