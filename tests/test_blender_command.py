@@ -50,17 +50,21 @@ def test_every_setting_arrives(command: ModuleType, tmp_path: Path) -> None:
 
 def test_the_command_understands_each_line(command: ModuleType, tmp_path: Path) -> None:
     files = command.files_of_run(tmp_path, "shot", ["Coat"])
+    for each in (files.coarse, files.cloth):  # The command asks for its shot before all else.
+        each.touch()
     settings = command.Settings((-3, 5), preset="denim", values={"density": 1.0}, level=-1, report=True, more=QUICK)
     for _, name, *words in command.command_lines("pg", settings, files, garments=["/a"], colliders=["/c"]):
         context = cli.main.commands[name].make_context(name, list(words))
         assert context.params["garments"] == ("/a",)
 
 
-def test_the_line_of_live_is_understood(command: ModuleType) -> None:
+def test_the_line_of_live_is_understood(command: ModuleType, tmp_path: Path) -> None:
+    shot = tmp_path / "a.usdc"
+    shot.touch()
     for more, device in (("", "cpu"), ("--workers 2 --device cuda", "cuda"), ("--device=cuda --workers 2", "cuda")):
         settings = command.Settings((1, 5), more=more)
-        line = command.live_line("pg", settings, Path("a.usdc"), garments=["/a", "/b"], colliders=["/c"])
-        assert line[:3] == ["pg", "live", "a.usdc"]
+        line = command.live_line("pg", settings, shot, garments=["/a", "/b"], colliders=["/c"])
+        assert line[:3] == ["pg", "live", str(shot)]
         given = cli.main.commands["live"].make_context("live", line[2:]).params
         assert given["garments"] == ("/a", "/b")
         assert given["colliders"] == ("/c",)
