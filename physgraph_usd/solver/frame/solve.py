@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -148,10 +148,8 @@ def solve_one_level(
         if problem.show is not None:
             problem.show(x)
         missing = _missing(begun, x, wanted) if blocked else 0.0
-        emerging = sum(view.look(x).in_bodies) < in_bodies
-        left.append(view.look(x).hopeful.count)
-        stuck = min(left[-STALLED:]) > 0 and min(left[-STALLED:]) >= min(left[:-STALLED], default=0)
-        if budget.ends(report, made=made, touched=touched, emerging=emerging, missing=missing, stuck=stuck):
+        emerging, left = sum(view.look(x).in_bodies) < in_bodies, [*left, view.look(x).hopeful.count]
+        if budget.ends(report, made=made, touched=touched, emerging=emerging, missing=missing, stuck=_is_stuck(left)):
             memory = _curvature(integrator, carry)
             break
         if carry.setbacks >= PATIENCE:
@@ -159,6 +157,16 @@ def solve_one_level(
         elif blocked:  # The guard's corrections do not apply to the blocked positions.
             carry = None if carry.setbacks else replace(carry, x=x)
     return x, reports, problem.module.joined_by(terms), memory
+
+
+def _is_stuck(left: Sequence[int]) -> bool:
+    """Whether crossings are left, and in none of the last `STALLED` rounds fewer than before.
+
+    Args:
+        left: Number of crossings at the start and after each round. If these are few, none is before: all count alike.
+    """
+    late = left[-STALLED:]
+    return min(late) > 0 and min(late) >= min(left[:-STALLED], default=0)
 
 
 def _solve_without_contact(

@@ -120,7 +120,7 @@ class Budget:
             touched: Whether any round had contact.
             emerging: Whether less cloth is inside or through a body than before the last round.
             missing: Part of the last round's moves that was blocked.
-            stuck: Whether the last rounds left as many crossings.
+            stuck: Whether crossings are left, and the last rounds left no fewer.
         """
         if stuck and made >= self.stuck:
             return True
