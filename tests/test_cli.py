@@ -318,7 +318,7 @@ class TestOtherCommands:
         done = run("validate", out)
         warning, last = done.stdout.splitlines()
         assert (done.exit_code, warning.startswith("warning")) == (0, True)
-        checked = f"1 prim at 2 time codes, alone and over {sample('swatch')}, by the rules of this package"
+        checked = f"1 prim at 2 time codes, alone and over {sample('swatch').name}, by the rules of this package"
         assert last.startswith(f"{out} is valid, with 1 warning: {checked}")
         layer = Sdf.Layer.FindOrOpen(str(out))
         layer.framesPerSecond = layer.timeCodesPerSecond = 7.0

@@ -84,7 +84,7 @@ def what_was_checked(layer: str | Path, shot: str | Path | None = None) -> str:
     below = shot or recorded_shot(opened)
     times = {time for path in _refined(opened) for time in _times(opened, path, None) if time is not None}
     samples = f"at {counted(len(times), 'time code')}" if times else "in one pose"
-    over = f"alone and over {below}" if below else "alone"
+    over = f"alone and over {Path(below).name}" if below else "alone"
     rules = "the rules of this package" + (" and USD's validators" if below and _usd_validation() else "")
     return f"{counted(len(_refined(opened)), 'prim')} {samples}, {over}, by {rules}"
 
