@@ -13,8 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 
 GRAVITY = 9.81
-"""Acceleration below which nothing is felt, and which is taken off larger ones [m/s^2]. With 0 instead, cloth is nearer
-to a fine simulation by up to 30% more in fast motion (`benchmarks.fidelity --paired`), but no shot is at rest."""
+"""Acceleration below which cloth feels nothing, and which is subtracted from larger accelerations [m/s^2]."""
 FASTEST = 10.0 * GRAVITY
 """Largest acceleration felt at a point [m/s^2]: a spin in a dance has 5 to 8 times gravity."""
 CUT = 2.0 * FASTEST
@@ -34,7 +33,14 @@ def acceleration_of(points: Sequence[np.ndarray], times: Sequence[float]) -> np.
 
 
 def felt(acceleration: np.ndarray) -> np.ndarray | None:
-    """The part of a cage's acceleration that its cloth feels [m/s^2], shape (V, 3); None where it feels nothing."""
+    """The excess of a cage's acceleration over gravity, which cloth feels [m/s^2], shape (V, 3).
+
+    Args:
+        acceleration: Acceleration of the cage's points [m/s^2], shape (V, 3).
+
+    Returns:
+        The excess, at most `FASTEST`; None if no point exceeds gravity, or the cage jumps (`CUT`).
+    """
     size = np.linalg.norm(acceleration, axis=1, keepdims=True)
     if not np.isfinite(size).all() or not (size > GRAVITY).any() or np.median(size) > CUT:
         return None

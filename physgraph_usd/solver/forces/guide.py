@@ -85,8 +85,8 @@ class Guide:
             three_columns(torch.as_tensor(each, dtype=level.dtype, device=level.device))
             for each in (self._coarse_weight, self._pin_weight)
         )
-        yields = np.divide(1.0, per_area, out=np.zeros_like(per_area), where=per_area > 0)
-        self._yields = three_columns(torch.as_tensor(yields, dtype=level.dtype, device=level.device))
+        compliance = np.divide(1.0, per_area, out=np.zeros_like(per_area), where=per_area > 0)
+        self._compliance = three_columns(torch.as_tensor(compliance, dtype=level.dtype, device=level.device))
         self._has_soft_pins = bool(soft.any())
         self._target = torch.zeros((len(per_area), 3), dtype=level.dtype, device=level.device)
         self._base = torch.zeros_like(level.rest)
@@ -104,7 +104,7 @@ class Guide:
         """
         base = self._level.base.apply(coarse)
         target = self._map.average.apply(base)
-        guide = self.aimed(target if push is None else target + self._yields * push, base)
+        guide = self.aimed(target if push is None else target + self._compliance * push, base)
         guide.coarse = coarse
         return guide
 

@@ -163,7 +163,8 @@ def _is_stuck(left: Sequence[int]) -> bool:
     """Whether crossings are left, and in none of the last `STALLED` rounds fewer than before.
 
     Args:
-        left: Number of crossings at the start and after each round. If these are few, none is before: all count alike.
+        left: Number of crossings at the start and after each round. With `STALLED` numbers or fewer, crossings that are
+            left count as stuck.
     """
     late = left[-STALLED:]
     return min(late) > 0 and min(late) >= min(left[:-STALLED], default=0)
@@ -268,7 +269,8 @@ def solve_soundly(group: Group, frame: FrameInput, last: FrameState | None) -> S
     self contact energy is as large as the cage's own crossings are deep). The second result is used if no patch of it
     follows the subdivided cage, or if it has fewer crossings of cloth with cloth. If it has as many: if the first alone
     crosses bodies too often (a few crossings less are no reason to change the folds); or if neither does, the first
-    energy is above the cage's, and the second is lower.
+    energy is above the cage's, and the second is lower. The second solve ends at a coarse level with as many crossings
+    of cloth as the first result: finer levels have more.
 
     Args:
         group: Garments solved together.

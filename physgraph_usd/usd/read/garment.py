@@ -129,7 +129,7 @@ class GarmentReader:
         return GarmentFrame(points, fabric, guide, detail, offset, acceleration), notices
 
     def _felt(self, time: float | None, points: np.ndarray) -> np.ndarray | None:
-        """Acceleration of the cage that the cloth feels [m/s^2], shape (V, 3); None where it feels none."""
+        """Acceleration of the cage felt by the cloth [m/s^2], shape (V, 3); None for slow or still cages."""
         share = self.values.number("inertia", time)
         found = None if self.motion is None or not share else self.motion.felt(time, points)
         return None if found is None else share * found

@@ -55,7 +55,7 @@ class CageMotion:
         self._known: dict[float, np.ndarray] = {}
 
     def felt(self, time: float | None, points: np.ndarray) -> np.ndarray | None:
-        """Acceleration that the cloth feels at a time code [m/s^2], shape (V, 3); None where it feels none.
+        """Acceleration that the cloth feels at a time code [m/s^2], shape (V, 3); None for slow or still cages.
 
         Args:
             points: The cage's positions at that time code [m].
@@ -70,7 +70,7 @@ class CageMotion:
         return felt(self._mean(_agreed(known))) if known else None
 
     def _stands(self, time: float, points: np.ndarray) -> bool:
-        """Whether the cage is where it was a frame before: it may have stopped since the samples before that."""
+        """Whether the cage rests since the previous frame, although earlier samples moved."""
         before = self._beside(time, -self._frame)
         try:
             return before is not None and float(np.abs(points - self._at(before)).max(initial=0.0)) < STANDS
@@ -78,7 +78,7 @@ class CageMotion:
             return False
 
     def _around(self, time: float) -> list[tuple[float, float, float]]:
-        """Time codes before, at and after each of up to three frames: this one and those around it."""
+        """Time codes before, at and after up to `MOST` frames: the frame at a time code and its neighbours."""
         apart = FRAMES * self._frame
         first, last = (self._beside(end, by) for end, by in ((self._times[0], apart), (self._times[-1], -apart)))
         if first is None or last is None or first > last:
