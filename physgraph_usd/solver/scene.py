@@ -157,6 +157,8 @@ class GarmentFrame:
         offset: Distance kept from colliders [m].
         acceleration: Acceleration of the coarse points that the cloth feels [m/s^2], shape (V, 3), as
             `inertia.felt` gives it; None where it feels none.
+        load: Force of the air per area at the coarse points [N/m^2], shape (V, 3), as `air.load` gives it; None for
+            calm air without a difference in pressure.
     """
 
     points: np.ndarray
@@ -165,6 +167,7 @@ class GarmentFrame:
     detail: float = 1.0
     offset: float = 0.002
     acceleration: np.ndarray | None = None
+    load: np.ndarray | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,7 +24,7 @@ AUTO_LEVEL = -1
 """Level value for automatic choice: as many subdivisions as the fabric's buckling wavelength needs."""
 
 REFINEMENT, FABRIC, REST = "Refinement", "Fabric", "Rest Shape"
-CONTACT, PAINTED, COLLISION = "Contact", "Painted Maps", "Collider"
+CONTACT, PAINTED, COLLISION, AIR = "Contact", "Painted Maps", "Collider", "Air"
 """Display groups."""
 SIDES = ("auto", "winding", "start", "front", "back")
 """Rules for the side of a mesh on which cloth belongs.
@@ -206,6 +206,24 @@ PROPERTIES: tuple[Property, ...] = (
         GARMENT_API, "physgraph:inertia", "float", 1.0, "", 0.0, 1.0,
         "Share of the animation's acceleration beyond gravity that the cloth feels. 0 leaves it out.",
         "Inertia", REFINEMENT, (0.0, 1.0),
+    ),
+    Property(
+        GARMENT_API, "physgraph:pressure", "float", 0.0, "Pa", -1e4, 1e4,
+        "Pressure of the air inside the garment over the pressure outside. It acts along the surface's normals.",
+        "Pressure", AIR, (-20.0, 20.0),
+    ),
+    Property(
+        GARMENT_API, "physgraph:wind:speed", "float", 0.0, "m/s", 0.0, 100.0,
+        "Mean speed of the wind. 0 is calm air.", "Wind Speed", AIR, (0.0, 15.0),
+    ),
+    Property(
+        GARMENT_API, "physgraph:wind:heading", "float", 0.0, "degrees", -360.0, 360.0,
+        "Direction in which the wind blows, turned about the up axis. 0 is along the stage's +X, or +Y where X is up.",
+        "Wind Heading", AIR, (-180.0, 180.0),
+    ),
+    Property(
+        GARMENT_API, "physgraph:wind:turbulence", "float", 0.0, "", 0.0, 2.0,
+        "Strength of the gusts over the mean speed of the wind.", "Wind Turbulence", AIR, (0.0, 1.0),
     ),
     _ease("warp"),
     _ease("weft"),

@@ -86,8 +86,8 @@ class Origin:
     def moved(self, part: tuple[int, ...], frame: Frame, near: Sequence[int], gravity: np.ndarray) -> float:
         """Largest motion of nearby bodies since the start frame, relative to the cages [m].
 
-        Infinite if more than poses changed. Gravity counts as a body: the end of its direction at a distance of one
-        metre.
+        Infinite if more than poses changed. A change of the air counts as far as it moves cloth. Gravity counts as a
+        body: the end of its direction at a distance of one metre.
         """
         known = [each for each in self.frames if each is not None]
         down = gravity / max(float(np.linalg.norm(gravity)), 1e-30)
@@ -96,6 +96,7 @@ class Origin:
             if last.part != part or not set_alike(frame.garments[index], last.frame) or set(near) != set(last.near):
                 return np.inf
             farthest = max(farthest, bodies_moved(last, frame.colliders, near, along=self.motion))
+            farthest = max(farthest, air_moved(last.frame, frame.garments[index]))
         return farthest
 
     @property
@@ -216,7 +217,7 @@ def is_same(part: tuple[int, ...], frame: Frame, memories: Sequence[GarmentHisto
         now, then = frame.garments[index], each.frame
         if not (set_alike(now, then) and np.array_equal(now.points, then.points)):
             return False
-        if not _pushed_alike(now.acceleration, then.acceleration):
+        if not (_pushed_alike(now.acceleration, then.acceleration) and _pushed_alike(now.load, then.load)):
             return False
         poses = [(each.colliders[body], frame.colliders[body]) for body in near]
         if not all(a is not None and b is not None and a.equals(b) for a, b in poses):
@@ -225,8 +226,16 @@ def is_same(part: tuple[int, ...], frame: Frame, memories: Sequence[GarmentHisto
 
 
 def _pushed_alike(a: np.ndarray | None, b: np.ndarray | None) -> bool:
-    """Whether the cloth feels equal accelerations."""
+    """Whether the cloth feels equal accelerations, or equal loads."""
     return a is b or (a is not None and b is not None and np.array_equal(a, b))
+
+
+def air_moved(before: GarmentFrame, now: GarmentFrame) -> float:
+    """Largest distance by which a change of the air's load moves the cloth against its guide [m]."""
+    if before.load is now.load:
+        return 0.0
+    change = sum(sign * (0.0 if each.load is None else each.load) for sign, each in ((1.0, now), (-1.0, before)))
+    return float(np.linalg.norm(change, axis=1).max(initial=0.0)) / max(now.guide, 1e-30)
 
 
 def set_alike(a: GarmentFrame, b: GarmentFrame) -> bool:

@@ -184,17 +184,21 @@ class LevelForces:
 
         Args:
             coarse: The recentred coarse positions [m].
-            frames: The garments in that frame, whose inertia pushes; () for none.
+            frames: The garments in that frame, with the loads of inertia and air; () for none.
         """
         guide = self.guide.retarget(coarse, self._push(frames))
         return ForceModule((*self.terms, guide), self._recordings, self._assembly)
 
     def _push(self, frames: Sequence[GarmentFrame]) -> Float[Tensor, "coarse 3"] | None:
-        """Minus the acceleration that cloth feels, times its density around each cage vertex [N/m^2]; None without."""
-        if all(frame.acceleration is None for frame in frames):
+        """Load of the air, minus the acceleration that cloth feels times its density, at each cage vertex [N/m^2]."""
+        if all(frame.acceleration is None and frame.load is None for frame in frames):
             return None
-        felt = [np.zeros_like(each.points) if each.acceleration is None else each.acceleration for each in frames]
-        return self._coarse_density * torch.as_tensor(-np.concatenate(felt)).to(self._coarse_density)
+        none = [np.zeros_like(frame.points) for frame in frames]
+        pairs = list(zip(frames, none, strict=True))
+        felt = np.concatenate([still if frame.acceleration is None else frame.acceleration for frame, still in pairs])
+        air = np.concatenate([calm if frame.load is None else frame.load for frame, calm in pairs])
+        density = self._coarse_density
+        return torch.as_tensor(air).to(density) - density * torch.as_tensor(felt).to(density)
 
     @cached_property
     def _coarse_density(self) -> Float[Tensor, "coarse 3"]:

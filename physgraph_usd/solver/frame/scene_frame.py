@@ -132,11 +132,16 @@ class SceneCloth:
         return {"penetration": depth, "crossing": crosses.astype(np.float32)}
 
 
-def _inertia(frames: Sequence[GarmentFrame]) -> dict[str, object]:
-    """Telemetry: the largest acceleration of the cages that is felt, relative to gravity; empty without any."""
-    felt = [frame.acceleration for frame in frames if frame.acceleration is not None]
-    sizes = [float(np.linalg.norm(each, axis=1).max(initial=0.0)) / GRAVITY for each in felt]
-    return {"inertia": round(max(sizes), 2)} if sizes else {}
+def _loads(frames: Sequence[GarmentFrame]) -> dict[str, object]:
+    """Telemetry: the largest acceleration that is felt, relative to gravity, and load of the air; empty without any."""
+    felt = [frame.acceleration / GRAVITY for frame in frames if frame.acceleration is not None]
+    air = [frame.load for frame in frames if frame.load is not None]
+    largest = {
+        name: max(float(np.linalg.norm(field, axis=1).max(initial=0.0)) for field in fields)
+        for name, fields in (("inertia", felt), ("air", air))
+        if fields
+    }
+    return {name: float(f"{value:.3g}") for name, value in largest.items()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,7 +253,7 @@ class SceneFrame:
         begun = origin.telemetry(None if cage is None else cage[1])
         entry |= begun | ({"start": solved.telemetry["start"]} if solved.telemetry["start"] != "cold" else {})
         entry |= {"time_limit": float(f"{self.limit:.3g}")} if is_over() else {}
-        entry |= _inertia(frames)
+        entry |= _loads(frames)
         states = split(solved.state, group.levels[0].spans, group.levels[-1].spans)
         found = list[Answer]()
         for place, (index, memory) in enumerate(zip(part, memories, strict=True)):

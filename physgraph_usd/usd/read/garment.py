@@ -25,6 +25,7 @@ from ..schema import GARMENT
 from ..stage import GarmentSource, Notice, Units, flattened
 from ..times import FrameGrid, within
 from .absence import Samples, absence
+from .air import Air
 from .bodies import sharpness_of
 from .cage import PointReader, read_cage
 from .grain import read_grain
@@ -92,6 +93,7 @@ class GarmentReader:
         notices: Warnings about the garment.
         hidden: Time codes of samples of the garment while invisible.
         motion: Acceleration of its cage; None for a still one.
+        air: Pressure and wind on it.
     """
 
     garment: Garment
@@ -102,6 +104,7 @@ class GarmentReader:
     notices: list[Notice] = field(default_factory=list)
     hidden: frozenset[float] = frozenset()
     motion: CageMotion | None = None
+    air: Air | None = None
 
     def frame(self, prim: Usd.Prim, metres: float, time: float | None) -> tuple[GarmentFrame, tuple[Notice, ...]]:
         """The garment at a time code, and notices of repairs.
@@ -126,7 +129,8 @@ class GarmentReader:
         thickness, offset = max(min(thickness, most), 2.0 * half), min(offset, most) + half
         fabric = replace(fabric, thickness=thickness)
         acceleration = self._felt(time, points) if there else None
-        return GarmentFrame(points, fabric, guide, detail, offset, acceleration), notices
+        load = self.air.load(points, time) if there and self.air is not None else None
+        return GarmentFrame(points, fabric, guide, detail, offset, acceleration, load), notices
 
     def _felt(self, time: float | None, points: np.ndarray) -> np.ndarray | None:
         """Acceleration of the cage felt by the cloth [m/s^2], shape (V, 3); None for slow or still cages."""
@@ -222,7 +226,8 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], samples: Samples, re
         shell=float(find_value(prim, GARMENT["shell:thickness"], request.overrides).at(None) or 0.0),
     )
     motion = _motion(prim, points, weld, times=every, metres=request.units.metres)
-    return GarmentReader(garment, source, values, points, weld, notices, samples.hidden, motion)
+    air = Air(values, garment, request.units.up, 1.0 / prim.GetStage().GetTimeCodesPerSecond())
+    return GarmentReader(garment, source, values, points, weld, notices, samples.hidden, motion, air)
 
 
 def _motion(

@@ -54,6 +54,7 @@ _EASE = ("rest:warpEase", "rest:weftEase")
 _FRAME_VALUES = (
     *(*STIFFNESSES, *_WOVEN, "density", "thickness", *_EASE),
     *("guide:stiffness", "refine:detail", "inertia", "contact:offset"),
+    *("pressure", "wind:speed", "wind:heading", "wind:turbulence"),
 )
 DENSITY = "physics:density"
 YOUNGS = "physics:youngsModulus"
