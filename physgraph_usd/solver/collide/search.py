@@ -132,7 +132,8 @@ def blocking_pairs(
     if near is None:
         none = not bool(asked.any())
         return Pairs.empty(0, asked.device) if none else _search(parts, arrays_of(start, end, **given), **kept)
-    found = _blocking_among(near.pairs, parts, query_of(arrays_of(start, end, **given), **kept))
+    some = near.pairs.where(asked[near.pairs.corners.long()].any(dim=1))
+    found = _blocking_among(some, parts, query_of(arrays_of(start, end, **given), **kept))
     given["asked"] = asked & near.leaving(end - start, floor)
     if not bool(given["asked"].any()):
         return found
