@@ -8,7 +8,7 @@ from folds import levels_of, named, square, view_of
 from test_tangles import pair
 
 from physgraph_usd.solver.forces.seam import Seam
-from physgraph_usd.solver.frame.no_worse import STAY, Faults, no_worse
+from physgraph_usd.solver.frame.no_worse import STAY, Faults, no_worse, patches_worse
 from physgraph_usd.solver.level import Placed
 
 APART = torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)
@@ -85,3 +85,15 @@ def test_seams_between_cloth_that_follows_and_cloth_as_solved_stay_closed():
     y, _, _ = kept(view, level, x, smooth, before=before)
     assert not torch.equal(y, x)
     assert torch.equal(y[ends[0]], y[ends[1]])
+
+
+def test_a_patch_is_judged_by_all_of_its_faults_together():
+    """Few vertices less inside a body are no reason to keep cloth that crosses much more often, and the other way."""
+    view, level, _ = two_pairs()
+    pairs = torch.zeros((0, 5), dtype=torch.int64)
+    triangles = level.triangles[:40].long()
+    many = torch.cat([triangles, triangles[:, :2]], dim=1)
+    inside = triangles[:10, 0]
+    crossing, within = Faults(many, inside[:0]), Faults(pairs, inside)
+    assert patches_worse(view, crossing, within)[triangles].all()
+    assert not patches_worse(view, within, crossing).any()

@@ -138,8 +138,8 @@ class TestGivenUp:
     """Pieces of cloth that are mostly tangled after all rounds at the cage of a cold frame are given up."""
 
     @staticmethod
-    def solved(*shapes: str) -> list[int]:
-        """Crossings given up in each frame; two large sheets cross everywhere, along one contour, or not at all."""
+    def shot_of(*shapes: str):
+        """Two large sheets that in each frame cross everywhere, along one contour, or not at all."""
         garments = [named(square(SIZE), each) for each in "AB"]
         rest = np.asarray(garments[0].rest)
         noise = np.random.default_rng(3).normal(size=len(rest))
@@ -149,7 +149,11 @@ class TestGivenUp:
             lower[:, 1] += (2.0 + 0.01 * time) * EDGE * noise if shape == "full" else 0.0
             upper[:, 1] += {"full": 0.0, "contour": 0.5 * rest[:, 0] + 0.1 * EDGE, "apart": 0.5 * EDGE}[shape]
             cages.append([lower, upper])
-        shown = shot(garments, cages)
+        return shot(garments, cages)
+
+    def solved(self, *shapes: str) -> list[int]:
+        """Crossings given up in each frame."""
+        shown = self.shot_of(*shapes)
         solver = shown.refiner(level=1, steps=2)
         told = [solver.solve(frame).telemetry[0] for frame in shown.frames]
         return [each["contact"]["cloth"]["after"]["given_up"] if "contact" in each else 0 for each in told]
@@ -158,6 +162,14 @@ class TestGivenUp:
         first, second, last = self.solved("full", "full", "apart")
         assert min(first, second) > SIZE**2
         assert last == 0
+
+    def test_cloth_that_is_all_given_up_follows_its_subdivided_cage_and_is_not_solved(self):
+        shown = self.shot_of("full")
+        answer = shown.refiner(level=1, steps=2).solve(shown.frames[0])
+        assert {report["level"] for report in answer.telemetry[0]["levels"]} == {0}
+        smooth = levels_of(*(named(square(SIZE), name) for name in "AB"))[-1].smooth_from_coarse
+        cages = np.concatenate([each.points for each in shown.frames[0].garments])
+        np.testing.assert_allclose(np.concatenate(answer.points), smooth @ cages, atol=1e-6)
 
     def test_one_contour_is_not(self):
         assert self.solved("contour") == [0]

@@ -1,9 +1,9 @@
 """No patch of refined cloth is worse than the subdivided cage: else it follows that cage.
 
 A patch is connected cloth around what crosses, in the solution or in the subdivided cage, with the cloth that it
-crosses. A patch is worse if more cloth or bodies cross in it than in the subdivided cage, and neither of these nor the
-vertices inside bodies are fewer. It follows the subdivided cage until the solution was as good there for `STAY` frames,
-so that it does not flicker between the two.
+crosses. Its faults are its crossings of cloth, its crossings with bodies, and its vertices inside bodies. A patch with
+more faults than in the subdivided cage follows that cage until the solution was as good there for `STAY` frames, so
+that it does not flicker between the two.
 """
 
 from __future__ import annotations
@@ -50,12 +50,10 @@ class Faults:
         none = corners.new_zeros(0)
         return Faults(corners, none if inside is None else torch.nonzero(inside.any(dim=0)).squeeze(1))
 
-    def by(self, patch: Int[Tensor, " vertices"]) -> Int[Tensor, "3 vertices"]:
-        """Crossings of cloth with cloth, with bodies, and vertices inside, of the patches by number."""
-        count = len(patch)
-        of_bodies, cloth = (self.corners >= count).any(dim=1), self.corners.amin(dim=1)  # Cloth has the lower numbers.
-        kinds = cloth[~of_bodies], cloth[of_bodies], self.inside
-        return torch.stack([torch.bincount(patch[each], minlength=count) for each in kinds])
+    def per_patch(self, patch: Int[Tensor, " vertices"]) -> Int[Tensor, " vertices"]:
+        """Number of faults of each patch, given the patch of each vertex."""
+        vertices = torch.cat([self.corners.amin(dim=1), self.inside])  # Cloth has the lower numbers.
+        return torch.bincount(patch[vertices], minlength=len(patch))
 
 
 def patches_worse(view: LevelContact, x: Faults, base: Faults) -> Bool[Tensor, " vertices"]:
@@ -68,8 +66,7 @@ def patches_worse(view: LevelContact, x: Faults, base: Faults) -> Bool[Tensor, "
     across = torch.cat([corners[:, [0, place]] for place in range(1, 5)])
     links = torch.cat([edges[region[edges].all(dim=1)], across[(across < count).all(dim=1)]])
     patch = torch.as_tensor(joined_by(links.cpu().numpy(), count), device=region.device).long()
-    more = x.by(patch) - base.by(patch)
-    return region & ((more.amin(dim=0) >= 0) & (more[:2].amax(dim=0) > 0))[patch]
+    return region & (x.per_patch(patch) > base.per_patch(patch))[patch]
 
 
 def no_worse(

@@ -58,7 +58,7 @@ def patched(problem: Problem, x: Placed) -> tuple[Placed, Tensor, dict[str, int]
     view, level = problem.view(problem.finest), problem.forces[-1].level
     if view is None:
         return x, problem.following, {}
-    smooth = level.smooth_base.apply(problem.cage.points)
+    smooth = problem.subdivided
     return no_worse(view, x, smooth, from_coarse=level.from_coarse, before=problem.following)
 
 

@@ -132,6 +132,24 @@ class Problem:
         """Whether the cage crosses itself."""
         return self.contact is not None and self.contact.crossed
 
+    @property
+    def hopeless(self) -> bool:
+        """Whether all cloth is given up: it is not solved, and follows the subdivided cage."""
+        lost = None if self.contact is None else self.contact.given_up
+        return lost is not None and bool(lost.all())
+
+    @property
+    def subdivided(self) -> Placed:
+        """The subdivided cage at the finest level [m]."""
+        x = self.forces[-1].level.smooth_base.apply(self.cage.points)
+        view = self.view(self.finest)
+        return Placed(x if view is None else view.closed(x))
+
+    @property
+    def module(self) -> ForceModule:
+        """All terms of the frame at the finest level, without contact."""
+        return self.forces[-1].module(self.aim, self.frame.garments)
+
     @cached_property
     def carried(self) -> Float[Tensor, "vertices 3"]:
         """The finest vertices with the last frame's detail, moved from their last positions as far as allowed [m]."""

@@ -65,23 +65,13 @@ def solve_frame(group: Group, frame: FrameInput, last: FrameState | None, *, few
     prepared = time.perf_counter()
     try:
         problem, reports = _with_cage_untangled(problem, since=prepared, fewer_than=fewer_than)
-        x, module, memory = None, ForceModule(()), None
-        for index in problem.levels:
-            level = problem.level(index, since=prepared)
-            if index == problem.finest and group.settings.shown is not None:
-                level = replace(level, show=partial(_show, problem, group.settings.shown))
-            x, made, module, memory = solve_one_level(level, *problem.begun(index, x))
-            if index == problem.finest and group.settings.ended is not None:
-                group.settings.ended(level, x)
-            if index < problem.finest:
-                made[-1].energies = module.energies(x)
-                if level.view is not None and level.view.look(x).hopeful.count >= fewer_than:
-                    raise WorseStartError
-            reports += made
+        if problem.hopeless:
+            x, made, module, memory = problem.subdivided, [], problem.module, None
+        else:
+            x, made, module, memory = _solve_levels(problem, since=prepared, fewer_than=fewer_than)
     except SolveError as error:
         broken = blame(group.garments, problem.forces[-1], problem.cage.points, error=error, at=frame.at)
         raise SolveError(broken) from error
-    assert x is not None
     finish, shown = dict[str, object](), x
     if problem.contact is not None:
         shown, finish = problem.contact.finish(x)
@@ -90,7 +80,7 @@ def solve_frame(group: Group, frame: FrameInput, last: FrameState | None, *, few
     shown, following, figures = patched(problem, solution)
     left = state_left(problem, x, memory, following)
     solved = time.perf_counter()
-    telemetry = telemetry_of(problem, solution, module, reports=reports)
+    telemetry = telemetry_of(problem, solution, module, reports=[*reports, *made])
     contact, crossing = measured(problem, shown)
     telemetry |= {"contact": contact | finish} if contact else {}
     telemetry |= {"follows_cage": figures} if figures else {}
@@ -98,6 +88,32 @@ def solve_frame(group: Group, frame: FrameInput, last: FrameState | None, *, few
     pairs = zip(("prepare", "solve", "measure"), marks, marks[1:], strict=False)
     telemetry["milliseconds"] = {name: round(1e3 * (end - start), 3) for name, start, end in pairs}
     return Solved(problem.placed(shown), left, telemetry, [crossing[span] for span in group.levels[-1].spans])
+
+
+def _solve_levels(
+    problem: Problem, *, since: float, fewer_than: float
+) -> tuple[Placed, list[LevelReport], ForceModule, Any]:
+    """Solve the levels of a frame, coarsest first; arguments as for `_with_cage_untangled`.
+
+    Returns:
+        As `solve_one_level`, of the finest level, with the reports of all levels.
+    """
+    settings, x, reports = problem.group.settings, None, list[LevelReport]()
+    module, memory = ForceModule(()), None
+    for index in problem.levels:
+        level = problem.level(index, since=since)
+        if index == problem.finest and settings.shown is not None:
+            level = replace(level, show=partial(_show, problem, settings.shown))
+        x, made, module, memory = solve_one_level(level, *problem.begun(index, x))
+        if index == problem.finest and settings.ended is not None:
+            settings.ended(level, x)
+        if index < problem.finest:
+            made[-1].energies = module.energies(x)
+            if level.view is not None and level.view.look(x).hopeful.count >= fewer_than:
+                raise WorseStartError
+        reports += made
+    assert x is not None
+    return x, reports, module, memory
 
 
 def _show(problem: Problem, shown: Callable[[Mapping[str, np.ndarray]], None], x: Placed) -> None:
