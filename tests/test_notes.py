@@ -13,8 +13,10 @@ from shots import run
 from stages import add_sheet, author, new_stage, save
 
 from physgraph_usd.errors import UsageError
+from physgraph_usd.shot.notes import of_given_up
 from physgraph_usd.shot.refine import inspect_shot
 from physgraph_usd.solver.fabric import NAMED, PRESETS, WORN
+from physgraph_usd.solver.scene import GIVEN_UP
 from physgraph_usd.usd.read.reader import open_shot
 from physgraph_usd.usd.schema import GARMENT, fabric_values
 
@@ -104,3 +106,14 @@ def test_a_preset_hides_what_another_has_authored(tmp_path: Path):
 
 def test_every_word_is_of_a_preset():
     assert {*NAMED.values(), *WORN.values()} <= set(PRESETS)
+
+
+def test_cloth_that_is_not_solved_is_named_with_its_frames():
+    frames = [
+        {"time": time, "garments": [{"start": start}]}
+        for time, start in ((1.0, "cold"), (2.0, GIVEN_UP), (3.0, GIVEN_UP))
+    ]
+    (note,) = of_given_up([{"path": "/dress"}], frames)
+    assert note.startswith("in 2 frames cloth is its subdivided cage")
+    assert "</dress>, first at time code 2" in note
+    assert of_given_up([{"path": "/dress"}], frames[:1]) == []

@@ -9,6 +9,7 @@ from typing import Any
 from ..errors import counted
 from ..solver.fabric import NAMED, PRESETS, WORN, Fabric
 from ..solver.resolution import SHARP_FRACTION, LevelChoice
+from ..solver.scene import GIVEN_UP
 from ..usd.lookup import PRESET
 from ..usd.schema import GARMENT
 from ..usd.stage import GarmentSource, at_time
@@ -179,6 +180,26 @@ def of_following(garments: Sequence[Mapping[str, Any]], frames: Sequence[Mapping
     text = f"in {when} part of the cloth follows its subdivided cage, where the solution crosses more often: "
     text += f"{vertices} of <{path}>{at_time(time)}, with {part['left']:,} crossings"
     return [f"{text} for {part['solved']:,} as solved"]
+
+
+def of_given_up(garments: Sequence[Mapping[str, Any]], frames: Sequence[Mapping[str, Any]]) -> list[str]:
+    """A note of the frames in which no cloth is solved, since it is given up.
+
+    Args:
+        garments: A report's garments.
+        frames: A report's frames.
+    """
+    times = [
+        (garment["path"], frame["time"])
+        for frame in frames
+        for garment, entry in zip(garments, frame.get("garments", ()), strict=False)
+        if entry.get("start") == GIVEN_UP
+    ]
+    if not times:
+        return []
+    path, time = times[0]
+    text = f"in {counted(len({time for _, time in times}), 'frame')} cloth is its subdivided cage, without folds: the"
+    return [f"{text} cage crosses itself too often to be solved (<{path}>, first{at_time(time)})"]
 
 
 def of_inertia(garments: Sequence[Mapping[str, Any]], frames: Sequence[Mapping[str, Any]]) -> list[str]:

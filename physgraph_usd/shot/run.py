@@ -29,7 +29,7 @@ from .describe import say_what_was
 from .farm import connected
 from .finished import made_from
 from .frames import CHUNK, FrameFolder, Outcome, frames_folder
-from .notes import of_energy, of_folds, of_following, of_inertia, of_rest
+from .notes import of_energy, of_folds, of_following, of_given_up, of_inertia, of_rest
 from .options import RefineOptions
 from .processes import Start, separate_processes
 from .report import LOG, RefineReport, of_a_kind
@@ -238,8 +238,8 @@ class Run:
         report.seconds["write"] = written
         report.warn(*of_frames(report), *of_drawn(entered), *of_loops(self._loop.gaps()))
         telemetry = report.garments, report.frames
-        report.note(*of_following(*telemetry), *of_inertia(*telemetry), *of_folds(*telemetry), *of_energy(*telemetry))
-        report.note(*of_polygons(drawn_through))
+        report.note(*of_following(*telemetry), *of_given_up(*telemetry), *of_inertia(*telemetry))
+        report.note(*of_folds(*telemetry), *of_energy(*telemetry), *of_polygons(drawn_through))
         (report.warn if options.strict else report.note)(*of_rest(report.unsettled, len(report.frames)))
         say_what_was(report)
 

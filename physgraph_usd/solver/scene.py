@@ -28,6 +28,8 @@ SPECK = 0.1
 """Size under which a garment's units are in doubt before its guide is [m]."""
 OUTGROWN = 1e3
 """Median edges of the rest shape above which those of a cage are not of stretched cloth: it rests as a speck."""
+GIVEN_UP = "given up: the cloth is its subdivided cage"
+"""Start, in a frame's telemetry, of cloth that is not solved since its cage crosses itself too often."""
 SAME_TIME = 1e-3
 """Time codes closer than this count as equal: float seconds and layer offsets leave rounding errors. Two poses that
 close are the sides of a jump."""

@@ -29,6 +29,7 @@ from ..integrate.guard import PATIENCE
 from ..integrate.saddle import leave_saddle
 from ..integrate.stop import UNTANGLINGS, WARM_UNTANGLINGS
 from ..level import Placed, unhindered
+from ..scene import GIVEN_UP
 from .group import Group
 from .level_forces import blame
 from .outcome import measured, patched, refuse_swallowed, scaled, state_left, telemetry_of
@@ -81,6 +82,7 @@ def solve_frame(group: Group, frame: FrameInput, last: FrameState | None, *, few
     left = state_left(problem, x, memory, following)
     solved = time.perf_counter()
     telemetry = telemetry_of(problem, solution, module, reports=[*reports, *made])
+    telemetry |= {"start": GIVEN_UP} if problem.hopeless else {}
     contact, crossing = measured(problem, shown)
     telemetry |= {"contact": contact | finish} if contact else {}
     telemetry |= {"follows_cage": figures} if figures else {}
@@ -326,7 +328,9 @@ def _waiting(solved: Solved, failures: int, wait: int) -> Solved:
 
 
 def _unsound(telemetry: Mapping[str, Any]) -> str:
-    """Why a result is unsound; "" if sound."""
+    """Why a result is unsound; "" if sound, or if nothing was solved."""
+    if telemetry["start"] == GIVEN_UP:
+        return ""
     if (worse := telemetry.get("follows_cage")) and not _given_up(telemetry):
         return f"it kept {worse['solved']:,} crossings, and the subdivided cage has {worse['subdivided']:,}"
     if crossings := _crossings(telemetry) + _through_bodies(telemetry):
