@@ -98,7 +98,7 @@ class Cloth:
         """Pairs that are found, in order."""
         some = np.ones(len(x), bool) if asked is None else asked
         given = [torch.as_tensor(each) for each in (x, end)]
-        return named_pairs(blocking_pairs(self.parts, *given, floor=0.0, asked=torch.as_tensor(some)))
+        return named_pairs(blocking_pairs(self.parts, *given, floor=0.0, queried=torch.as_tensor(some)))
 
     def missed(self, x: np.ndarray, end: np.ndarray, found: set[Pair]) -> set[Pair]:
         """Pairs of parts that touch on a move according to the toolkit, and are not found."""
@@ -246,7 +246,7 @@ def test_one_search_finds_what_blocks_a_move_and_what_is_near_at_its_end(shape: 
         start, aim = torch.as_tensor(x), torch.as_tensor(end)
         blocked, near = blocking_and_near(cloth.parts, start, aim, reach, floor=floor)
         asked = torch.ones(len(x), dtype=torch.bool)
-        alone = blocking_pairs(cloth.parts, start, aim, floor=floor, asked=asked)
+        alone = blocking_pairs(cloth.parts, start, aim, floor=floor, queried=asked)
         expected = set(named_pairs(alone))
         values = dict(zip(named_pairs(blocked), blocked.value.tolist(), strict=True))
         assert [values[pair] for pair in named_pairs(alone)] == pytest.approx(alone.value.tolist(), abs=1e-12)

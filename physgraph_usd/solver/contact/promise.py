@@ -54,7 +54,7 @@ class Promise:
     def blocking(self, begin: Tensor, end: Tensor, asked: Tensor, *, near: NearAt | None = None) -> Pairs:
         """As `blocking_pairs`."""
         given = {"floor": self.floor, "tangle": self.tangle, "inside": self.inside}
-        return blocking_pairs(self.mesh.parts, begin, end, **given, asked=asked, near=near)
+        return blocking_pairs(self.mesh.parts, begin, end, **given, queried=asked, near=near)
 
     def kept(
         self,
@@ -158,7 +158,7 @@ def safe_move(
     given = {"floor": floor, "tangle": tangle, "inside": inside}
     cloth, dtype = torch.arange(len(way), device=way.device) < parts.level.vertex_count, dtype or wanted.dtype
     for attempt in range(len(way) + ROUNDS):
-        more = blocking_pairs(parts, start, x, asked=asked, near=near, **given)
+        more = blocking_pairs(parts, start, x, queried=asked, near=near, **given)
         if not len(more.value):
             break
         least = torch.ones_like(share)

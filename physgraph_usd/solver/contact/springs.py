@@ -172,7 +172,7 @@ class ClothSprings:
         inside: Bool[Tensor, " all"] | None,
     ) -> NearAt:
         """Near pairs at the cloth's positions x, with bodies ``at`` [m]; masks are as for `near_parts`."""
-        near = self.known(x) or near_parts(self._mesh.parts, at, self.reach, asked=asked, inside=inside)
+        near = self.known(x) or near_parts(self._mesh.parts, at, self.reach, queried=asked, inside=inside)
         self._near = x, x._version, near
         return near
 
@@ -186,7 +186,7 @@ class ClothSprings:
         asked: Bool[Tensor, " all"] | None,
     ) -> Pairs:
         """Pairs that block a move of cloth and bodies to an end with the cloth at x [m]; near pairs there are kept."""
-        found, near = blocking_and_near(self._mesh.parts, begin, end, self.reach, floor=floor, asked=asked)
+        found, near = blocking_and_near(self._mesh.parts, begin, end, self.reach, floor=floor, queried=asked)
         self._near = x, x._version, near
         return found
 
@@ -220,7 +220,7 @@ class ClothSprings:
             stiffness: Stiffness by area [N/m^3].
         """
         near, count = springs.near, self._mesh.level.vertex_count
-        normal = torch.nn.functional.normalize(near.way, dim=1, eps=1e-300)
+        normal = torch.nn.functional.normalize(near.separation, dim=1, eps=1e-300)
         corners = near.corners.long()
         least = torch.where(corners < count, self._area[corners.clamp_max(count - 1)], torch.inf)
         share = torch.where(near.face & (corners[:, 0] < count), least[:, 0], least.amin(dim=1) / 3.0)
@@ -238,7 +238,7 @@ class ClothSprings:
         pairs, count = near.near, self._mesh.level.vertex_count
         corners = pairs.corners.long()
         with_body, of_vertex = corners.amax(dim=1) >= count, pairs.face & (corners[:, 0] < count)
-        touching = with_body & (pairs.way.norm(dim=1) < ON_SURFACE)
+        touching = with_body & (pairs.separation.norm(dim=1) < ON_SURFACE)
         out = torch.zeros((len(self._keep) - self._cloths, count), dtype=torch.bool, device=corners.device)
         on = corners[touching & of_vertex]
         out[self.owner[on[:, 3]].long() - self._cloths, on[:, 0]] = True

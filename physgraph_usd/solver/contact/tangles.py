@@ -170,11 +170,11 @@ def chords_of(
     """
     _, place = ways_out(mesh, pierced.crossings, x)
     edge, face = mesh.edges[pierced.crossings.edge], mesh.triangles[pierced.crossings.face]
-    own = pierced.own.unsqueeze(1)
+    own = pierced.cloth_edge.unsqueeze(1)
     corners = torch.where(own, edge[:, [0, 1, 0, 0]], face[:, [0, 1, 2, 0]])
     along = torch.nn.functional.pad(torch.stack([1.0 - place[:, 0], place[:, 0]], dim=1), (0, 2))
     weight = torch.where(own, along, torch.nn.functional.pad(place[:, 1:], (0, 1)))
-    number = torch.where(pierced.own, pierced.crossings.edge, pierced.crossings.face + len(mesh.edges))
+    number = torch.where(pierced.cloth_edge, pierced.crossings.edge, pierced.crossings.face + len(mesh.edges))
     key = number * len(inside) + pierced.body
     keys, row = torch.unique(key, return_inverse=True)
     mean = torch.zeros((len(keys), 4), dtype=weight.dtype, device=x.device)
