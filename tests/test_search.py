@@ -15,7 +15,7 @@ import warp as wp
 from folds import named
 from meshes import grid
 
-from physgraph_usd.solver.collide.narrow_phase import next_place
+from physgraph_usd.solver.collide.narrow_phase import next_slot
 from physgraph_usd.solver.collide.pairs import Pairs, Reach
 from physgraph_usd.solver.collide.parts import TASKS, Parts, Room
 from physgraph_usd.solver.collide.search import blocking_and_near, blocking_pairs, near_parts
@@ -164,7 +164,7 @@ def judged(shape: Shape, moves: int, seed: int) -> tuple[int, int]:
 @wp.kernel
 def list_items(first: wp.int32, count: wp.array(dtype=wp.int32), out: wp.array(dtype=wp.int32)):  # pyright: ignore
     """Write the number of each item of a launch to a place of its own."""
-    out[next_place(count)] = first + wp.tid()
+    out[next_slot(count)] = first + wp.tid()
 
 
 def test_threads_that_count_at_once_share_no_place():

@@ -201,13 +201,7 @@ def _kind_search(put: Any) -> Any:
         share: wp.int32,
         bits: wp.int32,
     ):
-        """Call ``put`` for pairs of parts of clusters i and j.
-
-        Of cluster i, only parts whose numbers end in the bits ``share`` take part.
-
-        Returns:
-            The next key.
-        """
+        """Call ``put`` for pairs of parts, of cluster i those whose numbers end in ``share``; returns the next key."""
         room, size = boxes.radius[i] + boxes.radius[j], parts.clusters + 1
         for b in range(parts.first[first * size + i], parts.first[first * size + i + 1], ALL):
             near = boxes_near(boxes.clusters, j, boxes.parts, b, blocks_left(parts, first, i, b), room)

@@ -227,10 +227,8 @@ def _search_pass(parts: Parts, query: Any) -> tuple[Tensor, ...]:
     _launch(parts, bound_parts, size, parts.topology, query, parts.boxes)
     candidates, count = torch.zeros((2, 1), dtype=torch.int32, device=device)
     keys = [torch.empty(size, dtype=torch.int64, device=device) for size in (room.candidates, room.pairs)]
-    candidate_parts, out = (
-        torch.empty((room.candidates, 3), dtype=torch.int32, device=device),
-        Pairs.empty(room.pairs, device),
-    )
+    out = Pairs.empty(room.pairs, device)
+    candidate_parts = torch.empty((room.candidates, 3), dtype=torch.int32, device=device)
     results = SearchResults()
     results.candidates, results.count = wp.from_torch(candidates), wp.from_torch(count)
     results.candidate_key, results.key = (wp.from_torch(key) for key in keys)
