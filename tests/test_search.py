@@ -228,7 +228,7 @@ def test_no_pair_that_blocks_a_move_is_lost_where_near_pairs_are_known(shape: Sh
     for x, end in random_moves(cloth, 30, seed=9):
         some, reach = 10.0 ** rng.uniform(-3.0, 0.0, (len(x), 1)), near_by(cloth, rng)
         start, aim = torch.as_tensor(x), torch.as_tensor(x + some * (end - x))
-        given = {"floor": 0.01 * EDGE, "asked": torch.ones(len(x), dtype=torch.bool)}
+        given = {"floor": 0.01 * EDGE, "queried": torch.ones(len(x), dtype=torch.bool)}
         near = near_parts(cloth.parts, start, reach)
         expected = set(named_pairs(blocking_pairs(cloth.parts, start, aim, **given)))
         found = set(named_pairs(blocking_pairs(cloth.parts, start, aim, near=near, **given)))
