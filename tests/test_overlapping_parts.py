@@ -57,10 +57,10 @@ class TestParts:
         way = surface.exit(x, found)
         lost = torch.ones(1, dtype=torch.bool)
         assert not bool(pinched(found, way, longest=0.02))
-        assert bool(pinched(found, way, longest=0.02, lost=lost))
-        assert bool(pinched(found, way, longest=0.06, lost=lost))
+        assert bool(pinched(found, way, longest=0.02, buried=lost))
+        assert bool(pinched(found, way, longest=0.06, buried=lost))
         # The report counts it as the solve leaves it.
-        assert [bool(depths(surface, x, lost, 0.02, lost=each)[1]) for each in (None, lost)] == [False, True]
+        assert [bool(depths(surface, x, lost, 0.02, buried=each)[1]) for each in (None, lost)] == [False, True]
 
     @pytest.mark.parametrize("along", [0.5, -0.5])
     def test_a_face_that_a_part_comes_through_is_no_way_out_there(self, along: float):
@@ -90,8 +90,8 @@ class TestLost:
     def test_cloth_right_through_an_overlap_is_lost_there(self):
         level, view, x = self.view(together(OVER, UNDER))
         assert view.bodies is not None
-        assert view.bodies.lost is not None
-        lost = view.bodies.lost[0]
+        assert view.bodies.buried is not None
+        lost = view.bodies.buried[0]
         assert int(lens_of(level).sum()) > 9
         assert bool(lost[lens_of(level, wider=-0.01)].all())
         assert not bool(lost[~lens_of(level, wider=0.01)].any())
@@ -102,8 +102,8 @@ class TestLost:
         """In one part, whose face over it the other buries, but nowhere in both: it is pushed out."""
         _, view, x = self.view(together(OVER, UNDER), height=0.03)
         assert view.bodies is not None
-        assert view.bodies.lost is not None
-        assert not bool(view.bodies.lost[0].any())
+        assert view.bodies.buried is not None
+        assert not bool(view.bodies.buried[0].any())
         assert not torch.equal(view.pushed_out(x), x)
 
 

@@ -15,7 +15,7 @@ import warp as wp
 from folds import named
 from meshes import grid
 
-from physgraph_usd.solver.collide.narrow_phase import next_place
+from physgraph_usd.solver.collide.narrow_phase import next_slot
 from physgraph_usd.solver.collide.pairs import Pairs, Reach
 from physgraph_usd.solver.collide.parts import TASKS, Parts, Room
 from physgraph_usd.solver.collide.search import blocking_and_near, blocking_pairs, near_parts
@@ -98,7 +98,7 @@ class Cloth:
         """Pairs that are found, in order."""
         some = np.ones(len(x), bool) if asked is None else asked
         given = [torch.as_tensor(each) for each in (x, end)]
-        return named_pairs(blocking_pairs(self.parts, *given, floor=0.0, asked=torch.as_tensor(some)))
+        return named_pairs(blocking_pairs(self.parts, *given, floor=0.0, queried=torch.as_tensor(some)))
 
     def missed(self, x: np.ndarray, end: np.ndarray, found: set[Pair]) -> set[Pair]:
         """Pairs of parts that touch on a move according to the toolkit, and are not found."""
@@ -164,7 +164,7 @@ def judged(shape: Shape, moves: int, seed: int) -> tuple[int, int]:
 @wp.kernel
 def list_items(first: wp.int32, count: wp.array(dtype=wp.int32), out: wp.array(dtype=wp.int32)):  # pyright: ignore
     """Write the number of each item of a launch to a place of its own."""
-    out[next_place(count)] = first + wp.tid()
+    out[next_slot(count)] = first + wp.tid()
 
 
 def test_threads_that_count_at_once_share_no_place():
@@ -228,7 +228,7 @@ def test_no_pair_that_blocks_a_move_is_lost_where_near_pairs_are_known(shape: Sh
     for x, end in random_moves(cloth, 30, seed=9):
         some, reach = 10.0 ** rng.uniform(-3.0, 0.0, (len(x), 1)), near_by(cloth, rng)
         start, aim = torch.as_tensor(x), torch.as_tensor(x + some * (end - x))
-        given = {"floor": 0.01 * EDGE, "asked": torch.ones(len(x), dtype=torch.bool)}
+        given = {"floor": 0.01 * EDGE, "queried": torch.ones(len(x), dtype=torch.bool)}
         near = near_parts(cloth.parts, start, reach)
         expected = set(named_pairs(blocking_pairs(cloth.parts, start, aim, **given)))
         found = set(named_pairs(blocking_pairs(cloth.parts, start, aim, near=near, **given)))
@@ -246,7 +246,7 @@ def test_one_search_finds_what_blocks_a_move_and_what_is_near_at_its_end(shape: 
         start, aim = torch.as_tensor(x), torch.as_tensor(end)
         blocked, near = blocking_and_near(cloth.parts, start, aim, reach, floor=floor)
         asked = torch.ones(len(x), dtype=torch.bool)
-        alone = blocking_pairs(cloth.parts, start, aim, floor=floor, asked=asked)
+        alone = blocking_pairs(cloth.parts, start, aim, floor=floor, queried=asked)
         expected = set(named_pairs(alone))
         values = dict(zip(named_pairs(blocked), blocked.value.tolist(), strict=True))
         assert [values[pair] for pair in named_pairs(alone)] == pytest.approx(alone.value.tolist(), abs=1e-12)

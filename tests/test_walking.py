@@ -94,7 +94,7 @@ class TestNearPairs:
         assert 0 < len(found.face) < len(every.face)
         at_rest = (found.weight.double().unsqueeze(2) * rest[found.corners.long()]).sum(dim=1).norm(dim=1)
         # The closest points at rest are others: they are no farther apart than these.
-        assert bool((found.way.norm(dim=1) < 0.5 * at_rest + 1e-6).all())
+        assert bool((found.separation.norm(dim=1) < 0.5 * at_rest + 1e-6).all())
 
 
 def parts_of(corners: list[int], split: int) -> frozenset[frozenset[int]]:

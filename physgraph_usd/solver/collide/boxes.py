@@ -30,7 +30,7 @@ wp.set_module_options(KERNELS)
 ROWS = 12
 """Rows of a block of boxes."""
 FAR = wp.constant(wp.float64(1.0e30))
-"""Corner of an empty box, and distance of what is not there [m]."""
+"""Corner of an empty box, and distance to missing parts [m]."""
 ROUNDED_UP = wp.constant(wp.float64(1.000001))
 """Factor on search distances, for their rounding to single precision."""
 
@@ -46,7 +46,7 @@ class Ask(IntEnum):
 
 _OVERLAPPING = """
     const float* a = (const float*)boxes.data + (part / 8) * 96 + part % 8;
-    const float* all = (const float*)others.data + block * 96;
+    const float* all = (const float*)blocks.data + block * 96;
     unsigned long long mask = 0;
     float low[3], high[3], to_low[3], to_high[3];
     for (int axis = 0; axis < 3; ++axis) {
@@ -93,16 +93,16 @@ _LOWEST = """
 
 @wp.struct
 class Query:
-    """What is searched: the kind of query, positions at both ends, queried vertices, and distances.
+    """A search: the kind of query, positions at both ends, queried vertices, and distances.
 
     Attributes:
         kind: As in `Ask`.
         clusters: Number of clusters searched: those of the cloth, or all.
         start: Positions [m].
         end: Positions at the end; those at the start without a move [m].
-        asked: Each pair contains a vertex for which this is True.
-        tangle: The tangle of each vertex, -1 outside tangles; pairs inside one tangle are no result.
-        inside: True for cloth vertices inside a body; their pairs with bodies are no result.
+        queried: True for queried vertices; each pair contains at least one.
+        tangle: The tangle of each vertex, -1 outside tangles; pairs inside one tangle are skipped.
+        inside: True for cloth vertices inside a body; their pairs with bodies are skipped.
         floor: Gap to keep in a move [m].
         radius: Search radius of near parts [m].
         play: As for `Reach` [m].
@@ -113,7 +113,7 @@ class Query:
     clusters: wp.int32
     start: wp.array(dtype=wp.vec3d)
     end: wp.array(dtype=wp.vec3d)
-    asked: wp.array(dtype=wp.bool)
+    queried: wp.array(dtype=wp.bool)
     tangle: wp.array(dtype=wp.int32)
     inside: wp.array(dtype=wp.bool)
     floor: wp.float64
@@ -130,7 +130,7 @@ class Boxes:
         clusters: Boxes of the clusters, in blocks [m].
         parts: Boxes of the parts, in blocks [m].
         radius: Search distance of each cluster [m].
-        asked: True for clusters with a queried vertex.
+        queried: True for clusters with a queried vertex.
         met: True for clusters in a pair that no axis separates.
         low: Least corner of each cluster's paths, less the search distance [m].
         high: Greatest corner of each cluster's paths, plus the search distance [m].
@@ -139,7 +139,7 @@ class Boxes:
     clusters: wp.array(dtype=wp.float32)
     parts: wp.array(dtype=wp.float32)
     radius: wp.array(dtype=wp.float32)
-    asked: wp.array(dtype=wp.bool)
+    queried: wp.array(dtype=wp.bool)
     met: wp.array(dtype=wp.bool)
     low: wp.array(dtype=wp.vec3f)
     high: wp.array(dtype=wp.vec3f)
@@ -149,7 +149,7 @@ class Boxes:
 def boxes_near(
     boxes: wp.array(dtype=wp.float32),
     part: wp.int32,
-    others: wp.array(dtype=wp.float32),
+    blocks: wp.array(dtype=wp.float32),
     block: wp.int32,
     count: wp.int32,
     room: wp.float32,
@@ -192,12 +192,12 @@ def put(
     to_high: wp.vec3d,
 ):
     """Write a box into its lane."""
-    place = (part // LANES) * (ROWS * LANES) + part % LANES
+    start = (part // LANES) * (ROWS * LANES) + part % LANES
     for axis in range(3):
-        boxes[place + LANES * axis] = lower(low[axis])
-        boxes[place + LANES * (3 + axis)] = upper(high[axis])
-        boxes[place + LANES * (6 + axis)] = lower(to_low[axis])
-        boxes[place + LANES * (9 + axis)] = upper(to_high[axis])
+        boxes[start + LANES * axis] = lower(low[axis])
+        boxes[start + LANES * (3 + axis)] = upper(high[axis])
+        boxes[start + LANES * (6 + axis)] = lower(to_low[axis])
+        boxes[start + LANES * (9 + axis)] = upper(to_high[axis])
 
 
 @wp.kernel
@@ -205,18 +205,18 @@ def bound_clusters(first: wp.int32, parts: Topology, query: Query, boxes: Boxes)
     """Boxes and search distances of the clusters, and whether they are queried."""
     i = first + wp.tid()
     low, high, to_low, to_high = wp.vec3d(FAR), wp.vec3d(-FAR), wp.vec3d(FAR), wp.vec3d(-FAR)
-    radius, asked = wp.float64(0.0), wp.int32(0)
+    radius, queried = wp.float64(0.0), wp.int32(0)
     for k in range(parts.first_corner[i], parts.first_corner[i + 1]):
         v = parts.corners[k]
         low, high = wp.min(low, query.start[v]), wp.max(high, query.start[v])
         to_low, to_high = wp.min(to_low, query.end[v]), wp.max(to_high, query.end[v])
         radius = wp.max(radius, query.radius[v])
-        if query.asked[v]:
-            asked = 1
+        if query.queried[v]:
+            queried = 1
     put(boxes.clusters, i, low, high, to_low, to_high)
     radius = ROUNDED_UP * (radius + wp.float64(0.5) * query.floor)
     boxes.radius[i] = wp.float32(radius)
-    boxes.asked[i] = asked == 1
+    boxes.queried[i] = queried == 1
     boxes.met[i] = False
     low, high = wp.min(low, to_low) - wp.vec3d(radius), wp.max(high, to_high) + wp.vec3d(radius)
     boxes.low[i] = wp.vec3f(lower(low[0]), lower(low[1]), lower(low[2]))
@@ -253,7 +253,7 @@ def boxes_for(topology: Any, device: str) -> Any:
         setattr(boxes, name, wp.array(np.tile(block, size), dtype=wp.float32, device=device))
     boxes.low, boxes.high = (wp.empty(count, dtype=wp.vec3f, device=device) for _ in range(2))
     boxes.radius = wp.empty(count, dtype=wp.float32, device=device)
-    boxes.asked, boxes.met = (wp.empty(count, dtype=wp.bool, device=device) for _ in range(2))
+    boxes.queried, boxes.met = (wp.empty(count, dtype=wp.bool, device=device) for _ in range(2))
     return boxes
 
 
@@ -267,28 +267,30 @@ def arrays_of(
     start: Tensor,
     end: Tensor | None = None,
     *,
-    asked: Tensor | None = None,
+    queried: Tensor | None = None,
     tangle: Tensor | None = None,
     inside: Tensor | None = None,
     radius: Tensor | None = None,
     play: Tensor | None = None,
 ) -> list[Tensor]:
     """The arrays of a query, in order, with constants for those that are None; float64 positions of shape (V, 3)."""
-    given = (
-        (asked, 1.0, torch.bool),
+    optional = (
+        (queried, 1.0, torch.bool),
         (tangle, -1.0, torch.int32),
         (inside, 0.0, torch.bool),
         (radius, 0.0, torch.float64),
         (play, 0.0, torch.float64),
     )
-    masks = [_filled(fill, len(start), start.device, kind) if each is None else each for each, fill, kind in given]
-    return [each.contiguous() for each in (start, start if end is None else end, *masks)]
+    filled = [
+        _filled(fill, len(start), start.device, dtype) if values is None else values for values, fill, dtype in optional
+    ]
+    return [values.contiguous() for values in (start, start if end is None else end, *filled)]
 
 
 def query_of(arrays: Sequence[Tensor], *, kind: Ask = Ask.MOVE, floor: float = 0.0, half: float = 0.0) -> Any:
-    """A query as a Warp struct, given its `arrays_of`; the numbers are described there."""
+    """A query as a Warp struct, given its `arrays_of`; the numbers are as for `Query`."""
     query = Query()
     query.kind, query.floor, query.half = int(kind), floor, half
-    for name, values in zip(("start", "end", "asked", "tangle", "inside", "radius", "play"), arrays, strict=True):
+    for name, values in zip(("start", "end", "queried", "tangle", "inside", "radius", "play"), arrays, strict=True):
         setattr(query, name, wp.from_torch(values, dtype=wp.vec3d if values.ndim == 2 else None))
     return query

@@ -29,9 +29,9 @@ class Crossings:
         """Number of crossings."""
         return len(self.edge)
 
-    def where(self, kept: Bool[Tensor, " crossings"]) -> Crossings:
+    def where(self, selected: Bool[Tensor, " crossings"]) -> Crossings:
         """The selected crossings."""
-        return Crossings(self.edge[kept], self.face[kept])
+        return Crossings(self.edge[selected], self.face[selected])
 
     @staticmethod
     def none(device: torch.device) -> Crossings:
@@ -41,15 +41,15 @@ class Crossings:
 
 
 def crossings(
-    parts: Parts, x: Float[Tensor, "vertices 3"], asked: Bool[Tensor, " vertices"] | None = None
+    parts: Parts, x: Float[Tensor, "vertices 3"], queried: Bool[Tensor, " vertices"] | None = None
 ) -> Crossings:
     """Crossings of cloth with cloth: edges through faces without a common or sewn vertex.
 
     Args:
         x: Positions of the cloth, or of the cloth and the bodies' corners [m].
-        asked: Mask of vertices; each crossing has one of these among its corners. All vertices when None.
+        queried: Mask of vertices; each crossing has at least one among its corners. All vertices when None.
     """
-    return all_crossings(parts, x, asked)[0]
+    return all_crossings(parts, x, queried)[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,13 +58,13 @@ class Pierced:
 
     Attributes:
         crossings: Edges of cloth or bodies and faces of bodies or cloth.
-        body: Number of the body of each, shape (N,).
-        own: True for edges of the cloth, shape (N,).
+        body: Number of the body of each crossing, shape (N,).
+        cloth_edge: True for edges of the cloth, shape (N,).
     """
 
     crossings: Crossings
     body: Int[Tensor, " crossings"]
-    own: Bool[Tensor, " crossings"]
+    cloth_edge: Bool[Tensor, " crossings"]
 
     @property
     def count(self) -> int:
@@ -79,27 +79,27 @@ class Pierced:
 
     def cut(self, body: int) -> Int[Tensor, " cut"]:
         """Indices of the cloth's edges that pass through a body, once for each face met."""
-        return self.crossings.edge[self.own & (self.body == body)]
+        return self.crossings.edge[self.cloth_edge & (self.body == body)]
 
 
 def all_crossings(
-    parts: Parts, x: Float[Tensor, "all 3"], asked: Bool[Tensor, " all"] | None = None
+    parts: Parts, x: Float[Tensor, "all 3"], queried: Bool[Tensor, " all"] | None = None
 ) -> tuple[Crossings, Pierced]:
     """As `crossings`, and the crossings of cloth and bodies.
 
     Args:
         x: Positions of the cloth, and of the bodies' corners if bodies are searched too [m].
-        asked: As for `crossings`; crossings with bodies may be missing in clusters without such vertices.
+        queried: As for `crossings`; crossings with bodies may be missing in clusters without such vertices.
     """
-    edge, face = piercing_edges(parts, x, asked).T.contiguous()
+    edge, face = piercing_edges(parts, x, queried).T.contiguous()
     if not len(edge):
         return Crossings(edge, face), Pierced.none(x.device)
     edges, faces = parts.starts
     of_edge, of_face = torch.bucketize(edge, edges, right=True), torch.bucketize(face, faces, right=True)
     with_body = (of_edge > 0) | (of_face > 0)
-    own, body = (of_edge == 0)[with_body], torch.maximum(of_edge, of_face)[with_body] - 1
-    found, pierced = Crossings(edge, face).where(~with_body), Crossings(edge, face).where(with_body)
-    if asked is not None:
-        corners = torch.cat([parts.level.edges[found.edge], parts.level.triangles[found.face]], dim=1).long()
-        found = found.where(asked[corners].any(dim=1))
-    return found, Pierced(pierced, body, own)
+    cloth_edge, body = (of_edge == 0)[with_body], torch.maximum(of_edge, of_face)[with_body] - 1
+    in_cloth, with_bodies = Crossings(edge, face).where(~with_body), Crossings(edge, face).where(with_body)
+    if queried is not None:
+        corners = torch.cat([parts.level.edges[in_cloth.edge], parts.level.triangles[in_cloth.face]], dim=1).long()
+        in_cloth = in_cloth.where(queried[corners].any(dim=1))
+    return in_cloth, Pierced(with_bodies, body, cloth_edge)

@@ -32,12 +32,12 @@ def along(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d):
 def weights_on_triangle(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
     """Weights of p and the corners in the vector from a triangle's closest point to p; the weights sum to 0."""
     zero, one = wp.float64(0.0), wp.float64(1.0)
-    first, second, way = b - a, c - a, p - a
+    first, second, to_p = b - a, c - a, p - a
     normal = wp.cross(first, second)
     size = wp.dot(normal, normal)
     if size > PARALLEL * wp.dot(first, first) * wp.dot(second, second):
         # Inside all three sides the foot of the perpendicular is the closest point.
-        v, w = wp.dot(wp.cross(way, second), normal), wp.dot(wp.cross(first, way), normal)
+        v, w = wp.dot(wp.cross(to_p, second), normal), wp.dot(wp.cross(first, to_p), normal)
         if v >= zero and w >= zero and v + w <= size:
             return wp.vec4d(one, (v + w) / size - one, -v / size, -w / size)
     r, s, t = along(p, a, b), along(p, b, c), along(p, c, a)
@@ -54,9 +54,9 @@ def weights_on_triangle(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
 def weights_of_edges(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
     """Weights of the ends in the shortest vector from the edge c-d to the edge a-b; the weights sum to 0."""
     zero, one = wp.float64(0.0), wp.float64(1.0)
-    first, second, way = b - a, d - c, a - c
+    first, second, c_to_a = b - a, d - c, a - c
     aa, cc, ac = wp.dot(first, first), wp.dot(second, second), wp.dot(first, second)
-    wa, wc = wp.dot(way, first), wp.dot(way, second)
+    wa, wc = wp.dot(c_to_a, first), wp.dot(c_to_a, second)
     size = aa * cc - ac * ac
     best = wp.vec4d(one, zero, zero, zero)
     least = wp.float64(1.0e300)
@@ -65,7 +65,7 @@ def weights_of_edges(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
         if s >= zero and s <= one and t >= zero and t <= one:
             # Of edges that are all but parallel rounding decides where: an end may be nearer.
             best = wp.vec4d(one - s, s, t - one, -t)
-            gap = way + s * first - t * second
+            gap = c_to_a + s * first - t * second
             least = wp.dot(gap, gap)
     for end in range(4):
         # One edge's end, and the closest point of the other edge.

@@ -25,15 +25,15 @@ PAIR_KINDS = wp.constant(3)
 
 
 @wp.struct
-class Found:
-    """Output of a search, in any order, counted even without room.
+class SearchResults:
+    """Output of a search, in any order; results beyond the room are counted too.
 
     Attributes:
-        candidates: Number of pairs of parts whose boxes meet, where they are noted, shape (1,).
-        candidate_key: The place of each of them in the right order.
-        parts: Kind of the first part of each, and numbers of both.
-        count: Number of pairs that are results, shape (1,).
-        key: The place of each result in the right order.
+        candidates: Number of noted pairs of parts whose boxes meet, shape (1,).
+        candidate_key: Sort key of each candidate.
+        parts: Kind of the first part of each candidate, and numbers of both parts.
+        count: Number of results, shape (1,).
+        key: Sort key of each result.
         corners, value, face: The fields of `Pairs`.
     """
 
@@ -68,9 +68,9 @@ def nearness(face: wp.bool, c: wp.vec4i, parts: Topology, query: Query, within: 
 
 
 @wp.func
-def is_asked(parts: Topology, query: Query, c: wp.vec4i):
+def is_queried(parts: Topology, query: Query, c: wp.vec4i):
     """True if a vertex of a pair is queried; not for cloth in one tangle, nor for cloth inside a body and the body."""
-    if not (query.asked[c[0]] or query.asked[c[1]] or query.asked[c[2]] or query.asked[c[3]]):
+    if not (query.queried[c[0]] or query.queried[c[1]] or query.queried[c[2]] or query.queried[c[3]]):
         return False
     if parts.owner[c[0]] >= parts.cloths or parts.owner[c[3]] >= parts.cloths:
         return not (query.inside[c[0]] or query.inside[c[1]] or query.inside[c[2]] or query.inside[c[3]])
@@ -83,11 +83,11 @@ def is_asked(parts: Topology, query: Query, c: wp.vec4i):
 def value_of(face: wp.bool, c: wp.vec4i, parts: Topology, query: Query):
     """Safe fraction of the paths of a vertex and a face or of two edges, or their distance over the search distance.
 
-    The value is 1 for pairs that are no result. Most are apart along the line through their middles already. If both
-    are searched, the safe fraction is less by 1, and thus negative.
+    The value is 1 for pairs that are not written. Most of these are separated along the line through their middles. If
+    moves and near pairs are searched together, the safe fraction is less by 1, and thus negative.
     """
     one, zero = wp.float64(1.0), wp.vec3d()
-    if not is_asked(parts, query, c):
+    if not is_queried(parts, query, c):
         return one
     at, to = query.start[c[0]], query.end[c[0]]
     b, d, f = query.start[c[1]] - at, query.start[c[2]] - at, query.start[c[3]] - at
@@ -142,13 +142,15 @@ def blocks_left(parts: Topology, kind: wp.int32, i: wp.int32, block: wp.int32):
 #endif
 """
 )
-def next_place(count: wp.array(dtype=wp.int32)) -> wp.int32:
-    """The count, which is then one more, also where several threads count; Warp's own sum counts alone on the CPU."""
+def next_slot(count: wp.array(dtype=wp.int32)) -> wp.int32:
+    """The count before it is increased by 1; unlike Warp's `atomic_add`, atomic on the CPU too."""
     ...
 
 
 @wp.func
-def write(parts: Topology, query: Query, found: Found, key: wp.int64, first: wp.int32, k: wp.int32, m: wp.int32):
+def write(
+    parts: Topology, query: Query, results: SearchResults, key: wp.int64, first: wp.int32, k: wp.int32, m: wp.int32
+):
     """Append a pair of parts to the results if its value is below 1; for crossings edge and face numbers as corners."""
     p, q = parts.parts[k], parts.parts[m]
     c = wp.vec4i(p[0], q[0], q[1], q[2])
@@ -163,21 +165,23 @@ def write(parts: Topology, query: Query, found: Found, key: wp.int64, first: wp.
         value = wp.float64(1.0)
     if value >= wp.float64(1.0):
         return
-    place = next_place(found.count)
-    if place < found.key.shape[0]:
-        found.key[place] = key
-        found.corners[place] = c
-        found.value[place] = value
-        found.face[place] = first == Part.VERTEX
+    slot = next_slot(results.count)
+    if slot < results.key.shape[0]:
+        results.key[slot] = key
+        results.corners[slot] = c
+        results.value[slot] = value
+        results.face[slot] = first == Part.VERTEX
 
 
 @wp.func
-def note(parts: Topology, query: Query, found: Found, key: wp.int64, first: wp.int32, k: wp.int32, m: wp.int32):
+def note(
+    parts: Topology, query: Query, results: SearchResults, key: wp.int64, first: wp.int32, k: wp.int32, m: wp.int32
+):
     """Note two parts as candidates."""
-    place = next_place(found.candidates)
-    if place < found.candidate_key.shape[0]:
-        found.candidate_key[place] = key
-        found.parts[place] = wp.vec3i(first, k, m)
+    slot = next_slot(results.candidates)
+    if slot < results.candidate_key.shape[0]:
+        results.candidate_key[slot] = key
+        results.parts[slot] = wp.vec3i(first, k, m)
 
 
 def _kind_search(put: Any) -> Any:
@@ -188,7 +192,7 @@ def _kind_search(put: Any) -> Any:
         parts: Topology,
         query: Query,
         boxes: Boxes,
-        found: Found,
+        results: SearchResults,
         first: wp.int32,
         second: wp.int32,
         i: wp.int32,
@@ -197,8 +201,7 @@ def _kind_search(put: Any) -> Any:
         share: wp.int32,
         bits: wp.int32,
     ):
-        """Put pairs of a cluster's parts of one kind, shared by the last bits of their numbers, and another's; returns
-        the next key."""
+        """Call ``put`` for pairs of parts, of cluster i those whose numbers end in ``share``; returns the next key."""
         room, size = boxes.radius[i] + boxes.radius[j], parts.clusters + 1
         for b in range(parts.first[first * size + i], parts.first[first * size + i + 1], ALL):
             near = boxes_near(boxes.clusters, j, boxes.parts, b, blocks_left(parts, first, i, b), room)
@@ -208,15 +211,15 @@ def _kind_search(put: Any) -> Any:
                 if k & bits != share:
                     continue
                 p = parts.parts[k]
-                if not (boxes.asked[j] or query.asked[p[0]] or query.asked[p[1]] or query.asked[p[2]]):
+                if not (boxes.queried[j] or query.queried[p[0]] or query.queried[p[1]] or query.queried[p[2]]):
                     continue
                 for c in range(parts.first[second * size + j], parts.first[second * size + j + 1], ALL):
-                    others = boxes_near(boxes.parts, k, boxes.parts, c, blocks_left(parts, second, j, c), room)
-                    while others != wp.uint64(0):
-                        m = LANES * c + lowest_bit(others)
-                        others = without_lowest(others)
+                    partners = boxes_near(boxes.parts, k, boxes.parts, c, blocks_left(parts, second, j, c), room)
+                    while partners != wp.uint64(0):
+                        m = LANES * c + lowest_bit(partners)
+                        partners = without_lowest(partners)
                         if (first != second or i != j or k < m) and not shares(parts.labels[k], parts.labels[m]):
-                            put(parts, query, found, key, first, k, m)
+                            put(parts, query, results, key, first, k, m)
                             key += wp.int64(1)
         return key
 
@@ -234,26 +237,26 @@ def _finder(put: Any, name: str) -> wp.Kernel:
         tasks: wp.int32,
         query: Query,
         boxes: Boxes,
-        found: Found,
+        results: SearchResults,
     ):
-        """Pairs of each two clusters, in one task or in a task for each kind and share.
+        """Search pairs of clusters, each in one task or in a task for each kind and share.
 
-        Clusters of negative numbers have none. With several tasks, their number is a power of two times `PAIR_KINDS`.
+        Pairs with negative numbers are skipped. With several tasks, their number is a power of two times `PAIR_KINDS`.
         """
         task = start + wp.tid()
-        n, own = task // tasks, task % tasks
+        n, subtask = task // tasks, task % tasks
         i, j = clusters[n][0], clusters[n][1]
         if i < 0:
             return
-        share, bits = own // PAIR_KINDS, wp.max(tasks // PAIR_KINDS, 1) - 1
-        kind, key = wp.where(tasks == 1, -1, own % PAIR_KINDS), wp.int64(task) << wp.int64(20)
-        one, other = wp.where(query.kind == Ask.CROSSING, Part.EDGE, Part.VERTEX), Part.FACE
+        share, bits = subtask // PAIR_KINDS, wp.max(tasks // PAIR_KINDS, 1) - 1
+        kind, key = wp.where(tasks == 1, -1, subtask % PAIR_KINDS), wp.int64(task) << wp.int64(20)
+        first_kind, second_kind = wp.where(query.kind == Ask.CROSSING, Part.EDGE, Part.VERTEX), Part.FACE
         if kind <= 0:
-            key = search_kind(parts, query, boxes, found, one, other, i, j, key, share, bits)
+            key = search_kind(parts, query, boxes, results, first_kind, second_kind, i, j, key, share, bits)
         if i != j and (kind < 0 or kind == 1):
-            key = search_kind(parts, query, boxes, found, one, other, j, i, key, share, bits)
+            key = search_kind(parts, query, boxes, results, first_kind, second_kind, j, i, key, share, bits)
         if query.kind != Ask.CROSSING and (kind < 0 or kind == 2):
-            key = search_kind(parts, query, boxes, found, Part.EDGE, Part.EDGE, i, j, key, share, bits)
+            key = search_kind(parts, query, boxes, results, Part.EDGE, Part.EDGE, i, j, key, share, bits)
 
     return cast(wp.Kernel, wp.kernel(find, name=name, **ALONE))
 
@@ -262,12 +265,12 @@ find_pairs, find_candidates = _finder(write, "find_pairs"), _finder(note, "find_
 
 
 @wp.kernel
-def judge_candidates(start: wp.int32, parts: Topology, query: Query, found: Found):
-    """Write the candidates that are results."""
+def judge_candidates(start: wp.int32, parts: Topology, query: Query, results: SearchResults):
+    """Evaluate all candidates and write results."""
     i = start + wp.tid()
-    if i < found.candidates[0]:
-        which = found.parts[i]
-        write(parts, query, found, found.candidate_key[i], which[0], which[1], which[2])
+    if i < results.candidates[0]:
+        candidate = results.parts[i]
+        write(parts, query, results, results.candidate_key[i], candidate[0], candidate[1], candidate[2])
 
 
 @wp.kernel

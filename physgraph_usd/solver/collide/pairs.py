@@ -48,15 +48,15 @@ class Pairs:
         value = torch.empty(count, dtype=torch.float64, device=device)
         return Pairs(corners, value, torch.empty(count, dtype=torch.bool, device=device))
 
-    def where(self, kept: Bool[Tensor, " pairs"] | Int[Tensor, " kept"]) -> Pairs:
+    def where(self, selected: Bool[Tensor, " pairs"] | Int[Tensor, " kept"]) -> Pairs:
         """The selected pairs."""
-        if kept.dtype == torch.bool:  # Once for all three.
-            kept = torch.nonzero(kept).squeeze(1)
-        return Pairs(self.corners[kept], self.value[kept], self.face[kept])
+        if selected.dtype == torch.bool:  # One conversion for three fields.
+            selected = torch.nonzero(selected).squeeze(1)
+        return Pairs(self.corners[selected], self.value[selected], self.face[selected])
 
-    def joined(self, other: Pairs) -> Pairs:
-        """These pairs and others."""
-        return Pairs(*(torch.cat([getattr(self, each.name), getattr(other, each.name)]) for each in fields(self)))
+    def joined(self, pairs: Pairs) -> Pairs:
+        """These pairs, followed by further pairs."""
+        return Pairs(*(torch.cat([getattr(self, field.name), getattr(pairs, field.name)]) for field in fields(self)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,33 +70,33 @@ class NearAt:
     pairs: Pairs
     reach: Reach
 
-    def leaving(self, way: Float[Tensor, "vertices 3"], floor: float) -> Bool[Tensor, " vertices"]:
+    def leaving(self, move: Float[Tensor, "vertices 3"], floor: float) -> Bool[Tensor, " vertices"]:
         """Mask of the vertices whose move [m] may bring parts that are not near closer than a floor [m].
 
         Parts that are not near are farther apart than the sum of their plays. Two parts whose vertices move by at most
-        their play less half the floor keep the floor. Where a play is under half the floor any move counts, and the
+        their play less half the floor keep the floor. If a play is less than half the floor, any move counts, and the
         parts keep at least half the floor.
         """
-        return way.norm(dim=1) > (self.reach.play - 0.5 * floor).clamp_min(0.0)
+        return move.norm(dim=1) > (self.reach.play - 0.5 * floor).clamp_min(0.0)
 
 
 @dataclass(frozen=True, eq=False)
 class NearPairs:
-    """Pairs of parts near one another.
+    """Near pairs of parts, and the shortest vectors between them.
 
     Attributes:
         corners: A vertex and the corners of a face, or the ends of two edges, shape (N, 4), int32.
         weight: Weights of the corners in the shortest vector from the second part to the first; rows sum to 0, shape
             (N, 4).
-        way: Shortest vector [m], shape (N, 3).
+        separation: Shortest vector [m], shape (N, 3).
         face: True for a vertex and a face, shape (N,).
     """
 
     corners: Int[Tensor, "pairs 4"]
     weight: Float[Tensor, "pairs 4"]
-    way: Float[Tensor, "pairs 3"]
+    separation: Float[Tensor, "pairs 3"]
     face: Bool[Tensor, " pairs"]
 
-    def where(self, kept: Int[Tensor, " kept"]) -> NearPairs:
+    def where(self, selected: Int[Tensor, " kept"]) -> NearPairs:
         """The selected pairs."""
-        return NearPairs(self.corners[kept], self.weight[kept], self.way[kept], self.face[kept])
+        return NearPairs(self.corners[selected], self.weight[selected], self.separation[selected], self.face[selected])

@@ -94,10 +94,12 @@ class Parts:
         label = np.arange(level.vertex_count) if label is None else label
         size = SIZE[torch.device(level.device).type]
         self.topology, self.surface = topology_of(level, meets, label, size=size, solids=solids)
-        edges = np.cumsum([len(level.edges), *(len(each.edges) for each in solids)])
-        faces = np.cumsum([len(level.triangles), *(len(each.faces) for each in solids)])
+        edges = np.cumsum([len(level.edges), *(len(solid.edges) for solid in solids)])
+        faces = np.cumsum([len(level.triangles), *(len(solid.faces) for solid in solids)])
         self.faces = int(faces[-1])
-        self.starts = tuple(torch.as_tensor(each[:-1].astype(np.int64), device=level.device) for each in (edges, faces))
+        self.starts = tuple(
+            torch.as_tensor(numbers[:-1].astype(np.int64), device=level.device) for numbers in (edges, faces)
+        )
         self.boxes, self.recordings = boxes_for(self.topology, level.device), Recordings()
         self.room, self.tasks = Room(), 1 if level.device == "cpu" else TASKS
 
@@ -120,11 +122,11 @@ class Parts:
         self, vertices: Int[Tensor, " some"]
     ) -> tuple[Int[Tensor, " links"], Int[Tensor, " links"], Float[Tensor, " links"]]:
         """The links of some vertices: these vertices, the linked vertices, and lengths at rest [m]."""
-        starts, others, lengths = self._rows
+        starts, neighbours, lengths = self._rows
         count = starts[vertices + 1] - starts[vertices]
-        place = torch.arange(int(count.sum()), device=count.device)
-        place += (starts[vertices] - count.cumsum(dim=0) + count).repeat_interleave(count)
-        return vertices.repeat_interleave(count), others[place], lengths[place]
+        slot = torch.arange(int(count.sum()), device=count.device)
+        slot += (starts[vertices] - count.cumsum(dim=0) + count).repeat_interleave(count)
+        return vertices.repeat_interleave(count), neighbours[slot], lengths[slot]
 
 
 def _sewn(label: np.ndarray) -> np.ndarray:

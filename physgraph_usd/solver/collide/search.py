@@ -20,7 +20,7 @@ from torch import Tensor
 from ..mesh.kernels import KERNELS
 from ..mesh.threads import argument, refit, run
 from .boxes import Ask, Boxes, Query, arrays_of, bound_clusters, bound_parts, boxes_near, query_of
-from .narrow_phase import Found, check_pairs, find_candidates, find_pairs, judge_candidates
+from .narrow_phase import SearchResults, check_pairs, find_candidates, find_pairs, judge_candidates
 from .pairs import NearAt, Pairs, Reach
 from .parts import Parts
 from .topology import LANES, Topology
@@ -39,13 +39,15 @@ def find_clusters(
     out: wp.array(dtype=wp.int32),
     count: wp.array(dtype=wp.int32),
 ):
-    """Clusters not separated from each queried cluster by an axis at both ends; each pair once, counted even without
-    room."""
+    """Clusters not separated from each queried cluster by an axis at both ends, each pair once.
+
+    Pairs beyond the room are counted too.
+    """
     i, j, n = first + wp.tid(), wp.int32(0), wp.int32(0)
-    if boxes.asked[i]:
+    if boxes.queried[i]:
         around = wp.bvh_query_aabb(tree, boxes.low[i], boxes.high[i])
         while wp.bvh_query_next(around, j):
-            if j >= query.clusters or (j < i and boxes.asked[j]):
+            if j >= query.clusters or (j < i and boxes.queried[j]):
                 continue
             if parts.meets[parts.garment[i] * parts.garments + parts.garment[j]] == 0:
                 continue
@@ -63,7 +65,7 @@ def list_clusters(
     first: wp.int32,
     room: wp.int32,
     boxes: Boxes,
-    found: wp.array(dtype=wp.int32),
+    slots: wp.array(dtype=wp.int32),
     count: wp.array(dtype=wp.int32),
     end: wp.array(dtype=wp.int32),
     pairs: wp.array(dtype=wp.vec2i),
@@ -75,15 +77,15 @@ def list_clusters(
     if count[i] > 0:
         boxes.met[i] = True
     for n in range(wp.min(count[i], room)):
-        j = found[i * room + n]
+        j = slots[i * room + n]
         k = wp.int32(n)
         boxes.met[j] = True
-        while k > 0 and found[i * room + k - 1] > j:
-            found[i * room + k] = found[i * room + k - 1]
+        while k > 0 and slots[i * room + k - 1] > j:
+            slots[i * room + k] = slots[i * room + k - 1]
             k -= 1
-        found[i * room + k] = j
+        slots[i * room + k] = j
     for n in range(wp.min(wp.min(count[i], room), pairs.shape[0] - end[i] + count[i])):
-        pairs[end[i] - count[i] + n] = wp.vec2i(i, found[i * room + n])
+        pairs[end[i] - count[i] + n] = wp.vec2i(i, slots[i * room + n])
 
 
 def near_parts(
@@ -91,15 +93,17 @@ def near_parts(
     x: Float[Tensor, "vertices 3"],
     reach: Reach,
     *,
-    asked: Bool[Tensor, " vertices"] | None = None,
+    queried: Bool[Tensor, " vertices"] | None = None,
     inside: Bool[Tensor, " vertices"] | None = None,
 ) -> NearAt:
     """All near pairs with cloth at x [m], without pairs of bodies and cloth inside a body.
 
-    Arguments are as for `blocking_pairs`. Positions of the cloth alone give pairs of the cloth alone, in all searches.
+    Arguments are as for `blocking_pairs`. In all searches, positions without the bodies' corners give pairs of cloth.
     """
-    asked = _of_cloth(parts, x) if asked is None else asked
-    arrays = arrays_of(x.double(), asked=asked, inside=inside, radius=reach.radius.double(), play=reach.play.double())
+    queried = _of_cloth(parts, x) if queried is None else queried
+    arrays = arrays_of(
+        x.double(), queried=queried, inside=inside, radius=reach.radius.double(), play=reach.play.double()
+    )
     return NearAt(_search(parts, arrays, kind=Ask.NEAR, half=reach.half), reach)
 
 
@@ -109,7 +113,7 @@ def blocking_pairs(
     end: Float[Tensor, "vertices 3"],
     *,
     floor: float,
-    asked: Bool[Tensor, " vertices"],
+    queried: Bool[Tensor, " vertices"],
     tangle: Int[Tensor, " vertices"] | None = None,
     inside: Bool[Tensor, " vertices"] | None = None,
     near: NearAt | None = None,
@@ -122,22 +126,24 @@ def blocking_pairs(
         start: Positions [m].
         end: End positions [m].
         floor: Gap that pairs keep [m]; a pair that is already closer keeps most of its distance.
-        asked: Queried vertices; each pair contains at least one.
+        queried: Queried vertices; each pair contains at least one.
         tangle: The tangle of each vertex, int32, -1 outside tangles; pairs inside a single tangle are skipped; or None.
         inside: Cloth vertices inside a body, without pairs with bodies; or None.
         near: All near pairs with cloth at the start; None if unknown.
     """
-    given = {"asked": asked, "tangle": tangle, "inside": inside}
-    start, end, kept = start.double(), end.double(), {"kind": Ask.MOVE, "floor": floor}
-    if near is None:
-        none = not bool(asked.any())
-        return Pairs.empty(0, asked.device) if none else _search(parts, arrays_of(start, end, **given), **kept)
-    some = near.pairs.where(asked[near.pairs.corners.long()].any(dim=1))
-    found = _blocking_among(some, parts, query_of(arrays_of(start, end, **given), **kept))
-    given["asked"] = asked & near.leaving(end - start, floor)
-    if not bool(given["asked"].any()):
-        return found
-    return found.joined(_search(parts, arrays_of(start, end, **given), **kept))
+    start, end = start.double(), end.double()
+
+    def arrays(queried: Tensor) -> list[Tensor]:
+        return arrays_of(start, end, queried=queried, tangle=tangle, inside=inside)
+
+    blocking = Pairs.empty(0, queried.device)
+    if near is not None:
+        some = near.pairs.where(queried[near.pairs.corners.long()].any(dim=1))
+        blocking = _blocking_among(some, parts, query_of(arrays(queried), kind=Ask.MOVE, floor=floor))
+        queried = queried & near.leaving(end - start, floor)
+    if not bool(queried.any()):
+        return blocking
+    return blocking.joined(_search(parts, arrays(queried), kind=Ask.MOVE, floor=floor))
 
 
 def blocking_and_near(
@@ -147,29 +153,29 @@ def blocking_and_near(
     reach: Reach,
     *,
     floor: float,
-    asked: Bool[Tensor, " vertices"] | None = None,
+    queried: Bool[Tensor, " vertices"] | None = None,
 ) -> tuple[Pairs, NearAt]:
     """All pairs blocking a move, and all near pairs at the end of the move, by one search.
 
-    Arguments are as for `blocking_pairs`; ``asked`` contains all vertices able to move, and is all cloth when None.
+    Arguments are as for `blocking_pairs`; ``queried`` contains all vertices able to move, and is all cloth when None.
     """
-    asked = _of_cloth(parts, start) if asked is None else asked
-    given = {"asked": asked, "radius": reach.radius.double(), "play": reach.play.double()}
-    arrays = arrays_of(start.double(), end.double(), **given)
-    found = _search(parts, arrays, kind=Ask.MOVE_NEAR, floor=floor, half=reach.half)
-    blocks = found.value < 0.0
-    blocking = found.where(blocks)
-    near = found.where(~blocks) if len(blocking.face) else found
+    queried = _of_cloth(parts, start) if queried is None else queried
+    radius, play = reach.radius.double(), reach.play.double()
+    arrays = arrays_of(start.double(), end.double(), queried=queried, radius=radius, play=play)
+    pairs = _search(parts, arrays, kind=Ask.MOVE_NEAR, floor=floor, half=reach.half)
+    blocks = pairs.value < 0.0
+    blocking = pairs.where(blocks)
+    near = pairs.where(~blocks) if len(blocking.face) else pairs
     return replace(blocking, value=blocking.value + 1.0), NearAt(near, reach)
 
 
 def piercing_edges(
-    parts: Parts, x: Float[Tensor, "vertices 3"], asked: Bool[Tensor, " vertices"] | None = None
+    parts: Parts, x: Float[Tensor, "vertices 3"], queried: Bool[Tensor, " vertices"] | None = None
 ) -> Int[Tensor, "crossings 2"]:
     """Indices of each crossing edge and face at x [m], sorted; clusters without a queried vertex may be left out."""
-    asked = _of_cloth(parts, x) if asked is None else asked
-    found = _search(parts, arrays_of(x.double(), asked=asked), kind=Ask.CROSSING).corners[:, :2].long()
-    return found[torch.argsort(found[:, 0] * max(parts.faces, 1) + found[:, 1])]
+    queried = _of_cloth(parts, x) if queried is None else queried
+    pairs = _search(parts, arrays_of(x.double(), queried=queried), kind=Ask.CROSSING).corners[:, :2].long()
+    return pairs[torch.argsort(pairs[:, 0] * max(parts.faces, 1) + pairs[:, 1])]
 
 
 def _of_cloth(parts: Parts, x: Tensor) -> Bool[Tensor, " vertices"]:
@@ -183,57 +189,58 @@ def _search(parts: Parts, arrays: Sequence[Tensor], *, kind: Ask, floor: float =
     if not clusters:
         return Pairs.empty(0, device)
 
-    def query(*arrays: Tensor) -> Any:
-        asked = query_of(arrays, kind=kind, floor=floor, half=half)
-        asked.clusters = clusters
-        return asked
+    def search_pass(*arrays: Tensor) -> tuple[Tensor, ...]:
+        query = query_of(arrays, kind=kind, floor=floor, half=half)
+        query.clusters = clusters
+        return _search_pass(parts, query)
 
     while True:
-        key = kind, floor, half, clusters
-        counts, order, *found = parts.recordings.run(key, lambda *arrays: _looked(parts, query(*arrays)), *arrays)
+        counts, order, *columns = parts.recordings.run((kind, floor, half, clusters), search_pass, *arrays)
         needed = counts.tolist()
         if not parts.room.lacks(*needed):
             break
         parts.recordings.clear()
     count = needed[-1]
-    return Pairs(*(each[:count] for each in found)).where(order[:count].argsort())
+    return Pairs(*(column[:count] for column in columns)).where(order[:count].argsort())
 
 
-def _looked(parts: Parts, query: Any) -> tuple[Tensor, ...]:
-    """One pass of a search in the room there is.
+def _search_pass(parts: Parts, query: Any) -> tuple[Tensor, ...]:
+    """One pass of a search with the present room.
 
-    On a card a thread judges one candidate: threads that judged what they find would wait for a few of them.
+    On a card each thread judges one candidate. If threads judged the candidates that they find, most threads would wait
+    for a few.
 
     Returns:
-        Most pairs of clusters of a cluster, number of them, of candidates, and of pairs of parts; the place of each
-        pair of parts in the right order; and the fields of `Pairs`.
+        Largest number of partners of a cluster, and numbers of pairs of clusters, of candidates and of pairs of parts;
+        the sort key of each pair of parts; and the fields of `Pairs`.
     """
     room, size, device, tree = parts.room, query.clusters, parts.level.device, parts.tree
     _launch(parts, bound_clusters, size, parts.topology, query, parts.boxes)
     refit(tree, device)
     slots = torch.empty(size * room.of_each, dtype=torch.int32, device=device)
-    own = torch.empty(size, dtype=torch.int32, device=device)
-    inputs = [parts.topology, query, parts.boxes, tree.id, room.of_each, argument(slots), argument(own)]
+    partner_counts = torch.empty(size, dtype=torch.int32, device=device)
+    inputs = [parts.topology, query, parts.boxes, tree.id, room.of_each, argument(slots), argument(partner_counts)]
     _launch(parts, find_clusters, size, *inputs)
-    last = own.cumsum(dim=0, dtype=torch.int32)
+    last = partner_counts.cumsum(dim=0, dtype=torch.int32)
     near = torch.full((room.clusters, 2), -1, dtype=torch.int32, device=device)
-    inputs = [argument(slots), argument(own), argument(last), argument(near, wp.vec2i)]
+    inputs = [argument(slots), argument(partner_counts), argument(last), argument(near, wp.vec2i)]
     _launch(parts, list_clusters, size, room.of_each, parts.boxes, *inputs)
     _launch(parts, bound_parts, size, parts.topology, query, parts.boxes)
     candidates, count = torch.zeros((2, 1), dtype=torch.int32, device=device)
-    keys = [torch.empty(each, dtype=torch.int64, device=device) for each in (room.candidates, room.pairs)]
-    which, out = torch.empty((room.candidates, 3), dtype=torch.int32, device=device), Pairs.empty(room.pairs, device)
-    found = Found()
-    found.candidates, found.count = wp.from_torch(candidates), wp.from_torch(count)
-    found.candidate_key, found.key = (wp.from_torch(each) for each in keys)
-    found.parts, found.corners = wp.from_torch(which, wp.vec3i), wp.from_torch(out.corners, wp.vec4i)
-    found.value, found.face = wp.from_torch(out.value), wp.from_torch(out.face)
+    keys = [torch.empty(size, dtype=torch.int64, device=device) for size in (room.candidates, room.pairs)]
+    out = Pairs.empty(room.pairs, device)
+    candidate_parts = torch.empty((room.candidates, 3), dtype=torch.int32, device=device)
+    results = SearchResults()
+    results.candidates, results.count = wp.from_torch(candidates), wp.from_torch(count)
+    results.candidate_key, results.key = (wp.from_torch(key) for key in keys)
+    results.parts, results.corners = wp.from_torch(candidate_parts, wp.vec3i), wp.from_torch(out.corners, wp.vec4i)
+    results.value, results.face = wp.from_torch(out.value), wp.from_torch(out.face)
     find = find_pairs if parts.tasks == 1 else find_candidates
-    inputs = [parts.topology, argument(near, wp.vec2i), parts.tasks, query, parts.boxes, found]
+    inputs = [parts.topology, argument(near, wp.vec2i), parts.tasks, query, parts.boxes, results]
     _launch(parts, find, len(near) * parts.tasks, *inputs)
     if find is find_candidates:
-        _launch(parts, judge_candidates, room.candidates, parts.topology, query, found)
-    counts = torch.stack([own.max(), last[-1], candidates[0], count[0]])
+        _launch(parts, judge_candidates, room.candidates, parts.topology, query, results)
+    counts = torch.stack([partner_counts.max(), last[-1], candidates[0], count[0]])
     return counts, keys[1], out.corners, out.value, out.face
 
 

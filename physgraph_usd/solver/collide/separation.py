@@ -78,9 +78,9 @@ def part_kept(
     fraction, so the gap is kept up to the returned fraction.
     """
     one = wp.float64(1.0)
-    way = between(face, a, b, c, d)
-    distance = wp.length(way)
-    first = way / distance
+    vector = between(face, a, b, c, d)
+    distance = wp.length(vector)
+    first = vector / distance
     gap = gap_along(first, face, e, f, g, h)
     if gap >= keep:
         return one

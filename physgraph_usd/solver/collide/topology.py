@@ -79,10 +79,10 @@ def topology_of(
     count = int(cluster[used].max(initial=-1)) + 1
     sides = find_edges(edges, faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2))
     of_face, of_edge = cluster[faces[:, 0]], np.zeros(len(edges), np.int64)
-    of_edge[sides[::-1]] = np.repeat(of_face, 3)[::-1]  # What is written last stays.
+    of_edge[sides[::-1]] = np.repeat(of_face, 3)[::-1]  # The last value written stays.
     kinds = ((cluster[used], np.stack([used] * 3, axis=1)), (of_edge, edges[:, [0, 1, 1]]), (of_face, faces))
     first, parts, number = zip(*(_blocks(of, corners, count) for of, corners in kinds), strict=True)
-    begin = np.cumsum([0, *(each[-1] for each in first)])
+    begin = np.cumsum([0, *(blocks[-1] for blocks in first)])
     of = np.concatenate([np.repeat(of, 3) for of, _ in kinds])
     corners = np.concatenate([corners.ravel() for _, corners in kinds])
     inside = sp.csr_matrix((np.ones(len(of), bool), (of, corners)), shape=(count, vertices))
@@ -93,7 +93,7 @@ def topology_of(
 
     table.clusters, table.garments, table.cloths = count, len(meets), cloths
     table.cloth_clusters = int(cluster[used][garment[used] < cloths].max(initial=-1)) + 1
-    table.first = array(np.concatenate([each + at for each, at in zip(first, begin, strict=False)]))
+    table.first = array(np.concatenate([blocks + start for blocks, start in zip(first, begin, strict=False)]))
     corners = np.concatenate(parts)
     table.parts, table.number = array(corners, wp.vec3i), array(np.concatenate(number))
     table.labels = array(np.where(corners < 0, -1, label[corners]), wp.vec3i)
@@ -111,7 +111,7 @@ def _with_solids(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Positions, edges, faces, garments and labels of the cloth at rest and of bodies, which follow as garments."""
     rest, garment = level.rest.double().cpu().numpy(), level.vertex_garment.cpu().numpy()
-    edges, faces = (each.cpu().numpy().astype(np.int64) for each in (level.edges, level.triangles))
+    edges, faces = (rows.cpu().numpy().astype(np.int64) for rows in (level.edges, level.triangles))
     points, sides, corners, owners = [rest], [edges], [faces], [garment]
     start = len(rest)
     for number, solid in enumerate(solids):
@@ -121,11 +121,11 @@ def _with_solids(
         owners.append(np.full(len(solid.points), len(level.spans) + number))
         start += len(solid.points)
     label = np.concatenate([label, np.arange(len(rest), start)])
-    return *(np.concatenate(each) for each in (points, sides, corners, owners)), label  # type: ignore[return-value]
+    return *(np.concatenate(arrays) for arrays in (points, sides, corners, owners)), label  # type: ignore[return-value]
 
 
 def halved(points: np.ndarray, group: np.ndarray, size: int) -> np.ndarray:
-    """The cluster of each point: each group is halved across its longest axis until no cluster is larger than a size.
+    """Cluster of each point: groups are halved across their longest axis until no cluster is larger than a size.
 
     Args:
         points: Points, shape (N, 3).
@@ -133,10 +133,10 @@ def halved(points: np.ndarray, group: np.ndarray, size: int) -> np.ndarray:
         size: Most points of a cluster.
 
     Returns:
-        Clusters from 0 in the order of the halves, so that neighbouring numbers are near one another, shape (N,).
+        Clusters from 0 in the order of the halves, so that clusters with consecutive numbers are near, shape (N,).
     """
     order, count = sorted_rows(group, count=int(group.max(initial=0)) + 1), np.bincount(group)
-    ranks = np.stack([sorted_rows(np.argsort(each, kind="stable"), count=len(points)) for each in points.T])
+    ranks = np.stack([sorted_rows(np.argsort(column, kind="stable"), count=len(points)) for column in points.T])
     while (count := count[count > 0]).max(initial=0) > size:
         first, placed = np.cumsum(count) - count, points[order]
         spread = np.maximum.reduceat(placed, first) - np.minimum.reduceat(placed, first)
@@ -153,7 +153,7 @@ def _blocks(cluster: np.ndarray, corners: np.ndarray, count: int) -> tuple[np.nd
     first = np.concatenate([[0], np.cumsum((size + LANES - 1) // LANES)])
     order = sorted_rows(cluster, count=count)
     owner = cluster[order]
-    place = LANES * first[owner] + np.arange(len(order)) - (np.cumsum(size) - size)[owner]
+    row = LANES * first[owner] + np.arange(len(order)) - (np.cumsum(size) - size)[owner]
     parts, number = np.full((LANES * first[-1], 3), -1), np.full(LANES * first[-1], -1)
-    parts[place], number[place] = corners[order], order
+    parts[row], number[row] = corners[order], order
     return first, parts, number

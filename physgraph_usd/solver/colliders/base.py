@@ -54,9 +54,9 @@ class Nearest:
     rim: Bool[Tensor, " points"]
     face: Int[Tensor, " points"]
 
-    def some(self, which: Int[Tensor, " some"]) -> Nearest:
+    def selected(self, indices: Int[Tensor, " some"]) -> Nearest:
         """The selected points."""
-        return Nearest(**{each.name: getattr(self, each.name)[which] for each in fields(self)})
+        return Nearest(**{field.name: getattr(self, field.name)[indices] for field in fields(self)})
 
     def is_behind(self, side: Float[Tensor, " points"] | float) -> Bool[Tensor, " points"]:
         """Mask of the points behind an open surface: on the disallowed side, and not past the rim.
@@ -66,7 +66,10 @@ class Nearest:
         """
         return (self.side * side < 0) & ~self.rim
 
-    def with_those(self, which: Int[Tensor, " some"], others: Nearest) -> Nearest:
+    def with_points(self, indices: Int[Tensor, " some"], points: Nearest) -> Nearest:
         """A copy with some points replaced."""
-        names = [each.name for each in fields(self)]
-        return Nearest(**{name: getattr(self, name).index_put((which,), getattr(others, name)) for name in names})
+        replaced = {
+            field.name: getattr(self, field.name).index_put((indices,), getattr(points, field.name))
+            for field in fields(self)
+        }
+        return Nearest(**replaced)

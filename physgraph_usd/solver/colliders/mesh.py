@@ -54,9 +54,9 @@ def _closest(
     i = first + wp.tid()
     query = wp.mesh_query_point_sign_normal(mesh, x[i], reach[i])
     if query.result:
-        place = wp.mesh_eval_position(mesh, query.face, query.u, query.v)
-        point[i] = place
-        distance[i] = wp.length(x[i] - place)
+        closest = wp.mesh_eval_position(mesh, query.face, query.u, query.v)
+        point[i] = closest
+        distance[i] = wp.length(x[i] - closest)
         normal[i] = wp.mesh_eval_face_normal(mesh, query.face)
         face[i] = query.face
         weight[i] = wp.vec3f(query.u, query.v, 1.0 - query.u - query.v)
@@ -153,7 +153,7 @@ class MeshSurface:
         self.device, self.threads = device, threads
         self._used, compact = np.unique(triangles, return_inverse=True)
         self.solid = Solid.of(pose.points[self._used], compact.reshape(-1, 3))
-        self._rim = None if rim is None else [torch.as_tensor(each, device=device) for each in rim]
+        self._rim = None if rim is None else [torch.as_tensor(mask, device=device) for mask in rim]
         self.corners = torch.as_tensor(triangles, device=device).long()
         # At a hole or where more than two faces meet, the other side of a face need not be inside.
         ragged = np.isin(triangles, self.edges[np.bincount(edge) != 2]).any(axis=1)
@@ -165,7 +165,7 @@ class MeshSurface:
 
     @property
     def has_inside(self) -> bool:
-        """True if places are disallowed wherever cloth starts: inside a closed surface, behind a fixed side."""
+        """True if a side is disallowed wherever cloth starts: inside a closed surface, or behind a fixed side."""
         return self.closed or self.fixed_side is not None
 
     @property
@@ -174,7 +174,7 @@ class MeshSurface:
         return LIFT * float(np.ptp(self.bounds, axis=0).max())
 
     def repose(self, pose: Pose) -> None:
-        """Move the surface to another finite pose of its topology; a rigid motion keeps known self-intersections."""
+        """Move the surface to another finite pose of its topology; a rigid motion keeps cached self-intersections."""
         self.mesh.points.assign(self._place(pose))
         self.mesh.refit()
         rigid = moved_rigidly(self._judged, self.world)
@@ -205,15 +205,15 @@ class MeshSurface:
 
     def _closest(self, mesh: wp.Mesh, x: Tensor, reach: Tensor) -> Nearest:
         count = len(x)
-        asked, limit = x.to(torch.float32).contiguous(), reach.to(torch.float32).contiguous()
+        queries, limit = x.to(torch.float32).contiguous(), reach.to(torch.float32).contiguous()
         distance = torch.full((count,), float("inf"), dtype=torch.float32, device=x.device)
-        point, normal, weight = (torch.zeros_like(asked) for _ in range(3))
+        point, normal, weight = (torch.zeros_like(queries) for _ in range(3))
         face = torch.zeros(count, dtype=torch.int32, device=x.device)
         side = torch.zeros_like(distance)
         if count:
-            outputs = [argument(distance), *(_vectors(each) for each in (point, normal)), argument(face)]
+            outputs = [argument(distance), *(_vectors(array) for array in (point, normal)), argument(face)]
             outputs += [_vectors(weight), argument(side)]
-            self.run(_closest, mesh, count, [_vectors(asked), argument(limit), *outputs])
+            self.run(_closest, mesh, count, [_vectors(queries), argument(limit), *outputs])
         rim = self._on_rim(face.long(), weight) & distance.isfinite()
         return Nearest(distance.to(x), point.to(x), normal.to(x), side.to(x), rim, face)
 
@@ -228,45 +228,46 @@ class MeshSurface:
             return self._turns(x) > parts - 0.5
         if self.closed and len(x):
             far = float(np.linalg.norm(np.ptp(self.bounds, axis=0))) + float(x.abs().max()) + 1.0
-            asked = x.to(torch.float32).contiguous()
+            queries = x.to(torch.float32).contiguous()
             self.run(
                 _winding,
                 self.mesh,
                 len(x),
-                [_vectors(asked), wp.float32(far), wp.float32(parts - 0.5), argument(side)],
+                [_vectors(queries), wp.float32(far), wp.float32(parts - 0.5), argument(side)],
             )
         return side < 0
 
     def _turns(self, x: Float[Tensor, "points 3"]) -> Float[Tensor, " points"]:
         """Generalised winding number of the surface around each point."""
         half = torch.empty((len(x), int(SHARES)), dtype=torch.float32, device=x.device)
-        asked, mesh = x.to(torch.float32).contiguous(), self.mesh
-        inputs = [mesh.indices, mesh.points, _vectors(asked), argument(half.view(-1))]
+        queries, mesh = x.to(torch.float32).contiguous(), self.mesh
+        inputs = [mesh.indices, mesh.points, _vectors(queries), argument(half.view(-1))]
         run(_solid_angles, half.numel(), inputs, device=self.device, threads=self.threads)
         return half.sum(dim=1) / (2.0 * torch.pi)
 
-    def exit(self, x: Float[Tensor, "points 3"], found: Nearest) -> Nearest:
+    def exit(self, x: Float[Tensor, "points 3"], nearest: Nearest) -> Nearest:
         """The closest points on exposed faces; where body parts overlap, the nearest face may be deep inside.
 
         A face is exposed if none of its corners is inside the surface. Another part may still pierce the face's middle:
         a point whose exit would be inside that part takes the closest unpierced face.
         """
         if not self.closed or not len(x):
-            return found
-        way = self._closest_bare(x, found, whole=False) if bool(self._faces.is_buried(found.face).any()) else found
-        doubtful = torch.nonzero(self._faces.is_unsure(way.face)).squeeze(1)
-        doubtful = doubtful[self.inside(way.point[doubtful] + self.lift * way.normal[doubtful])]
+            return nearest
+        buried = bool(self._faces.is_buried(nearest.face).any())
+        exits = self._closest_bare(x, nearest, unpierced=False) if buried else nearest
+        doubtful = torch.nonzero(self._faces.is_unsure(exits.face)).squeeze(1)
+        doubtful = doubtful[self.inside(exits.point[doubtful] + self.lift * exits.normal[doubtful])]
         if not len(doubtful):
-            return way
-        return way.with_those(doubtful, self._closest_bare(x[doubtful], way.some(doubtful), whole=True))
+            return exits
+        return exits.with_points(doubtful, self._closest_bare(x[doubtful], exits.selected(doubtful), unpierced=True))
 
-    def _closest_bare(self, x: Tensor, known: Nearest, *, whole: bool) -> Nearest:
+    def _closest_bare(self, x: Tensor, nearest: Nearest, *, unpierced: bool) -> Nearest:
         """The closest points on wholly exposed faces, or else on exposed faces; unchanged if there are none."""
-        skin = self._faces.bare(whole)
+        skin = self._faces.bare(unpierced)
         if skin is None:
-            return known
+            return nearest
         mesh, faces = skin
-        bare = self._closest(mesh, x, torch.full_like(known.distance, float("inf")))
+        bare = self._closest(mesh, x, torch.full_like(nearest.distance, float("inf")))
         return replace(bare, face=faces[bare.face.long()])
 
     def run(self, kernel: wp.Kernel, mesh: wp.Mesh, count: int, inputs: list[object]) -> None:
@@ -277,7 +278,7 @@ class MeshSurface:
         """Mask of the closest points on a rim edge or a rim vertex."""
         if self._rim is None:
             return torch.zeros(len(face), dtype=torch.bool, device=face.device)
-        edges, corners = (each[face] for each in self._rim)
+        edges, corners = (mask[face] for mask in self._rim)
         low = weight < ON_EDGE
         at_corner = weight > 1.0 - 2.0 * ON_EDGE
         return (edges & low).any(dim=1) | (corners & at_corner).any(dim=1)
@@ -292,7 +293,7 @@ class Faces:
     def __init__(self, surface: MeshSurface) -> None:
         """Start with empty caches."""
         self._surface = surface
-        self._asked: Tensor | None = None
+        self._tested: Tensor | None = None
         self._buried: Tensor | None = None
         self._overlaps: Tensor | None = None
         self._up: Tensor | None = None
@@ -300,21 +301,21 @@ class Faces:
 
     def turned(self) -> Faces:
         """The properties that remain valid after a rigid motion."""
-        other = Faces(self._surface)
-        other._asked, other._buried, other._overlaps = self._asked, self._buried, self._overlaps
-        return other
+        faces = Faces(self._surface)
+        faces._tested, faces._buried, faces._overlaps = self._tested, self._buried, self._overlaps
+        return faces
 
     def is_buried(self, face: Tensor) -> Bool[Tensor, " points"]:
         """Mask of the faces with a corner inside the surface; each corner is tested once a pose."""
         count = len(self._surface.mesh.points)
-        if self._buried is None or self._asked is None:
-            self._asked, self._buried = (torch.zeros(count, dtype=torch.bool, device=face.device) for _ in range(2))
+        if self._buried is None or self._tested is None:
+            self._tested, self._buried = (torch.zeros(count, dtype=torch.bool, device=face.device) for _ in range(2))
         corners = self._surface.corners[face.long()]
         needed = torch.zeros(count, dtype=torch.bool, device=face.device)
         needed[corners.ravel()] = True
-        new = torch.nonzero(needed & ~self._asked).squeeze(1)
+        new = torch.nonzero(needed & ~self._tested).squeeze(1)
         self._buried[new] = self._lifted_inside(new)
-        self._asked[new] = True
+        self._tested[new] = True
         return self._buried[corners].any(dim=1)
 
     def is_unsure(self, face: Tensor) -> Bool[Tensor, " points"]:
@@ -340,15 +341,15 @@ class Faces:
         if self._up is None:
             self._up = self._normals()
         size, up = np.ptp(self._surface.bounds, axis=0), self._up[vertices]
-        asked = wp.to_torch(self._surface.mesh.points)[vertices] + LIFT * float(size.max()) * up
+        lifted = wp.to_torch(self._surface.mesh.points)[vertices] + LIFT * float(size.max()) * up
         if self._surface.has_holes:
-            return self._surface.inside(asked)
+            return self._surface.inside(lifted)
         far = wp.float32(2.0 * float(np.linalg.norm(size)))
         self._surface.run(
-            _meets, self._surface.mesh, len(vertices), [_vectors(asked), _vectors(up), far, argument(out)]
+            _meets, self._surface.mesh, len(vertices), [_vectors(lifted), _vectors(up), far, argument(out)]
         )
         met = torch.nonzero(out | (up == 0.0).all(dim=1)).squeeze(1)  # Flat faces have no normal to look along.
-        out[met] = self._surface.inside(asked[met])
+        out[met] = self._surface.inside(lifted[met])
         return out
 
     def _normals(self) -> Float[Tensor, "vertices 3"]:
@@ -361,17 +362,17 @@ class Faces:
             add_at(normal, self._surface.corners[:, corner], area)
         return torch.nn.functional.normalize(normal, dim=1, eps=1e-30)
 
-    def bare(self, whole: bool) -> tuple[wp.Mesh, Tensor] | None:
-        """Mesh and indices of the exposed faces, only of wholly exposed faces if ``whole``; None without any."""
-        if whole not in self._skins:
+    def bare(self, unpierced: bool) -> tuple[wp.Mesh, Tensor] | None:
+        """Mesh and indices of the exposed faces, only of wholly exposed faces if ``unpierced``; None without any."""
+        if unpierced not in self._skins:
             every = torch.arange(len(self._surface.corners), device=self._surface.device)
             hidden = self.is_buried(every)
-            faces = torch.nonzero(~(hidden | self.is_unsure(every)) if whole else ~hidden).squeeze(1)
+            faces = torch.nonzero(~(hidden | self.is_unsure(every)) if unpierced else ~hidden).squeeze(1)
             if not len(faces):
                 return None
             triangles = self._surface.triangles[faces.cpu().numpy()]
-            self._skins[whole] = (_hierarchy(self._surface.mesh.points, triangles, False), faces.to(torch.int32))
-        return self._skins[whole]
+            self._skins[unpierced] = (_hierarchy(self._surface.mesh.points, triangles, False), faces.to(torch.int32))
+        return self._skins[unpierced]
 
 
 class MeshBody:
@@ -391,7 +392,7 @@ class MeshBody:
         )
         finite = bool(np.isfinite(pose.points).all())
         if same and pose.points.shape == self._points.shape and finite:
-            if not np.array_equal(pose.points, self._points):  # What stands still keeps what was found out about it.
+            if not np.array_equal(pose.points, self._points):  # A body at rest keeps its cached properties.
                 for surface in self._surfaces:
                     surface.repose(pose)
             self._points = pose.points.copy()
@@ -423,14 +424,14 @@ def _vectors(tensor: Tensor) -> Any:
 @wp.func
 def _pierces(x: wp.array(dtype=wp.vec3f), t: wp.vec3i, u: wp.vec3i):
     """True if a side of triangle t that shares no corner's place with triangle u passes through u."""
-    found = bool(False)  # noqa: UP018 - a literal would be a constant to Warp
+    pierced = bool(False)  # noqa: UP018 - a literal would be a constant to Warp
     p, q, r = wide(x[u[0]]), wide(x[u[1]]), wide(x[u[2]])
     for side in range(3):
         a, b = wide(x[t[side]]), wide(x[t[(side + 1) % 3]])
         beside = a == p or a == q or a == r or b == p or b == q or b == r  # noqa: PLR1714 - Warp has no `in`
         if not beside and passes_through(a, b, u, p, q, r):
-            found = True
-    return found
+            pierced = True
+    return pierced
 
 
 @wp.kernel
@@ -448,13 +449,13 @@ def _overlap(
     a, b, c = x[t[0]], x[t[1]], x[t[2]]
     query = wp.mesh_query_aabb(mesh, wp.min(a, wp.min(b, c)), wp.max(a, wp.max(b, c)))
     g = wp.int32(0)
-    found = wp.int32(0)
+    pierced = wp.int32(0)
     while wp.mesh_query_aabb_next(query, g):
-        if found == 0 and g != f:
+        if pierced == 0 and g != f:
             u = wp.vec3i(corners[3 * g], corners[3 * g + 1], corners[3 * g + 2])
             if _pierces(x, t, u) or _pierces(x, u, t):
-                found = 1
-    out[i] = found
+                pierced = 1
+    out[i] = pierced
 
 
 def overlapping(mesh: wp.Mesh, faces: Int[Tensor, " faces"], *, threads: int = 1) -> Bool[Tensor, " faces"]:

@@ -102,16 +102,16 @@ def _welded(points: np.ndarray) -> np.ndarray:
     low = points[finite].min(axis=0)
     size = max(float(np.ptp(points[finite], axis=0).max()), 1e-12)
     cell = np.where(finite[:, None], np.round((np.where(finite[:, None], points, low) - low) / (WELD * size)), -1.0)
-    _, first, where = np.unique(cell, axis=0, return_index=True, return_inverse=True)
-    return np.where(finite, first[where.reshape(-1)], np.arange(len(points)))
+    _, first, cell_of = np.unique(cell, axis=0, return_index=True, return_inverse=True)
+    return np.where(finite, first[cell_of.reshape(-1)], np.arange(len(points)))
 
 
 def _edges(faces: np.ndarray, vertex_count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Edge of each side (0-1, 1-2, 2-0) of each face, whether the side runs upwards, and the faces at each edge."""
-    here, there = faces, np.roll(faces, -1, axis=1)
-    keys = np.minimum(here, there) * vertex_count + np.maximum(here, there)
+    start, end = faces, np.roll(faces, -1, axis=1)
+    keys = np.minimum(start, end) * vertex_count + np.maximum(start, end)
     _, edge, count = np.unique(keys, return_inverse=True, return_counts=True)
-    return edge.reshape(-1, 3), here < there, count
+    return edge.reshape(-1, 3), start < end, count
 
 
 def _orientation(
@@ -124,9 +124,9 @@ def _orientation(
     """
     order = np.argsort(edge.ravel(), kind="stable")
     starts = np.concatenate([[0], np.cumsum(count)[:-1]])[count == 2]
-    one, two = order[starts], order[starts + 1]
-    agree = forward.ravel()[one] != forward.ravel()[two]
-    a, b = one // 3, two // 3
+    first, second = order[starts], order[starts + 1]
+    agree = forward.ravel()[first] != forward.ravel()[second]
+    a, b = first // 3, second // 3
     rows = np.concatenate([a, a + faces])
     columns = np.concatenate([np.where(agree, b, b + faces), np.where(agree, b + faces, b)])
     graph = sparse.coo_matrix((np.ones(len(rows), bool), (rows, columns)), shape=(2 * faces, 2 * faces))
@@ -148,15 +148,15 @@ def _openings(
     area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     total = np.bincount(piece, area, piece.max() + 1)
     face, side = np.nonzero(count[edge] != 2)
-    here, there = faces[face, side], faces[face, (side + 1) % 3]
+    start, end = faces[face, side], faces[face, (side + 1) % 3]
     # Rims of two pieces that meet in a vertex are two.
-    places, ends = np.unique(np.stack([here, there]) + piece[face] * len(points), return_inverse=True)
+    vertices, ends = np.unique(np.stack([start, end]) + piece[face] * len(points), return_inverse=True)
     ends = ends.reshape(2, -1)
-    rims = sparse.coo_matrix((np.ones(len(face), bool), (ends[0], ends[1])), shape=(len(places), len(places)))
+    rims = sparse.coo_matrix((np.ones(len(face), bool), (ends[0], ends[1])), shape=(len(vertices), len(vertices)))
     rim_count, rim = csgraph.connected_components(rims, directed=False)
-    length = np.bincount(rim[ends[0]], np.linalg.norm(points[there] - points[here], axis=1), rim_count)
+    length = np.bincount(rim[ends[0]], np.linalg.norm(points[end] - points[start], axis=1), rim_count)
     owner = np.zeros(rim_count, np.int64)
-    owner[rim] = places // len(points)
+    owner[rim] = vertices // len(points)
     return np.bincount(owner, length**2 / (4.0 * np.pi), len(total)) / np.maximum(total, np.finfo(float).tiny)
 
 
@@ -211,9 +211,9 @@ def winding_numbers(points: np.ndarray, triangles: np.ndarray, x: np.ndarray) ->
         x: Query points [m], shape (N, 3).
     """
     numbers = np.empty(len(x))
-    for index, place in enumerate(x):
-        a, b, c = (points[triangles[:, corner]] - place for corner in range(3))
-        la, lb, lc = (np.linalg.norm(each, axis=1) for each in (a, b, c))
+    for index, point in enumerate(x):
+        a, b, c = (points[triangles[:, corner]] - point for corner in range(3))
+        la, lb, lc = (np.linalg.norm(vectors, axis=1) for vectors in (a, b, c))
         volume = np.einsum("td,td->t", a, np.cross(b, c))
         dots = (np.einsum("td,td->t", *pair) for pair in ((a, b), (b, c), (c, a)))
         below = la * lb * lc + sum(dot * length for dot, length in zip(dots, (lc, la, lb), strict=True))

@@ -47,26 +47,26 @@ class Pose:
     endless: bool = False
 
     def corners(self) -> np.ndarray:
-        """Points whose convex hull contains what is drawn of the mesh [m], shape (N, 3)."""
+        """Points whose convex hull contains the drawn part of the mesh [m], shape (N, 3)."""
         return self.points[:4] if self.endless else self.points
 
-    def equals(self, other: Pose) -> bool:
+    def equals(self, pose: Pose) -> bool:
         """True if both poses are bitwise equal."""
-        return np.array_equal(self.triangles, other.triangles) and np.array_equal(self.points, other.points)
+        return np.array_equal(self.triangles, pose.triangles) and np.array_equal(self.points, pose.points)
 
-    def moved(self, since: Pose, along: Rigid = AT_REST) -> float:
-        """Largest distance of a corner from its image of another pose under a motion [m]; infinite for unlike poses."""
-        if self.triangles is not since.triangles and not np.array_equal(self.triangles, since.triangles):
+    def moved(self, reference: Pose, along: Rigid = AT_REST) -> float:
+        """Largest distance of a corner from the moved reference pose [m]; infinite if the topology differs."""
+        if self.triangles is not reference.triangles and not np.array_equal(self.triangles, reference.triangles):
             return np.inf
-        return _farthest(self.corners(), since.corners() if along is AT_REST else along(since.corners()))
+        return _farthest(self.corners(), reference.corners() if along is AT_REST else along(reference.corners()))
 
 
-def _farthest(points: np.ndarray, others: np.ndarray) -> float:
+def _farthest(points: np.ndarray, targets: np.ndarray) -> float:
     """Largest distance of corresponding points [m], 0 without points; infinite for non-finite points."""
-    if points.shape != others.shape:
+    if points.shape != targets.shape:
         return np.inf
-    way = points - others
-    far = float(np.sqrt(np.einsum("vc,vc->v", way, way).max(initial=0.0)))
+    differences = points - targets
+    far = float(np.sqrt(np.einsum("vc,vc->v", differences, differences).max(initial=0.0)))
     return far if np.isfinite(far) else np.inf
 
 
@@ -79,7 +79,7 @@ def bounds_of(points: np.ndarray) -> np.ndarray:
 
 
 def extent(points: np.ndarray) -> np.ndarray:
-    """How large points, shape (N, 3), are along each axis, shape (3,); minus infinity without points."""
+    """Extent of points, shape (N, 3), along each axis, shape (3,); minus infinity without points."""
     low, high = bounds_of(points)
     return high - low
 
@@ -87,14 +87,14 @@ def extent(points: np.ndarray) -> np.ndarray:
 def moved_rigidly(before: np.ndarray, after: np.ndarray) -> bool:
     """True if the points moved rigidly, by comparison with the best rigid motion (Kabsch 1976).
 
-    Points that bend mostly show it in the distances between a few of them, which a rigid motion keeps.
+    A rigid motion keeps the distances between points. A few distances are compared first, which excludes most bending.
 
     Args:
         before: Positions [m], shape (V, 3), float64.
         after: Positions of the points after the motion [m].
     """
-    allowed, few = RIGID * extent(before).max(), slice(None, None, len(before) // FEW + 1)
-    was, now = (np.linalg.norm(np.diff(each[few], axis=0), axis=1) for each in (before, after))
-    if (np.abs(now - was) > 2.0 * allowed).any():
+    allowed, sample = RIGID * extent(before).max(), slice(None, None, len(before) // FEW + 1)
+    steps_before, steps_after = (np.linalg.norm(np.diff(points[sample], axis=0), axis=1) for points in (before, after))
+    if (np.abs(steps_after - steps_before) > 2.0 * allowed).any():
         return False
     return _farthest(after, best_motion(before, after)(before)) <= allowed

@@ -1,4 +1,4 @@
-"""Triangles of spheres, capsules, cylinders, cones, boxes and planes: all that contact knows of a primitive."""
+"""Triangles of spheres, capsules, cylinders, cones, boxes and planes, which stand for primitives in contact."""
 
 from __future__ import annotations
 
@@ -83,10 +83,11 @@ def _revolved(profile: np.ndarray, poles: np.ndarray, around: int) -> tuple[np.n
     return np.concatenate([ring.reshape(-1, 3), ends]), triangles.astype(np.int32)
 
 
-def _between(here: np.ndarray, there: np.ndarray) -> np.ndarray:
-    """Triangles between two closed rows of as many points, the second above the first, by their numbers."""
-    after, beside = np.roll(here, -1), np.roll(there, -1)
-    return np.concatenate([np.stack([here, after, beside], axis=1), np.stack([here, beside, there], axis=1)])
+def _between(lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+    """Triangles between two closed rows of equally many points, given by their numbers."""
+    lower_next, upper_next = np.roll(lower, -1), np.roll(upper, -1)
+    triangles = (lower, lower_next, upper_next), (lower, upper_next, upper)
+    return np.concatenate([np.stack(corners, axis=1) for corners in triangles])
 
 
 def _box(size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -98,7 +99,7 @@ def _box(size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @functools.cache
 def _plane() -> tuple[np.ndarray, np.ndarray]:
-    """Points and triangles of squares around one another, the innermost first."""
+    """Points and triangles of nested squares, the innermost first."""
     corners = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
     ids = np.arange(4 * len(SQUARES)).reshape(-1, 4)
     inner = np.array([[0, 1, 2], [0, 2, 3]])

@@ -1,4 +1,4 @@
-"""Least-squares correction of blocked displacements: the closest displacements by which no met pair comes too near."""
+"""Least-squares correction of blocked displacements: the closest displacements that keep all blocking pairs apart."""
 
 # Warp's kernels are typed by values that only Warp reads.
 # pyright: reportArgumentType=false, reportIndexIssue=false
@@ -35,14 +35,14 @@ def _push_apart(
     normal: wp.array(dtype=wp.vec3d),
     may: wp.array(dtype=wp.float64),
     stiffness: wp.array(dtype=wp.float64),
-    way: wp.array(dtype=wp.vec3d),
+    displacement: wp.array(dtype=wp.vec3d),
     push: wp.array(dtype=wp.float64),
 ):
     """Update each pair's multiplier from the approach of its parts."""
     n = first + wp.tid()
     nearer = wp.float64(0.0)
     for k in range(4):
-        along_it = wp.cw_mul(normal[n], way[corners[n][k]])
+        along_it = wp.cw_mul(normal[n], displacement[corners[n][k]])
         nearer += weight[n][k] * (along_it[0] + along_it[1] + along_it[2])
     push[n] = wp.max(push[n] - (nearer + may[n]) / stiffness[n], wp.float64(0.0))
 
@@ -56,15 +56,15 @@ def _add_pushes(
     normal: wp.array(dtype=wp.vec3d),
     push: wp.array(dtype=wp.float64),
     wanted: wp.array(dtype=wp.vec3d),
-    way: wp.array(dtype=wp.vec3d),
+    displacement: wp.array(dtype=wp.vec3d),
 ):
-    """Add the pushes of its pairs to each vertex's wanted displacement."""
+    """Add to each vertex's wanted displacement the pushes of the vertex's pairs."""
     v = first + wp.tid()
     total = wanted[v]
     for k in range(starts[v], starts[v + 1]):
         n = slots[k] // 4
         total += push[n] * gives[n][slots[k] - 4 * n] * normal[n]
-    way[v] = total
+    displacement[v] = total
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,28 +92,32 @@ class ApproachLimits:
             ends: Positions after the move [m], float64, shape (V, 3).
             met: Pairs that come too near on the move.
             floor: Gap that pairs keep [m]; a pair that is already closer keeps most of its distance.
-            corners: True holds the two corners that are nearest at the ends, False the closest points.
+            corners: True limits the two corners that are nearest at the ends, False the closest points.
         """
         met = met.where(_distinct(met, len(x)))
-        places, face = met.corners.long(), met.face.bool()
-        at, to = x[places], ends[places]
+        vertices, face = met.corners.long(), met.face.bool()
+        at, to = x[vertices], ends[vertices]
         distance = _between(at, face)[1].norm(dim=1)
-        weight, way = _between(at + met.value.reshape(-1, 1, 1) * (to - at), face)
-        normal = way / way.norm(dim=1, keepdim=True).clamp_min(1e-300)
+        weight, vector = _between(at + met.value.reshape(-1, 1, 1) * (to - at), face)
+        normal = vector / vector.norm(dim=1, keepdim=True).clamp_min(1e-300)
         if corners:
             weight = _nearest(to @ normal.unsqueeze(2), face)
         gap = (weight * (at @ normal.unsqueeze(2)).squeeze(2)).sum(dim=1)
         may = COMES * (distance - (TIGHT * distance).clamp_max(floor))
         return ApproachLimits(met.corners, weight, normal, gap - distance + may)
 
-    def joined(self, other: ApproachLimits) -> ApproachLimits:
-        """Both sets of planes."""
-        pairs = ((getattr(self, each.name), getattr(other, each.name)) for each in fields(self))
+    def joined(self, limits: ApproachLimits) -> ApproachLimits:
+        """These limits, followed by further limits."""
+        pairs = ((getattr(self, field.name), getattr(limits, field.name)) for field in fields(self))
         return ApproachLimits(*(torch.cat(pair) for pair in pairs))
 
 
 def along(
-    way: Float[Tensor, "vertices 3"], planes: ApproachLimits, *, free: Bool[Tensor, "vertices 1"], threads: int = 1
+    displacements: Float[Tensor, "vertices 3"],
+    planes: ApproachLimits,
+    *,
+    free: Bool[Tensor, "vertices 1"],
+    threads: int = 1,
 ) -> Float[Tensor, "vertices 3"]:
     """Displacements closest to the wanted displacements [m] that violate no plane.
 
@@ -122,49 +126,49 @@ def along(
     among its pairs (Tonge et al. 2012).
 
     Args:
-        way: Wanted displacement of each vertex [m], float64.
+        displacements: Wanted displacement of each vertex [m], float64.
         planes: ApproachLimits of the blocking pairs.
         free: Vertices whose displacement may be changed.
         threads: Most threads on the CPU.
     """
     if not len(planes.may):
-        return way
-    used, places = torch.unique(planes.corners.long(), return_inverse=True)
-    weight, wanted = planes.weight.contiguous(), way[used]
-    starts, slots = incidence(places, len(used))
-    gives = (weight * free[used][places].squeeze(2)).contiguous()
-    count = starts.diff().to(way)
-    stiffness = (gives.square() * count[places]).sum(dim=1).clamp_min(1e-300)
-    pairs = [argument(places.to(torch.int32), wp.vec4i), *(argument(each, wp.vec4d) for each in (weight, gives))]
+        return displacements
+    used, rows = torch.unique(planes.corners.long(), return_inverse=True)
+    weight, wanted = planes.weight.contiguous(), displacements[used]
+    starts, slots = incidence(rows, len(used))
+    gives = (weight * free[used][rows].squeeze(2)).contiguous()
+    count = starts.diff().to(displacements)
+    stiffness = (gives.square() * count[rows]).sum(dim=1).clamp_min(1e-300)
+    pairs = [argument(rows.to(torch.int32), wp.vec4i), *(argument(table, wp.vec4d) for table in (weight, gives))]
     pairs += [_vectors(planes.normal)]
     moved = wanted.clone()
     push, out = argument(torch.zeros_like(planes.may)), _vectors(moved)
     push_apart = [*pairs[:2], pairs[3], argument(planes.may), argument(stiffness), out, push]
     add_pushes = [argument(starts), argument(slots), pairs[2], pairs[3], push, _vectors(wanted), out]
-    launched = {"device": str(way.device), "threads": threads}
+    device = str(displacements.device)
     launches = [
-        Launch(_push_apart, len(places), push_apart, **launched),
-        Launch(_add_pushes, len(used), add_pushes, **launched),
+        Launch(_push_apart, len(rows), push_apart, device=device, threads=threads),
+        Launch(_add_pushes, len(used), add_pushes, device=device, threads=threads),
     ]
     for launch in launches * JACOBI_PASSES:
         launch({})
-    return way.index_copy(0, used, moved)
+    return displacements.index_copy(0, used, moved)
 
 
 def _between(at: Float[Tensor, "pairs 4 3"], face: Tensor) -> tuple[Float[Tensor, "pairs 4"], Float[Tensor, "pairs 3"]]:
     """Weights of each pair's corners in the shortest vector between its parts, and the vector, from positions [m]."""
-    own = torch.arange(4 * len(at), dtype=torch.int32, device=at.device).reshape(-1, 4)
-    weight = weights(at.reshape(-1, 3), own, face)
+    corners = torch.arange(4 * len(at), dtype=torch.int32, device=at.device).reshape(-1, 4)
+    weight = weights(at.reshape(-1, 3), corners, face)
     return weight, (weight.unsqueeze(2) * at).sum(dim=1)
 
 
 def _nearest(height: Float[Tensor, "pairs 4 1"], face: Bool[Tensor, " pairs"]) -> Float[Tensor, "pairs 4"]:
     """1 for the lowest corner of each pair's first part, -1 for the highest of its second, by heights [m]."""
-    own = height.squeeze(2)
-    is_first = torch.arange(4, device=own.device) < torch.where(face, 1, 2).unsqueeze(1)
-    low = torch.where(is_first, own, torch.inf).argmin(dim=1, keepdim=True)
-    high = torch.where(is_first, -torch.inf, own).argmax(dim=1, keepdim=True)
-    return torch.zeros_like(own).scatter(1, low, 1.0).scatter(1, high, -1.0)
+    heights = height.squeeze(2)
+    is_first = torch.arange(4, device=heights.device) < torch.where(face, 1, 2).unsqueeze(1)
+    low = torch.where(is_first, heights, torch.inf).argmin(dim=1, keepdim=True)
+    high = torch.where(is_first, -torch.inf, heights).argmax(dim=1, keepdim=True)
+    return torch.zeros_like(heights).scatter(1, low, 1.0).scatter(1, high, -1.0)
 
 
 def _distinct(met: Pairs, count: int) -> Int[Tensor, " pairs"]:
@@ -181,9 +185,9 @@ def _distinct(met: Pairs, count: int) -> Int[Tensor, " pairs"]:
     order = torch.argsort(second, stable=True)
     order = order[torch.argsort(first[order], stable=True)]
     first, second = first[order], second[order]
-    kept = torch.ones_like(first, dtype=torch.bool)
-    kept[1:] = (first[1:] != first[:-1]) | (second[1:] != second[:-1])
-    return order[torch.nonzero(kept).squeeze(1)]
+    is_first = torch.ones_like(first, dtype=torch.bool)
+    is_first[1:] = (first[1:] != first[:-1]) | (second[1:] != second[:-1])
+    return order[torch.nonzero(is_first).squeeze(1)]
 
 
 def _vectors(x: Tensor) -> Any:

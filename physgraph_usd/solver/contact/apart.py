@@ -2,7 +2,7 @@
 
 Springs shorten a contour step by step and stop when the cloth between is stretched. The smaller piece is taken to be on
 the wrong side (Baraff, Witkin and Kass 2003): its vertices are mirrored to the other side of the cloth they went
-through, by at most a gap. A dent, a corner or half a sheet comes back whole at any depth. All pieces move at once.
+through, by at most a gap. A dent, a corner or half a sheet comes back at any depth. All pieces move at once.
 """
 
 # Warp's kernels are typed by values that only Warp reads.
@@ -63,18 +63,18 @@ def drawn_apart(
     start: Crossings,
     *,
     gap: float,
-    asked: Bool[Tensor, " vertices"] | None = None,
+    queried: Bool[Tensor, " vertices"] | None = None,
 ) -> tuple[Float[Tensor, "vertices 3"], int]:
     """Move cut-off pieces back to their side, as long as the number of crossings falls.
 
     Args:
         x: Positions [m].
-        gap: Largest final distance from the penetrated cloth [m]; replaced by a fraction of an edge if fewer parts
-            cross then.
-        asked: As for `crossings`.
+        gap: Largest final distance from the penetrated cloth [m]; a fraction of an edge is used instead if it leaves
+            fewer crossings.
+        queried: As for `crossings`.
 
     Returns:
-        Positions [m], x itself if nothing improves, and the number of crossings there.
+        Positions [m], x itself if nothing improves, and their number of crossings.
     """
     best, first = (x, start), None
     for least in (0.0, SECOND_GAP):
@@ -82,39 +82,39 @@ def drawn_apart(
             break
         first = _gone_through(mesh, start, x) if first is None else first
         wide = max(gap, least * float(mesh.level.spacing.mean()))
-        at, found, through = x, start, first
+        at, remaining, through = x, start, first
         for _ in range(MIRROR_PASSES):
             moved = through.back(at, wide)
-            after = crossings(mesh.parts, moved, asked)
-            if after.count >= found.count:
+            after = crossings(mesh.parts, moved, queried)
+            if after.count >= remaining.count:
                 break
-            at, found = moved, after
-            if not found.count or is_over():
+            at, remaining = moved, after
+            if not remaining.count or is_over():
                 break
-            through = _gone_through(mesh, found, at)
-        best = (at, found) if found.count < best[1].count else best
+            through = _gone_through(mesh, remaining, at)
+        best = (at, remaining) if remaining.count < best[1].count else best
     return best[0], best[1].count
 
 
-def _gone_through(mesh: ClothMesh, found: Crossings, x: Tensor) -> _Through:
+def _gone_through(mesh: ClothMesh, contours: Crossings, x: Tensor) -> _Through:
     """Vertices of the smallest piece at each contour, and their depths through the cloth."""
-    piece, met = _chosen(mesh, found)
+    piece, met = _chosen(mesh, contours)
     count = met.shape[0]
     inside = torch.as_tensor(piece >= 0, device=x.device) & mesh.level.free[:, 0]
     vertices = torch.nonzero(inside).squeeze(1)
-    which = torch.as_tensor(piece, device=x.device)[vertices]
-    own = sp.csr_matrix(
+    rows = torch.as_tensor(piece, device=x.device)[vertices]
+    members = sp.csr_matrix(
         (np.ones(int((piece >= 0).sum()), np.float32), (piece[piece >= 0], np.flatnonzero(piece >= 0))), shape=met.shape
     )
     rings = np.ceil(np.sqrt(np.bincount(piece[piece >= 0], minlength=count))).astype(int) + RINGS
-    barrier = _grown(mesh, met, rings) - _grown(mesh, own, np.full(count, RINGS))
+    barrier = _grown(mesh, met, rings) - _grown(mesh, members, np.full(count, RINGS))
     barrier = sp.csr_matrix(barrier > 0)
-    depth = displacements_to(mesh.level, x, vertices, which, _faces_of(mesh, barrier))
-    kept = torch.nonzero((depth != 0).any(dim=1)).squeeze(1)
-    return _Through(vertices[kept], depth[kept])
+    depth = displacements_to(mesh.level, x, vertices, rows, _faces_of(mesh, barrier))
+    deep = torch.nonzero((depth != 0).any(dim=1)).squeeze(1)
+    return _Through(vertices[deep], depth[deep])
 
 
-def pieces_of(mesh: ClothMesh, found: Crossings) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def pieces_of(mesh: ClothMesh, contours: Crossings) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Connected pieces into which contours cut the cloth.
 
     Returns:
@@ -123,39 +123,39 @@ def pieces_of(mesh: ClothMesh, found: Crossings) -> tuple[np.ndarray, np.ndarray
     """
     count = mesh.level.vertex_count
     ends = mesh.parts.links.cpu().numpy()
-    kept = np.ones(len(ends), bool)
-    kept[found.edge.cpu().numpy()] = False
-    whole, piece = joined_by(ends, count), joined_by(ends[kept], count)
+    uncut = np.ones(len(ends), bool)
+    uncut[contours.edge.cpu().numpy()] = False
+    component, piece = joined_by(ends, count), joined_by(ends[uncut], count)
     area = np.bincount(piece, mesh.level.vertex_area.double().cpu().numpy())
     first = np.unique(piece, return_index=True)[1]
-    largest = np.zeros(int(whole.max()) + 1)
-    np.maximum.at(largest, whole[first], area)
-    return piece, area < largest[whole[first]], area
+    largest = np.zeros(int(component.max()) + 1)
+    np.maximum.at(largest, component[first], area)
+    return piece, area < largest[component[first]], area
 
 
-def _chosen(mesh: ClothMesh, found: Crossings) -> tuple[Int[np.ndarray, " vertices"], sp.csr_matrix]:
+def _chosen(mesh: ClothMesh, contours: Crossings) -> tuple[Int[np.ndarray, " vertices"], sp.csr_matrix]:
     """The smallest piece at each contour.
 
     Returns:
         The row of each vertex's piece, -1 outside all chosen pieces, and the vertices that each piece crosses, shape
         (pieces, V).
     """
-    piece, off, area = pieces_of(mesh, found)
+    piece, off, area = pieces_of(mesh, contours)
     rank = np.empty(len(area), np.int64)
     rank[np.argsort(area, kind="stable")] = np.arange(len(area))
-    corners = mesh.corners_of(found).cpu().numpy()
+    corners = mesh.corners_of(contours).cpu().numpy()
     pieces = piece[corners]
     of_edge = (pieces[:, :, None] == pieces[:, None, :2]).any(axis=2)
     of_face = (pieces[:, :, None] == pieces[:, None, 2:]).any(axis=2)
     order = np.where(off[pieces] & (of_edge ^ of_face), rank[pieces], len(area))
-    place = order.argmin(axis=1)
+    column = order.argmin(axis=1)
     has = np.flatnonzero(order.min(axis=1) < len(area))
-    numbers, row = np.unique(pieces[has, place[has]], return_inverse=True)
-    # What a piece met is the face where the piece has the edge, and the edge where it has the face.
-    by_edge = of_edge[has, place[has]]
-    other = np.where(by_edge[:, None], corners[has][:, [2, 3, 4]], corners[has][:, [0, 1, 1]])
+    numbers, row = np.unique(pieces[has, column[has]], return_inverse=True)
+    # A piece pierces the face if the crossing edge is part of the piece, and is pierced by the edge otherwise.
+    by_edge = of_edge[has, column[has]]
+    pierced = np.where(by_edge[:, None], corners[has][:, [2, 3, 4]], corners[has][:, [0, 1, 1]])
     met = sp.csr_matrix(
-        (np.ones(other.size, np.float32), (np.repeat(row, 3), other.ravel())),
+        (np.ones(pierced.size, np.float32), (np.repeat(row, 3), pierced.ravel())),
         shape=(len(numbers), mesh.level.vertex_count),
     )
     rows = np.full(len(area), -1, np.int64)
@@ -163,12 +163,12 @@ def _chosen(mesh: ClothMesh, found: Crossings) -> tuple[Int[np.ndarray, " vertic
     return rows[piece], met
 
 
-def _grown(mesh: ClothMesh, some: sp.csr_matrix, rings: np.ndarray) -> sp.csr_matrix:
+def _grown(mesh: ClothMesh, sets: sp.csr_matrix, rings: np.ndarray) -> sp.csr_matrix:
     """Each row's vertices grown by the row's number of rings; ones, float32."""
-    grown = sp.csr_matrix(some > 0).astype(np.float32)
+    grown = sp.csr_matrix(sets > 0).astype(np.float32)
     for ring in range(int(rings.max(initial=0))):
-        more = sp.diags((rings > ring).astype(np.float32)) @ grown @ mesh.beside
-        grown = sp.csr_matrix(grown + more > 0).astype(np.float32)
+        added = sp.diags((rings > ring).astype(np.float32)) @ grown @ mesh.beside
+        grown = sp.csr_matrix(grown + added > 0).astype(np.float32)
     return grown
 
 
@@ -201,15 +201,15 @@ def _closest_of(
     x: wp.array(dtype=wp.vec3d),
     faces: wp.array(dtype=wp.vec3i),
     tree: wp.uint64,
-    asked: wp.array(dtype=wp.int32),
-    which: wp.array(dtype=wp.int32),
+    queried: wp.array(dtype=wp.int32),
+    rows: wp.array(dtype=wp.int32),
     begin: wp.array(dtype=wp.int32),
     members: wp.array(dtype=wp.int32),
     radius: wp.float64,
     out: wp.array(dtype=wp.vec3d),
 ):
     n = first + wp.tid()
-    at, row = x[asked[n]], which[n]
+    at, row = x[queried[n]], rows[n]
     begins, ends = begin[row], begin[row + 1]
     least, within, k = wp.float64(0.0) + FAR, wp.float64(0.5) * radius, wp.int32(0)
     while begins < ends and least > within:
@@ -229,16 +229,16 @@ def _closest_of(
 def displacements_to(
     level: Level,
     x: Float[Tensor, "vertices 3"],
-    asked: Int[Tensor, " asked"],
-    which: Int[Tensor, " asked"],
+    queried: Int[Tensor, " queried"],
+    rows: Int[Tensor, " queried"],
     sets: csr_matrix,
-) -> Float[Tensor, "asked 3"]:
+) -> Float[Tensor, "queried 3"]:
     """Displacements from the closest point of a set of faces to each query vertex [m], float64; 0 for empty sets.
 
     Args:
         x: Positions [m].
-        asked: Indices of the query vertices.
-        which: The row of each query vertex's set.
+        queried: Indices of the query vertices.
+        rows: The row of each query vertex's set.
         sets: Faces of each set, shape (sets, T).
     """
     at, device = x.double().contiguous(), level.device
@@ -249,11 +249,11 @@ def displacements_to(
     tree = wp.Bvh(wp.from_torch(low, dtype=wp.vec3f), wp.from_torch(high, dtype=wp.vec3f))
     sets.sort_indices()
     begin, members = (
-        wp.array(each.astype(np.int32), dtype=wp.int32, device=device) for each in (sets.indptr, sets.indices)
+        wp.array(indices.astype(np.int32), dtype=wp.int32, device=device) for indices in (sets.indptr, sets.indices)
     )
-    out = torch.zeros((len(asked), 3), dtype=torch.float64, device=device)
+    out = torch.zeros((len(queried), 3), dtype=torch.float64, device=device)
     inputs = [wp.from_torch(at, dtype=wp.vec3d), wp.from_torch(level.triangles.int().contiguous(), dtype=wp.vec3i)]
-    inputs += [tree.id, *(wp.from_torch(each.int().contiguous()) for each in (asked, which)), begin, members]
+    inputs += [tree.id, *(wp.from_torch(indices.int().contiguous()) for indices in (queried, rows)), begin, members]
     inputs += [2.0 * float(level.spacing.mean()), wp.from_torch(out, dtype=wp.vec3d)]
-    run(_closest_of, len(asked), inputs, device=device, threads=level.threads)
+    run(_closest_of, len(queried), inputs, device=device, threads=level.threads)
     return out

@@ -1,11 +1,11 @@
-"""Bodies near a group of garments in one frame, and cloth that is inside them.
+"""Bodies near a group of garments in one frame, and cloth inside the bodies.
 
-Bodies are triangles beside the cloth's in all searches (`collide`): cloth outside is kept there by pairs of parts, as
-from other cloth. Cloth that is inside a body at the start has no such pairs with bodies. It is pulled out by the
-shortest way to the body's exposed faces.
+In all searches (`collide`) the bodies' triangles follow the cloth's. Pairs of parts keep cloth outside bodies as they
+keep layers of cloth apart. Cloth that is inside a body at the start has no such pairs with bodies. It is pulled out by
+the shortest way to the body's exposed faces.
 
-What is inside is found without distances: the edges that pass through a body cut the cloth into pieces, and each piece
-is inside or outside as a whole.
+Inside cloth is found without distances: edges that pass through a body cut the cloth into pieces, and each piece is
+entirely inside or entirely outside.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from .measure import is_between, pinched
 from .settings import ContactSettings
 
 SIDE_SAMPLES = 8
-"""Most vertices of a piece of cloth whose sides are found; the majority decides."""
+"""Largest number of vertices of a piece of cloth that are tested; the majority decides the side."""
 ON_SURFACE = 1e-6
 """Distance below which the direction to the closest point is rounding, and the face's normal is taken [m]."""
 
@@ -90,63 +90,64 @@ class FrameBodies:
             origin: World position of the group's origin [m], shape (3,).
             settings: Contact settings, with the stiffness in SI.
         """
-        shifts = tuple(torch.as_tensor(origin - each.surface.origin).to(coarse) for each in touching)
-        known = [each.before for each in touching if each.before is not None]
+        surfaces = [body.surface for body in touching]
+        shifts = tuple(torch.as_tensor(origin - surface.origin).to(coarse) for surface in surfaces)
+        earlier = [body.before for body in touching if body.before is not None]
         points, before = (
-            torch.as_tensor(np.concatenate(each) - origin, dtype=torch.float64, device=coarse.device)
-            for each in ([each.surface.world for each in touching], known or [np.zeros((0, 3))])
+            torch.as_tensor(np.concatenate(corners) - origin, dtype=torch.float64, device=coarse.device)
+            for corners in ([surface.world for surface in surfaces], earlier or [np.zeros((0, 3))])
         )
-        sides = tuple(_start_sides(each.surface, coarse + shift) for each, shift in zip(touching, shifts, strict=True))
+        sides = tuple(_start_sides(surface, coarse + shift) for surface, shift in zip(surfaces, shifts, strict=True))
         longest = settings.way_out * edge
-        whole = len(known) == len(touching)
-        return FrameBodies(tuple(touching), shifts, points, before if whole else None, longest, settings, sides)
+        complete = len(earlier) == len(touching)
+        return FrameBodies(tuple(touching), shifts, points, before if complete else None, longest, settings, sides)
 
     def exits(self, index: int, at: Float[Tensor, "points 3"]) -> tuple[Nearest, Nearest]:
         """Closest points of a closed surface, and closest points on its exposed faces, for points inside.
 
-        A way out that ends inside another body is none, and infinitely long: cloth pinched by two bodies stays.
+        A way out that ends inside another body is not used and gets infinite length: cloth pinched by two bodies stays.
 
         Args:
             at: The points in the surface's coordinates [m].
         """
         surface = self.touching[index].surface
-        found = surface.closest(at, torch.full_like(at[:, 0], float("inf")))
-        way = surface.exit(at, found)
-        out, blocked = way.point + surface.lift * way.normal, torch.zeros_like(found.rim)
-        for other in self._beside(index):
-            there = self.touching[other].surface
-            blocked |= there.inside(out + torch.as_tensor(surface.origin - there.origin).to(out))
-        return found, replace(way, distance=way.distance.masked_fill(blocked, torch.inf))
+        nearest = surface.closest(at, torch.full_like(at[:, 0], float("inf")))
+        exits = surface.exit(at, nearest)
+        out, blocked = exits.point + surface.lift * exits.normal, torch.zeros_like(nearest.rim)
+        for number in self._beside(index):
+            neighbour = self.touching[number].surface
+            blocked |= neighbour.inside(out + torch.as_tensor(surface.origin - neighbour.origin).to(out))
+        return nearest, replace(exits, distance=exits.distance.masked_fill(blocked, torch.inf))
 
     def parts_around(self, index: int, at: Float[Tensor, "points 3"]) -> Int[Tensor, " points"]:
-        """Number of parts around points in a surface's coordinates [m]: up to 2 of the surface, and of those beside."""
+        """Number of body parts around points in a surface's coordinates [m], up to 2 of the surface itself."""
         surface = self.touching[index].surface
         count = surface.inside(at).long() + surface.inside(at, parts=2).long()
-        for other in self._beside(index):
-            there = self.touching[other].surface
-            count += there.inside(at + torch.as_tensor(surface.origin - there.origin).to(at)).long()
+        for number in self._beside(index):
+            neighbour = self.touching[number].surface
+            count += neighbour.inside(at + torch.as_tensor(surface.origin - neighbour.origin).to(at)).long()
         return count
 
     def _beside(self, index: int) -> tuple[int, ...]:
-        """Numbers of the closed surfaces, felt by the same garments, whose bounds overlap a closed surface's."""
-        own = self.touching[index]
+        """Numbers of the closed surfaces in contact with the same garments whose bounds overlap a closed surface's."""
+        body = self.touching[index]
         return tuple(
             number
-            for number, each in enumerate(self.touching)
-            if number != index and each.surface.closed and own.surface.closed
-            if [np.isfinite(offset) for offset in each.offset] == [np.isfinite(offset) for offset in own.offset]
-            if _meet(each.surface, own.surface)
+            for number, candidate in enumerate(self.touching)
+            if number != index and candidate.surface.closed and body.surface.closed
+            if [np.isfinite(offset) for offset in candidate.offset] == [np.isfinite(offset) for offset in body.offset]
+            if _meet(candidate.surface, body.surface)
         )
 
     @property
     def solids(self) -> tuple[Solid, ...]:
         """The triangles of the surfaces."""
-        return tuple(each.surface.solid for each in self.touching)
+        return tuple(body.surface.solid for body in self.touching)
 
     @property
     def offsets(self) -> np.ndarray:
-        """Distance kept by each garment from each body [m]; minus infinity for bodies it ignores, shape (G, B)."""
-        return np.array([each.offset for each in self.touching]).T
+        """Distance kept by each garment from each body [m]; minus infinity for ignored bodies, shape (G, B)."""
+        return np.array([body.offset for body in self.touching]).T
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,20 +156,20 @@ class LevelBodies:
 
     Attributes:
         pieces: Piece of each vertex of the uncut cloth, shape (V,).
-        lost: For each body, a mask of the cloth between its overlapping parts, shape (V,); None if not asked for.
+        buried: For each body, a mask of the cloth between its overlapping parts, shape (V,); None if not computed.
     """
 
     level: Level
     frame: FrameBodies
     pieces: Int[np.ndarray, " vertices"]
-    lost: tuple[Bool[Tensor, " vertices"], ...] | None = None
+    buried: tuple[Bool[Tensor, " vertices"], ...] | None = None
 
     def inside(self, x: Float[Tensor, "vertices 3"], pierced: Pierced) -> Bool[Tensor, "bodies vertices"]:
         """Whether each vertex is inside each body: in a closed surface, or behind an open one.
 
         Args:
             x: Positions [m].
-            pierced: Crossings of cloth and bodies there.
+            pierced: Crossings of cloth and bodies at x.
         """
         out = [self._inside(index, x, pierced.cut(index)) for index in range(len(self.frame.touching))]
         return torch.stack(out) if out else self.level.free.T[:0]
@@ -179,27 +180,27 @@ class LevelBodies:
             return out
         piece = self.pieces
         if len(cut):
-            kept = np.ones(len(self.level.edges), bool)
-            kept[cut.cpu().numpy()] = False
-            piece = joined_by(self.level.edges.cpu().numpy()[kept], self.level.vertex_count)
-        asked, owner = _spread(piece)
-        which = torch.as_tensor(asked, device=x.device)
-        wrong = self._behind(index, x[which], which).cpu().numpy()
+            uncut = np.ones(len(self.level.edges), bool)
+            uncut[cut.cpu().numpy()] = False
+            piece = joined_by(self.level.edges.cpu().numpy()[uncut], self.level.vertex_count)
+        samples, owner = _spread(piece)
+        vertices = torch.as_tensor(samples, device=x.device)
+        wrong = self._behind(index, x[vertices], vertices).cpu().numpy()
         votes = np.bincount(owner, np.where(wrong, 1.0, -1.0), int(piece.max()) + 1)
         return torch.as_tensor(votes[piece] > 0, device=x.device) & self._feels(index)
 
     def _feels(self, index: int) -> Bool[Tensor, " vertices"]:
         """Mask of the vertices of garments that do not ignore a body."""
-        felt = torch.as_tensor(np.isfinite(self.frame.touching[index].offset), device=self.level.rest.device)
-        return felt[self.level.vertex_garment.long()]
+        by_garment = torch.as_tensor(np.isfinite(self.frame.touching[index].offset), device=self.level.rest.device)
+        return by_garment[self.level.vertex_garment.long()]
 
-    def _behind(self, index: int, x: Tensor, which: Tensor) -> Bool[Tensor, " points"]:
+    def _behind(self, index: int, x: Tensor, vertices: Tensor) -> Bool[Tensor, " points"]:
         """Mask of the points x of some vertices that are inside a body or behind it."""
         surface, at = self.frame.touching[index].surface, x + self.frame.shifts[index]
         if surface.closed:
             return surface.inside(at)
-        found = surface.closest(at, torch.full_like(at[:, 0], float("inf")))
-        return found.is_behind(self.side(index)[which])
+        nearest = surface.closest(at, torch.full_like(at[:, 0], float("inf")))
+        return nearest.is_behind(self.side(index)[vertices])
 
     def side(self, index: int) -> Float[Tensor, " vertices"]:
         """Allowed side of an open surface for each vertex: 1 or -1; 0 if undecided or closed."""
@@ -221,46 +222,46 @@ class LevelBodies:
         """
         surface, at = self.frame.touching[index].surface, x + self.frame.shifts[index]
         if surface.closed:
-            found, way = self.frame.exits(index, at)
+            nearest, exits = self.frame.exits(index, at)
         else:
-            found = way = surface.closest(at, torch.full_like(at[:, 0], float("inf")))
-        stays = ~way.distance.isfinite()
+            nearest = exits = surface.closest(at, torch.full_like(at[:, 0], float("inf")))
+        stays = ~exits.distance.isfinite()
         if surface.closed:
-            stays |= pinched(found, way, longest=self.frame.longest)
-        outward = way.normal if surface.closed else way.normal * side.unsqueeze(1)
-        direct = (way.point - at) / way.distance.clamp_min(ON_SURFACE).unsqueeze(1)
-        normal = torch.where((way.distance > ON_SURFACE).unsqueeze(1), direct, outward)
-        return torch.nn.functional.normalize(normal, dim=1, eps=1e-30), way.distance, stays
+            stays |= pinched(nearest, exits, longest=self.frame.longest)
+        outward = exits.normal if surface.closed else exits.normal * side.unsqueeze(1)
+        direct = (exits.point - at) / exits.distance.clamp_min(ON_SURFACE).unsqueeze(1)
+        normal = torch.where((exits.distance > ON_SURFACE).unsqueeze(1), direct, outward)
+        return torch.nn.functional.normalize(normal, dim=1, eps=1e-30), exits.distance, stays
 
     def _vertices_out(
         self, index: int, x: Tensor, inside: Tensor
     ) -> tuple[Int[Tensor, " some"], Float[Tensor, "some 3"], Float[Tensor, " some"]]:
         """Vertices to be moved out of a body, their unit directions out, and depths [m]."""
-        which = torch.nonzero(inside).squeeze(1)
-        normal, depth, stays = self.ways_out(index, x[which], self.side(index)[which])
-        if self.lost is not None:
-            stays |= self.lost[index][which]
-        kept = torch.nonzero(~stays).squeeze(1)
-        return which[kept], normal[kept], depth[kept]
+        vertices = torch.nonzero(inside).squeeze(1)
+        normal, depth, stays = self.ways_out(index, x[vertices], self.side(index)[vertices])
+        if self.buried is not None:
+            stays |= self.buried[index][vertices]
+        movable = torch.nonzero(~stays).squeeze(1)
+        return vertices[movable], normal[movable], depth[movable]
 
     def _vertices_beside(
-        self, index: int, x: Tensor, some: Tensor
+        self, index: int, x: Tensor, candidates: Tensor
     ) -> tuple[Int[Tensor, " some"], Float[Tensor, "some 3"], Float[Tensor, " some"]]:
-        """Vertices of some that are near a body and outside; directions from the body; negative distances [m]."""
-        which = torch.nonzero(some & self._feels(index)).squeeze(1)
-        surface, at = self.frame.touching[index].surface, x[which] + self.frame.shifts[index]
-        found = surface.closest(at, torch.full_like(at[:, 0], self.frame.longest))
-        kept = torch.nonzero(found.distance.isfinite() & (found.distance > ON_SURFACE)).squeeze(1)
-        far = found.distance[kept]
-        return which[kept], (at[kept] - found.point[kept]) / far.unsqueeze(1), -far
+        """Candidates outside that are near a body, their directions from the body, and their negative distances [m]."""
+        vertices = torch.nonzero(candidates & self._feels(index)).squeeze(1)
+        surface, at = self.frame.touching[index].surface, x[vertices] + self.frame.shifts[index]
+        nearest = surface.closest(at, torch.full_like(at[:, 0], self.frame.longest))
+        reached = torch.nonzero(nearest.distance.isfinite() & (nearest.distance > ON_SURFACE)).squeeze(1)
+        far = nearest.distance[reached]
+        return vertices[reached], (at[reached] - nearest.point[reached]) / far.unsqueeze(1), -far
 
     def pinched(
         self, x: Float[Tensor, "vertices 3"], inside: Bool[Tensor, "bodies vertices"]
     ) -> Bool[Tensor, " vertices"]:
         """Mask of the vertices between overlapping parts of bodies, too far from a way out."""
         out = inside.any(dim=0)
-        for index, own in enumerate(inside):
-            out[self._vertices_out(index, x, own)[0]] = False
+        for index, in_body in enumerate(inside):
+            out[self._vertices_out(index, x, in_body)[0]] = False
         return out
 
     def pulls(
@@ -276,28 +277,27 @@ class LevelBodies:
         Args:
             x: Positions [m].
             inside: The vertices inside each body.
-            chords: Places inside on edges and faces whose corners are outside; None for none.
+            chords: Points inside on edges and faces whose corners are outside; None for none.
             share: Fraction of the offsets.
         """
-        found = []
-        for index, own in enumerate(inside):
-            outs = self._vertices_out(index, x, own), self._vertices_beside(index, x, inside.any(dim=0) & ~own)
-            which, normal, depth = (torch.cat(each) for each in zip(*outs, strict=True))
-            corners = which.unsqueeze(1).expand(-1, 4)
-            weight = torch.zeros_like(x[:1, :1]).repeat(len(which), 4)
+        groups = []
+        for index, in_body in enumerate(inside):
+            outs = self._vertices_out(index, x, in_body), self._vertices_beside(index, x, inside.any(dim=0) & ~in_body)
+            vertices, normal, depth = (torch.cat(columns) for columns in zip(*outs, strict=True))
+            corners = vertices.unsqueeze(1).expand(-1, 4)
+            weight = torch.zeros_like(x[:1, :1]).repeat(len(vertices), 4)
             weight[:, 0] = 1.0
-            found.append((index, corners, weight, normal, depth))
+            groups.append((index, corners, weight, normal, depth))
             if chords is None:
                 continue
-            some = torch.nonzero(chords.body == index).squeeze(1)
-            corners, weight = chords.corners[some], chords.weight[some]
+            rows = torch.nonzero(chords.body == index).squeeze(1)
+            corners, weight = chords.corners[rows], chords.weight[rows]
             at, side = (weight.unsqueeze(2) * x[corners]).sum(dim=1), self.side(index)[corners[:, 0]]
             within = torch.nonzero(self._behind(index, at, corners[:, 0])).squeeze(1)
             normal, depth, stays = self.ways_out(index, at[within], side[within])
             within, normal, depth = within[~stays], normal[~stays], depth[~stays]
-            found.append((index, corners[within], weight[within], normal, depth))
-        made = [self._pull(x, *each, share=share) for each in found]
-        return reduce(PairConstraints.with_more, made)
+            groups.append((index, corners[within], weight[within], normal, depth))
+        return reduce(PairConstraints.with_more, (self._pull(x, *group, share=share) for group in groups))
 
     def _pull(
         self, x: Tensor, index: int, corners: Tensor, weight: Tensor, normal: Tensor, depth: Tensor, *, share: float
@@ -306,8 +306,8 @@ class LevelBodies:
         at = (weight.unsqueeze(2) * x[corners]).sum(dim=1)
         goal = (normal * at).sum(dim=1) + depth + share * self.offset(index)[corners[:, 0]]
         stiffness = self.frame.settings.stiffness * self.level.vertex_area[corners].amin(dim=1)
-        whole = (each.contiguous() for each in (weight, normal, goal, stiffness))
-        return PairConstraints(corners.to(torch.int32).contiguous(), *whole)
+        columns = (column.contiguous() for column in (weight, normal, goal, stiffness))
+        return PairConstraints(corners.to(torch.int32).contiguous(), *columns)
 
     def offset(self, index: int) -> Float[Tensor, " vertices"]:
         """Distance that each vertex keeps from a body [m]."""
@@ -324,37 +324,37 @@ class LevelBodies:
         free, threads = self.level.free, self.level.threads
         return x + along(torch.zeros_like(x, dtype=torch.float64), limits, free=free, threads=threads).to(x)
 
-    def losing(self, x: Float[Tensor, "vertices 3"], inside: Bool[Tensor, "bodies vertices"]) -> LevelBodies:
-        """View that does not push out cloth between overlapping parts of a body at x [m] while the cloth stays inside.
+    def with_buried(self, x: Float[Tensor, "vertices 3"], inside: Bool[Tensor, "bodies vertices"]) -> LevelBodies:
+        """View in which cloth between overlapping parts of a body at x [m] is not pushed out while it stays inside.
 
         Such cloth is a patch of vertices with buried closest faces, some of them inside two parts at once. Pushed out,
-        the patch would fold through its neighbours, which leave on the opposite side: the T-shirt, whole, three
-        ripples, ended with 674 vertices in its body for 20.
+        the patch would fold through its neighbours, which leave on the opposite side: the T-shirt (whole shot, three
+        ripples) ended with 674 instead of 20 vertices in its body.
         """
-        lost = tuple(self._between(index, x, own) for index, own in enumerate(inside))
-        return replace(self, lost=lost)
+        buried = tuple(self._between(index, x, in_body) for index, in_body in enumerate(inside))
+        return replace(self, buried=buried)
 
     def _between(self, index: int, x: Tensor, inside: Tensor) -> Bool[Tensor, " vertices"]:
-        surface, which = self.frame.touching[index].surface, torch.nonzero(inside).squeeze(1)
-        some, seeds = torch.zeros_like(inside), torch.zeros_like(inside)
-        if not len(which) or not surface.closed:
-            return some
-        at = x[which] + self.frame.shifts[index]
+        surface, vertices = self.frame.touching[index].surface, torch.nonzero(inside).squeeze(1)
+        members, seeds = torch.zeros_like(inside), torch.zeros_like(inside)
+        if not len(vertices) or not surface.closed:
+            return members
+        at = x[vertices] + self.frame.shifts[index]
         between = torch.nonzero(is_between(*self.frame.exits(index, at))).squeeze(1)
-        some[which[between]] = True
-        seeds[which[between[self.frame.parts_around(index, at[between]) > 1]]] = True
-        masks = (each.cpu().numpy() for each in (some, seeds))
+        members[vertices[between]] = True
+        seeds[vertices[between[self.frame.parts_around(index, at[between]) > 1]]] = True
+        masks = (mask.cpu().numpy() for mask in (members, seeds))
         return torch.as_tensor(patches_with(self.level.edges.cpu().numpy(), *masks), device=x.device)
 
 
 @dataclass(frozen=True, eq=False)
 class Chords:
-    """Places inside bodies on edges and faces whose corners are outside: the middles of where they are pierced.
+    """Points inside bodies on edges and faces whose corners are outside: means of the crossings of an edge or face.
 
     Attributes:
         body: Number of the body, shape (N,).
         corners: Vertices of the edge or face, the first one repeated, shape (N, 4).
-        weight: Weights of the vertices in the place, shape (N, 4).
+        weight: Weights of the vertices in the point, shape (N, 4).
     """
 
     body: Int[Tensor, " chords"]
@@ -362,9 +362,9 @@ class Chords:
     weight: Float[Tensor, "chords 4"]
 
 
-def _meet(one: MeshSurface, other: MeshSurface) -> bool:
+def _meet(first: MeshSurface, second: MeshSurface) -> bool:
     """Whether the bounds of two surfaces meet."""
-    a, b = one.bounds + one.origin, other.bounds + other.origin
+    a, b = first.bounds + first.origin, second.bounds + second.origin
     return bool((a[0] <= b[1]).all() and (b[0] <= a[1]).all())
 
 
@@ -373,8 +373,8 @@ def _spread(piece: Int[np.ndarray, " vertices"]) -> tuple[np.ndarray, np.ndarray
     order = np.argsort(piece, kind="stable")
     size = np.bincount(piece)
     first, step = np.cumsum(size) - size, np.maximum(size // SIDE_SAMPLES, 1)
-    place = np.arange(len(piece)) - first[piece[order]]
-    taken = (place % step[piece[order]] == 0) & (place // step[piece[order]] < SIDE_SAMPLES)
+    rank = np.arange(len(piece)) - first[piece[order]]
+    taken = (rank % step[piece[order]] == 0) & (rank // step[piece[order]] < SIDE_SAMPLES)
     return order[taken], piece[order[taken]]
 
 
@@ -382,5 +382,5 @@ def _start_sides(surface: MeshSurface, cage: Float[Tensor, "coarse 3"]) -> Float
     """Side of the surface on which each cage vertex lies, 1 or -1; 0 past the rim, and for closed surfaces."""
     if surface.closed or surface.fixed_side is not None:
         return torch.full_like(cage[:, 0], surface.fixed_side or 0.0)
-    found: Nearest = surface.closest(cage, torch.full_like(cage[:, 0], float("inf")))
-    return torch.where(found.rim, torch.zeros_like(found.side), found.side)
+    nearest: Nearest = surface.closest(cage, torch.full_like(cage[:, 0], float("inf")))
+    return torch.where(nearest.rim, torch.zeros_like(nearest.side), nearest.side)

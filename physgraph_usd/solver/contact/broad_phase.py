@@ -41,12 +41,13 @@ class TouchingGroups:
         Two cages are near if two of their vertices are closer than the expected distance of the cloth from its cage
         plus an edge, because a vertex may be near the middle of an edge. A collapsed cage is near no cage.
         """
-        whole = [not has_collapsed(garment, own.points) for garment, own in zip(self._garments, frames, strict=True)]
+        pairs = zip(self._garments, frames, strict=True)
+        intact = [not has_collapsed(garment, frame.points) for garment, frame in pairs]
         trees: dict[int, cKDTree] = {}
         near = [
             (a, b)
             for a, b in (self._boxes_meet(frames) if self._together else ())
-            if whole[a] and whole[b] and touch_one_another(self._garments[a], self._garments[b])
+            if intact[a] and intact[b] and touch_one_another(self._garments[a], self._garments[b])
             if self._close(a, b, frames, trees)
         ]
         parts: list[tuple[int, ...]] = [(index,) for index in range(len(frames))]
@@ -65,19 +66,19 @@ class TouchingGroups:
         bounds = np.array([bounds_of(frame.points) for frame in frames]).reshape(-1, 2, 3)
         reach = np.array([self._reach(index, frame) for index, frame in enumerate(frames)])[:, None]
         low, high = bounds[:, 0] - reach, bounds[:, 1] + reach
-        kept = np.flatnonzero((low <= high).all(axis=1))  # Those of no finite points meet none.
-        if not len(kept):
+        order = np.flatnonzero((low <= high).all(axis=1))  # Bounds of a cage without finite points are empty.
+        if not len(order):
             return
-        axis = int(np.ptp(low[kept], axis=0).argmax())
-        kept = kept[np.argsort(low[kept, axis], kind="stable")]
-        low, high = low[kept], high[kept]
+        axis = int(np.ptp(low[order], axis=0).argmax())
+        order = order[np.argsort(low[order, axis], kind="stable")]
+        low, high = low[order], high[order]
         ends = np.searchsorted(low[:, axis], high[:, axis], side="right")
-        found = []
-        for place, end in enumerate(ends.tolist()):
-            others = slice(place + 1, end)
-            meets = (low[others] <= high[place]).all(axis=1) & (low[place] <= high[others]).all(axis=1)
-            found += [sorted((kept[place], other)) for other in kept[others][meets]]
-        yield from sorted((int(a), int(b)) for a, b in found)
+        pairs = []
+        for rank, end in enumerate(ends.tolist()):
+            candidates = slice(rank + 1, end)
+            meets = (low[candidates] <= high[rank]).all(axis=1) & (low[rank] <= high[candidates]).all(axis=1)
+            pairs += [sorted((order[rank], partner)) for partner in order[candidates][meets]]
+        yield from sorted((int(a), int(b)) for a, b in pairs)
 
     def _close(self, a: int, b: int, frames: Sequence[GarmentFrame], trees: dict[int, cKDTree]) -> bool:
         """True if vertices of two cages are within reach and the cages are not copies."""
@@ -113,8 +114,10 @@ class Bodies:
 
     def forget(self) -> None:
         """Build every body anew: a refitted hierarchy breaks ties by the pose of its first build."""
-        sides = ["front" if each.kind == "plane" and each.side not in FIXED else each.side for each in self.colliders]
-        self._meshes = [MeshBody(side=side, device=self._device, threads=self._threads) for side in sides]
+        self._meshes = []
+        for collider in self.colliders:
+            side = "front" if collider.kind == "plane" and collider.side not in FIXED else collider.side
+            self._meshes.append(MeshBody(side=side, device=self._device, threads=self._threads))
 
     def pose(self, poses: Sequence[Pose | None]) -> None:
         """Set the pose of each collider for a frame."""
@@ -161,21 +164,21 @@ class Bodies:
 
         Args:
             before: Poses of all colliders in the start frame; () if unknown.
-            motion: Motion of the start frame since.
+            motion: Motion from the start frame to this frame.
             offsets: For each garment, the distance kept from each collider [m]; None if the garment ignores the
                 collider.
         """
-        found = []
-        for place, index in enumerate(indices):
+        touched = []
+        for column, index in enumerate(indices):
             collider = self.colliders[index]
-            own = (each[place] for each in offsets)
-            offset = tuple(-math.inf if each is None else each + collider.offset for each in own)
-            known = before[index] if before else None
+            distances = (row[column] for row in offsets)
+            offset = tuple(-math.inf if distance is None else distance + collider.offset for distance in distances)
+            pose_before = before[index] if before else None
             for surface in self._posed(index):
-                placed = None if known is None else surface.placed(known)
+                placed = None if pose_before is None else surface.placed(pose_before)
                 placed = None if placed is None else motion(placed)
-                found.append(Touching(collider.path, surface, offset, placed))
-        return tuple(found)
+                touched.append(Touching(collider.path, surface, offset, placed))
+        return tuple(touched)
 
     def _posed(self, index: int) -> tuple[MeshSurface, ...]:
         if index not in self._surfaces:

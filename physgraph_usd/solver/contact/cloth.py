@@ -1,7 +1,7 @@
-"""A level's contact in a frame: near pairs, crossings, the forces that keep parts apart, and moves that cross nothing.
+"""A level's contact in a frame: near pairs, crossings, forces that keep parts apart, and moves without new crossings.
 
-Penalty springs carry the load but guarantee nothing; the safe moves of `promise` do. The springs act on all near pairs,
-not only on the nearest: otherwise cloth that pushes at a place and is held at another would stay locked.
+Penalty springs carry the load; safe moves (`promise`) guarantee that nothing newly crosses. Springs act on all near
+pairs, not only on the nearest pairs: otherwise cloth that pushes at one point and is blocked at another would lock.
 
 All searches work on the corners of the cloth, then of the bodies, as one array in float64.
 """
@@ -34,8 +34,8 @@ from .tangles import OUT, Tangles, chords_of, gaps_out
 KEPT_GAP = 0.06
 """Gap below which gaps shrink by at most a tenth a move, as a fraction of the thickness."""
 
-_Since = tuple[Tensor, Tensor | None]
-"""Corners in the start frame [m], and a mask of the exempt cloth there, or None."""
+_Begin = tuple[Tensor, Tensor | None]
+"""Corners in the start frame [m], and a mask of the exempt cloth in it, or None."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,10 +47,10 @@ class ContactState:
         version: The version counter of x when its crossings were found.
         corners: Positions of the cloth, then of the bodies' corners [m], float64.
         crossings: Crossings of cloth with cloth, without given-up cloth.
-        tangles: These with the cloth around them; None without crossings and given-up cloth.
+        tangles: The crossings with the cloth around; None without crossings and given-up cloth.
         pierced: Crossings of cloth and bodies.
-        inside: The vertices inside each body, shape (B, V); None if none is.
-        exempt: Mask of the cloth inside or through a body, False for the bodies' corners; None if none is.
+        inside: Mask of the vertices inside each body, shape (B, V); None without such vertices.
+        exempt: Mask of the cloth inside or through a body, False for the bodies' corners; None without such cloth.
     """
 
     x: Tensor
@@ -64,7 +64,7 @@ class ContactState:
 
     @staticmethod
     def clean(x: Tensor, corners: Tensor, given_up: Tangles | None = None) -> ContactState:
-        """Positions at which nothing crosses but given-up cloth."""
+        """Positions at which only given-up cloth crosses."""
         return ContactState(x, x._version, corners, Crossings.none(x.device), given_up, Pierced.none(x.device))
 
     @property
@@ -79,7 +79,7 @@ class ContactState:
 
     @property
     def is_clean(self) -> bool:
-        """Whether nothing crosses, neither cloth, but where it is given up, nor bodies."""
+        """Whether no cloth crosses cloth or bodies, given-up cloth excepted."""
         return self.crossings.count == 0 and self.exempt is None
 
 
@@ -96,7 +96,7 @@ class ClothContact:
         self._meshes: dict[int, tuple[tuple[object, ...], ClothMesh]] = {}
 
     def mesh(self, level: Level, seam: Seam | None, bodies: FrameBodies | None, *, itself: bool) -> ClothMesh:
-        """A level's mesh with the given seam and bodies; cached while these stay equal.
+        """A level's mesh with a seam and bodies; cached while both stay equal.
 
         Args:
             seam: Sewn vertices; None without seams.
@@ -110,8 +110,8 @@ class ClothContact:
             none = np.zeros((len(solids), len(solids)), bool)
             meets = np.block([[meets, feels], [feels.T, none]])
         key = (sewn.tobytes(), meets.tobytes(), *map(id, solids))
-        known, mesh = self._meshes.get(level.index, ((), None))
-        if mesh is None or key != known:
+        last_key, mesh = self._meshes.get(level.index, ((), None))
+        if mesh is None or key != last_key:
             mesh = ClothMesh(level, meets, sewn, solids=solids)
             self._meshes[level.index] = key, mesh
         return mesh
@@ -149,15 +149,15 @@ class LevelContact:
             base: The upsampled cage [m]; distances between parts in the cage are not widened.
             thickness: Thickness of each garment [m].
             settings: Contact settings, in SI.
-            doubtful: Mask of the vertices that the cage places near what crosses in it; None if nothing does.
+            doubtful: Mask of the vertices that follow crossing parts of the cage; None if the cage has no crossings.
         """
         self.keeps_sides = settings.cloth == "pairs" and bool(lasting.meets.any())
         self.mesh = lasting.mesh(level, seam, bodies, itself=self.keeps_sides)
         self.seam, self.frame = seam, bodies
         self.given_up, self._doubtful = (
-            None if some is None else self.mesh.padded(some) for some in (given_up, doubtful)
+            None if mask is None else self.mesh.padded(mask) for mask in (given_up, doubtful)
         )
-        self._asked = None if self.given_up is None else ~self.given_up
+        self._queried = None if self.given_up is None else ~self.given_up
         self._base, self._settings, self._thickness = base, settings, thickness
         self._all_bodies = None if bodies is None else LevelBodies(level, bodies, self.mesh.pieces)
         self._looked: ContactState | None = None
@@ -167,7 +167,7 @@ class LevelContact:
     def bodies(self) -> LevelBodies | None:
         """The level's view of the bodies; cloth between overlapping parts of a body in the cage stays there."""
         bodies, inside = self._all_bodies, self.at_base.inside
-        return bodies if bodies is None or inside is None else bodies.losing(self._base, inside)
+        return bodies if bodies is None or inside is None else bodies.with_buried(self._base, inside)
 
     @cached_property
     def at_base(self) -> ContactState:
@@ -184,7 +184,7 @@ class LevelContact:
         return x if self.seam is None else self.seam.closed(x)
 
     def of_cage(self, x: Float[Tensor, "vertices 3"]) -> ContactState:
-        """As `look` for an upsampled cage [m], searched only around what crosses in the cage itself."""
+        """As `look` for an upsampled cage [m], searched only around crossings of the cage itself."""
         if self._doubtful is None:
             return ContactState.clean(x, self._corners(x))
         return self.found(x, self._doubtful)
@@ -196,30 +196,30 @@ class LevelContact:
         return self._looked
 
     def remember(self, x: Float[Tensor, "vertices 3"], given_up: Tangles | None = None) -> None:
-        """Record that nothing crosses at x [m] but given-up cloth, as after a safe move from such positions."""
+        """Record that only given-up cloth crosses at x [m], as after a safe move from such positions."""
         self._looked = ContactState.clean(x, self._corners(x), given_up)
 
     def _corners(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "all 3"]:
         """Corners of the cloth, then of the bodies in this frame [m], float64."""
         return x.double() if self.frame is None else torch.cat([x.double(), self.frame.points])
 
-    def found(self, x: Tensor, some: Bool[Tensor, " all"] | None = None) -> ContactState:
-        """Crossings, tangles and cloth inside bodies at x [m], of the given vertices or of all; not cached."""
-        mesh, corners, lost = self.mesh, self._corners(x), self.given_up
-        asked = self._asked if some is None else some if self._asked is None else some & self._asked
-        found, pierced = all_crossings(mesh.parts, corners, asked)
+    def found(self, x: Tensor, vertices: Bool[Tensor, " all"] | None = None) -> ContactState:
+        """Crossings, tangles and cloth inside bodies at x [m], of some vertices or, with None, of all; not cached."""
+        mesh, corners, given_up = self.mesh, self._corners(x), self.given_up
+        queried = self._queried if vertices is None else vertices if self._queried is None else vertices & self._queried
+        crossings, pierced = all_crossings(mesh.parts, corners, queried)
         inside = None if self._all_bodies is None else self._all_bodies.inside(x, pierced)
         inside = inside if inside is not None and bool(inside.any()) else None
         tangles = None
-        if found.count or lost is not None:
-            lost = mesh.padded(torch.zeros_like(x[:, 0], dtype=torch.bool)) if lost is None else lost
-            found = found.where(~lost[mesh.corners_of(found)].all(dim=1))
-            tangles = Tangles.find(mesh, found, lost)
+        if crossings.count or given_up is not None:
+            given_up = mesh.padded(torch.zeros_like(x[:, 0], dtype=torch.bool)) if given_up is None else given_up
+            crossings = crossings.where(~given_up[mesh.corners_of(crossings)].all(dim=1))
+            tangles = Tangles.find(mesh, crossings, given_up)
         exempt = None
         if pierced.count or inside is not None:
             exempt = mesh.grown(mesh.crossed(pierced.crossings), RINGS)
             exempt = mesh.padded(exempt if inside is None else exempt | inside.any(dim=0))
-        return ContactState(x, x._version, corners, found, tangles, pierced, inside, exempt)
+        return ContactState(x, x._version, corners, crossings, tangles, pierced, inside, exempt)
 
     def tangled_pieces(self, x: Float[Tensor, "vertices 3"]) -> Bool[Tensor, " vertices"] | None:
         """Mask of the connected pieces of cloth with most of their vertices in tangles at x [m]; None without any."""
@@ -239,23 +239,23 @@ class LevelContact:
         state, springs, stiffness = self.look(x), self._springs, self._settings.stiffness
         at, tangles = state.corners, state.tangles
         inside = None if state.inside is None else self.mesh.padded(state.inside.any(dim=0))
-        near = springs.find(at, springs.near(x, at, asked=self._asked, inside=inside).pairs)
+        near = springs.find(at, springs.near(x, at, queried=self._queried, inside=inside).pairs)
         near, with_body, touching = springs.sided(near, state.exempt)
         every = springs.constraints(near, at, stiffness)
         pushes, gaps = every.where(with_body), every.where(~with_body)
         if self.bodies is not None and (any(state.in_bodies) or bool(touching.any())):
             within, chords = _within(self.mesh, self.bodies, state)
             pushes = pushes.with_more(self.bodies.pulls(x, within | touching, chords))
-        if tangles is not None:  # What crosses has no side to keep.
+        if tangles is not None:  # Crossing parts have no side to keep.
             corners = gaps.corners.long()
-            kept = ~self.mesh.crossed(state.crossings)[corners].any(dim=1)
-            gaps = gaps.where(kept & ~tangles.given_up[corners].all(dim=1))
+            sided = ~self.mesh.crossed(state.crossings)[corners].any(dim=1)
+            gaps = gaps.where(sided & ~tangles.given_up[corners].all(dim=1))
         if state.hopeful.count:
             step = OUT * float(self.mesh.level.spacing.mean())
             gaps = gaps.with_more(gaps_out(self.mesh, state.hopeful, x, step=step, stiffness=stiffness))
         self.came_near = bool(self.came_near) or len(gaps.corners) > 0
         named = (("contact", pushes.sharing_room(x)), ("self_contact", gaps))
-        return tuple(SelfContact(self.mesh.level, each, name) for name, each in named if len(each.corners))
+        return tuple(SelfContact(self.mesh.level, pairs, name) for name, pairs in named if len(pairs.corners))
 
     def moved(self, start: Placed, wanted: Float[Tensor, "vertices 3"]) -> Placed:
         """Positions as close to the wanted as is safe [m], seams closed; without seams ``wanted`` itself if safe.
@@ -268,57 +268,57 @@ class LevelContact:
     def carried(
         self, start: Placed, wanted: Float[Tensor, "vertices 3"], inside: Bool[Tensor, " vertices"] | None
     ) -> Placed:
-        """As `moved` from the start frame, with bodies that move too, and pass through cloth that cannot give way.
+        """As `moved` from the start frame, with moving bodies, which pass through cloth that cannot give way.
 
         Args:
             inside: Mask of the cloth inside a body in the start frame; None for none.
         """
         before = None if self.frame is None else self.frame.before
         exempt = None if inside is None else self.mesh.padded(inside)
-        since = None if before is None else (torch.cat([start.double(), before]), exempt)
-        return self._moved(start, self.closed(wanted), since)
+        start_frame = None if before is None else (torch.cat([start.double(), before]), exempt)
+        return self._moved(start, self.closed(wanted), start_frame)
 
     def drawn(self, start: Placed, wanted: Float[Tensor, "vertices 3"]) -> Placed:
         """As `moved`, but the number of crossings in a tangle may grow for a while."""
         tangles = self.look(start).tangles
         return self._go(start, self.closed(wanted), None if tangles is None else tangles.label, None)[0]
 
-    def _moved(self, start: Placed, wanted: Tensor, since: _Since | None) -> Placed:
-        """As `moved`; ``since`` holds the corners and the exempt cloth in the start frame, or is None."""
+    def _moved(self, start: Placed, wanted: Tensor, start_frame: _Begin | None) -> Placed:
+        """As `moved`; ``start_frame`` holds the corners and the exempt cloth in the start frame, or is None."""
         state = self.look(start)
         tangles = state.tangles
         if tangles is None or bool(tangles.hopeless.all()):
-            x, proved = self._go(start, wanted, None if tangles is None else tangles.label, since)
+            x, proved = self._go(start, wanted, None if tangles is None else tangles.label, start_frame)
             if proved and state.is_clean:
                 self.remember(x, tangles)
             return x
         free = tangles.label.clone()
-        x, _ = self._go(start, wanted, free, since)
-        for whole in (False, True):  # First the worse tangles alone are held, then all.
+        x, _ = self._go(start, wanted, free, start_frame)
+        for hold_all in (False, True):  # First only the worse tangles are held, then all.
             worse = tangles.worse(self.look(x).crossings)
             if not bool(worse.any()):
                 break
-            free[~tangles.given_up if whole else worse] = -1
-            x, _ = self._go(start, wanted, free, since)
+            free[~tangles.given_up if hold_all else worse] = -1
+            x, _ = self._go(start, wanted, free, start_frame)
         return x
 
-    def _go(self, start: Placed, aim: Tensor, tangle: Tensor | None, since: _Since | None) -> tuple[Placed, bool]:
+    def _go(self, start: Placed, aim: Tensor, tangle: Tensor | None, start_frame: _Begin | None) -> tuple[Placed, bool]:
         """As `moved`, without a promise for pairs in one tangle; and whether all pairs with bodies are proved apart."""
         state, end, springs = self.look(start), self._corners(aim), self._springs
-        begin, exempt = since or (state.corners, state.exempt)
-        near = springs.known(start) if since is None else None
+        begin, exempt = start_frame or (state.corners, state.exempt)
+        near = springs.cached(start) if start_frame is None else None
         promise = Promise(self.mesh, self.seam, KEPT_GAP * float(self._thickness.min()), tangle, exempt)
         if near is None and tangle is None and exempt is None:
-            found = springs.blocking(begin, end, aim, floor=promise.floor, asked=self._asked)
+            blocking = springs.blocking(begin, end, aim, floor=promise.floor, queried=self._queried)
         else:
-            asked = (end != begin).any(dim=1) if self._asked is None else self._asked
-            found = promise.blocking(begin, end, asked, near=near)
-        x, proved = promise.kept(begin, end, found, halved=since is not None, near=near)
+            queried = (end != begin).any(dim=1) if self._queried is None else self._queried
+            blocking = promise.blocking(begin, end, queried, near=near)
+        x, proved = promise.kept(begin, end, blocking, halved=start_frame is not None, near=near)
         return Placed(aim if x is end else x[: len(aim)].to(aim)), proved
 
 
 def _within(mesh: ClothMesh, bodies: LevelBodies, state: ContactState) -> tuple[Tensor, Chords]:
-    """The vertices inside each body, and the places inside on edges and faces whose corners are outside."""
+    """The vertices inside each body, and the points inside on edges and faces whose corners are outside."""
     size = len(bodies.frame.touching), len(state.x)
     inside = state.x.new_zeros(size, dtype=torch.bool) if state.inside is None else state.inside
     return inside, chords_of(mesh, state.pierced, state.corners, inside)

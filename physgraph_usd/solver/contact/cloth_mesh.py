@@ -18,7 +18,7 @@ from ..level import Level
 from ..mesh.topology import adjacency, joined_by
 
 RINGS = 2
-"""Rings of vertices around a crossing, or around a piece of cloth, that belong to it."""
+"""Rings of vertices that count as part of the crossing or the piece of cloth in their middle."""
 
 
 class ClothMesh:
@@ -50,33 +50,32 @@ class ClothMesh:
         edges, triangles, sides = self.parts.surface
         self.pieces = joined_by(cloth, count)
         self.beside = _across(adjacency(cloth, count), label)
-        self._others = sum(len(each.points) for each in solids)
+        self._body_corners = sum(len(solid.points) for solid in solids)
         self.free = self.padded(level.free[:, 0]).unsqueeze(1)
         self.edges, self.triangles, self.opposite = (
-            torch.as_tensor(each, device=level.device)
-            for each in (edges, triangles, _opposite(triangles, sides, len(edges)))
+            torch.as_tensor(vertices, device=level.device)
+            for vertices in (edges, triangles, _opposite(triangles, sides, len(edges)))
         )
-        first, second = self.beside.nonzero()
         self._first, self._second = (
-            torch.as_tensor(each.astype(np.int64)).to(level.device) for each in (first, second)
+            torch.as_tensor(vertices.astype(np.int64)).to(level.device) for vertices in self.beside.nonzero()
         )
 
     def padded(self, vertices: Bool[Tensor, " vertices"]) -> Bool[Tensor, " all"]:
         """A mask of vertices, with False for the bodies' corners."""
-        return torch.nn.functional.pad(vertices, (0, self._others))
+        return torch.nn.functional.pad(vertices, (0, self._body_corners))
 
     def grown(self, vertices: Bool[Tensor, " some"], rings: int) -> Bool[Tensor, " some"]:
-        """The given vertices and all vertices of the cloth at most `rings` edges away."""
+        """A mask of vertices, extended to all vertices of the cloth at most `rings` edges away."""
         for _ in range(rings):
-            given, vertices = vertices, vertices.clone()
-            vertices[self._second[given[self._first]]] = True
+            seeds, vertices = vertices, vertices.clone()
+            vertices[self._second[seeds[self._first]]] = True
         return vertices
 
-    def pieces_with(self, some: Bool[Tensor, " all"], *, over: float) -> Bool[Tensor, " vertices"] | None:
-        """Mask of the connected pieces, also across seams, with over a fraction of the vertices; None for none."""
+    def pieces_with(self, members: Bool[Tensor, " all"], *, over: float) -> Bool[Tensor, " vertices"] | None:
+        """Mask of the connected pieces, also across seams, with more than a fraction of members; None without any."""
         count = self.level.vertex_count
-        piece = torch.as_tensor(joined_by(self.parts.links.cpu().numpy(), count), device=some.device).long()
-        share = torch.bincount(piece, some[:count].double()) / torch.bincount(piece).clamp_min(1)
+        piece = torch.as_tensor(joined_by(self.parts.links.cpu().numpy(), count), device=members.device).long()
+        share = torch.bincount(piece, members[:count].double()) / torch.bincount(piece).clamp_min(1)
         out = (share > over)[piece]
         return out if bool(out.any()) else None
 
@@ -108,8 +107,8 @@ class ClothMesh:
             still = torch.where(fixed, weight, torch.zeros_like(weight))
             offset = offset - (normal * (still.unsqueeze(2) * x[corners.long()]).sum(dim=1)).sum(dim=1)
             weight, corners = weight - still, torch.where(fixed, corners.amin(dim=1, keepdim=True), corners)
-        given = (each.to(self.level.rest).contiguous() for each in (weight, normal, offset, stiffness))
-        return PairConstraints(corners.contiguous(), *given)
+        columns = (column.to(self.level.rest).contiguous() for column in (weight, normal, offset, stiffness))
+        return PairConstraints(corners.contiguous(), *columns)
 
     def between(self, crossings: Crossings) -> np.ndarray:
         """Number of crossings between garments, the lower number first, shape (G, G)."""

@@ -25,7 +25,7 @@ from .settings import ContactSettings
 from .tangles import Tangles
 
 STALLED = 4
-"""Most passes of moving cloth out of bodies without progress, and rounds over which untangling is judged."""
+"""Largest number of passes that move cloth out of bodies without progress, and of rounds that judge untangling."""
 
 
 class FrameContact:
@@ -74,36 +74,36 @@ class FrameContact:
 
     @cached_property
     def _cage(self) -> tuple[ClothMesh, Crossings, LevelBodies | None, Pierced, Tensor | None]:
-        """The cage's mesh, crossings, view of the bodies, crossings with them, and vertices inside each."""
+        """The cage's mesh, crossings, view of the bodies, crossings with bodies, and vertices inside each body."""
         cage, bodies, x = self._levels[0], self._bodies, self._coarse.double()
         mesh = self._cloth.mesh(cage, self._seam_at(cage), bodies, itself=self._settings.cloth == "pairs")
-        found, pierced = all_crossings(mesh.parts, x if bodies is None else torch.cat([x, bodies.points]))
+        contours, pierced = all_crossings(mesh.parts, x if bodies is None else torch.cat([x, bodies.points]))
         if bodies is None:
-            return mesh, found, None, pierced, None
+            return mesh, contours, None, pierced, None
         view = LevelBodies(cage, bodies, mesh.pieces)
         inside = view.inside(self._coarse, pierced)
-        return mesh, found, view, pierced, inside if bool(inside.any()) else None
+        return mesh, contours, view, pierced, inside if bool(inside.any()) else None
 
     @cached_property
     def given_up(self) -> Bool[Tensor, " coarse"] | None:
-        """Mask of the pieces of the cage that the last frame gave up and that cross still; None for none.
+        """Mask of the pieces of the cage that the last frame gave up and that still cross; None without any.
 
-        What the last frame solved is never given up because the cage crosses there.
+        Cloth that the last frame solved is never given up because of a crossing of the cage.
         """
         if self._last_given_up is None or not (self.crossed and self._last_given_up.any()):
             return None
-        mesh, found, *_ = self._cage
-        lost = mesh.padded(self._last_given_up)
-        tangled = Tangles.find(mesh, found, torch.zeros_like(lost)).label >= 0
-        return mesh.pieces_with(lost & tangled, over=0.0)
+        mesh, contours, *_ = self._cage
+        given_up = mesh.padded(self._last_given_up)
+        tangled = Tangles.find(mesh, contours, torch.zeros_like(given_up)).label >= 0
+        return mesh.pieces_with(given_up & tangled, over=0.0)
 
     def after_cage(self, x: Float[Tensor, "coarse 3"]) -> FrameContact:
-        """This contact, where pieces that are mostly tangled in the cage x [m] of a cold frame are given up."""
-        lost = self.at(self._levels[0]).tangled_pieces(x)
-        if lost is None:
+        """This contact without the pieces that are mostly tangled in the cage x [m] of a cold frame."""
+        tangled = self.at(self._levels[0]).tangled_pieces(x)
+        if tangled is None:
             return self
         out = copy(self)
-        out.given_up, out._views = lost, {}
+        out.given_up, out._views = tangled, {}
         return out
 
     @cached_property
@@ -118,14 +118,14 @@ class FrameContact:
     def _aimed(self) -> tuple[Float[Tensor, "coarse 3"], Float[Tensor, "coarse 3"]]:
         """`aim` and `untangled`."""
         seam, aim = self._seam_at(self._levels[0]), self._repaired
-        mesh, found, *_ = self._cage
-        found = found if aim is self._coarse else crossings(mesh.parts, aim)
-        asked = None if self.given_up is None else ~self.given_up
-        if asked is not None:
-            found = found.where(asked[mesh.corners_of(found)].any(dim=1))
-        apart, left = drawn_apart(mesh, aim, found, gap=float(self._thickness.mean()), asked=asked)
-        pair = (aim if left else apart), apart
-        aim, apart = (each if seam is None or each is self._coarse else seam.closed(each) for each in pair)
+        mesh, contours, *_ = self._cage
+        contours = contours if aim is self._coarse else crossings(mesh.parts, aim)
+        queried = None if self.given_up is None else ~self.given_up
+        if queried is not None:
+            contours = contours.where(queried[mesh.corners_of(contours)].any(dim=1))
+        apart, remaining = drawn_apart(mesh, aim, contours, gap=float(self._thickness.mean()), queried=queried)
+        pair = (aim if remaining else apart), apart
+        aim, apart = (points if seam is None or points is self._coarse else seam.closed(points) for points in pair)
         return aim, apart
 
     @property
@@ -144,10 +144,17 @@ class FrameContact:
         if level.index not in self._views:
             level = self._levels[level.index]
             seam, base = self._seam_at(level), level.base.apply(self.aim)
-            own = {"base": base, "thickness": self._thickness, "settings": self._settings, "seam": seam}
-            own |= {"bodies": self._bodies, "given_up": self._given_up_at(level)}
-            own |= {"doubtful": None if self._doubtful is None else _share_of(level, self._doubtful) > 0.0}
-            self._views[level.index] = LevelContact(self._cloth, level, **own)
+            self._views[level.index] = LevelContact(
+                self._cloth,
+                level,
+                base=base,
+                thickness=self._thickness,
+                settings=self._settings,
+                bodies=self._bodies,
+                seam=seam,
+                given_up=self._given_up_at(level),
+                doubtful=None if self._doubtful is None else _share_of(level, self._doubtful) > 0.0,
+            )
         return self._views[level.index]
 
     def _given_up_at(self, level: Level) -> Bool[Tensor, " vertices"] | None:
@@ -156,13 +163,13 @@ class FrameContact:
 
     @cached_property
     def _doubtful(self) -> Bool[Tensor, " coarse"] | None:
-        """Mask of the cage's vertices around all that crosses in it, or was repaired; None for none."""
-        mesh, found, _, pierced, inside = self._cage
-        if not found.count and not pierced.count and inside is None and self.aim is self._coarse:
+        """Mask of the cage's vertices around crossings and repairs; None without any."""
+        mesh, contours, _, pierced, inside = self._cage
+        if not contours.count and not pierced.count and inside is None and self.aim is self._coarse:
             return None
-        some = mesh.crossed(found) | mesh.crossed(pierced.crossings) | (self.aim != self._coarse).any(dim=1)
-        some = some if inside is None else some | inside.any(dim=0)
-        return mesh.grown(some, 1) if bool(some.any()) else None
+        mask = mesh.crossed(contours) | mesh.crossed(pierced.crossings) | (self.aim != self._coarse).any(dim=1)
+        mask = mask if inside is None else mask | inside.any(dim=0)
+        return mesh.grown(mask, 1) if bool(mask.any()) else None
 
     def _seam_at(self, level: Level) -> Seam | None:
         return self._seams[level.index] if self._seams else None
@@ -176,12 +183,12 @@ class FrameContact:
         moved: dict[str, object] = {}
         if self.aim is not self._coarse:
             moved["repaired"] = _moves(self._coarse, self.aim)
-        # First all cloth inside is moved, then the vertices inside alone: an edge's way out may put a vertex inside.
+        # First all cloth inside is moved, then only vertices inside: an edge's way out may put a vertex inside.
         view = self.at(self._levels[-1])
-        whole, passes = _out_of_bodies(view, x, vertices=False)
-        out, more = _out_of_bodies(view, whole, vertices=True)
+        projected, passes = _out_of_bodies(view, x, vertices=False)
+        out, vertex_passes = _out_of_bodies(view, projected, vertices=True)
         if self._bodies is not None:
-            moved["projected"] = _moves(x, out) | {"passes": passes + more}
+            moved["projected"] = _moves(x, out) | {"passes": passes + vertex_passes}
         return out, moved
 
     def is_out(self, x: Placed) -> bool:
@@ -210,8 +217,8 @@ def _out_of_bodies(view: LevelContact, start: Placed, *, vertices: bool) -> tupl
     """Positions moved safely out of bodies [m], the start itself if no cloth had to move, and the number of passes.
 
     In all passes together, a vertex moves at most the distance of its first push plus a mean edge: cloth pinched
-    between two limbs, pushed out of one into the other in turns, would form spikes. Passes end once `STALLED` of them
-    in a row left as much; the best positions stay.
+    between two limbs, pushed out of each limb into the other in turns, would form spikes. Passes end after `STALLED`
+    passes without progress; the best positions are returned.
 
     Args:
         start: Positions [m].
@@ -223,19 +230,19 @@ def _out_of_bodies(view: LevelContact, start: Placed, *, vertices: bool) -> tupl
         return inside if vertices else inside + crossings
 
     x, reach = start, None
-    best, left, passes, stalled = x, count(x), 0, 0
-    while left and stalled < STALLED and not is_over():
+    best, remaining, passes, stalled = x, count(x), 0, 0
+    while remaining and stalled < STALLED and not is_over():
         wanted = view.pushed_out(x, vertices=vertices)
         shift = wanted - start
         far = shift.norm(dim=1, keepdim=True)
         reach = far + view.mesh.level.rest_length.mean() if reach is None else reach
         x = view.moved(x, torch.where(far > reach, start + shift * (reach / far), wanted))
-        passes, stalled, now = passes + 1, stalled + 1, count(x)
-        if now < left:
-            best, left, stalled = x, now, 0
+        passes, stalled, count_after = passes + 1, stalled + 1, count(x)
+        if count_after < remaining:
+            best, remaining, stalled = x, count_after, 0
     return best, passes
 
 
-def _share_of(level: Level, some: Bool[Tensor, " coarse"]) -> Float[Tensor, " vertices"]:
+def _share_of(level: Level, mask: Bool[Tensor, " coarse"]) -> Float[Tensor, " vertices"]:
     """Sum of the weights of some cage vertices in each vertex of a level."""
-    return torch.as_tensor(level.from_coarse @ some.cpu().numpy().astype(np.float64), device=level.device)
+    return torch.as_tensor(level.from_coarse @ mask.cpu().numpy().astype(np.float64), device=level.device)

@@ -14,7 +14,7 @@ from ..colliders.mesh import MeshSurface
 from ..level import Level
 
 Exits = Callable[[Tensor], tuple[Nearest, Nearest]]
-"""Finds the closest points of a surface, and on exposed faces, for points inside [m]."""
+"""Gives the closest points of a surface, and the closest points on exposed faces, for points inside [m]."""
 DETOUR = 1.05
 """Ratio of the way out to the closest distance above which the closest face counts as buried."""
 DEEP = 1e-4
@@ -32,8 +32,9 @@ class Penetration:
         deepest_mm: Depth of the deepest free vertex [mm].
         pinned: Number of pinned vertices deeper than `DEEP`; pinned vertices stay.
         pinched: Number of free vertices inside whose cloth lies between overlapping parts of the body in the input,
-            that are between such parts now and farther from any way out than half a cage edge, or whose way out ends in
-            another body. Pinched vertices stay, out of sight; forced out, they would fold through their neighbours.
+            that are between such parts in the result and farther from any way out than half a cage edge, or whose way
+            out ends in another body. Pinched vertices stay, out of sight; forced out, they would fold through their
+            neighbours.
         crossings: Number of cloth edges through faces of the body plus body edges through faces of the cloth.
     """
 
@@ -53,7 +54,7 @@ def penetration(
     *,
     longest: float,
     crossings: int,
-    lost: Bool[Tensor, " vertices"] | None = None,
+    buried: Bool[Tensor, " vertices"] | None = None,
     exits: Exits | None = None,
 ) -> Penetration:
     """Measure one garment group against one surface.
@@ -63,11 +64,11 @@ def penetration(
         inside: The vertices inside.
         longest: Way out from between overlapping parts above which a vertex counts as pinched [m].
         crossings: Number of edges through faces.
-        lost: Vertices of cloth between overlapping parts, or None.
+        buried: Vertices of cloth between overlapping parts, or None.
         exits: As for `depths`.
     """
     free = level.free[:, 0]
-    depth, stays = depths(surface, x, inside, longest, lost=lost, exits=exits)
+    depth, stays = depths(surface, x, inside, longest, buried=buried, exits=exits)
     deep = (depth > DEEP) & ~stays
     count = int((deep & free).sum())
     deepest = float((depth * (free & ~stays)).max()) if len(depth) else 0.0
@@ -87,7 +88,7 @@ def depths(
     inside: Bool[Tensor, " vertices"],
     longest: float,
     *,
-    lost: Bool[Tensor, " vertices"] | None = None,
+    buried: Bool[Tensor, " vertices"] | None = None,
     exits: Exits | None = None,
 ) -> tuple[Float[Tensor, " vertices"], Bool[Tensor, " vertices"]]:
     """Length of each vertex's way out of a surface, or depth without one [m], 0 outside; a mask of pinched vertices.
@@ -96,47 +97,47 @@ def depths(
         x: Positions in the surface's coordinates [m].
         inside: The vertices inside.
         longest: Way out from between overlapping parts above which a vertex counts as pinched [m].
-        lost: Vertices of cloth between overlapping parts, or None.
+        buried: Vertices of cloth between overlapping parts, or None.
         exits: Closest points of the surface and on exposed faces; None for the surface alone.
     """
     depth, stays = torch.zeros_like(x[:, 0]), torch.zeros_like(inside)
     within = torch.nonzero(inside).squeeze(1) if surface.has_inside else depth.long()[:0]
     if len(within):
         if exits is None:
-            found = surface.closest(x[within], torch.full_like(depth[within], float("inf")))
-            way = surface.exit(x[within], found)
+            nearest = surface.closest(x[within], torch.full_like(depth[within], float("inf")))
+            exit_points = surface.exit(x[within], nearest)
         else:
-            found, way = exits(x[within])
-        known = None if lost is None else lost[within]
-        depth[within] = torch.where(way.distance.isfinite(), way.distance, found.distance)
-        stays[within] = pinched(found, way, longest=longest, lost=known)
+            nearest, exit_points = exits(x[within])
+        buried_within = None if buried is None else buried[within]
+        depth[within] = torch.where(exit_points.distance.isfinite(), exit_points.distance, nearest.distance)
+        stays[within] = pinched(nearest, exit_points, longest=longest, buried=buried_within)
     return depth, stays
 
 
 def pinched(
-    found: Nearest,
-    way: Nearest,
+    nearest: Nearest,
+    exit_points: Nearest,
     *,
     longest: float,
-    lost: Bool[Tensor, " points"] | None = None,
+    buried: Bool[Tensor, " points"] | None = None,
 ) -> Bool[Tensor, " points"]:
-    """Mask of the inside points that lie between overlapping parts too far from a way out, or are held there.
+    """Mask of the inside points between overlapping parts that are too far from a way out, or are buried.
 
     Args:
-        found: Closest points.
-        way: Closest points on exposed faces.
+        nearest: Closest points.
+        exit_points: Closest points on exposed faces.
         longest: Longest way out [m].
-        lost: Points of cloth between overlapping parts, which stay wherever they have moved; or None.
+        buried: Points of cloth between overlapping parts, which stay wherever they have moved; or None.
     """
-    stays = (way.distance > longest) & is_between(found, way)
-    return stays if lost is None else stays | lost
+    stays = (exit_points.distance > longest) & is_between(nearest, exit_points)
+    return stays if buried is None else stays | buried
 
 
-def is_between(found: Nearest, way: Nearest) -> Bool[Tensor, " points"]:
-    """Mask of the points between overlapping parts of a surface: their closest face is inside the surface, too.
+def is_between(nearest: Nearest, exit_points: Nearest) -> Bool[Tensor, " points"]:
+    """Mask of the points between overlapping parts of a surface: the closest face is itself inside the surface.
 
     Args:
-        found: Closest points.
-        way: Closest points on exposed faces.
+        nearest: Closest points.
+        exit_points: Closest points on exposed faces.
     """
-    return way.distance > DETOUR * found.distance
+    return exit_points.distance > DETOUR * nearest.distance

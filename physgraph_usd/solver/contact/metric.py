@@ -1,11 +1,10 @@
-"""The metric of cloth that something touches, level by level, as P in `integrate.metric`.
+"""The metric of cloth in contact, level by level, as P in `integrate.metric`.
 
-What touches is far stiffer than cloth, so the metric of free cloth misjudges both a patch that is held and the rough
-errors beside planes that turn from vertex to vertex. By levels, the contact is seen at each size, and only the cage is
-factorised anew. Of the stiffness of what touches, K is three times the mean over directions, since a plane holds in
-one of them.
+Contact is far stiffer than cloth, so the metric of free cloth misjudges both a patch that is held and the rough errors
+beside planes that turn from vertex to vertex. The levels represent contact at each size, and only the cage is
+factorised anew. K is three times the mean contact stiffness over all directions, since a plane holds in one direction.
 
-The network makes its steps whole, without a line search, and gets half of P.
+The network makes full steps, without a line search, and gets half of P.
 """
 
 from __future__ import annotations
@@ -43,7 +42,7 @@ class HeldMetric:
     def of(plain: Metric, stiff: Float[Tensor, " vertices"], last: Preconditioner | None) -> Metric | HeldMetric:
         """The metric with a contact stiffness [N/m]; the last metric while its stiffness suffices."""
         if not isinstance(last, HeldMetric):
-            return HeldMetric(plain, stiff) if bool((stiff > 0).any()) else plain  # Things are near, but none pushes.
+            return HeldMetric(plain, stiff) if bool((stiff > 0).any()) else plain  # Pairs are near, but no pair pushes.
         return last if last.serves(stiff) else HeldMetric(plain, torch.maximum(stiff, last.stiff))
 
     def serves(self, stiff: Float[Tensor, " vertices"]) -> bool:
@@ -65,8 +64,8 @@ class HeldMetric:
 
     def held(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
         """R H^-1 R F [m], R = (D / (D + K))^1/2, with `Metric.estimate` for H^-1: the measure of the remaining move."""
-        own = self._plain.diagonal.to(self.stiff)
-        factor = (own / (own + self.stiff)).sqrt().unsqueeze(1)
+        diagonal = self._plain.diagonal.to(self.stiff)
+        factor = (diagonal / (diagonal + self.stiff)).sqrt().unsqueeze(1)
         return self._plain.estimate(force * factor).mul_(factor)
 
     def short(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:

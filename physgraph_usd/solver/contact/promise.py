@@ -28,12 +28,11 @@ from .along import ApproachLimits, along
 from .cloth_mesh import RINGS, ClothMesh
 
 ROUNDS = 4
-"""Most passes that shorten blocked displacements. Vertices still blocked afterwards stay at the start, so the passes
-end."""
+"""Passes that shorten blocked displacements. Vertices that are still blocked then stay at the start, so passes end."""
 
 STRAINS, NEGLIGIBLE = 0.5, 0.01
 """Largest strain of an edge between vertices whose displacements are shortened, and the fraction of that change which
-is negligible. Without the limit shot 02 needs twice the rounds (53 for 24 in frame 18) and keeps crossings."""
+is negligible. Without the limit shot 02 needs 53 instead of 24 rounds in frame 18 and keeps crossings."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,10 +50,18 @@ class Promise:
     tangle: Int[Tensor, " all"] | None
     inside: Bool[Tensor, " all"] | None
 
-    def blocking(self, begin: Tensor, end: Tensor, asked: Tensor, *, near: NearAt | None = None) -> Pairs:
+    def blocking(self, begin: Tensor, end: Tensor, queried: Tensor, *, near: NearAt | None = None) -> Pairs:
         """As `blocking_pairs`."""
-        given = {"floor": self.floor, "tangle": self.tangle, "inside": self.inside}
-        return blocking_pairs(self.mesh.parts, begin, end, **given, asked=asked, near=near)
+        return blocking_pairs(
+            self.mesh.parts,
+            begin,
+            end,
+            floor=self.floor,
+            queried=queried,
+            tangle=self.tangle,
+            inside=self.inside,
+            near=near,
+        )
 
     def kept(
         self,
@@ -65,7 +72,7 @@ class Promise:
         halved: bool,
         near: NearAt | None = None,
     ) -> tuple[Float[Tensor, "all 3"], bool]:
-        """Corners after a safe move, the wanted themselves if no pair blocks; and whether pairs with bodies are proved.
+        """Corners after a safe move, ``end`` itself if no pair blocks; and whether pairs with bodies are proved.
 
         Displacements are projected onto the planes of the blocking pairs, and then shortened. Only pairs of vertices
         with changed ends are checked again.
@@ -74,7 +81,7 @@ class Promise:
             begin: Corners of cloth and bodies [m], float64.
             end: Wanted corners [m]; those of bodies are reached.
             met: Pairs that block the move.
-            halved: Whether vertices in or around pairs that stay blocked move in two halves: planes may turn once more.
+            halved: Whether vertices around pairs that stay blocked move in two halves, so that planes may turn once.
             near: All near pairs at the start; None if unknown.
         """
         if not len(met.value):
@@ -97,13 +104,23 @@ class Promise:
             last = torch.where(late.unsqueeze(1), end, ends)
             halfway = 0.5 * (begin + last)
             for aim in (self._rounded(halfway, halfway), last):
-                begin, one = self.kept(begin, aim, self.blocking(begin, aim, late), halved=False)
-                late, proved = late | (begin != aim).any(dim=1), proved and one
+                begin, half_proved = self.kept(begin, aim, self.blocking(begin, aim, late), halved=False)
+                late, proved = late | (begin != aim).any(dim=1), proved and half_proved
             return begin, proved
-        # Cloth that stays behind a body that moves on would be in the body.
+        # Cloth that a moving body reaches, and that cannot move on, is then inside the body.
         inside = self.inside if stand else torch.arange(len(moves), device=moves.device) < mesh.level.vertex_count
-        given = {"floor": self.floor, "tangle": self.tangle, "inside": inside, "dtype": mesh.level.dtype}
-        return safe_move(begin, ends, mesh.parts, asked=late, near=near, **given), stand
+        x = safe_move(
+            begin,
+            ends,
+            mesh.parts,
+            floor=self.floor,
+            tangle=self.tangle,
+            inside=inside,
+            queried=late,
+            near=near,
+            dtype=mesh.level.dtype,
+        )
+        return x, stand
 
     def _rounded(self, points: Tensor, end: Tensor) -> Float[Tensor, "all 3"]:
         """Corners of the cloth rounded to the type of the solve, seams closed, and corners of bodies at their ends."""
@@ -112,10 +129,10 @@ class Promise:
         return torch.cat([cloth.double(), end[len(cloth) :]])
 
 
-def _with_corners(met: Pairs, others: Bool[Tensor, " all"]) -> Bool[Tensor, " all"]:
-    asked = others.clone()
-    asked[met.corners.long().reshape(-1)] = True
-    return asked
+def _with_corners(met: Pairs, vertices: Bool[Tensor, " all"]) -> Bool[Tensor, " all"]:
+    mask = vertices.clone()
+    mask[met.corners.long().reshape(-1)] = True
+    return mask
 
 
 def safe_move(
@@ -126,7 +143,7 @@ def safe_move(
     floor: float,
     tangle: Int[Tensor, " vertices"] | None = None,
     inside: Bool[Tensor, " vertices"] | None = None,
-    asked: Bool[Tensor, " vertices"] | None = None,
+    queried: Bool[Tensor, " vertices"] | None = None,
     near: NearAt | None = None,
     dtype: torch.dtype | None = None,
 ) -> Placed:
@@ -143,7 +160,7 @@ def safe_move(
         tangle: The tangle of each vertex, int32, -1 outside tangles; pairs inside a single tangle have no promise. None
             without tangles.
         inside: Cloth inside a body; its pairs with bodies have no promise. None for none.
-        asked: Vertices whose pairs must be checked; pairs without such a vertex are known to be safe. None checks every
+        queried: Vertices whose pairs must be checked; pairs without such a vertex are safe. None checks every
             vertex that moves.
         near: All near pairs at the start; None if unknown.
         dtype: Type to which positions of the cloth are rounded; None for the type of the wanted positions.
@@ -152,37 +169,38 @@ def safe_move(
         Positions [m], ``wanted`` itself if no pair is blocked.
     """
     at = start.double()
-    way = wanted.double() - at
-    share = torch.ones(len(way), dtype=torch.float64, device=way.device)
-    x, asked = wanted, (way != 0).any(dim=1) if asked is None else asked
-    given = {"floor": floor, "tangle": tangle, "inside": inside}
-    cloth, dtype = torch.arange(len(way), device=way.device) < parts.level.vertex_count, dtype or wanted.dtype
-    for attempt in range(len(way) + ROUNDS):
-        more = blocking_pairs(parts, start, x, asked=asked, near=near, **given)
-        if not len(more.value):
+    displacement = wanted.double() - at
+    share = torch.ones(len(displacement), dtype=torch.float64, device=displacement.device)
+    x, queried = wanted, (displacement != 0).any(dim=1) if queried is None else queried
+    cloth, dtype = torch.arange(len(share), device=share.device) < parts.level.vertex_count, dtype or wanted.dtype
+    for attempt in range(len(displacement) + ROUNDS):
+        blocking = blocking_pairs(
+            parts, start, x, floor=floor, queried=queried, tangle=tangle, inside=inside, near=near
+        )
+        if not len(blocking.value):
             break
         least = torch.ones_like(share)
-        corner = more.corners.long().reshape(-1)
-        least.scatter_reduce_(0, corner, more.value.repeat_interleave(4), "amin")
+        corner = blocking.corners.long().reshape(-1)
+        least.scatter_reduce_(0, corner, blocking.value.repeat_interleave(4), "amin")
         shorter = share * least if attempt < ROUNDS else torch.where(least < 1.0, 0.0, share)
-        # Once time is over all stays where it is.
-        less = torch.zeros_like(share) if is_over() else _spread(shorter, way, parts)
-        known, share = share, torch.where(cloth, less, share)  # Bodies go their way.
-        asked = share < known
-        moved = (at + share.unsqueeze(1) * way).to(dtype).to(wanted)
+        # After the deadline no vertex moves.
+        less = torch.zeros_like(share) if is_over() else _spread(shorter, displacement, parts)
+        last_share, share = share, torch.where(cloth, less, share)  # Bodies always move to their ends.
+        queried = share < last_share
+        moved = (at + share.unsqueeze(1) * displacement).to(dtype).to(wanted)
         x = torch.where((share < 1.0).unsqueeze(1), moved, wanted)
     return Placed(x)
 
 
-def _spread(share: Tensor, way: Tensor, parts: Parts) -> Float[Tensor, " vertices"]:
+def _spread(share: Tensor, displacement: Tensor, parts: Parts) -> Float[Tensor, " vertices"]:
     """Fractions reduced around shortened vertices, so that no edge is strained by more than `STRAINS`."""
-    length = way.norm(dim=1)
+    length = displacement.norm(dim=1)
     late = length * (1.0 - share)
     least = NEGLIGIBLE * STRAINS * parts.lengths.mean()
     changed = torch.nonzero(late > least).squeeze(1)
     while len(changed) and not is_over():
-        vertex, other, rest = parts.links_of(changed)
-        new = late.scatter_reduce(0, other, late[vertex] - STRAINS * rest, "amax")
+        vertex, neighbour, rest = parts.links_of(changed)
+        new = late.scatter_reduce(0, neighbour, late[vertex] - STRAINS * rest, "amax")
         late, changed = new, torch.nonzero(new > late + least).squeeze(1)
     out = torch.minimum(share, (1.0 - late / length.clamp_min(1e-300)).clamp_min(0.0))
     sewn, partner = parts.links[len(parts.level.edges) :].T  # Seams stay closed to the last bit.

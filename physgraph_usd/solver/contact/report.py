@@ -25,7 +25,7 @@ def measured(
 ) -> tuple[dict[str, object], Bool[Tensor, " vertices"]]:
     """Penetrations and crossings before and after, and a mask of the vertices of crossing cloth after.
 
-    Positions that safe moves reached from a start without crossings have none and are not searched again.
+    Positions reached by safe moves from a start without crossings have no crossings and are not searched again.
 
     Args:
         view: The finest level's cloth.
@@ -33,60 +33,69 @@ def measured(
         x: The result [m].
     """
     first, last = view.at_base if torch.equal(before, view.at_base.x) else view.of_cage(before), view.look(x)
-    said: dict[str, object] = {}
+    figures: dict[str, object] = {}
     if view.bodies is not None:
-        said["bodies"] = _of_bodies(view.bodies, before, first, x, last)
-    found = last.hopeful if view.given_up is None else crossings(view.mesh.parts, x)
+        figures["bodies"] = _of_bodies(view.bodies, before, first, x, last)
+    contours = last.hopeful if view.given_up is None else crossings(view.mesh.parts, x)
     if view.keeps_sides:
         base = first.crossings if view.given_up is None else crossings(view.mesh.parts, before)
         crossed = {
-            name: {"crossings": each.count, "between_garments": int(np.triu(view.mesh.between(each), 1).sum())}
-            for name, each in (("before", base), ("after", found))
+            name: {"crossings": state.count, "between_garments": int(np.triu(view.mesh.between(state), 1).sum())}
+            for name, state in (("before", base), ("after", contours))
         }
-        crossed["after"]["given_up"] = found.count - last.hopeful.count
-        near = bool(view.came_near) or any(each["crossings"] for each in crossed.values())
-        said["cloth"] = {"near": near, **crossed}
-    return said, view.mesh.crossed(found)
+        crossed["after"]["given_up"] = contours.count - last.hopeful.count
+        near = bool(view.came_near) or any(state["crossings"] for state in crossed.values())
+        figures["cloth"] = {"near": near, **crossed}
+    return figures, view.mesh.crossed(contours)
 
 
 def _of_bodies(
     bodies: LevelBodies, before: Tensor, first: ContactState, x: Tensor, last: ContactState
 ) -> dict[str, object]:
     """Penetrations and crossings of each body before and after the solve."""
-    found: dict[str, object] = {}
-    for index, each in enumerate(bodies.frame.touching):
-        name = each.path if each.surface.has_inside else f"{each.path} (open part)"
-        lost = None if bodies.lost is None else bodies.lost[index]
-        found[name] = {
-            "before": asdict(_penetration(bodies, index, before, first, lost=None)),
-            "after": asdict(_penetration(bodies, index, x, last, lost=lost)),
+    figures: dict[str, object] = {}
+    for index, body in enumerate(bodies.frame.touching):
+        name = body.path if body.surface.has_inside else f"{body.path} (open part)"
+        buried = None if bodies.buried is None else bodies.buried[index]
+        figures[name] = {
+            "before": asdict(_penetration(bodies, index, before, first, buried=None)),
+            "after": asdict(_penetration(bodies, index, x, last, buried=buried)),
         }
-    return found
+    return figures
 
 
-def _penetration(bodies: LevelBodies, index: int, x: Tensor, look: ContactState, *, lost: Tensor | None) -> Penetration:
+def _penetration(
+    bodies: LevelBodies, index: int, x: Tensor, look: ContactState, *, buried: Tensor | None
+) -> Penetration:
     crossings = int((look.pierced.body == index).sum()) if look.pierced.count else 0
     if look.inside is None:
         return Penetration(crossings=crossings)
-    inside, known = look.inside[index], {"longest": bodies.frame.longest, "lost": lost, "crossings": crossings}
-    surface, at = bodies.frame.touching[index].surface, x + bodies.frame.shifts[index]
-    exits = partial(bodies.frame.exits, index) if surface.closed else None
-    return penetration(surface, bodies.level, at, inside, exits=exits, **known)
+    surface = bodies.frame.touching[index].surface
+    return penetration(
+        surface,
+        bodies.level,
+        x + bodies.frame.shifts[index],
+        look.inside[index],
+        longest=bodies.frame.longest,
+        crossings=crossings,
+        buried=buried,
+        exits=partial(bodies.frame.exits, index) if surface.closed else None,
+    )
 
 
 def swallowed(
     bodies: LevelBodies, x: Float[Tensor, "vertices 3"], inside: Bool[Tensor, "bodies vertices"] | None
 ) -> list[tuple[float, str]]:
     """Mean depth [m] and body path of each garment that is wholly inside a body, or behind its fixed side, at x [m]."""
-    found = [(0.0, "")] * len(bodies.level.spans)
-    for index, own in enumerate(() if inside is None else inside):
-        each = bodies.frame.touching[index]
-        for place, span in enumerate(bodies.level.spans):
-            if each.surface.has_inside and span.stop > span.start and bool(own[span].all()):
+    deepest = [(0.0, "")] * len(bodies.level.spans)
+    for index, in_body in enumerate(() if inside is None else inside):
+        body = bodies.frame.touching[index]
+        for garment, span in enumerate(bodies.level.spans):
+            if body.surface.has_inside and span.stop > span.start and bool(in_body[span].all()):
                 at = x[span] + bodies.frame.shifts[index]
-                near = each.surface.closest(at, torch.full_like(at[:, 0], float("inf")))
-                found[place] = max(found[place], (float(near.distance.mean()), each.path))
-    return found
+                near = body.surface.closest(at, torch.full_like(at[:, 0], float("inf")))
+                deepest[garment] = max(deepest[garment], (float(near.distance.mean()), body.path))
+    return deepest
 
 
 def penetration_map(surfaces: Sequence[MeshSurface], points: np.ndarray, *, device: str = "cpu") -> np.ndarray:
@@ -109,8 +118,8 @@ def penetration_map(surfaces: Sequence[MeshSurface], points: np.ndarray, *, devi
         if surface.closed:
             depth = depths(surface, x, surface.inside(x), float("inf"))[0]
         else:
-            found = surface.closest(x, torch.full_like(deepest, float("inf")))
-            depth = torch.where(found.is_behind(surface.fixed_side or 0.0), found.distance, 0.0)
+            nearest = surface.closest(x, torch.full_like(deepest, float("inf")))
+            depth = torch.where(nearest.is_behind(surface.fixed_side or 0.0), nearest.distance, 0.0)
         deepest = torch.maximum(deepest, depth)
     return (1e3 * deepest).to(torch.float32).cpu().numpy()
 
@@ -127,7 +136,7 @@ def body_crossings(level: Level, surfaces: Sequence[MeshSurface], points: np.nda
     cloth, bodies = len(level.spans), len(surfaces)
     meets = np.zeros((cloth + bodies, cloth + bodies), bool)
     meets[:cloth, cloth:] = meets[cloth:, :cloth] = True
-    mesh = ClothMesh(level, meets, np.zeros((0, 2), np.int64), solids=tuple(each.solid for each in surfaces))
-    x = np.concatenate([points, *(each.world for each in surfaces)]) - points.mean(axis=0)
+    mesh = ClothMesh(level, meets, np.zeros((0, 2), np.int64), solids=tuple(surface.solid for surface in surfaces))
+    x = np.concatenate([points, *(surface.world for surface in surfaces)]) - points.mean(axis=0)
     pierced = all_crossings(mesh.parts, torch.as_tensor(x, device=level.device))[1]
     return mesh.crossed(pierced.crossings).cpu().numpy()

@@ -38,7 +38,7 @@ HALF, MARGIN = 0.5, 0.1
 and the search distance beyond the thickness, in edges."""
 LEAST_OFFSET = 0.25
 """Minimum offset as a fraction of the thickness, however close the parts are in the input."""
-_HALF, _MARGIN, _LEAST = (wp.constant(wp.float64(each)) for each in (HALF, MARGIN, LEAST_OFFSET))
+_HALF, _MARGIN, _LEAST = (wp.constant(wp.float64(value)) for value in (HALF, MARGIN, LEAST_OFFSET))
 
 
 @wp.func
@@ -61,9 +61,9 @@ def _find_springs(
     corners: wp.array(dtype=wp.vec4i),
     face: wp.array(dtype=wp.bool),
     weight: wp.array(dtype=wp.vec4d),
-    way: wp.array(dtype=wp.vec3d),
+    separation: wp.array(dtype=wp.vec3d),
     offset: wp.array(dtype=wp.float64),
-    kept: wp.array(dtype=wp.bool),
+    is_near: wp.array(dtype=wp.bool),
 ):
     i = first + wp.tid()
     c = corners[i]
@@ -82,9 +82,9 @@ def _find_springs(
             keeps = wp.min(keeps, _HALF * wp.length(_apart(w, c, rest)))
         near = distance < keeps + _MARGIN * edge
         weight[i] = w
-        way[i] = between
+        separation[i] = between
         offset[i] = keeps
-    kept[i] = near
+    is_near[i] = near
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,19 +98,19 @@ class NearSprings:
     near: NearPairs
     offset: Float[Tensor, " pairs"]
 
-    def where(self, kept: Bool[Tensor, " pairs"]) -> NearSprings:
+    def where(self, selected: Bool[Tensor, " pairs"]) -> NearSprings:
         """The selected springs."""
-        return NearSprings(self.near.where(torch.nonzero(kept).squeeze(1)), self.offset[kept])
+        return NearSprings(self.near.where(torch.nonzero(selected).squeeze(1)), self.offset[selected])
 
 
-def _kept(thickness: Float[Tensor, " garments"], offsets: np.ndarray | None) -> Float[Tensor, "all all"]:
+def _required_gaps(thickness: Float[Tensor, " garments"], offsets: np.ndarray | None) -> Float[Tensor, "all all"]:
     """Distance kept by two garments, or by a garment and a body, which follow as further garments [m]."""
     mean, count = 0.5 * (thickness.unsqueeze(0) + thickness.unsqueeze(1)), len(thickness)
     if offsets is None:
         return mean
-    own = torch.as_tensor(offsets).to(mean)
-    out = mean.new_zeros((count + own.shape[1],) * 2)
-    out[:count, :count], out[:count, count:], out[count:, :count] = mean, own, own.T
+    body_offsets = torch.as_tensor(offsets).to(mean)
+    out = mean.new_zeros((count + body_offsets.shape[1],) * 2)
+    out[:count, :count], out[:count, count:], out[count:, :count] = mean, body_offsets, body_offsets.T
     return out
 
 
@@ -137,29 +137,29 @@ class ClothSprings:
         level, none = mesh.level, base.new_zeros((0, 3)).double()
         points = none if bodies is None else bodies.points
         self._mesh, self._cloths, self._area = mesh, len(level.spans), level.vertex_area.double()
-        self._keep = _kept(thickness.double(), None if bodies is None else bodies.offsets).contiguous()
-        sizes = torch.tensor([len(each.points) for each in (() if bodies is None else bodies.solids)]).long()
-        others = torch.arange(len(sizes)).repeat_interleave(sizes).to(level.vertex_garment) + self._cloths
-        self.owner = torch.cat([level.vertex_garment, others]).to(torch.int32).contiguous()
-        self._rest, self._base = (torch.cat([each.double(), points]) for each in (level.rest, base))
+        self._keep = _required_gaps(thickness.double(), None if bodies is None else bodies.offsets).contiguous()
+        sizes = torch.tensor([len(solid.points) for solid in (() if bodies is None else bodies.solids)]).long()
+        body_owner = torch.arange(len(sizes)).repeat_interleave(sizes).to(level.vertex_garment) + self._cloths
+        self.owner = torch.cat([level.vertex_garment, body_owner]).to(torch.int32).contiguous()
+        self._rest, self._base = (torch.cat([cloth.double(), points]) for cloth in (level.rest, base))
         self._spacing = torch.nn.functional.pad(level.spacing.double(), (0, len(points)), value=torch.inf)
         self._near: tuple[Tensor, int, NearAt] | None = None
 
     @cached_property
     def reach(self) -> Reach:
-        """Search radii: half the distance kept by garments, and half of `MARGIN` edges; a body's adds what it keeps."""
+        """Search radii: half the gap of garments and half of `MARGIN` edges; a body's radius also covers its offset."""
         level, count = self._mesh.level, self._mesh.level.vertex_count
         play, garment = 0.5 * MARGIN * level.spacing.double(), level.vertex_garment.long()
         thickness = self._keep.diagonal()[: self._cloths]
-        radius, others = 0.5 * thickness[garment] + play, len(self.owner) - count
-        if others:
+        radius, body_corners = 0.5 * thickness[garment] + play, len(self.owner) - count
+        if body_corners:
             beyond = (self._keep[: self._cloths, self._cloths :] - 0.5 * thickness.unsqueeze(1)).amax(dim=0)
             of_body = beyond.clamp_min(0.0) + play.max()
             radius = torch.cat([radius, of_body[self.owner[count:].long() - self._cloths]])
-        return Reach(radius, torch.nn.functional.pad(play, (0, others)), HALF)
+        return Reach(radius, torch.nn.functional.pad(play, (0, body_corners)), HALF)
 
-    def known(self, x: Float[Tensor, "vertices 3"]) -> NearAt | None:
-        """Near pairs at the cloth's positions x [m] if the last search found them there; None otherwise."""
+    def cached(self, x: Float[Tensor, "vertices 3"]) -> NearAt | None:
+        """Near pairs at the cloth's positions x [m], if the last search was at x; None otherwise."""
         near = self._near
         return near[2] if near is not None and near[0] is x and near[1] == x._version else None
 
@@ -168,11 +168,11 @@ class ClothSprings:
         x: Float[Tensor, "vertices 3"],
         at: Float[Tensor, "all 3"],
         *,
-        asked: Bool[Tensor, " all"] | None,
+        queried: Bool[Tensor, " all"] | None,
         inside: Bool[Tensor, " all"] | None,
     ) -> NearAt:
         """Near pairs at the cloth's positions x, with bodies ``at`` [m]; masks are as for `near_parts`."""
-        near = self.known(x) or near_parts(self._mesh.parts, at, self.reach, asked=asked, inside=inside)
+        near = self.cached(x) or near_parts(self._mesh.parts, at, self.reach, queried=queried, inside=inside)
         self._near = x, x._version, near
         return near
 
@@ -183,12 +183,12 @@ class ClothSprings:
         x: Float[Tensor, "vertices 3"],
         *,
         floor: float,
-        asked: Bool[Tensor, " all"] | None,
+        queried: Bool[Tensor, " all"] | None,
     ) -> Pairs:
-        """Pairs that block a move of cloth and bodies to an end with the cloth at x [m]; near pairs there are kept."""
-        found, near = blocking_and_near(self._mesh.parts, begin, end, self.reach, floor=floor, asked=asked)
+        """Pairs that block a move of cloth and bodies to an end with the cloth at x [m]; near pairs are cached."""
+        pairs, near = blocking_and_near(self._mesh.parts, begin, end, self.reach, floor=floor, queried=queried)
         self._near = x, x._version, near
-        return found
+        return pairs
 
     def find(self, x: Float[Tensor, "all 3"], pairs: Pairs) -> NearSprings:
         """Pairs that have a spring.
@@ -198,19 +198,19 @@ class ClothSprings:
             pairs: Candidates, each once; must contain all near pairs at x.
         """
         count, device = len(pairs.face), x.device
-        weight, way, offset = (
+        weight, separation, offset = (
             torch.empty(shape, dtype=torch.float64, device=device) for shape in ((count, 4), (count, 3), (count,))
         )
-        kept = torch.empty(count, dtype=torch.bool, device=device)
-        inputs: list[object] = [argument(each, wp.vec3d) for each in (x.contiguous(), self._rest, self._base)]
+        is_near = torch.empty(count, dtype=torch.bool, device=device)
+        inputs: list[object] = [argument(points, wp.vec3d) for points in (x.contiguous(), self._rest, self._base)]
         inputs += [argument(self.owner), argument(self._keep.view(-1)), len(self._keep), self._cloths]
         inputs += [argument(self._spacing)]
         inputs += [argument(pairs.corners, wp.vec4i), argument(pairs.face)]
-        inputs += [argument(weight, wp.vec4d), argument(way, wp.vec3d), argument(offset), argument(kept)]
+        inputs += [argument(weight, wp.vec4d), argument(separation, wp.vec3d), argument(offset), argument(is_near)]
         run(_find_springs, count, inputs, device=str(device), threads=self._mesh.level.threads)
-        some = torch.nonzero(kept).squeeze(1)  # Once for all that follows.
-        near = NearPairs(pairs.corners[some], weight[some], way[some], pairs.face[some])
-        return NearSprings(near, offset[some])
+        rows = torch.nonzero(is_near).squeeze(1)  # One conversion for all fields.
+        near = NearPairs(pairs.corners[rows], weight[rows], separation[rows], pairs.face[rows])
+        return NearSprings(near, offset[rows])
 
     def constraints(self, springs: NearSprings, x: Float[Tensor, "all 3"], stiffness: float) -> PairConstraints:
         """The springs as constraints of the contact force; a body's part of a pair is constant.
@@ -220,7 +220,7 @@ class ClothSprings:
             stiffness: Stiffness by area [N/m^3].
         """
         near, count = springs.near, self._mesh.level.vertex_count
-        normal = torch.nn.functional.normalize(near.way, dim=1, eps=1e-300)
+        normal = torch.nn.functional.normalize(near.separation, dim=1, eps=1e-300)
         corners = near.corners.long()
         least = torch.where(corners < count, self._area[corners.clamp_max(count - 1)], torch.inf)
         share = torch.where(near.face & (corners[:, 0] < count), least[:, 0], least.amin(dim=1) / 3.0)
@@ -229,7 +229,7 @@ class ClothSprings:
     def sided(
         self, near: NearSprings, exempt: Bool[Tensor, " all"] | None
     ) -> tuple[NearSprings, Bool[Tensor, " springs"], Bool[Tensor, "bodies vertices"]]:
-        """Springs that know their side, a mask of those with bodies, and the vertices on each body's faces.
+        """Springs with a certain direction, a mask of springs with bodies, and the vertices on each body's faces.
 
         Where cloth goes through a body (`exempt`) or lies on it, the shortest vector between edges, or from the body's
         vertices, may point either way; from a vertex outside to a face it points out. Springs of vertices on a face
@@ -238,11 +238,11 @@ class ClothSprings:
         pairs, count = near.near, self._mesh.level.vertex_count
         corners = pairs.corners.long()
         with_body, of_vertex = corners.amax(dim=1) >= count, pairs.face & (corners[:, 0] < count)
-        touching = with_body & (pairs.way.norm(dim=1) < ON_SURFACE)
+        touching = with_body & (pairs.separation.norm(dim=1) < ON_SURFACE)
         out = torch.zeros((len(self._keep) - self._cloths, count), dtype=torch.bool, device=corners.device)
         on = corners[touching & of_vertex]
         out[self.owner[on[:, 3]].long() - self._cloths, on[:, 0]] = True
         either = torch.nn.functional.pad(out.any(dim=0), (0, len(self.owner) - count))
         either = either if exempt is None else either | exempt
-        kept = ~with_body | (~touching & (of_vertex | ~either[corners].any(dim=1)))
-        return near.where(kept), with_body[kept], out
+        sided = ~with_body | (~touching & (of_vertex | ~either[corners].any(dim=1)))
+        return near.where(sided), with_body[sided], out

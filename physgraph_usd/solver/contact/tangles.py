@@ -60,23 +60,23 @@ class Tangles:
         """Tangles: connected components of the crossings and the cloth within `RINGS` rings.
 
         Args:
-            given_up: Mask of the vertices that are given up; these and all tangles they reach are one tangle.
+            given_up: Mask of the vertices that are given up; all tangles with such vertices are one tangle.
         """
         corners = mesh.corners_of(crossings)
         region = torch.zeros_like(given_up)
         region[corners.reshape(-1)] = True
         region, edges = mesh.grown(region, RINGS) | given_up, mesh.level.edges.long()
         inside = edges[region[edges].all(dim=1)]
-        across = torch.cat([corners[:, [0, place]] for place in range(1, 5)])
-        lost = torch.nonzero(given_up).squeeze(1)
-        together = torch.stack([lost[:1].expand(len(lost)), lost], dim=1)
-        piece = joined_by(torch.cat([inside, across, together]).cpu().numpy(), len(region))
-        which = region.cpu().numpy()
-        label = np.full(len(which), -1, np.int32)
-        numbers, label[which] = np.unique(piece[which], return_inverse=True)
+        across = torch.cat([corners[:, [0, corner]] for corner in range(1, 5)])
+        abandoned = torch.nonzero(given_up).squeeze(1)
+        links = torch.stack([abandoned[:1].expand(len(abandoned)), abandoned], dim=1)
+        piece = joined_by(torch.cat([inside, across, links]).cpu().numpy(), len(region))
+        in_region = region.cpu().numpy()
+        label = np.full(len(in_region), -1, np.int32)
+        numbers, label[in_region] = np.unique(piece[in_region], return_inverse=True)
         labels = torch.as_tensor(label, device=region.device)
         before = torch.bincount(labels[corners[:, 0]].long(), minlength=len(numbers))
-        hopeless = torch.bincount(labels[lost].long(), minlength=len(numbers)) > 0
+        hopeless = torch.bincount(labels[abandoned].long(), minlength=len(numbers)) > 0
         return Tangles(labels, before, hopeless, mesh)
 
     def worse(self, crossings: Crossings) -> Bool[Tensor, " all"]:
@@ -94,8 +94,8 @@ class Tangles:
         """Crossings outside hopeless tangles."""
         return crossings.where(~self.given_up[self._mesh.corners_of(crossings)].any(dim=1))
 
-    def _of(self, some: Bool[Tensor, " tangles"]) -> Bool[Tensor, " all"]:
-        return some[self.label.clamp_min(0).long()] & (self.label >= 0)
+    def _of(self, tangles: Bool[Tensor, " tangles"]) -> Bool[Tensor, " all"]:
+        return tangles[self.label.clamp_min(0).long()] & (self.label >= 0)
 
 
 def ways_out(
@@ -120,18 +120,19 @@ def ways_out(
     point = a + at.unsqueeze(1) * (b - a)
     cosine = (normal * along).sum(dim=1)
     cosine = torch.where(cosine < 0, cosine.clamp_max(-GRAZING), cosine.clamp_min(GRAZING))
-    way = torch.zeros_like(a)
+    direction = torch.zeros_like(a)
     for third in mesh.opposite[crossings.edge].T:
-        there = third >= 0
+        exists = third >= 0
         side = torch.linalg.cross(b - a, x[third.clamp_min(0)] - a)
         contour = torch.nn.functional.normalize(torch.linalg.cross(normal, side), dim=1, eps=1e-30)
         inwards = x[third.clamp_min(0)] - a
         inwards = inwards - (inwards * along).sum(dim=1, keepdim=True) * along
         contour = torch.where((contour * inwards).sum(dim=1, keepdim=True) < 0, -contour, contour)
         share = (contour * along).sum(dim=1) / cosine
-        way = way + torch.where(there.unsqueeze(1), contour - share.unsqueeze(1) * normal, torch.zeros_like(way))
-    place = torch.cat([at.unsqueeze(1), _barycentric(point, p, q, r)], dim=1)
-    return way / way.norm(dim=1, keepdim=True).clamp_min(1.0), place
+        shortening = contour - share.unsqueeze(1) * normal
+        direction = direction + torch.where(exists.unsqueeze(1), shortening, torch.zeros_like(shortening))
+    coordinates = torch.cat([at.unsqueeze(1), _barycentric(point, p, q, r)], dim=1)
+    return direction / direction.norm(dim=1, keepdim=True).clamp_min(1.0), coordinates
 
 
 def gaps_out(
@@ -144,37 +145,37 @@ def gaps_out(
         step: Relative move of the edge and the face [m].
         stiffness: k_c [N/m^3].
     """
-    way, place = ways_out(mesh, crossings, x)
+    direction, coordinates = ways_out(mesh, crossings, x)
     ends, face = mesh.edges[crossings.edge], mesh.triangles[crossings.face]
     corners = torch.cat([torch.cat([ends[:, i : i + 1], face], dim=1) for i in range(2)])
-    share = torch.cat([1.0 - place[:, 0], place[:, 0]])
-    weight = torch.cat([torch.ones_like(place[:, :1]), -place[:, 1:]], dim=1).repeat(2, 1)
-    length = way.norm(dim=1).repeat(2)
-    normal = torch.nn.functional.normalize(way, dim=1, eps=1e-30).repeat(2, 1)
-    here = (normal * (weight.unsqueeze(2) * x[corners]).sum(dim=1)).sum(dim=1)
+    share = torch.cat([1.0 - coordinates[:, 0], coordinates[:, 0]])
+    weight = torch.cat([torch.ones_like(coordinates[:, :1]), -coordinates[:, 1:]], dim=1).repeat(2, 1)
+    length = direction.norm(dim=1).repeat(2)
+    normal = torch.nn.functional.normalize(direction, dim=1, eps=1e-30).repeat(2, 1)
+    position = (normal * (weight.unsqueeze(2) * x[corners]).sum(dim=1)).sum(dim=1)
     strength = stiffness * share * mesh.level.vertex_area[corners[:, 0]]
     return PairConstraints(
-        corners.to(torch.int32).contiguous(), weight.contiguous(), normal, here + step * length, strength
+        corners.to(torch.int32).contiguous(), weight.contiguous(), normal, position + step * length, strength
     )
 
 
 def chords_of(
     mesh: ClothMesh, pierced: Pierced, x: Float[Tensor, "all 3"], inside: Bool[Tensor, "bodies vertices"]
 ) -> Chords:
-    """The middle of the crossings of each edge and face of the cloth whose corners and neighbours are outside a body.
+    """Mean crossing of each edge and face of the cloth whose corners and neighbours are outside a body.
 
     Args:
         pierced: Crossings of cloth and bodies at x.
         x: Positions of cloth and bodies [m].
         inside: The vertices inside each body.
     """
-    _, place = ways_out(mesh, pierced.crossings, x)
+    _, coordinates = ways_out(mesh, pierced.crossings, x)
     edge, face = mesh.edges[pierced.crossings.edge], mesh.triangles[pierced.crossings.face]
-    own = pierced.own.unsqueeze(1)
-    corners = torch.where(own, edge[:, [0, 1, 0, 0]], face[:, [0, 1, 2, 0]])
-    along = torch.nn.functional.pad(torch.stack([1.0 - place[:, 0], place[:, 0]], dim=1), (0, 2))
-    weight = torch.where(own, along, torch.nn.functional.pad(place[:, 1:], (0, 1)))
-    number = torch.where(pierced.own, pierced.crossings.edge, pierced.crossings.face + len(mesh.edges))
+    by_edge = pierced.cloth_edge.unsqueeze(1)
+    corners = torch.where(by_edge, edge[:, [0, 1, 0, 0]], face[:, [0, 1, 2, 0]])
+    along = torch.nn.functional.pad(torch.stack([1.0 - coordinates[:, 0], coordinates[:, 0]], dim=1), (0, 2))
+    weight = torch.where(by_edge, along, torch.nn.functional.pad(coordinates[:, 1:], (0, 1)))
+    number = torch.where(pierced.cloth_edge, pierced.crossings.edge, pierced.crossings.face + len(mesh.edges))
     key = number * len(inside) + pierced.body
     keys, row = torch.unique(key, return_inverse=True)
     mean = torch.zeros((len(keys), 4), dtype=weight.dtype, device=x.device)
@@ -182,7 +183,7 @@ def chords_of(
     mean = mean / mean.sum(dim=1, keepdim=True)
     first = torch.full_like(keys, len(key)).scatter_reduce(0, row, torch.arange(len(key), device=x.device), "amin")
     body, corners = pierced.body[first], corners[first]
-    around = torch.stack([mesh.grown(own, 1) for own in inside])  # Beside vertices inside, these draw the cloth along.
+    around = torch.stack([mesh.grown(in_body, 1) for in_body in inside])  # Vertices inside draw their neighbours along.
     outside = ~around[body.unsqueeze(1), corners].any(dim=1)
     return Chords(body[outside], corners[outside], mean[outside].to(mesh.level.rest))
 
@@ -190,8 +191,8 @@ def chords_of(
 def _barycentric(point: Tensor, p: Tensor, q: Tensor, r: Tensor) -> Float[Tensor, "points 3"]:
     """Barycentric coordinates of points in triangles, clamped to the triangles."""
     normal = torch.linalg.cross(q - p, r - p)
-    whole = normal.square().sum(dim=1).clamp_min(1e-30)
-    first = (torch.linalg.cross(r - q, point - q) * normal).sum(dim=1) / whole
-    second = (torch.linalg.cross(p - r, point - r) * normal).sum(dim=1) / whole
+    square = normal.square().sum(dim=1).clamp_min(1e-30)
+    first = (torch.linalg.cross(r - q, point - q) * normal).sum(dim=1) / square
+    second = (torch.linalg.cross(p - r, point - r) * normal).sum(dim=1) / square
     weight = torch.stack([first, second, 1.0 - first - second], dim=1).clamp_min(0.0)
     return weight / weight.sum(dim=1, keepdim=True).clamp_min(1e-30)

@@ -40,9 +40,9 @@ class OnEdge:
     part: Float[np.ndarray, " near"]
     distance: Float[np.ndarray, " near"]
 
-    def where(self, kept: np.ndarray) -> OnEdge:
+    def where(self, selected: np.ndarray) -> OnEdge:
         """The selected rows."""
-        return OnEdge(self.vertex[kept], self.edge[kept], self.part[kept], self.distance[kept])
+        return OnEdge(self.vertex[selected], self.edge[selected], self.part[selected], self.distance[selected])
 
     def at(self, points: Float[np.ndarray, "vertices 3"]) -> OnEdge:
         """Nearest points and distances of the vertices in a new pose."""
@@ -78,10 +78,10 @@ def nearest_edges(
     start, end = points[edges[owner, 0]], points[edges[owner, 1]]
     reach = within.max() + 0.5 * float((length / count).max())
     tree = cKDTree(start + part[:, None] * (end - start))
-    found = tree.query(points[vertices], k=min(BORDER_SAMPLES, len(owner)), distance_upper_bound=reach)[1]
-    found = found.reshape(len(vertices), -1)
-    row, column = np.nonzero(found < len(owner))
-    vertex, edge = vertices[row], edges[owner[found[row, column]]]
+    samples = tree.query(points[vertices], k=min(BORDER_SAMPLES, len(owner)), distance_upper_bound=reach)[1]
+    samples = samples.reshape(len(vertices), -1)
+    row, column = np.nonzero(samples < len(owner))
+    vertex, edge = vertices[row], edges[owner[samples[row, column]]]
     beside = _neighbours(edges, vertex, edge)
     near = _on_edges(points, vertex[~beside], edge[~beside])
     order = np.lexsort((near.distance, near.vertex))
@@ -103,33 +103,33 @@ def finer_side(points: Float[np.ndarray, "vertices 3"], borders: np.ndarray, nea
         near: Vertices of the borders and the edges below.
     """
     length = np.linalg.norm(points[borders[:, 0]] - points[borders[:, 1]], axis=1)
-    own = np.full(len(points), np.inf)
-    np.minimum.at(own, borders, length[:, None])
-    other = np.linalg.norm(points[near.edge[:, 0]] - points[near.edge[:, 1]], axis=1)
-    follows, followed, kept = set[int](), set[int](), np.zeros(len(near.vertex), bool)
-    for row in np.argsort(-other / own[near.vertex], kind="stable").tolist():
+    shortest = np.full(len(points), np.inf)
+    np.minimum.at(shortest, borders, length[:, None])
+    length_below = np.linalg.norm(points[near.edge[:, 0]] - points[near.edge[:, 1]], axis=1)
+    follows, followed, selected = set[int](), set[int](), np.zeros(len(near.vertex), bool)
+    for row in np.argsort(-length_below / shortest[near.vertex], kind="stable").tolist():
         vertex, ends = int(near.vertex[row]), near.edge[row].tolist()
         if vertex not in followed and follows.isdisjoint(ends):
             follows.add(vertex)
             followed.update(ends)
-            kept[row] = True
-    return near.where(kept)
+            selected[row] = True
+    return near.where(selected)
 
 
 def _neighbours(edges: np.ndarray, vertex: np.ndarray, edge: np.ndarray) -> np.ndarray:
     """Whether an edge ends in a vertex or in a neighbour of the vertex along open edges, shape (N,)."""
     size = int(max(edges.max(), vertex.max(initial=0))) + 1
-    known = np.sort(np.concatenate([edges[:, 0] * size + edges[:, 1], edges[:, 1] * size + edges[:, 0]]))
+    keys = np.sort(np.concatenate([edges[:, 0] * size + edges[:, 1], edges[:, 1] * size + edges[:, 0]]))
     beside = (edge == vertex[:, None]).any(axis=1)
     for end in edge.T:
         wanted = vertex * size + end
-        beside |= known[np.minimum(np.searchsorted(known, wanted), len(known) - 1)] == wanted
+        beside |= keys[np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)] == wanted
     return beside
 
 
 def _on_edges(points: np.ndarray, vertex: np.ndarray, edge: np.ndarray) -> OnEdge:
-    start, way = points[edge[:, 0]], points[edge[:, 1]] - points[edge[:, 0]]
-    squared = np.maximum((way**2).sum(axis=1), np.finfo(float).tiny)
-    part = np.clip(((points[vertex] - start) * way).sum(axis=1) / squared, 0.0, 1.0)
-    distance = np.linalg.norm(points[vertex] - start - part[:, None] * way, axis=1)
+    start, span = points[edge[:, 0]], points[edge[:, 1]] - points[edge[:, 0]]
+    squared = np.maximum((span**2).sum(axis=1), np.finfo(float).tiny)
+    part = np.clip(((points[vertex] - start) * span).sum(axis=1) / squared, 0.0, 1.0)
+    distance = np.linalg.norm(points[vertex] - start - part[:, None] * span, axis=1)
     return OnEdge(vertex, edge, part, distance)

@@ -43,20 +43,20 @@ def defects(mesh: PolygonMesh, points: np.ndarray | None = None) -> list[Defect]
     """
     broken = (mesh.indices < 0) | (mesh.indices >= mesh.vertex_count)
     bad_faces = np.unique(mesh.corner_face[broken])
-    found = [
+    faults = [
         Defect("index-out-of-range", int(face), f"face {face} uses a vertex that does not exist") for face in bad_faces
     ]
     valid = np.setdiff1d(np.arange(mesh.face_count), bad_faces)
     corners = ~np.isin(mesh.corner_face, bad_faces)
     sound = PolygonMesh(mesh.counts[valid], mesh.indices[corners], mesh.vertex_count) if len(bad_faces) else mesh
-    found += _face_defects(sound, points, valid)
-    return found + _edge_defects(sound) + _vertex_defects(sound)
+    faults += _face_defects(sound, points, valid)
+    return faults + _edge_defects(sound) + _vertex_defects(sound)
 
 
-def in_brief(found: Sequence[Defect]) -> list[str]:
+def in_brief(faults: Sequence[Defect]) -> list[str]:
     """A line for each kind of defects: the first in words, and the number of further defects."""
-    kinds = Counter(defect.kind for defect in found)
-    first = {defect.kind: defect.message for defect in reversed(found)}
+    kinds = Counter(defect.kind for defect in faults)
+    first = {defect.kind: defect.message for defect in reversed(faults)}
     return [first[kind] + (f", and {count - 1:,} more" if count > 1 else "") for kind, count in kinds.items()]
 
 
@@ -74,21 +74,21 @@ def _face_defects(mesh: PolygonMesh, points: np.ndarray | None, names: np.ndarra
         degenerate[faces] |= (corners[:, 1:] == corners[:, :-1]).any(axis=1)
         first = np.unique(corners, axis=0, return_index=True)[1]
         duplicate[np.setdiff1d(faces, faces[first])] = True
-    found = _named("degenerate-face", names[degenerate], "face {} repeats a vertex or has fewer than three corners")
+    faults = _named("degenerate-face", names[degenerate], "face {} repeats a vertex or has fewer than three corners")
     if points is not None:
         flat = _areas_vanish(mesh, np.asarray(points, np.float64)) & ~degenerate
-        found += _named("zero-area-face", names[flat], "face {} has no area")
-    return found + _named("duplicate-face", names[duplicate], "face {} has the vertices of an earlier face")
+        faults += _named("zero-area-face", names[flat], "face {} has no area")
+    return faults + _named("duplicate-face", names[duplicate], "face {} has the vertices of an earlier face")
 
 
 def _areas_vanish(mesh: PolygonMesh, points: np.ndarray) -> np.ndarray:
     """Whether each face's area is negligible compared with its longest edge squared, shape (F,)."""
-    here, there = points[mesh.indices], points[mesh.indices[mesh.next_corner]]
-    origin = here[mesh.starts[mesh.corner_face]]
-    twice = np.cross(here - origin, there - origin)
+    start, end = points[mesh.indices], points[mesh.indices[mesh.next_corner]]
+    origin = start[mesh.starts[mesh.corner_face]]
+    twice = np.cross(start - origin, end - origin)
     area = np.stack([np.bincount(mesh.corner_face, column, mesh.face_count) for column in twice.T], axis=1)
     longest = np.zeros(mesh.face_count)
-    np.maximum.at(longest, mesh.corner_face, ((there - here) ** 2).sum(axis=1))
+    np.maximum.at(longest, mesh.corner_face, ((end - start) ** 2).sum(axis=1))
     return ~(0.5 * np.linalg.norm(area, axis=1) > NO_AREA * longest)
 
 
@@ -101,11 +101,11 @@ def _edge_defects(mesh: PolygonMesh) -> list[Defect]:
     faces = np.bincount(visits[0], minlength=len(half.edges))
     crowded = np.flatnonzero(proper & (faces > 2))
     twisted = np.flatnonzero(proper & (half.count == 2) & (faces == 2) & (forward != 1))
-    found = [
+    faults = [
         Defect("non-manifold-edge", int(row), f"edge {_pair(half.edges[row])} has {faces[row]} faces")
         for row in crowded
     ]
-    return found + [
+    return faults + [
         Defect("inconsistent-winding", int(row), f"both faces run through edge {_pair(half.edges[row])} the same way")
         for row in twisted
     ]
@@ -117,5 +117,5 @@ def _pair(edge: np.ndarray) -> str:
 
 def _vertex_defects(mesh: PolygonMesh) -> list[Defect]:
     bow_ties, isolated = np.flatnonzero(mesh.fan_counts > 1), np.flatnonzero(mesh.fan_counts == 0)
-    found = _named("bow-tie-vertex", bow_ties, "vertex {} joins several fans of faces in a point")
-    return found + _named("isolated-point", isolated, "no face uses vertex {}")
+    faults = _named("bow-tie-vertex", bow_ties, "vertex {} joins several fans of faces in a point")
+    return faults + _named("isolated-point", isolated, "no face uses vertex {}")

@@ -57,15 +57,15 @@ def elastic_elements(mesh: PolygonMesh, split: TriangleSplit, rest: np.ndarray) 
     """
     quads = _convex_quads(mesh, split, rest)
     a, b, c, d = mesh.indices[mesh.starts[quads, None] + np.arange(4)].T
-    alone = ~np.isin(split.face, quads)
+    not_quad = ~np.isin(split.face, quads)
     halves = np.stack([a, b, c, c, d, a, b, c, d, d, a, b], axis=1).reshape(-1, 3)
-    membrane = np.concatenate([split.triangles[alone], halves]).astype(np.int32)
-    face = np.concatenate([split.face[alone], np.repeat(quads, 4)])
-    share = np.where(np.arange(len(membrane)) < alone.sum(), 1.0, 0.5)
+    membrane = np.concatenate([split.triangles[not_quad], halves]).astype(np.int32)
+    face = np.concatenate([split.face[not_quad], np.repeat(quads, 4)])
+    share = np.where(np.arange(len(membrane)) < not_quad.sum(), 1.0, 0.5)
     first = np.searchsorted(split.face, quads)
-    (i, other, j), k = split.triangles[first].T, split.triangles[first + 1, 2]
-    twist = np.stack([i, j, k, k, other, other], axis=1)
-    sides = hinges_of(split.triangles[alone], np.stack([a, b, c, d], axis=1))
+    (i, ell, j), k = split.triangles[first].T, split.triangles[first + 1, 2]
+    twist = np.stack([i, j, k, k, ell, ell], axis=1)
+    sides = hinges_of(split.triangles[not_quad], np.stack([a, b, c, d], axis=1))
     springs = edges_of(membrane, mesh.vertex_count)
     return ElasticElements(
         springs=springs.vertices,
@@ -84,8 +84,8 @@ def _convex_quads(mesh: PolygonMesh, split: TriangleSplit, rest: np.ndarray) -> 
     faces = np.flatnonzero((count == 2) & (mesh.counts == 4))
     corners = at_corners(rest, mesh.indices[mesh.starts[faces, None] + np.arange(4)])
     sides = np.roll(corners, -1, axis=0) - corners
-    normals = [cross(each, after) for each, after in zip(sides, np.roll(sides, -1, axis=0), strict=True)]
-    return faces[np.all([dot(one, two) > 0 for n, one in enumerate(normals) for two in normals[n:]], axis=0)]
+    normals = [cross(side, after) for side, after in zip(sides, np.roll(sides, -1, axis=0), strict=True)]
+    return faces[np.all([dot(a, b) > 0 for n, a in enumerate(normals) for b in normals[n:]], axis=0)]
 
 
 def hinges_of(triangles: np.ndarray, quads: np.ndarray | None = None) -> np.ndarray:
@@ -107,15 +107,15 @@ def hinges_of(triangles: np.ndarray, quads: np.ndarray | None = None) -> np.ndar
     a, b, c = triangles.T
     faces = [triangles[(a != b) & (b != c) & (c != a)], np.empty((0, 4), np.int64) if quads is None else quads]
     table = np.concatenate(
-        [np.roll(each, -side, axis=1)[:, [0, 1, 2, -1]] for each in faces for side in range(each.shape[1])]
+        [np.roll(corners, -side, axis=1)[:, [0, 1, 2, -1]] for corners in faces for side in range(corners.shape[1])]
     )
     if not len(table):
         return np.empty((0, 6), np.int32)
     edge = paired(table[:, 0], table[:, 1], int(table.max()) + 1)[1]
     order, count = sorted_rows(edge, count=len(edge)), np.bincount(edge)
     first = (np.cumsum(count) - count)[count == 2]
-    one, two = table[order[first]], table[order[first + 1]]
-    hinges = np.concatenate([one, two[:, 2:]], axis=1).astype(np.int32)
+    first_face, second_face = table[order[first]], table[order[first + 1]]
+    hinges = np.concatenate([first_face, second_face[:, 2:]], axis=1).astype(np.int32)
     k, other_k, ell, other_l = hinges[:, 2:].T
     return hinges[((k != ell) | (other_k != other_l)) & ((k != other_l) | (other_k != ell))]
 
@@ -134,11 +134,11 @@ def flat_rows(x: np.ndarray, hinges: np.ndarray) -> np.ndarray:
     """dtheta/dz of each hinge, unfolded flat [1/m], shape (6, H) as its corners; zero at triangles without area."""
     i, j, k, other_k, ell, other_l = at_corners(x, hinges)
     axis, sides = j - i, (0.5 * (k + other_k) - i, 0.5 * (ell + other_l) - i)
-    square, size = dot(axis, axis), sum(dot(each, each) for each in (axis, *sides))
+    square, size = dot(axis, axis), sum(dot(vector, vector) for vector in (axis, *sides))
     square = np.maximum(square, 1e-12 * size + 1e-300)
     double = np.stack([norm(cross(axis, side)) for side in sides])
-    whole = (double > 1e-12 * size).all(axis=0)
-    at_k, at_l = np.where(whole, np.sqrt(square) / np.where(whole, double, 1.0), 0.0)
+    has_area = (double > 1e-12 * size).all(axis=0)
+    at_k, at_l = np.where(has_area, np.sqrt(square) / np.where(has_area, double, 1.0), 0.0)
     foot_k, foot_l = (dot(side, axis) / square for side in sides)
     at_i, at_j = -(at_k * (1.0 - foot_k) + at_l * (1.0 - foot_l)), -(at_k * foot_k + at_l * foot_l)
     return np.stack([at_i, at_j, 0.5 * at_k, 0.5 * at_k, 0.5 * at_l, 0.5 * at_l])

@@ -233,13 +233,13 @@ auto store = [&](Number energy, const Vec (&force)[K]) {
 
 
 def one_by_one(formula: str, dtype: torch.dtype) -> str:
-    """Source of a native function with the names ``Scalar``, `Four` and ``three`` alone."""
+    """Source of a native function that uses only the names ``Scalar``, ``Four`` and ``three``."""
     scalar = "float" if dtype == torch.float32 else "double"
     return f"typedef {scalar} Scalar;\n{_FOUR}\n{formula}"
 
 
 def at_once(formula: str, count: str, dtype: torch.dtype) -> str:
-    """Source of a native function for the elements of a block, of a number of elements named in C++."""
+    """Source of a native function for the elements of a block; ``count`` is the number of elements, in C++."""
     names = f"#ifdef __CUDACC__\n{_ON_CUDA}\n#else\n{_ON_CPU}\n#endif\n"
     return one_by_one(f"const int count = {count};\n{names}\n{formula}", dtype)
 
@@ -257,7 +257,7 @@ def native(function: Any, name: str, source: str, *kinds: Any) -> Any:
 
 
 def kernel(function: Any, name: str, *kinds: Any) -> wp.Kernel:
-    """A kernel of (first item, arrays of given kinds) that compiles alone; the name tells it from all others."""
+    """A kernel of (first item, arrays of given kinds) that compiles separately; its name must be unique."""
     _annotate(function, *kinds)
     return cast(wp.Kernel, wp.kernel(function, name=name, **ALONE))
 
@@ -265,8 +265,8 @@ def kernel(function: Any, name: str, *kinds: Any) -> wp.Kernel:
 def _annotate(function: Any, *kinds: Any) -> None:
     """Set the Warp types of a function's parameters: an integer, then arrays, or scalars where a kind is one."""
     code = function.__code__
-    given = (wp.int32, *kinds)
-    function.__annotations__ = dict(zip(code.co_varnames[: code.co_argcount], given, strict=True))
+    types = (wp.int32, *kinds)
+    function.__annotations__ = dict(zip(code.co_varnames[: code.co_argcount], types, strict=True))
 
 
 def element_kernels(
@@ -291,10 +291,10 @@ def element_kernels(
         ): ...
 
         def parts(
-            first, blocks, whole, elements, vertices, x, corners, parameter0, parameter1, energies, totals, forces
+            first, blocks, all_blocks, elements, vertices, x, corners, parameter0, parameter1, energies, totals, forces
         ):
             part = first + wp.tid()
-            for block in range(part * blocks, wp.min((part + 1) * blocks, whole)):
+            for block in range(part * blocks, wp.min((part + 1) * blocks, all_blocks)):
                 compute(
                     block,
                     part,
@@ -313,8 +313,8 @@ def element_kernels(
         vector, number, ends = VECTOR[dtype], parameter[dtype], wp.types.vector(corners, wp.int32)
         arrays = [wp.array(dtype=kind) for kind in (vector, ends, number, number, SCALAR[dtype], wp.float64, vector)]
         full = f"{name}_{SCALAR[dtype].__name__}"
-        source, whole = at_once(_OF_ELEMENTS + formula, "elements", dtype), [wp.int32] * 4
-        compute = native(of_block, full, source, *whole, *arrays)
-        return kernel(parts, full, *whole, *arrays)
+        kinds, source = [*[wp.int32] * 4, *arrays], at_once(_OF_ELEMENTS + formula, "elements", dtype)
+        compute = native(of_block, full, source, *kinds)
+        return kernel(parts, full, *kinds)
 
     return {dtype: kernel_of(dtype) for dtype in SCALAR}

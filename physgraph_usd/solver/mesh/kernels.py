@@ -21,9 +21,9 @@ _FLAGS = (wp.config.cpu_compiler_flags or "-march=native").replace("-march=nativ
 KERNELS = {"enable_backward": False, "cpu_compiler_flags": _FLAGS}
 """Options of Warp modules: no derivatives; on the CPU Warp's default flags, for the target instructions."""
 FUSED = {**KERNELS, "cpu_compiler_flags": f"{_FLAGS} -ffp-contract=fast"}
-"""These options with fused multiply-adds on the CPU. Warp's own option for it, on by default, makes none there."""
+"""`KERNELS` with fused multiply-adds on the CPU, where Warp's own option, on by default, makes none."""
 ALONE: dict[str, Any] = {"module": "unique", "module_options": FUSED}
-"""Arguments of `wp.kernel` for a kernel that compiles alone."""
+"""Arguments of `wp.kernel` for a kernel that compiles separately."""
 
 
 @functools.cache
@@ -43,8 +43,8 @@ def start_warp() -> None:
         raise _no_cache(f"{wp.config.kernel_cache_dir} may not be written")
 
 
-def _no_cache(why: str) -> PhysGraphError:
-    return PhysGraphError(f"cannot keep compiled kernels, {why}; WARP_CACHE_PATH names another folder for them")
+def _no_cache(reason: str) -> PhysGraphError:
+    return PhysGraphError(f"cannot keep compiled kernels, {reason}; WARP_CACHE_PATH names another folder for them")
 
 
 def _compiled() -> list[Path]:
@@ -59,28 +59,28 @@ def compile_kernels(device: str) -> None:
     wp.force_load(device, max_workers=os.cpu_count())
 
 
-def device_of(asked: str) -> str:
+def device_of(device: str) -> str:
     """The device's name in torch and Warp.
 
     Args:
-        asked: "cpu", "cuda", a certain card as "cuda:1", or "auto" for a card where there is one.
+        device: "cpu", "cuda", a certain card as "cuda:1", or "auto" for a card if there is one.
 
     Raises:
         UsageError: CUDA was requested but is missing.
     """
-    if asked == "auto":
+    if device == "auto":
         return "cuda" if torch.cuda.is_available() else "cpu"
-    if asked.startswith("cuda") and not torch.cuda.is_available():
+    if device.startswith("cuda") and not torch.cuda.is_available():
         raise UsageError("device 'cuda' was asked for and no CUDA device is there; use --device auto or cpu")
-    return asked
+    return device
 
 
-def cards_for(asked: str) -> list[str]:
-    """Names, for CUDA_VISIBLE_DEVICES, of the cards that processes may share out; none for a certain card or the CPU.
+def cards_for(device: str) -> list[str]:
+    """Names, for CUDA_VISIBLE_DEVICES, of the cards to share among processes; none for a certain card or the CPU.
 
     Arguments are as for `device_of`.
     """
-    if asked not in ("cuda", "auto"):
+    if device not in ("cuda", "auto"):
         return []
     visible = os.environ.get("CUDA_VISIBLE_DEVICES")
     return visible.split(",") if visible else [str(card) for card in range(torch.cuda.device_count())]

@@ -51,20 +51,22 @@ def _folds(
     h = first + wp.tid()
     i, c = x[hinges[h][0]], hinges[h]
     axis = x[c[1]] - i
-    one, two = wp.cross(axis, x[c[2]] - i + x[c[3]] - i), wp.cross(x[c[4]] - i + x[c[5]] - i, axis)
-    cosine[h] = wp.dot(one, two) / (wp.length(one) * wp.length(two))
+    n1, n2 = wp.cross(axis, x[c[2]] - i + x[c[3]] - i), wp.cross(x[c[4]] - i + x[c[5]] - i, axis)
+    cosine[h] = wp.dot(n1, n2) / (wp.length(n1) * wp.length(n2))
 
 
 def _for_both(kernel: Any, corners: Any, kinds: Mapping[torch.dtype, Any]) -> dict[torch.dtype, wp.Kernel]:
     """A generic kernel for float32 and float64."""
     kind = {dtype: [corners, VECTOR[dtype], kinds[dtype]] for dtype in VECTOR}
-    return {dtype: wp.overload(kernel, [wp.int32, *(wp.array(dtype=each) for each in kind[dtype])]) for dtype in kind}
+    return {
+        dtype: wp.overload(kernel, [wp.int32, *(wp.array(dtype=element) for element in kind[dtype])]) for dtype in kind
+    }
 
 
 LENGTHS, NORMALS = _for_both(_lengths, wp.vec2i, SCALAR), _for_both(_normals, wp.vec3i, VECTOR)
 FOLDS = _for_both(_folds, wp.types.vector(length=6, dtype=wp.int32), SCALAR)
 """Kernels for `ElementValues`: edge lengths [m], normals of twice the triangle's area [m^2], and cosines of the angle
-between a hinge's faces; not a number where one has no area."""
+between a hinge's faces; not a number if a face has no area."""
 
 
 class ElementValues:

@@ -24,42 +24,43 @@ _logger = logging.getLogger(__name__)
 class Recordings:
     """Functions of tensors, recorded for each key and combination of shapes.
 
-    The functions read nothing back from the card, and all that changes from call to call is an input. Without a card,
-    with an input that is no tensor there, or where recording fails, a function is called as it is.
+    The functions read nothing back from the card, and everything that changes from call to call is an input. Without a
+    card, with an input that is no tensor on it, or if recording fails, a function is called without a recording.
     """
 
     def __init__(self) -> None:
         """Begin without recordings."""
-        self._known: dict[Any, int | _Recording] = {}
+        self._records: dict[Any, int | _Recording] = {}
         self._inputs: dict[Any, _Input] = {}
 
-    def run(self, key: Any, function: Callable[..., Sequence[Tensor]], *given: Any) -> Sequence[Tensor]:
-        """The function's tensors, the caller's own.
+    def run(self, key: Any, function: Callable[..., Sequence[Tensor]], *tensors: Any) -> Sequence[Tensor]:
+        """The function's tensors; the caller may change them.
 
         Args:
-            key: What functions of equal work have in common.
-            function: Computes tensors from those given.
+            key: Equal for functions that do the same work on the same constants.
+            function: Computes tensors from the inputs.
+            tensors: Inputs of the function.
         """
-        if not all(isinstance(each, Tensor) and each.is_cuda for each in given):
-            return function(*given)
-        key = (key, *((each.shape, each.dtype) for each in given))
-        known = self._known.get(key, 0)
-        if isinstance(known, _Recording):
-            return known(given)
-        self._known[key] = known + 1 if known < CALLS else self._recording(function, given)
-        return function(*given)
+        if not all(isinstance(tensor, Tensor) and tensor.is_cuda for tensor in tensors):
+            return function(*tensors)
+        key = (key, *((tensor.shape, tensor.dtype) for tensor in tensors))
+        record = self._records.get(key, 0)
+        if isinstance(record, _Recording):
+            return record(tensors)
+        self._records[key] = record + 1 if record < CALLS else self._recording(function, tensors)
+        return function(*tensors)
 
     def clear(self) -> None:
         """Forget all recordings."""
         self.__init__()
 
-    def _recording(self, function: Callable[..., Sequence[Tensor]], given: Sequence[Tensor]) -> _Recording | int:
-        places = [(number, each.shape, each.dtype) for number, each in enumerate(given)]
+    def _recording(self, function: Callable[..., Sequence[Tensor]], tensors: Sequence[Tensor]) -> _Recording | int:
+        slots = [(number, tensor.shape, tensor.dtype) for number, tensor in enumerate(tensors)]
         try:
             self._inputs |= {
-                place: _Input(each) for place, each in zip(places, given, strict=True) if place not in self._inputs
+                slot: _Input(tensor) for slot, tensor in zip(slots, tensors, strict=True) if slot not in self._inputs
             }
-            return _Recording(function, [self._inputs[place] for place in places])
+            return _Recording(function, [self._inputs[slot] for slot in slots])
         except RuntimeError as error:
             _logger.info("%s is not recorded: %s", function.__qualname__, error)
             return NEVER
@@ -67,40 +68,40 @@ class Recordings:
 
 @dataclass(frozen=True, eq=False)
 class Work:
-    """A function of a tensor and of others, for cards to record.
+    """A function of tensors, for cards to record.
 
     Attributes:
-        key: What functions of equal work have in common.
-        function: Computes tensors from the tensor and those given.
-        given: The other tensors.
+        key: As for `Recordings.run`.
+        function: Computes tensors from those given to `run`, followed by ``tensors``.
+        tensors: The function's last inputs.
     """
 
     key: Any
     function: Callable[..., Sequence[Tensor]]
-    given: Sequence[Any]
+    tensors: Sequence[Any]
 
     def run(self, recordings: Recordings, *first: Tensor) -> Sequence[Tensor]:
         """The function's tensors."""
-        return recordings.run(self.key, self.function, *first, *self.given)
+        return recordings.run(self.key, self.function, *first, *self.tensors)
 
 
 class _Input:
-    """A tensor read by recordings, shared by those with an input of its shape in the same place.
+    """An input of recordings, shared by all recordings with an argument of its position, shape and type.
 
     Attributes:
-        own: The tensor.
+        buffer: The tensor that the recordings read.
     """
 
-    def __init__(self, given: Tensor) -> None:
+    def __init__(self, values: Tensor) -> None:
         """Take the first values."""
-        self.own = given.clone(memory_format=torch.contiguous_format)
+        self.buffer = values.clone(memory_format=torch.contiguous_format)
         self._last: tuple[Any, int] | None = None
 
-    def differs(self, given: Tensor) -> bool:
-        """True for a tensor or a version other than the last call's."""
-        if self._last is not None and self._last[0]() is given and self._last[1] == given._version:
+    def differs(self, tensor: Tensor) -> bool:
+        """True unless the last call had the same tensor in the same version."""
+        if self._last is not None and self._last[0]() is tensor and self._last[1] == tensor._version:
             return False
-        self._last = weakref.ref(given), given._version
+        self._last = weakref.ref(tensor), tensor._version
         return True
 
 
@@ -109,18 +110,19 @@ class _Recording:
 
     def __init__(self, function: Callable[..., Sequence[Tensor]], inputs: Sequence[_Input]) -> None:
         """Record a function without running it, and keep its closure alive: the graph reads the closure's tensors."""
-        self._function, self._inputs, own = function, inputs, [each.own for each in inputs]
-        card = own[0].device
-        self._graph, self._outputs = _captured(lambda: function(*own), card, pool=_shared(card).pool())
+        self._function, self._inputs, buffers = function, inputs, [recorded.buffer for recorded in inputs]
+        card = buffers[0].device
+        self._graph, self._outputs = _captured(lambda: function(*buffers), card, pool=_shared(card).pool())
 
-    def __call__(self, given: Sequence[Tensor]) -> list[Tensor]:
+    def __call__(self, tensors: Sequence[Tensor]) -> list[Tensor]:
         """Replay with other inputs."""
-        changed = [(mine.own, each) for mine, each in zip(self._inputs, given, strict=True) if mine.differs(each)]
+        pairs = zip(self._inputs, tensors, strict=True)
+        changed = [(recorded.buffer, tensor) for recorded, tensor in pairs if recorded.differs(tensor)]
         if changed:
-            own, new = [mine for mine, _ in changed], [each for _, each in changed]
-            torch._foreach_copy_(own, new)  # pyright: ignore[reportPrivateImportUsage]
+            buffers, values = map(list, zip(*changed, strict=True))
+            torch._foreach_copy_(buffers, values)  # pyright: ignore[reportPrivateImportUsage]
         self._graph.replay()
-        return [each.clone() for each in self._outputs]
+        return [output.clone() for output in self._outputs]
 
 
 def _captured(
@@ -141,14 +143,14 @@ def _captured(
         with torch.cuda.stream(stream):
             graph.capture_begin(pool=pool, capture_error_mode="thread_local")
             try:
-                made = function()
+                outputs = function()
             finally:
                 graph.capture_end()
     finally:
         if collects:
             gc.enable()
     before.wait_stream(stream)
-    return graph, made
+    return graph, outputs
 
 
 @functools.cache

@@ -58,15 +58,15 @@ def vectors(tensor: Tensor) -> Any:
     return argument(tensor, kind)
 
 
-def add_at(total: Tensor, places: Int[Tensor, " items"], values: Tensor) -> Tensor:
+def add_at(total: Tensor, indices: Int[Tensor, " items"], values: Tensor) -> Tensor:
     """Add values in place at first indices, possibly repeated, in the same order on every run; returns ``total``.
 
     The order, and thus the rounding, of `index_add_` changes from run to run on CUDA; that of `index_put_` does on
     several threads of a CPU.
     """
     if total.is_cuda:
-        return total.index_put_((places,), values, accumulate=True)
-    return total.index_add_(0, places, values)
+        return total.index_put_((indices,), values, accumulate=True)
+    return total.index_add_(0, indices, values)
 
 
 class Stencil:

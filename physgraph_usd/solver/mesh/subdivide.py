@@ -160,10 +160,10 @@ def on_triangles(mesh: PolygonMesh, refinement: Refinement, split: TriangleSplit
     face = split.face[triangle]
     quad = mesh.counts[face] == 4
     centre, ends = face_points(mesh)[face[quad]], split.triangles[triangle[quad]][:, [0, 2]]
-    kept = np.ones(refinement.mesh.vertex_count)
-    kept[centre] = 0.0
+    weight = np.ones(refinement.mesh.vertex_count)
+    weight[centre] = 0.0
     half = sparse.csr_matrix((np.full(ends.size, 0.5), (np.repeat(centre, 2), ends.ravel())), refinement.linear.shape)
-    return sparse.csr_matrix(sparse.diags(kept) @ refinement.linear + half)
+    return sparse.csr_matrix(sparse.diags(weight) @ refinement.linear + half)
 
 
 def subdivide_times(mesh: PolygonMesh, levels: int) -> tuple[Refinement, ...]:
@@ -276,46 +276,46 @@ def _fixed_part(mesh: PolygonMesh, rules: _Rules) -> _Part:
     """Fixed vertices, midpoints of boundary and non-manifold edges, and face points."""
     edges = mesh.vertex_count + np.flatnonzero(~rules.smooth_edge)
     faces = face_points(mesh)
-    kept = np.concatenate([np.flatnonzero(~rules.smooth_vertex & ~rules.rim_vertex), edges, faces[faces >= 0]])
-    return kept, kept, np.ones(len(kept))
+    unmoved = np.concatenate([np.flatnonzero(~rules.smooth_vertex & ~rules.rim_vertex), edges, faces[faces >= 0]])
+    return unmoved, unmoved, np.ones(len(unmoved))
 
 
 def _edge_part(mesh: PolygonMesh, rules: _Rules) -> _Part:
     """Each face's half of the rule of a smooth edge."""
     corners = np.flatnonzero(rules.smooth_edge[mesh.half_edges.edge])
     polygon = mesh.is_polygon[mesh.corner_face[corners]]
-    here, there = mesh.indices[corners], mesh.indices[mesh.next_corner[corners]]
+    start, end = mesh.indices[corners], mesh.indices[mesh.next_corner[corners]]
     opposite = mesh.indices[mesh.previous_corner[corners]]
     far = np.where(polygon, face_points(mesh)[mesh.corner_face[corners]], opposite)
     near, across = np.where(polygon, 1 / 8, 3 / 16), np.where(polygon, 1 / 4, 1 / 8)
-    return _stack(mesh.vertex_count + mesh.half_edges.edge[corners], [here, there, far], [near, near, across])
+    return _stack(mesh.vertex_count + mesh.half_edges.edge[corners], [start, end, far], [near, near, across])
 
 
 def _rim_part(mesh: PolygonMesh, rules: _Rules) -> _Part:
     """Cubic B-spline vertices, one half per boundary edge."""
     ends = mesh.half_edges.edges[rules.boundary]
     ends = np.concatenate([ends, ends[:, ::-1]])
-    here, there = ends[rules.rim_vertex[ends[:, 0]]].T
-    return _stack(here, [here, there], [3 / 8, 1 / 8])
+    vertex, neighbour = ends[rules.rim_vertex[ends[:, 0]]].T
+    return _stack(vertex, [vertex, neighbour], [3 / 8, 1 / 8])
 
 
 def _vertex_part(mesh: PolygonMesh, rules: _Rules) -> _Part:
     """Each corner's part of the rule of a smooth vertex."""
     corners = np.flatnonzero(rules.smooth_vertex[mesh.indices])
     polygon = mesh.is_polygon[mesh.corner_face[corners]]
-    here, before = mesh.indices[corners], mesh.previous_corner[corners]
-    turn = np.bincount(here, weights=np.where(polygon, 1 / 4, 1 / 6), minlength=mesh.vertex_count)[here]
+    vertex, before = mesh.indices[corners], mesh.previous_corner[corners]
+    turn = np.bincount(vertex, weights=np.where(polygon, 1 / 4, 1 / 6), minlength=mesh.vertex_count)[vertex]
     valence = np.where(polygon, 4, 6) * turn
     beta = (5 / 8 - (3 / 8 + np.cos(2 * np.pi / valence) / 4) ** 2) / valence
     ring = np.where(polygon, valence**-2.0, beta / 2)
     edge = mesh.half_edges.edge
-    left = np.where(polygon, mesh.vertex_count + edge[corners], mesh.indices[mesh.next_corner[corners]])
-    right = np.where(polygon, mesh.vertex_count + edge[before], mesh.indices[before])
-    centre = np.where(polygon, face_points(mesh)[mesh.corner_face[corners]], here)
+    ahead = np.where(polygon, mesh.vertex_count + edge[corners], mesh.indices[mesh.next_corner[corners]])
+    behind = np.where(polygon, mesh.vertex_count + edge[before], mesh.indices[before])
+    centre = np.where(polygon, face_points(mesh)[mesh.corner_face[corners]], vertex)
     centre_weight = 1 / valence - 2 * ring
     return _stack(
-        here,
-        [left, right, centre, here],
+        vertex,
+        [ahead, behind, centre, vertex],
         [ring, ring, np.where(polygon, ring, centre_weight), np.where(polygon, centre_weight - ring, 0.0)],
     )
 
@@ -333,10 +333,10 @@ def creases_of(
     if closed is None or not closed.any():
         return np.zeros((0, 2), np.int32)
     half, normal = mesh.half_edges, face_normals(mesh, rest)
-    one, two = mesh.twin_corners[closed[mesh.indices[mesh.twin_corners[:, 0]]]].T
-    same = np.where(half.forward[one] != half.forward[two], 1.0, -1.0)  # Neighbours may have opposite winding.
-    cosine = same * (normal[mesh.corner_face[one]] * normal[mesh.corner_face[two]]).sum(axis=1)
-    return half.edges[half.edge[one[cosine < np.cos(np.radians(SHARP))]]]
+    first, second = mesh.twin_corners[closed[mesh.indices[mesh.twin_corners[:, 0]]]].T
+    same = np.where(half.forward[first] != half.forward[second], 1.0, -1.0)  # Neighbours may have opposite winding.
+    cosine = same * (normal[mesh.corner_face[first]] * normal[mesh.corner_face[second]]).sum(axis=1)
+    return half.edges[half.edge[first[cosine < np.cos(np.radians(SHARP))]]]
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,8 +1,8 @@
 """Kernel launches prepared once: on the CPU in slices on several threads, on CUDA as a whole.
 
 Warp runs a CPU kernel on the calling thread and releases the interpreter lock meanwhile, so slices run in parallel.
-Each item writes only to its own places, so the number of threads changes no bit of the result. How many threads a
-launch gets follows from the time that the kernel took for an item so far.
+Each item writes only its own results, so the number of threads changes no bit of the result. The number of threads of
+a launch depends on the time per item in the kernel's last launches.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class Launch:
         Args:
             kernel: Kernel of (first, *inputs).
             size: Number of items; of elements if a kernel's item is a block of elements.
-            inputs: The kernel's arrays; changing arrays are given again at each call.
+            inputs: The kernel's arrays; changing arrays are replaced at each call.
             device: "cpu" or a CUDA device.
             threads: Most threads to use on the CPU; at most `MOST_THREADS` are.
             at_once: Number of elements in an item of the kernel.
@@ -60,40 +60,40 @@ class Launch:
         self._size, self._name = -(-size // at_once), f"{kernel.module.name}.{kernel.key}"
         self._device = None if device == "cpu" else device
         self._most = min(threads, MOST_THREADS) if self._device is None else 1
-        whole = wp.launch(kernel, dim=self._size, inputs=[0, *inputs], device=device, record_cmd=True)
-        self._whole: wp.Launch | None = whole if self._size else None
-        self._call = None if self._whole is None or self._device is not None else _Call(self._whole)
+        command = wp.launch(kernel, dim=self._size, inputs=[0, *inputs], device=device, record_cmd=True)
+        self._command: wp.Launch | None = command if self._size else None
+        self._call = None if self._command is None or self._device is not None else _Call(self._command)
         self._slices: list[_Call] = []
 
     def change(self, changed: Mapping[int, Any]) -> None:
         """Replace some inputs from now on, by position in ``inputs``; tensors only by tensors of equal shape."""
-        if self._whole is None:
+        if self._command is None:
             return
         if self._call is None:
-            kinds = self._whole.kernel.adj.args
-            for place, value in changed.items():
+            kinds = self._command.kernel.adj.args
+            for position, value in changed.items():
                 packed = value
                 if isinstance(value, Tensor):
-                    packed = argument(value, kinds[place + 1].type.dtype)
+                    packed = argument(value, kinds[position + 1].type.dtype)
                     if packed.ndim != 1:
                         raise ValueError("a kernel reads arrays of one dimension only")
-                self._whole.set_param_at_index(place + 1, packed)
+                self._command.set_param_at_index(position + 1, packed)
         for call in (self._call, *self._slices) if self._call is not None else ():
             call.change(changed)
 
     def __call__(self, changed: Mapping[int, Any]) -> None:
         """Run with some inputs replaced, by position in ``inputs``."""
         self.change(changed)
-        if self._whole is None:
+        if self._command is None:
             return
         if self._call is None:
-            self._whole.launch(stream=current_stream(str(self._device)))
+            self._command.launch(stream=current_stream(str(self._device)))
             return
-        known = _item_seconds[self._name]
-        work = known * self._size
+        item_seconds = _item_seconds[self._name]
+        work = item_seconds * self._size
         threads = min(self._most, int(work / LEAST_SECONDS))
         spent = _run([self._call]) if threads < 2 else self._shared(threads, work)
-        _item_seconds[self._name] = 0.5 * (known + spent / self._size)
+        _item_seconds[self._name] = 0.5 * (item_seconds + spent / self._size)
 
     def _shared(self, threads: int, work: float) -> float:
         """Run on several threads, given the work [s]; returns the time of all threads together [s]."""
@@ -101,15 +101,15 @@ class Launch:
         if not self._slices:
             bounds = _tapered(self._size, min(SLICES * threads, int(work / SLICE_SECONDS), self._size))
             self._slices = [self._call.part(a, b) for a, b in pairwise(bounds) if b > a]
-        left = iter(self._slices)  # A list's iterator hands each call to one thread only.
-        others: list[Future[float]] = []
+        queue = iter(self._slices)  # A list's iterator hands each call to one thread only.
+        futures: list[Future[float]] = []
         try:
             for _ in range(threads - 1):
-                others.append(_pool(self._most).submit(_run, left))
-            spent = _run(left)
+                futures.append(_pool(self._most).submit(_run, queue))
+            spent = _run(queue)
         finally:
-            wait(others)  # The caller may free its arrays only after all threads have finished.
-        return spent + sum(other.result() for other in others)
+            wait(futures)  # The caller may free its arrays only after all threads have finished.
+        return spent + sum(future.result() for future in futures)
 
 
 class _Call:
@@ -118,24 +118,24 @@ class _Call:
     def __init__(self, command: wp.Launch) -> None:
         """Pack the arguments of a recorded launch, and keep it, and thus its arrays, alive."""
         self._command, self._bounds = command, command.params[0]
-        self._places = [f"argument{number}" for number in range(len(command.params) - 1)]
-        kinds = [*zip(self._places, map(type, command.params[1:]), strict=True)]
+        self._names = [f"argument{number}" for number in range(len(command.params) - 1)]
+        kinds = [*zip(self._names, map(type, command.params[1:]), strict=True)]
         self._packed: Any = type("Arguments", (ctypes.Structure,), {"_fields_": kinds})()
         hooks: Any = command.hooks
         self._forward = hooks.forward
-        for place, value in zip(self._places, command.params[1:], strict=True):
-            setattr(self._packed, place, value)
+        for name, value in zip(self._names, command.params[1:], strict=True):
+            setattr(self._packed, name, value)
 
     def change(self, changed: Mapping[int, Any]) -> None:
         """Replace some inputs, as in `Launch.change`."""
-        for place, value in changed.items():
+        for position, value in changed.items():
             if isinstance(value, Tensor):
                 if not value.is_contiguous():
                     raise ValueError("a kernel reads contiguous tensors only")
-                getattr(self._packed, self._places[place + 1]).data = value.data_ptr()
+                getattr(self._packed, self._names[position + 1]).data = value.data_ptr()
             else:
                 plain = value.__ctype__() if isinstance(value, wp.array) else value
-                setattr(self._packed, self._places[place + 1], plain)
+                setattr(self._packed, self._names[position + 1], plain)
 
     def part(self, begin: int, end: int) -> _Call:
         """The call for a slice of the items."""
@@ -144,7 +144,7 @@ class _Call:
         command.set_dim(end - begin)
         part = _Call(command)
         part._packed = type(self._packed).from_buffer_copy(self._packed)
-        setattr(part._packed, part._places[0], begin)
+        setattr(part._packed, part._names[0], begin)
         return part
 
     def launch(self) -> None:

@@ -141,9 +141,9 @@ class PolygonMesh:
     @cached_property
     def half_edges(self) -> HalfEdges:
         """Edges of the faces, and the edge of each half-edge."""
-        here, there = self.indices, self.indices[self.next_corner]
-        edges, edge = paired(here, there, self.vertex_count)
-        return HalfEdges(edges, edge, here <= there, np.bincount(edge, minlength=len(edges)).astype(np.int32))
+        start, end = self.indices, self.indices[self.next_corner]
+        edges, edge = paired(start, end, self.vertex_count)
+        return HalfEdges(edges, edge, start <= end, np.bincount(edge, minlength=len(edges)).astype(np.int32))
 
     @cached_property
     def twin_corners(self) -> np.ndarray:
@@ -161,10 +161,8 @@ class PolygonMesh:
         """
         bad = np.flatnonzero((self.indices < 0) | (self.indices >= self.vertex_count))
         if len(bad):
-            where = f"face {self.corner_face[bad[0]]}"
-            raise ValueError(
-                f"{where} uses vertex {self.indices[bad[0]]}, but the mesh has {self.vertex_count} vertices"
-            )
+            face, vertex = self.corner_face[bad[0]], self.indices[bad[0]]
+            raise ValueError(f"face {face} uses vertex {vertex}, but the mesh has {self.vertex_count} vertices")
 
     @cached_property
     def fan_counts(self) -> np.ndarray:
@@ -177,9 +175,9 @@ class PolygonMesh:
         same = np.flatnonzero(half.edge[order[1:]] == half.edge[order[:-1]])
         ends = np.stack([np.arange(len(self.indices)), self.next_corner], axis=1)
         ends = np.where(half.forward[:, None], ends, ends[:, ::-1])
-        one, two = ends[order[same]].reshape(-1), ends[order[same + 1]].reshape(-1)
+        first, second = ends[order[same]].reshape(-1), ends[order[same + 1]].reshape(-1)
         size = len(self.indices)
-        links = sparse.coo_matrix((np.ones(len(one), bool), (one, two)), shape=(size, size))
+        links = sparse.coo_matrix((np.ones(len(first), bool), (first, second)), shape=(size, size))
         _, label = csgraph.connected_components(links, directed=False)
         fans = np.unique(label.astype(np.int64) * max(self.vertex_count, 1) + self.indices)
         return np.bincount(fans % max(self.vertex_count, 1), minlength=self.vertex_count).astype(np.int32)
@@ -213,8 +211,8 @@ class PolygonMesh:
 
 def area_vectors(mesh: PolygonMesh, points: np.ndarray) -> np.ndarray:
     """Twice the area vector of each face [m^2], shape (F, 3), by Newell's sum; faces have corners."""
-    here, after = points[mesh.indices], points[mesh.indices[mesh.next_corner]]
-    return np.add.reduceat(np.cross(here, after), mesh.starts[: mesh.face_count])
+    start, end = points[mesh.indices], points[mesh.indices[mesh.next_corner]]
+    return np.add.reduceat(np.cross(start, end), mesh.starts[: mesh.face_count])
 
 
 def face_normals(mesh: PolygonMesh, points: np.ndarray) -> np.ndarray:
@@ -260,9 +258,9 @@ def sorted_rows(*columns: np.ndarray, count: int) -> np.ndarray:
     return order
 
 
-def paired(here: np.ndarray, there: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+def paired(start: np.ndarray, end: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Unique edges, lower vertex first, in lexicographic order, shape (E, 2); and the edge of each pair, shape (K,)."""
-    ends = np.stack([np.minimum(here, there), np.maximum(here, there)])
+    ends = np.stack([np.minimum(start, end), np.maximum(start, end)])
     order = sorted_rows(*ends, count=count)
     ends, pair = ends[:, order], np.empty(len(order), np.int32)
     first = np.append(True, (ends[:, 1:] != ends[:, :-1]).any(axis=0))[: len(order)]
@@ -287,17 +285,17 @@ def find_edges(edges: np.ndarray, pairs: np.ndarray) -> np.ndarray:
     keys = edges[:, 0] * stride + edges[:, 1]
     low, high = np.minimum(pairs[:, 0], pairs[:, 1]), np.maximum(pairs[:, 0], pairs[:, 1])
     wanted = np.where((low >= 0) & (high < stride), low * stride + high, -1)
-    found = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
-    return np.where(keys[found] == wanted, found, -1)
+    row = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
+    return np.where(keys[row] == wanted, row, -1)
 
 
 def edges_of(triangles: np.ndarray, vertex_count: int) -> Edges:
     """The undirected edges of triangles of numbered vertices, shape (T, 3), without loops from a vertex to itself."""
     a, b, c = triangles.T
-    here, there = triangles.reshape(-1), triangles[:, [1, 2, 0]].reshape(-1)
-    kept, proper = np.flatnonzero(here != there), (a != b) & (b != c) & (c != a)
-    sides = np.full(len(here), -1, np.int32)
-    vertices, sides[kept] = paired(here[kept], there[kept], vertex_count)
+    start, end = triangles.reshape(-1), triangles[:, [1, 2, 0]].reshape(-1)
+    distinct, proper = np.flatnonzero(start != end), (a != b) & (b != c) & (c != a)
+    sides = np.full(len(start), -1, np.int32)
+    vertices, sides[distinct] = paired(start[distinct], end[distinct], vertex_count)
     count = np.bincount(sides[np.repeat(proper, 3)], minlength=len(vertices))
     return Edges(vertices, count.astype(np.int32), sides.reshape(-1, 3))
 
@@ -308,13 +306,13 @@ def joined_by(edges: np.ndarray, count: int) -> np.ndarray:
     return csgraph.connected_components(graph, directed=False)[1]
 
 
-def patches_with(edges: np.ndarray, some: np.ndarray, seeds: np.ndarray) -> np.ndarray:
-    """Members of the patches of ``some`` vertices, connected by edges, with at least one seed, shape (V,)."""
-    patch = joined_by(edges[some[edges].all(axis=1)], len(some))
-    return some & np.isin(patch, patch[some & seeds])
+def patches_with(edges: np.ndarray, members: np.ndarray, seeds: np.ndarray) -> np.ndarray:
+    """Mask of the patches with at least one seed, shape (V,); patches are the connected parts of ``members``."""
+    patch = joined_by(edges[members[edges].all(axis=1)], len(members))
+    return members & np.isin(patch, patch[members & seeds])
 
 
 def adjacency(edges: np.ndarray, count: int) -> sparse.csr_matrix:
     """Adjacency matrix of vertices joined by edges."""
-    both = np.concatenate([edges, edges[:, ::-1]])
-    return sparse.csr_matrix((np.ones(len(both), np.float32), (both[:, 0], both[:, 1])), shape=(count, count))
+    rows, columns = np.concatenate([edges, edges[:, ::-1]]).T
+    return sparse.csr_matrix((np.ones(len(rows), np.float32), (rows, columns)), shape=(count, count))

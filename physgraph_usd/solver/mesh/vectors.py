@@ -14,7 +14,7 @@ def at_corners(x: np.ndarray, elements: np.ndarray) -> np.ndarray:
 
 def mean_of(values: np.ndarray, elements: np.ndarray) -> np.ndarray:
     """Mean of the vertices' values, shape (..., V), over the corners of elements, shape (N, K): shape (..., N)."""
-    return reduce(np.add, (values.take(each, axis=-1) for each in elements.T)) / elements.shape[1]
+    return reduce(np.add, (values.take(corner, axis=-1) for corner in elements.T)) / elements.shape[1]
 
 
 def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -24,8 +24,8 @@ def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Dot products of vectors, shapes (..., 3, N)."""
-    each = a * b
-    return each[..., 0, :] + each[..., 2, :] + each[..., 1, :]  # In this order, as `np.einsum` adds.
+    products = a * b
+    return products[..., 0, :] + products[..., 2, :] + products[..., 1, :]  # In this order, as `np.einsum` adds.
 
 
 def norm(a: np.ndarray) -> np.ndarray:
@@ -37,10 +37,10 @@ def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Products of small matrices, shapes (I, J, N) and (J, K, N), rounded as by BLAS, in fused additions."""
     import torch  # noqa: PLC0415  stages are read without torch
 
-    left, right = torch.as_tensor(a), torch.as_tensor(b)
-    total = left[:, 0, None] * right[0]
+    first, second = torch.as_tensor(a), torch.as_tensor(b)
+    total = first[:, 0, None] * second[0]
     for j in range(1, len(b)):
-        total = torch.addcmul(total, left[:, j, None], right[j])
+        total = torch.addcmul(total, first[:, j, None], second[j])
     return total.numpy()
 
 
@@ -48,7 +48,7 @@ def inverse(matrix: np.ndarray) -> np.ndarray:
     """Inverses of symmetric matrices, shape (2, 2, N), by elimination with the larger entry of the first row first."""
     (a, b), (_, d) = matrix
     turned = np.abs(b) > np.abs(a)
-    (pivot, under), (beside, last) = (np.where(turned, each[::-1], each) for each in (matrix[0], (b, d)))
+    (pivot, under), (beside, last) = (np.where(turned, row[::-1], row) for row in (matrix[0], (b, d)))
     factor = under * (1.0 / pivot)
     column = np.stack([1.0 - turned, turned])
     second = (column[::-1] - factor * column) * (1.0 / (last - factor * beside))

@@ -28,7 +28,7 @@ WIDEST = 0.25
 THICKEST = 0.5
 """Largest thickness of a thick sheet, in distances to the next vertex of the same skin: cords are thicker."""
 UNEVEN = 2.0
-"""Largest ratio between two thicknesses at one place of a thick sheet over the shot; skins that part more are two."""
+"""Largest ratio between two thicknesses of a thick sheet at a vertex over the shot; above, the skins stay apart."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +41,7 @@ class Weld:
             face.
         number: Vertex of the welded mesh for each vertex, shape (V,).
         faces: Faces of ``apart`` kept in the welded mesh, ascending.
-        across: Place of each vertex along the normal of a thick sheet's middle [m], shape (V,); None for sheets.
+        across: Height of each vertex over the middle of a thick sheet [m], shape (V,); None for thin sheets.
     """
 
     apart: PolygonMesh
@@ -83,12 +83,14 @@ class Weld:
         welded, number, apart, faces, across = self.mesh, self.number, self.apart, self.faces, self.across
         for step, fine in zip(steps, subdivide_times(self.mesh, levels), strict=True):
             # A reversed face has its children in a different order.
-            own = _sorted_corners(apart, number[apart.indices])
-            rim = _are_rims(own) & (across is not None)
+            corners = _sorted_corners(apart, number[apart.indices])
+            rim = _are_rims(corners) & (across is not None)
             of_faces = np.zeros(apart.face_count, np.int64)
-            of_faces[~rim] = face_points(welded)[_first_like(own[~rim], _sorted_corners(welded, welded.indices))]
-            lowest = np.where(own[rim] < 0, own[rim, -1:], own[rim]).min(axis=1, initial=welded.vertex_count)
-            of_faces[rim] = _halfway(fine, np.stack([lowest, own[rim, -1]], axis=1))
+            of_faces[~rim] = face_points(welded)[_first_like(corners[~rim], _sorted_corners(welded, welded.indices))]
+            lowest = np.where(corners[rim] < 0, corners[rim, -1:], corners[rim]).min(
+                axis=1, initial=welded.vertex_count
+            )
+            of_faces[rim] = _halfway(fine, np.stack([lowest, corners[rim, -1]], axis=1))
             number = np.concatenate([number, _halfway(fine, number[step.edges]), of_faces[apart.is_polygon]])
             faces = np.flatnonzero(np.isin(step.parent_face, faces))
             apart, welded = step.mesh, fine.mesh
@@ -96,7 +98,7 @@ class Weld:
         return steps, Weld(apart, welded, number, faces, across)
 
     def sharp_edges(self, rest: Float[np.ndarray, "welded 3"], closed: np.ndarray | None) -> Int[np.ndarray, "edges 2"]:
-        """Edges of ``apart`` that subdivision keeps sharp: those of closed pieces, and the rims' of a thick sheet.
+        """Edges of ``apart`` that subdivision keeps sharp: of closed pieces, and around the rims of a thick sheet.
 
         Args:
             rest: Rest positions of the welded mesh [m].
@@ -107,26 +109,25 @@ class Weld:
             creases = creases_of(self.mesh, rest, closed)
             return half.edges[find_edges(creases, self.number[half.edges]) >= 0]
         rim = _are_rims(_sorted_corners(self.apart, self.number[self.apart.indices]))
-        one, two = self.apart.twin_corners.T
-        return half.edges[half.edge[one[rim[beside[one]] != rim[beside[two]]]]]
+        first, second = self.apart.twin_corners.T
+        return half.edges[half.edge[first[rim[beside[first]] != rim[beside[second]]]]]
 
     @property
     def torn(self) -> Bool[np.ndarray, " vertices"]:
         """Mask of the vertices of ``apart`` whose welded copies subdivision would move differently.
 
-        Open edges of the copies differ: three panels meet at the vertex, or one panel's border has a corner there and
-        the other's has none.
+        Open edges of the copies differ: three panels meet at the vertex, or only one of two panels has a corner at it.
         """
         count = len(self.number)
         if self.is_none or self.across is not None:
             return np.zeros(count, bool)
         ends = open_edges(self.apart)
-        here, there = np.concatenate([ends, ends[:, ::-1]]).T
+        vertex, neighbour = np.concatenate([ends, ends[:, ::-1]]).T
         rules = np.zeros((4, count), np.int64)
-        rules[0] = np.bincount(here, minlength=count)
+        rules[0] = np.bincount(vertex, minlength=count)
         rules[1] = np.bincount(self.apart.indices, minlength=count) < 2
-        np.maximum.at(rules[2], here, self.number[there])
-        np.maximum.at(rules[3], here, count - self.number[there])
+        np.maximum.at(rules[2], vertex, self.number[neighbour])
+        np.maximum.at(rules[3], vertex, count - self.number[neighbour])
         unlike = np.zeros(len(self._first), bool)
         for rule in rules:
             unlike[self.number[rule != rule[self._first][self.number]]] = True
@@ -134,7 +135,7 @@ class Weld:
 
     @property
     def without_rims(self) -> Weld:
-        """The weld without the rims in ``apart``, whose edges have no length where the skins are joined."""
+        """The weld without the rims in ``apart``: edges of rims have no length once the skins are joined."""
         rim = _are_rims(_sorted_corners(self.apart, self.number[self.apart.indices]))
         indices = self.apart.indices[~rim[self.apart.corner_face]]
         return replace(self, apart=PolygonMesh(self.apart.counts[~rim], indices, self.apart.vertex_count))
@@ -144,9 +145,9 @@ class Weld:
         """A number for each vertex, equal for vertices with a common normal; a doubled sheet has one per side."""
         if self.across is not None:
             return np.arange(len(self.number))
-        shown = np.zeros(len(self.number), bool)
-        shown[self.apart.indices[np.isin(self.apart.corner_face, self.faces)]] = True
-        return np.unique(2 * self.number + ~shown, return_inverse=True)[1].reshape(-1)
+        in_front = np.zeros(len(self.number), bool)
+        in_front[self.apart.indices[np.isin(self.apart.corner_face, self.faces)]] = True
+        return np.unique(2 * self.number + ~in_front, return_inverse=True)[1].reshape(-1)
 
     @cached_property
     def _first(self) -> np.ndarray:
@@ -170,30 +171,30 @@ def weld(mesh: PolygonMesh, poses: Sequence[Float[np.ndarray, "vertices 3"]], wi
     pairs = pairs[~_in_one_face(mesh, pairs)]
     if not len(pairs):
         return replace(unwelded(mesh), mesh=wound_alike(mesh, poses[0]))
-    place = joined_by(pairs, mesh.vertex_count)
-    corners = _sorted_corners(mesh, place[mesh.indices])
+    site = joined_by(pairs, mesh.vertex_count)
+    corners = _sorted_corners(mesh, site[mesh.indices])
     like = _first_like(corners, corners)
     faces, again = (np.flatnonzero(mask) for mask in (like == np.arange(len(like)), like != np.arange(len(like))))
-    doubled = _corners_together(mesh, place, again, like[again])
+    doubled = _corners_together(mesh, site, again, like[again])
     label = _lowest(mesh.vertex_count, doubled)
-    kept = np.isin(mesh.corner_face, faces)
-    single = replace(mesh, counts=mesh.counts[faces], indices=label[mesh.indices[kept]])
-    number = _lowest(mesh.vertex_count, np.concatenate([doubled, _edge_pairs(single, place)]))
+    in_faces = np.isin(mesh.corner_face, faces)
+    single = replace(mesh, counts=mesh.counts[faces], indices=label[mesh.indices[in_faces]])
+    number = _lowest(mesh.vertex_count, np.concatenate([doubled, _edge_pairs(single, site)]))
     used, number = np.unique(number, return_inverse=True)
     if len(used) == mesh.vertex_count:
         return replace(unwelded(mesh), mesh=wound_alike(mesh, poses[0]))
     number = number.reshape(-1)
-    indices = number[mesh.indices[kept]].astype(np.int32)
-    whole = replace(mesh, counts=mesh.counts[faces], indices=indices, vertex_count=len(used))
+    indices = number[mesh.indices[in_faces]].astype(np.int32)
+    welded = replace(mesh, counts=mesh.counts[faces], indices=indices, vertex_count=len(used))
     first = np.unique(number, return_index=True)[1]
-    return Weld(mesh, wound_alike(whole, poses[0][first]), number, faces)
+    return Weld(mesh, wound_alike(welded, poses[0][first]), number, faces)
 
 
 def weld_skins(mesh: PolygonMesh, poses: Sequence[Float[np.ndarray, "vertices 3"]]) -> Weld | None:
-    """Join the skins of a thick sheet into the sheet in its middle; None unless the whole mesh is one.
+    """Join the skins of a thick sheet into the sheet in its middle; None if the mesh is no thick sheet.
 
-    In a thick sheet each vertex has one nearest other vertex, its partner, in the other skin. Each face is
-    a rim, between an edge and the partners' edge, or in a skin, with a face of the partners in the other.
+    In a thick sheet the nearest vertex of each vertex is its partner in the opposite skin. Each face is part of a rim,
+    between an edge and the partners' edge, or of a skin, with a face between the partners in the opposite skin.
 
     Args:
         poses: Positions [m], at least one.
@@ -224,8 +225,8 @@ def weld_skins(mesh: PolygonMesh, poses: Sequence[Float[np.ndarray, "vertices 3"
     if repeated.any() or (of_skins < 0).any() or not twice or (of_skins == of_skins[partner]).any():
         return None
     faces = np.sort(np.where(skin[twos] < skin[like[like != sheet]], twos, like[like != sheet]))
-    kept = np.isin(mesh.corner_face, faces)
-    joined = PolygonMesh(mesh.counts[faces], number[mesh.indices[kept]].astype(np.int32), int(number.max()) + 1)
+    in_faces = np.isin(mesh.corner_face, faces)
+    joined = PolygonMesh(mesh.counts[faces], number[mesh.indices[in_faces]].astype(np.int32), int(number.max()) + 1)
     middle = 0.5 * (poses[0] + poses[0][partner])
     first = np.unique(number, return_index=True)[1]
     joined = wound_alike(joined, middle[first])
@@ -241,7 +242,7 @@ def _are_rims(corners: np.ndarray) -> np.ndarray:
 
 
 def _halfway(step: Refinement, ends: np.ndarray) -> np.ndarray:
-    """Child vertices halfway between the ends of edges, or at the ends where both are one vertex, shape (N,)."""
+    """Child vertices halfway between the ends of edges; if both ends are one vertex, that vertex; shape (N,)."""
     halfway = step.parent_vertex_count + find_edges(step.edges, ends)
     return np.where(ends[:, 0] == ends[:, 1], ends[:, 0], halfway)
 
@@ -252,11 +253,11 @@ def wound_alike(mesh: PolygonMesh, points: Float[np.ndarray, "vertices 3"]) -> P
     Pieces with reversed faces are wound counter-clockwise seen from outside.
     """
     half, count = mesh.half_edges, mesh.face_count
-    one, two = mesh.twin_corners.T
-    unlike = half.forward[one] == half.forward[two]
+    first, second = mesh.twin_corners.T
+    unlike = half.forward[first] == half.forward[second]
     if not unlike.any():
         return mesh
-    a, b = mesh.corner_face[one].astype(np.int64), mesh.corner_face[two].astype(np.int64)
+    a, b = mesh.corner_face[first].astype(np.int64), mesh.corner_face[second].astype(np.int64)
     # The graph has two nodes per face, as authored and reversed: consistent neighbours link nodes of equal kind.
     links = np.concatenate(
         [np.stack([a, np.where(unlike, b + count, b)], 1), np.stack([a + count, np.where(unlike, b, b + count)], 1)]
@@ -280,13 +281,13 @@ def _lowest(count: int, links: np.ndarray) -> np.ndarray:
     return np.unique(label, return_index=True)[1][label]
 
 
-def _first_like(corners: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """For each face, the first of the faces ``others`` with the same sorted corners, which must exist, shape (F,)."""
-    width = max(corners.shape[1], others.shape[1])
-    rows = [np.pad(each, ((0, 0), (width - each.shape[1], 0)), constant_values=-1) for each in (corners, others)]
+def _first_like(corners: np.ndarray, candidates: np.ndarray) -> np.ndarray:
+    """For each face, the first candidate with the same sorted corners, which must exist, shape (F,)."""
+    width = max(corners.shape[1], candidates.shape[1])
+    rows = [np.pad(array, ((0, 0), (width - array.shape[1], 0)), constant_values=-1) for array in (corners, candidates)]
     label = np.unique(np.concatenate(rows), axis=0, return_inverse=True)[1].reshape(-1)
-    known, first = np.unique(label[len(corners) :], return_index=True)
-    return first[np.searchsorted(known, label[: len(corners)])]
+    labels, first = np.unique(label[len(corners) :], return_index=True)
+    return first[np.searchsorted(labels, label[: len(corners)])]
 
 
 def _sorted_corners(mesh: PolygonMesh, values: np.ndarray) -> np.ndarray:
@@ -296,26 +297,26 @@ def _sorted_corners(mesh: PolygonMesh, values: np.ndarray) -> np.ndarray:
     return np.sort(out, axis=1)
 
 
-def _corners_together(mesh: PolygonMesh, place: np.ndarray, one: np.ndarray, other: np.ndarray) -> np.ndarray:
+def _corners_together(mesh: PolygonMesh, site: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Pairs of coincident corners of pairs of coincident faces, shape (N, 2)."""
     pairs = [np.zeros((0, 2), np.int64)]
-    for a, b in zip(one.tolist(), other.tolist(), strict=True):
-        here, there = (mesh.indices[mesh.starts[face] : mesh.starts[face + 1]].astype(np.int64) for face in (a, b))
-        pairs.append(np.stack([here[np.argsort(place[here])], there[np.argsort(place[there])]], axis=1))
+    for a, b in zip(first.tolist(), second.tolist(), strict=True):
+        p, q = (mesh.indices[mesh.starts[face] : mesh.starts[face + 1]].astype(np.int64) for face in (a, b))
+        pairs.append(np.stack([p[np.argsort(site[p])], q[np.argsort(site[q])]], axis=1))
     return np.concatenate(pairs)
 
 
-def _edge_pairs(mesh: PolygonMesh, place: np.ndarray) -> np.ndarray:
+def _edge_pairs(mesh: PolygonMesh, site: np.ndarray) -> np.ndarray:
     """Pairs of ends of coincident open edges with exactly two copies, shape (N, 2)."""
     edges = open_edges(mesh)
-    edges = edges[place[edges[:, 0]] != place[edges[:, 1]]]
-    turned = place[edges[:, 0]] > place[edges[:, 1]]
+    edges = edges[site[edges[:, 0]] != site[edges[:, 1]]]
+    turned = site[edges[:, 0]] > site[edges[:, 1]]
     edges = np.where(turned[:, None], edges[:, ::-1], edges)
-    ends = place[edges]
-    _, where, count = np.unique(ends, axis=0, return_inverse=True, return_counts=True)
-    where = where.reshape(-1)
-    order = np.argsort(where, kind="stable")
-    twice = edges[order[count[where][order] == 2]].reshape(-1, 2, 2)
+    ends = site[edges]
+    _, group, count = np.unique(ends, axis=0, return_inverse=True, return_counts=True)
+    group = group.reshape(-1)
+    order = np.argsort(group, kind="stable")
+    twice = edges[order[count[group][order] == 2]].reshape(-1, 2, 2)
     return np.concatenate([twice[:, :, 0], twice[:, :, 1]])
 
 
@@ -329,13 +330,13 @@ def seam_reach(mesh: PolygonMesh, points: Float[np.ndarray, "vertices 3"], toler
     return float(np.clip(tolerance, WELDED * edge, WIDEST * edge))
 
 
-def pairs_within(poses: Sequence[np.ndarray], which: np.ndarray, within: float) -> np.ndarray:
+def pairs_within(poses: Sequence[np.ndarray], vertices: np.ndarray, within: float) -> np.ndarray:
     """Pairs of some vertices within a distance [m] in every pose, shape (N, 2)."""
     for pose in poses:
-        which = which[np.isfinite(pose[which]).all(axis=1)]
-    if len(which) < 2:
+        vertices = vertices[np.isfinite(pose[vertices]).all(axis=1)]
+    if len(vertices) < 2:
         return np.zeros((0, 2), np.int64)
-    pairs = which[cKDTree(poses[0][which]).query_pairs(within, output_type="ndarray")].reshape(-1, 2)
+    pairs = vertices[cKDTree(poses[0][vertices]).query_pairs(within, output_type="ndarray")].reshape(-1, 2)
     for pose in poses[1:]:
         pairs = pairs[np.linalg.norm(pose[pairs[:, 0]] - pose[pairs[:, 1]], axis=1) <= within]
     return pairs
@@ -350,16 +351,16 @@ def _in_one_face(mesh: PolygonMesh, pairs: np.ndarray) -> np.ndarray:
     key = mesh.corner_face[corners].astype(np.int64) * mesh.vertex_count + mesh.indices[corners]
     order = np.argsort(mesh.indices[corners], kind="stable")
     starts = np.searchsorted(mesh.indices[corners][order], np.arange(mesh.vertex_count + 1))
-    found, known = np.zeros(len(pairs), bool), np.sort(key)
+    shared, keys = np.zeros(len(pairs), bool), np.sort(key)
     widest = int(np.diff(starts)[used].max(initial=0))
-    for place in range(widest):  # Loop over the faces of the first vertex.
-        at = starts[pairs[:, 0]] + place
-        there = at < starts[pairs[:, 0] + 1]
-        face = mesh.corner_face[corners[order[np.where(there, at, 0)]]].astype(np.int64)
+    for nth in range(widest):  # Loop over the faces of the first vertex.
+        at = starts[pairs[:, 0]] + nth
+        exists = at < starts[pairs[:, 0] + 1]
+        face = mesh.corner_face[corners[order[np.where(exists, at, 0)]]].astype(np.int64)
         wanted = face * mesh.vertex_count + pairs[:, 1]
-        where = np.minimum(np.searchsorted(known, wanted), len(known) - 1)
-        found |= there & (known[where] == wanted)
-    return found
+        position = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
+        shared |= exists & (keys[position] == wanted)
+    return shared
 
 
 def _volumes(mesh: PolygonMesh, points: np.ndarray, piece: np.ndarray) -> np.ndarray:
@@ -367,7 +368,7 @@ def _volumes(mesh: PolygonMesh, points: np.ndarray, piece: np.ndarray) -> np.nda
     owner = piece[mesh.corner_face]
     sums, count = np.zeros((len(piece) * 2, 3)), np.bincount(owner, minlength=len(piece) * 2)
     np.add.at(sums, owner, points[mesh.indices])
-    about = points[mesh.indices] - (sums / np.maximum(count, 1)[:, None])[owner]
-    first = about[mesh.starts[mesh.corner_face]]
-    each = (first * np.cross(about, about[mesh.next_corner])).sum(axis=1) / 6.0
-    return np.bincount(mesh.corner_face, each, mesh.face_count)
+    relative = points[mesh.indices] - (sums / np.maximum(count, 1)[:, None])[owner]
+    first = relative[mesh.starts[mesh.corner_face]]
+    volumes = (first * np.cross(relative, relative[mesh.next_corner])).sum(axis=1) / 6.0
+    return np.bincount(mesh.corner_face, volumes, mesh.face_count)
