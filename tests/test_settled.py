@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import time
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -89,7 +90,7 @@ def ends_at_look(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
 
     def end(looks: int) -> None:
         count = itertools.count()
-        clock = SimpleNamespace(perf_counter=lambda: 1e9 * max(next(count) - looks, 0))
+        clock = SimpleNamespace(process_time=lambda: 1e9 * max(next(count) - looks, 0))
         monkeypatch.setattr(deadline, "time", clock)
 
     return end
@@ -104,10 +105,31 @@ def test_a_frame_over_its_limit_is_written_and_named(tmp_path: Path):
         (CLOTH, 1.0, "time limit"),
         (CLOTH, 2.0, "time limit"),
     ]
-    said = "was not solved to its end: it reached its limit of time; see --frame-limit; also at time code 2"
+    sets = "--frame-limit sets it, in processor time, on cuda in wall time"
+    said = f"was not solved to its end: it reached its limit of time; {sets}; also at time code 2"
     assert [warning for warning in report.warnings if said in warning]
     assert report.exit_code == 3
     assert [frame["garments"][0]["time_limit"] for frame in report.frames] == [1e-6, 1e-6]
+
+
+def test_held_cloth_is_solved_on_after_a_frame_that_was_stopped(tmp_path: Path):
+    shot = cloth_shot(tmp_path / "s.usda", times=(1.0, 2.0, 3.0), frozen=True)
+    for limit, reused in ((1e-6, [False, False]), (None, [True, True])):
+        report = refine(shot, tmp_path / f"{limit}.usdc", frame_limit=limit)
+        starts = [str(frame["garments"][0]["start"]) for frame in report.frames[1:]]
+        assert ["reused" in start for start in starts] == reused
+
+
+def test_a_limit_counts_what_the_processor_does_and_on_a_card_what_passes():
+    for device, waited in (("cpu", False), ("cuda", True), ("cuda:1", True)):
+        with deadline.ends_after(0.05, deadline.clock_of(device)):
+            time.sleep(0.06)
+            assert deadline.is_over() == waited
+            began = time.process_time()
+            while time.process_time() < began + 0.06:
+                pass
+            assert deadline.is_over()
+    assert not deadline.is_over()
 
 
 def test_nothing_newly_crosses_wherever_a_frame_is_stopped(

@@ -95,7 +95,8 @@ class RefineOptions:
     budget_ms: float | None = _solver(None, "Time limit of the steps of a frame.", metavar="MS", above=0)
     frame_limit: float | None = _solver(
         None,
-        "Time limit per frame. A frame over the limit keeps its current state and is reported as not settled.  "
+        "Limit per frame in processor time, all threads together; on cuda in wall time. A frame over the limit keeps "
+        "its current state and is reported as not settled.  "
         "[default: 20 times the time of the shot's frames, at least two minutes]",
         metavar="SECONDS",
         above=0,

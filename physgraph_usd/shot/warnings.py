@@ -78,11 +78,12 @@ WARNINGS = {
     ),
     LIMITED: Kind(
         "the frame reached its limit of time",
-        "the frame took over 20 times as long as the others and was stopped. The cloth is valid but has not converged, "
-        "and depends on the machine's speed. Look at the cage and the bodies there; `--frame-limit SECONDS` "
-        "sets the limit",
+        "the frame took over 20 times the processor time of the others, or more than `--frame-limit`, and was stopped. "
+        "The cloth is valid but has not converged, and depends on the processor's speed. On a graphics card wall time "
+        "counts, and other programs change it too. The next frame continues from there. Look at the cage and the "
+        "bodies; `--frame-limit SECONDS` sets the limit",
         "the frame was not solved to its end: it reached its limit of time",
-        "see --frame-limit",
+        "--frame-limit sets it, in processor time, on cuda in wall time",
     ),
     UNSOLVED: Kind(
         "it follows its cage there, not solved",
