@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import sys
 import time as clock
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing, nullcontext
 from dataclasses import dataclass
 from functools import cached_property
@@ -57,7 +57,7 @@ class Stored:
         outcomes: The frames.
     """
 
-    numbers: range
+    numbers: Sequence[int]
     record: Mapping[str, Any]
     outcomes: Outcomes
 
@@ -71,6 +71,7 @@ class Run:
         out: The layer to write, or None for a layer in memory.
         report: The report, with the garments filled in.
         stored: Frames to write instead of solving; None to solve.
+        show_first: Called with the first refined frame as soon as it is done; or None.
     """
 
     shot: Shot
@@ -78,6 +79,7 @@ class Run:
     options: RefineOptions
     report: RefineReport
     stored: Stored | None = None
+    show_first: Callable[[Outcome], None] | None = None
 
     def refine(self) -> Layer | None:
         """Solve and write all frames; returns the layer if in memory.
@@ -122,7 +124,7 @@ class Run:
         options, chunk = self.options, self._is_chunk
         decides = {"levels": self.solver.levels, "times": self._times, "report": options.report is not None}
         if chunk:
-            decides[CHUNK] = [self._numbers.start, self._numbers.stop]
+            decides[CHUNK] = [self._numbers[0], self._numbers[-1] + 1]
         meshes = fine_meshes(self.shot.scene.garments, refinements)
         counts = [mesh.vertex_count for mesh in meshes]
         return FrameFolder(
@@ -146,7 +148,7 @@ class Run:
         return list(self.shot.scene.times) or [None]
 
     @cached_property
-    def _numbers(self) -> range:
+    def _numbers(self) -> Sequence[int]:
         """Numbers of the time codes to solve: all open time codes, or for a chunk those of the shot in ``frames``."""
         if self.stored is not None:
             return self.stored.numbers
@@ -252,6 +254,8 @@ class Run:
             self.report.failed[name] = error
             self.report.warn(WARNINGS["failed"](name=name, error=error))
             return 0.0
+        if self.show_first is not None and len(self.report.frames) == len(self.report.failed) + 1:
+            self.show_first(outcome)
         if writer is None:
             return 0.0
         start, records = clock.perf_counter(), self.report.frames

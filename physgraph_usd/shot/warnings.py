@@ -167,6 +167,17 @@ WARNINGS = {
         "{kept} are those of a run that was interrupted; the others are solved{again}",
         "folds that can lie in several ways may lie otherwise there than in an undisturbed run",
     ),
+    "partial": Kind(
+        "the layer has a part of the frames",
+        "`stitch --partial` leaves out the frames that are not finished. `refine --resume` solves them",
+        "the layer has {count} of {frames}; not finished: {missing}",
+        "refine --resume solves them",
+    ),
+    "undrawn": Kind(
+        "the first frame is not drawn",
+        "the text after it says why; the frames are refined without the picture",
+        "the first frame is not drawn into {picture}: {error}",
+    ),
     "slower": Kind(
         "cholespy is not installed",
         "install it, if it has a wheel for your system; solves then take less time",

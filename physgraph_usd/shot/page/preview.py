@@ -58,17 +58,13 @@ def preview(
         The picture written.
 
     Raises:
-        UsageError: When the suffix is unknown, a PNG is asked for several times, or the picture exists, is a link or is
-            a file of the shot.
+        UsageError: As in `check_picture`, or the picture is a link or a file of the shot.
         LayerError: When the picture cannot be written.
         StageError: When a stage cannot be opened or shows no mesh.
     """
     layer, out = Path(layer), Path(out)
+    check_picture(out, times=times, overwrite=overwrite)
     suffix = out.suffix.lower()
-    if suffix not in {STILL, LOOP}:
-        raise UsageError(f"cannot draw {out.name!r}; known suffixes: {STILL}, {LOOP}")
-    if times is not None and suffix == STILL and len(times) != 1:
-        raise UsageError(f"a {STILL} shows one time code, not {len(times)}; write a {LOOP} for several")
     below = shot_of(layer) if shot is None else Path(shot)
     check_targets([("the picture", out)], files_of(layer) | (files_of(below) if below else set()))
     check_place(out)
@@ -89,6 +85,23 @@ def preview(
     finally:
         temporary.unlink(missing_ok=True)
     return out
+
+
+def check_picture(out: Path, *, times: Sequence[float] | None, overwrite: bool) -> None:
+    """Refuse (UsageError) an unknown suffix, several time codes for a still, and a picture that exists.
+
+    Args:
+        out: Picture to write.
+        times: Time codes to draw; None for the usual ones.
+        overwrite: Whether an existing picture may be replaced.
+    """
+    suffix = out.suffix.lower()
+    if suffix not in {STILL, LOOP}:
+        raise UsageError(f"cannot draw {out.name!r}; known suffixes: {STILL}, {LOOP}")
+    if times is not None and suffix == STILL and len(times) != 1:
+        raise UsageError(f"a {STILL} shows one time code, not {len(times)}; write a {LOOP} for several")
+    if out.is_file() and not overwrite:
+        raise UsageError(f"{out} exists; choose another name or replace it by --overwrite")
 
 
 class Pictures:
