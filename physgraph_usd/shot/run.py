@@ -28,6 +28,7 @@ from .cuts import Cuts, Loop
 from .describe import say_what_was
 from .farm import connected
 from .finished import made_from
+from .forecast import Forecast
 from .frames import CHUNK, FrameFolder, Outcome, frames_folder
 from .notes import of_energy, of_folds, of_following, of_inertia, of_rest
 from .options import RefineOptions
@@ -43,8 +44,6 @@ try:
     import resource
 except ImportError:  # Windows has none.
     resource = None
-TIMED_FRAMES, LONG_RUN = 3, 60.0
-"""Frames after which a run announces its end, and least remaining time for an announcement [s]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,6 +187,7 @@ class Run:
             yield from self.solver(self._times)
             return
         _warn_of_finished(self, frames, len(self._numbers))
+        _announce_preroll(self, frames)
         with _processes(self.options) as start:
             chunks = solve_in_chunks(
                 self.solver,
@@ -206,7 +206,8 @@ class Run:
     def _write_frames(self, writer: LayerWriter | None, solved: Outcomes, count: int) -> None:
         """Write each frame as soon as solved, then close the layer; a chunk's frames are already in its folder."""
         report, options = self.report, self.options
-        written, first, shot, began = 0.0, 0.0, {"shot": report.shot}, clock.perf_counter()
+        written, shot, began = 0.0, {"shot": report.shot}, clock.perf_counter()
+        forecast = Forecast(count, options.workers)
         compared = frames_compared(count if options.contact != "off" else 0)
         drawn_through, entered = list[Shown](), dict[float | None, dict[str, float]]()
         drawn = DrawnCloth(self.shot, self.solver.levels if options.report and options.scheme == "keep" else ())
@@ -215,9 +216,7 @@ class Run:
             drawn_through += shown_through(self.shot, outcome) if done - 1 in compared else []
             entered[outcome.time] = drawn.depths(outcome) if done - 1 in compared else {}
             LOG.info("frame %d of %d: time code %s", done, count, named_time(outcome.time), extra=shot)
-            spent = clock.perf_counter() - began
-            first = spent if done == 1 else first
-            if done == TIMED_FRAMES < count and (message := ending(spent, first, count, options.workers)):
+            if message := forecast.after(clock.perf_counter() - began):
                 LOG.log(NOTICE, "%s", message, extra=shot)
             LOG.debug("%s", outcome.record, extra=shot)
             if options.progress:
@@ -293,6 +292,14 @@ def _warn_of_finished(run: Run, frames: FrameFolder, count: int) -> None:
         run.report.warn(WARNINGS["resumed"](kept=reused, again=again))
 
 
+def _announce_preroll(run: Run, frames: FrameFolder) -> None:
+    """Say how many frames a chunk solves before its own."""
+    early = min(run._preroll, run._numbers[0])
+    if run._is_chunk and early and not frames.kept:
+        first = f"before time code {named_time(run._times[run._numbers[0]])} the pre-roll is solved"
+        LOG.log(NOTICE, "%s: %s", first, counted(early, "frame"), extra={"shot": run.report.shot})
+
+
 def _processes(options: RefineOptions) -> AbstractContextManager[Start | None]:
     """Starter of chunks: on a farm, in processes of this machine, or None to solve in this process."""
     if options.scheduler:
@@ -323,26 +330,6 @@ def numbers_in(every: Sequence[float], frames: tuple[float, float] | None) -> ra
 def fine_meshes(garments: Sequence[Garment], refinements: Sequence[Sequence[Refinement]]) -> list[PolygonMesh]:
     """The finest mesh of each garment."""
     return [[cage, *steps][-1].mesh for cage, steps in zip(garments, refinements, strict=True)]
-
-
-def ending(seconds: float, first: float, count: int, workers: int) -> str:
-    """When a run will end, as text; "" if soon.
-
-    The first frame starts from the cage and takes longer than the others, which the rest of the run is judged by.
-
-    Args:
-        seconds: Duration of the first `TIMED_FRAMES` frames [s].
-        first: Duration of the first of them [s].
-        count: Frames of the run.
-        workers: Processes sharing the frames; the first frames to arrive are the first process's.
-    """
-    frames = -(-count // workers) - TIMED_FRAMES
-    remaining = frames * (seconds - first) / (TIMED_FRAMES - 1)
-    if remaining < LONG_RUN:
-        return ""
-    at = clock.strftime("%H:%M", clock.localtime(clock.time() + remaining))
-    duration = f"{remaining / 60.0:.0f} min" if remaining < 5400.0 else f"{remaining / 3600.0:.1f} h"
-    return f"{TIMED_FRAMES} of {count} frames in {seconds:.0f} s: all in about {duration} more, at {at}"
 
 
 def peak_memory_mb() -> float | None:
