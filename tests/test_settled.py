@@ -14,7 +14,7 @@ from shots import CLOTH, cloth_shot, faults, refine, run, sample_times
 
 from physgraph_usd.shot.notes import of_energy
 from physgraph_usd.shot.report import RefineReport
-from physgraph_usd.shot.warnings import WARNINGS, Entries, of_contact
+from physgraph_usd.shot.warnings import WARNINGS, Entries, of_contact, of_more
 from physgraph_usd.solver import deadline
 
 
@@ -53,12 +53,42 @@ class TestContact:
         remedy = WARNINGS["contact"].remedy
         entries: Entries = {1.0: entry("/Body", 10, 1), 2.0: entry("/Body", 1196, 174), 3.0: entry("/Body", 9, 0)}
         assert list(of_contact({"path": "/A"}, entries)) == [
-            f"</A> at time code 2: 174 crossings with </Body> (1,196 in the cage) are left; {remedy}; "
+            f"</A> at time code 2: 174 crossings with </Body> (1,196 in the subdivided cage) are left; {remedy}; "
             "also at time code 1"
         ]
         assert list(of_contact({"path": "/A"}, {1.0: entry("cloth", 3, 1)})) == [
-            f"</A> at time code 1: 1 crossing of cloth (3 in the cage) are left; {remedy}"
+            f"</A> at time code 1: 1 crossing of cloth (3 in the subdivided cage) is left; {remedy}"
         ]
+
+    def test_of_garments_that_are_counted_together_all_are_named(self):
+        entries: Entries = {1.0: entry("cloth", 3, 2) | {"together": ["/A", "/B"]}}
+        (said,) = of_contact({"path": "/A"}, entries)
+        assert "2 crossings of cloth (3 in the subdivided cage) are left, counted together with </B>; " in said
+        assert list(of_contact({"path": "/B"}, entries)) == []
+
+    def test_more_crossings_than_in_the_subdivided_cage_are_told_with_the_first_frame(self):
+        cloth, body = entry("cloth", 1015, 1421), entry("/Body", 5, 5)
+        both = {"contact": cloth["contact"] | body["contact"]}
+        frames = [
+            {"time": 1.0, "garments": [entry("cloth", 9, 9), entry("/Body", 0, 1)]},
+            {"time": 2.0, "garments": [both, entry("/Body", 2, 1)]},
+            {"time": 3.0, "garments": [entry("cloth", 9, 10), {}]},
+            {"time": 4.0, "error": "no sample"},
+        ]
+        report = RefineReport("s", None, {}, garments=[{"path": "/A"}, {"path": "/B"}], frames=frames)
+        more = "in the subdivided cage: more than by subdivision alone; look at these frames"
+        assert of_more(report) == [
+            f"</A> at time code 2: 1,426 crossings are left, 1,020 {more}; also at time code 3",
+            f"</B> at time code 1: 1 crossing is left, 0 {more}",
+        ]
+        assert of_more(RefineReport("s", None, {}, garments=[{"path": "/A"}], frames=frames[:1])) == []
+
+    def test_it_is_the_last_line_of_a_run(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+        monkeypatch.setattr("physgraph_usd.shot.run.of_more", lambda report: ["crossings"] * bool(report.frames))
+        shot = cloth_shot(tmp_path / "s.usdc", broken={3.0: 0.5})
+        done = run("refine", shot, "-o", tmp_path / "f.usdc", "--level", 1, "--steps", 0, "--strict")
+        *before, last = done.stderr.splitlines()
+        assert (last, [line for line in before if "did not settle" in line] != []) == ("warning: crossings", True)
 
     @pytest.mark.parametrize(("after", "code"), [(0, 0), (10, 0), (11, 3)])
     def test_a_strict_run_leaves_a_tenth_at_most(self, after: int, code: int):

@@ -38,7 +38,7 @@ from .settled import unsettled_frames
 from .skin import DrawnCloth, Shown, frames_compared, of_polygons, shown_through
 from .solve import Outcomes, ShotSolver
 from .untagged import AUTO
-from .warnings import WARNINGS, of_drawn, of_frames, of_loops
+from .warnings import WARNINGS, of_drawn, of_frames, of_loops, of_more
 
 try:
     import resource
@@ -235,14 +235,14 @@ class Run:
             writer.close(lacking=lacking)
             report.warn(*map(str, writer.notices))
             report.note(*of_a_kind(map(str, writer.notes)))
-        report.seconds["close"] = clock.perf_counter() - start
-        report.seconds["write"] = written
+        report.seconds |= {"close": clock.perf_counter() - start, "write": written}
         report.warn(*of_frames(report), *of_drawn(entered), *of_loops(self._loop.gaps()))
         telemetry = report.garments, report.frames
         report.note(*of_following(*telemetry), *of_inertia(*telemetry), *of_folds(*telemetry), *of_energy(*telemetry))
         report.note(*of_polygons(drawn_through))
         (report.warn if options.strict else report.note)(*of_rest(report.unsettled, len(report.frames)))
         say_what_was(report)
+        report.warn(*of_more(report))  # The last line of a run.
 
     def _write_frame(self, writer: LayerWriter | None, outcome: Outcome) -> float:
         """Write the result of one time code and record the result; returns the seconds spent writing."""
