@@ -250,7 +250,8 @@ class TestErrors:
         assert not list(tmp_path.iterdir())
 
     def test_missing_package_is_named(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-        monkeypatch.delitem(sys.modules, "physgraph_usd.shot.page.preview", raising=False)
+        for module in ("stopped", "page.frames", "page.preview"):
+            monkeypatch.delitem(sys.modules, f"physgraph_usd.shot.{module}", raising=False)
         monkeypatch.setitem(sys.modules, "PIL", None)
         layer = tmp_path / "a.usdc"
         layer.touch()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pytest
@@ -14,8 +14,8 @@ from shots import cloth_shot, command, fine, refine, run
 
 from physgraph_usd.errors import GarmentError
 from physgraph_usd.shot.estimate import cannot_fit, estimate
+from physgraph_usd.shot.forecast import Forecast
 from physgraph_usd.shot.refine import inspect_shot
-from physgraph_usd.shot.run import ending
 
 
 @pytest.mark.parametrize("kind", ["quads", "triangles", "ngons", "mixed"])
@@ -47,15 +47,32 @@ def test_the_estimate_is_within_a_factor_of_two_of_what_a_run_takes(tmp_path: Pa
 
 
 def test_a_long_run_says_after_three_frames_when_it_will_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    assert re.fullmatch(r"3 of 48 frames in 30 s: all in about 8 min more, at \d\d:\d\d", ending(30.0, 10.0, 48, 1))
-    assert "about 4 min more" in ending(30.0, 10.0, 48, 2)
-    assert "about 4 min more" in ending(30.0, 20.0, 48, 1)  # The first frame is no measure of the others.
-    assert ending(0.3, 0.1, 48, 1) == ""
-    monkeypatch.setattr("physgraph_usd.shot.run.LONG_RUN", 0.0)
+    whole = r"3 of 48 frames in 30 s: all in about 8 min more, at \d\d:\d\d"
+    assert re.fullmatch(whole, messages(48, 1, [10.0, 20.0, 30.0])[-1])
+    assert "about 4 min more" in messages(48, 2, [10.0, 20.0, 30.0])[-1]
+    assert "about 4 min more" in messages(48, 1, [20.0, 25.0, 30.0])[-1]  # The first frame is no measure of the others.
+    assert messages(48, 1, [0.1, 0.2, 0.3]) == [""] * 3
+    monkeypatch.setattr("physgraph_usd.shot.forecast.LONG_RUN", 0.0)
     shot = cloth_shot(tmp_path / "shot.usda", times=(1.0, 2.0, 3.0, 4.0, 5.0))
     done = run("refine", shot, "-o", tmp_path / "out.usdc", "--level", 0)
     assert done.exit_code == 0, done.output
     assert "3 of 5 frames in " in done.output
+
+
+def messages(count: int, workers: int, ends: Sequence[float]) -> list[str]:
+    """The forecasts after frames that end at these times [s]."""
+    forecast = Forecast(count, workers)
+    return [forecast.after(end) for end in ends]
+
+
+def test_a_forecast_is_revised_where_frames_become_slower():
+    """Ten frames of 10 s and ten of 40 s: half of the run is in the frames that the first forecast did not know."""
+    ends = [10.0 * k for k in range(1, 11)] + [100.0 + 40.0 * k for k in range(1, 11)]
+    found = [text for text in messages(20, 1, ends) if text]
+    assert [text.partition(" frames")[0] for text in found] == ["3 of 20", "11 of 20", "14 of 20"]
+    assert "about 3 min more" in found[0]
+    assert "about 4 min more" in found[-1]
+    assert len([text for text in messages(20, 1, [10.0 * k for k in range(1, 21)]) if text]) == 1
 
 
 def test_what_cannot_fit_is_refused_with_the_level_that_can():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import time
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,7 +14,7 @@ from shots import CLOTH, cloth_shot, faults, refine, run, sample_times
 
 from physgraph_usd.shot.notes import of_energy
 from physgraph_usd.shot.report import RefineReport
-from physgraph_usd.shot.warnings import WARNINGS, Entries, of_contact
+from physgraph_usd.shot.warnings import WARNINGS, Entries, of_contact, of_more
 from physgraph_usd.solver import deadline
 
 
@@ -52,12 +53,42 @@ class TestContact:
         remedy = WARNINGS["contact"].remedy
         entries: Entries = {1.0: entry("/Body", 10, 1), 2.0: entry("/Body", 1196, 174), 3.0: entry("/Body", 9, 0)}
         assert list(of_contact({"path": "/A"}, entries)) == [
-            f"</A> at time code 2: 174 crossings with </Body> (1,196 in the cage) are left; {remedy}; "
+            f"</A> at time code 2: 174 crossings with </Body> (1,196 in the subdivided cage) are left; {remedy}; "
             "also at time code 1"
         ]
         assert list(of_contact({"path": "/A"}, {1.0: entry("cloth", 3, 1)})) == [
-            f"</A> at time code 1: 1 crossing of cloth (3 in the cage) are left; {remedy}"
+            f"</A> at time code 1: 1 crossing of cloth (3 in the subdivided cage) is left; {remedy}"
         ]
+
+    def test_of_garments_that_are_counted_together_all_are_named(self):
+        entries: Entries = {1.0: entry("cloth", 3, 2) | {"together": ["/A", "/B"]}}
+        (said,) = of_contact({"path": "/A"}, entries)
+        assert "2 crossings of cloth (3 in the subdivided cage) are left, counted together with </B>; " in said
+        assert list(of_contact({"path": "/B"}, entries)) == []
+
+    def test_more_crossings_than_in_the_subdivided_cage_are_told_with_the_first_frame(self):
+        cloth, body = entry("cloth", 1015, 1421), entry("/Body", 5, 5)
+        both = {"contact": cloth["contact"] | body["contact"]}
+        frames = [
+            {"time": 1.0, "garments": [entry("cloth", 9, 9), entry("/Body", 0, 1)]},
+            {"time": 2.0, "garments": [both, entry("/Body", 2, 1)]},
+            {"time": 3.0, "garments": [entry("cloth", 9, 10), {}]},
+            {"time": 4.0, "error": "no sample"},
+        ]
+        report = RefineReport("s", None, {}, garments=[{"path": "/A"}, {"path": "/B"}], frames=frames)
+        more = "in the subdivided cage: more than by subdivision alone; look at these frames"
+        assert of_more(report) == [
+            f"</A> at time code 2: 1,426 crossings are left, 1,020 {more}; also at time code 3",
+            f"</B> at time code 1: 1 crossing is left, 0 {more}",
+        ]
+        assert of_more(RefineReport("s", None, {}, garments=[{"path": "/A"}], frames=frames[:1])) == []
+
+    def test_it_is_the_last_line_of_a_run(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+        monkeypatch.setattr("physgraph_usd.shot.run.of_more", lambda report: ["crossings"] * bool(report.frames))
+        shot = cloth_shot(tmp_path / "s.usdc", broken={3.0: 0.5})
+        done = run("refine", shot, "-o", tmp_path / "f.usdc", "--level", 1, "--steps", 0, "--strict")
+        *before, last = done.stderr.splitlines()
+        assert (last, [line for line in before if "did not settle" in line] != []) == ("warning: crossings", True)
 
     @pytest.mark.parametrize(("after", "code"), [(0, 0), (10, 0), (11, 3)])
     def test_a_strict_run_leaves_a_tenth_at_most(self, after: int, code: int):
@@ -89,7 +120,7 @@ def ends_at_look(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
 
     def end(looks: int) -> None:
         count = itertools.count()
-        clock = SimpleNamespace(perf_counter=lambda: 1e9 * max(next(count) - looks, 0))
+        clock = SimpleNamespace(process_time=lambda: 1e9 * max(next(count) - looks, 0))
         monkeypatch.setattr(deadline, "time", clock)
 
     return end
@@ -104,10 +135,31 @@ def test_a_frame_over_its_limit_is_written_and_named(tmp_path: Path):
         (CLOTH, 1.0, "time limit"),
         (CLOTH, 2.0, "time limit"),
     ]
-    said = "was not solved to its end: it reached its limit of time; see --frame-limit; also at time code 2"
+    sets = "--frame-limit sets it, in processor time, on cuda in wall time"
+    said = f"was not solved to its end: it reached its limit of time; {sets}; also at time code 2"
     assert [warning for warning in report.warnings if said in warning]
     assert report.exit_code == 3
     assert [frame["garments"][0]["time_limit"] for frame in report.frames] == [1e-6, 1e-6]
+
+
+def test_held_cloth_is_solved_on_after_a_frame_that_was_stopped(tmp_path: Path):
+    shot = cloth_shot(tmp_path / "s.usda", times=(1.0, 2.0, 3.0), frozen=True)
+    for limit, reused in ((1e-6, [False, False]), (None, [True, True])):
+        report = refine(shot, tmp_path / f"{limit}.usdc", frame_limit=limit)
+        starts = [str(frame["garments"][0]["start"]) for frame in report.frames[1:]]
+        assert ["reused" in start for start in starts] == reused
+
+
+def test_a_limit_counts_what_the_processor_does_and_on_a_card_what_passes():
+    for device, waited in (("cpu", False), ("cuda", True), ("cuda:1", True)):
+        with deadline.ends_after(0.05, deadline.clock_of(device)):
+            time.sleep(0.06)
+            assert deadline.is_over() == waited
+            began = time.process_time()
+            while time.process_time() < began + 0.06:
+                pass
+            assert deadline.is_over()
+    assert not deadline.is_over()
 
 
 def test_nothing_newly_crosses_wherever_a_frame_is_stopped(

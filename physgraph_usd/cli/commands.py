@@ -18,6 +18,7 @@ from ..shot.plain_json import to_json
 from ..solver.fabric import PRESETS
 from .options import (
     config_option,
+    existing_or_stopped,
     json_option,
     layer_argument,
     of_field,
@@ -68,6 +69,12 @@ session_options = together(
 )
 @click.option(
     "--root", type=click.Path(path_type=Path), help="Also write a root file (.usda) with the layer over the shot."
+)
+@click.option(
+    "--partial",
+    is_flag=True,
+    help="Write the finished frames alone, whatever seams move; CHUNK may be the .frames folder or the layer of a "
+    "stopped run.",
 )
 @overwrite_option
 def stitch(chunks: tuple[Path, ...], out: Path | None, *, check_seams: bool, seam_bound: float, **options: Any) -> None:
@@ -236,7 +243,7 @@ def sample(name: str, out: Path, *, overwrite: bool) -> None:
 
 
 @click.command()
-@layer_argument
+@click.argument("layer", type=click.Path(), callback=existing_or_stopped)
 @out_option("PNG|GIF", "Picture to write.")
 @click.option(
     "--shot", type=click.Path(dir_okay=False), help="The coarse shot.  [default: the shot named in the layer]"
@@ -250,11 +257,12 @@ def sample(name: str, out: Path, *, overwrite: bool) -> None:
 def preview(layer: str, out: Path, *, times: tuple[float, ...], **options: Any) -> None:
     """Draw the smoothly subdivided input beside the cloth of LAYER and print the picture's path.
 
-    A PNG shows a single time code, a GIF all time codes.
+    A PNG shows a single time code, a GIF all time codes. For a run that was stopped LAYER is the layer's name, or the
+    folder of finished frames beside it; only finished frames are drawn.
     """
-    from ..shot.page.preview import preview as draw
+    from ..shot.stopped import preview_any
 
-    click.echo(draw(layer, out, times=times or None, **options))
+    click.echo(preview_any(layer, out, times=times or None, **options))
 
 
 @click.command()

@@ -39,6 +39,20 @@ def _existing(ctx: click.Context, param: click.Parameter, path: str) -> str:
     return path
 
 
+def existing_or_stopped(ctx: click.Context, param: click.Parameter, path: str) -> str:
+    """Refuse a missing file, unless finished frames of a stopped run are at the path or beside it.
+
+    Args:
+        ctx: Context of the command.
+        param: The argument.
+        path: A file, or the folder or layer of a stopped run.
+    """
+    from ..usd.write.atomic import FRAMES_SUFFIX
+
+    is_stopped = Path(path).is_dir() or Path(path + FRAMES_SUFFIX).is_dir()
+    return path if is_stopped else _existing(ctx, param, path)
+
+
 def _type_of(name: str) -> click.ParamType | type:
     """Function to turn text into the value of a field."""
     option, kind = OPTIONS[name], str(_FIELDS[name].type).removesuffix(" | None")

@@ -90,11 +90,12 @@ def _jobs(ctx: click.Context, shots: tuple[str, ...], out: Path) -> list[Job]:
         layers = [out] if len(shots) == 1 else [out / Path(shot).stem for shot in shots]
     reports = _each_or_none(shots, ctx.params["report"], "--report", suffix="", accepts=(".json",))
     roots = _each_or_none(shots, ctx.params["root"], "--root", suffix=".usda", accepts=USD_SUFFIXES)
+    pictures = _each_or_none(shots, ctx.params["preview"], "--preview", suffix=".png", accepts=(".png",))
     jobs = []
-    for shot, layer, report, root in zip(shots, layers, reports, roots, strict=True):
+    for shot, layer, report, root, picture in zip(shots, layers, reports, roots, pictures, strict=True):
         values, sources = values_for(ctx, shot, ctx.command)
         options = {name: value for name, value in values.items() if name in OPTIONS and name != "progress"}
-        options |= {"report": report, "root": root, "sources": sources}
+        options |= {"report": report, "root": root, "preview": picture, "sources": sources}
         jobs.append((shot, layer, RefineOptions(**options)))
     return jobs
 

@@ -96,7 +96,7 @@ def solve_in_chunks(
     workers: int,
     movers: Movers | None,
     warn: Callable[..., object],
-    only: range | None = None,
+    only: Sequence[int] | None = None,
     preroll: int = PREROLL,
     start: Start | None = None,
 ) -> Generator[Outcome, None, None]:

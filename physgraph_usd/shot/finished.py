@@ -17,7 +17,7 @@ from ..usd.stage import open_stage
 from ..usd.view import StageView
 from ..version import __version__, code_digest
 from .frames import frames_folder
-from .options import RefineOptions
+from .options import PICTURE, RefineOptions
 from .report import LOG, RefineReport
 
 if TYPE_CHECKING:
@@ -50,7 +50,7 @@ def finished(shot: str | Path, out: Path, options: RefineOptions) -> RefineRepor
         LOG.info("skipped: %s is there", out, extra={"shot": report.shot})
         report.out, report.skipped = out, True
         return report
-    complete = options.resume and all(path.is_file() for _, path in options.targets(out))
+    complete = options.resume and all(path.is_file() for name, path in options.targets(out) if name != PICTURE)
     if options.dry_run or not complete or frames_folder(out).exists():
         return None
     try:

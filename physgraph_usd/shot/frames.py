@@ -24,7 +24,7 @@ import numpy as np
 from filelock import BaseFileLock, FileLock, Timeout
 
 from ..errors import LayerError, UsageError, counted
-from ..usd.write.atomic import HOST, check_no_link, make_file, temporary_path, write_text
+from ..usd.write.atomic import FRAMES_SUFFIX, HOST, check_no_link, make_file, temporary_path, write_text
 
 RUN = "run.json"
 """File with a record of everything the frames depend on."""
@@ -38,7 +38,6 @@ _NO_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP)
 CHUNK = "chunk"
 """Entry in a chunk's record: number of the first frame, and of the frame after the last."""
 _DONE, _FAILED = ".npz", ".failed.npz"
-_FRAMES = ".frames"
 _DAMAGED = (OSError, ValueError, KeyError, TypeError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error)
 """Errors of numpy and zipfile when reading a file not written by `FrameFolder.write`."""
 _NAME = re.compile(r"(\d+)(?:\.before(\d+))?(\.failed)?\.npz")
@@ -68,7 +67,7 @@ class Outcome:
 
 def frames_folder(layer: Path) -> Path:
     """The folder of a layer's finished frames."""
-    return layer.with_name(layer.name + _FRAMES)
+    return layer.with_name(layer.name + FRAMES_SUFFIX)
 
 
 @dataclass(frozen=True)
@@ -247,7 +246,7 @@ class FrameFolder(Finished):
             owner = "another run"
             with suppress(OSError, ValueError):
                 owner = file.read_text(encoding="utf-8") or owner
-            layer = self.folder.with_name(self.folder.name.removesuffix(_FRAMES))
+            layer = self.folder.with_name(self.folder.name.removesuffix(FRAMES_SUFFIX))
             raise LayerError(
                 f"{layer} is being made by {owner}; wait for it, end it, or name another layer"
             ) from timeout

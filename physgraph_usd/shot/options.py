@@ -10,6 +10,7 @@ import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,6 +26,8 @@ INTEGRATORS = ("physgraph", "quasi-newton")
 """Names of the solver's own methods in `integrate.METHODS`; repeated here because `integrate` imports torch."""
 REPORT_NAME, PAGE_NAME = "report.json", "report.html"
 """File names of the report and its page in a report folder."""
+PICTURE, PICTURE_SUFFIX = "the picture", ".png"
+"""Description of the picture of the first frame among a run's files, and its suffix."""
 LIST = "; repeatable"
 
 
@@ -95,7 +98,8 @@ class RefineOptions:
     budget_ms: float | None = _solver(None, "Time limit of the steps of a frame.", metavar="MS", above=0)
     frame_limit: float | None = _solver(
         None,
-        "Time limit per frame. A frame over the limit keeps its current state and is reported as not settled.  "
+        "Limit per frame in processor time, all threads together; on cuda in wall time. A frame over the limit keeps "
+        "its current state and is reported as not settled.  "
         "[default: 20 times the time of the shot's frames, at least two minutes]",
         metavar="SECONDS",
         above=0,
@@ -137,6 +141,11 @@ class RefineOptions:
     )
     report: Path | None = _files(
         None, "Write a report of the run, also of a failed run; DIR: as a page too.", metavar="FILE.json|DIR"
+    )
+    preview: Path | None = _files(
+        None,
+        "Draw the first refined frame as soon as it is done; with --resume an existing picture stays.",
+        metavar="FILE.png",
     )
     overwrite: bool = _files(False, "Replace files that exist.")
     dry_run: bool = _files(False, "Print the work to be done; write nothing.")
@@ -238,6 +247,7 @@ class RefineOptions:
             raise UsageError(
                 "root and skip existing are for layers, preroll makes a chunk: give stitch the root, or resume"
             )
+        _check_picture(self.preview)
         if self.device not in ("cpu", "auto") and not self.device.startswith("cuda"):
             raise UsageError(f"unknown device '{self.device}'; known: cpu, cuda, auto")
 
@@ -250,6 +260,7 @@ class RefineOptions:
             report = json_of(Path(self.report))
             files.append(("the report", report))
             files += [("the report's page", report.with_name(PAGE_NAME))] if report != self.report else []
+        files += [] if (picture := picture_of(self)) is None else [(PICTURE, picture)]
         return files
 
 
@@ -267,6 +278,19 @@ def _check(name: str, value: Any, option: Option) -> None:
         raise UsageError(f"{name} is {value:g}: give {option.least} or more")
     if option.above is not None and value is not None and not value > option.above:
         raise UsageError(f"{name} is {value:g}: give a value above {option.above}")
+
+
+def picture_of(options: RefineOptions) -> Path | None:
+    """The picture of the first frame, if one is to be drawn: a resumed run leaves an existing one."""
+    picture = None if options.preview is None else Path(options.preview)
+    return None if picture is None or (options.resume and picture.is_file()) else picture
+
+
+def _check_picture(picture: Path | None) -> None:
+    if picture is not None and Path(picture).suffix.lower() != PICTURE_SUFFIX:
+        raise UsageError(f"cannot draw {picture}; known suffixes: {PICTURE_SUFFIX}")
+    if picture is not None and find_spec("PIL") is None:
+        raise UsageError("a preview needs Pillow, which is not installed: pip install pillow")
 
 
 def json_of(report: Path) -> Path:

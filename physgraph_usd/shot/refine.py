@@ -14,7 +14,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
-from ..errors import LayerError, PhysGraphError, StageError, UsageError
+from ..errors import NOTICE, LayerError, PhysGraphError, StageError, UsageError
 from ..interrupts import SIGNALLED, exit_code_of, importing, signals_noted
 from ..usd.files import check_targets, files_of
 from ..usd.provenance import write_root
@@ -25,11 +25,11 @@ from ..usd.write.atomic import check_folder_of, check_place
 from .describe import begin_report, describe, describe_meshes, too_large
 from .farm import shots_at_once
 from .finished import Job, check_jobs, finished, results
-from .frames import kept_for
+from .frames import Outcome, kept_for
 from .opened import open_for
-from .options import RefineOptions, json_of
+from .options import RefineOptions, json_of, picture_of
 from .processes import call_each, memory_is_named
-from .report import DONE, RefineReport, is_of_failure
+from .report import DONE, LOG, RefineReport, is_of_failure
 from .warnings import WARNINGS
 
 if TYPE_CHECKING:
@@ -68,7 +68,9 @@ def refine_shot(shot: str | Path, out: str | Path, options: RefineOptions = DEFA
         _check_new(out, options)
         with importing():
             from .run import Run
-        write_all(Run(opened, out, options, report), out)
+        picture = picture_of(options)
+        show_first = None if picture is None else partial(_draw_first, report, opened, options, picture)
+        write_all(Run(opened, out, options, report, show_first=show_first), out)
     return report
 
 
@@ -238,7 +240,7 @@ def _check_of_stage(stage: Stage, options: RefineOptions) -> None:
     options.check()
     if options.workers > 1:
         raise UsageError(f"workers is {options.workers}: an open stage lives in one process; save it, or take 1")
-    for name in ("resume", "dry_run", "root", "scheduler", "preroll"):
+    for name in ("resume", "dry_run", "root", "scheduler", "preroll", "preview"):
         if getattr(options, name):
             raise UsageError(f"{name} is for layers on disk; an open stage is refined into a layer in memory")
     if options.report is not None:
@@ -292,6 +294,18 @@ def _write_report(report: RefineReport, path: Path, opened: Shot) -> None:
         from .page.report import write_folder
 
         write_folder(report, path, opened)
+
+
+def _draw_first(report: RefineReport, opened: Shot, options: RefineOptions, picture: Path, outcome: Outcome) -> None:
+    """Draw the first refined frame; a picture that cannot be drawn is a warning, because the frames are worth more."""
+    from .page.frames import draw_frames
+
+    levels = [garment["level"] for garment in report.garments]
+    try:
+        draw_frames(opened, levels, [outcome], picture, options=options, overwrite=options.overwrite)
+        LOG.log(NOTICE, "%s shows the first frame", picture, extra={"shot": report.shot})
+    except (LayerError, StageError, UsageError) as error:
+        report.warn(WARNINGS["undrawn"](picture=picture, error=error))
 
 
 def _write_failure(report: RefineReport, options: RefineOptions) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import sys
 import time as clock
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing, nullcontext
 from dataclasses import dataclass
 from functools import cached_property
@@ -28,6 +28,7 @@ from .cuts import Cuts, Loop
 from .describe import say_what_was
 from .farm import connected
 from .finished import made_from
+from .forecast import Forecast
 from .frames import CHUNK, FrameFolder, Outcome, frames_folder
 from .notes import of_energy, of_folds, of_following, of_given_up, of_inertia, of_rest
 from .options import RefineOptions
@@ -37,14 +38,12 @@ from .settled import unsettled_frames
 from .skin import DrawnCloth, Shown, frames_compared, of_polygons, shown_through
 from .solve import Outcomes, ShotSolver
 from .untagged import AUTO
-from .warnings import WARNINGS, of_drawn, of_frames, of_loops
+from .warnings import WARNINGS, of_drawn, of_frames, of_loops, of_more
 
 try:
     import resource
 except ImportError:  # Windows has none.
     resource = None
-TIMED_FRAMES, LONG_RUN = 3, 60.0
-"""Frames after which a run announces its end, and least remaining time for an announcement [s]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +56,7 @@ class Stored:
         outcomes: The frames.
     """
 
-    numbers: range
+    numbers: Sequence[int]
     record: Mapping[str, Any]
     outcomes: Outcomes
 
@@ -71,6 +70,7 @@ class Run:
         out: The layer to write, or None for a layer in memory.
         report: The report, with the garments filled in.
         stored: Frames to write instead of solving; None to solve.
+        show_first: Called with the first refined frame as soon as it is done; or None.
     """
 
     shot: Shot
@@ -78,6 +78,7 @@ class Run:
     options: RefineOptions
     report: RefineReport
     stored: Stored | None = None
+    show_first: Callable[[Outcome], None] | None = None
 
     def refine(self) -> Layer | None:
         """Solve and write all frames; returns the layer if in memory.
@@ -122,7 +123,7 @@ class Run:
         options, chunk = self.options, self._is_chunk
         decides = {"levels": self.solver.levels, "times": self._times, "report": options.report is not None}
         if chunk:
-            decides[CHUNK] = [self._numbers.start, self._numbers.stop]
+            decides[CHUNK] = [self._numbers[0], self._numbers[-1] + 1]
         meshes = fine_meshes(self.shot.scene.garments, refinements)
         counts = [mesh.vertex_count for mesh in meshes]
         return FrameFolder(
@@ -146,7 +147,7 @@ class Run:
         return list(self.shot.scene.times) or [None]
 
     @cached_property
-    def _numbers(self) -> range:
+    def _numbers(self) -> Sequence[int]:
         """Numbers of the time codes to solve: all open time codes, or for a chunk those of the shot in ``frames``."""
         if self.stored is not None:
             return self.stored.numbers
@@ -186,6 +187,7 @@ class Run:
             yield from self.solver(self._times)
             return
         _warn_of_finished(self, frames, len(self._numbers))
+        _announce_preroll(self, frames)
         with _processes(self.options) as start:
             chunks = solve_in_chunks(
                 self.solver,
@@ -204,7 +206,8 @@ class Run:
     def _write_frames(self, writer: LayerWriter | None, solved: Outcomes, count: int) -> None:
         """Write each frame as soon as solved, then close the layer; a chunk's frames are already in its folder."""
         report, options = self.report, self.options
-        written, first, shot, began = 0.0, 0.0, {"shot": report.shot}, clock.perf_counter()
+        written, shot, began = 0.0, {"shot": report.shot}, clock.perf_counter()
+        forecast = Forecast(count, options.workers)
         compared = frames_compared(count if options.contact != "off" else 0)
         drawn_through, entered = list[Shown](), dict[float | None, dict[str, float]]()
         drawn = DrawnCloth(self.shot, self.solver.levels if options.report and options.scheme == "keep" else ())
@@ -213,9 +216,7 @@ class Run:
             drawn_through += shown_through(self.shot, outcome) if done - 1 in compared else []
             entered[outcome.time] = drawn.depths(outcome) if done - 1 in compared else {}
             LOG.info("frame %d of %d: time code %s", done, count, named_time(outcome.time), extra=shot)
-            spent = clock.perf_counter() - began
-            first = spent if done == 1 else first
-            if done == TIMED_FRAMES < count and (message := ending(spent, first, count, options.workers)):
+            if message := forecast.after(clock.perf_counter() - began):
                 LOG.log(NOTICE, "%s", message, extra=shot)
             LOG.debug("%s", outcome.record, extra=shot)
             if options.progress:
@@ -234,14 +235,14 @@ class Run:
             writer.close(lacking=lacking)
             report.warn(*map(str, writer.notices))
             report.note(*of_a_kind(map(str, writer.notes)))
-        report.seconds["close"] = clock.perf_counter() - start
-        report.seconds["write"] = written
+        report.seconds |= {"close": clock.perf_counter() - start, "write": written}
         report.warn(*of_frames(report), *of_drawn(entered), *of_loops(self._loop.gaps()))
         telemetry = report.garments, report.frames
         report.note(*of_following(*telemetry), *of_given_up(*telemetry), *of_inertia(*telemetry))
         report.note(*of_folds(*telemetry), *of_energy(*telemetry), *of_polygons(drawn_through))
         (report.warn if options.strict else report.note)(*of_rest(report.unsettled, len(report.frames)))
         say_what_was(report)
+        report.warn(*of_more(report))  # The last line of a run.
 
     def _write_frame(self, writer: LayerWriter | None, outcome: Outcome) -> float:
         """Write the result of one time code and record the result; returns the seconds spent writing."""
@@ -252,6 +253,8 @@ class Run:
             self.report.failed[name] = error
             self.report.warn(WARNINGS["failed"](name=name, error=error))
             return 0.0
+        if self.show_first is not None and len(self.report.frames) == len(self.report.failed) + 1:
+            self.show_first(outcome)
         if writer is None:
             return 0.0
         start, records = clock.perf_counter(), self.report.frames
@@ -289,6 +292,14 @@ def _warn_of_finished(run: Run, frames: FrameFolder, count: int) -> None:
         run.report.warn(WARNINGS["resumed"](kept=reused, again=again))
 
 
+def _announce_preroll(run: Run, frames: FrameFolder) -> None:
+    """Say how many frames a chunk solves before its own."""
+    early = min(run._preroll, run._numbers[0])
+    if run._is_chunk and early and not frames.kept:
+        first = f"before time code {named_time(run._times[run._numbers[0]])} the pre-roll is solved"
+        LOG.log(NOTICE, "%s: %s", first, counted(early, "frame"), extra={"shot": run.report.shot})
+
+
 def _processes(options: RefineOptions) -> AbstractContextManager[Start | None]:
     """Starter of chunks: on a farm, in processes of this machine, or None to solve in this process."""
     if options.scheduler:
@@ -319,26 +330,6 @@ def numbers_in(every: Sequence[float], frames: tuple[float, float] | None) -> ra
 def fine_meshes(garments: Sequence[Garment], refinements: Sequence[Sequence[Refinement]]) -> list[PolygonMesh]:
     """The finest mesh of each garment."""
     return [[cage, *steps][-1].mesh for cage, steps in zip(garments, refinements, strict=True)]
-
-
-def ending(seconds: float, first: float, count: int, workers: int) -> str:
-    """When a run will end, as text; "" if soon.
-
-    The first frame starts from the cage and takes longer than the others, which the rest of the run is judged by.
-
-    Args:
-        seconds: Duration of the first `TIMED_FRAMES` frames [s].
-        first: Duration of the first of them [s].
-        count: Frames of the run.
-        workers: Processes sharing the frames; the first frames to arrive are the first process's.
-    """
-    frames = -(-count // workers) - TIMED_FRAMES
-    remaining = frames * (seconds - first) / (TIMED_FRAMES - 1)
-    if remaining < LONG_RUN:
-        return ""
-    at = clock.strftime("%H:%M", clock.localtime(clock.time() + remaining))
-    duration = f"{remaining / 60.0:.0f} min" if remaining < 5400.0 else f"{remaining / 3600.0:.1f} h"
-    return f"{TIMED_FRAMES} of {count} frames in {seconds:.0f} s: all in about {duration} more, at {at}"
 
 
 def peak_memory_mb() -> float | None:

@@ -24,6 +24,7 @@ from .joined import Mover, Positions, counts, worse
 from .opened import open_for
 from .options import RefineOptions
 from .processes import cores
+from .run_in import RunIn
 
 Outcomes = Generator[Outcome, None, None]
 
@@ -63,7 +64,8 @@ class ShotSolver:
     def __call__(self, times: Sequence[float | None]) -> Outcomes:
         """Solve time codes in order; a failed one yields its error, the next starts from the last solved frame."""
         shot, refiner = self._built()
-        self._begin(shot, refiner, times)
+        seconds = self._begin(shot, refiner, times)
+        before: dict[str, object] = {"run_in_ms": round(1e3 * seconds, 3)} if seconds else {}
         for time in times:
             began = clock.perf_counter()
             try:
@@ -71,11 +73,12 @@ class ShotSolver:
                     frame = shot.frame(time)
                     read_ms = round(1e3 * (clock.perf_counter() - began), 3)
                     state = refiner.solve(frame, sampled_at(shot, time))
-                record = {"time": time, "read_ms": read_ms, "garments": list(state.telemetry)}
+                record = {"time": time, "read_ms": read_ms, "garments": list(state.telemetry)} | before
                 outcome = Outcome(time, state.points, state.reused, record, state.heat)
             except (SolveError, StageError) as error:
                 outcome = Outcome(time, (), (), {"time": time, "error": str(error)})
             leave_if_asked()  # A signal may have cut the frame short.
+            before = {}
             yield outcome
         self._refiner = refiner
 
@@ -119,19 +122,25 @@ class ShotSolver:
         )
         return self._opened, refiner
 
-    def _begin(self, shot: Shot, refiner: Refiner, times: Sequence[float | None]) -> None:
-        """Start a shot in the middle, if its cage crosses itself, with the cage advanced from an earlier frame."""
+    def _begin(self, shot: Shot, refiner: Refiner, times: Sequence[float | None]) -> float:
+        """Start a shot in the middle, if its cage crosses itself, with the cage advanced from an earlier frame.
+
+        Returns:
+            Wall time of the run-in [s]; 0 without one.
+        """
         earlier = [] if not times or times[0] is None else shot.times_until(times[0])
+        run_in = RunIn(shot.frame, earlier, self._shot)
         advanced = cages_walked(
             shot.scene,
             self._options.solve_settings(),
-            shot.frame,
+            run_in,
             times=earlier,
             device=device_of(self._options.device),
             threads=self._threads,
         )
         if advanced is not None:
             refiner.begin_at(advanced[0], since=advanced[1])
+        return run_in.seconds
 
 
 def sampled_at(shot: Shot, time: float | None) -> list[bool]:

@@ -1,5 +1,7 @@
 """Joins chunks, the folders of finished frames written by `refine --preroll`, into a layer with the ordinary writer.
 
+The finished frames of a stopped run, and chunks with missing frames, make a partial layer, to be looked at.
+
 Each chunk begins a few frames early, in the pre-roll. The previous chunk holds the same frames: `joined` blends the two
 solutions over the pre-roll.
 """
@@ -9,7 +11,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from math import ceil
 from pathlib import Path
@@ -22,7 +24,7 @@ from ..solver.level import refine_garments
 from ..usd.read.reader import Shot
 from .chunks import frames_in_order
 from .finished import check_jobs, made_from
-from .frames import CHUNK, Finished, Outcome, record_in
+from .frames import CHUNK, Finished, Outcome, frames_folder, record_in
 from .joined import Both, Joint, between, join
 from .opened import open_for
 from .options import RefineOptions
@@ -30,6 +32,7 @@ from .refine import check_places, running, write_all
 from .report import RefineReport
 from .run import Run, Stored, fine_meshes, numbers_in
 from .solve import ShotSolver
+from .warnings import WARNINGS
 
 SEAM_BOUND = 0.05
 """Largest increase of a frame's move by a seam, RMS over a garment, in mean fine edges; figures in `docs/farm.md`."""
@@ -65,8 +68,8 @@ class Seam:
         return f"{move}, {extent}" + (f" ({self.why})" if self.why else "")
 
 
-class _Chunk(Finished):
-    """A chunk's folder.
+class Chunk(Finished):
+    """The folder of a chunk, or of the finished frames of a stopped run.
 
     Attributes:
         run: The record of the run.
@@ -102,20 +105,22 @@ class _Chunk(Finished):
 
     def options(self, **more: Any) -> RefineOptions:
         """Options for joining: without weights and on the CPU, because the frames are already solved."""
-        ignored = ("frames", "preroll", "weights", "device")
+        ignored = ("preroll", "weights", "device", *(("frames",) if CHUNK in self.run else ()))
         plain = {name: value for name, value in self.run["options"].items() if name not in ignored}
+        plain |= {"frames": tuple(plain["frames"])} if plain.get("frames") else {}
         paths = "absolute" if Path(self.run["shot"]).is_absolute() else "relative"
         return RefineOptions(**plain, asset_paths=paths, **more)
 
 
 @dataclass(eq=False)
 class _Joins:
-    """Chunks of an open shot to join, and the measured seams."""
+    """Chunks of an open shot to join, and the measured seams; ``numbers`` are the frames of the layer, None for all."""
 
-    parts: Sequence[_Chunk]
+    parts: Sequence[Chunk]
     shot: Shot
     bound: float
     warn: Callable[..., object]
+    numbers: Sequence[int] | None = None
     seams: list[Seam] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -126,7 +131,9 @@ class _Joins:
             part.counts = tuple(mesh.vertex_count for mesh in self.meshes)
         self.chunks = {k: part for part in self.parts for k in part.numbers}
         starts = {start: first for part in self.parts for start, first in part.seams.items()}
-        self.starts = {start: first for start, first in starts.items() if {start - 1, start} <= self.chunks.keys()}
+        wanted = {*(self.chunks if self.numbers is None else self.numbers)}
+        self.starts = {start: first for start, first in starts.items() if {start - 1, start} <= wanted}
+        self._anew = {number for number in wanted if number in starts or number - 1 not in wanted}
 
     def outcomes(self, numbers: Iterable[int]) -> Generator[Outcome, None, None]:
         """Frames by number, joined, then a check of the seams (LayerError)."""
@@ -144,7 +151,8 @@ class _Joins:
     def _read(self, index: int, seam: int | None) -> Outcome:
         time = self.run["times"][index]
         if outcome := self.chunks[index if seam is None else seam].read(index, time, seam=seam):
-            return outcome
+            kept = () if index in self._anew and seam is None else outcome.reused  # No frame before, or not its own.
+            return replace(outcome, reused=kept or (False,) * len(outcome.reused))
         raise LayerError(f"the result of time code {time} is gone; refine it anew by --resume")
 
     def _measure(self, seam: int, both: Both, joint: Joint) -> None:
@@ -186,12 +194,14 @@ def stitch(
     root: str | Path | None = None,
     report_to: str | Path | None = None,
     overwrite: bool = False,
+    partial: bool = False,
 ) -> tuple[RefineReport, list[Seam]]:
     """Join chunks of one shot into one layer. Joined cloth is moved without new intersections or vertices in bodies.
 
     Args:
         chunks: Folders written by `refine_shot` with ``preroll``, in any order; a folder of chunks stands for all
-            inside.
+            inside. With ``partial`` also the folder of the finished frames of a stopped run, alone, or the layer that
+            the run would have written.
         out: Layer to write.
         frames: First and last time code of the layer; None for the whole shot.
         seam_bound: Largest increase of a frame's move by a seam, RMS over a garment, in mean fine edge lengths.
@@ -199,6 +209,8 @@ def stitch(
         root: A small root layer to write, with the layer over the shot.
         report_to: Path of the report, a JSON file or a folder.
         overwrite: Whether existing files may be replaced.
+        partial: Write the finished frames and leave out the missing ones, with a warning that names them. Seams may
+            then move by any distance.
 
     Returns:
         The report, as of one run of all frames, and the seams in order.
@@ -209,20 +221,26 @@ def stitch(
         StageError: The shot cannot be read.
         LayerError: A frame is damaged, a seam moves too far, or the layer cannot be written or is invalid.
     """
-    out, parts = Path(out), _opened(chunks)
+    out, parts = Path(out), chunks_in(chunks, partial=partial)
     _check_alike(parts, one_shot=shot is None)
-    numbers = _check_frames(parts, frames)
+    numbers, missing = _check_frames(parts, frames, partial=partial)
+    if partial and any(part.folder.resolve() == frames_folder(out).resolve() for part in parts):
+        raise UsageError(f"{out} is the layer of the run that was stopped; name another for a part of its frames")
     options = parts[0].options(overwrite=overwrite, root=root and Path(root), report=report_to and Path(report_to))
     source = Path(shot or parts[0].shot)
     check_jobs([(source, out, options)])
     check_places(out, options)
     with running(str(source), options, out=out) as (opened, report):
-        _check_same_shot(parts[0], made_from(opened, out, options))
+        check_same_shot(parts[0], made_from(opened, out, options))
         recorded = {name: value for name, value in parts[0].run["options"].items() if name not in _OF_ONE_CHUNK}
         recorded |= {"frames": list(frames)} if frames else {}
         recorded["preroll"] = max(part.run["options"].get("preroll", 0) for part in parts)
         report.options = dict(recorded)
-        joins = _Joins(parts, opened, seam_bound, report.warn)
+        if missing:
+            every, count = parts[0].run["times"], len(numbers) + len(missing)
+            spans = _spans([every[number] for number in missing], every)
+            report.warn(WARNINGS["partial"](count=len(numbers), frames=counted(count, "frame"), missing=spans))
+        joins = _Joins(parts, opened, np.inf if partial else seam_bound, report.warn, numbers)
         record = {"options": recorded, "chunks": [_span(part.times) for part in parts]}
         _make_folder(out.resolve().parent)
         write_all(Run(opened, out, options, report, Stored(numbers, record, joins.outcomes(numbers))), out)
@@ -251,9 +269,9 @@ def check_seams(
         UsageError: Chunks are not of one shot, version and set of options.
         LayerError: A frame is damaged, or a seam moves too far.
     """
-    parts = _opened(chunks)
+    parts = chunks_in(chunks)
     if of is not None:
-        (chunk,) = _opened([of])
+        (chunk,) = chunks_in([of])
         parts = [part for part in parts if part.shot == chunk.shot and part.is_whole]
     pairs = [pair for pair in pairwise(parts) if pair[0].numbers[-1] + 1 == pair[1].numbers[0]]
     if of is not None:
@@ -263,7 +281,7 @@ def check_seams(
         return []
     _check_alike(parts, one_shot=shot is None)
     with closing(open_for(str(shot or parts[0].shot), parts[0].options())) as opened:
-        _check_same_shot(parts[0], made_from(opened, parts[0].folder, parts[0].options()))
+        check_same_shot(parts[0], made_from(opened, parts[0].folder, parts[0].options()))
         joins = _Joins(parts, opened, seam_bound, lambda *_: None)
         before = [k for start, first in joins.starts.items() for k in range(first, start)]
         deque(joins.outcomes(sorted(joins.chunks.keys() & {*before})), maxlen=0)
@@ -278,21 +296,47 @@ def _make_folder(folder: Path) -> None:
         raise LayerError(f"cannot make the folder {folder}: {error.strerror}") from error
 
 
-def _opened(chunks: Sequence[str | Path]) -> list[_Chunk]:
-    """The chunks sorted by frames; unrelated entries in a folder of chunks are ignored."""
-    chunks_in: dict[Path, _Chunk] = {}
-    for place in map(Path, chunks):
+def chunks_in(places: Sequence[str | Path], *, partial: bool = False) -> list[Chunk]:
+    """The chunks sorted by frames; unrelated entries in a folder of chunks are ignored.
+
+    Args:
+        places: Folders of chunks and chunks.
+        partial: Whether a single place may be the folder of a stopped run's finished frames, or the run's layer.
+
+    Raises:
+        UsageError: A place is no such folder, or no frame is finished.
+    """
+    found: dict[Path, Chunk] = {}
+    for place in map(Path, places):
+        if partial and (folder := stopped_run(place)) is not None:
+            found[folder.resolve()] = Chunk(folder, record_in(folder))
+            continue
         run = record_in(place)
         inside = [] if run or not place.is_dir() else [child for child in sorted(place.iterdir()) if record_in(child)]
         if not inside and not _is_of_chunk(run):
-            raise UsageError(f"{place} is no chunk of a shot, nor a folder of chunks; refine with --preroll makes one")
+            other = "; --partial takes the finished frames of a stopped run" if stopped_run(place) else ""
+            remedy = f"refine with --preroll makes one{other}"
+            raise UsageError(f"{place} is no chunk of a shot, nor a folder of chunks; {remedy}")
         for folder in inside or [place]:
             if _is_of_chunk(record := record_in(folder)):
-                chunks_in[folder.resolve()] = _Chunk(folder, record)
-    parts = [part for part in chunks_in.values() if part.numbers]
+                found[folder.resolve()] = Chunk(folder, record)
+    parts = [part for part in found.values() if part.numbers]
     if not parts:
-        raise UsageError(f"there are no frames to stitch in {', '.join(map(str, chunks)) or 'no folders'}")
+        raise UsageError(f"there are no frames to stitch in {', '.join(map(str, places)) or 'no folders'}")
+    stopped = [part for part in parts if CHUNK not in part.run]
+    if stopped and len(parts) > 1:
+        raise UsageError(f"{stopped[0].folder} is of a stopped run, which is no chunk; give it alone")
     return sorted(parts, key=lambda part: part.numbers)
+
+
+def stopped_run(place: Path) -> Path | None:
+    """The folder of the finished frames of a stopped run, given the folder or the run's layer; None if it is neither.
+
+    A run that goes on has such a folder too.
+    """
+    folder = place if place.is_dir() else frames_folder(place)
+    run = record_in(folder)
+    return folder if CHUNK not in run and _is_of_chunk({CHUNK: [], **run}) else None
 
 
 def _is_of_chunk(run: Mapping[str, Any]) -> bool:
@@ -301,7 +345,7 @@ def _is_of_chunk(run: Mapping[str, Any]) -> bool:
     return all(isinstance(run.get(name), kind) for name, kind in kinds.items())
 
 
-def _check_alike(parts: Sequence[_Chunk], *, one_shot: bool) -> None:
+def _check_alike(parts: Sequence[Chunk], *, one_shot: bool) -> None:
     """Refuse chunks of different shots, versions or options."""
     first = parts[0]
     for part in parts[1:]:
@@ -318,7 +362,7 @@ def _check_alike(parts: Sequence[_Chunk], *, one_shot: bool) -> None:
             )
 
 
-def _check_same_shot(part: _Chunk, record: Mapping[str, Any]) -> None:
+def check_same_shot(part: Chunk, record: Mapping[str, Any]) -> None:
     """Refuse a shot changed since the chunk was refined, and a chunk of a different version of this package."""
     if _hashes(record) != _hashes(part.run):
         raise UsageError(f"the shot has changed since {part.folder} was refined from it; refine the chunks anew")
@@ -332,10 +376,16 @@ def _hashes(run: Mapping[str, Any]) -> list[tuple[str, str]]:
     return sorted((Path(name).name, str(value)) for name, value in run["inputs"].items())
 
 
-def _check_frames(parts: Sequence[_Chunk], frames: tuple[float, float] | None) -> range:
-    """Refuse missing, doubled or unrequested frames; returns the numbers of the requested frames."""
+def _check_frames(
+    parts: Sequence[Chunk], frames: tuple[float, float] | None, *, partial: bool
+) -> tuple[Sequence[int], Sequence[int]]:
+    """Refuse doubled frames and, unless ``partial``, missing or unrequested frames.
+
+    Returns:
+        Numbers of the requested frames, and of those of them that are missing.
+    """
     every = parts[0].run["times"]
-    owners: dict[int, list[_Chunk]] = {}
+    owners: dict[int, list[Chunk]] = {}
     for part in parts:
         for number in part.numbers:
             owners.setdefault(number, []).append(part)
@@ -345,16 +395,17 @@ def _check_frames(parts: Sequence[_Chunk], frames: tuple[float, float] | None) -
         times = _span([every[number] for number in doubled])
         raise UsageError(f"frames {times} are in more than one chunk: {', '.join(folders)}; leave one out")
     wanted = numbers_in([time for time in every if time is not None], frames)
-    missing = [every[number] for number in wanted if number not in owners]
-    if missing:
-        spans = ", ".join(f"{part.folder} ({_span(part.times)})" for part in parts)
-        remedy = "refine them, or go on by --resume"
-        raise UsageError(f"frames {_spans(missing, every)} are in no chunk; those there: {spans}; {remedy}")
-    for part in parts:
+    missing = [number for number in wanted if number not in owners]
+    if missing and (not partial or len(missing) == len(wanted)):
+        spans = ", ".join(f"{part.folder} ({_spans(part.times, every)})" for part in parts)
+        remedy = "refine them, or go on by --resume" + ("" if partial else ", or leave them out by --partial")
+        names = _spans([every[number] for number in missing], every)
+        raise UsageError(f"frames {names} are in no chunk; those there: {spans}; {remedy}")
+    for part in () if partial else parts:
         if not set(part.numbers) <= set(wanted):
             outside = f"{part.folder} holds the frames {_span(part.times)}, of which some lie outside --frames"
             raise UsageError(f"{outside}; leave it out")
-    return wanted
+    return [number for number in wanted if number in owners], missing
 
 
 def _span(times: Sequence[float]) -> str:

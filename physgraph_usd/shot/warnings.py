@@ -78,11 +78,12 @@ WARNINGS = {
     ),
     LIMITED: Kind(
         "the frame reached its limit of time",
-        "the frame took over 20 times as long as the others and was stopped. The cloth is valid but has not converged, "
-        "and depends on the machine's speed. Look at the cage and the bodies there; `--frame-limit SECONDS` "
-        "sets the limit",
+        "the frame took over 20 times the processor time of the others, or more than `--frame-limit`, and was stopped. "
+        "The cloth is valid but has not converged, and depends on the processor's speed. On a graphics card wall time "
+        "counts, and other programs change it too. The next frame continues from there. Look at the cage and the "
+        "bodies; `--frame-limit SECONDS` sets the limit",
         "the frame was not solved to its end: it reached its limit of time",
-        "see --frame-limit",
+        "--frame-limit sets it, in processor time, on cuda in wall time",
     ),
     UNSOLVED: Kind(
         "it follows its cage there, not solved",
@@ -94,8 +95,15 @@ WARNINGS = {
         "crossings or vertices inside a body are left",
         "`--heat-map` writes where, so that you can mend the cage there; `physgraph:collider:side` corrects a side "
         "that was guessed wrong. Some frames come out clean if they are refined alone (`--frames`)",
-        "{left} are left",
+        "{left} {are} left{together}",
         "--heat-map shows where, to mend the cage there",
+    ),
+    "more": Kind(
+        "more crossings are left than there are in the subdivided cage",
+        "the last line of a run. The cloth is worse there than plain subdivision: look at it before you use it. "
+        "`--heat-map` writes where; mend the cage there, or refine those frames alone (`--frames`)",
+        "{left} {are} left{together}, {before:,} in the subdivided cage: more than by subdivision alone",
+        "look at these frames",
     ),
     "drawn": Kind(
         "the surface that renderers draw enters a body",
@@ -165,6 +173,17 @@ WARNINGS = {
         "no action needed; folds may differ slightly from an uninterrupted run",
         "{kept} are those of a run that was interrupted; the others are solved{again}",
         "folds that can lie in several ways may lie otherwise there than in an undisturbed run",
+    ),
+    "partial": Kind(
+        "the layer has a part of the frames",
+        "`stitch --partial` leaves out the frames that are not finished. `refine --resume` solves them",
+        "the layer has {count} of {frames}; not finished: {missing}",
+        "refine --resume solves them",
+    ),
+    "undrawn": Kind(
+        "the first frame is not drawn",
+        "the text after it says why; the frames are refined without the picture",
+        "the first frame is not drawn into {picture}: {error}",
     ),
     "slower": Kind(
         "cholespy is not installed",
@@ -259,8 +278,42 @@ def of_contact(garment: Mapping[str, Any], entries: Entries) -> Iterator[str]:
     remaining = {time: counts for time, counts in remaining.items() if counts}
     if remaining:
         times = sorted(remaining, key=lambda time: -sum(after for _, after, _ in remaining[time]))  # The worst first.
-        named = [f"{text} ({before:,} in the cage)" for text, _, before in remaining[times[0]]]
-        yield WARNINGS["contact"](garment["path"], times, left=", ".join(named))
+        counts = remaining[times[0]]
+        named = [f"{text} ({before:,} in the subdivided cage)" for text, _, before in counts]
+        are = "is" if len(counts) == 1 and counts[0][1] == 1 else "are"
+        together = _together(garment["path"], entries[times[0]])
+        yield WARNINGS["contact"](garment["path"], times, left=", ".join(named), are=are, together=together)
+
+
+def of_more(report: RefineReport) -> list[str]:
+    """A warning for each garment with more crossings in a frame than its subdivided cage, with the first such frame."""
+    found: dict[str, list[tuple[float | None, int, int, str]]] = {}
+    for frame in report.frames:
+        for garment, entry in zip(report.garments, frame.get("garments", ()), strict=False):
+            after, before = (_crossings(entry.get("contact") or {}, side) for side in ("after", "before"))
+            if after > before and is_first(garment["path"], entry):
+                figures = frame["time"], after, before, _together(garment["path"], entry)
+                found.setdefault(garment["path"], []).append(figures)
+    warnings = []
+    for path in [garment["path"] for garment in report.garments if garment["path"] in found]:
+        frames = found[path]
+        _, after, before, together = frames[0]
+        left, are = counted(after, "crossing"), "is" if after == 1 else "are"
+        times = [time for time, *_ in frames]
+        warnings.append(WARNINGS["more"](path, times, left=left, are=are, before=before, together=together))
+    return warnings
+
+
+def _crossings(contact: Mapping[str, Any], side: str) -> int:
+    """Crossings of cloth and with all bodies, "before" or "after"."""
+    measured = [contact.get("cloth") or {}, *(contact.get("bodies") or {}).values()]
+    return sum(int(each.get(side, {}).get("crossings", 0)) for each in measured)
+
+
+def _together(path: str, entry: Mapping[str, Any]) -> str:
+    """Text naming the other garments that figures of a garment count too; "" for a garment solved by itself."""
+    others = [f"<{other}>" for other in entry.get("together") or () if other != path]
+    return f", counted together with {', '.join(others)}" if others else ""
 
 
 def of_drawn(depths_at: Mapping[float | None, Mapping[str, float]]) -> list[str]:

@@ -9,6 +9,7 @@ import numpy as np
 import viser
 from scipy import sparse
 
+from ..shot.page.drawing import BODY_COLOR, CLOTH_COLOR, encode_color
 from ..solver.colliders.pose import Pose
 from ..solver.scene import Frame
 from ..usd.read.bindings import GarmentBindings
@@ -21,8 +22,8 @@ from .skins import Placed, Skins
 from .takes import Shown
 from .view import BESIDE_A, CAGE, FINE, KEPT, SUBDIVISION, View
 
-COLORS = {CAGE: (201, 160, 110), SUBDIVISION: (168, 160, 150), KEPT: (150, 170, 140), FINE: (122, 150, 190)}
-TRIM, BODY, WIRE, RING = (176, 168, 140), (150, 150, 150), (40, 44, 52), (16, 18, 22)
+COLORS = {CAGE: (201, 160, 110), SUBDIVISION: (196, 178, 152), KEPT: (190, 205, 165), FINE: encode_color(CLOTH_COLOR)}
+TRIM, BODY, WIRE, RING = (176, 168, 140), encode_color(BODY_COLOR), (40, 44, 52), (16, 18, 22)
 """Colours, sRGB; a garment or body with a colour of its own on the stage has that."""
 GAP = 0.04
 """Space between columns, in the size of what is drawn."""

@@ -29,6 +29,9 @@ KEY, KEY_WIDTH = np.array([-0.62, 0.62, 0.48]), 0.16
 BACKGROUND = np.array([0.80, 0.80, 0.79])
 """Linear colour of the studio."""
 
+CLOTH_COLOR, BODY_COLOR = (0.73, 0.61, 0.44), (0.30, 0.30, 0.31)
+"""Linear colours of cloth and of other meshes without a colour of their own: a light warm one and a grey."""
+
 SKY_MAPS, SKY_SIZE = 12, 256
 """Depth maps of the sky, each for a pair of opposite directions, and the width of a map [pixels]."""
 

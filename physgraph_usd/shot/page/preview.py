@@ -12,9 +12,9 @@ from PIL import Image, ImageDraw, ImageFont
 
 from ...errors import LayerError, StageError, UsageError
 from ...usd.files import check_targets, files_of
-from ...usd.read.meshes import DrawnMesh, DrawnStage, refined_in, shot_of
+from ...usd.read.meshes import NEUTRAL, DrawnMesh, DrawnStage, refined_in, shot_of
 from ...usd.write.atomic import check_place, make_file, prepare_target, publish, temporary_path
-from .drawing import BACKGROUND, View, draw, encode_color, fit_view, vertex_normals
+from .drawing import BACKGROUND, BODY_COLOR, CLOTH_COLOR, View, draw, encode_color, fit_view, vertex_normals
 from .worst import CLOSE, CloseUp
 
 STILL, LOOP = ".png", ".gif"
@@ -28,6 +28,18 @@ ELEVATIONS = (-30.0, 45.0)
 
 COMPRESSION = {"compress_level": 1}
 """Of a PNG: Pillow's strongest compression takes as long as drawing and saves a tenth."""
+
+TURNS = (
+    *((turn, 0.0) for turn in (0.0, 30.0, -30.0)),
+    *((turn, lift) for lift in (25.0, -25.0) for turn in (0.0, 30.0, -30.0)),
+    *((turn, 0.0) for turn in (60.0, -60.0, 180.0, 150.0, 210.0, 120.0, 240.0)),
+)
+"""Turns of a close picture's camera about the place, azimuth and elevation [degrees], until the place is in open view.
+From 90 degrees on the camera sees the cloth's inner side."""
+MOST_TURNED = 4
+"""Most places that the camera turns about."""
+CUT = 0.25
+"""Distance before a place, in radii of its picture, up to which everything belongs to the place."""
 
 INK, FAINT = (38, 40, 44), (112, 114, 118)
 """Colours of the labels."""
@@ -58,17 +70,13 @@ def preview(
         The picture written.
 
     Raises:
-        UsageError: When the suffix is unknown, a PNG is asked for several times, or the picture exists, is a link or is
-            a file of the shot.
+        UsageError: As in `check_picture`, or the picture is a link or a file of the shot.
         LayerError: When the picture cannot be written.
         StageError: When a stage cannot be opened or shows no mesh.
     """
     layer, out = Path(layer), Path(out)
+    check_picture(out, times=times, overwrite=overwrite)
     suffix = out.suffix.lower()
-    if suffix not in {STILL, LOOP}:
-        raise UsageError(f"cannot draw {out.name!r}; known suffixes: {STILL}, {LOOP}")
-    if times is not None and suffix == STILL and len(times) != 1:
-        raise UsageError(f"a {STILL} shows one time code, not {len(times)}; write a {LOOP} for several")
     below = shot_of(layer) if shot is None else Path(shot)
     check_targets([("the picture", out)], files_of(layer) | (files_of(below) if below else set()))
     check_place(out)
@@ -89,6 +97,23 @@ def preview(
     finally:
         temporary.unlink(missing_ok=True)
     return out
+
+
+def check_picture(out: Path, *, times: Sequence[float] | None, overwrite: bool) -> None:
+    """Refuse (UsageError) an unknown suffix, several time codes for a still, and a picture that exists.
+
+    Args:
+        out: Picture to write.
+        times: Time codes to draw; None for the usual ones.
+        overwrite: Whether an existing picture may be replaced.
+    """
+    suffix = out.suffix.lower()
+    if suffix not in {STILL, LOOP}:
+        raise UsageError(f"cannot draw {out.name!r}; known suffixes: {STILL}, {LOOP}")
+    if times is not None and suffix == STILL and len(times) != 1:
+        raise UsageError(f"a {STILL} shows one time code, not {len(times)}; write a {LOOP} for several")
+    if out.is_file() and not overwrite:
+        raise UsageError(f"{out} exists; choose another name or replace it by --overwrite")
 
 
 class Pictures:
@@ -145,8 +170,14 @@ class Pictures:
         floor = float(points[:, 1].min() - 0.03 * np.ptp(points, axis=0).max())
         return [self._compose(self._sides(code), code, view, floor) for code in codes]
 
-    def draw_close(self, close: CloseUp) -> Image.Image:
-        """Draw both sides around a place in refined cloth, seen from its outer side, the first in open view if any.
+    def draw_close(self, close: CloseUp) -> tuple[Image.Image, str]:
+        """Draw both sides around a place in refined cloth, from a direction in which the place is in open view.
+
+        The camera sees the outer side of the cloth if it can, and turns else. Bodies that hide the place in every
+        direction are left out. If cloth hides it in every direction, everything before the place is cut away.
+
+        Returns:
+            The picture, and what was done to show the place, in words; "" for nothing.
 
         Raises:
             StageError: The stage does not show the mesh.
@@ -158,11 +189,36 @@ class Pictures:
         radius = CLOSE * float(np.linalg.norm(np.ptp(mesh.points, axis=0)))
         normals = vertex_normals(mesh)
         views = [(mesh.points[vertex], _angles(mesh.points, vertex, normals[vertex])) for vertex in close.vertices]
-        centre, angles = next((view for view in views if _is_open(sides[-1], *view, radius=radius)), views[0])
+        centre, angles, left_out = self._open_view(sides[-1], views, radius=radius)
         ball = centre + radius * np.concatenate([np.eye(3), -np.eye(3)])
         view = fit_view(ball, self._panel[0] / self._panel[1], azimuth=angles[0], elevation=angles[1])
-        view = replace(view, nearest=float(np.linalg.norm(centre - view.eye)) - 2.0 * radius)
-        return self._compose(sides, close.time, view, -np.inf)
+        kept = [[each for each in meshes if each.path not in left_out] for meshes in sides]
+        words = f"without {', '.join(f'<{path}>' for path in left_out)}, which would hide it" if left_out else ""
+        reach = 2.0 * radius
+        if not _is_open(kept[-1], centre, angles, radius=radius):
+            kept = [[_cut(each, centre, view.axes[2], CUT * radius) for each in meshes] for meshes in sides]
+            reach, words = CUT * radius, "cut open before it"
+        nearest = float(np.linalg.norm(centre - view.eye)) - reach
+        return self._compose(kept, close.time, replace(view, nearest=nearest), -np.inf), words
+
+    def _open_view(
+        self, meshes: Sequence[DrawnMesh], views: Sequence[tuple[np.ndarray, tuple[float, float]]], *, radius: float
+    ) -> tuple[np.ndarray, tuple[float, float], list[str]]:
+        """The first place and direction in open view, and the bodies left out for it.
+
+        Args:
+            views: Places, shape (3,), with azimuth and elevation of the cloth's outer side [degrees].
+            radius: Radius of the picture [m].
+        """
+        turned = [(centre, _turned(angles, *turn)) for turn in TURNS[1:] for centre, angles in views[:MOST_TURNED]]
+        bodies = {mesh.path for mesh in meshes} - {*self._garments, *self._refined}
+        cloth = [mesh for mesh in meshes if mesh.path not in bodies]
+        for drawn in (meshes, cloth):
+            for centre, angles in (*views, *turned):
+                if _is_open(drawn, centre, angles, radius=radius):
+                    hidden_by = [each.path for each in meshes if not _is_open([each], centre, angles, radius=radius)]
+                    return centre, angles, hidden_by
+        return *views[0], []
 
     def _in_picture(self, meshes: Sequence[DrawnMesh]) -> np.ndarray:
         """Points in a box a little larger than the garments, to show the surrounding body."""
@@ -181,7 +237,15 @@ class Pictures:
             sides.append(self._stages[1].meshes(code, cages=cages))
         faces = {mesh.path: mesh.mesh.face_count for mesh in sides[-1] if mesh.path in self._refined}
         coarse = [mesh.subdivided(faces.get(mesh.path, faces.get(f"{mesh.path}_refined", 0))) for mesh in sides[0]]
-        return [coarse, *sides[1:]]
+        return [[self._colored(mesh) for mesh in side] for side in (coarse, *sides[1:])]
+
+    def _colored(self, mesh: DrawnMesh) -> DrawnMesh:
+        """A mesh with the usual colour of cloth or bodies on faces without a colour, if the stage names its cloth."""
+        if not self._garments and not self._refined:
+            return mesh
+        usual = CLOTH_COLOR if mesh.path in (*self._garments, *self._refined) else BODY_COLOR
+        without = (mesh.face_colors == NEUTRAL).all(axis=1, keepdims=True)
+        return replace(mesh, face_colors=np.where(without, usual, mesh.face_colors))
 
     def _compose(
         self, sides: Sequence[Sequence[DrawnMesh]], code: float | None, view: View, floor: float
@@ -208,25 +272,48 @@ def _angles(points: np.ndarray, vertex: int, normal: np.ndarray) -> tuple[float,
     return float(np.degrees(np.arctan2(outward[0], outward[2]))), float(np.clip(elevation, *ELEVATIONS))
 
 
+def _cut(mesh: DrawnMesh, centre: np.ndarray, backward: np.ndarray, reach: float) -> DrawnMesh:
+    """A mesh without the faces that stand wholly before a place, seen from a direction.
+
+    Args:
+        mesh: The mesh.
+        centre: The place [m], shape (3,).
+        backward: Direction from the place to the camera, shape (3,).
+        reach: Distance before the place from which on faces are left out [m].
+    """
+    counts, before = mesh.mesh.counts, (mesh.points - centre) @ backward
+    number = np.repeat(np.arange(len(counts)), counts)
+    stays = np.bincount(number, before[mesh.mesh.indices] <= reach, minlength=len(counts)) > 0
+    polygons = replace(mesh.mesh, counts=counts[stays], indices=mesh.mesh.indices[stays[number]])
+    return replace(mesh, mesh=polygons, face_colors=mesh.face_colors[stays])
+
+
+def _turned(angles: tuple[float, float], turn: float, lift: float) -> tuple[float, float]:
+    """Azimuth and elevation turned by some degrees."""
+    return angles[0] + turn, float(np.clip(angles[1] + lift, *ELEVATIONS))
+
+
 def _is_open(meshes: Sequence[DrawnMesh], centre: np.ndarray, angles: tuple[float, float], *, radius: float) -> bool:
     """Whether no vertex beside the line of sight, and no face across it, stands before a place.
 
     Args:
         angles: Azimuth and elevation of the line of sight [degrees].
-        radius: Radius of the picture [m]; what stands less than a quarter of it before the place belongs to the place.
+        radius: Radius of the picture [m]; what stands less than `CUT` of it before the place belongs to the place.
     """
     azimuth, elevation = np.radians(angles)
     direction = np.array([np.sin(azimuth) * np.cos(elevation), np.sin(elevation), np.cos(azimuth) * np.cos(elevation)])
     right = np.array([np.cos(azimuth), 0.0, -np.sin(azimuth)])
     for mesh in meshes:
         x, y, before = np.stack([right, np.cross(direction, right), direction]) @ (mesh.points - centre).T
-        hides = before > 0.25 * radius
+        hides = before > CUT * radius
         if (hides & (np.hypot(x, y) < 0.5 * radius)).any():
             return False
-        a = mesh.triangles[hides[mesh.triangles].all(axis=1)]
+        a = mesh.triangles[hides[mesh.triangles].any(axis=1)]
         b = np.roll(a, 1, axis=1)
-        turns = np.sign(x[a] * y[b] - x[b] * y[a])
-        if (np.abs(turns.sum(axis=1)) == 3.0).any():
+        areas = x[a] * y[b] - x[b] * y[a]  # Of the corner opposite to each edge, twice: barycentric on the line.
+        across = np.abs(np.sign(areas).sum(axis=1)) == 3.0
+        weights, corners = np.abs(areas[across]), np.roll(a[across], -1, axis=1)
+        if ((weights * before[corners]).sum(axis=1) > CUT * radius * weights.sum(axis=1)).any():
             return False
     return True
 

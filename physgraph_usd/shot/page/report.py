@@ -125,7 +125,8 @@ def _pictures(report: RefineReport, shot: Shot) -> str:
     picture = close_up(report, shot)
     try:
         pictures = kind(report.out, Path(report.shot), SIZE, codes=[time for time in written if time is not None])
-        close = "" if picture is None else _figure(pictures.draw_close(picture), picture.caption)
+        image, words = (None, "") if picture is None else pictures.draw_close(picture)
+        close = "" if picture is None else _figure(image, "; ".join(filter(None, (picture.caption, words))))
         drawn = pictures.draw(times) if times else []
     except (StageError, LayerError) as error:
         return f"{title}<p class='note'>No pictures: {html.escape(str(error))}</p>"

@@ -33,7 +33,7 @@ class SolvedFrame:
         points: Fine positions [m].
         crossing: Whether each fine vertex belongs to cloth that crosses cloth.
         first: Whether no frame was solved before.
-        whole: As `SolveSettings.whole`, at the end of the solve.
+        whole: As `SolveSettings.whole`, at the end of the solve; False too if the time limit stopped the frame.
     """
 
     time: float | None

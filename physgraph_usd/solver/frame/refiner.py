@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time as clock
 from collections.abc import Iterable, Iterator, Sequence
 from copy import copy
 from dataclasses import replace
@@ -13,7 +12,7 @@ import numpy as np
 import torch
 
 from ..contact.bodies import Touching
-from ..deadline import ends_after
+from ..deadline import clock_of, ends_after
 from ..mesh.subdivide import Refinement
 from ..scene import Frame, Scene, State, refuse_far
 from .group import Group
@@ -22,9 +21,10 @@ from .scene_frame import SceneCloth, SceneFrame
 from .settings import SolveSettings
 
 LIMIT, LEAST_LIMIT, LIMIT_PER_VERTEX = 20.0, 120.0, 0.01
-"""Time limit of a frame: a multiple of the median over the shot's frames, but at least a number of seconds plus seconds
-per fine vertex. The slowest cold frames of the samples and shots take 0.6 ms per vertex on one core, and the first
-frame on a machine may compile kernels, some 15 s. No ordinary frame should reach the limit."""
+"""Time limit of a frame by `deadline.clock_of`, processor time on the CPU: a multiple of the median over the shot's
+frames, but at least a number of seconds plus seconds per fine vertex. The slowest cold frames of the samples and shots
+take 0.6 ms per vertex on one core, and the first frame on a machine may compile kernels, some 15 s. No ordinary frame
+should reach the limit."""
 
 
 class Refiner:
@@ -62,6 +62,7 @@ class Refiner:
         self._memories = (GarmentHistory(),) * len(scene.garments)
         self._time: float | None = None
         self._walked: tuple[Sequence[np.ndarray | None], float] | None = None
+        self._clock = clock_of(device)
         self._seconds: list[float] = []  # Durations of completed frames.
 
     @property
@@ -140,16 +141,16 @@ class Refiner:
             GarmentError: A position is out of bounds.
             SolveError: No garment could be solved: a term of the potential is not finite, or cloth left its cage.
         """
-        began = clock.perf_counter()
-        with ends_after(self._limit):
+        began = self._clock()
+        with ends_after(self._limit, self._clock):
             state = self._solve(frame, wanted)
         if not any("time_limit" in entry for entry in state.telemetry):
-            self._seconds.append(clock.perf_counter() - began)
+            self._seconds.append(self._clock() - began)
         return state
 
     @property
     def _limit(self) -> float:
-        """Time limit of a frame [s]."""
+        """Time limit of a frame [s], by `clock_of` the device."""
         if self._settings.frame_limit is not None:
             return self._settings.frame_limit
         count = sum(chain[-1].mesh.vertex_count for chain in self.refinements if chain)

@@ -168,7 +168,7 @@ class SceneFrame:
         memories: GarmentHistory of each garment's last frames.
         gap: Whether the time since the last frame is too long for a warm start.
         walked: World positions of each cage [m] advanced here by another refiner, and the start time code; or None.
-        limit: Time limit of the frame [s].
+        limit: Time limit of the frame [s], for the report.
     """
 
     cloth: SceneCloth
@@ -252,14 +252,15 @@ class SceneFrame:
         entry = solved.telemetry | self._surroundings(part, near)
         begun = origin.telemetry(None if cage is None else cage[1])
         entry |= begun | ({"start": solved.telemetry["start"]} if solved.telemetry["start"] != "cold" else {})
-        entry |= {"time_limit": float(f"{self.limit:.3g}")} if is_over() else {}
+        cut = is_over()
+        entry |= {"time_limit": float(f"{self.limit:.3g}")} if cut else {}
         entry |= _loads(frames)
         states = split(solved.state, group.levels[0].spans, group.levels[-1].spans)
         found = list[Answer]()
         for place, (index, memory) in enumerate(zip(part, memories, strict=True)):
             at = self.frame.time, self.frame.garments[index], self.frame.colliders, near, part
             points, crossing = solved.points[place], solved.crossing[place]
-            ends = {"first": memory.last is None, "whole": self.settings.whole}
+            ends = {"first": memory.last is None, "whole": self.settings.whole and not cut}
             now = SolvedFrame(*at, points, states[place], crossing, **ends)
             before = memory.last if origin.broken is None else origin.frames[place]
             found.append(Answer(points, entry, GarmentHistory(now, before)))

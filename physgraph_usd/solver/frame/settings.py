@@ -38,7 +38,8 @@ class SolveSettings:
         steps: Most steps at the finest level; each coarser level may take four times as many.
         tolerance: Stop when the RMS of H0^-1 F is under this many local edge lengths.
         budget_ms: Time limit for solving a frame [ms], or None.
-        frame_limit: Time limit after which a frame stops in its current state [s]; None for a multiple of usual frames.
+        frame_limit: Time after which a frame stops in its current state [s], by `deadline.clock_of`: processor time on
+            the CPU. None for a multiple of usual frames.
         temporal: "tether", "warm" or "off".
         tether: Tether stiffness over that of inertia in an implicit step of the time between samples, m / dt^2.
         reset: Thresholds for a cold start.

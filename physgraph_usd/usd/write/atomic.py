@@ -21,6 +21,8 @@ NO_LINK = getattr(os, "O_NOFOLLOW", 0)
 """Flag of `os.open` to refuse links; Windows has none."""
 ASSET_PATHS = ("relative", "absolute")
 """Forms of a path in a file: relative to the file's folder, or absolute."""
+FRAMES_SUFFIX = ".frames"
+"""Suffix of the folder of a layer's finished frames, after the layer's name."""
 HOST = re.sub(r"[^\w-]", "_", socket.gethostname()) or "host"
 """Name of this machine, for temporary file names."""
 
