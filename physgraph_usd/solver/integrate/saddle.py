@@ -96,8 +96,8 @@ def _missing_slope(
 
 def _normals(level: Level, x: Tensor) -> Float[Tensor, "vertices 3"]:
     """Unit normals of the vertices, weighted by area; 0 without area."""
-    places = level.triangles.long().T.reshape(-1)
-    normal = add_at(torch.zeros_like(x), places, level.normals(x).repeat(3, 1))
+    vertices = level.triangles.long().T.reshape(-1)
+    normal = add_at(torch.zeros_like(x), vertices, level.normals(x).repeat(3, 1))
     return torch.nn.functional.normalize(normal, dim=1, eps=1e-30)
 
 
