@@ -95,14 +95,7 @@ def part_kept(
 
 @wp.func
 def safe_fraction(
-    face: wp.bool,
-    b: wp.vec3d,
-    c: wp.vec3d,
-    d: wp.vec3d,
-    v: wp.vec3d,
-    p: wp.vec3d,
-    q: wp.vec3d,
-    floor: wp.float64,
+    face: wp.bool, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d, v: wp.vec3d, p: wp.vec3d, q: wp.vec3d, floor: wp.float64
 ):
     """Fraction of their paths v, p, q that the corners b, c, d can move, in (0, 1]; 1 if the parts touch already.
 

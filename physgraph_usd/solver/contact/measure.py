@@ -115,11 +115,7 @@ def depths(
 
 
 def pinched(
-    nearest: Nearest,
-    exit_points: Nearest,
-    *,
-    longest: float,
-    buried: Bool[Tensor, " points"] | None = None,
+    nearest: Nearest, exit_points: Nearest, *, longest: float, buried: Bool[Tensor, " points"] | None = None
 ) -> Bool[Tensor, " points"]:
     """Mask of the inside points between overlapping parts that are too far from a way out, or are buried.
 

@@ -47,13 +47,7 @@ class CoarseLevels:
     """
 
     def __init__(
-        self,
-        matrix: sp.csr_matrix,
-        ups: Sequence[Stencil],
-        onto: sp.csr_matrix,
-        *,
-        dtype: torch.dtype,
-        device: str,
+        self, matrix: sp.csr_matrix, ups: Sequence[Stencil], onto: sp.csr_matrix, *, dtype: torch.dtype, device: str
     ) -> None:
         """Take a metric to its coarser levels.
 

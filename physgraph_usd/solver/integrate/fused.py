@@ -365,7 +365,4 @@ def _features(parts: Parts, pairs: Pairs, families: Families) -> list[str]:
     kinds = 1 + max(family for family, _ in families)
     logarithm = f"{LOG_SCALE!r}f * logarithm(size[%d]) + {LOG_OFFSET!r}f"
     values = ", ".join([*terms, *(logarithm % kind for kind in range(kinds))])
-    return [
-        f"const Number seen[] = {{{values}}};\n",
-        f"constexpr int SEEN = {len(terms) + kinds};\n",
-    ]
+    return [f"const Number seen[] = {{{values}}};\n", f"constexpr int SEEN = {len(terms) + kinds};\n"]

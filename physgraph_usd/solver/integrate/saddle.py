@@ -32,10 +32,7 @@ TRIES = 4
 
 
 def facets(
-    level: Level,
-    x: Float[Tensor, "vertices 3"],
-    coarse: Float[Tensor, "coarse 3"],
-    smooth: Callable[[Tensor], Tensor],
+    level: Level, x: Float[Tensor, "vertices 3"], coarse: Float[Tensor, "coarse 3"], smooth: Callable[[Tensor], Tensor]
 ) -> Float[Tensor, "vertices 3"]:
     """The move across the surface to remove a coarser mesh's facets [m]; 0 at fixed vertices.
 

@@ -266,12 +266,7 @@ class SecantProducts:
         self._combine = Launch(combine, len(spans), inputs, device=device, threads=threads)
 
     def directed(
-        self,
-        secants: Secants,
-        force: Float[Tensor, "vertices 3"],
-        image: Float[Tensor, "vertices 3"],
-        *,
-        is_new: bool,
+        self, secants: Secants, force: Float[Tensor, "vertices 3"], image: Float[Tensor, "vertices 3"], *, is_new: bool
     ) -> Secants:
         """The secants with the direction for a force.
 
