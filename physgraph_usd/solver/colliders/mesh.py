@@ -120,7 +120,6 @@ class MeshSurface:
         origin: World position of the origin of the surface's coordinates [m], shape (3,), float64.
         bounds: Least and greatest corner [m], shape (2, 3), float64.
         triangles: Corners, shape (T, 3), int32.
-        edges: Sides of the triangles, each once, shape (E, 2), int32.
         solid: The triangles, numbered without unused vertices.
         world: World positions of the solid's corners [m], shape (B, 3), float64.
     """
@@ -149,14 +148,14 @@ class MeshSurface:
         self.fixed_side = None if self.closed else FIXED.get(side)
         self.triangles = triangles
         count = int(triangles.max(initial=-1)) + 1
-        self.edges, edge = paired(triangles.ravel(), triangles[:, [1, 2, 0]].ravel(), count)
+        edges, edge = paired(triangles.ravel(), triangles[:, [1, 2, 0]].ravel(), count)
         self.device, self.threads = device, threads
         self._used, compact = np.unique(triangles, return_inverse=True)
         self.solid = Solid.of(pose.points[self._used], compact.reshape(-1, 3))
         self._rim = None if rim is None else [torch.as_tensor(mask, device=device) for mask in rim]
         self.corners = torch.as_tensor(triangles, device=device).long()
         # At a hole or where more than two faces meet, the other side of a face need not be inside.
-        ragged = np.isin(triangles, self.edges[np.bincount(edge) != 2]).any(axis=1)
+        ragged = np.isin(triangles, edges[np.bincount(edge) != 2]).any(axis=1)
         self.ragged, self.has_holes = torch.as_tensor(ragged, device=device), bool(ragged.any())
         self.origin, self.bounds = np.zeros(3), np.zeros((2, 3))
         self.mesh = _hierarchy(wp.array(self._place(pose), dtype=wp.vec3f, device=device), triangles, self.closed)
@@ -199,12 +198,16 @@ class MeshSurface:
         points = pose.points.take(self._used, axis=0)
         return points if np.isfinite(points).all() else None
 
-    def closest(self, x: Float[Tensor, "points 3"], reach: Float[Tensor, " points"]) -> Nearest:
-        """The closest points within reach [m]; the side is the pseudonormal's (Baerentzen and Aanaes 2005)."""
+    def closest(self, x: Float[Tensor, "points 3"], reach: Float[Tensor, " points"] | None = None) -> Nearest:
+        """The closest points within reach [m], or at any distance; the side is the pseudonormal's.
+
+        The pseudonormal is by Baerentzen and Aanaes (2005).
+        """
         return self._closest(self.mesh, x, reach)
 
-    def _closest(self, mesh: wp.Mesh, x: Tensor, reach: Tensor) -> Nearest:
+    def _closest(self, mesh: wp.Mesh, x: Tensor, reach: Tensor | None = None) -> Nearest:
         count = len(x)
+        reach = torch.full_like(x[:, 0], torch.inf) if reach is None else reach
         queries, limit = x.to(torch.float32).contiguous(), reach.to(torch.float32).contiguous()
         distance = torch.full((count,), float("inf"), dtype=torch.float32, device=x.device)
         point, normal, weight = (torch.zeros_like(queries) for _ in range(3))
@@ -229,12 +232,8 @@ class MeshSurface:
         if self.closed and len(x):
             far = float(np.linalg.norm(np.ptp(self.bounds, axis=0))) + float(x.abs().max()) + 1.0
             queries = x.to(torch.float32).contiguous()
-            self.run(
-                _winding,
-                self.mesh,
-                len(x),
-                [_vectors(queries), wp.float32(far), wp.float32(parts - 0.5), argument(side)],
-            )
+            inputs = [_vectors(queries), wp.float32(far), wp.float32(parts - 0.5), argument(side)]
+            self.run(_winding, self.mesh, len(x), inputs)
         return side < 0
 
     def _turns(self, x: Float[Tensor, "points 3"]) -> Float[Tensor, " points"]:
@@ -267,7 +266,7 @@ class MeshSurface:
         if skin is None:
             return nearest
         mesh, faces = skin
-        bare = self._closest(mesh, x, torch.full_like(nearest.distance, float("inf")))
+        bare = self._closest(mesh, x)
         return replace(bare, face=faces[bare.face.long()])
 
     def run(self, kernel: wp.Kernel, mesh: wp.Mesh, count: int, inputs: list[object]) -> None:

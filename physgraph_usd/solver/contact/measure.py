@@ -104,7 +104,7 @@ def depths(
     within = torch.nonzero(inside).squeeze(1) if surface.has_inside else depth.long()[:0]
     if len(within):
         if exits is None:
-            nearest = surface.closest(x[within], torch.full_like(depth[within], float("inf")))
+            nearest = surface.closest(x[within])
             exit_points = surface.exit(x[within], nearest)
         else:
             nearest, exit_points = exits(x[within])

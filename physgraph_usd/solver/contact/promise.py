@@ -52,15 +52,9 @@ class Promise:
 
     def blocking(self, begin: Tensor, end: Tensor, queried: Tensor, *, near: NearAt | None = None) -> Pairs:
         """As `blocking_pairs`."""
+        parts, tangle, inside = self.mesh.parts, self.tangle, self.inside
         return blocking_pairs(
-            self.mesh.parts,
-            begin,
-            end,
-            floor=self.floor,
-            queried=queried,
-            tangle=self.tangle,
-            inside=self.inside,
-            near=near,
+            parts, begin, end, floor=self.floor, queried=queried, tangle=tangle, inside=inside, near=near
         )
 
     def kept(
@@ -109,16 +103,9 @@ class Promise:
             return begin, proved
         # Cloth that a moving body reaches, and that cannot move on, is then inside the body.
         inside = self.inside if stand else torch.arange(len(moves), device=moves.device) < mesh.level.vertex_count
+        parts, floor, tangle, dtype = mesh.parts, self.floor, self.tangle, mesh.level.dtype
         x = safe_move(
-            begin,
-            ends,
-            mesh.parts,
-            floor=self.floor,
-            tangle=self.tangle,
-            inside=inside,
-            queried=late,
-            near=near,
-            dtype=mesh.level.dtype,
+            begin, ends, parts, floor=floor, tangle=tangle, inside=inside, queried=late, near=near, dtype=dtype
         )
         return x, stand
 

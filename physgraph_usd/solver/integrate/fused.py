@@ -44,7 +44,7 @@ for (int i = 0; i < BLOCK; ++i) {
     const int at = element[i];
     const Four here = *row_of(at, POSITION);
     for (int k = corners.data[at]; k < corners.data[at + 1]; ++k) {
-        const Four a = *row_of(opposite.data[k][0], POSITION) - here, b = *row_of(opposite.data[k][1], POSITION) - here;
+        const Four a = *row_of(ring.data[k][0], POSITION) - here, b = *row_of(ring.data[k][1], POSITION) - here;
         area[i] += turned(a * turned(b) - turned(a) * b);
     }
 }
@@ -203,14 +203,12 @@ def fused_kernel(config: PhysgraphConfig) -> wp.Kernel:
     formula = "".join(line for lines in sources for line in lines)
 
     def of_block(
-        block, vertices, rows, spacing, reach, corners, opposite, ends, far, weights, biases, longest, out, to
+        block, vertices, rows, spacing, reach, corners, ring, ends, far, weights, biases, longest, out, to
     ): ...
 
-    def physgraph(
-        first, vertices, rows, spacing, reach, corners, opposite, ends, far, weights, biases, longest, out, to
-    ):
+    def physgraph(first, vertices, rows, spacing, reach, corners, ring, ends, far, weights, biases, longest, out, to):
         block = first + wp.tid()
-        compute(block, vertices, rows, spacing, reach, corners, opposite, ends, far, weights, biases, longest, out, to)
+        compute(block, vertices, rows, spacing, reach, corners, ring, ends, far, weights, biases, longest, out, to)
 
     number, index, vector, pair = (wp.array(dtype=kind) for kind in (wp.float32, wp.int32, wp.vec3f, wp.vec2i))
     row = wp.array(dtype=wp.vec4f)

@@ -216,10 +216,6 @@ class Secants:
         weights[:, 0] = 1.0
         return Secants(fields, 0, 0, gram, weights)
 
-    def move(self, age: int) -> Float[Tensor, "vertices 3"] | None:
-        """The move of a secant [m], the newest with age 1; None if there are fewer secants."""
-        return self.fields[0, (self.newest + SLOTS + 1 - age) % SLOTS] if age <= self.count else None
-
     def after(self, move: Tensor, forces: tuple[Tensor, Tensor], images: tuple[Tensor, Tensor]) -> Secants:
         """With a newest secant.
 

@@ -23,7 +23,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..level import Level
-from ..mesh.stencil import Stencil, add_at, incidence, vectors
+from ..mesh.stencil import Stencil, add_at, incidence
 
 PARTS = ("normal", "smooth")
 
@@ -50,11 +50,6 @@ class VertexFrame:
         area = self._level.normals(self._x).repeat_interleave(3, dim=0)
         total = add_at(torch.zeros_like(self._x), self._level.triangles.long().reshape(-1), area)
         return torch.nn.functional.normalize(total, dim=1, eps=torch.finfo(total.dtype).tiny)
-
-    @property
-    def positions(self) -> Any:
-        """The positions, for kernels."""
-        return vectors(self._x)
 
     @property
     def mesh(self) -> tuple[wp.array, ...]:
