@@ -22,7 +22,7 @@ from .distance import weights_of
 wp.set_module_options(KERNELS)
 
 TIGHT = 0.9
-"""Fraction of its distance kept by a pair already below the floor, and fraction of the safe path that is used."""
+"""Fraction of the present distance to keep for pairs below the floor, and used fraction of the safe path."""
 
 TOUCHES = 1e-12
 """Distance up to which parts touch [m]: nearer, double precision does not tell the side."""

@@ -140,7 +140,7 @@ class MeshSurface:
             pose: Any pose.
             triangles: The pieces' triangles, shape (T, 3).
             rim: Rim edges and rim corners of open pieces, or None for closed pieces.
-            side: One of `sides.SIDES`.
+            side: One of `schema.SIDES`.
             device: "cpu" or a CUDA device.
             threads: Most threads of a query on the CPU.
         """
@@ -173,7 +173,7 @@ class MeshSurface:
         return LIFT * float(np.ptp(self.bounds, axis=0).max())
 
     def repose(self, pose: Pose) -> None:
-        """Move the surface to another finite pose of its topology; a rigid motion keeps cached self-intersections."""
+        """Move the surface to a finite pose of equal topology; a rigid motion keeps cached self-intersections."""
         self.mesh.points.assign(self._place(pose))
         self.mesh.refit()
         rigid = moved_rigidly(self._judged, self.world)
@@ -192,7 +192,7 @@ class MeshSurface:
         return local
 
     def placed(self, pose: Pose) -> np.ndarray | None:
-        """World positions of the corners in another pose [m]; None if the pose is of another shape."""
+        """World positions of the corners in a further pose [m]; None if the pose has a different number of points."""
         if len(pose.points) != len(self.mesh.points):
             return None
         points = pose.points.take(self._used, axis=0)
@@ -247,8 +247,8 @@ class MeshSurface:
     def exit(self, x: Float[Tensor, "points 3"], nearest: Nearest) -> Nearest:
         """The closest points on exposed faces; where body parts overlap, the nearest face may be deep inside.
 
-        A face is exposed if none of its corners is inside the surface. Another part may still pierce the face's middle:
-        a point whose exit would be inside that part takes the closest unpierced face.
+        A face is exposed if none of its corners is inside the surface. A part may still pierce the face's middle: a point
+        with an exit inside such a part takes the closest unpierced face.
         """
         if not self.closed or not len(x):
             return nearest
@@ -378,7 +378,7 @@ class MeshBody:
     """One mesh collider over the shot; its surfaces are kept while the topology is unchanged."""
 
     def __init__(self, *, side: str = "auto", device: str, threads: int) -> None:
-        """Store device, threads and ``side``, one of `sides.SIDES`."""
+        """Prepare a collider without a pose; ``side`` is one of `schema.SIDES`."""
         self._side, self._device, self._threads = side, device, threads
         self._triangles: np.ndarray | None = None
         self._points = np.zeros((0, 3))

@@ -193,7 +193,7 @@ class LevelBodies:
         return by_garment[self.level.vertex_garment.long()]
 
     def _behind(self, index: int, x: Tensor, vertices: Tensor) -> Bool[Tensor, " points"]:
-        """Mask of the points x of some vertices that are inside a body or behind it."""
+        """Mask of the vertices, at positions x [m], that are inside or behind a body."""
         surface, at = self.frame.touching[index].surface, x + self.frame.shifts[index]
         if surface.closed:
             return surface.inside(at)
@@ -243,7 +243,7 @@ class LevelBodies:
     def _vertices_beside(
         self, index: int, x: Tensor, candidates: Tensor
     ) -> tuple[Int[Tensor, " some"], Float[Tensor, "some 3"], Float[Tensor, " some"]]:
-        """Candidates outside that are near a body, their directions from the body, and their negative distances [m]."""
+        """Candidates outside that are near a body, unit directions from the body, and negative distances [m]."""
         vertices = torch.nonzero(candidates & self._feels(index)).squeeze(1)
         surface, at = self.frame.touching[index].surface, x[vertices] + self.frame.shifts[index]
         nearest = surface.closest(at, torch.full_like(at[:, 0], self.frame.longest))
@@ -298,7 +298,7 @@ class LevelBodies:
     def _pull(
         self, x: Tensor, index: int, corners: Tensor, weight: Tensor, normal: Tensor, depth: Tensor, *, share: float
     ) -> PairConstraints:
-        """Constraints that move points of the cloth along their ways out [m]."""
+        """Constraints that move points of the cloth out of a body, along unit normals by depths [m]."""
         at = (weight.unsqueeze(2) * x[corners]).sum(dim=1)
         goal = (normal * at).sum(dim=1) + depth + share * self.offset(index)[corners[:, 0]]
         stiffness = self.frame.settings.stiffness * self.level.vertex_area[corners].amin(dim=1)
@@ -306,7 +306,7 @@ class LevelBodies:
         return PairConstraints(corners.to(torch.int32).contiguous(), *columns)
 
     def offset(self, index: int) -> Float[Tensor, " vertices"]:
-        """Distance that each vertex keeps from a body [m]."""
+        """Offset of each vertex from a body [m]."""
         offset = torch.tensor(self.frame.touching[index].offset, dtype=self.level.dtype, device=self.level.rest.device)
         return offset[self.level.vertex_garment.long()]
 

@@ -1,4 +1,4 @@
-"""Broad phase: bodies that a garment can touch in a frame, and their surfaces, posed once a frame for all garments."""
+"""Broad phase: bodies that a garment can touch in a frame, with surfaces posed once a frame for all garments."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class TouchingGroups:
         return 0.5 * frame.fabric.thickness + (0.5 * REACH + 1.0) * self._edges[index]
 
     def _boxes_meet(self, frames: Sequence[GarmentFrame]) -> Iterator[tuple[int, int]]:
-        """Pairs of cages with overlapping bounds, grown by their reach, in order of index; sweep along one axis."""
+        """Pairs of cages whose bounds, grown by the reach, overlap, in order of index; sweep along an axis."""
         bounds = np.array([bounds_of(frame.points) for frame in frames]).reshape(-1, 2, 3)
         reach = np.array([self._reach(index, frame) for index, frame in enumerate(frames)])[:, None]
         low, high = bounds[:, 0] - reach, bounds[:, 1] + reach

@@ -28,11 +28,11 @@ from .along import ApproachLimits, along
 from .cloth_mesh import RINGS, ClothMesh
 
 ROUNDS = 4
-"""Passes that shorten blocked displacements. Vertices that are still blocked then stay at the start, so passes end."""
+"""Number of passes that shorten blocked displacements. Vertices that are blocked after the last pass do not move."""
 
 STRAINS, NEGLIGIBLE = 0.5, 0.01
-"""Largest strain of an edge between vertices whose displacements are shortened, and the fraction of that change which
-is negligible. Without the limit shot 02 needs 53 instead of 24 rounds in frame 18 and keeps crossings."""
+"""Largest strain of an edge between vertices with shortened displacements, and the fraction of this strain that is
+neglected. Without the limit shot 02 needs 53 instead of 24 rounds in frame 18 and keeps crossings."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,7 +180,7 @@ def safe_move(
 
 
 def _spread(share: Tensor, displacement: Tensor, parts: Parts) -> Float[Tensor, " vertices"]:
-    """Fractions reduced around shortened vertices, so that no edge is strained by more than `STRAINS`."""
+    """Fractions of displacements, reduced around shortened vertices: no edge is strained by more than `STRAINS`."""
     length = displacement.norm(dim=1)
     late = length * (1.0 - share)
     least = NEGLIGIBLE * STRAINS * parts.lengths.mean()
