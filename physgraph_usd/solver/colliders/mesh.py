@@ -247,8 +247,8 @@ class MeshSurface:
     def exit(self, x: Float[Tensor, "points 3"], nearest: Nearest) -> Nearest:
         """The closest points on exposed faces; where body parts overlap, the nearest face may be deep inside.
 
-        A face is exposed if none of its corners is inside the surface. A part may still pierce the face's middle: a point
-        with an exit inside such a part takes the closest unpierced face.
+        A face is exposed if none of its corners is inside the surface. A part may still pierce the face's middle: a
+        point with an exit inside such a part takes the closest unpierced face.
         """
         if not self.closed or not len(x):
             return nearest
