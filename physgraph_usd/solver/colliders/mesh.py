@@ -9,6 +9,7 @@ and without self-intersection is wholly exposed: cloth can leave through all of 
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -291,11 +292,9 @@ class Faces:
 
     def __init__(self, surface: MeshSurface) -> None:
         """Start with empty caches."""
-        self._surface = surface
-        self._tested: Tensor | None = None
-        self._buried: Tensor | None = None
-        self._overlaps: Tensor | None = None
-        self._up: Tensor | None = None
+        self._surface, device = surface, surface.corners.device
+        self._tested, self._buried = torch.zeros((2, len(surface.mesh.points)), dtype=torch.bool, device=device)
+        self._overlaps = torch.full((len(surface.corners),), -1, dtype=torch.int8, device=device)
         self._skins: dict[bool, tuple[wp.Mesh, Tensor]] = {}
 
     def turned(self) -> Faces:
@@ -306,28 +305,19 @@ class Faces:
 
     def is_buried(self, face: Tensor) -> Bool[Tensor, " points"]:
         """Mask of the faces with a corner inside the surface; each corner is tested once a pose."""
-        count = len(self._surface.mesh.points)
-        if self._buried is None or self._tested is None:
-            self._tested, self._buried = (torch.zeros(count, dtype=torch.bool, device=face.device) for _ in range(2))
         corners = self._surface.corners[face.long()]
-        needed = torch.zeros(count, dtype=torch.bool, device=face.device)
-        needed[corners.ravel()] = True
-        new = torch.nonzero(needed & ~self._tested).squeeze(1)
+        new = torch.unique(corners[~self._tested[corners]])
         self._buried[new] = self._lifted_inside(new)
         self._tested[new] = True
         return self._buried[corners].any(dim=1)
 
     def is_unsure(self, face: Tensor) -> Bool[Tensor, " points"]:
         """Mask of the faces at a hole or with self-intersections; each face is tested once a pose."""
-        if self._overlaps is None:
-            self._overlaps = torch.full((len(self._surface.corners),), -1, dtype=torch.int8, device=face.device)
-        needed = torch.zeros(len(self._surface.corners), dtype=torch.bool, device=face.device)
-        needed[face.long()] = True
-        new = torch.nonzero(needed & (self._overlaps < 0)).squeeze(1)
-        self._overlaps[new] = (
-            overlapping(self._surface.mesh, new, threads=self._surface.threads) | self._surface.ragged[new]
-        ).to(torch.int8)
-        return self._overlaps[face.long()] > 0
+        face = face.long()
+        new = torch.unique(face[self._overlaps[face] < 0])
+        pierced = overlapping(self._surface.mesh, new, threads=self._surface.threads)
+        self._overlaps[new] = (pierced | self._surface.ragged[new]).to(torch.int8)
+        return self._overlaps[face] > 0
 
     def _lifted_inside(self, vertices: Tensor) -> Bool[Tensor, " vertices"]:
         """Mask of the vertices with an inside point just above.
@@ -337,9 +327,7 @@ class Faces:
         out = torch.zeros(len(vertices), dtype=torch.bool, device=vertices.device)
         if not len(vertices):
             return out
-        if self._up is None:
-            self._up = self._normals()
-        size, up = np.ptp(self._surface.bounds, axis=0), self._up[vertices]
+        size, up = np.ptp(self._surface.bounds, axis=0), self._normals[vertices]
         lifted = wp.to_torch(self._surface.mesh.points)[vertices] + LIFT * float(size.max()) * up
         if self._surface.has_holes:
             return self._surface.inside(lifted)
@@ -351,6 +339,7 @@ class Faces:
         out[met] = self._surface.inside(lifted[met])
         return out
 
+    @cached_property
     def _normals(self) -> Float[Tensor, "vertices 3"]:
         """Unit normals of the vertices."""
         points = wp.to_torch(self._surface.mesh.points)

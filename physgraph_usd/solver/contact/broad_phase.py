@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 from ..colliders.mesh import MeshBody, MeshSurface
 from ..colliders.orient import FIXED
 from ..colliders.pose import Collider, Pose, bounds_of
+from ..mesh.topology import joined_by
 from ..rigid import AT_REST, Rigid
 from ..scene import Garment, GarmentFrame, mean_edge
 from ..strain import has_collapsed
@@ -50,12 +51,8 @@ class TouchingGroups:
             if intact[a] and intact[b] and touch_one_another(self._garments[a], self._garments[b])
             if self._close(a, b, frames, trees)
         ]
-        parts: list[tuple[int, ...]] = [(index,) for index in range(len(frames))]
-        for a, b in near:
-            joined = tuple(sorted({*parts[a], *parts[b]}))
-            for index in joined if parts[a] != parts[b] else ():
-                parts[index] = joined
-        return list(dict.fromkeys(parts))
+        group = joined_by(np.array(near, np.int64).reshape(-1, 2), len(frames))
+        return [tuple(np.flatnonzero(group == number).tolist()) for number in range(group.max(initial=-1) + 1)]
 
     def _reach(self, index: int, frame: GarmentFrame) -> float:
         """A garment's share of the distance at which two garments are near [m]."""

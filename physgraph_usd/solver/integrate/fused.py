@@ -316,10 +316,8 @@ def _combined(parts: Parts) -> list[str]:
     """Source of the combination of the vectors, limited in length."""
     lines = ["Vec move = {};\nNumber lift = {};\n"]
     for a, (row, normal) in enumerate(parts):
-        term = (
-            f"lift += last[{a}] * dot(row[{row}], across);\n" if normal else f"move = move + row[{row}] * last[{a}];\n"
-        )
-        lines.append(term)
+        lift, move = f"lift += last[{a}] * dot(row[{row}], across);\n", f"move = move + row[{row}] * last[{a}];\n"
+        lines.append(lift if normal else move)
     return [*lines, _LIMITED]
 
 

@@ -98,11 +98,9 @@ class LearnedMetric:
             secants = _products_of(system).directed(secants, force, image, is_new=True)
             memory = carry.memory.after(carry, secants)
         else:
-            product, differences = (
-                partial(garment_dot, system.level),
-                (carry.force - force, carry.preconditioned - image),
-            )
-            memory = carry.memory.after(carry, Secant(move, *differences, product))
+            yields, image_change = carry.force - force, carry.preconditioned - image
+            secant = Secant(move, yields, image_change, partial(garment_dot, system.level))
+            memory = carry.memory.after(carry, secant)
         return self._carry(system, x, (energy, force, image), memory)
 
     def _carry(self, system: System, x: Tensor, evaluated: tuple[Tensor, Tensor, Tensor], memory: Any) -> Carry:

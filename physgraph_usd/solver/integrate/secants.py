@@ -87,13 +87,8 @@ def _products_kernel() -> wp.Kernel:
     def secant_products(first, vertices, newest, secants, bounds, force, image, fields, partial):
         add(first + wp.tid(), vertices, newest, secants, bounds, force, image, fields, partial)
 
-    number, pair, vector, total = (
-        wp.int32,
-        wp.array(dtype=wp.vec2i),
-        wp.array(dtype=wp.vec3f),
-        wp.array(dtype=wp.float64),
-    )
-    kinds = number, number, number, pair, vector, vector, vector, total
+    pair, vector, total = (wp.array(dtype=kind) for kind in (wp.vec2i, wp.vec3f, wp.float64))
+    kinds = *[wp.int32] * 3, pair, vector, vector, vector, total
     add = native(of_chunk, "secant_products", at_once(_PRODUCTS, "bounds.shape[0]", torch.float32), *kinds)
     return kernel(secant_products, "secant_products", *kinds)
 
