@@ -90,8 +90,9 @@ class Budget:
         longest = ROUND if blocked or first else CLEAR_ROUND
         longest = HURRIED if self.hurried and first else min(longest, remaining) if touching else FREE_ROUND
         longest = self.steps if first and self.warm and not (self.hurried or in_bodies) else longest
-        once = {} if first else {"rest": 1.0, "least": 0}
-        return replace(self, steps=min(longest, self.steps), tolerance=shrunk * self.tolerance, **once)
+        steps, tolerance = min(longest, self.steps), shrunk * self.tolerance
+        rest, least = (self.rest, self.least) if first else (1.0, 0)
+        return replace(self, steps=steps, tolerance=tolerance, rest=rest, least=least)
 
     def for_untangling(self) -> Budget:
         """The budget of an untangling round, without a tolerance: contours shorten in small moves."""
