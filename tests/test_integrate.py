@@ -261,7 +261,7 @@ def test_a_metric_of_new_materials_takes_over_what_only_the_mesh_determines(leve
     touched = torch.as_tensor(np.random.default_rng(1).random(len(side)) * 10.0 * float(alone.diagonal.mean()))
     force = side * torch.as_tensor(np.random.default_rng(4).normal(size=(len(side), 3)))
     works = [each.by_levels(touched) for each in (metric, alone)]
-    one, other = (work.function(force, *work.given)[0] for work in works)
+    one, other = (work.function(force, *work.tensors)[0] for work in works)
     assert torch.equal(one, other)
 
 

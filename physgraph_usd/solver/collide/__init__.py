@@ -1,1 +1,1 @@
-"""Collision detection: near pairs, and pairs that would touch on their paths. Stateless: positions in, pairs out."""
+"""Collision detection, stateless: positions in; near pairs, crossings and pairs too near on a move out."""

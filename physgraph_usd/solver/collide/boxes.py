@@ -32,7 +32,7 @@ ROWS = 12
 FAR = wp.constant(wp.float64(1.0e30))
 """Corner of an empty box, and distance to missing parts [m]."""
 ROUNDED_UP = wp.constant(wp.float64(1.000001))
-"""Factor on search distances, for their rounding to single precision."""
+"""Factor on search distances, for rounding to single precision."""
 
 
 class Ask(IntEnum):
@@ -160,7 +160,7 @@ def boxes_near(
 
 @wp.func_native(_LOWEST)
 def lowest_bit(mask: wp.uint64) -> wp.int32:
-    """Position of the lowest bit of a mask that is not 0."""
+    """Position of the lowest bit of a nonzero mask."""
     ...
 
 
@@ -259,7 +259,7 @@ def boxes_for(topology: Any, device: str) -> Any:
 
 @functools.lru_cache(maxsize=16)
 def _filled(value: float, count: int, device: torch.device, dtype: torch.dtype) -> Tensor:
-    """A constant for each vertex, which kernels only read."""
+    """A constant for each vertex, read-only in kernels."""
     return torch.full((count,), value, dtype=dtype, device=device)
 
 
@@ -273,7 +273,7 @@ def arrays_of(
     radius: Tensor | None = None,
     play: Tensor | None = None,
 ) -> list[Tensor]:
-    """The arrays of a query, in order, with constants for those that are None; float64 positions of shape (V, 3)."""
+    """The arrays of a query, in order, with constants in place of None; float64 positions of shape (V, 3)."""
     optional = (
         (queried, 1.0, torch.bool),
         (tangle, -1.0, torch.int32),

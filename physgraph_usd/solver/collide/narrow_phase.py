@@ -17,7 +17,7 @@ from .topology import LANES, Part, Topology
 wp.set_module_options(KERNELS)
 
 WITHIN = wp.constant(wp.float64(20.0))
-"""Largest distance of a body's edges and vertices from cloth that they push, in plays, of which an edge has twenty."""
+"""Largest distance at which edges and vertices of a body push cloth, in plays; an edge is twenty plays long."""
 ALL = wp.constant(8)
 """Most blocks compared at a time."""
 PAIR_KINDS = wp.constant(3)
@@ -57,7 +57,7 @@ def sum_of(face: wp.bool, a: wp.float64, b: wp.float64, c: wp.float64, d: wp.flo
 
 @wp.func
 def nearness(face: wp.bool, c: wp.vec4i, parts: Topology, query: Query, within: wp.float64):
-    """Distance of a pair at the end over its search distance, which is smaller for pairs near at rest; at most 1."""
+    """Distance of a pair at the end over the search distance, at most 1; pairs near at rest have a smaller distance."""
     p, rest = query.play, parts.rest
     distance = distance_of(face, query.end[c[0]], query.end[c[1]], query.end[c[2]], query.end[c[3]])
     if distance < within and parts.owner[c[0]] == parts.owner[c[3]]:

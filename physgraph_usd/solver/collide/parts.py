@@ -130,7 +130,7 @@ class Parts:
 
 
 def _sewn(label: np.ndarray) -> np.ndarray:
-    """Each vertex that is not the first of its label, and the first vertex, shape (N, 2)."""
+    """Each vertex with the label of an earlier vertex, and the first vertex of the label, shape (N, 2)."""
     first = np.unique(label, return_index=True)[1][np.unique(label, return_inverse=True)[1]]
     later = np.flatnonzero(first != np.arange(len(label)))
     return np.stack([later, first[later]], axis=1)

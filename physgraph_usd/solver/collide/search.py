@@ -183,7 +183,7 @@ def _of_cloth(parts: Parts, x: Tensor) -> Bool[Tensor, " vertices"]:
 
 
 def _search(parts: Parts, arrays: Sequence[Tensor], *, kind: Ask, floor: float = 0.0, half: float = 0.0) -> Pairs:
-    """All pairs of a query, ordered by their clusters, given its `arrays_of`."""
+    """All pairs of a query, ordered by cluster, given the arrays of `arrays_of`."""
     table, device = parts.topology, parts.level.device
     clusters = table.clusters if len(arrays[0]) > parts.level.vertex_count else table.cloth_clusters
     if not clusters:

@@ -22,7 +22,7 @@ from .distance import weights_of
 wp.set_module_options(KERNELS)
 
 TIGHT = 0.9
-"""Fraction of its distance kept by a pair already below the floor, and fraction of the safe path that is used."""
+"""Fraction of the present distance to keep for pairs below the floor, and used fraction of the safe path."""
 
 TOUCHES = 1e-12
 """Distance up to which parts touch [m]: nearer, double precision does not tell the side."""
@@ -95,14 +95,7 @@ def part_kept(
 
 @wp.func
 def safe_fraction(
-    face: wp.bool,
-    b: wp.vec3d,
-    c: wp.vec3d,
-    d: wp.vec3d,
-    v: wp.vec3d,
-    p: wp.vec3d,
-    q: wp.vec3d,
-    floor: wp.float64,
+    face: wp.bool, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d, v: wp.vec3d, p: wp.vec3d, q: wp.vec3d, floor: wp.float64
 ):
     """Fraction of their paths v, p, q that the corners b, c, d can move, in (0, 1]; 1 if the parts touch already.
 

@@ -112,16 +112,13 @@ def _with_solids(
     """Positions, edges, faces, garments and labels of the cloth at rest and of bodies, which follow as garments."""
     rest, garment = level.rest.double().cpu().numpy(), level.vertex_garment.cpu().numpy()
     edges, faces = (rows.cpu().numpy().astype(np.int64) for rows in (level.edges, level.triangles))
-    points, sides, corners, owners = [rest], [edges], [faces], [garment]
-    start = len(rest)
-    for number, solid in enumerate(solids):
-        points.append(solid.points)
-        sides.append(solid.edges + start)
-        corners.append(solid.faces + start)
-        owners.append(np.full(len(solid.points), len(level.spans) + number))
-        start += len(solid.points)
-    label = np.concatenate([label, np.arange(len(rest), start)])
-    return *(np.concatenate(arrays) for arrays in (points, sides, corners, owners)), label  # type: ignore[return-value]
+    points = np.concatenate([rest, *(solid.points for solid in solids)])
+    starts = np.cumsum([len(rest), *(len(solid.points) for solid in solids)])
+    edges = np.concatenate([edges, *(solid.edges + start for solid, start in zip(solids, starts, strict=False))])
+    faces = np.concatenate([faces, *(solid.faces + start for solid, start in zip(solids, starts, strict=False))])
+    body = np.repeat(np.arange(len(solids)), np.diff(starts))
+    label = np.concatenate([label, np.arange(len(rest), len(points))])
+    return points, edges, faces, np.concatenate([garment, len(level.spans) + body]), label
 
 
 def halved(points: np.ndarray, group: np.ndarray, size: int) -> np.ndarray:

@@ -56,7 +56,7 @@ class Nearest:
 
     def selected(self, indices: Int[Tensor, " some"]) -> Nearest:
         """The selected points."""
-        return Nearest(**{field.name: getattr(self, field.name)[indices] for field in fields(self)})
+        return Nearest(*(getattr(self, field.name)[indices] for field in fields(self)))
 
     def is_behind(self, side: Float[Tensor, " points"] | float) -> Bool[Tensor, " points"]:
         """Mask of the points behind an open surface: on the disallowed side, and not past the rim.
@@ -68,8 +68,5 @@ class Nearest:
 
     def with_points(self, indices: Int[Tensor, " some"], points: Nearest) -> Nearest:
         """A copy with some points replaced."""
-        replaced = {
-            field.name: getattr(self, field.name).index_put((indices,), getattr(points, field.name))
-            for field in fields(self)
-        }
-        return Nearest(**replaced)
+        columns = ((getattr(self, field.name), getattr(points, field.name)) for field in fields(self))
+        return Nearest(*(values.index_put((indices,), new) for values, new in columns))

@@ -9,6 +9,7 @@ and without self-intersection is wholly exposed: cloth can leave through all of 
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -120,7 +121,6 @@ class MeshSurface:
         origin: World position of the origin of the surface's coordinates [m], shape (3,), float64.
         bounds: Least and greatest corner [m], shape (2, 3), float64.
         triangles: Corners, shape (T, 3), int32.
-        edges: Sides of the triangles, each once, shape (E, 2), int32.
         solid: The triangles, numbered without unused vertices.
         world: World positions of the solid's corners [m], shape (B, 3), float64.
     """
@@ -141,7 +141,7 @@ class MeshSurface:
             pose: Any pose.
             triangles: The pieces' triangles, shape (T, 3).
             rim: Rim edges and rim corners of open pieces, or None for closed pieces.
-            side: One of `sides.SIDES`.
+            side: One of `schema.SIDES`.
             device: "cpu" or a CUDA device.
             threads: Most threads of a query on the CPU.
         """
@@ -149,14 +149,14 @@ class MeshSurface:
         self.fixed_side = None if self.closed else FIXED.get(side)
         self.triangles = triangles
         count = int(triangles.max(initial=-1)) + 1
-        self.edges, edge = paired(triangles.ravel(), triangles[:, [1, 2, 0]].ravel(), count)
+        edges, edge = paired(triangles.ravel(), triangles[:, [1, 2, 0]].ravel(), count)
         self.device, self.threads = device, threads
         self._used, compact = np.unique(triangles, return_inverse=True)
         self.solid = Solid.of(pose.points[self._used], compact.reshape(-1, 3))
         self._rim = None if rim is None else [torch.as_tensor(mask, device=device) for mask in rim]
         self.corners = torch.as_tensor(triangles, device=device).long()
         # At a hole or where more than two faces meet, the other side of a face need not be inside.
-        ragged = np.isin(triangles, self.edges[np.bincount(edge) != 2]).any(axis=1)
+        ragged = np.isin(triangles, edges[np.bincount(edge) != 2]).any(axis=1)
         self.ragged, self.has_holes = torch.as_tensor(ragged, device=device), bool(ragged.any())
         self.origin, self.bounds = np.zeros(3), np.zeros((2, 3))
         self.mesh = _hierarchy(wp.array(self._place(pose), dtype=wp.vec3f, device=device), triangles, self.closed)
@@ -174,7 +174,7 @@ class MeshSurface:
         return LIFT * float(np.ptp(self.bounds, axis=0).max())
 
     def repose(self, pose: Pose) -> None:
-        """Move the surface to another finite pose of its topology; a rigid motion keeps cached self-intersections."""
+        """Move the surface to a finite pose of equal topology; a rigid motion keeps cached self-intersections."""
         self.mesh.points.assign(self._place(pose))
         self.mesh.refit()
         rigid = moved_rigidly(self._judged, self.world)
@@ -193,18 +193,22 @@ class MeshSurface:
         return local
 
     def placed(self, pose: Pose) -> np.ndarray | None:
-        """World positions of the corners in another pose [m]; None if the pose is of another shape."""
+        """World positions of the corners in a further pose [m]; None if the pose has a different number of points."""
         if len(pose.points) != len(self.mesh.points):
             return None
         points = pose.points.take(self._used, axis=0)
         return points if np.isfinite(points).all() else None
 
-    def closest(self, x: Float[Tensor, "points 3"], reach: Float[Tensor, " points"]) -> Nearest:
-        """The closest points within reach [m]; the side is the pseudonormal's (Baerentzen and Aanaes 2005)."""
+    def closest(self, x: Float[Tensor, "points 3"], reach: Float[Tensor, " points"] | None = None) -> Nearest:
+        """The closest points within reach [m], or at any distance; the side is the pseudonormal's.
+
+        The pseudonormal is by Baerentzen and Aanaes (2005).
+        """
         return self._closest(self.mesh, x, reach)
 
-    def _closest(self, mesh: wp.Mesh, x: Tensor, reach: Tensor) -> Nearest:
+    def _closest(self, mesh: wp.Mesh, x: Tensor, reach: Tensor | None = None) -> Nearest:
         count = len(x)
+        reach = torch.full_like(x[:, 0], torch.inf) if reach is None else reach
         queries, limit = x.to(torch.float32).contiguous(), reach.to(torch.float32).contiguous()
         distance = torch.full((count,), float("inf"), dtype=torch.float32, device=x.device)
         point, normal, weight = (torch.zeros_like(queries) for _ in range(3))
@@ -229,12 +233,8 @@ class MeshSurface:
         if self.closed and len(x):
             far = float(np.linalg.norm(np.ptp(self.bounds, axis=0))) + float(x.abs().max()) + 1.0
             queries = x.to(torch.float32).contiguous()
-            self.run(
-                _winding,
-                self.mesh,
-                len(x),
-                [_vectors(queries), wp.float32(far), wp.float32(parts - 0.5), argument(side)],
-            )
+            inputs = [_vectors(queries), wp.float32(far), wp.float32(parts - 0.5), argument(side)]
+            self.run(_winding, self.mesh, len(x), inputs)
         return side < 0
 
     def _turns(self, x: Float[Tensor, "points 3"]) -> Float[Tensor, " points"]:
@@ -248,8 +248,8 @@ class MeshSurface:
     def exit(self, x: Float[Tensor, "points 3"], nearest: Nearest) -> Nearest:
         """The closest points on exposed faces; where body parts overlap, the nearest face may be deep inside.
 
-        A face is exposed if none of its corners is inside the surface. Another part may still pierce the face's middle:
-        a point whose exit would be inside that part takes the closest unpierced face.
+        A face is exposed if none of its corners is inside the surface. A part may still pierce the face's middle: a
+        point with an exit inside such a part takes the closest unpierced face.
         """
         if not self.closed or not len(x):
             return nearest
@@ -267,7 +267,7 @@ class MeshSurface:
         if skin is None:
             return nearest
         mesh, faces = skin
-        bare = self._closest(mesh, x, torch.full_like(nearest.distance, float("inf")))
+        bare = self._closest(mesh, x)
         return replace(bare, face=faces[bare.face.long()])
 
     def run(self, kernel: wp.Kernel, mesh: wp.Mesh, count: int, inputs: list[object]) -> None:
@@ -292,11 +292,9 @@ class Faces:
 
     def __init__(self, surface: MeshSurface) -> None:
         """Start with empty caches."""
-        self._surface = surface
-        self._tested: Tensor | None = None
-        self._buried: Tensor | None = None
-        self._overlaps: Tensor | None = None
-        self._up: Tensor | None = None
+        self._surface, device = surface, surface.corners.device
+        self._tested, self._buried = torch.zeros((2, len(surface.mesh.points)), dtype=torch.bool, device=device)
+        self._overlaps = torch.full((len(surface.corners),), -1, dtype=torch.int8, device=device)
         self._skins: dict[bool, tuple[wp.Mesh, Tensor]] = {}
 
     def turned(self) -> Faces:
@@ -307,28 +305,19 @@ class Faces:
 
     def is_buried(self, face: Tensor) -> Bool[Tensor, " points"]:
         """Mask of the faces with a corner inside the surface; each corner is tested once a pose."""
-        count = len(self._surface.mesh.points)
-        if self._buried is None or self._tested is None:
-            self._tested, self._buried = (torch.zeros(count, dtype=torch.bool, device=face.device) for _ in range(2))
         corners = self._surface.corners[face.long()]
-        needed = torch.zeros(count, dtype=torch.bool, device=face.device)
-        needed[corners.ravel()] = True
-        new = torch.nonzero(needed & ~self._tested).squeeze(1)
+        new = torch.unique(corners[~self._tested[corners]])
         self._buried[new] = self._lifted_inside(new)
         self._tested[new] = True
         return self._buried[corners].any(dim=1)
 
     def is_unsure(self, face: Tensor) -> Bool[Tensor, " points"]:
         """Mask of the faces at a hole or with self-intersections; each face is tested once a pose."""
-        if self._overlaps is None:
-            self._overlaps = torch.full((len(self._surface.corners),), -1, dtype=torch.int8, device=face.device)
-        needed = torch.zeros(len(self._surface.corners), dtype=torch.bool, device=face.device)
-        needed[face.long()] = True
-        new = torch.nonzero(needed & (self._overlaps < 0)).squeeze(1)
-        self._overlaps[new] = (
-            overlapping(self._surface.mesh, new, threads=self._surface.threads) | self._surface.ragged[new]
-        ).to(torch.int8)
-        return self._overlaps[face.long()] > 0
+        face = face.long()
+        new = torch.unique(face[self._overlaps[face] < 0])
+        pierced = overlapping(self._surface.mesh, new, threads=self._surface.threads)
+        self._overlaps[new] = (pierced | self._surface.ragged[new]).to(torch.int8)
+        return self._overlaps[face] > 0
 
     def _lifted_inside(self, vertices: Tensor) -> Bool[Tensor, " vertices"]:
         """Mask of the vertices with an inside point just above.
@@ -338,9 +327,7 @@ class Faces:
         out = torch.zeros(len(vertices), dtype=torch.bool, device=vertices.device)
         if not len(vertices):
             return out
-        if self._up is None:
-            self._up = self._normals()
-        size, up = np.ptp(self._surface.bounds, axis=0), self._up[vertices]
+        size, up = np.ptp(self._surface.bounds, axis=0), self._normals[vertices]
         lifted = wp.to_torch(self._surface.mesh.points)[vertices] + LIFT * float(size.max()) * up
         if self._surface.has_holes:
             return self._surface.inside(lifted)
@@ -352,6 +339,7 @@ class Faces:
         out[met] = self._surface.inside(lifted[met])
         return out
 
+    @cached_property
     def _normals(self) -> Float[Tensor, "vertices 3"]:
         """Unit normals of the vertices."""
         points = wp.to_torch(self._surface.mesh.points)
@@ -379,7 +367,7 @@ class MeshBody:
     """One mesh collider over the shot; its surfaces are kept while the topology is unchanged."""
 
     def __init__(self, *, side: str = "auto", device: str, threads: int) -> None:
-        """Store device, threads and ``side``, one of `sides.SIDES`."""
+        """Prepare a collider without a pose; ``side`` is one of `schema.SIDES`."""
         self._side, self._device, self._threads = side, device, threads
         self._triangles: np.ndarray | None = None
         self._points = np.zeros((0, 3))

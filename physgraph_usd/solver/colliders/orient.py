@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import sparse
-from scipy.sparse import csgraph
+
+from ..mesh.topology import joined_by, paired
 
 WELD = 1e-6
 """Distance below which vertices are merged, relative to the mesh's size."""
@@ -108,10 +108,9 @@ def _welded(points: np.ndarray) -> np.ndarray:
 
 def _edges(faces: np.ndarray, vertex_count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Edge of each side (0-1, 1-2, 2-0) of each face, whether the side runs upwards, and the faces at each edge."""
-    start, end = faces, np.roll(faces, -1, axis=1)
-    keys = np.minimum(start, end) * vertex_count + np.maximum(start, end)
-    _, edge, count = np.unique(keys, return_inverse=True, return_counts=True)
-    return edge.reshape(-1, 3), start < end, count
+    ends = np.roll(faces, -1, axis=1)
+    edge = paired(faces.ravel(), ends.ravel(), vertex_count)[1]
+    return edge.reshape(-1, 3), faces < ends, np.bincount(edge)
 
 
 def _orientation(
@@ -129,8 +128,7 @@ def _orientation(
     a, b = first // 3, second // 3
     rows = np.concatenate([a, a + faces])
     columns = np.concatenate([np.where(agree, b, b + faces), np.where(agree, b + faces, b)])
-    graph = sparse.coo_matrix((np.ones(len(rows), bool), (rows, columns)), shape=(2 * faces, 2 * faces))
-    _, label = csgraph.connected_components(graph, directed=False)
+    label = joined_by(np.stack([rows, columns], axis=1), 2 * faces)
     as_is, reverse = label[:faces], label[faces:]
     _, piece = np.unique(np.minimum(as_is, reverse), return_inverse=True)
     one_sided = np.bincount(piece.reshape(-1), as_is == reverse) > 0
@@ -152,10 +150,9 @@ def _openings(
     # Rims of two pieces that meet in a vertex are two.
     vertices, ends = np.unique(np.stack([start, end]) + piece[face] * len(points), return_inverse=True)
     ends = ends.reshape(2, -1)
-    rims = sparse.coo_matrix((np.ones(len(face), bool), (ends[0], ends[1])), shape=(len(vertices), len(vertices)))
-    rim_count, rim = csgraph.connected_components(rims, directed=False)
-    length = np.bincount(rim[ends[0]], np.linalg.norm(points[end] - points[start], axis=1), rim_count)
-    owner = np.zeros(rim_count, np.int64)
+    rim = joined_by(ends.T, len(vertices))
+    length = np.bincount(rim[ends[0]], np.linalg.norm(points[end] - points[start], axis=1))
+    owner = np.zeros(len(length), np.int64)
     owner[rim] = vertices // len(points)
     return np.bincount(owner, length**2 / (4.0 * np.pi), len(total)) / np.maximum(total, np.finfo(float).tiny)
 

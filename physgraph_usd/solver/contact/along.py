@@ -38,7 +38,7 @@ def _push_apart(
     displacement: wp.array(dtype=wp.vec3d),
     push: wp.array(dtype=wp.float64),
 ):
-    """Update each pair's multiplier from the approach of its parts."""
+    """Update the multiplier of a pair from the approach of both parts."""
     n = first + wp.tid()
     nearer = wp.float64(0.0)
     for k in range(4):

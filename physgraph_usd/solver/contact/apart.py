@@ -1,7 +1,7 @@
 """Untangling of cages that start with intersections: the smaller piece cut off by each contour moves back.
 
 Springs shorten a contour step by step and stop when the cloth between is stretched. The smaller piece is taken to be on
-the wrong side (Baraff, Witkin and Kass 2003): its vertices are mirrored to the other side of the cloth they went
+the wrong side (Baraff, Witkin and Kass 2003): the piece's vertices are mirrored at the cloth that the piece passed
 through, by at most a gap. A dent, a corner or half a sheet comes back at any depth. All pieces move at once.
 """
 
@@ -32,14 +32,14 @@ from .cloth_mesh import RINGS, ClothMesh
 wp.set_module_options(KERNELS)
 
 MIRROR_PASSES = 6
-"""Most passes that move pieces back: a pass may uncover another contour."""
+"""Largest number of passes that move pieces back: a pass may uncover further contours."""
 SECOND_GAP = 0.25
 """Minimum gap of a second try, in mean edges: faces of curved cloth intersect if the gap is smaller than their sag."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Through:
-    """Vertices of pieces that went through cloth.
+    """Vertices of pieces that passed through cloth.
 
     Attributes:
         vertices: Indices of the vertices, shape (N,), int64.

@@ -111,11 +111,10 @@ class FrameBodies:
             at: The points in the surface's coordinates [m].
         """
         surface = self.touching[index].surface
-        nearest = surface.closest(at, torch.full_like(at[:, 0], float("inf")))
+        nearest = surface.closest(at)
         exits = surface.exit(at, nearest)
         out, blocked = exits.point + surface.lift * exits.normal, torch.zeros_like(nearest.rim)
-        for number in self._beside(index):
-            neighbour = self.touching[number].surface
+        for neighbour in self._beside(index):
             blocked |= neighbour.inside(out + torch.as_tensor(surface.origin - neighbour.origin).to(out))
         return nearest, replace(exits, distance=exits.distance.masked_fill(blocked, torch.inf))
 
@@ -123,16 +122,15 @@ class FrameBodies:
         """Number of body parts around points in a surface's coordinates [m], up to 2 of the surface itself."""
         surface = self.touching[index].surface
         count = surface.inside(at).long() + surface.inside(at, parts=2).long()
-        for number in self._beside(index):
-            neighbour = self.touching[number].surface
+        for neighbour in self._beside(index):
             count += neighbour.inside(at + torch.as_tensor(surface.origin - neighbour.origin).to(at)).long()
         return count
 
-    def _beside(self, index: int) -> tuple[int, ...]:
-        """Numbers of the closed surfaces in contact with the same garments whose bounds overlap a closed surface's."""
+    def _beside(self, index: int) -> tuple[MeshSurface, ...]:
+        """The closed surfaces in contact with the same garments whose bounds overlap a closed surface's."""
         body = self.touching[index]
         return tuple(
-            number
+            candidate.surface
             for number, candidate in enumerate(self.touching)
             if number != index and candidate.surface.closed and body.surface.closed
             if [np.isfinite(offset) for offset in candidate.offset] == [np.isfinite(offset) for offset in body.offset]
@@ -195,12 +193,11 @@ class LevelBodies:
         return by_garment[self.level.vertex_garment.long()]
 
     def _behind(self, index: int, x: Tensor, vertices: Tensor) -> Bool[Tensor, " points"]:
-        """Mask of the points x of some vertices that are inside a body or behind it."""
+        """Mask of the vertices, at positions x [m], that are inside or behind a body."""
         surface, at = self.frame.touching[index].surface, x + self.frame.shifts[index]
         if surface.closed:
             return surface.inside(at)
-        nearest = surface.closest(at, torch.full_like(at[:, 0], float("inf")))
-        return nearest.is_behind(self.side(index)[vertices])
+        return surface.closest(at).is_behind(self.side(index)[vertices])
 
     def side(self, index: int) -> Float[Tensor, " vertices"]:
         """Allowed side of an open surface for each vertex: 1 or -1; 0 if undecided or closed."""
@@ -223,12 +220,11 @@ class LevelBodies:
         surface, at = self.frame.touching[index].surface, x + self.frame.shifts[index]
         if surface.closed:
             nearest, exits = self.frame.exits(index, at)
+            outward, stays = exits.normal, pinched(nearest, exits, longest=self.frame.longest)
         else:
-            nearest = exits = surface.closest(at, torch.full_like(at[:, 0], float("inf")))
-        stays = ~exits.distance.isfinite()
-        if surface.closed:
-            stays |= pinched(nearest, exits, longest=self.frame.longest)
-        outward = exits.normal if surface.closed else exits.normal * side.unsqueeze(1)
+            exits = surface.closest(at)
+            outward, stays = exits.normal * side.unsqueeze(1), torch.zeros_like(exits.rim)
+        stays |= ~exits.distance.isfinite()
         direct = (exits.point - at) / exits.distance.clamp_min(ON_SURFACE).unsqueeze(1)
         normal = torch.where((exits.distance > ON_SURFACE).unsqueeze(1), direct, outward)
         return torch.nn.functional.normalize(normal, dim=1, eps=1e-30), exits.distance, stays
@@ -247,7 +243,7 @@ class LevelBodies:
     def _vertices_beside(
         self, index: int, x: Tensor, candidates: Tensor
     ) -> tuple[Int[Tensor, " some"], Float[Tensor, "some 3"], Float[Tensor, " some"]]:
-        """Candidates outside that are near a body, their directions from the body, and their negative distances [m]."""
+        """Candidates outside that are near a body, unit directions from the body, and negative distances [m]."""
         vertices = torch.nonzero(candidates & self._feels(index)).squeeze(1)
         surface, at = self.frame.touching[index].surface, x[vertices] + self.frame.shifts[index]
         nearest = surface.closest(at, torch.full_like(at[:, 0], self.frame.longest))
@@ -302,7 +298,7 @@ class LevelBodies:
     def _pull(
         self, x: Tensor, index: int, corners: Tensor, weight: Tensor, normal: Tensor, depth: Tensor, *, share: float
     ) -> PairConstraints:
-        """Constraints that move points of the cloth along their ways out [m]."""
+        """Constraints that move points of the cloth out of a body, along unit normals by depths [m]."""
         at = (weight.unsqueeze(2) * x[corners]).sum(dim=1)
         goal = (normal * at).sum(dim=1) + depth + share * self.offset(index)[corners[:, 0]]
         stiffness = self.frame.settings.stiffness * self.level.vertex_area[corners].amin(dim=1)
@@ -310,7 +306,7 @@ class LevelBodies:
         return PairConstraints(corners.to(torch.int32).contiguous(), *columns)
 
     def offset(self, index: int) -> Float[Tensor, " vertices"]:
-        """Distance that each vertex keeps from a body [m]."""
+        """Offset of each vertex from a body [m]."""
         offset = torch.tensor(self.frame.touching[index].offset, dtype=self.level.dtype, device=self.level.rest.device)
         return offset[self.level.vertex_garment.long()]
 
@@ -382,5 +378,5 @@ def _start_sides(surface: MeshSurface, cage: Float[Tensor, "coarse 3"]) -> Float
     """Side of the surface on which each cage vertex lies, 1 or -1; 0 past the rim, and for closed surfaces."""
     if surface.closed or surface.fixed_side is not None:
         return torch.full_like(cage[:, 0], surface.fixed_side or 0.0)
-    nearest: Nearest = surface.closest(cage, torch.full_like(cage[:, 0], float("inf")))
+    nearest = surface.closest(cage)
     return torch.where(nearest.rim, torch.zeros_like(nearest.side), nearest.side)

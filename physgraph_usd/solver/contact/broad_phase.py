@@ -1,4 +1,4 @@
-"""Broad phase: bodies that a garment can touch in a frame, and their surfaces, posed once a frame for all garments."""
+"""Broad phase: bodies that a garment can touch in a frame, with surfaces posed once a frame for all garments."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 from ..colliders.mesh import MeshBody, MeshSurface
 from ..colliders.orient import FIXED
 from ..colliders.pose import Collider, Pose, bounds_of
+from ..mesh.topology import joined_by
 from ..rigid import AT_REST, Rigid
 from ..scene import Garment, GarmentFrame, mean_edge
 from ..strain import has_collapsed
@@ -50,19 +51,15 @@ class TouchingGroups:
             if intact[a] and intact[b] and touch_one_another(self._garments[a], self._garments[b])
             if self._close(a, b, frames, trees)
         ]
-        parts: list[tuple[int, ...]] = [(index,) for index in range(len(frames))]
-        for a, b in near:
-            joined = tuple(sorted({*parts[a], *parts[b]}))
-            for index in joined if parts[a] != parts[b] else ():
-                parts[index] = joined
-        return list(dict.fromkeys(parts))
+        group = joined_by(np.array(near, np.int64).reshape(-1, 2), len(frames))
+        return [tuple(np.flatnonzero(group == number).tolist()) for number in range(group.max(initial=-1) + 1)]
 
     def _reach(self, index: int, frame: GarmentFrame) -> float:
         """A garment's share of the distance at which two garments are near [m]."""
         return 0.5 * frame.fabric.thickness + (0.5 * REACH + 1.0) * self._edges[index]
 
     def _boxes_meet(self, frames: Sequence[GarmentFrame]) -> Iterator[tuple[int, int]]:
-        """Pairs of cages with overlapping bounds, grown by their reach, in order of index; sweep along one axis."""
+        """Pairs of cages whose bounds, grown by the reach, overlap, in order of index; sweep along an axis."""
         bounds = np.array([bounds_of(frame.points) for frame in frames]).reshape(-1, 2, 3)
         reach = np.array([self._reach(index, frame) for index, frame in enumerate(frames)])[:, None]
         low, high = bounds[:, 0] - reach, bounds[:, 1] + reach

@@ -64,7 +64,7 @@ class ContactState:
 
     @staticmethod
     def clean(x: Tensor, corners: Tensor, given_up: Tangles | None = None) -> ContactState:
-        """Positions at which only given-up cloth crosses."""
+        """The state of positions without crossings outside given-up cloth."""
         return ContactState(x, x._version, corners, Crossings.none(x.device), given_up, Pierced.none(x.device))
 
     @property
@@ -171,7 +171,7 @@ class LevelContact:
 
     @cached_property
     def at_base(self) -> ContactState:
-        """The state of the upsampled cage that is followed."""
+        """The state of the upsampled cage that the cloth follows."""
         return self.of_cage(self._base)
 
     @cached_property
@@ -196,7 +196,7 @@ class LevelContact:
         return self._looked
 
     def remember(self, x: Float[Tensor, "vertices 3"], given_up: Tangles | None = None) -> None:
-        """Record that only given-up cloth crosses at x [m], as after a safe move from such positions."""
+        """Record that only given-up cloth crosses at x [m], as after a safe move from a clean state."""
         self._looked = ContactState.clean(x, self._corners(x), given_up)
 
     def _corners(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "all 3"]:

@@ -18,7 +18,7 @@ from ..level import Level
 from ..mesh.topology import adjacency, joined_by
 
 RINGS = 2
-"""Rings of vertices that count as part of the crossing or the piece of cloth in their middle."""
+"""Rings of vertices around a crossing or a piece of cloth that count as part of it."""
 
 
 class ClothMesh:
@@ -100,7 +100,7 @@ class ClothMesh:
         stiffness: Float[Tensor, " pairs"],
         x: Float[Tensor, "all 3"],
     ) -> PairConstraints:
-        """Constraints in which the corners of bodies are constant at x [m]; other arguments are `PairConstraints`'."""
+        """Constraints with the bodies' corners constant at x [m]; the arguments are as for `PairConstraints`."""
         count = self.level.vertex_count
         if len(x) > count:
             fixed = corners >= count

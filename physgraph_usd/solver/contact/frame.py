@@ -140,7 +140,10 @@ class FrameContact:
         return self._cage[1].count > 0
 
     def at(self, level: Level) -> LevelContact:
-        """The cached view of one level. Distances at rest use the rest shape without ease."""
+        """The cached view of one level. Distances at rest use the rest shape without ease.
+
+        Vertices that depend only on given-up vertices of the cage are given up too.
+        """
         if level.index not in self._views:
             level = self._levels[level.index]
             seam, base = self._seam_at(level), level.base.apply(self.aim)
@@ -152,14 +155,10 @@ class FrameContact:
                 settings=self._settings,
                 bodies=self._bodies,
                 seam=seam,
-                given_up=self._given_up_at(level),
+                given_up=None if self.given_up is None else _share_of(level, ~self.given_up) == 0.0,
                 doubtful=None if self._doubtful is None else _share_of(level, self._doubtful) > 0.0,
             )
         return self._views[level.index]
-
-    def _given_up_at(self, level: Level) -> Bool[Tensor, " vertices"] | None:
-        """Mask of a level's vertices that depend only on given-up vertices of the cage."""
-        return None if self.given_up is None else _share_of(level, ~self.given_up) == 0.0
 
     @cached_property
     def _doubtful(self) -> Bool[Tensor, " coarse"] | None:

@@ -104,7 +104,7 @@ def depths(
     within = torch.nonzero(inside).squeeze(1) if surface.has_inside else depth.long()[:0]
     if len(within):
         if exits is None:
-            nearest = surface.closest(x[within], torch.full_like(depth[within], float("inf")))
+            nearest = surface.closest(x[within])
             exit_points = surface.exit(x[within], nearest)
         else:
             nearest, exit_points = exits(x[within])
@@ -115,11 +115,7 @@ def depths(
 
 
 def pinched(
-    nearest: Nearest,
-    exit_points: Nearest,
-    *,
-    longest: float,
-    buried: Bool[Tensor, " points"] | None = None,
+    nearest: Nearest, exit_points: Nearest, *, longest: float, buried: Bool[Tensor, " points"] | None = None
 ) -> Bool[Tensor, " points"]:
     """Mask of the inside points between overlapping parts that are too far from a way out, or are buried.
 

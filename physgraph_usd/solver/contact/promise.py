@@ -28,11 +28,11 @@ from .along import ApproachLimits, along
 from .cloth_mesh import RINGS, ClothMesh
 
 ROUNDS = 4
-"""Passes that shorten blocked displacements. Vertices that are still blocked then stay at the start, so passes end."""
+"""Number of passes that shorten blocked displacements. Vertices that are blocked after the last pass do not move."""
 
 STRAINS, NEGLIGIBLE = 0.5, 0.01
-"""Largest strain of an edge between vertices whose displacements are shortened, and the fraction of that change which
-is negligible. Without the limit shot 02 needs 53 instead of 24 rounds in frame 18 and keeps crossings."""
+"""Largest strain of an edge between vertices with shortened displacements, and the fraction of this strain that is
+neglected. Without the limit shot 02 needs 53 instead of 24 rounds in frame 18 and keeps crossings."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,15 +52,9 @@ class Promise:
 
     def blocking(self, begin: Tensor, end: Tensor, queried: Tensor, *, near: NearAt | None = None) -> Pairs:
         """As `blocking_pairs`."""
+        parts, tangle, inside = self.mesh.parts, self.tangle, self.inside
         return blocking_pairs(
-            self.mesh.parts,
-            begin,
-            end,
-            floor=self.floor,
-            queried=queried,
-            tangle=self.tangle,
-            inside=self.inside,
-            near=near,
+            parts, begin, end, floor=self.floor, queried=queried, tangle=tangle, inside=inside, near=near
         )
 
     def kept(
@@ -109,16 +103,9 @@ class Promise:
             return begin, proved
         # Cloth that a moving body reaches, and that cannot move on, is then inside the body.
         inside = self.inside if stand else torch.arange(len(moves), device=moves.device) < mesh.level.vertex_count
+        parts, floor, tangle, dtype = mesh.parts, self.floor, self.tangle, mesh.level.dtype
         x = safe_move(
-            begin,
-            ends,
-            mesh.parts,
-            floor=self.floor,
-            tangle=self.tangle,
-            inside=inside,
-            queried=late,
-            near=near,
-            dtype=mesh.level.dtype,
+            begin, ends, parts, floor=floor, tangle=tangle, inside=inside, queried=late, near=near, dtype=dtype
         )
         return x, stand
 
@@ -193,7 +180,7 @@ def safe_move(
 
 
 def _spread(share: Tensor, displacement: Tensor, parts: Parts) -> Float[Tensor, " vertices"]:
-    """Fractions reduced around shortened vertices, so that no edge is strained by more than `STRAINS`."""
+    """Fractions of displacements, reduced around shortened vertices: no edge is strained by more than `STRAINS`."""
     length = displacement.norm(dim=1)
     late = length * (1.0 - share)
     least = NEGLIGIBLE * STRAINS * parts.lengths.mean()

@@ -50,7 +50,7 @@ def repaired_cage(
 
 
 def _membrane(x: Tensor, region: Bool[Tensor, " vertices"], beside: sp.csr_matrix) -> Tensor:
-    """Positions with each vertex of a region at the mean of its neighbours; all other vertices are held."""
+    """Positions in which each vertex of a region is the mean of the neighbours; the remaining vertices are held."""
     inner, rest = (np.flatnonzero(mask.cpu().numpy()) for mask in (region, ~region))
     rows = sp.csr_matrix(sp.diags(np.asarray(beside.sum(axis=1)).ravel()) - beside)[inner]
     touched = np.unique(csgraph.connected_components(beside, directed=False)[1][rest])

@@ -93,7 +93,7 @@ def swallowed(
         for garment, span in enumerate(bodies.level.spans):
             if body.surface.has_inside and span.stop > span.start and bool(in_body[span].all()):
                 at = x[span] + bodies.frame.shifts[index]
-                near = body.surface.closest(at, torch.full_like(at[:, 0], float("inf")))
+                near = body.surface.closest(at)
                 deepest[garment] = max(deepest[garment], (float(near.distance.mean()), body.path))
     return deepest
 
@@ -118,7 +118,7 @@ def penetration_map(surfaces: Sequence[MeshSurface], points: np.ndarray, *, devi
         if surface.closed:
             depth = depths(surface, x, surface.inside(x), float("inf"))[0]
         else:
-            nearest = surface.closest(x, torch.full_like(deepest, float("inf")))
+            nearest = surface.closest(x)
             depth = torch.where(nearest.is_behind(surface.fixed_side or 0.0), nearest.distance, 0.0)
         deepest = torch.maximum(deepest, depth)
     return (1e3 * deepest).to(torch.float32).cpu().numpy()

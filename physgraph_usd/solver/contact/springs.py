@@ -43,7 +43,7 @@ _HALF, _MARGIN, _LEAST = (wp.constant(wp.float64(value)) for value in (HALF, MAR
 
 @wp.func
 def _apart(weight: wp.vec4d, c: wp.vec4i, x: wp.array(dtype=wp.vec3d)):
-    """Vector from a pair's second point to its first."""
+    """Vector from the second point of a pair to the first."""
     return weight[0] * x[c[0]] + weight[1] * x[c[1]] + weight[2] * x[c[2]] + weight[3] * x[c[3]]
 
 
@@ -92,7 +92,7 @@ class NearSprings:
     """Near pairs and their offsets.
 
     Attributes:
-        offset: Distance that each pair keeps [m], shape (N,).
+        offset: Distance to keep [m], shape (N,).
     """
 
     near: NearPairs

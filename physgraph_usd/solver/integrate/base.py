@@ -100,9 +100,9 @@ class System:
         """Evaluations, metric solves and failed evaluations so far."""
         return self.evaluations, self.metric_solves, self.failed
 
-    def has_same_metric(self, other: System) -> bool:
-        """Whether curvature information from the ``other`` system is valid for this system."""
-        return self.metric is other.metric
+    def has_same_metric(self, system: System) -> bool:
+        """Whether curvature information from another system is valid for this system."""
+        return self.metric is system.metric
 
     def energy_and_force(self, x: Float[Tensor, "vertices 3"]) -> tuple[float, Float[Tensor, "vertices 3"]]:
         """Energy [J] and force [N]; the force on fixed vertices is zero."""

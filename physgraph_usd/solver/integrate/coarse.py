@@ -6,10 +6,10 @@
 |---|---|
 | H | metric of the level that is solved, shape (V, V) |
 | Z_l | linear map from level l; l = 0 is the cage |
-| K | stiffness of what touches, a diagonal |
+| K | contact stiffness, a diagonal |
 
-Of the levels between, only the diagonal of A_l is needed; of the cage, all entries. Both are linear in K: one sparse
-product gives them all, and the cage's pattern stays the same, whatever touches.
+For the levels between, only the diagonal of A_l is needed; for the cage, all entries. Both are linear in K, so one
+sparse product gives all, and the cage's pattern does not depend on the contact.
 """
 
 from __future__ import annotations
@@ -41,19 +41,13 @@ class CoarseLevels:
     """The coarser levels of a metric, with any contact stiffness.
 
     Attributes:
-        ups: Linear map to each level from the next coarser one, finest first; at the cage, from itself.
+        ups: Linear map to each level from the next coarser one, finest first; for the cage, from itself.
         dense: Whether the cage is solved by its inverse matrix.
-        recordings: Of moves, on a card.
+        recordings: Recorded moves, on a card.
     """
 
     def __init__(
-        self,
-        matrix: sp.csr_matrix,
-        ups: Sequence[Stencil],
-        onto: sp.csr_matrix,
-        *,
-        dtype: torch.dtype,
-        device: str,
+        self, matrix: sp.csr_matrix, ups: Sequence[Stencil], onto: sp.csr_matrix, *, dtype: torch.dtype, device: str
     ) -> None:
         """Take a metric to its coarser levels.
 
@@ -74,38 +68,38 @@ class CoarseLevels:
             weights.append(sp.csr_matrix(basis.multiply(basis).T))
         self._factors = Factors(sp.csr_matrix(pattern + sp.identity(basis.shape[1])), dtype=dtype, device=device)
         weights[-1] = _squares(basis, self._factors)
-        self._sizes, self._known = [each.shape[0] for each in weights], self._entries(matrix)
+        self._sizes, self._plain_entries = [table.shape[0] for table in weights], self._entries(matrix)
         self._weights = Stencil(sp.csr_matrix(sp.vstack(weights)), dtype=torch.float64, device=device)
         self._dtype, self.dense = dtype, device != "cpu" and 0 < basis.shape[1] <= MOST_DENSE
         self.recordings = Recordings()
 
     def of(self, matrix: sp.csr_matrix) -> CoarseLevels:
         """The levels of another matrix H [N/m] of the same pattern, shape (V, V)."""
-        other = copy.copy(self)
-        other._known = self._entries(matrix)
-        return other
+        levels = copy.copy(self)
+        levels._plain_entries = self._entries(matrix)
+        return levels
 
     def _entries(self, matrix: sp.csr_matrix) -> Float[Tensor, " entries"]:
         """Diagonals of all H_l, finest first, of the cage all entries [N/m]."""
-        known = list[np.ndarray]()
+        entries = list[np.ndarray]()
         for up in self.ups:
             matrix = sp.csr_matrix(up.transposed.matrix @ (matrix @ up.matrix))
-            known.append(matrix.diagonal())
-        apart = sp.diags((known[-1] <= 0).astype(np.float64))  # Identity rows where nothing moves.
-        known[-1] = self._factors.taken(sp.csr_matrix(matrix + apart))
-        return torch.as_tensor(np.concatenate(known), device=self._factors.rows.device)
+            entries.append(matrix.diagonal())
+        apart = sp.diags((entries[-1] <= 0).astype(np.float64))  # Identity rows where nothing moves.
+        entries[-1] = self._factors.taken(sp.csr_matrix(matrix + apart))
+        return torch.as_tensor(np.concatenate(entries), device=self._factors.rows.device)
 
     def held(self, stiff: Float[Tensor, " vertices"]) -> tuple[list[Tensor], Solver | Float[Tensor, "cage cage"]]:
         """Diagonals of the levels between [N/m], finest first, and the solve of the cage, given K [N/m].
 
         The solve is the inverse matrix if `dense`, else a function.
         """
-        entries = self._known + self._weights.apply(three_columns(stiff.double()))[:, 0]
+        entries = self._plain_entries + self._weights.apply(three_columns(stiff.double()))[:, 0]
         *between, cage = entries.split(self._sizes)
         scale = cage[self._factors.diagonal].mean().reciprocal()
         cage = cage * scale
         cage[self._factors.diagonal] += REGULARISATION
-        scale, between = scale.to(stiff), [each.to(stiff) for each in between]
+        scale, between = scale.to(stiff), [diagonal.to(stiff) for diagonal in between]
         if self.dense:
             return between, self._factors.inverse(cage).mul_(scale)
         solver = self._factors.of(cage)
@@ -120,7 +114,7 @@ class CoarseLevels:
             force: F [N].
             cage: The solve of the cage.
             rough: Factor of the finest level's part [m/N].
-            middle: Factors of the levels' between, finest first.
+            middle: Factors of the parts of the levels between, finest first.
         """
         *finer, low = self.forces(force)
         move = (cage @ low if isinstance(cage, Tensor) else cage(low)).mul_(COARSE)
@@ -137,23 +131,23 @@ class CoarseLevels:
 
     def scaled(self, stiffer: Float[Tensor, " vertices"]) -> CoarseLevels:
         """Approximation of the levels of R H R, R^2 the given numbers: R^2 is averaged at each coarse vertex."""
-        other, ones = copy.copy(self), torch.ones_like(stiffer)
-        sums = (self.forces(three_columns(each.to(self._dtype))) for each in (stiffer, ones))
-        means = [(some[:, 0] / whole[:, 0]).nan_to_num(nan=1.0).double() for some, whole in zip(*sums, strict=True)]
+        levels, ones = copy.copy(self), torch.ones_like(stiffer)
+        sums = (self.forces(three_columns(values.to(self._dtype))) for values in (stiffer, ones))
+        means = [(total[:, 0] / weight[:, 0]).nan_to_num(nan=1.0).double() for total, weight in zip(*sums, strict=True)]
         entries = (means[-1][self._factors.rows] * means[-1][self._factors.columns]).sqrt()
-        other._known = self._known * torch.cat([*means[1:-1], entries])
-        return other
+        levels._plain_entries = self._plain_entries * torch.cat([*means[1:-1], entries])
+        return levels
 
 
 def _squares(basis: sp.csr_matrix, cage: Factors) -> sp.csr_matrix:
     """The linear map from a diagonal K to the entries of Z^T K Z, shape (entries, V)."""
     counts = np.diff(basis.indptr)
     vertex = np.repeat(np.arange(basis.shape[0]), counts)
-    left = np.repeat(np.arange(basis.nnz), counts[vertex])
-    right = ranges(basis.indptr[vertex], counts[vertex])
-    place = cage.places(basis.indices[left], basis.indices[right])
-    products = basis.data[left] * basis.data[right]
-    return sp.csr_matrix((products, (place, vertex[left])), shape=(len(cage.rows), basis.shape[0]))
+    first = np.repeat(np.arange(basis.nnz), counts[vertex])
+    second = ranges(basis.indptr[vertex], counts[vertex])
+    entry = cage.places(basis.indices[first], basis.indices[second])
+    products = basis.data[first] * basis.data[second]
+    return sp.csr_matrix((products, (entry, vertex[first])), shape=(len(cage.rows), basis.shape[0]))
 
 
 def ranges(starts: np.ndarray, counts: np.ndarray) -> np.ndarray:

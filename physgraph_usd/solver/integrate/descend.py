@@ -27,7 +27,7 @@ class LevelReport:
         energy_after: Energy at the end [J].
         remaining_move: RMS of H0^-1 F at the end, in local edge lengths.
         milliseconds: Wall time of the level.
-        stopped: "tolerance", "seen", "steps", "budget" or "stalled"; "seen" where nothing is seen to move any more.
+        stopped: "tolerance", "seen", "steps", "budget" or "stalled"; "seen" once no visible motion is left.
         movers: Number of steps by mover.
         energies: Energy of each term at the end [J], if requested by the solver's caller.
         failed: Evaluations in failed line searches.
@@ -100,7 +100,7 @@ def descend(
     report.energy_after = carry.energy
     report.remaining_move = _remaining_move(system, carry)
     report.evaluations, report.metric_solves, report.failed = (
-        now - then for now, then in zip(system.counted, before, strict=True)
+        end - start for end, start in zip(system.counted, before, strict=True)
     )
     report.milliseconds = 1e3 * (time.perf_counter() - began)
     return carry, report

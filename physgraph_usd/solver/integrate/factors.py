@@ -38,7 +38,7 @@ class Factors:
         self._count, columns = pattern.shape[0], pattern.indices.astype(np.int64)
         rows = np.repeat(np.arange(self._count), np.diff(pattern.indptr))
         self._keys = rows * self._count + columns
-        self.rows, self.columns = (torch.as_tensor(each, device=device) for each in (rows, columns))
+        self.rows, self.columns = (torch.as_tensor(indices, device=device) for indices in (rows, columns))
         self.diagonal = torch.as_tensor(np.flatnonzero(rows == columns), device=device)
 
     def places(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
@@ -47,8 +47,8 @@ class Factors:
 
     def taken(self, matrix: sp.csr_matrix) -> Float[np.ndarray, " entries"]:
         """Entries of a matrix with a smaller or equal pattern, in this pattern's order."""
-        out, each = np.zeros(len(self._keys)), sp.coo_matrix(matrix)
-        out[self.places(each.row, each.col)] = each.data
+        out, coo = np.zeros(len(self._keys)), sp.coo_matrix(matrix)
+        out[self.places(coo.row, coo.col)] = coo.data
         return out
 
     def of(self, values: Float[Tensor, " entries"]) -> Solver:
@@ -56,8 +56,8 @@ class Factors:
         if not self._count:
             return torch.empty_like
         if cholespy is None:
-            place, shape = (self.rows.cpu().numpy(), self.columns.cpu().numpy()), (self._count, self._count)
-            return _of_scipy(sp.coo_matrix((values.cpu().numpy(), place), shape=shape))
+            indices, shape = (self.rows.cpu().numpy(), self.columns.cpu().numpy()), (self._count, self._count)
+            return _of_scipy(sp.coo_matrix((values.cpu().numpy(), indices), shape=shape))
         return _of_cholespy(cholespy, values, self.rows.int(), self.columns.int(), self._dtype)
 
     def inverse(self, values: Float[Tensor, " entries"]) -> Float[Tensor, "V V"]:
@@ -78,7 +78,7 @@ def _of_cholespy(module: Any, values: Tensor, rows: Tensor, columns: Tensor, dty
         solved[:] = [force.new_empty(len(force), 0)] if force.device.type == "cpu" else []
         return out
 
-    # Also at the end of the process: cholespy complains on stderr of factors that a traceback or a thread still holds.
+    # Also at exit: cholespy complains on stderr about factors that a traceback or a thread still references.
     weakref.finalize(solve, _release, factor, solved)
     return solve
 
@@ -86,8 +86,8 @@ def _of_cholespy(module: Any, values: Tensor, rows: Tensor, columns: Tensor, dty
 def _release(factor: list[Any], solved: list[Tensor]) -> None:
     """Free a factor, and on the CPU its copy of the last right-hand sides: 24 bytes a vertex.
 
-    cholespy 2.2 frees that copy only in a solve of another number of right-hand sides, not with the factor. A factor
-    that has solved nothing has no copy, and no memory to solve none with.
+    cholespy 2.2 frees the copy only in a solve with a different number of right-hand sides, not with the factor. A
+    factor without a solve has no copy, and cannot solve an empty right-hand side.
 
     Args:
         factor: The factor alone.

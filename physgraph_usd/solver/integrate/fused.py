@@ -44,7 +44,7 @@ for (int i = 0; i < BLOCK; ++i) {
     const int at = element[i];
     const Four here = *row_of(at, POSITION);
     for (int k = corners.data[at]; k < corners.data[at + 1]; ++k) {
-        const Four a = *row_of(others.data[k][0], POSITION) - here, b = *row_of(others.data[k][1], POSITION) - here;
+        const Four a = *row_of(ring.data[k][0], POSITION) - here, b = *row_of(ring.data[k][1], POSITION) - here;
         area[i] += turned(a * turned(b) - turned(a) * b);
     }
 }
@@ -112,16 +112,16 @@ class FusedPhysgraph:
         inputs = (layers[0].in_features, *widths[:-1])
         sizes = zip(layers, inputs, widths, strict=True)
         self._weights = torch.cat([_padded(layer.weight.T, from_, to).reshape(-1) for layer, from_, to in sizes])
-        self._rows = torch.zeros((vertices * len(_places(network.config.vectors)), 4), device=device)
+        self._rows = torch.zeros((vertices * len(_table_rows(network.config.vectors)), 4), device=device)
         none = vectors(torch.zeros((1, 3), device=device))
-        number, whole, pair = (wp.zeros(1, dtype=kind, device=device) for kind in (wp.float32, wp.int32, wp.vec2i))
-        rows, place = vectors(self._rows), dict[str, Any](device=device, threads=threads)
-        given = [vertices, 0, 0, whole, number, number, *[none] * 7, rows]
-        place["at_once"] = block_size(device)
-        self._pack = Launch(pack_kernel(network.config.vectors), vertices, given, **place)
+        number, index, pair = (wp.zeros(1, dtype=kind, device=device) for kind in (wp.float32, wp.int32, wp.vec2i))
+        rows, at_once = vectors(self._rows), block_size(device)
+        pack, fused = pack_kernel(network.config.vectors), fused_kernel(network.config)
+        inputs = [vertices, 0, 0, index, number, number, *[none] * 7, rows]
+        self._pack = Launch(pack, vertices, inputs, device=device, threads=threads, at_once=at_once)
         learned = [argument(self._weights), argument(self._bias), longest, none, none]
-        given = [vertices, rows, number, number, whole, pair, whole, whole, *learned]
-        self._launch = Launch(fused_kernel(network.config), vertices, given, **place)
+        inputs = [vertices, rows, number, number, index, pair, index, index, *learned]
+        self._launch = Launch(fused, vertices, inputs, device=device, threads=threads, at_once=at_once)
 
     def __call__(
         self, past: Past, x: Float[Tensor, "vertices 3"], frame: VertexFrame | None
@@ -129,7 +129,7 @@ class FusedPhysgraph:
         """The displacement, limited to the longest allowed, and the positions after it [m].
 
         Args:
-            past: What the vectors are made of.
+            past: Sources of the vectors.
             x: Positions [m].
             frame: The surroundings of the vertices; None without a mesh, for networks that need none.
         """
@@ -137,7 +137,7 @@ class FusedPhysgraph:
         fields = secants.fields.view(-1, 3)
         packed = [past.garment, secants.weights.view(-1), past.stiffness, fields, x]
         packed += [past.force, past.image, past.force1, past.image1, past.image2]
-        self._pack(dict(enumerate([secants.newest, secants.known, *packed], start=1)))
+        self._pack(dict(enumerate([secants.newest, secants.count, *packed], start=1)))
         move, moved = torch.empty_like(x), torch.empty_like(x)
         changed = {2: past.spacing, 3: past.reach, 9: self.bias_at(past.step), 11: move, 12: moved}
         if frame is not None:
@@ -203,12 +203,12 @@ def fused_kernel(config: PhysgraphConfig) -> wp.Kernel:
     formula = "".join(line for lines in sources for line in lines)
 
     def of_block(
-        block, vertices, rows, spacing, reach, corners, others, ends, far, weights, biases, longest, out, to
+        block, vertices, rows, spacing, reach, corners, ring, ends, far, weights, biases, longest, out, to
     ): ...
 
-    def physgraph(first, vertices, rows, spacing, reach, corners, others, ends, far, weights, biases, longest, out, to):
+    def physgraph(first, vertices, rows, spacing, reach, corners, ring, ends, far, weights, biases, longest, out, to):
         block = first + wp.tid()
-        compute(block, vertices, rows, spacing, reach, corners, others, ends, far, weights, biases, longest, out, to)
+        compute(block, vertices, rows, spacing, reach, corners, ring, ends, far, weights, biases, longest, out, to)
 
     number, index, vector, pair = (wp.array(dtype=kind) for kind in (wp.float32, wp.int32, wp.vec3f, wp.vec2i))
     row = wp.array(dtype=wp.vec4f)
@@ -217,11 +217,11 @@ def fused_kernel(config: PhysgraphConfig) -> wp.Kernel:
     return kernel(physgraph, name, *kinds)
 
 
-def _places(names: Sequence[str]) -> dict[str, int]:
+def _table_rows(names: Sequence[str]) -> dict[str, int]:
     """Row of each whole vector, and of the positions "x", in a vertex's table; first those with neighbour means."""
     wholes, smoothed, _ = in_rows(names)
-    first = [wholes[place] for place in smoothed]
-    return {name: row for row, name in enumerate([*first, "x", *(each for each in wholes if each not in first)])}
+    first = [wholes[index] for index in smoothed]
+    return {name: row for row, name in enumerate([*first, "x", *(name for name in wholes if name not in first)])}
 
 
 _VECTOR_SOURCES = {
@@ -230,8 +230,8 @@ _VECTOR_SOURCES = {
     "metric2": "at((const float*)g2.data, vertex)",
     "diagonal": "at((const float*)f.data, vertex) * soft[i]",
     "diagonal1": "at((const float*)f1.data, vertex) * soft[i]",
-    "move1": "known > 0 ? at(moves[0], vertex) : Four{}",
-    "move2": "known > 1 ? at(moves[1], vertex) : Four{}",
+    "move1": "secants > 0 ? at(moves[0], vertex) : Four{}",
+    "move2": "secants > 1 ? at(moves[1], vertex) : Four{}",
     "secant": "direction(vertex)",
     "x": "at((const float*)x.data, vertex)",
 }
@@ -252,7 +252,7 @@ auto at = [&](const float* field, size_t vertex) {  // Four numbers are read whe
 auto direction = [&](size_t vertex) {
     const float* w = weights.data + WEIGHTS * garment.data[vertex];
     Four sum = at((const float*)g.data, vertex) * w[0];
-    for (int i = 0; i < known; ++i)
+    for (int i = 0; i < secants; ++i)
         sum += at(images[i], vertex) * w[1 + i] + at(moves[i], vertex) * w[1 + SECANTS + i];
     return sum;
 };
@@ -263,17 +263,17 @@ auto direction = [&](size_t vertex) {
 @functools.cache
 def pack_kernel(names: tuple[str, ...]) -> wp.Kernel:
     """The kernel that writes each vertex's table of vectors, for networks of given vectors; an item is a block."""
-    places = _places(names)
+    table = _table_rows(names)
     lines = ["for (int i = 0; i < BLOCK; ++i) {\nconst size_t vertex = element[i];\n"]
-    lines += [f"Four* row = (Four*)rows.data + vertex * {len(places)};\n"]
-    lines += [f"row[{row}] = {_VECTOR_SOURCES[name]};\n" for name, row in places.items()]
+    lines += [f"Four* row = (Four*)rows.data + vertex * {len(table)};\n"]
+    lines += [f"row[{row}] = {_VECTOR_SOURCES[name]};\n" for name, row in table.items()]
     name = f"pack_{hashlib.sha256(repr(names).encode()).hexdigest()[:16]}"
 
-    def of_block(block, vertices, newest, known, garment, weights, stiffness, fields, x, f, g, f1, g1, g2, rows): ...
+    def of_block(block, vertices, newest, secants, garment, weights, stiffness, fields, x, f, g, f1, g1, g2, rows): ...
 
-    def pack(first, vertices, newest, known, garment, weights, stiffness, fields, x, f, g, f1, g1, g2, rows):
+    def pack(first, vertices, newest, secants, garment, weights, stiffness, fields, x, f, g, f1, g1, g2, rows):
         block = first + wp.tid()
-        write(block, vertices, newest, known, garment, weights, stiffness, fields, x, f, g, f1, g1, g2, rows)
+        write(block, vertices, newest, secants, garment, weights, stiffness, fields, x, f, g, f1, g1, g2, rows)
 
     number, index, vector = (wp.array(dtype=kind) for kind in (wp.float32, wp.int32, wp.vec3f))
     kinds = (wp.int32, wp.int32, wp.int32, index, number, number, *[vector] * 7, wp.array(dtype=wp.vec4f))
@@ -284,15 +284,15 @@ def pack_kernel(names: tuple[str, ...]) -> wp.Kernel:
 
 def _widths(config: PhysgraphConfig) -> tuple[int, ...]:
     """Numbers after each layer, as multiples of `ROW`."""
-    return tuple(-(-each // ROW) * ROW for each in (*[config.width] * config.depth, len(config.vectors)))
+    return tuple(-(-width // ROW) * ROW for width in (*[config.width] * config.depth, len(config.vectors)))
 
 
 def _rows(names: Sequence[str]) -> list[str]:
     """Source of the normal ``across``, 0 if no part needs it, and of the vectors ``row`` [m]."""
-    (wholes, smoothed, parts), places = in_rows(names), _places(names)
-    order = ", ".join(str(places[name]) for name in wholes)
+    (wholes, smoothed, parts), table = in_rows(names), _table_rows(names)
+    order = ", ".join(str(table[name]) for name in wholes)
     lines = [
-        f"constexpr int ROWS = {len(places)}, POSITION = {places['x']}, PLACES[] = {{{order}}};\n",
+        f"constexpr int ROWS = {len(table)}, POSITION = {table['x']}, PLACES[] = {{{order}}};\n",
         "auto row_of = [&](size_t vertex, int row) { return (const Four*)rows.data + vertex * ROWS + row; };\n",
         f"Vec across = {{}}, row[{len(wholes) + len(smoothed)}];\n",
         f"for (int u = 0; u < {len(wholes)}; ++u)\n",
@@ -305,21 +305,19 @@ def _rows(names: Sequence[str]) -> list[str]:
 
 def _layers(widths: tuple[int, ...]) -> list[str]:
     """Source of the layers: from the features ``seen`` to the coefficients ``last``."""
-    lines, now, after, inputs = [f"constexpr int WIDEST = {max(widths)};\n", _LAYERS], "seen", "other", "SEEN"
-    for place, width in enumerate(widths):
-        lines.append(f"layer({now}, {inputs}, {after}, {width}, {str(place + 1 == len(widths)).lower()});\n")
-        now, after, inputs = after, ("hidden" if after == "other" else "other"), str(width)
-    return [*lines[:1], "Number hidden[WIDEST];\n", *lines[1:], f"const Number* last = {now};\n"]
+    lines, source, target, inputs = [f"constexpr int WIDEST = {max(widths)};\n", _LAYERS], "seen", "other", "SEEN"
+    for number, width in enumerate(widths):
+        lines.append(f"layer({source}, {inputs}, {target}, {width}, {str(number + 1 == len(widths)).lower()});\n")
+        source, target, inputs = target, ("hidden" if target == "other" else "other"), str(width)
+    return [*lines[:1], "Number hidden[WIDEST];\n", *lines[1:], f"const Number* last = {source};\n"]
 
 
 def _combined(parts: Parts) -> list[str]:
     """Source of the combination of the vectors, limited in length."""
     lines = ["Vec move = {};\nNumber lift = {};\n"]
     for a, (row, normal) in enumerate(parts):
-        term = (
-            f"lift += last[{a}] * dot(row[{row}], across);\n" if normal else f"move = move + row[{row}] * last[{a}];\n"
-        )
-        lines.append(term)
+        lift, move = f"lift += last[{a}] * dot(row[{row}], across);\n", f"move = move + row[{row}] * last[{a}];\n"
+        lines.append(lift if normal else move)
     return [*lines, _LIMITED]
 
 
@@ -334,7 +332,7 @@ def _units(parts: Parts, families: Families) -> list[str]:
         f"const Number scale = 1.0f / load(spacing);\nfor (int u = 0; u < {rows}; ++u) near[u] = row[u] * scale;\n",
     ]
     for kind in range(kinds):
-        terms = [_square(*part) for part, each in zip(parts, families, strict=True) if each == (kind, True)]
+        terms = [_square(*part) for part, family in zip(parts, families, strict=True) if family == (kind, True)]
         lines.append(f"size[{kind}] = {1.0 / len(terms)!r}f * ({' + '.join(terms)}) + {ZERO_LENGTH**2!r}f;\n")
         lines.append(f"inverse[{kind}] = 1.0f / root(size[{kind}]);\n")
     family_of = {row: family for (row, _), (family, _) in reversed(tuple(zip(parts, families, strict=True)))}
@@ -363,7 +361,4 @@ def _features(parts: Parts, pairs: Pairs, families: Families) -> list[str]:
     kinds = 1 + max(family for family, _ in families)
     logarithm = f"{LOG_SCALE!r}f * logarithm(size[%d]) + {LOG_OFFSET!r}f"
     values = ", ".join([*terms, *(logarithm % kind for kind in range(kinds))])
-    return [
-        f"const Number seen[] = {{{values}}};\n",
-        f"constexpr int SEEN = {len(terms) + kinds};\n",
-    ]
+    return [f"const Number seen[] = {{{values}}};\n", f"constexpr int SEEN = {len(terms) + kinds};\n"]

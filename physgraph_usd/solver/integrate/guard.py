@@ -87,10 +87,10 @@ class Guard:
                 if shorter.energy <= carry.energy:
                     return shorter.moved_by(mover)
         direction = system.apply_metric_inverse(carry.force)
-        found = backtrack(system, carry, direction, float((carry.force * direction).sum()))
-        if found is None:
+        reached = backtrack(system, carry, direction, float((carry.force * direction).sum()))
+        if reached is None:
             return carry.moved_by("stayed")
-        return self._inner.start(system, found[0]).moved_by("fallback")
+        return self._inner.start(system, reached[0]).moved_by("fallback")
 
     def _spare_of(self, carry: Carry) -> Integrator | None:
         """The spare integrator if responsible after this carry, or None."""

@@ -98,11 +98,9 @@ class LearnedMetric:
             secants = _products_of(system).directed(secants, force, image, is_new=True)
             memory = carry.memory.after(carry, secants)
         else:
-            product, differences = (
-                partial(garment_dot, system.level),
-                (carry.force - force, carry.preconditioned - image),
-            )
-            memory = carry.memory.after(carry, Secant(move, *differences, product))
+            yields, image_change = carry.force - force, carry.preconditioned - image
+            secant = Secant(move, yields, image_change, partial(garment_dot, system.level))
+            memory = carry.memory.after(carry, secant)
         return self._carry(system, x, (energy, force, image), memory)
 
     def _carry(self, system: System, x: Tensor, evaluated: tuple[Tensor, Tensor, Tensor], memory: Any) -> Carry:
@@ -119,7 +117,7 @@ class LearnedMetric:
     def curvature(self, carry: Carry) -> Any:
         """The memory of a carry, if it has secants."""
         memory = carry.memory
-        return memory if isinstance(memory, _FusedHistory) and memory.secants.known else None
+        return memory if isinstance(memory, _FusedHistory) and memory.secants.count else None
 
     def transported(self, memory: Any, rotation: Float[Tensor, "vertices 3 3"]) -> Any:
         """The memory with all fields rotated at each vertex; rotations keep the scalar products."""
@@ -156,8 +154,8 @@ class LearnedMetric:
     def _combined(self, system: System, carry: Carry) -> Tensor:
         """The network's combination of vectors [m]."""
         frame = cache(lambda: VertexFrame(level_of(system.level), carry.x))
-        whole = partial(_vector, carry=carry, stiffness=system.rest_diagonal_columns)
-        stacked = torch.stack(vectors_of(self._network.config.vectors, whole, frame=frame), dim=1)  # V N 3
+        vector_of = partial(_vector, carry=carry, stiffness=system.rest_diagonal_columns)
+        stacked = torch.stack(vectors_of(self._network.config.vectors, vector_of, frame=frame), dim=1)  # V N 3
         coefficients = self._network(stacked / system.spacing.reshape(-1, 1, 1), carry.memory.step)  # V N
         move = (coefficients.unsqueeze(2) * stacked).sum(dim=1)  # V 3
         return limited(move, system.spacing) * system.free
@@ -232,33 +230,33 @@ def limited(move: Float[Tensor, "vertices 3"], spacing: Float[Tensor, " vertices
 
 
 def vectors_of(
-    names: Sequence[str], whole: Callable[[str], Tensor], *, frame: Callable[[], VertexFrame]
+    names: Sequence[str], vector_of: Callable[[str], Tensor], *, frame: Callable[[], VertexFrame]
 ) -> list[Tensor]:
     """The vectors of given names [m]; names with a dot are parts of whole vectors (`vertex_frame.PARTS`).
 
     Args:
         names: Names in `network.VECTORS`.
-        whole: Gives a vector for a name without a dot.
+        vector_of: Gives a vector for a name without a dot.
         frame: Gives the surroundings of the vertices.
     """
-    found: dict[str, Tensor] = {}
+    vectors: dict[str, Tensor] = {}
     for name in names:
         base, _, part = name.partition(".")
-        if base not in found:
-            found[base] = whole(base)
+        if base not in vectors:
+            vectors[base] = vector_of(base)
         if part:
-            found[name] = frame().part(found[base], part)
-    return [found[name] for name in names]
+            vectors[name] = frame().part(vectors[base], part)
+    return [vectors[name] for name in names]
 
 
 def garment_dot(level: Level | None, a: Tensor, b: Tensor) -> Tensor:
     """The scalar product of two fields in each garment, at each vertex of the garment; (1, 1) for a single garment."""
     if level is None or len(level.spans) == 1:
         return torch.dot(a.reshape(-1), b.reshape(-1)).reshape(1, 1)
-    each, owner = (a * b).sum(dim=1, keepdim=True), level.vertex_garment.long()
+    products, owner = (a * b).sum(dim=1, keepdim=True), level.vertex_garment.long()
     if len(level.spans) <= MOST_GARMENTS:  # In a fixed order.
-        return torch.stack([each[span].sum(dim=0) for span in level.spans])[owner]
-    return each.new_zeros(len(level.spans), 1).index_add_(0, owner, each)[owner]
+        return torch.stack([products[span].sum(dim=0) for span in level.spans])[owner]
+    return products.new_zeros(len(level.spans), 1).index_add_(0, owner, products)[owner]
 
 
 def level_of(level: Level | None) -> Level:

@@ -8,8 +8,8 @@ Bramble, Pasciak and Xu 1990): the cage exactly, each finer level by its diagona
 | symbol | meaning |
 |---|---|
 | Z_l | linear map from level l; l = 0 is the cage, the sum has the levels between |
-| K | stiffness of what touches, a diagonal |
-| c, r | `coarse.COARSE`, `ROUGH`: about so much that a first step needs no shortening |
+| K | contact stiffness, a diagonal |
+| c, r | `coarse.COARSE`, `ROUGH`: such that a first step hardly needs shortening |
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ ROUGH = 2.0
 
 
 def laplacian(edges: np.ndarray, between: np.ndarray, fixed: np.ndarray) -> sp.csr_matrix:
-    """The matrix of springs, without those that push.
+    """The matrix of springs; springs with negative stiffness are left out.
 
     Args:
         edges: End vertices, shape (E, 2).
@@ -49,12 +49,12 @@ def laplacian(edges: np.ndarray, between: np.ndarray, fixed: np.ndarray) -> sp.c
     count, between, (a, b) = len(fixed), np.maximum(between, 0.0), np.asarray(edges).T
     diagonal = fixed + np.bincount(a, between, count) + np.bincount(b, between, count)
     itself = np.arange(count, dtype=a.dtype)
-    place = np.concatenate([a, b, itself]), np.concatenate([b, a, itself])
-    return sp.csr_matrix((np.concatenate([-between, -between, diagonal]), place), shape=(count, count))
+    indices = np.concatenate([a, b, itself]), np.concatenate([b, a, itself])
+    return sp.csr_matrix((np.concatenate([-between, -between, diagonal]), indices), shape=(count, count))
 
 
 def _same(field: Tensor) -> Tensor:
-    """A field on the vertices of cloth without merged vertices, whose matrix has a row for each."""
+    """The field itself: without merged vertices the matrix has a row for each vertex."""
     return field
 
 
@@ -83,7 +83,7 @@ class Metric:
             free: False at fixed vertices, whose rows become identity rows.
             dtype: Scalar type of the right-hand sides.
             ups: Linear map to each level from the next coarser one, finest first.
-            last: A metric of the same cloth with a matrix of the same pattern, for what only that determines; or None.
+            last: A metric of the same cloth with a matrix of the same pattern, to reuse its coarse levels; or None.
         """
         self._alike: CoarseLevels | None = None if last is None else last.__dict__.get("coarse", last._alike)
         self._free, self._matrix, self._ups, device = free.squeeze(1), matrix, tuple(ups), str(free.device)
@@ -105,11 +105,11 @@ class Metric:
         """The solve by the Cholesky factor of H0."""
         if self._unscaled is not None:
             return self._unscaled[0]._solver
-        kept = sp.csr_matrix(self._keep @ self._matrix @ self._keep)
-        kept.eliminate_zeros()
-        pattern = sp.csr_matrix(abs(kept) + sp.identity(kept.shape[0]))
+        moving = sp.csr_matrix(self._keep @ self._matrix @ self._keep)
+        moving.eliminate_zeros()
+        pattern = sp.csr_matrix(abs(moving) + sp.identity(moving.shape[0]))
         factors = Factors(pattern, dtype=self._mask.dtype, device=str(self._mask.device))
-        values = torch.as_tensor(self._scale * factors.taken(kept), device=self._mask.device)
+        values = torch.as_tensor(self._scale * factors.taken(moving), device=self._mask.device)
         values[factors.diagonal] += torch.where(self._free, REGULARISATION, 1.0)
         return factors.of(values)
 
@@ -135,13 +135,13 @@ class Metric:
         Args:
             stiffer: R^2 at each vertex, positive.
         """
-        other, root = copy.copy(self), three_columns(stiffer.to(self._mask).rsqrt())
-        for own in ("coarse", "_solver", "_of_free"):
-            other.__dict__.pop(own, None)
-        other._scaled, other._mask = self._scaled * root, self._mask * root
-        other.diagonal = torch.where(self._free, self.diagonal * stiffer.double(), 1.0)
-        other._unscaled = self, stiffer
-        return other
+        metric, root = copy.copy(self), three_columns(stiffer.to(self._mask).rsqrt())
+        for name in ("coarse", "_solver", "_of_free"):
+            metric.__dict__.pop(name, None)
+        metric._scaled, metric._mask = self._scaled * root, self._mask * root
+        metric.diagonal = torch.where(self._free, self.diagonal * stiffer.double(), 1.0)
+        metric._unscaled = self, stiffer
+        return metric
 
     def merged(self, label: np.ndarray) -> MergedMetric:
         """The metric of the same cloth with all vertices of equal label merged; cached while the labels stay the same.
@@ -150,8 +150,8 @@ class Metric:
             label: A number for each vertex, shape (V,).
         """
         if self._merged is None or not np.array_equal(self._merged.label, label):
-            given = {"free": self._free.unsqueeze(1), "dtype": self._mask.dtype, "ups": self._ups}
-            self._merged = MergedMetric(self._matrix, label, **given)
+            free, dtype = self._free.unsqueeze(1), self._mask.dtype
+            self._merged = MergedMetric(self._matrix, label, free=free, dtype=dtype, ups=self._ups)
         return self._merged
 
     def solve(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
@@ -166,14 +166,14 @@ class Metric:
 
     def by_levels(self, stiff: Float[Tensor, " vertices"]) -> Work:
         """P F [m] of F, given K [N/m]; zero at fixed vertices, provided that the force is zero there."""
-        tiny = torch.finfo(stiff.dtype).tiny  # Where there is no cloth, there is no force.
+        tiny = torch.finfo(stiff.dtype).tiny  # Rows without stiffness have no force.
         rough = ROUGH / self.gathered(three_columns(self.diagonal.to(stiff) + stiff)).clamp_min(tiny)
         between, cage = self.coarse.held(self.gathered(three_columns(stiff))[:, 0])
-        middle = [three_columns(1.0 / each.clamp_min(tiny)) for each in between]
+        middle = [three_columns(1.0 / diagonal.clamp_min(tiny)) for diagonal in between]
         move, gathered, spread = self.coarse.move, self.gathered, self.spread
 
-        def product(force: Tensor, *given: Any) -> tuple[Tensor]:  # Holds no metric: metrics hold products.
-            return (spread(move(gathered(force), *given)),)
+        def product(force: Tensor, *arrays: Any) -> tuple[Tensor]:  # Holds no metric: metrics hold products.
+            return (spread(move(gathered(force), *arrays)),)
 
         return Work(self.coarse.ups[0], product, (cage, rough, *middle))
 
@@ -216,8 +216,8 @@ class MergedMetric(Metric):
         representative, count = first[group], len(label)
         members = np.bincount(group)
         joined = sp.csr_matrix((np.ones(count), (representative, np.arange(count))), shape=(count, count))
-        held = np.bincount(group, ~free[:, 0].cpu().numpy())[group] > 0
-        device, moves = free.device, (representative == np.arange(count)) & ~held
+        fixed = np.bincount(group, ~free[:, 0].cpu().numpy())[group] > 0
+        device, moves = free.device, (representative == np.arange(count)) & ~fixed
         self.label, self._joined = label, joined
         first_of = torch.as_tensor(representative, device=device)
         merged, free = sp.csr_matrix(joined @ matrix @ joined.T), torch.as_tensor(moves, device=device).unsqueeze(1)

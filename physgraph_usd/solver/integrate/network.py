@@ -105,7 +105,7 @@ def families_of(names: Sequence[str]) -> tuple[int, ...]:
 
 def counted(names: Sequence[str]) -> tuple[bool, ...]:
     """Whether each vector counts in its family's mean square: all but normal parts of vectors present themselves."""
-    return tuple(not (part == "normal" and whole in names) for whole, _, part in (n.partition(".") for n in names))
+    return tuple(not (part == "normal" and base in names) for base, _, part in (n.partition(".") for n in names))
 
 
 def family_means(names: Sequence[str]) -> Float[Tensor, "vectors families"]:
@@ -126,9 +126,9 @@ def pairs_of(names: Sequence[str]) -> Int[Tensor, "2 pairs"]:
     kinds = [kind for _, kind in split]
 
     def seen(a: int, b: int) -> bool:
-        (whole, kind), (other, part) = split[a], split[b]
-        related = whole == other and not (kind and part) and "normal" not in (kind, part)
-        return kind == part == "" or related or (kind == part and kinds.index(kind) in (a, b))
+        (base_a, part_a), (base_b, part_b) = split[a], split[b]
+        related = base_a == base_b and not (part_a and part_b) and "normal" not in (part_a, part_b)
+        return part_a == part_b == "" or related or (part_a == part_b and kinds.index(part_a) in (a, b))
 
     count = len(names)
     chosen = [(a, b) for a in range(count) for b in range(a + 1, count) if seen(a, b)]
@@ -153,14 +153,14 @@ def in_rows(names: Sequence[str]) -> tuple[tuple[str, ...], tuple[int, ...], Par
         name its row and whether the name is the normal part of the row.
     """
     split = [name.partition(".")[::2] for name in names]
-    wholes = tuple(dict.fromkeys(whole for whole, _ in split))
-    smoothed = tuple(wholes.index(whole) for whole, part in split if part == "smooth")
+    wholes = tuple(dict.fromkeys(base for base, _ in split))
+    smoothed = tuple(wholes.index(base) for base, part in split if part == "smooth")
 
-    def place(whole: str, part: str) -> tuple[int, bool]:
-        row = wholes.index(whole)
+    def row_of(base: str, part: str) -> tuple[int, bool]:
+        row = wholes.index(base)
         return (len(wholes) + smoothed.index(row), False) if part == "smooth" else (row, part == "normal")
 
-    return wholes, smoothed, tuple(place(*each) for each in split)
+    return wholes, smoothed, tuple(row_of(base, part) for base, part in split)
 
 
 def clock_of(step: int) -> float:

@@ -106,16 +106,16 @@ class QuasiNewton:
         slope = dot(carry.force, direction)
         if not slope > 0:
             direction, slope = memory.image, dot(carry.force, memory.image)
-        found = backtrack(system, carry, direction, slope, by_force=True)
-        if found is None:
+        reached = backtrack(system, carry, direction, slope, by_force=True)
+        if reached is None:
             return self._forget(system, carry)
-        x, energy, force = found
+        x, energy, force = reached
         move = x - carry.x
         if dot(move, move) < SHORTENED**2 * dot(direction, direction):
             again = memory.shortened and not memory.stiff
             inverse = self._present(system, x) if again else None
-            begun = self._begin(system, x, energy, force, inverse=inverse)
-            return replace(begun, memory=replace(begun.memory, shortened=True))
+            restarted = self._begin(system, x, energy, force, inverse=inverse)
+            return replace(restarted, memory=replace(restarted.memory, shortened=True))
         image = system.apply_metric_inverse(force, memory.inverse)
         secants, newest = memory.secants, Secant(move, carry.force - force, memory.image - image)
         if newest.curvature < math.inf:
@@ -129,7 +129,7 @@ class QuasiNewton:
     def _softened(self, system: System, carry: Carry) -> _Memory:
         """The memory of a carry, with the stiffened metric replaced by the rest metric."""
         memory: _Memory = carry.memory
-        secants = tuple(replace(each, image=system.apply_metric_inverse(each.yields)) for each in memory.secants)
+        secants = tuple(replace(secant, image=system.apply_metric_inverse(secant.yields)) for secant in memory.secants)
         return _Memory(secants, None, system.apply_metric_inverse(carry.force))
 
     def _carry(self, x: Tensor, energy: float, force: Tensor, memory: _Memory) -> Carry:
@@ -146,10 +146,10 @@ class QuasiNewton:
             inverse = self._present(system, carry.x)
             return self._begin(system, carry.x, carry.energy, carry.force, inverse=inverse)
         direction = carry.force / system.diagonal(carry.x).unsqueeze(1)
-        found = backtrack(system, carry, direction, dot(carry.force, direction))
-        if found is None:
+        reached = backtrack(system, carry, direction, dot(carry.force, direction))
+        if reached is None:
             return carry.moved_by("stayed")
-        x, energy, force = found
+        x, energy, force = reached
         return self._begin(system, x, energy, force, inverse=self._present(system, x))
 
 
@@ -303,9 +303,9 @@ def secant_direction(
     return image
 
 
-def _plus(field: Tensor, weight: Any, other: Tensor) -> Tensor:
+def _plus(field: Tensor, weight: Any, step: Tensor) -> Tensor:
     """A field plus a multiple of another; in place for numbers."""
-    return torch.addcmul(field, weight, other) if isinstance(weight, Tensor) else field.add_(other, alpha=weight)
+    return torch.addcmul(field, weight, step) if isinstance(weight, Tensor) else field.add_(step, alpha=weight)
 
 
 def _scaled(image: Tensor, newest: Secant) -> Tensor:

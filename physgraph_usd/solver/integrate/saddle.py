@@ -32,10 +32,7 @@ TRIES = 4
 
 
 def facets(
-    level: Level,
-    x: Float[Tensor, "vertices 3"],
-    coarse: Float[Tensor, "coarse 3"],
-    smooth: Callable[[Tensor], Tensor],
+    level: Level, x: Float[Tensor, "vertices 3"], coarse: Float[Tensor, "coarse 3"], smooth: Callable[[Tensor], Tensor]
 ) -> Float[Tensor, "vertices 3"]:
     """The move across the surface to remove a coarser mesh's facets [m]; 0 at fixed vertices.
 
@@ -96,8 +93,8 @@ def _missing_slope(
 
 def _normals(level: Level, x: Tensor) -> Float[Tensor, "vertices 3"]:
     """Unit normals of the vertices, weighted by area; 0 without area."""
-    places = level.triangles.long().T.reshape(-1)
-    normal = add_at(torch.zeros_like(x), places, level.normals(x).repeat(3, 1))
+    vertices = level.triangles.long().T.reshape(-1)
+    normal = add_at(torch.zeros_like(x), vertices, level.normals(x).repeat(3, 1))
     return torch.nn.functional.normalize(normal, dim=1, eps=1e-30)
 
 

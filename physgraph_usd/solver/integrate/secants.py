@@ -34,7 +34,7 @@ from ..mesh.threads import Launch, argument, run
 from .quasi_newton import SECANTS
 
 SLOTS = SECANTS + 1
-"""Slots of the ring buffer: the secants of a carry, and a free slot for the secant of the next step."""
+"""Slots of the ring buffer: the secants of a carry, and a free slot for the next step's secant."""
 CHUNK = {"cpu": 1024, "cuda": 64}
 """Vertices per item of the product kernel, by device type."""
 SUMS = 4 * SECANTS + 2
@@ -50,7 +50,7 @@ const float *f = (const float*)force.data, *g = (const float*)image.data, *all =
 const size_t size = 3 * (size_t)vertices;
 const float *s[SECANTS], *y[SECANTS], *z = all + (2 * SLOTS + newest) * size;
 for (int i = 0; i < SECANTS; ++i) {
-    const int slot = (newest + SLOTS - (i < known ? i : 0)) % SLOTS;
+    const int slot = (newest + SLOTS - (i < secants ? i : 0)) % SLOTS;
     s[i] = all + slot * size, y[i] = all + (SLOTS + slot) * size;
 }
 Number sum[SUMS] = {};
@@ -80,20 +80,15 @@ wp.set_module_options(KERNELS)
 
 
 def _products_kernel() -> wp.Kernel:
-    """The kernel of (first, vertices, newest, known, bounds, force, image, fields, partial), an item a chunk."""
+    """The kernel of (first, vertices, newest, secants, bounds, force, image, fields, partial); an item is a chunk."""
 
-    def of_chunk(block, vertices, newest, known, bounds, force, image, fields, partial): ...
+    def of_chunk(block, vertices, newest, secants, bounds, force, image, fields, partial): ...
 
-    def secant_products(first, vertices, newest, known, bounds, force, image, fields, partial):
-        add(first + wp.tid(), vertices, newest, known, bounds, force, image, fields, partial)
+    def secant_products(first, vertices, newest, secants, bounds, force, image, fields, partial):
+        add(first + wp.tid(), vertices, newest, secants, bounds, force, image, fields, partial)
 
-    number, pair, vector, total = (
-        wp.int32,
-        wp.array(dtype=wp.vec2i),
-        wp.array(dtype=wp.vec3f),
-        wp.array(dtype=wp.float64),
-    )
-    kinds = number, number, number, pair, vector, vector, vector, total
+    pair, vector, total = (wp.array(dtype=kind) for kind in (wp.vec2i, wp.vec3f, wp.float64))
+    kinds = *[wp.int32] * 3, pair, vector, vector, vector, total
     add = native(of_chunk, "secant_products", at_once(_PRODUCTS, "bounds.shape[0]", torch.float32), *kinds)
     return kernel(secant_products, "secant_products", *kinds)
 
@@ -149,7 +144,7 @@ def keep_products(
 @wp.kernel
 def combine(
     first: wp.int32,
-    known: wp.int32,
+    count: wp.int32,
     is_new: wp.int32,
     sums: wp.array(dtype=wp.float64),
     before: wp.array(dtype=wp.float64),
@@ -159,7 +154,7 @@ def combine(
     """The coefficients of a garment's direction, and the products of its secants with one another.
 
     Of each garment, ``gram`` has s_i.y_j, then y_i.z_j, for all i and j, newest first; last, whether s_i.y_i is safely
-    positive: a secant of which it is not has no effect. In the loops the first product of a secant in ``sums`` becomes
+    positive: otherwise the secant has no effect. In the loops the first product of a secant in ``sums`` becomes
     alpha, the second alpha - beta.
     """
     garment = first + wp.tid()
@@ -167,25 +162,25 @@ def combine(
     size, none = 2 * _N * _N + _N, wp.float64(0.0)
     sy, yz, good, s = garment * size, garment * size + _N * _N, (garment + 1) * size - _N, garment * _SUMS
     gamma = wp.where(gram[good] > none, gram[sy] / gram[yz], wp.float64(1.0))
-    for i in range(known):
-        left = sums[s + 4 * i]
+    for i in range(count):
+        residual = sums[s + 4 * i]
         for j in range(i):
-            left -= sums[s + 4 * j] * gram[sy + j + i * _N]
-        sums[s + 4 * i] = wp.where(gram[good + i] > none, left / gram[sy + i * _N + i], none)
-    for n in range(known):
-        i = known - 1 - n
+            residual -= sums[s + 4 * j] * gram[sy + j + i * _N]
+        sums[s + 4 * i] = wp.where(gram[good + i] > none, residual / gram[sy + i * _N + i], none)
+    for n in range(count):
+        i = count - 1 - n
         along = gamma * sums[s + 4 * i + 1]
-        for j in range(known):
+        for j in range(count):
             along -= gamma * sums[s + 4 * j] * gram[yz + i * _N + j]
-        for j in range(i + 1, known):
+        for j in range(i + 1, count):
             along += sums[s + 4 * j + 1] * gram[sy + j * _N + i]
         rest = sums[s + 4 * i] - along / gram[sy + i * _N + i]
         sums[s + 4 * i + 1] = wp.where(gram[good + i] > none, rest, none)
     w = garment * _WEIGHTS
     weights[w] = wp.float32(gamma)
     for i in range(_N):
-        weights[w + 1 + i] = wp.where(i < known, wp.float32(-gamma * sums[s + 4 * i]), wp.float32(0.0))
-        weights[w + 1 + _N + i] = wp.where(i < known, wp.float32(sums[s + 4 * i + 1]), wp.float32(0.0))
+        weights[w + 1 + i] = wp.where(i < count, wp.float32(-gamma * sums[s + 4 * i]), wp.float32(0.0))
+        weights[w + 1 + _N + i] = wp.where(i < count, wp.float32(sums[s + 4 * i + 1]), wp.float32(0.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,14 +191,14 @@ class Secants:
         fields: Moves s [m], differences y of negative forces [N], and their images z [m], shape (3, `SLOTS`, V, 3). All
             carries of a descent share them; a carry from which two steps made a secant keeps the second.
         newest: Slot of the newest secant.
-        known: Number of secants.
+        count: Number of secants.
         gram: Products of the secants with one another, and which have an effect, per garment, float64.
         weights: Coefficients of the direction, shape (garments, `WEIGHTS`).
     """
 
     fields: Float[Tensor, "3 slots vertices 3"]
     newest: int
-    known: int
+    count: int
     gram: Tensor
     weights: Float[Tensor, "garments weights"]
 
@@ -215,10 +210,6 @@ class Secants:
         weights = torch.zeros((garments, WEIGHTS), dtype=torch.float32, device=x.device)
         weights[:, 0] = 1.0
         return Secants(fields, 0, 0, gram, weights)
-
-    def move(self, age: int) -> Float[Tensor, "vertices 3"] | None:
-        """The move of some secants ago [m], the newest of age 1; None if there are fewer."""
-        return self.fields[0, (self.newest + SLOTS + 1 - age) % SLOTS] if age <= self.known else None
 
     def after(self, move: Tensor, forces: tuple[Tensor, Tensor], images: tuple[Tensor, Tensor]) -> Secants:
         """With a newest secant.
@@ -233,7 +224,7 @@ class Secants:
         moves.copy_(move)
         torch.sub(*forces, out=yields)
         torch.sub(*images, out=moved)
-        return replace(self, newest=newest, known=min(self.known + 1, SECANTS))
+        return replace(self, newest=newest, count=min(self.count + 1, SECANTS))
 
 
 class SecantProducts:
@@ -250,8 +241,7 @@ class SecantProducts:
         size = CHUNK[device.split(":", maxsplit=1)[0]]
         chunks = [[(at, min(at + size, end)) for at in range(begin, end, size)] for begin, end in spans]
         ends = np.cumsum([0, *map(len, chunks)])
-        bounds = np.array([each for garment in chunks for each in garment], np.int32).reshape(-1, 2)
-        place = {"device": device, "threads": threads}
+        bounds = np.array([chunk for garment in chunks for chunk in garment], np.int32).reshape(-1, 2)
         self._bounds = wp.array(bounds, dtype=wp.vec2i, device=device)
         self._ends = wp.array(np.stack([ends[:-1], ends[1:]], axis=1).astype(np.int32), dtype=wp.vec2i, device=device)
         self._partial = torch.zeros(len(bounds) * SUMS, dtype=torch.float64, device=device)
@@ -260,17 +250,14 @@ class SecantProducts:
         weight = wp.zeros(1, dtype=wp.float32, device=device)
         partial = argument(self._partial)
         inputs = [0, 0, 0, self._bounds, vector, vector, vector, partial]
-        self._products = Launch(_PRODUCTS_KERNEL, len(bounds), inputs, **place)
-        self._add_up = Launch(add_up, len(self._sums), [self._ends, partial, total], **place)
-        self._combine = Launch(combine, len(spans), [0, 0, total, total, total, weight], **place)
+        self._products = Launch(_PRODUCTS_KERNEL, len(bounds), inputs, device=device, threads=threads)
+        inputs = [self._ends, partial, total]
+        self._add_up = Launch(add_up, len(self._sums), inputs, device=device, threads=threads)
+        inputs = [0, 0, total, total, total, weight]
+        self._combine = Launch(combine, len(spans), inputs, device=device, threads=threads)
 
     def directed(
-        self,
-        secants: Secants,
-        force: Float[Tensor, "vertices 3"],
-        image: Float[Tensor, "vertices 3"],
-        *,
-        is_new: bool,
+        self, secants: Secants, force: Float[Tensor, "vertices 3"], image: Float[Tensor, "vertices 3"], *, is_new: bool
     ) -> Secants:
         """The secants with the direction for a force.
 
@@ -280,13 +267,13 @@ class SecantProducts:
             image: H0^-1 F [m].
             is_new: Whether the newest secant's products are missing.
         """
-        if not secants.known:
+        if not secants.count:
             return secants
-        given = [len(force), secants.newest, secants.known]
-        self._products(dict(enumerate(given)) | {4: force, 5: image, 6: secants.fields.view(-1, 3)})
+        fields = secants.fields.view(-1, 3)
+        self._products({0: len(force), 1: secants.newest, 2: secants.count, 4: force, 5: image, 6: fields})
         self._add_up({})
         gram, weights = torch.empty_like(secants.gram), torch.empty_like(secants.weights)
-        self._combine(dict(enumerate([secants.known, int(is_new), self._sums, secants.gram, gram, weights.view(-1)])))
+        self._combine(dict(enumerate([secants.count, int(is_new), self._sums, secants.gram, gram, weights.view(-1)])))
         return replace(secants, gram=gram, weights=weights)
 
 
@@ -323,7 +310,7 @@ def rotated_fields(
 ) -> Float[Tensor, "fields vertices 3"]:
     """Fields rotated at each vertex, single precision, shape (N, V, 3)."""
     out, rotation = torch.empty_like(fields), rotation.contiguous()
-    arrays = [argument(each.reshape(-1)) for each in (rotation, fields, out)]
+    arrays = [argument(array.reshape(-1)) for array in (rotation, fields, out)]
     run(_TURN_KERNEL, len(rotation), [len(rotation), len(fields), *arrays], device=str(fields.device))
     return out
 

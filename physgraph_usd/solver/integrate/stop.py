@@ -1,9 +1,9 @@
-"""When a level ends: the cloth rests, the steps are spent, or the time is over.
+"""Conditions for the end of a level: the cloth rests, the steps are spent, or the time is over.
 
 `Budget` holds the criteria of a level, or of one round of a level: `descend` asks `reason` before each step, and the
-rounds of a frame ask `ends` after each round. Held poses (`frame/start.py`), corrections by the guard
-(`integrate/guard.py`), the tolerance with contact (`contact/metric.py`) and time limits (`frame/refiner.py`) have
-their numbers there.
+rounds of a frame ask `ends` after each round. The numbers for held poses are in `frame/start.py`, for corrections by
+the guard in `integrate/guard.py`, for the tolerance with contact in `contact/metric.py`, and for time limits in
+`frame/refiner.py`.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ ROUND, CLEAR_ROUND, FREE_ROUND = 4, 8, 16
 near pairs are found again after a round. With 16 for 8, beside 4 for all, two of 14 shots take 0.67 of the time and end
 higher, layers by 5% and the overcoat by 10% (three ripples each); 12 are equal. With 8 the overcoat ends 6% higher."""
 HURRIED = 2
-"""Most steps of a first round that somebody waits for."""
+"""Step limit of the first round of an interactive solve."""
 TOUCHING = 2
 """Most steps of the finest level with contact, relative to the budget's: blocked moves cost steps. With 1, 1.5 and 3
 warm frames of 09, tshirt, layers and overcoat take as long and cross about as often; with 1 first frames end higher."""
@@ -30,7 +30,8 @@ LEAST_MISSING = 0.01
 """Part of a round's moves that may be blocked at the end of a warm frame's steps; of six shots, contact blocked 0.0 to
 0.8% after a round of 24 steps."""
 SEEN_STEPS, SEEN_TURN, SEEN_PART = 4, 0.5, 0.1
-"""Cloth rests to the eye where in so many steps at most this part of its faces turned by more than so many degrees."""
+"""Number of steps, turn [degrees] and fraction of faces: cloth rests visibly if in so many steps at most this fraction
+of its faces turns by more."""
 COARSE_STEPS, COARSE_TOLERANCE, COARSE_TIME = 4, 0.1, 0.3
 """Steps and tolerance of a coarse level, relative to the finest: coarse steps are cheap and shape the folds. And the
 fraction of its time that a level leaves to the coarser levels."""
@@ -55,13 +56,13 @@ class Budget:
         tolerance: Stop when the RMS of H0^-1 F is under this many local edge lengths; 0 for never.
         deadline: `time.perf_counter` value after which only the first `least` steps may begin, or None.
         rest: Remaining move, in tolerances, below which no step is made from the start: cloth nearly at rest stays.
-        cancelled: Asked before each step whether the result is no longer needed; or None.
+        cancelled: Called before each step; True if the result is no longer needed; or None.
         least: Number of steps exempt from the deadline.
         touching: Most steps with contact, if more.
-        stuck: Steps after which a level ends whose crossings do not become fewer.
+        stuck: Number of steps after which a level ends if its number of crossings does not fall.
         warm: Whether the level starts from the last frame's result. Its first round then has all steps, since steps
             cost far less than finding the near pairs again, and ends when nothing is seen to move.
-        hurried: Whether somebody waits for the first round, and another solve follows: contact gives no more steps.
+        hurried: Whether an interactive solve waits for the first round: contact then adds no steps.
     """
 
     steps: int
@@ -79,25 +80,26 @@ class Budget:
         """The budget of a round.
 
         Args:
-            made: Steps of all rounds before.
+            made: Number of steps in all earlier rounds.
             touching: Whether there is contact.
             in_bodies: Whether cloth is inside or through a body: the way out changes every few steps.
             blocked: Whether the last round's move was blocked.
             shrunk: Factor of the tolerance: a metric with contact underestimates moves.
         """
-        first, left = not made, max(self.steps, self.touching) - made
+        first, remaining = not made, max(self.steps, self.touching) - made
         longest = ROUND if blocked or first else CLEAR_ROUND
-        longest = HURRIED if self.hurried and first else min(longest, left) if touching else FREE_ROUND
+        longest = HURRIED if self.hurried and first else min(longest, remaining) if touching else FREE_ROUND
         longest = self.steps if first and self.warm and not (self.hurried or in_bodies) else longest
-        once = {} if first else {"rest": 1.0, "least": 0}
-        return replace(self, steps=min(longest, self.steps), tolerance=shrunk * self.tolerance, **once)
+        steps, tolerance = min(longest, self.steps), shrunk * self.tolerance
+        rest, least = (self.rest, self.least) if first else (1.0, 0)
+        return replace(self, steps=steps, tolerance=tolerance, rest=rest, least=least)
 
     def for_untangling(self) -> Budget:
-        """The budget of an untangling round, without a tolerance: contours shorten while nothing moves much."""
+        """The budget of an untangling round, without a tolerance: contours shorten in small moves."""
         return replace(self, steps=min(ROUND, self.steps), tolerance=0.0, least=0)
 
     def reason(self, steps: int, remaining: Callable[[], float]) -> str:
-        """Why no further step follows: "tolerance", "steps" or "budget"; "" if one does.
+        """Reason to stop: "tolerance", "steps" or "budget"; "" to continue.
 
         Args:
             steps: Number of steps made.
@@ -116,11 +118,11 @@ class Budget:
 
         Args:
             report: Report of the last round.
-            made: Steps of all rounds.
+            made: Number of steps in all rounds.
             touched: Whether any round had contact.
             emerging: Whether less cloth is inside or through a body than before the last round.
             missing: Part of the last round's moves that was blocked.
-            stuck: Whether crossings are left, and the last rounds left no fewer.
+            stuck: Whether crossings are left, and the last rounds did not reduce them.
         """
         if stuck and made >= self.stuck:
             return True

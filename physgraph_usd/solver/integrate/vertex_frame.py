@@ -23,7 +23,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..level import Level
-from ..mesh.stencil import Stencil, add_at, incidence, vectors
+from ..mesh.stencil import Stencil, add_at, incidence
 
 PARTS = ("normal", "smooth")
 
@@ -52,11 +52,6 @@ class VertexFrame:
         return torch.nn.functional.normalize(total, dim=1, eps=torch.finfo(total.dtype).tiny)
 
     @property
-    def positions(self) -> Any:
-        """The positions, for kernels."""
-        return vectors(self._x)
-
-    @property
     def mesh(self) -> tuple[wp.array, ...]:
         """Kernel arrays: starts of each vertex's triangles, their other corners, starts of its edges, the far ends."""
         return self._tables.mesh
@@ -69,7 +64,7 @@ class _Tables:
         count, device, dtype = len(level.rest), str(level.rest.device), level.rest.dtype
         triangles, edges = level.triangles.cpu().numpy(), level.edges.cpu().numpy()
         (corner_starts, corner), (end_starts, end) = (
-            [each.cpu().numpy() for each in incidence(elements, count)] for elements in (level.triangles, level.edges)
+            [rows.cpu().numpy() for rows in incidence(elements, count)] for elements in (level.triangles, level.edges)
         )
         turned = np.take_along_axis(
             triangles[corner // 3], (corner[:, None] % 3 + np.array([1, 2], np.int32)) % 3, axis=1
@@ -79,13 +74,11 @@ class _Tables:
         def ints(values: np.ndarray, kind: Any = wp.int32) -> wp.array:
             return wp.array(np.ascontiguousarray(values, np.int32), dtype=kind, device=device)
 
-        place = {"device": device, "threads": level.threads}
         self.mesh = (ints(corner_starts), ints(turned, wp.vec2i), ints(end_starts), ints(far))
         degree = np.diff(end_starts)
         weights = 1.0 / np.repeat(np.maximum(degree, 1), degree)
         mean = sp.csr_matrix((weights, far, end_starts), shape=(count, count))
-        self._mean = Stencil(mean, dtype=dtype, **place)
-        self._back = Stencil(sp.csr_matrix(mean.T), dtype=dtype, **place)
+        self._mean = Stencil(mean, dtype=dtype, device=device, threads=level.threads)
 
     def smooth(self, vector: Tensor) -> Tensor:
         """Mean over the neighbours; gradients flow through."""
@@ -102,7 +95,7 @@ class _Smooth(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *gradients: Any) -> tuple[Tensor, None]:  # type: ignore[override]
-        return ctx.tables._back.apply(gradients[0].contiguous()), None
+        return ctx.tables._mean.transposed.apply(gradients[0].contiguous()), None
 
 
 _TABLES: WeakKeyDictionary[Level, _Tables] = WeakKeyDictionary()

@@ -89,14 +89,14 @@ def save_network(network: nn.Module, file: Path) -> str:
         The hash of the weights, in hexadecimal.
     """
     tensors = {name: value.detach().cpu().contiguous() for name, value in network.state_dict().items()}
-    about = {
+    metadata = {
         "kind": kind_of(network),
         "version": VERSION,
         "config": json.dumps(asdict(cast(Any, network).config)),
         "sha256": hash_of(tensors),
     }
-    save_file(tensors, file, metadata=about)
-    return about["sha256"]
+    save_file(tensors, file, metadata=metadata)
+    return metadata["sha256"]
 
 
 def load_network(file: Path, *, kind: str, device: str = "cpu") -> nn.Module:
@@ -113,15 +113,15 @@ def load_network(file: Path, *, kind: str, device: str = "cpu") -> nn.Module:
     Raises:
         WeightsError: The file is missing, damaged, of a different kind or of a different version.
     """
-    tensors, about = _read(Path(file))
-    if about.get("version") != VERSION:
-        raise WeightsError(f"{file} has version {about.get('version')!r}; this release reads {VERSION!r}")
-    if about.get("kind") != kind:
-        raise WeightsError(f"{file} holds weights of '{about.get('kind')}', not of '{kind}'")
-    if about.get("sha256") != hash_of(tensors):
+    tensors, metadata = _read(Path(file))
+    if metadata.get("version") != VERSION:
+        raise WeightsError(f"{file} has version {metadata.get('version')!r}; this release reads {VERSION!r}")
+    if metadata.get("kind") != kind:
+        raise WeightsError(f"{file} holds weights of '{metadata.get('kind')}', not of '{kind}'")
+    if metadata.get("sha256") != hash_of(tensors):
         raise WeightsError(f"{file} is damaged: its numbers do not have the hash that it names")
     try:
-        network = make_network(_config(kind, json.loads(about.get("config", ""))))
+        network = make_network(_config(kind, json.loads(metadata.get("config", ""))))
         network.load_state_dict(tensors)
     except KeyError as error:
         raise WeightsError(f"{file} does not fit its own configuration: {error} is missing from it") from error
@@ -171,10 +171,10 @@ def _read(file: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
 def _config(kind: str, values: dict[str, Any]) -> Any:
     """A configuration from a file, with every field present; lists become tuples."""
     config = NETWORKS[kind].config
-    for each in fields(config):
-        _ = values[each.name]
-    made = config(**{name: tuple(value) if isinstance(value, list) else value for name, value in values.items()})
-    unknown = [name for name in getattr(made, "vectors", ()) if name not in VECTORS]
+    for field in fields(config):
+        _ = values[field.name]
+    built = config(**{name: tuple(value) if isinstance(value, list) else value for name, value in values.items()})
+    unknown = [name for name in getattr(built, "vectors", ()) if name not in VECTORS]
     if unknown:
         raise ValueError(f"unknown vectors {unknown}")
-    return made
+    return built

@@ -211,7 +211,7 @@ auto store = [&](Number energy, const Vec (&force)[K]) {
         if (energies.data) energies.data[element[i]] = value;
         total += value;
     }
-    totals.data[part] = block == part * blocks ? total : totals.data[part] + total;
+    sums.data[part] = block == part * blocks ? total : sums.data[part] + total;
 #ifdef __CUDACC__
     write((Scalar*)forces.data, 3 * K, &force[0].x, 3 * K);
 #else
@@ -275,7 +275,7 @@ def element_kernels(
     """Kernels of the energies and forces of elements, for each torch scalar type.
 
     Their arguments are (first, blocks, all blocks, elements, vertices, x, corners, parameter0, parameter1, energies,
-    totals, forces). An item is a part of so many blocks of elements. On a CPU it adds to its own forces on all
+    sums, forces). An item is a part of so many blocks of elements. On a CPU it adds to its own forces on all
     vertices, on CUDA it writes the force on each corner. Energies of single elements are written if there is room.
 
     Args:
@@ -287,27 +287,16 @@ def element_kernels(
 
     def kernel_of(dtype: torch.dtype) -> wp.Kernel:
         def of_block(
-            block, part, blocks, elements, vertices, x, corners, parameter0, parameter1, energies, totals, forces
+            block, part, blocks, elements, vertices, x, corners, parameter0, parameter1, energies, sums, forces
         ): ...
 
         def parts(
-            first, blocks, all_blocks, elements, vertices, x, corners, parameter0, parameter1, energies, totals, forces
+            first, blocks, all_blocks, elements, vertices, x, corners, parameter0, parameter1, energies, sums, forces
         ):
             part = first + wp.tid()
             for block in range(part * blocks, wp.min((part + 1) * blocks, all_blocks)):
                 compute(
-                    block,
-                    part,
-                    blocks,
-                    elements,
-                    vertices,
-                    x,
-                    corners,
-                    parameter0,
-                    parameter1,
-                    energies,
-                    totals,
-                    forces,
+                    block, part, blocks, elements, vertices, x, corners, parameter0, parameter1, energies, sums, forces
                 )
 
         vector, number, ends = VECTOR[dtype], parameter[dtype], wp.types.vector(corners, wp.int32)

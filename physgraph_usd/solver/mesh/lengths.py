@@ -19,23 +19,13 @@ wp.set_module_options(KERNELS)
 
 
 @wp.kernel
-def _lengths(
-    first: wp.int32,
-    edges: wp.array(dtype=wp.vec2i),
-    x: wp.array(dtype=Any),
-    length: wp.array(dtype=Any),
-):
+def _lengths(first: wp.int32, edges: wp.array(dtype=wp.vec2i), x: wp.array(dtype=Any), length: wp.array(dtype=Any)):
     e = first + wp.tid()
     length[e] = wp.length(x[edges[e][1]] - x[edges[e][0]])
 
 
 @wp.kernel
-def _normals(
-    first: wp.int32,
-    triangles: wp.array(dtype=wp.vec3i),
-    x: wp.array(dtype=Any),
-    normal: wp.array(dtype=Any),
-):
+def _normals(first: wp.int32, triangles: wp.array(dtype=wp.vec3i), x: wp.array(dtype=Any), normal: wp.array(dtype=Any)):
     t = first + wp.tid()
     a = x[triangles[t][0]]
     normal[t] = wp.cross(x[triangles[t][1]] - a, x[triangles[t][2]] - a)

@@ -88,7 +88,7 @@ class Stencil:
         """
         csr = sp.csr_matrix(matrix)
         csr.sort_indices()
-        self.matrix, self._made = csr, {"dtype": dtype, "device": device, "threads": threads}
+        self.matrix, self._dtype, self._device, self._threads = csr, dtype, device, threads
         self.shape: tuple[int, int] = (csr.shape[0], csr.shape[1])
         self._empty = 0 in self.shape
         starts = wp.array(csr.indptr.astype(np.int32), dtype=wp.int32, device=device)
@@ -100,7 +100,7 @@ class Stencil:
 
     def alike(self, matrix: sp.csr_matrix) -> Stencil:
         """Another matrix, of equal type and on the same device."""
-        return Stencil(matrix, **self._made)
+        return Stencil(matrix, dtype=self._dtype, device=self._device, threads=self._threads)
 
     @cached_property
     def transposed(self) -> Stencil:

@@ -111,12 +111,7 @@ def _place_quads(mesh: PolygonMesh, midpoint: np.ndarray, starts: np.ndarray, in
     corners = np.flatnonzero(mesh.is_polygon[mesh.corner_face])
     face = mesh.corner_face[corners]
     quads = np.stack(
-        [
-            mesh.indices[corners],
-            midpoint[corners],
-            face_points(mesh)[face],
-            midpoint[mesh.previous_corner[corners]],
-        ],
+        [mesh.indices[corners], midpoint[corners], face_points(mesh)[face], midpoint[mesh.previous_corner[corners]]],
         axis=1,
     )
     local = corners - mesh.starts[face]

@@ -38,14 +38,7 @@ class Launch:
     """A kernel over items 0 to size - 1; the kernel's first parameter is the first item of a slice."""
 
     def __init__(
-        self,
-        kernel: wp.Kernel,
-        size: int,
-        inputs: Sequence[Any],
-        *,
-        device: str,
-        threads: int = 1,
-        at_once: int = 1,
+        self, kernel: wp.Kernel, size: int, inputs: Sequence[Any], *, device: str, threads: int = 1, at_once: int = 1
     ) -> None:
         """Prepare the launch.
 
@@ -152,14 +145,7 @@ class _Call:
         self._forward(ctypes.byref(self._bounds), ctypes.byref(self._packed))
 
 
-def run(
-    kernel: wp.Kernel,
-    size: int,
-    inputs: Sequence[Any],
-    *,
-    device: str,
-    threads: int = 1,
-) -> None:
+def run(kernel: wp.Kernel, size: int, inputs: Sequence[Any], *, device: str, threads: int = 1) -> None:
     """Run a kernel once, like a `Launch`."""
     if device == "cpu":
         Launch(kernel, size, inputs, device=device, threads=threads)({})

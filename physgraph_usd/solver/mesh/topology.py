@@ -176,9 +176,7 @@ class PolygonMesh:
         ends = np.stack([np.arange(len(self.indices)), self.next_corner], axis=1)
         ends = np.where(half.forward[:, None], ends, ends[:, ::-1])
         first, second = ends[order[same]].reshape(-1), ends[order[same + 1]].reshape(-1)
-        size = len(self.indices)
-        links = sparse.coo_matrix((np.ones(len(first), bool), (first, second)), shape=(size, size))
-        _, label = csgraph.connected_components(links, directed=False)
+        label = joined_by(np.stack([first, second], axis=1), len(self.indices))
         fans = np.unique(label.astype(np.int64) * max(self.vertex_count, 1) + self.indices)
         return np.bincount(fans % max(self.vertex_count, 1), minlength=self.vertex_count).astype(np.int32)
 
