@@ -201,7 +201,7 @@ def test_normals_of_a_body_repeat_bit_for_bit_on_two_threads():
     before = torch.get_num_threads()
     torch.set_num_threads(2)
     try:
-        first, *others = (Faces(surface)._normals() for _ in range(6))
+        first, *others = (Faces(surface)._normals for _ in range(6))
     finally:
         torch.set_num_threads(before)
     assert all(torch.equal(first, each) for each in others)
