@@ -208,7 +208,8 @@ def measured(shot: Path, time: float, refined: Sequence[Sequence[DrawnMesh]]) ->
     world = np.concatenate([each.points for each in frame.garments])
     origin, settings = world.mean(axis=0), ContactSettings()
     coarse = torch.as_tensor(world - origin, dtype=torch.float32)
-    touched = FrameBodies.begin(levels[0], touching, coarse, origin=origin, settings=settings) if touching else None
+    edge = float(levels[0].spacing.mean())
+    touched = FrameBodies.begin(touching, coarse, edge=edge, origin=origin, settings=settings) if touching else None
     contact = FrameContact(
         levels,
         coarse,

@@ -75,7 +75,7 @@ def preview(
         StageError: When a stage cannot be opened or shows no mesh.
     """
     layer, out = Path(layer), Path(out)
-    check_picture(out, times=times, overwrite=overwrite)
+    check_picture(out, times=times, overwrite=True)  # A file of the shot is named as such below.
     suffix = out.suffix.lower()
     below = shot_of(layer) if shot is None else Path(shot)
     check_targets([("the picture", out)], files_of(layer) | (files_of(below) if below else set()))
