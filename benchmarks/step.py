@@ -73,8 +73,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         lines.append(line)
     if given.json:
         name = torch.cuda.get_device_name(given.device) if given.device.startswith("cuda") else "CPU"
-        known: dict[str, Any] = {"device": name, "command": f"python -m benchmarks.step --device {given.device}", "commit": commit()}
-        known["rows"] = lines
+        command = f"python -m benchmarks.step --device {given.device}"
+        known = {"device": name, "command": command, "commit": commit(), "rows": lines}
         given.json.write_text(json.dumps(known, indent=1) + "\n", encoding="utf-8")
 
 
