@@ -16,6 +16,7 @@ from physgraph_usd.solver.contact.along import ApproachLimits, along
 from physgraph_usd.solver.contact.cloth import LevelContact
 from physgraph_usd.solver.forces.self_contact import PairConstraints, SelfContact
 from physgraph_usd.solver.level import Level, Placed
+from physgraph_usd.solver.scene import GIVEN_UP
 
 SIZE = 20
 LIFT = 0.3 * EDGE
@@ -164,12 +165,26 @@ class TestGivenUp:
         assert last == 0
 
     def test_cloth_that_is_all_given_up_follows_its_subdivided_cage_and_is_not_solved(self):
-        shown = self.shot_of("full")
-        answer = shown.refiner(level=1, steps=2).solve(shown.frames[0])
+        shown = self.shot_of("full", "full")
+        answer, later = shown.refiner(level=1, steps=2).refine(shown.frames)
+        assert [each.telemetry[0]["start"] for each in (answer, later)] == [GIVEN_UP, GIVEN_UP]
+        assert later.telemetry[0]["levels"] == []
         assert {report["level"] for report in answer.telemetry[0]["levels"]} == {0}
         smooth = levels_of(*(named(square(SIZE), name) for name in "AB"))[-1].smooth_from_coarse
         cages = np.concatenate([each.points for each in shown.frames[0].garments])
         np.testing.assert_allclose(np.concatenate(answer.points), smooth @ cages, atol=1e-6)
+
+    def test_its_energy_above_the_upsampled_cage_is_no_reason_to_solve_it(self):
+        """Sheets that rest as their cages lie: the smooth shape is strained, the upsampled one is not."""
+        shown = self.shot_of("full", "full")
+        pairs = zip(shown.scene.garments, shown.frames[0].garments, strict=True)
+        resting = [replace(garment, rest=frame.points) for garment, frame in pairs]
+        cages = [[garment.points for garment in frame.garments] for frame in shown.frames]
+        answers = shot(resting, cages).refiner(level=1, steps=2).refine(shown.frames)
+        told = [answer.telemetry[0] for answer in answers]
+        energies = [sum(told[1]["energy_joules"][side].values()) for side in ("input", "output")]
+        assert energies[1] > energies[0]
+        assert [frame["start"] for frame in told] == [GIVEN_UP, GIVEN_UP]
 
     def test_one_contour_is_not(self):
         assert self.solved("contour") == [0]

@@ -14,6 +14,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 DENSITY_OF_AIR = 1.2
 """[kg/m^3], at 20 degrees Celsius at sea level."""
@@ -23,16 +24,16 @@ LONGEST_GUST, SHORTEST_GUST = 2.0, 0.3
 """Wavelengths of the gusts [m]: shorter ones average out over a cage's edges."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Wind:
     """Wind of a constant mean.
 
     Attributes:
-        mean: Mean velocity [m/s].
+        mean: Mean velocity [m/s], shape (3,).
         turbulence: RMS of the gusts, in each direction, over the mean speed.
     """
 
-    mean: tuple[float, float, float]
+    mean: ArrayLike
     turbulence: float = 0.0
 
     def at(self, points: np.ndarray, time: float) -> np.ndarray:
@@ -42,7 +43,7 @@ class Wind:
             points: Places [m], shape (V, 3).
             time: [s].
         """
-        mean = np.asarray(self.mean)
+        mean = np.asarray(self.mean, float)
         velocity = np.broadcast_to(mean, points.shape)
         if self.turbulence == 0.0:
             return velocity

@@ -23,7 +23,7 @@ RESOLVED = 0.1
 """Part of an edge that single precision must tell apart where the farthest vertex is: about the garment's mean the
 solver's positions have 24 bits, and with less than that nothing of the cloth is left in them."""
 FALLS = 4.0
-"""Largest distance by which a garment may sink, in its sizes. Cloth farther from its cage than one size is invalid."""
+"""Largest distance that a garment may sink, in its diameters. Cloth over one diameter off its cage is invalid."""
 SPECK = 0.1
 """Size under which a garment's units are in doubt before its guide is [m]."""
 OUTGROWN = 1e3
@@ -303,7 +303,7 @@ def _unsolvable(garment: Garment, points: np.ndarray) -> str:
 
 
 def refuse_falling(scene: Scene, frame: Frame) -> None:
-    """Refuse a frame in which a garment would fall out of its shot: too weak a guide, and nothing else that holds it.
+    """Refuse a frame in which a garment would fall: its guide is too weak, and neither pins nor contact hold it.
 
     By its weight over the guide's stiffness it sinks without pins, bodies and other garments. Held by these at one end
     it stretches: a strip of length L and modulus Y that hangs is longer by w L^2 / 2 Y, with w its weight by area.

@@ -234,8 +234,9 @@ def air_moved(before: GarmentFrame, now: GarmentFrame) -> float:
     """Largest distance by which a change of the air's load moves the cloth against its guide [m]."""
     if before.load is now.load:
         return 0.0
-    change = sum(sign * (0.0 if each.load is None else each.load) for sign, each in ((1.0, now), (-1.0, before)))
-    return float(np.linalg.norm(change, axis=1).max(initial=0.0)) / max(now.guide, 1e-30)
+    calm = np.zeros_like(now.points)
+    start, end = (calm if frame.load is None else frame.load for frame in (before, now))
+    return float(np.linalg.norm(end - start, axis=1).max(initial=0.0)) / max(now.guide, 1e-30)
 
 
 def set_alike(a: GarmentFrame, b: GarmentFrame) -> bool:

@@ -193,12 +193,14 @@ class LevelForces:
         """Load of the air, minus the acceleration that cloth feels times its density, at each cage vertex [N/m^2]."""
         if all(frame.acceleration is None and frame.load is None for frame in frames):
             return None
-        none = [np.zeros_like(frame.points) for frame in frames]
-        pairs = list(zip(frames, none, strict=True))
-        felt = np.concatenate([still if frame.acceleration is None else frame.acceleration for frame, still in pairs])
-        air = np.concatenate([calm if frame.load is None else frame.load for frame, calm in pairs])
         density = self._coarse_density
-        return torch.as_tensor(air).to(density) - density * torch.as_tensor(felt).to(density)
+
+        def stacked(fields: Sequence[np.ndarray | None]) -> Float[Tensor, "coarse 3"]:
+            pairs = zip(fields, frames, strict=True)
+            values = [np.zeros_like(frame.points) if field is None else field for field, frame in pairs]
+            return torch.as_tensor(np.concatenate(values)).to(density)
+
+        return stacked([frame.load for frame in frames]) - density * stacked([frame.acceleration for frame in frames])
 
     @cached_property
     def _coarse_density(self) -> Float[Tensor, "coarse 3"]:

@@ -1,4 +1,4 @@
-"""No patch of refined cloth is worse than the subdivided cage: else it follows that cage.
+"""Replaces patches of refined cloth that have more faults than the subdivided cage by the subdivided cage.
 
 A patch is connected cloth around what crosses, in the solution or in the subdivided cage, with the cloth that it
 crosses. Its faults are its crossings of cloth, its crossings with bodies, and its vertices inside bodies. A patch with
@@ -25,7 +25,7 @@ from ..mesh.topology import joined_by
 STAY = 20
 """Number of frames for which a patch follows the subdivided cage after the last frame with a worse solution."""
 GROWTHS = 4
-"""Largest number of times that patches grow: cloth that follows the cage may newly cross its neighbours."""
+"""Largest number of passes that enlarge patches: a patch on the subdivided cage may cross the refined cloth around."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -53,7 +53,7 @@ class VertexFrame:
 
     @property
     def mesh(self) -> tuple[wp.array, ...]:
-        """Kernel arrays: starts of each vertex's triangles, their other corners, starts of its edges, the far ends."""
+        """Arrays of the kernel, by vertex: row starts and corners of triangles, row starts and far ends of edges."""
         return self._tables.mesh
 
 

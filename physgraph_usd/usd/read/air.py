@@ -42,8 +42,7 @@ class Air:
             return None
         outwards = -1.0 if self.garment.flipped else 1.0
         normals = outwards * vertex_normals(points, self._triangles)
-        mean = speed * self._direction(heading)
-        wind = Wind((float(mean[0]), float(mean[1]), float(mean[2])), turbulence)
+        wind = Wind(speed * self._direction(heading), turbulence)
         velocity = wind.at(points, self.seconds * (time or 0.0)) if speed else None
         return load(normals, pressure, velocity)
 

@@ -16,7 +16,7 @@ MOST = 3
 STANDS = 1e-4
 """Motion in a frame below which a cage stands still [m]."""
 ROUNDS = 4
-"""Number of times that vertices take the mean of themselves and their neighbours."""
+"""Passes of smoothing over the cage: each mixes a vertex with the mean of its neighbours in equal parts."""
 FRAMES = 2
 """Frames from a time code to the samples before and after."""
 _KEPT = 2 * FRAMES + 4
@@ -128,7 +128,7 @@ class CageMotion:
 
 
 def _agreed(found: Sequence[np.ndarray]) -> np.ndarray:
-    """At each vertex the one of up to three vectors that is nearest to the others; the shortest of two."""
+    """The medoid of three accelerations at each vertex [m/s^2], shape (V, 3); of two accelerations the smaller."""
     rows = np.arange(len(found[0]))
     stacked = np.stack(found)  # N V 3
     others = stacked if len(found) == MOST else np.zeros_like(stacked[:1])
