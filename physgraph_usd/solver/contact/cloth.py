@@ -184,10 +184,13 @@ class LevelContact:
         return x if self.seam is None else self.seam.closed(x)
 
     def of_cage(self, x: Float[Tensor, "vertices 3"]) -> ContactState:
-        """As `look` for an upsampled cage [m], searched only around crossings of the cage itself."""
+        """As `look` for an upsampled cage [m], searched only around crossings of the cage itself.
+
+        With given-up cloth all is searched, so that crossings of that cloth with bodies count here as in `look`.
+        """
         if self._doubtful is None:
             return ContactState.clean(x, self._corners(x))
-        return self.found(x, self._doubtful)
+        return self.found(x, self._doubtful if self.given_up is None else None)
 
     def look(self, x: Float[Tensor, "vertices 3"]) -> ContactState:
         """Crossings at x [m]; cached for the same tensor until its version changes."""
@@ -257,13 +260,19 @@ class LevelContact:
         named = (("contact", pushes.sharing_room(x)), ("self_contact", gaps))
         return tuple(SelfContact(self.mesh.level, pairs, name) for name, pairs in named if len(pairs.corners))
 
-    def moved(self, start: Placed, wanted: Float[Tensor, "vertices 3"]) -> Placed:
+    def moved(self, start: Placed, wanted: Float[Tensor, "vertices 3"], *, stuck: bool = False) -> Placed:
         """Positions as close to the wanted as is safe [m], seams closed; without seams ``wanted`` itself if safe.
 
         In a tangle of the start, cloth may pass through itself as long as the tangle's number of crossings does not
         grow. Cloth inside a body may pass through bodies.
+
+        Args:
+            start: Positions now [m].
+            wanted: Positions wanted [m].
+            stuck: Whether tangles no longer become smaller. No cloth in them may then pass through itself, which saves
+                the search that finds out which of them would grow.
         """
-        return self._moved(start, self.closed(wanted), None)
+        return self._moved(start, self.closed(wanted), None, stuck=stuck)
 
     def carried(
         self, start: Placed, wanted: Float[Tensor, "vertices 3"], inside: Bool[Tensor, " vertices"] | None
@@ -283,7 +292,7 @@ class LevelContact:
         tangles = self.look(start).tangles
         return self._go(start, self.closed(wanted), None if tangles is None else tangles.label, None)[0]
 
-    def _moved(self, start: Placed, wanted: Tensor, start_frame: _Begin | None) -> Placed:
+    def _moved(self, start: Placed, wanted: Tensor, start_frame: _Begin | None, *, stuck: bool = False) -> Placed:
         """As `moved`; ``start_frame`` holds the corners and the exempt cloth in the start frame, or is None."""
         state = self.look(start)
         tangles = state.tangles
@@ -293,8 +302,10 @@ class LevelContact:
                 self.remember(x, tangles)
             return x
         free = tangles.label.clone()
+        if stuck:
+            free[~tangles.given_up] = -1
         x, _ = self._go(start, wanted, free, start_frame)
-        for hold_all in (False, True):  # First only the worse tangles are held, then all.
+        for hold_all in () if stuck else (False, True):  # First only the worse tangles are held, then all.
             worse = tangles.worse(self.look(x).crossings)
             if not bool(worse.any()):
                 break

@@ -25,7 +25,10 @@ from .settings import ContactSettings
 from .tangles import Tangles
 
 STALLED = 4
-"""Largest number of passes that move cloth out of bodies without progress, and of rounds that judge untangling."""
+"""Number of rounds or passes whose progress decides whether more follow: of untangling, and of moving out of bodies."""
+PAYS = 0.1
+"""Least fraction of the cloth in bodies that `STALLED` passes must move out for more to follow: at a slower pace, over
+forty passes would follow. A suit in a random pose made 30 passes with 3.5% less cloth in its body after them."""
 
 
 class FrameContact:
@@ -216,8 +219,8 @@ def _out_of_bodies(view: LevelContact, start: Placed, *, vertices: bool) -> tupl
     """Positions moved safely out of bodies [m], the start itself if no cloth had to move, and the number of passes.
 
     In all passes together, a vertex moves at most the distance of its first push plus a mean edge: cloth pinched
-    between two limbs, pushed out of each limb into the other in turns, would form spikes. Passes end after `STALLED`
-    passes without progress; the best positions are returned.
+    between two limbs, pushed out of each limb into the other in turns, would form spikes. Passes end if the last
+    `STALLED` passes moved out less than `PAYS` of the cloth; the best positions are returned.
 
     Args:
         start: Positions [m].
@@ -228,18 +231,21 @@ def _out_of_bodies(view: LevelContact, start: Placed, *, vertices: bool) -> tupl
         inside, crossings = view.look(x).in_bodies
         return inside if vertices else inside + crossings
 
-    x, reach = start, None
-    best, remaining, passes, stalled = x, count(x), 0, 0
-    while remaining and stalled < STALLED and not is_over():
+    x, best, reach, left = start, start, None, [count(start)]
+    while left[-1] and _pays(left) and not is_over():
         wanted = view.pushed_out(x, vertices=vertices)
         shift = wanted - start
         far = shift.norm(dim=1, keepdim=True)
         reach = far + view.mesh.level.rest_length.mean() if reach is None else reach
         x = view.moved(x, torch.where(far > reach, start + shift * (reach / far), wanted))
-        passes, stalled, count_after = passes + 1, stalled + 1, count(x)
-        if count_after < remaining:
-            best, remaining, stalled = x, count_after, 0
-    return best, passes
+        best = x if count(x) < min(left) else best
+        left.append(count(x))
+    return best, len(left) - 1
+
+
+def _pays(left: Sequence[int]) -> bool:
+    """Whether more passes follow, given the numbers of cloth in bodies at the start and after each pass."""
+    return len(left) <= STALLED or min(left[-STALLED:]) <= (1.0 - PAYS) * min(left[:-STALLED])
 
 
 def _share_of(level: Level, mask: Bool[Tensor, " coarse"]) -> Float[Tensor, " vertices"]:

@@ -161,7 +161,7 @@ def solve_one_level(
         reports.append(report)
         made += report.steps
         wanted = carry.x
-        begun, x, last = x, view.moved(x, wanted), system
+        begun, x, last = x, view.moved(x, wanted, stuck=_is_stuck(left)), system
         blocked = x is not wanted
         if problem.show is not None:
             problem.show(x)
@@ -181,11 +181,9 @@ def _is_stuck(left: Sequence[int]) -> bool:
     """Whether crossings are left, and in none of the last `STALLED` rounds fewer than before.
 
     Args:
-        left: Number of crossings at the start and after each round. With `STALLED` numbers or fewer, crossings that are
-            left count as stuck.
+        left: Number of crossings at the start and after each round.
     """
-    late = left[-STALLED:]
-    return min(late) > 0 and min(late) >= min(left[:-STALLED], default=0)
+    return len(left) > STALLED and 0 < min(left[:-STALLED]) <= min(left[-STALLED:])
 
 
 def _solve_without_contact(
