@@ -17,6 +17,7 @@ from physgraph_usd.solver.colliders.mesh import MeshBody
 from physgraph_usd.solver.colliders.pose import Pose
 from physgraph_usd.solver.contact.bodies import FrameBodies, Touching
 from physgraph_usd.solver.contact.cloth import ClothContact, LevelContact
+from physgraph_usd.solver.contact.frame import _pays
 from physgraph_usd.solver.contact.measure import depths, pinched
 from physgraph_usd.solver.contact.settings import ContactSettings
 from physgraph_usd.solver.frame.refiner import Refiner
@@ -139,3 +140,10 @@ def test_a_sleeve_deep_in_the_body_ends_with_no_more_crossings(tmp_path: Path):
     for body in contact["bodies"].values():
         assert body["after"]["inside"] <= 0.02 * (body["before"]["inside"] + body["before"]["pinched"])
         assert body["after"]["pinched"] <= body["before"]["inside"] + body["before"]["pinched"]
+
+
+def test_passes_out_of_bodies_end_when_they_move_out_too_little():
+    assert _pays([100, 99, 98, 97])  # Too few passes to judge.
+    assert _pays([100, 99, 98, 97, 90])
+    assert not _pays([100, 99, 98, 97, 91])
+    assert not _pays([100, 80, 80, 80, 80, 80])

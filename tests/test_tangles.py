@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from bodies import ball
 from brute import Soup, crossings
 from folds import EDGE, SHAPES, curved, folded, levels_of, named, placed, square, strip, view_of
 from scenes import shot
@@ -72,11 +74,12 @@ class TestMoves:
 
     @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2, 3))])
     @pytest.mark.parametrize("size", [0.3, 1.0, 3.0])
+    @pytest.mark.parametrize("stuck", [False, True])
     @pytest.mark.parametrize("name", ["flat", "folded", "rolled", "crumpled", "rolled through itself"])
-    def test_never_more_crossings_than_before(self, name: str, size: float, seed: int):
+    def test_never_more_crossings_than_before(self, name: str, stuck: bool, size: float, seed: int):
         level, view, base = crossed_strip(name)
         noise = torch.randn(base.shape, generator=torch.Generator().manual_seed(seed))
-        x = view.moved(Placed(base), base + size * 0.3 * EDGE * noise * level.free)
+        x = view.moved(Placed(base), base + size * 0.3 * EDGE * noise * level.free, stuck=stuck)
         before, after = (len(crossings(Soup.of(level, at))) for at in (base, x))
         assert view.look(x).crossings.count == after
         assert after <= before
@@ -139,7 +142,7 @@ class TestGivenUp:
     """Pieces of cloth that are mostly tangled after all rounds at the cage of a cold frame are given up."""
 
     @staticmethod
-    def shot_of(*shapes: str):
+    def shot_of(*shapes: str, bodies: Sequence[Soup] = ()):
         """Two large sheets that in each frame cross everywhere, along one contour, or not at all."""
         garments = [named(square(SIZE), each) for each in "AB"]
         rest = np.asarray(garments[0].rest)
@@ -150,7 +153,7 @@ class TestGivenUp:
             lower[:, 1] += (2.0 + 0.01 * time) * EDGE * noise if shape == "full" else 0.0
             upper[:, 1] += {"full": 0.0, "contour": 0.5 * rest[:, 0] + 0.1 * EDGE, "apart": 0.5 * EDGE}[shape]
             cages.append([lower, upper])
-        return shot(garments, cages)
+        return shot(garments, cages, bodies)
 
     def solved(self, *shapes: str) -> list[int]:
         """Crossings given up in each frame."""
@@ -173,6 +176,13 @@ class TestGivenUp:
         smooth = levels_of(*(named(square(SIZE), name) for name in "AB"))[-1].smooth_from_coarse
         cages = np.concatenate([each.points for each in shown.frames[0].garments])
         np.testing.assert_allclose(np.concatenate(answer.points), smooth @ cages, atol=1e-6)
+
+    def test_its_crossings_with_bodies_count_in_the_subdivided_cage_too(self):
+        shown = self.shot_of("full", "full", bodies=[ball(0.1, at=(0.0, 0.09, 0.0))] * 2)
+        for answer in shown.refiner(level=1, steps=2).refine(shown.frames):
+            (body,) = answer.telemetry[0]["contact"]["bodies"].values()
+            assert answer.telemetry[0]["start"] == GIVEN_UP
+            assert body["after"]["crossings"] <= body["before"]["crossings"] > 0
 
     def test_its_energy_above_the_upsampled_cage_is_no_reason_to_solve_it(self):
         """Sheets that rest as their cages lie: the smooth shape is strained, the upsampled one is not."""

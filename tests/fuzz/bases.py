@@ -25,6 +25,8 @@ from stages import (
 from physgraph_usd.solver.mesh.topology import PolygonMesh
 from physgraph_usd.usd.mesh.shell import Shell
 
+from .poses import write_limb
+
 SIZE = (3, 2)
 TIMES = (1.0, 2.0)
 METRES = 0.05
@@ -247,6 +249,7 @@ BASES: dict[str, Callable[[Path], None]] = {
     "curtain": _curtain,
     "loops": _loops,
     "thick": _thick,
+    "limb": write_limb,
 }
 """What writes each sound shot, ``shot.usda``, into a folder."""
 

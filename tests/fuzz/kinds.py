@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from . import attributes, composed, files, meshes, odd, records, shown, wholes
+from . import attributes, composed, files, meshes, odd, poses, records, shown, wholes
 
 KINDS = (
     *files.KINDS,
@@ -13,4 +13,5 @@ KINDS = (
     *records.KINDS,
     *shown.KINDS,
     *composed.KINDS,
+    *poses.KINDS,
 )

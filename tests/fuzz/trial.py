@@ -17,13 +17,14 @@ from physgraph_usd.errors import GarmentError, PhysGraphError
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.refine import inspect_shot, refine_shot
 from physgraph_usd.shot.report import RefineReport
+from physgraph_usd.shot.warnings import of_more
 from physgraph_usd.usd.check.validate import validate_layer
 
 from .files import sizes
 from .mutant import Draft, Kind, make
 
 GOOD = ("done", "in part", "refused")
-BAD = ("traceback", "invalid layer", "files left", "input changed", "poor message", "hang", "died")
+BAD = ("traceback", "invalid layer", "worse", "files left", "input changed", "poor message", "hang", "died")
 MADE_BY_US = {"out.usdc", "out.root.usda"}
 READING = ("garments", "colliders", "frames", "level", "overrides", "rest_frame")
 LONGEST_MESSAGE = 2000
@@ -108,6 +109,8 @@ def _checked(report: RefineReport, out: Path, shot: Path) -> tuple[str, str]:
         return "traceback", f"validate_layer: {error}"
     if errors:
         return "invalid layer", "\n".join(errors)
+    if more := of_more(report):
+        return "worse", "; ".join(more)
     return ("in part" if report.failed else "done"), "; ".join(report.failed.values())
 
 
