@@ -82,8 +82,8 @@ class Guide:
         self._coarse_weight = per_area * guide_map.coarse_area
         self._pin_weight = soft * np.asarray(guide_map.fine_areas @ per_area).ravel()
         self._weight, self._pin = (
-            three_columns(torch.as_tensor(each, dtype=level.dtype, device=level.device))
-            for each in (self._coarse_weight, self._pin_weight)
+            three_columns(torch.as_tensor(weight, dtype=level.dtype, device=level.device))
+            for weight in (self._coarse_weight, self._pin_weight)
         )
         compliance = np.divide(1.0, per_area, out=np.zeros_like(per_area), where=per_area > 0)
         self._compliance = three_columns(torch.as_tensor(compliance, dtype=level.dtype, device=level.device))
