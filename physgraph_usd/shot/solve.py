@@ -139,7 +139,7 @@ class ShotSolver:
             threads=self._threads,
         )
         if advanced is not None:
-            refiner.begin_at(advanced[0], since=advanced[1])
+            refiner.begin_at(advanced[0], time_code=advanced[1])
         return run_in.seconds
 
 

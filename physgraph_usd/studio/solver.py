@@ -81,7 +81,7 @@ class FrameSolver:
         frame = shot.frame(time)
         follows = bool(self._at) and (self._at[0], time) in set(pairwise(self._times))
         temporal = self._settings.temporal if follows else "warm"  # No time passes for the tether to slow cloth down.
-        settings = replace(self._settings, rough=rough, shown=seen, cancelled=cancelled, temporal=temporal)
+        settings = replace(self._settings, rough=rough, show_round=seen, cancelled=cancelled, temporal=temporal)
         if self._at:
             self.refiner = self.refiner.fork(settings)
         else:
@@ -106,7 +106,7 @@ class FrameSolver:
         earlier = [] if time is None else shot.times_until(time)
         found = cages_walked(shot.scene, self._settings, shot.frame, times=earlier, threads=cores())
         if found is not None:
-            self.refiner.begin_at(found[0], since=found[1])
+            self.refiner.begin_at(found[0], time_code=found[1])
 
 
 def _settings(*, contact: bool) -> SolveSettings:
