@@ -95,7 +95,7 @@ def no_worse(
     if not bool(remaining.any()) and not len(solved.corners):
         return x, remaining, {}
     smooth, free = view.closed(smooth), view.mesh.level.free
-    base = Faults.of(view, view.found(smooth))
+    base = Faults.of(view, view.detect(smooth))
 
     def blended(remaining: Tensor) -> Tensor:
         solved_share = from_coarse @ ((remaining == 0).double().cpu().numpy())
@@ -116,7 +116,7 @@ def no_worse(
     for _ in range(GROWTHS):
         remaining = remaining if extended is None else extended
         y = blended(remaining)
-        faults = Faults.of(view, view.found(y))
+        faults = Faults.of(view, view.detect(y))
         extended = longer(faults)
         if extended is None:
             break
