@@ -306,11 +306,11 @@ def _unsolvable(garment: Garment, points: np.ndarray) -> str:
 def refuse_falling(scene: Scene, frame: Frame) -> None:
     """Refuse a frame in which a garment would fall: its guide is too weak, and neither pins nor contact hold it.
 
-    By its weight over the guide's stiffness it sinks without pins, bodies and other garments. Held by these at one end
-    it stretches: a strip of length L and modulus Y that hangs is longer by w L^2 / 2 Y, with w its weight by area.
+    Without pins, colliders and other garments, a garment sinks by its weight per area w over the guide's stiffness.
+    Held at one end, it stretches: a hanging strip of length L and modulus Y is longer by w L^2 / 2 Y.
 
     Raises:
-        GarmentError: It would sink, and held cloth stretch, by `FALLS` times its own size.
+        GarmentError: A garment would sink, or if held stretch, by `FALLS` times its size.
     """
     for garment, garment_frame in zip(scene.garments, frame.garments, strict=True):
         weight = garment_frame.fabric.density * float(np.linalg.norm(scene.gravity))

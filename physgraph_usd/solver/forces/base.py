@@ -116,7 +116,7 @@ class ForceModule:
         self._work = Work(names, total_of(self.forces, assembly), aims)
 
     def joined_by(self, terms: Sequence[Force]) -> ForceModule:
-        """This module's terms and more."""
+        """The sum of this module's terms and further terms."""
         return ForceModule((*self.forces, *terms), self._recordings, self._assembly)
 
     def energy_and_force(self, x: Float[Tensor, "vertices 3"]) -> tuple[Float[Tensor, ""], Float[Tensor, "vertices 3"]]:
