@@ -239,12 +239,8 @@ def _motion(
     def read(time: float) -> np.ndarray:
         return weld.joined(place(points.read(time)[0], to_metres(prim, metres, time)))
 
-    pace: dict[str, Any] = {
-        "edges": weld.mesh.half_edges.edges,
-        "frame": FrameGrid.of(stage).length,
-        "seconds": 1.0 / stage.GetTimeCodesPerSecond(),
-    }
-    return CageMotion(times, read, **pace) if times else None
+    edges, frame, seconds = weld.mesh.half_edges.edges, FrameGrid.of(stage).length, 1.0 / stage.GetTimeCodesPerSecond()
+    return CageMotion(times, read, edges=edges, frame=frame, seconds=seconds) if times else None
 
 
 def _animation(
