@@ -118,11 +118,11 @@ class Origin:
         passed = 0.0 if time is None or not times else time - min(times)
         return seconds * passed if abs(passed) > SAME_TIME else 0.0
 
-    def telemetry(self, walked_from: float | None) -> dict[str, object]:
+    def telemetry(self, prerolled_from: float | None) -> dict[str, object]:
         """Telemetry of the start, given the time code from which a cold frame's cage was advanced, or None."""
         entries: dict[str, object] = {"start": "cold: the time between samples is too long"} if self.gap else {}
-        if walked_from is not None:
-            entries["start"] = f"cold: the cage walked here from time code {named_time(walked_from)}"
+        if prerolled_from is not None:
+            entries["start"] = f"cold: the cage walked here from time code {named_time(prerolled_from)}"
         if self.broken is not None:
             entries["broken_before"] = self.broken
         if self.jumped is not None:

@@ -15,7 +15,7 @@ from .refiner import Refiner
 from .settings import SolveSettings
 
 
-def cages_walked(
+def prerolled_cages(
     scene: Scene,
     settings: SolveSettings,
     frame_at: Callable[[float | None], Frame],

@@ -62,7 +62,7 @@ def patched(problem: Problem, x: Placed) -> tuple[Placed, Tensor, dict[str, int]
     return no_worse(view, x, smooth, from_coarse=level.from_coarse, before=problem.following)
 
 
-def state_left(problem: Problem, x: Placed, memory: Any, following: Tensor) -> FrameState:
+def next_state(problem: Problem, x: Placed, memory: Any, following: Tensor) -> FrameState:
     """State for the start of the next frame.
 
     Args:

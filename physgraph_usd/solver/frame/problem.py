@@ -99,7 +99,7 @@ class Problem:
         began: Start of the frame's computation [s].
         aim: The cage followed by the fine cloth [m].
         forces: The lasting terms of each level, coarsest first.
-        walked: Cages advanced from an earlier frame [m], for a cold start; or None.
+        prerolled: Cages advanced from an earlier frame [m], for a cold start; or None.
         before: Fine positions in the last frame [m], float64; None without a last frame.
         inside: Mask of the vertices inside a body in the last frame; None if none was.
         tether: Stiffness of the tie to the start [1/s^2]; None without tie.
@@ -115,7 +115,7 @@ class Problem:
     forces: Sequence[LevelForces]
     contact: FrameContact | None
     start: Start
-    walked: Float[Tensor, "coarse 3"] | None
+    prerolled: Float[Tensor, "coarse 3"] | None
     before: Placed | None
     inside: Bool[Tensor, " vertices"] | None
     tether: float | None
@@ -162,8 +162,8 @@ class Problem:
     @property
     def _first_cage(self) -> Float[Tensor, "coarse 3"]:
         """Start of the cage's level [m]: advanced from an earlier frame, or untangled."""
-        if self.walked is not None:
-            return self.walked
+        if self.prerolled is not None:
+            return self.prerolled
         return self.aim if self.contact is None else self.contact.untangled
 
     @property
@@ -222,7 +222,7 @@ class Problem:
         points = group.followers.placed(x, self.cage.origin, self.cage.world)
         return [points[span] for span in group.levels[-1].spans]
 
-    def begun(
+    def level_start(
         self, index: int, below: Float[Tensor, "below 3"] | None
     ) -> tuple[Float[Tensor, "vertices 3"], Float[Tensor, "vertices 3"] | None]:
         """Start of a level [m], and the move to remove a coarser mesh's facets; None in a warm frame.
@@ -277,7 +277,7 @@ def begin(group: Group, frame: FrameInput, last: FrameState | None) -> Problem:
         forces=forces,
         contact=contact,
         start=start,
-        walked=None if frame.walked is None else group.tensor(frame.walked - cage.origin),
+        prerolled=None if frame.prerolled is None else group.tensor(frame.prerolled - cage.origin),
         before=before,
         inside=last.inside if last is not None and bool(last.inside.any()) else None,
         tether=start.slowed * settings.tether * frame.rate**2 if settings.temporal == "tether" else None,

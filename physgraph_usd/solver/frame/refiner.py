@@ -61,7 +61,7 @@ class Refiner:
         self.scene, self._settings, self._heat_map = scene, settings, heat_map
         self._memories = (GarmentHistory(),) * len(scene.garments)
         self._time: float | None = None
-        self._walked: tuple[Sequence[np.ndarray | None], float] | None = None
+        self._prerolled: tuple[Sequence[np.ndarray | None], float] | None = None
         self._clock = clock_of(device)
         self._seconds: list[float] = []  # Durations of completed frames.
 
@@ -82,16 +82,16 @@ class Refiner:
     def forget(self) -> None:
         """Start the next frame cold, like the first."""
         self._cloth.bodies.forget()
-        self._memories, self._time, self._walked = (GarmentHistory(),) * len(self._memories), None, None
+        self._memories, self._time, self._prerolled = (GarmentHistory(),) * len(self._memories), None, None
 
-    def begin_at(self, cages: Refiner, *, time_code: float) -> None:
+    def start_from_cages(self, cages: Refiner, *, time_code: float) -> None:
         """Start the first frame, if cold, with the cage advanced by another refiner.
 
         Args:
             cages: A refiner of the same scene without subdivision, after solving the first frame.
             time_code: The start time code of the advance, for the report.
         """
-        self._walked = [None if memory.last is None else memory.last.points for memory in cages._memories], time_code
+        self._prerolled = [None if memory.last is None else memory.last.points for memory in cages._memories], time_code
 
     def use(self, settings: SolveSettings) -> None:
         """Solve all following frames with new settings, the next frame cold; levels and metrics are kept."""
@@ -104,7 +104,7 @@ class Refiner:
         forked._settings = settings
         return forked
 
-    def go_on_from(self, refiner: Refiner) -> None:
+    def continue_from(self, refiner: Refiner) -> None:
         """Start the next frame from the last frame of a refiner of the same meshes; its result is not reused."""
         lasts = [
             None if memory.last is None else replace(memory.last, is_reusable=False) for memory in refiner._memories
@@ -168,10 +168,10 @@ class Refiner:
         self._cloth.bodies.pose(frame.colliders)
         count = len(frame.garments)
         requested = [True] * count if wanted is None else list(wanted)
-        scene_frame = SceneFrame(self._cloth, self._settings, frame, self._memories, gap, self._walked, self._limit)
+        scene_frame = SceneFrame(self._cloth, self._settings, frame, self._memories, gap, self._prerolled, self._limit)
         answers, reused = scene_frame.solve(requested)
         self._memories = tuple(answers[k].memory if k in answers else memory for k, memory in enumerate(self._memories))
-        self._time, self._walked = frame.time, None
+        self._time, self._prerolled = frame.time, None
         points = [answers[index].points if index in answers and requested[index] else None for index in range(count)]
         absent: dict[str, object] = {"start": "left out: the garment has no sample here"}
         telemetry = [absent if points[index] is None else answers[index].telemetry for index in range(count)]

@@ -168,7 +168,7 @@ class SceneFrame:
         cloth: Levels, groups and bodies of the scene; the bodies are posed.
         memories: GarmentHistory of each garment's last frames.
         gap: Whether the time since the last frame is too long for a warm start.
-        walked: World positions of each cage [m] advanced here by another refiner, and the start time code; or None.
+        prerolled: World positions of each cage [m] advanced here by another refiner, and the start time code; or None.
         limit: Time limit of the frame [s], for the report.
     """
 
@@ -177,7 +177,7 @@ class SceneFrame:
     frame: Frame
     memories: Sequence[GarmentHistory]
     gap: bool
-    walked: tuple[Sequence[np.ndarray | None], float] | None
+    prerolled: tuple[Sequence[np.ndarray | None], float] | None
     limit: float
 
     def solve(self, requested: Sequence[bool]) -> tuple[dict[int, Answer], list[bool]]:
@@ -235,14 +235,14 @@ class SceneFrame:
         frames, memories = [self.frame.garments[index] for index in part], [self.memories[index] for index in part]
         group = self.cloth.group(part, self.settings)
         origin = origin_of(part, self.frame, memories, near=near, edge=group.spacings[0], gap=self.gap)
-        cage = None if origin.state is not None else self._cage_walked(part)
+        cage = None if origin.state is not None else self._prerolled_cage(part)
         elapsed = origin.elapsed(self.frame.time, self.cloth.scene.seconds)
         at = None if self.frame.time is None else float(self.frame.time)
         while True:
             touching = self.cloth.touching(part, frames, near, origin=origin)
             moved = origin.moved(part, self.frame, near, self.cloth.scene.gravity)
-            walked = None if cage is None else cage[0]
-            frame_input = FrameInput(frames, at, touching, moved, walked=walked, elapsed=elapsed)
+            prerolled = None if cage is None else cage[0]
+            frame_input = FrameInput(frames, at, touching, moved, prerolled=prerolled, elapsed=elapsed)
             try:
                 solved = solve_soundly(group, frame_input, origin.state)
             except RunawayError as error:
@@ -283,12 +283,12 @@ class SceneFrame:
             entries["together"] = [self.cloth.scene.garments[index].path for index in part]
         return entries
 
-    def _cage_walked(self, part: tuple[int, ...]) -> tuple[np.ndarray, float] | None:
+    def _prerolled_cage(self, part: tuple[int, ...]) -> tuple[np.ndarray, float] | None:
         """World positions of cages advanced to this frame by another refiner [m], and the start time code."""
-        if self.walked is None:
+        if self.prerolled is None:
             return None
-        cages = [cage for cage in (self.walked[0][index] for index in part) if cage is not None]
-        return (np.concatenate(cages), self.walked[1]) if len(cages) == len(part) else None
+        cages = [cage for cage in (self.prerolled[0][index] for index in part) if cage is not None]
+        return (np.concatenate(cages), self.prerolled[1]) if len(cages) == len(part) else None
 
     def _refuse_strayed(self, part: tuple[int, ...], points: Sequence[np.ndarray]) -> None:
         for index, fine in zip(part, points, strict=True):

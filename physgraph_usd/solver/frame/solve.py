@@ -32,7 +32,7 @@ from ..level import Placed, unhindered
 from ..scene import GIVEN_UP
 from .group import Group
 from .level_forces import blame
-from .outcome import measured, patched, refuse_swallowed, scaled, state_left, telemetry_of
+from .outcome import measured, next_state, patched, refuse_swallowed, scaled, telemetry_of
 from .problem import LevelProblem, Problem, begin
 from .values import FrameInput, FrameState, Solved
 
@@ -79,7 +79,7 @@ def solve_frame(group: Group, frame: FrameInput, last: FrameState | None, *, few
         x = visible if problem.contact.is_out(visible) else x  # What is pushed out in vain is not carried on.
     solution = scaled(problem, visible)
     visible, following, figures = patched(problem, solution)
-    state = state_left(problem, x, memory, following)
+    state = next_state(problem, x, memory, following)
     solved = time.perf_counter()
     telemetry = telemetry_of(problem, solution, module, reports=[*reports, *level_reports])
     telemetry |= {"start": GIVEN_UP} if problem.hopeless else {}
@@ -106,7 +106,7 @@ def _solve_levels(
         level = problem.level(index, start_time=start_time)
         if index == problem.finest and settings.show_round is not None:
             level = replace(level, show=partial(_show, problem, settings.show_round))
-        x, level_reports, module, memory = solve_one_level(level, *problem.begun(index, x))
+        x, level_reports, module, memory = solve_one_level(level, *problem.level_start(index, x))
         if index == problem.finest and settings.ended is not None:
             settings.ended(level, x)
         if index < problem.finest:
@@ -233,12 +233,12 @@ def _with_cage_untangled(
     if contact is None or problem.warm or not contact.crossed:
         return problem, []
     level = problem.level(0, start_time=start_time)
-    view, start = level.view, problem.begun(0, None)[0]
+    view, start = level.view, problem.level_start(0, None)[0]
     assert view is not None
     x, reports = _untangle(level, view, Placed(view.closed(start)), view.drawn, most=UNTANGLINGS)
     if view.look(x).hopeful.count >= fewer_than:
         raise WorseStartError
-    return replace(problem, contact=contact.after_cage(x), walked=x), reports
+    return replace(problem, contact=contact.after_cage(x), prerolled=x), reports
 
 
 def _untangle(
@@ -304,12 +304,12 @@ def solve_soundly(group: Group, frame: FrameInput, last: FrameState | None) -> S
     reason = _unsound(solved.telemetry)
     settings = group.settings
     ended_early = is_over() or settings.budget_ms is not None or settings.steps == 0 or not settings.is_reusable
-    if not reason or (last is None and frame.walked is None) or ended_early:
+    if not reason or (last is None and frame.prerolled is None) or ended_early:
         return solved
     if last is not None and last.wait:
         return _waiting(solved, last.failures, last.wait - 1)
     given_up = None if last is None else last.given_up
-    again = replace(frame, moved=np.inf, walked=None, elapsed=0.0, given_up=given_up)
+    again = replace(frame, moved=np.inf, prerolled=None, elapsed=0.0, given_up=given_up)
     failures = 1 if last is None else last.failures + 1
     wait = min(2**failures - 1, MOST_WAIT)
     crossings = 0 if "follows_cage" in solved.telemetry else _crossings(solved.telemetry, given_up=True)

@@ -26,7 +26,7 @@ class FrameInput:
         at: The time code, for errors.
         touching: Surfaces within reach of the garments.
         moved: Largest motion of the surfaces since the last frame [m]; infinite if more than poses changed.
-        walked: World positions of cages advanced from an earlier frame [m], shape (C, 3), for a cold start; or None.
+        prerolled: World positions of cages advanced from an earlier frame [m], shape (C, 3), for a cold start; or None.
         elapsed: Time since the start frame [s]; 0 for a cold start.
         given_up: As `FrameState.given_up`, for a start from the cage.
     """
@@ -35,7 +35,7 @@ class FrameInput:
     at: float | None = None
     touching: Sequence[Touching] = ()
     moved: float = np.inf
-    walked: np.ndarray | None = None
+    prerolled: np.ndarray | None = None
     elapsed: float = 0.0
     given_up: Bool[Tensor, " coarse"] | None = None
 
