@@ -48,8 +48,11 @@ class TestState:
             FrameState(coarse, fine, fine[:, 0] > 0, coarse[:, 0] > 0, coarse[:, 0].long(), held) for held in (7, 2)
         )
         both = join([one, other])
-        assert both.held == 2
-        assert [each.held for each in split(both, [slice(0, 2), slice(2, 4)], [slice(0, 4), slice(4, 8)])] == [2, 2]
+        assert both.still_frames == 2
+        assert [each.still_frames for each in split(both, [slice(0, 2), slice(2, 4)], [slice(0, 4), slice(4, 8)])] == [
+            2,
+            2,
+        ]
 
 
 class TestHeldPose:

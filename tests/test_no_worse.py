@@ -33,9 +33,9 @@ def test_only_the_pair_that_crosses_more_follows_its_cage():
     x[number == 1, 1] -= 0.004
     x[number == 3, 1] += 0.012
     y, left, told = kept(view, level, x, smooth)
-    first, counts = number < 2, [len(Faults.of(view, view.found(each)).corners) for each in (x, smooth, y)]
+    first, counts = number < 2, [len(Faults.of(view, view.detect(each)).corners) for each in (x, smooth, y)]
     crossing = torch.zeros_like(first)
-    crossing[torch.cat([Faults.of(view, view.found(each)).corners.reshape(-1) for each in (x, smooth)]).long()] = True
+    crossing[torch.cat([Faults.of(view, view.detect(each)).corners.reshape(-1) for each in (x, smooth)]).long()] = True
     crossing &= first
     moved = (y != x).any(dim=1)
     assert torch.equal(y[crossing], smooth[crossing])

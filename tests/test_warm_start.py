@@ -33,7 +33,7 @@ MESH, REST = sheet(8, 6)
 def begun(group: Group, state: FrameState, cage: Cage) -> Start:
     """Where a frame starts, with no body that has moved."""
     given = {"frames": group.moving_frames, "reset": group.settings.reset}
-    return start_of(state.about(cage.origin), state.held, cage, **given, moved=0.0)
+    return start_of(state.about(cage.origin), state.still_frames, cage, **given, moved=0.0)
 
 
 @pytest.mark.parametrize(("moved", "still"), [(0.9, True), (1.1, False)])
@@ -43,7 +43,7 @@ def test_a_pose_is_held_while_its_cage_hardly_moves(moved: float, still: bool):
     edge = float(group.levels[0].spacing.mean())
     cage = group.cage(frame_of(points + np.array([0.0, moved * STILL * edge, 0.0])).garments)
     start = begun(group, state, cage)
-    assert (start.why, start.held) == ("warm", int(still))
+    assert (start.reason, start.still_frames) == ("warm", int(still))
 
 
 def test_what_rests_stays_until_it_is_moved_by_more_than_it_rested_with():

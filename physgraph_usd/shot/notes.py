@@ -72,7 +72,7 @@ def of_fabrics(sources: Iterable[GarmentSource]) -> list[str]:
 
 
 def of_subsets(sources: Iterable[GarmentSource]) -> list[str]:
-    """A note for each subset of faces whose fabric is not its garment's."""
+    """Notes on the subsets of faces with another fabric than their garment, one note per subset."""
     return [
         f"<{source.path.AppendChild(name) if name else source.path}>: {words}"
         for source in sources
@@ -81,7 +81,7 @@ def of_subsets(sources: Iterable[GarmentSource]) -> list[str]:
 
 
 def preset_overrides(sources: Iterable[GarmentSource]) -> list[str]:
-    """Values of ``--set`` that give garments the fabric they are named after."""
+    """Values of ``--set`` that choose a preset for the garments named like one."""
     return [f"{source.path}.{PRESET}={preset}" for source, _, preset in _named(sources)]
 
 

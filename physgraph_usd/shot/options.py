@@ -310,7 +310,7 @@ def scene_words(options: RefineOptions) -> list[str]:
 
 
 def _text(value: Any) -> str:
-    """A level, a time code, a range of them or a word, as the command line takes it."""
+    """Command-line text of a level, a time code, a range of time codes, or a word."""
     if isinstance(value, tuple):
         return ":".join(map(_text, value))
     if value == -1 and isinstance(value, int):
@@ -319,5 +319,5 @@ def _text(value: Any) -> str:
 
 
 def options_of(name: str, values: Iterable[str]) -> list[str]:
-    """An option for each of some values, as words of a command."""
+    """Command-line arguments that repeat an option, once per value."""
     return [word for value in values for word in (name, value)]

@@ -14,7 +14,7 @@ import torch
 
 from ..errors import At, SolveError, StageError
 from ..interrupts import leave_if_asked
-from ..solver.frame.lead_in import cages_walked
+from ..solver.frame.lead_in import prerolled_cages
 from ..solver.frame.refiner import Refiner
 from ..solver.mesh.kernels import device_of, start_warp
 from ..usd.read.reader import Shot
@@ -130,7 +130,7 @@ class ShotSolver:
         """
         earlier = [] if not times or times[0] is None else shot.times_until(times[0])
         run_in = RunIn(shot.frame, earlier, self._shot)
-        advanced = cages_walked(
+        advanced = prerolled_cages(
             shot.scene,
             self._options.solve_settings(),
             run_in,
@@ -139,7 +139,7 @@ class ShotSolver:
             threads=self._threads,
         )
         if advanced is not None:
-            refiner.begin_at(advanced[0], since=advanced[1])
+            refiner.start_from_cages(advanced[0], time_code=advanced[1])
         return run_in.seconds
 
 

@@ -37,7 +37,7 @@ from .warnings import WARNINGS
 SEAM_BOUND = 0.05
 """Largest increase of a frame's move by a seam, RMS over a garment, in mean fine edges; figures in `docs/farm.md`."""
 SPARE = 1 / 3
-"""Fraction of the bound that a proposed pre-roll leaves: a longer one settles in other folds, nearer or farther."""
+"""Fraction of the bound left unused by a proposed pre-roll: a longer pre-roll may end in folds that differ more."""
 _OF_ONE_CHUNK = ("frames", "preroll")
 """Options allowed to differ between chunks of one shot."""
 

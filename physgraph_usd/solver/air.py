@@ -57,10 +57,10 @@ class Wind:
 def _modes() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Wave vectors [1/m] and unit directions at right angles to them, shape (M, 3), and phases, shape (M,)."""
     random = np.random.default_rng(1)
-    wave, other = random.normal(size=(2, MODES, 3))
+    wave, arbitrary = random.normal(size=(2, MODES, 3))
     length = np.geomspace(LONGEST_GUST, SHORTEST_GUST, MODES)
     wave *= 2.0 * np.pi / (length * np.linalg.norm(wave, axis=1))[:, None]
-    along = np.cross(wave, other)
+    along = np.cross(wave, arbitrary)
     return wave, along / np.linalg.norm(along, axis=1, keepdims=True), random.uniform(0.0, 2.0 * np.pi, MODES)
 
 

@@ -39,7 +39,7 @@ class Fabric:
     @property
     def has_membrane(self) -> bool:
         """Whether it needs a membrane: edge springs have a single stiffness and no stretch limit."""
-        return any(each is not None for each in (self.shear, self.weft_stretch, self.stretch_limit))
+        return any(value is not None for value in (self.shear, self.weft_stretch, self.stretch_limit))
 
     @property
     def is_eased(self) -> bool:

@@ -60,8 +60,8 @@ def axes(sides: np.ndarray, warp: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     normal = cross(*sides)
     normal /= np.maximum(norm(normal), np.finfo(float).tiny)
     nearest = np.eye(3).take(np.abs(normal).argmin(axis=0), axis=1)
-    inside = [each - normal * dot(each, normal) for each in (warp, nearest)]
-    lengths = [norm(each) for each in inside]
+    inside = [direction - normal * dot(direction, normal) for direction in (warp, nearest)]
+    lengths = [norm(vector) for vector in inside]
     along = np.where(lengths[0] > 1e-3, *inside) / np.where(lengths[0] > 1e-3, *lengths)
     return along, cross(normal, along)
 
@@ -78,12 +78,12 @@ def edge_cosines(
         count: Number of edges E.
         warp: As for `axes`.
     """
-    corners, which = at_corners(rest, triangles), sides.T.ravel()
+    corners, edges = at_corners(rest, triangles), sides.T.ravel()
     spans = np.roll(corners, -1, axis=0) - corners
     square = np.maximum((spans**2).sum(axis=1), np.finfo(float).tiny)
-    both = axes(corners[1:] - corners[0], warp)
-    total = [np.bincount(which, (dot(spans, axis) ** 2 / square).ravel(), count) for axis in both]
-    number = np.bincount(which, minlength=count)
+    directions = axes(corners[1:] - corners[0], warp)
+    total = [np.bincount(edges, (dot(spans, axis) ** 2 / square).ravel(), count) for axis in directions]
+    number = np.bincount(edges, minlength=count)
     return np.where(number > 0, total / np.maximum(number, 1.0), 0.5).T
 
 

@@ -27,9 +27,9 @@ def acceleration_of(points: Sequence[np.ndarray], times: Sequence[float]) -> np.
         points: Positions at the times [m], three arrays of shape (V, 3).
         times: Three times, ascending [s].
     """
-    (before, here, after), (first, middle, last) = points, times
-    change = (after - here) / (last - middle) - (here - before) / (middle - first)
-    return 2.0 * change / (last - first)
+    (x0, x1, x2), (t0, t1, t2) = points, times
+    change = (x2 - x1) / (t2 - t1) - (x1 - x0) / (t1 - t0)
+    return 2.0 * change / (t2 - t0)
 
 
 def felt(acceleration: np.ndarray) -> np.ndarray | None:

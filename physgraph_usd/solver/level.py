@@ -128,9 +128,9 @@ class Level:
 
     def eased(self, fabrics: Sequence[Fabric]) -> Level:
         """The level with the rest lengths and areas of its garments' fabrics; this level if no fabric has ease."""
-        if self.grain is None or not (self.grain.gathers or any(each.is_eased for each in fabrics)):
+        if self.grain is None or not (self.grain.gathers or any(fabric.is_eased for fabric in fabrics)):
             return self
-        ease = self.rest.new_tensor([[each.warp_ease, each.weft_ease] for each in fabrics])
+        ease = self.rest.new_tensor([[fabric.warp_ease, fabric.weft_ease] for fabric in fabrics])
         at_springs, at_membrane = (
             (1.0 + scale.unsqueeze(1) * ease[owner.long()] + torch.stack([0.0 * gather, gather], dim=1)).clamp_min(
                 SHORTEST
@@ -217,8 +217,8 @@ class Level:
         """
         hinges, springs = self.hinges.cpu().numpy(), self.springs.cpu().numpy()
         rows = flat_rows(self.rest.double().cpu().numpy(), hinges).T.ravel()
-        place = hinges.ravel(), np.repeat(np.arange(len(hinges), dtype=np.int32), 6)
-        by_vertex = sp.csr_matrix((rows, place), shape=(self.vertex_count, len(hinges)))
+        indices = hinges.ravel(), np.repeat(np.arange(len(hinges), dtype=np.int32), 6)
+        by_vertex = sp.csr_matrix((rows, indices), shape=(self.vertex_count, len(hinges)))
         return sp.csr_matrix(-by_vertex[springs[:, 0]].multiply(by_vertex[springs[:, 1]]))
 
     @cached_property
@@ -269,14 +269,14 @@ def build_levels(
     levels: list[Level] = []
     carried = [_carried(g, chain) for g, chain in zip(garments, refinements, strict=True)]
     for index in range(depth + 1):
-        parts = [_garment_level(g, *next(each)) for g, each in zip(garments, carried, strict=True)]
+        parts = [_garment_level(g, *next(meshes)) for g, meshes in zip(garments, carried, strict=True)]
         below: list[Stencil | None] = [None, None]
         ups = tuple[Stencil, ...]()
         if index:
             maps = zip(*((part.linear_step, part.smooth_step, part.flat_step) for part in parts), strict=True)
-            whole = [sp.csr_matrix(sp.block_diag(each)) for each in maps] or [sp.csr_matrix((0, 0))] * 3
-            up, smooth, flat = (Stencil(each, dtype=dtype, device=device, threads=threads) for each in whole)
-            below = [smooth, flat if abs(whole[2] - whole[0]).sum() > 0 else up]
+            joined = [sp.csr_matrix(sp.block_diag(blocks)) for blocks in maps] or [sp.csr_matrix((0, 0))] * 3
+            up, smooth, flat = (Stencil(matrix, dtype=dtype, device=device, threads=threads) for matrix in joined)
+            below = [smooth, flat if abs(joined[2] - joined[0]).sum() > 0 else up]
             ups = (up, *levels[-1].ups)
         levels.append(_join(index, parts, below, ups=ups, dtype=dtype, device=device, threads=threads))
     return tuple(levels)
@@ -308,7 +308,7 @@ def _garment_level(
     """Arrays of a garment at one level, given mesh, cage faces and maps from `_carried`."""
     linear, smoothing, mesh = maps["linear"], maps["smooth"], cage.mesh
     always = np.unique(np.sort(cage.ends[np.isinf(cage.creases)], axis=1), axis=0)
-    rest, smooth_rest = (np.asarray(each @ np.asarray(garment.rest, dtype=np.float64)) for each in (linear, smoothing))
+    rest, smooth_rest = (np.asarray(matrix @ np.asarray(garment.rest, np.float64)) for matrix in (linear, smoothing))
     split = _sound(mesh.triangulate(rest if mesh is garment.mesh else None), rest, rigid=_is_rigid(garment, linear))
     elements = elastic_elements(mesh, split, rest)
     # Along normals only: what smoothing moves within the surface would strain a flat cage.
@@ -327,7 +327,7 @@ def _garment_level(
         elements=elements,
         bent=garment.bent_rest | (find_edges(always, elements.hinges[:, :2]) >= 0),
         pressed=_pressed_angles(garment, elements, linear=linear, smoothing=smoothing),
-        vertex_values={name: np.asarray(linear @ each.astype(np.float64)) for name, each in painted.items()},
+        vertex_values={name: np.asarray(linear @ values.astype(np.float64)) for name, values in painted.items()},
         warp=None if garment.grain is None else garment.grain.warp[face[elements.face]],
         fabric=scale[face[elements.face]],
         **maps,
@@ -387,15 +387,15 @@ def _metric_of(
     cage, surface = (x[1:] - x[0] for x in (at_corners(rest, triangles), at_corners(smooth_rest, triangles)))
     normal = cross(*surface)
     double = norm(normal)
-    known = 0.5 * double > 1e-9 * (surface**2).reshape(6, -1).sum(axis=0)
-    gram, lengths = (np.stack([[dot(a, b) for b in each] for a in each]) for each in (surface, cage))
-    dual = product(inverse(np.where(known, gram, np.eye(2)[:, :, None])), surface)
-    normal /= np.where(known, double, 1.0)
+    has_area = 0.5 * double > 1e-9 * (surface**2).reshape(6, -1).sum(axis=0)
+    gram, lengths = (np.stack([[dot(a, b) for b in vectors] for a in vectors]) for vectors in (surface, cage))
+    dual = product(inverse(np.where(has_area, gram, np.eye(2)[:, :, None])), surface)
+    normal /= np.where(has_area, double, 1.0)
     tensor = product(product(dual.swapaxes(0, 1), lengths), dual) + normal[:, None] * normal
-    tensor[:, :, ~known] = np.eye(3)[:, :, None]
+    tensor[:, :, ~has_area] = np.eye(3)[:, :, None]
     weight, starts = np.repeat(elements.share * (0.5 * double), 3), np.arange(0, 3 * len(triangles) + 1, 3)
-    places = np.sort(triangles, axis=1).ravel()
-    around = linear.T @ sp.csc_matrix((weight, places, starts), shape=(len(rest), len(triangles)))
+    vertices = np.sort(triangles, axis=1).ravel()
+    around = linear.T @ sp.csc_matrix((weight, vertices, starts), shape=(len(rest), len(triangles)))
     total, mean = np.asarray(around.sum(axis=1)), np.asarray(around @ tensor.reshape(9, -1).T)
     mean = np.where(total > 0, mean / np.where(total > 0, total, 1.0), np.eye(3).ravel())
     return np.asarray(linear @ mean)
@@ -409,7 +409,7 @@ def _in_cloth(vectors: np.ndarray, metric: np.ndarray) -> np.ndarray:
         metric: S, shape (3, 3, T).
     """
     second = cross(cross(vectors[0], vectors[1]), vectors[0])
-    axes = np.stack([each / norm(each).clip(np.finfo(float).tiny) for each in (vectors[0], second)])
+    axes = np.stack([vector / norm(vector).clip(np.finfo(float).tiny) for vector in (vectors[0], second)])
     plane = product(product(axes, metric), axes.swapaxes(0, 1))
     root = np.sqrt((plane[0, 0] * plane[1, 1] - plane[0, 1] ** 2).clip(0.0))
     trace = (plane[0, 0] + plane[1, 1] + 2.0 * root).clip(np.finfo(float).tiny)
@@ -447,8 +447,8 @@ def _join(
 ) -> Level:
     """Concatenate garments into one level, with lengths, areas and angles at rest."""
     joined, starts = _joined(parts), np.cumsum([0, *(len(part.rest) for part in parts)])
-    names = (*OF_VERTICES, "sides", "edge_spring", "hinge_spring", *(f"{each}_garment" for each in OWNED))
-    whole = {name: joined[name] for name in names}
+    names = (*OF_VERTICES, "sides", "edge_spring", "hinge_spring", *(f"{element}_garment" for element in OWNED))
+    integers = {name: joined[name] for name in names}
     warp, grain = _grain(parts, joined)
     real = _measured(joined, warp=warp)
     tensors = {n: torch.as_tensor(np.ascontiguousarray(a), dtype=dtype, device=device) for n, a in grain.items()}
@@ -456,7 +456,7 @@ def _join(
         index=index,
         spans=tuple(slice(int(a), int(b)) for a, b in pairwise(starts)),
         **{n: torch.as_tensor(np.ascontiguousarray(a), dtype=dtype, device=device) for n, a in real.items()},
-        **{n: torch.as_tensor(np.ascontiguousarray(a, dtype=np.int32), device=device) for n, a in whole.items()},
+        **{n: torch.as_tensor(np.ascontiguousarray(a, dtype=np.int32), device=device) for n, a in integers.items()},
         from_coarse=sp.csr_matrix(sp.block_diag([part.linear for part in parts])),
         smooth_from_coarse=sp.csr_matrix(sp.block_diag([part.smooth for part in parts])),
         ups=ups,
@@ -471,13 +471,13 @@ def _joined(parts: Sequence[_GarmentLevel]) -> dict[str, np.ndarray]:
     """Arrays of all garments by name, garment number of each element, and spring along each edge and hinge."""
     tables = [vars(part) | vars(part.elements) | part.vertex_values for part in parts]
     names = "rest smooth_rest metric share twists bent pressed fabric stretch_scale bend_scale pin".split()
-    joined = {name: np.concatenate([each[name] for each in tables]) for name in names}
+    joined = {name: np.concatenate([table[name] for table in tables]) for name in names}
     for names, counted in ((OF_VERTICES, "rest"), (("sides",), "springs")):
-        starts = np.cumsum([0, *(len(each[counted]) for each in tables)])
+        starts = np.cumsum([0, *(len(table[counted]) for table in tables)])
         for name in names:
-            joined[name] = np.concatenate([each[name] + start for each, start in zip(tables, starts, strict=False)])
+            joined[name] = np.concatenate([table[name] + start for table, start in zip(tables, starts, strict=False)])
     for name, owned in OWNED.items():
-        joined[f"{name}_garment"] = np.repeat(np.arange(len(tables)), [len(each[owned]) for each in tables])
+        joined[f"{name}_garment"] = np.repeat(np.arange(len(tables)), [len(table[owned]) for table in tables])
     for name, ends in (("edge_spring", joined["edges"]), ("hinge_spring", joined["hinges"][:, :2])):
         joined[name] = find_edges(joined["springs"], ends)
     return joined
@@ -530,18 +530,18 @@ def _measured(joined: dict[str, np.ndarray], *, warp: np.ndarray | None) -> dict
     }
 
 
-def mean_at(which: np.ndarray, values: np.ndarray, count: int, *, weight: np.ndarray | None = None) -> np.ndarray:
+def mean_at(elements: np.ndarray, values: np.ndarray, count: int, *, weight: np.ndarray | None = None) -> np.ndarray:
     """Mean of the values at each of some elements, shape (count,); 1 at an element without values.
 
     Args:
-        which: Element of each value, shape (K,).
+        elements: Element of each value, shape (K,).
         values: Shape (K,).
         count: Number of elements.
         weight: Weight of each value, shape (K,); None for equal weights.
     """
-    weight = np.ones(len(which)) if weight is None else weight
-    total = np.bincount(which, weight, count)
-    return np.divide(np.bincount(which, weight * values, count), total, out=np.ones(count), where=total > 0)
+    weight = np.ones(len(elements)) if weight is None else weight
+    total = np.bincount(elements, weight, count)
+    return np.divide(np.bincount(elements, weight * values, count), total, out=np.ones(count), where=total > 0)
 
 
 def rest_shape(joined: dict[str, np.ndarray], *, length: np.ndarray, area: np.ndarray) -> dict[str, np.ndarray]:
@@ -596,5 +596,5 @@ def triangle_inverse(sides: np.ndarray, warp: np.ndarray | None = None) -> np.nd
     along, across = axes(sides, np.zeros_like(sides[0]) if warp is None else warp)
     a, b, c, d = (dot(side, axis) for axis in (along, across) for side in sides)
     squares = (sides**2).sum(axis=1)
-    whole = double > 1e-12 * (squares[0] + squares[1])
-    return np.where(whole, np.stack([d, -b, -c, a]) / np.where(whole, double, 1.0), 0.0).T
+    has_area = double > 1e-12 * (squares[0] + squares[1])
+    return np.where(has_area, np.stack([d, -b, -c, a]) / np.where(has_area, double, 1.0), 0.0).T

@@ -131,7 +131,7 @@ def _choose(garment: Garment, frames: list[GarmentFrame]) -> LevelChoice:
         )
     fine = edge / 2**level
     counts = fine_count(garment.mesh, level), fine_count(garment.mesh, needed)
-    raised = tuple(raised_by(fabric, edge / 2**each) if garment.raises_bending else 1.0 for each in range(level + 1))
+    raised = tuple(raised_by(fabric, edge / 2**depth) if garment.raises_bending else 1.0 for depth in range(level + 1))
     reason += f"; edges of {1e3 * fine:.1f} mm resolve wrinkles of {1e3 * EDGES_PER_WAVE * fine:.1f} mm and more"
     reason += f"; bending is raised {raised[-1]:.3g} times" if raised[-1] > 1.0 else ""
     return LevelChoice(level, reason, wave, fine, needed, counts, raised, strain)

@@ -50,7 +50,7 @@ def best_motion(before: np.ndarray, after: np.ndarray) -> Rigid:
     """
     if np.array_equal(before, after) or not (np.isfinite(before).all() and np.isfinite(after).all()):
         return AT_REST
-    middle, there = before.mean(axis=0), after.mean(axis=0)
-    u, _, vt = np.linalg.svd((after - there).T @ (before - middle))
+    centre, centre_after = before.mean(axis=0), after.mean(axis=0)
+    u, _, vt = np.linalg.svd((after - centre_after).T @ (before - centre))
     turn = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
-    return Rigid(turn, middle, there - middle)
+    return Rigid(turn, centre, centre_after - centre)

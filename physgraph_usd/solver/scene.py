@@ -142,10 +142,10 @@ class Garment:
             colliders: Numbers of the scene's colliders that it feels.
             pin: 1 where the fine cloth follows the coarse cloth exactly, shape (V,); None pins no vertex.
         """
-        one, corners = np.ones(len(rest)), np.asarray(faces)
+        ones, corners = np.ones(len(rest)), np.asarray(faces)
         mesh = PolygonMesh(np.full(len(corners), corners.shape[1]), corners.ravel(), len(rest))
-        held = 0 * one if pin is None else np.asarray(pin, float)
-        return Garment(path, mesh, np.asarray(rest, float), level, False, one, one, one, one, held, colliders)
+        pinned = 0 * ones if pin is None else np.asarray(pin, float)
+        return Garment(path, mesh, np.asarray(rest, float), level, False, ones, ones, ones, ones, pinned, colliders)
 
 
 @dataclass(frozen=True, eq=False)
@@ -289,10 +289,11 @@ def _unsolvable(garment: Garment, points: np.ndarray) -> str:
     rest, size = _median_edge(garment), float(np.linalg.norm(extent(points)))
     if size <= OUTGROWN * rest and np.finfo(np.float32).eps * size <= RESOLVED * rest:
         return ""
-    now = float(np.median(np.linalg.norm(points[ends[:, 1]] - points[ends[:, 0]], axis=1)))
-    if now > OUTGROWN * rest > 0:
-        return f"the cage's edges are of {now:.3g} m, those of its rest shape, to which cloth shrinks, of {rest:.3g} m"
-    edge = max(now, rest)
+    median = float(np.median(np.linalg.norm(points[ends[:, 1]] - points[ends[:, 0]], axis=1)))
+    if median > OUTGROWN * rest > 0:
+        shape = "those of its rest shape, to which cloth shrinks"
+        return f"the cage's edges are of {median:.3g} m, {shape}, of {rest:.3g} m"
+    edge = max(median, rest)
     used = np.zeros(len(points), bool)
     used[ends] = True
     away = np.where(used, np.linalg.norm(points - points[used].mean(axis=0), axis=1), 0.0)
@@ -305,20 +306,20 @@ def _unsolvable(garment: Garment, points: np.ndarray) -> str:
 def refuse_falling(scene: Scene, frame: Frame) -> None:
     """Refuse a frame in which a garment would fall: its guide is too weak, and neither pins nor contact hold it.
 
-    By its weight over the guide's stiffness it sinks without pins, bodies and other garments. Held by these at one end
-    it stretches: a strip of length L and modulus Y that hangs is longer by w L^2 / 2 Y, with w its weight by area.
+    Without pins, colliders and other garments, a garment sinks by its weight per area w over the guide's stiffness.
+    Held at one end, it stretches: a hanging strip of length L and modulus Y is longer by w L^2 / 2 Y.
 
     Raises:
-        GarmentError: It would sink, and held cloth stretch, by `FALLS` times its own size.
+        GarmentError: A garment would sink, or if held stretch, by `FALLS` times its size.
     """
     for garment, garment_frame in zip(scene.garments, frame.garments, strict=True):
         weight = garment_frame.fabric.density * float(np.linalg.norm(scene.gravity))
-        held = garment.colliders or (garment.pin > 0).any() or len(scene.garments) > 1
+        supported = garment.colliders or (garment.pin > 0).any() or len(scene.garments) > 1
         size = max(SPECK, *(float(extent(x).max()) for x in (garment_frame.points, garment.rest)))
         guide, stretch = garment_frame.guide * float(garment.guide_scale.mean()), garment_frame.fabric.stretch
         if (garment.pin >= 1.0).all() or weight <= FALLS * size * guide:
             continue
-        if not held:
+        if not supported:
             sinks = "without end" if guide == 0 else f"by {weight / guide:.3g} m"
             problem = f"nothing holds it up but a guide of {garment_frame.guide:g} N/m^3: it would sink {sinks}"
             remedy = "raise physgraph:guide:stiffness, or pin it"

@@ -22,8 +22,8 @@ def vertex_normals(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     Returns:
         Shape (V, 3); zero at vertices without triangles.
     """
-    areas, places = _area_vectors(points, triangles), triangles.ravel()
-    total = np.stack([np.bincount(places, np.repeat(each, 3), len(points)) for each in areas.T], axis=1)
+    areas, corners = _area_vectors(points, triangles), triangles.ravel()
+    total = np.stack([np.bincount(corners, np.repeat(component, 3), len(points)) for component in areas.T], axis=1)
     return _unit(total)
 
 

@@ -82,14 +82,14 @@ def strained_parts(
             share = float(rest[faces].sum() / rest.sum())
             if share >= LEAST_FRACTION:
                 size = float(np.median(areas[:, faces].sum(axis=1)) / rest[faces].sum())
-                where = _where(garment, faces, subsets, up)
-                parts.append(StrainedPart(where, len(faces), round(size, 3), round(share, 4)))
+                location = _where(garment, faces, subsets, up)
+                parts.append(StrainedPart(location, len(faces), round(size, 3), round(share, 4)))
     return sorted(parts, key=lambda part: -part.share)
 
 
 def size_left(garment: Garment, points: np.ndarray) -> float:
     """How large a cage at positions [m], shape (V, 3), is along its longest axis over its rest shape; 1 without one."""
-    sizes = [float(extent(each).max()) if len(each) else 0.0 for each in (points, garment.rest)]
+    sizes = [float(extent(positions).max()) if len(positions) else 0.0 for positions in (points, garment.rest)]
     return sizes[0] / sizes[1] if sizes[1] > 0 else 1.0
 
 
@@ -105,8 +105,9 @@ def strayed(cage: np.ndarray, fine: np.ndarray, *, before: np.ndarray | None = N
     if not len(cage) or not len(fine):
         return ""
     earlier = cage if before is None else before
-    size, fine_size, earlier_size = (float(np.linalg.norm(extent(each))) for each in (cage, fine, earlier))
-    middle, fine_middle = (np.ones(len(each)) @ each / len(each) for each in (cage, fine))  # `mean` over rows is slow.
+    size, fine_size, earlier_size = (float(np.linalg.norm(extent(positions))) for positions in (cage, fine, earlier))
+    # `mean` over rows is slow.
+    middle, fine_middle = (np.ones(len(positions)) @ positions / len(positions) for positions in (cage, fine))
     away = float(np.linalg.norm(fine_middle - middle))
     if away > size:
         return f"the refined cloth lies {1e3 * away:.4g} mm from its cage, which is {1e3 * size:.4g} mm large"
@@ -134,7 +135,7 @@ def _connected(garment: Garment, faces: np.ndarray) -> list[np.ndarray]:
     corners = np.flatnonzero(np.isin(mesh.corner_face, faces))
     sides = np.stack([mesh.indices[corners], mesh.indices[mesh.next_corner[corners]]], axis=1)
     label = joined_by(sides, mesh.vertex_count)[mesh.indices[mesh.starts[faces]]]
-    return [faces[label == each] for each in np.unique(label)]
+    return [faces[label == number] for number in np.unique(label)]
 
 
 def _where(garment: Garment, faces: np.ndarray, subsets: Mapping[str, np.ndarray], up: np.ndarray) -> str:

@@ -131,8 +131,8 @@ class PaintPanel:
             return
         value = float(GARMENT[self._name].fallback or 0.0) if mode == ERASE else self._limited()
         brush = Brush(1e-3 * self._radius.value, value, self._strength.value, mode=mode, mirrored=self._mirror.value)
-        where = {"mesh": cage.mesh, "rest": cage.rest, "right": self._desk.picture.axes[0]}
-        stroke.touch(brush, self._desk.picture.world(at), points[: cage.mesh.vertex_count], **where)
+        points, right = points[: cage.mesh.vertex_count], self._desk.picture.axes[0]
+        stroke.touch(brush, self._desk.picture.world(at), points, mesh=cage.mesh, rest=cage.rest, right=right)
         self._stroke = self._desk.picture.stroke = stroke
         self._say_value(session, index, at, stroke.values)
 

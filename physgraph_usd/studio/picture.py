@@ -187,12 +187,13 @@ class Picture:
         points = self._points(shown, kept, index, column)
         if points is None or len(points) != mesh.vertex_count:
             return []
-        look: dict[str, Any] = {"flat": column == CAGE, "color": self._color(cage.path, COLORS[column])}
+        flat, color, colors = column == CAGE, self._color(cage.path, COLORS[column]), None
         if column == FINE and (found := find_map(self._session, shown, index, self.view.map, stroke=self.stroke)):
             self.bar, values = found
-            look["colors"] = self.bar.colors(values)
+            colors = self.bar.colors(values)
         triangles = mesh.triangulate(cage.rest if mesh is cage.mesh else None).triangles
-        self._place(name := f"{column}/{index}", points, triangles, at=at, column=column, **look)
+        name = f"{column}/{index}"
+        self._place(name, points, triangles, at=at, column=column, flat=flat, color=color, colors=colors)
         if self.view.wires:
             edges = self._side(points, mesh.half_edges.edges, column)
             self._draw_lines(f"wires/{name}", self._placed(points, at)[edges], WIRE, WIRE_PIXELS)
@@ -220,10 +221,9 @@ class Picture:
 
     def _draw_lines(self, name: str, segments: np.ndarray, color: tuple[int, int, int], pixels: float) -> None:
         """Draw line segments in the scene [m], shape (S, 2, 3), under a name, in place of those before."""
-        look: dict[str, Any] = {"thickness": pixels, "thickness_units": "screen"}
         self._scene.remove_by_name(name)
         if len(segments):
-            self._scene.add_line_segments(name, segments, color, **look)
+            self._scene.add_line_segments(name, segments, color, thickness=pixels, thickness_units="screen")
 
     def _draw_trims(self, shown: Shown, index: int, *, at: np.ndarray) -> list[str]:
         """Draw the meshes that hang on a refined garment; returns the names of what is drawn."""

@@ -221,7 +221,7 @@ class TuneSession(Tuning):
         setting, before, old = self.setting, self._solves, self.solver
         if setting.levels != before.levels or setting.painted is not before.painted:
             self.solver = FrameSolver(self.shot, setting.levels, contact=setting.contact, device=self._device)
-            self.solver.go_on_from(old)
+            self.solver.continue_from(old)
         if setting.contact != before.contact:
             self.solver.feel(contact=setting.contact)
         self._solves = setting

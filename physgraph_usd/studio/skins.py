@@ -11,7 +11,6 @@ import threading
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from itertools import count
-from typing import Any
 
 import numpy as np
 import viser
@@ -73,8 +72,14 @@ class Skins:
         before = self._placed.get(name)
         if before is None or not np.array_equal(before.triangles, mesh.triangles):
             self.remove(name)
-            look: dict[str, Any] = {"color": encode_color(tuple(mesh.color)), "flat_shading": mesh.flat}
-            self.meshes[name] = self._scene.add_mesh_simple(name, mesh.points, mesh.triangles, side="double", **look)
+            self.meshes[name] = self._scene.add_mesh_simple(
+                name,
+                mesh.points,
+                mesh.triangles,
+                side="double",
+                color=encode_color(tuple(mesh.color)),
+                flat_shading=mesh.flat,
+            )
         elif not np.array_equal(self.meshes[name].vertices, mesh.points):
             self.move(name, mesh.points)
         self._placed[name] = mesh

@@ -11,7 +11,7 @@ import numpy as np
 from ..shot.options import RefineOptions
 from ..shot.processes import cores
 from ..shot.solve import sampled_at
-from ..solver.frame.lead_in import cages_walked
+from ..solver.frame.lead_in import prerolled_cages
 from ..solver.frame.refiner import Refiner
 from ..solver.frame.settings import SolveSettings
 from ..solver.scene import Frame, State
@@ -45,11 +45,11 @@ class FrameSolver:
         """Whether a frame was solved since the solver was made, or last told whether cloth feels contact."""
         return bool(self._at)
 
-    def go_on_from(self, other: FrameSolver) -> None:
+    def continue_from(self, other: FrameSolver) -> None:
         """Start the next frame from another solver's last result, if at equal levels."""
         counts = [[len(chain) for chain in each.refinements] for each in (self, other)]
         if other.begun and counts[0] == counts[1]:
-            self.refiner.go_on_from(other.refiner)
+            self.refiner.continue_from(other.refiner)
             self._at = other._at
 
     def feel(self, *, contact: bool) -> None:
@@ -81,7 +81,7 @@ class FrameSolver:
         frame = shot.frame(time)
         follows = bool(self._at) and (self._at[0], time) in set(pairwise(self._times))
         temporal = self._settings.temporal if follows else "warm"  # No time passes for the tether to slow cloth down.
-        settings = replace(self._settings, rough=rough, shown=seen, cancelled=cancelled, temporal=temporal)
+        settings = replace(self._settings, rough=rough, show_round=seen, cancelled=cancelled, temporal=temporal)
         if self._at:
             self.refiner = self.refiner.fork(settings)
         else:
@@ -104,9 +104,9 @@ class FrameSolver:
     def _lead_in(self, shot: Shot, time: float | None) -> None:
         """Begin in the middle of a shot with the cage advanced from an earlier frame, if the cage crosses."""
         earlier = [] if time is None else shot.times_until(time)
-        found = cages_walked(shot.scene, self._settings, shot.frame, times=earlier, threads=cores())
+        found = prerolled_cages(shot.scene, self._settings, shot.frame, times=earlier, threads=cores())
         if found is not None:
-            self.refiner.begin_at(found[0], since=found[1])
+            self.refiner.start_from_cages(found[0], time_code=found[1])
 
 
 def _settings(*, contact: bool) -> SolveSettings:

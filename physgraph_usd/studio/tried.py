@@ -78,8 +78,8 @@ class TriedShot:
             LayerError: It cannot be written.
         """
         values = {**setting.values, **self._of_subsets(setting.values)}
-        given = {"values": values, "painted": self._authored(setting.painted), "overwrite": overwrite}
-        return tag(self.opened.path, out, **self._found, **given)
+        painted = self._authored(setting.painted)
+        return tag(self.opened.path, out, **self._found, values=values, painted=painted, overwrite=overwrite)
 
     @property
     def _found(self) -> dict[str, Any]:

@@ -23,7 +23,7 @@ def tube(radius: float, start: float, end: float, rows: int) -> tuple[np.ndarray
     """Points [m] and quads of an open tube about x, wound outward."""
     angle = 2.0 * np.pi * np.arange(AROUND) / AROUND
     ring = radius * np.stack([0.0 * angle, np.cos(angle), np.sin(angle)], axis=1)
-    points = np.concatenate([ring + [x, 0.0, 0.0] for x in np.linspace(start, end, rows)])
+    points = np.concatenate([ring + np.array([x, 0.0, 0.0]) for x in np.linspace(start, end, rows)])
     row, column = (grid.ravel() for grid in np.mgrid[: rows - 1, :AROUND])
     first, second = row * AROUND + column, row * AROUND + (column + 1) % AROUND
     return points, np.stack([first, second, second + AROUND, first + AROUND], axis=1)

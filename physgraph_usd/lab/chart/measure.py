@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import statistics
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -129,29 +129,30 @@ class CurveBench:
                 began = time.perf_counter()
                 points = self.timed.upsampled(frame, smooth=smooth)
                 spent = 1e3 * (time.perf_counter() - began)
-                self._add(name, frame, spent, steps=0, repeat=0, made=0, **self.judged(frame, points))
+                self._add(name, frame, spent, {"steps": 0, "repeat": 0, "made": 0, **self.judged(frame, points)})
 
     def _run(self, name: str, curve: Curve | None, steps: int, *, repeat: int) -> None:
         """Measure a method at one step budget on all frames; ``curve`` None measures refine's default settings."""
         settings = COLD
-        about: dict[str, Any] = {"tolerance": COLD.tolerance}
+        kind: dict[str, Any] = {"tolerance": COLD.tolerance}
         if curve is not None:
             settings = replace(settings, method=curve.method, steps=steps, tolerance=0.0)
-            about = {"integrator": curve.integrator, "nested": curve.method.nested}
+            kind = {"integrator": curve.integrator, "nested": curve.method.nested}
         for frame in self.frames:
-            key = {"method": name, "steps": steps, "frame": frame.time}
-            if self.journal.one("point", repeat=repeat, **key) or self.journal.one("failed", **key):
+            if self.journal.one("point", repeat=repeat, method=name, steps=steps, frame=frame.time):
+                continue
+            if self.journal.one("failed", method=name, steps=steps, frame=frame.time):
                 continue
             self.clock.say(f"{name}, {counted(steps, 'step')}, turn {repeat + 1} of {self.plan.repeats}")
             try:
                 solved = self.timed.solve(frame, settings)
             except SolveError as error:
-                self.journal.add("failed", error=str(error), **key)
+                self.journal.add("failed", error=str(error), method=name, steps=steps, frame=frame.time)
                 continue
             values = {} if repeat else self.judged(frame, solved.points)
             values |= {"made": solved.steps, "prepared": solved.prepared}
             values |= {"elapsed": solved.elapsed, "waited": solved.waited}
-            self._add(name, frame, solved.milliseconds, steps=steps, repeat=repeat, **about, **values)
+            self._add(name, frame, solved.milliseconds, {"steps": steps, "repeat": repeat, **kind, **values})
 
     def _is_done(self, name: str, steps: int) -> bool:
         """Whether a method's next budget would take too long, or its last three changed next to nothing.
@@ -174,7 +175,7 @@ class CurveBench:
         flat = all(math.isfinite(total) and abs(total - totals[-1]) < FLAT * fall for total in totals)
         return len(budgets) == 3 and flat
 
-    def _add(self, name: str, frame: Frame, spent: float, **values: Any) -> None:
+    def _add(self, name: str, frame: Frame, spent: float, values: Mapping[str, Any]) -> None:
         self.journal.add("point", method=name, frame=frame.time, ms=round(spent, 3), **values)
 
 

@@ -7,6 +7,7 @@ import statistics
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -149,15 +150,16 @@ def _plan(
     judge.judge(frame, spent[-1].points)
     began = time.perf_counter()
     judge.judge(frame, spent[-1].points)
-    costs = {
-        "curves": len(curves),
-        "default_ms": statistics.median(frame.milliseconds for frame in spent[1:]),
-        "elapsed_ms": statistics.median(frame.elapsed for frame in spent[1:]),
-        "judge_ms": 1e3 * (time.perf_counter() - began),
-        "least_ms": timed.solve(frame, replace(COLD, steps=1, tolerance=0.0)).elapsed,
-    }
-    plan = make_plan(options.size(), **costs)
-    journal.add("plan", plan=asdict(plan), long_minutes=make_plan(LONG, **costs).minutes)
+    plan_of = partial(
+        make_plan,
+        curves=len(curves),
+        default_ms=statistics.median(frame.milliseconds for frame in spent[1:]),
+        elapsed_ms=statistics.median(frame.elapsed for frame in spent[1:]),
+        judge_ms=1e3 * (time.perf_counter() - began),
+        least_ms=timed.solve(frame, replace(COLD, steps=1, tolerance=0.0)).elapsed,
+    )
+    plan = plan_of(options.size())
+    journal.add("plan", plan=asdict(plan), long_minutes=plan_of(LONG).minutes)
     return plan
 
 

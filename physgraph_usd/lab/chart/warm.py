@@ -38,8 +38,7 @@ def measure_warm(journal: Journal, problems: tuple[Problem, Problem], row: Seque
         runs += [(name, steps, replace(DEFAULT, method=METHODS[name], steps=steps)) for name in METHODS_OF_WARM]
     for repeat in range(REPEATS):
         for number, (name, steps, settings) in enumerate(runs):
-            key = {"method": name, "steps": steps, "frame": row[-1].time}
-            if journal.one("warm", repeat=repeat, **key):
+            if journal.one("warm", repeat=repeat, method=name, steps=steps, frame=row[-1].time):
                 continue
             if clock.late:
                 return
@@ -53,5 +52,14 @@ def measure_warm(journal: Journal, problems: tuple[Problem, Problem], row: Seque
             values: dict[str, Any] = {} if repeat else asdict(judge.judge(row[-1], solved[-1].points))
             values |= {} if name == AUTO else {"integrator": name, "nested": settings.method.nested}
             spent = [frame.milliseconds for frame in solved[1:]]
-            record = {"made": solved[-1].steps, "tolerance": settings.tolerance}
-            journal.add("warm", repeat=repeat, ms=round(typical(spent), 3), **key, **record, **values)
+            journal.add(
+                "warm",
+                repeat=repeat,
+                ms=round(typical(spent), 3),
+                method=name,
+                steps=steps,
+                frame=row[-1].time,
+                made=solved[-1].steps,
+                tolerance=settings.tolerance,
+                **values,
+            )

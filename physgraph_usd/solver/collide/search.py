@@ -138,8 +138,8 @@ def blocking_pairs(
 
     blocking = Pairs.empty(0, queried.device)
     if near is not None:
-        some = near.pairs.where(queried[near.pairs.corners.long()].any(dim=1))
-        blocking = _blocking_among(some, parts, query_of(arrays(queried), kind=Ask.MOVE, floor=floor))
+        queried_pairs = near.pairs.where(queried[near.pairs.corners.long()].any(dim=1))
+        blocking = _blocking_among(queried_pairs, parts, query_of(arrays(queried), kind=Ask.MOVE, floor=floor))
         queried = queried & near.leaving(end - start, floor)
     if not bool(queried.any()):
         return blocking

@@ -54,13 +54,13 @@ def gap_along(n: wp.vec3d, face: wp.bool, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d,
 
 
 @wp.func
-def kept_of(distance: wp.float64, floor: wp.float64):
-    """Gap kept by a pair of parts: the floor, or most of the pair's distance if less."""
+def required_gap(distance: wp.float64, floor: wp.float64):
+    """Gap required between a pair of parts: the floor, or most of the pair's distance if less."""
     return wp.min(wp.float64(TIGHT) * distance, floor)
 
 
 @wp.func
-def part_kept(
+def separated_fraction(
     face: wp.bool,
     a: wp.vec3d,
     b: wp.vec3d,
@@ -106,12 +106,12 @@ def safe_fraction(
     distance = distance_of(face, zero, b, c, d)
     if distance <= wp.float64(TOUCHES):
         return one
-    keep = kept_of(distance, floor)
+    keep = required_gap(distance, floor)
     time, step = wp.float64(0.0), wp.float64(1.0)
     while time < one:
         end = time + step
         i, j, k = b + time * v, c + time * p, d + time * q
-        part = part_kept(face, zero, i, j, k, zero, b + end * v, c + end * p, d + end * q, keep)
+        part = separated_fraction(face, zero, i, j, k, zero, b + end * v, c + end * p, d + end * q, keep)
         if part == one:
             time = end
         elif step <= LEAST_TIME:

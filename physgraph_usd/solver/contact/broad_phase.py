@@ -27,13 +27,13 @@ another cage. Copies do not touch."""
 class TouchingGroups:
     """Groups of garments in mutual contact in a frame."""
 
-    def __init__(self, garments: Sequence[Garment], *, together: bool) -> None:
+    def __init__(self, garments: Sequence[Garment], *, joint: bool) -> None:
         """Measure the cages.
 
         Args:
-            together: False solves every garment apart.
+            joint: False solves every garment apart.
         """
-        self._garments, self._together = tuple(garments), together
+        self._garments, self._joint = tuple(garments), joint
         self._edges = [mean_edge(garment) for garment in garments]
 
     def of(self, frames: Sequence[GarmentFrame]) -> list[tuple[int, ...]]:
@@ -47,7 +47,7 @@ class TouchingGroups:
         trees: dict[int, cKDTree] = {}
         near = [
             (a, b)
-            for a, b in (self._boxes_meet(frames) if self._together else ())
+            for a, b in (self._boxes_meet(frames) if self._joint else ())
             if intact[a] and intact[b] and touch_one_another(self._garments[a], self._garments[b])
             if self._close(a, b, frames, trees)
         ]

@@ -190,12 +190,12 @@ class LevelContact:
         """
         if self._doubtful is None:
             return ContactState.clean(x, self._corners(x))
-        return self.found(x, self._doubtful if self.given_up is None else None)
+        return self.detect(x, self._doubtful if self.given_up is None else None)
 
     def look(self, x: Float[Tensor, "vertices 3"]) -> ContactState:
         """Crossings at x [m]; cached for the same tensor until its version changes."""
         if self._looked is None or self._looked.x is not x or self._looked.version != x._version:
-            self._looked = self.found(x)
+            self._looked = self.detect(x)
         return self._looked
 
     def remember(self, x: Float[Tensor, "vertices 3"], given_up: Tangles | None = None) -> None:
@@ -206,7 +206,7 @@ class LevelContact:
         """Corners of the cloth, then of the bodies in this frame [m], float64."""
         return x.double() if self.frame is None else torch.cat([x.double(), self.frame.points])
 
-    def found(self, x: Tensor, vertices: Bool[Tensor, " all"] | None = None) -> ContactState:
+    def detect(self, x: Tensor, vertices: Bool[Tensor, " all"] | None = None) -> ContactState:
         """Crossings, tangles and cloth inside bodies at x [m], of some vertices or, with None, of all; not cached."""
         mesh, corners, given_up = self.mesh, self._corners(x), self.given_up
         queried = self._queried if vertices is None else vertices if self._queried is None else vertices & self._queried
@@ -324,7 +324,7 @@ class LevelContact:
         else:
             queried = (end != begin).any(dim=1) if self._queried is None else self._queried
             blocking = promise.blocking(begin, end, queried, near=near)
-        x, proved = promise.kept(begin, end, blocking, halved=start_frame is not None, near=near)
+        x, proved = promise.safe_corners(begin, end, blocking, halved=start_frame is not None, near=near)
         return Placed(aim if x is end else x[: len(aim)].to(aim)), proved
 
 

@@ -57,7 +57,7 @@ class Promise:
             parts, begin, end, floor=self.floor, queried=queried, tangle=tangle, inside=inside, near=near
         )
 
-    def kept(
+    def safe_corners(
         self,
         begin: Float[Tensor, "all 3"],
         end: Float[Tensor, "all 3"],
@@ -98,7 +98,7 @@ class Promise:
             last = torch.where(late.unsqueeze(1), end, ends)
             halfway = 0.5 * (begin + last)
             for aim in (self._rounded(halfway, halfway), last):
-                begin, half_proved = self.kept(begin, aim, self.blocking(begin, aim, late), halved=False)
+                begin, half_proved = self.safe_corners(begin, aim, self.blocking(begin, aim, late), halved=False)
                 late, proved = late | (begin != aim).any(dim=1), proved and half_proved
             return begin, proved
         # Cloth that a moving body reaches, and that cannot move on, is then inside the body.

@@ -51,21 +51,21 @@ def total_of(terms: Sequence[Force], assembly: Assembly | None = None) -> Callab
         terms: The terms.
         assembly: Joint sum of the elements of the first terms, or None.
     """
-    together = () if assembly is None else assembly.kinds
+    assembled = () if assembly is None else assembly.kinds
 
     def total(x: Tensor, *aims: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        left, now = iter(aims), list[Any]()
-        for each in terms:
-            now.append(_aimed(each, tuple(islice(left, len(_aims_of(each))))))
+        unused, aimed_terms = iter(aims), list[Any]()
+        for term in terms:
+            aimed_terms.append(_aimed(term, tuple(islice(unused, len(_aims_of(term))))))
         if assembly is None:
             force, first = torch.zeros_like(x), {}
         else:
             force = torch.empty_like(x)
-            first = dict(zip(map(id, together), assembly.evaluate(x, force, adds=False), strict=True))
+            first = dict(zip(map(id, assembled), assembly.evaluate(x, force, adds=False), strict=True))
         energies = list[Tensor]()
-        for each in now:
-            known = [first[id(kind)] for kind in _elements_of(each) if id(kind) in first]
-            energies.append(sum(known[1:], known[0]) if known else each.add_force(x, force))
+        for term in aimed_terms:
+            summed = [first[id(kind)] for kind in _elements_of(term) if id(kind) in first]
+            energies.append(sum(summed[1:], summed[0]) if summed else term.add_force(x, force))
         values = torch.stack(energies) if energies else x.new_zeros(0, dtype=torch.float64)
         return values.sum(), force, values
 
@@ -111,13 +111,13 @@ class ForceModule:
         """
         self.forces = tuple(forces)
         self._recordings = Recordings() if recordings is None else recordings
-        names, aims = tuple(each.name for each in forces), [aim for each in forces for aim in _aims_of(each)]
+        names, aims = tuple(term.name for term in forces), [aim for term in forces for aim in _aims_of(term)]
         self._assembly = assembly
         self._work = Work(names, total_of(self.forces, assembly), aims)
 
-    def joined_by(self, more: Sequence[Force]) -> ForceModule:
-        """This module's terms and more."""
-        return ForceModule((*self.forces, *more), self._recordings, self._assembly)
+    def joined_by(self, terms: Sequence[Force]) -> ForceModule:
+        """The sum of this module's terms and further terms."""
+        return ForceModule((*self.forces, *terms), self._recordings, self._assembly)
 
     def energy_and_force(self, x: Float[Tensor, "vertices 3"]) -> tuple[Float[Tensor, ""], Float[Tensor, "vertices 3"]]:
         """Total energy [J], float64 scalar, and force [N] at positions x [m]."""
@@ -215,12 +215,12 @@ class Elements:
         self.energy = torch.empty(len(corners), dtype=level.dtype, device=level.device)
 
     @cached_property
-    def _alone(self) -> Assembly:
+    def _assembly(self) -> Assembly:
         return Assembly([self], self.level, energies=True)
 
     def evaluate(self, x: Float[Tensor, "vertices 3"], force: Float[Tensor, "vertices 3"]) -> Float[Tensor, ""]:
         """Add the forces [N] to ``force`` and return the energy [J], a float64 scalar, at positions x [m]."""
-        return self._alone.evaluate(x, force)[0]
+        return self._assembly.evaluate(x, force)[0]
 
 
 class Assembly:
@@ -243,31 +243,30 @@ class Assembly:
         """
         self.kinds = tuple(kinds)
         dtype, device, count = level.dtype, level.device, level.vertex_count
-        place: dict[str, Any] = {"device": device, "threads": level.threads}
         on_card, size = device != "cpu", block_size(device)
         none = torch.zeros(1, dtype=torch.int32, device=device)
         self._tables = _corners_at(kinds, count) if on_card else (none, none)
         # On CUDA one more row: the gather reads four numbers at once.
-        parts = ELEMENT_PARTS if sum(len(each.corners) for each in kinds) >= LEAST_PARTED else 1
-        rows = (sum(each.corners.numel() for each in kinds) + 1, 3) if on_card else (parts * count, 4)
+        parts = ELEMENT_PARTS if sum(len(kind.corners) for kind in kinds) >= LEAST_PARTED else 1
+        rows = (sum(kind.corners.numel() for kind in kinds) + 1, 3) if on_card else (parts * count, 4)
         self._forces = torch.zeros(rows, dtype=dtype, device=device)
         flat = self._forces.reshape(-1)[: self._forces.numel() // 3 * 3].reshape(-1, 3)
         self._totals, self._launches, begin, x = list[Tensor](), list[Launch](), 0, vectors(level.rest)
-        for each in kinds:
-            blocks = -(-len(each.corners) // size)
+        for kind in kinds:
+            blocks = -(-len(kind.corners) // size)
             of_part = 1 if on_card else -(-blocks // parts)
             items = -(-blocks // max(of_part, 1))
             self._totals.append(torch.zeros(items, dtype=torch.float64, device=device))
-            packed = wp.from_torch(each.corners, dtype=wp.types.vector(length=each.corners.shape[1], dtype=wp.int32))
-            numbers = [vectors(some) if some.ndim == 2 else wp.from_torch(some) for some in each.parameters]
-            energy = wp.from_torch(each.energy) if energies else wp.array(dtype=SCALAR[dtype], device=device)
-            own = flat[begin:] if on_card else flat
-            arrays = [x, packed, *numbers, energy, wp.from_torch(self._totals[-1]), vectors(own)]
-            inputs = [of_part, blocks, len(each.corners), count, *arrays]
-            self._launches.append(Launch(each.kernels[dtype], items, inputs, **place))
-            begin += each.corners.numel()
-        inputs = [1, parts, count, *(wp.from_torch(each) for each in self._tables), vectors(flat), x]
-        self._sum = Launch(_SUM[on_card, dtype], count, inputs, **place)
+            packed = wp.from_torch(kind.corners, dtype=wp.types.vector(length=kind.corners.shape[1], dtype=wp.int32))
+            numbers = [vectors(values) if values.ndim == 2 else wp.from_torch(values) for values in kind.parameters]
+            energy = wp.from_torch(kind.energy) if energies else wp.array(dtype=SCALAR[dtype], device=device)
+            forces = flat[begin:] if on_card else flat
+            arrays = [x, packed, *numbers, energy, wp.from_torch(self._totals[-1]), vectors(forces)]
+            inputs = [of_part, blocks, len(kind.corners), count, *arrays]
+            self._launches.append(Launch(kind.kernels[dtype], items, inputs, device=device, threads=level.threads))
+            begin += kind.corners.numel()
+        inputs = [1, parts, count, *(wp.from_torch(table) for table in self._tables), vectors(flat), x]
+        self._sum = Launch(_SUM[on_card, dtype], count, inputs, device=device, threads=level.threads)
 
     def evaluate(
         self, x: Float[Tensor, "vertices 3"], force: Float[Tensor, "vertices 3"], *, adds: bool = True
@@ -294,4 +293,4 @@ def _corners_at(kinds: Sequence[Elements], count: int) -> tuple[Tensor, Tensor]:
     """The corners of all elements at each of so many vertices, as of `incidence`."""
     if len(kinds) == 1 and kinds[0].rows is not None:
         return kinds[0].rows
-    return incidence(torch.cat([each.corners.reshape(-1) for each in kinds]).unsqueeze(1), count)
+    return incidence(torch.cat([kind.corners.reshape(-1) for kind in kinds]).unsqueeze(1), count)

@@ -98,12 +98,12 @@ class _Kind:
     """Hinges with the same number of corners.
 
     Attributes:
-        which: Numbers among the level's hinges, shape (K,).
+        numbers: Numbers among the level's hinges, shape (K,).
         corners: Corner vertices, shape (K, 4) between triangles and in quads, (K, 6) at edges of quads.
         elements: The launches.
     """
 
-    which: Int[Tensor, " hinges"]
+    numbers: Int[Tensor, " hinges"]
     corners: Int[Tensor, "hinges corners"]
     elements: Elements
 
@@ -143,47 +143,47 @@ class Bending:
         narrow = (level.hinges[:, 2] == level.hinges[:, 3]) & (level.hinges[:, 4] == level.hinges[:, 5])
         self._kinds = [
             _Kind(
-                which,
+                numbers,
                 corners,
-                Elements(kernels, corners, [self.weight[which], level.rest_angle[which]], level=level),
+                Elements(kernels, corners, [self.weight[numbers], level.rest_angle[numbers]], level=level),
             )
-            for which, columns, kernels in (
+            for numbers, columns, kernels in (
                 (torch.nonzero(narrow)[:, 0], [0, 1, 2, 4], _KERNELS),
                 (torch.nonzero(~narrow)[:, 0], [0, 1, 2, 3, 4, 5], _KERNELS_OF_QUADS),
             )
-            for corners in (level.hinges[which][:, columns],)
-            if len(which)
+            for corners in (level.hinges[numbers][:, columns],)
+            if len(numbers)
         ]
 
     @property
     def elements(self) -> tuple[Elements, ...]:
         """The hinges, by number of corners."""
-        return tuple(each.elements for each in self._kinds)
+        return tuple(kind.elements for kind in self._kinds)
 
     def add_force(self, x: Float[Tensor, "vertices 3"], force: Float[Tensor, "vertices 3"]) -> Float[Tensor, ""]:
         """Add the force [N] in place and return the energy [J]."""
         energy = torch.zeros((), dtype=torch.float64, device=x.device)
-        for each in self._kinds:
-            energy = energy + each.elements.evaluate(x, force)
+        for kind in self._kinds:
+            energy = energy + kind.elements.evaluate(x, force)
         return energy
 
     def split(self, x: Float[Tensor, "vertices 3"]) -> tuple[Float[Tensor, " parts"], Int[Tensor, " parts"]]:
         """Energy of each hinge [J] at the last evaluated positions, and the hinge's garment."""
         energy = torch.zeros_like(self.weight)
-        for each in self._kinds:
-            energy[each.which] = each.elements.energy
+        for kind in self._kinds:
+            energy[kind.numbers] = kind.elements.energy
         return energy, self._level.hinge_garment
 
     def diagonal(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " vertices"]:
         """A third of the trace of w (dtheta/dx)(dtheta/dx)^T at each corner [N/m]."""
         total = torch.zeros_like(self._level.spacing)
-        for each in self._kinds:
-            jacobian = hinge_jacobian(x, each.corners)
-            value = self.weight[each.which].unsqueeze(1) * (jacobian**2).sum(dim=2) / 3.0
-            if each.corners.shape[1] == 6:  # A triangle's corner is repeated, with half of its gradient each time.
-                twice = (each.corners[:, 2::2] == each.corners[:, 3::2]).repeat_interleave(2, dim=1)
+        for kind in self._kinds:
+            jacobian = hinge_jacobian(x, kind.corners)
+            value = self.weight[kind.numbers].unsqueeze(1) * (jacobian**2).sum(dim=2) / 3.0
+            if kind.corners.shape[1] == 6:  # A triangle's corner is repeated, with half of its gradient each time.
+                twice = (kind.corners[:, 2::2] == kind.corners[:, 3::2]).repeat_interleave(2, dim=1)
                 value[:, 2:] *= torch.where(twice, 2.0, 1.0)
-            add_at(total, each.corners.long().reshape(-1), value.reshape(-1))
+            add_at(total, kind.corners.long().reshape(-1), value.reshape(-1))
         return total
 
     def rest_springs(self) -> tuple[np.ndarray, float]:
@@ -195,8 +195,8 @@ def hinge_jacobian(
     x: Float[Tensor, "vertices 3"], hinges: Int[Tensor, "hinges corners"]
 ) -> Float[Tensor, "hinges corners 3"]:
     """dtheta/dx at the four or six corners of each hinge [1/m]; zero rows at triangles without area."""
-    places = _places(hinges.shape[1])
-    xi, xj, xk, xl = (x[hinges[:, columns].long()].mean(dim=1) for columns in places)
+    ends = _columns_of_ends(hinges.shape[1])
+    xi, xj, xk, xl = (x[hinges[:, columns].long()].mean(dim=1) for columns in ends)
     axis, ik, il = xj - xi, xk - xi, xl - xi
     n1, n2 = torch.linalg.cross(axis, ik), torch.linalg.cross(il, axis)
     square = (axis**2).sum(dim=1, keepdim=True)
@@ -209,9 +209,11 @@ def hinge_jacobian(
     t2 = (il * axis).sum(dim=1, keepdim=True) / square
     at_i, at_j = -(at_k * (1 - t1) + at_l * (1 - t2)), -(at_k * t1 + at_l * t2)
     at = (at_i, at_j, at_k, at_l)
-    return torch.stack([each / len(columns) for each, columns in zip(at, places, strict=True) for _ in columns], dim=1)
+    return torch.stack(
+        [gradient / len(columns) for gradient, columns in zip(at, ends, strict=True) for _ in columns], dim=1
+    )
 
 
-def _places(width: int) -> tuple[list[int], list[int], list[int], list[int]]:
+def _columns_of_ends(width: int) -> tuple[list[int], list[int], list[int], list[int]]:
     """The columns of a hinge's four or six corners for i, j, k and l."""
     return ([0], [1], [2], [3]) if width == 4 else ([0], [1], [2, 3], [4, 5])

@@ -82,8 +82,8 @@ class Guide:
         self._coarse_weight = per_area * guide_map.coarse_area
         self._pin_weight = soft * np.asarray(guide_map.fine_areas @ per_area).ravel()
         self._weight, self._pin = (
-            three_columns(torch.as_tensor(each, dtype=level.dtype, device=level.device))
-            for each in (self._coarse_weight, self._pin_weight)
+            three_columns(torch.as_tensor(weight, dtype=level.dtype, device=level.device))
+            for weight in (self._coarse_weight, self._pin_weight)
         )
         compliance = np.divide(1.0, per_area, out=np.zeros_like(per_area), where=per_area > 0)
         self._compliance = three_columns(torch.as_tensor(compliance, dtype=level.dtype, device=level.device))
@@ -95,12 +95,12 @@ class Guide:
     def retarget(self, coarse: Float[Tensor, "coarse 3"], push: Float[Tensor, "coarse 3"] | None = None) -> Guide:
         """The guide of a frame.
 
-        A push on the cage is a shift of its target: with R^T W = k_g A P, W d = k_g A_c s_c d pulls every fine vertex
-        as hard as the push, subdivided, does on its area.
+        A push on the cage shifts the target by d, so that the guide pulls each fine vertex by the subdivided push times
+        the area of the vertex: R^T W = k_g A P, and W d = k_g A_c s_c d.
 
         Args:
             coarse: The cage's positions [m], shape (C, 3).
-            push: Force per area at each vertex of the cage [N/m^2], felt where the guide pulls; or None.
+            push: Force per area at each vertex of the cage [N/m^2], without effect where the guide is zero; or None.
         """
         base = self._level.base.apply(coarse)
         target = self._map.average.apply(base)

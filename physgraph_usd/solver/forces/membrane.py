@@ -120,8 +120,8 @@ class Membrane:
         # A triangle without area has no rest shape to strain from; a sliver is strained by the mesh, not by the cloth.
         weight = weight * level.membrane_inverse.any(dim=1) * sliver_weight(level)
         self.warp_stiffness, self.weft_stiffness = (
-            weight * each.to(level.rest)[owner] / (1.0 - POISSON**2)
-            for each in (youngs, youngs if weft is None else weft)
+            weight * modulus.to(level.rest)[owner] / (1.0 - POISSON**2)
+            for modulus in (youngs, youngs if weft is None else weft)
         )
         self.shear_stiffness = weight * shear.to(level.rest)[owner]
         limits = torch.full_like(youngs, NO_LIMIT) if limit is None else limit
@@ -153,7 +153,7 @@ class Membrane:
         u = f / reach
         sine = (u[:, 0] * u[:, 1]).sum(dim=1)
         turn = (1.0 + COLLAPSED_SIDE**2) * (u.flip(1) - u * sine[:, None, None]) / reach
-        c11, c22, c12, c66 = (each[:, None] for each in self._stiffnesses)
+        c11, c22, c12, c66 = (stiffness[:, None] for stiffness in self._stiffnesses)
         cosine = (f[:, 0] * f[:, 1]).sum(dim=1, keepdim=True) / length.prod(dim=1, keepdim=True)
         g = shape_gradients(self._level)
         g1, g2 = g.unbind(dim=2)
@@ -171,9 +171,9 @@ class Membrane:
         On an equilateral mesh with G = 0.375 Y these are the edge springs, shape (S,).
         """
         level, (g1, g2) = self._level, shape_gradients(self._level).double().unbind(dim=2)
-        c11, c22, _, c66 = (each.double()[:, None] for each in self._stiffnesses)
+        c11, c22, _, c66 = (stiffness.double()[:, None] for stiffness in self._stiffnesses)
         coupling = (c11 + c66) * g1 * g1.roll(-1, 1) + (c22 + c66) * g2 * g2.roll(-1, 1)
-        sides, values = (each.cpu().numpy().ravel() for each in (level.sides, -coupling))
+        sides, values = (array.cpu().numpy().ravel() for array in (level.sides, -coupling))
         return np.bincount(sides, values, len(level.springs)), 0.0
 
     @property
@@ -196,8 +196,8 @@ def sliver_weight(level: Level) -> Float[Tensor, " triangles"]:
 
 def shape_gradients(level: Level) -> Float[Tensor, "triangles 3 2"]:
     """Gradients of the corners' shape functions along warp and weft [1/m]."""
-    others = level.membrane_inverse.reshape(-1, 2, 2)
-    return torch.cat([-others.sum(dim=1, keepdim=True), others], dim=1)
+    gradients = level.membrane_inverse.reshape(-1, 2, 2)
+    return torch.cat([-gradients.sum(dim=1, keepdim=True), gradients], dim=1)
 
 
 def in_plane_terms(level: Level, fabrics: Sequence[Fabric]) -> tuple[Force, ...]:
@@ -208,17 +208,17 @@ def in_plane_terms(level: Level, fabrics: Sequence[Fabric]) -> tuple[Force, ...]
     """
     woven = torch.tensor([fabric.has_membrane for fabric in fabrics], dtype=torch.bool)
 
-    def each(values: Sequence[float]) -> Tensor:
+    def per_garment(values: Sequence[float]) -> Tensor:
         return torch.tensor(values, dtype=level.dtype)
 
-    youngs = each([fabric.stretch for fabric in fabrics])
+    youngs = per_garment([fabric.stretch for fabric in fabrics])
     terms: list[Force] = []
     if not bool(woven.all()) or not fabrics:
         terms.append(Stretch(level, torch.where(woven, 0.0, youngs)))
     if bool(woven.any()):
-        weft = each([fabric.stretch if f is None else f for fabric in fabrics for f in (fabric.weft_stretch,)])
-        shear = each([shear_stiffness(fabric) for fabric in fabrics])
-        limit = each([NO_LIMIT if f.stretch_limit is None else f.stretch_limit for f in fabrics])
+        weft = per_garment([fabric.stretch if f is None else f for fabric in fabrics for f in (fabric.weft_stretch,)])
+        shear = per_garment([shear_stiffness(fabric) for fabric in fabrics])
+        limit = per_garment([NO_LIMIT if f.stretch_limit is None else f.stretch_limit for f in fabrics])
         youngs, weft, shear = (torch.where(woven, value, 0.0) for value in (youngs, weft, shear))
         terms.append(Membrane(level, youngs, shear, weft=weft, limit=limit))
     return tuple(terms)

@@ -47,18 +47,18 @@ class Seam:
             between: Vertices lying on edges. The ends of the edges do not lie on edges themselves.
         """
         self._between = None
-        together = pairs
+        joined = pairs
         if between is not None and len(between.vertex):
             self._between = _Between(level, between)
             nearer = np.where(between.part < 0.5, between.edge[:, 0], between.edge[:, 1])
-            together = np.concatenate([pairs, np.stack([between.vertex, nearer], axis=1)])
-        self.pairs = together
-        self.label = _lowest(together, level.vertex_count)
+            joined = np.concatenate([pairs, np.stack([between.vertex, nearer], axis=1)])
+        self.pairs = joined
+        self.label = _lowest(joined, level.vertex_count)
         sewn = np.unique(pairs)
         group = np.unique(_lowest(pairs, level.vertex_count)[sewn], return_inverse=True)[1].reshape(-1)
         free = level.free[:, 0].cpu().numpy()[sewn]
-        held = np.bincount(group, ~free, minlength=1)[group] > 0
-        leads = np.where(held, ~free, True)
+        has_fixed = np.bincount(group, ~free, minlength=1)[group] > 0
+        leads = np.where(has_fixed, ~free, True)
         member = sp.csr_matrix(
             (leads.astype(float), (group, np.arange(len(sewn)))), shape=(group.max(initial=-1) + 1, len(sewn))
         )
@@ -66,23 +66,23 @@ class Seam:
         leading = np.flatnonzero(leads)  # Each group has one, and without groups there is none.
         first = leading[np.unique(group[leading], return_index=True)[1]][group]
         device, dtype = level.device, level.dtype
-        self._place, self._first = (torch.as_tensor(each, device=device) for each in (sewn, first))
-        self._free = level.free[self._place]
+        self._sewn, self._first = (torch.as_tensor(vertices, device=device) for vertices in (sewn, first))
+        self._free = level.free[self._sewn]
         self._mean = Stencil(mean, dtype=dtype, device=device)
-        self._fraction = Stencil(sp.csr_matrix(sp.diags((~held).astype(float)) @ mean), dtype=dtype, device=device)
+        self._fraction = Stencil(sp.csr_matrix(sp.diags((~has_fixed).astype(float)) @ mean), dtype=dtype, device=device)
 
     def closed(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
         """Positions with sewn points moved together; coincident points are unchanged to the bit."""
-        points = x[self._place]
+        points = x[self._sewn]
         first = points[self._first]
         out = x.clone()
-        out[self._place] = torch.where(self._free, first + self._mean.apply(points - first), points)
+        out[self._sewn] = torch.where(self._free, first + self._mean.apply(points - first), points)
         return out if self._between is None else self._between.placed(out)
 
     def shared(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
         """Forces on sewn points, A^T F; zero on points sewn to a fixed vertex."""
         out = force.clone() if self._between is None else self._between.handed_on(force)
-        out[self._place] = self._fraction.apply(out[self._place])
+        out[self._sewn] = self._fraction.apply(out[self._sewn])
         return out
 
 
@@ -92,7 +92,7 @@ class _Between:
     def __init__(self, level: Level, on: OnEdge) -> None:
         device, dtype = level.device, level.dtype
         self._vertex, self._start, self._end = (
-            torch.as_tensor(each, device=device) for each in (on.vertex, on.edge[:, 0], on.edge[:, 1])
+            torch.as_tensor(vertices, device=device) for vertices in (on.vertex, on.edge[:, 0], on.edge[:, 1])
         )
         self._part = torch.as_tensor(on.part, dtype=dtype, device=device).unsqueeze(1)
         self._free = level.free[self._vertex]
@@ -135,15 +135,15 @@ class SewnForces:
 
     def diagonal(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " vertices"]:
         """A third of the trace of each vertex's Hessian block [N/m], averaged over sewn points."""
-        apart = self._field.diagonal(self._seam.closed(x)).unsqueeze(1).expand(-1, 3)
-        together = self._seam.shared(apart.contiguous())[:, 0]
-        return torch.where(together > 0, together, apart[:, 0])
+        diagonal = self._field.diagonal(self._seam.closed(x)).unsqueeze(1).expand(-1, 3)
+        averaged = self._seam.shared(diagonal.contiguous())[:, 0]
+        return torch.where(averaged > 0, averaged, diagonal[:, 0])
 
 
 def level_seams(levels: Sequence[Level], garments: Sequence[Garment]) -> list[Seam | None]:
     """The seam of each level, None where nothing is sewn; garments as `Garment.sewn_at` has them."""
-    places = [np.full((len(g.rest), 3), np.nan) if g.sewn_at is None else g.sewn_at for g in garments]
-    sewn_at = np.concatenate(places) if places else np.zeros((0, 3))
+    positions = [np.full((len(g.rest), 3), np.nan) if g.sewn_at is None else g.sewn_at for g in garments]
+    sewn_at = np.concatenate(positions) if positions else np.zeros((0, 3))
     return [_seam(level, sewn_at) for level in levels]
 
 
@@ -158,15 +158,15 @@ def _seam(level: Level, sewn_at: Float[np.ndarray, "coarse 3"]) -> Seam | None:
     points = np.asarray(level.from_coarse @ np.where(sewn[:, None], sewn_at, 0.0))
     within = WELDED * float(level.spacing.mean())
     pairs = pairs_within([points], np.flatnonzero(on_seam), within)
-    alone = on_seam.copy()
-    alone[pairs] = False
-    between = _between(level, points, on_seam, np.flatnonzero(alone), within)
+    unpaired = on_seam.copy()
+    unpaired[pairs] = False
+    between = _between(level, points, on_seam, np.flatnonzero(unpaired), within)
     return Seam(level, pairs, between) if len(pairs) or len(between.vertex) else None
 
 
-def _between(level: Level, points: np.ndarray, on_seam: np.ndarray, alone: np.ndarray, within: float) -> OnEdge:
+def _between(level: Level, points: np.ndarray, on_seam: np.ndarray, unpaired: np.ndarray, within: float) -> OnEdge:
     """Border vertices between the vertices of another border, with the edge under each."""
-    found = edges_of(level.triangles.cpu().numpy(), level.vertex_count)
-    border = found.vertices[found.face_count == 1].astype(np.int64)
+    edges = edges_of(level.triangles.cpu().numpy(), level.vertex_count)
+    border = edges.vertices[edges.face_count == 1].astype(np.int64)
     border = border[on_seam[border].all(axis=1)]
-    return finer_side(points, border, nearest_edges(points, alone, border, np.full(len(alone), within)))
+    return finer_side(points, border, nearest_edges(points, unpaired, border, np.full(len(unpaired), within)))

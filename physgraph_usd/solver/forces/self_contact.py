@@ -45,15 +45,15 @@ class PairConstraints:
     offset: Float[Tensor, " gaps"]
     stiffness: Float[Tensor, " gaps"]
 
-    def where(self, kept: Bool[Tensor, " gaps"]) -> PairConstraints:
+    def where(self, selected: Bool[Tensor, " gaps"]) -> PairConstraints:
         """The selected pairs."""
-        some = torch.nonzero(kept).squeeze(1)
-        return PairConstraints(*(getattr(self, each.name)[some] for each in fields(self)))
+        numbers = torch.nonzero(selected).squeeze(1)
+        return PairConstraints(*(getattr(self, field.name)[numbers] for field in fields(self)))
 
-    def with_more(self, other: PairConstraints) -> PairConstraints:
+    def with_more(self, added: PairConstraints) -> PairConstraints:
         """Both sets of pairs combined."""
         return PairConstraints(
-            *(torch.cat([getattr(self, each.name), getattr(other, each.name)]) for each in fields(self))
+            *(torch.cat([getattr(self, field.name), getattr(added, field.name)]) for field in fields(self))
         )
 
     def sharing_room(self, x: Float[Tensor, "vertices 3"]) -> PairConstraints:
@@ -71,8 +71,8 @@ class PairConstraints:
             return value.new_zeros(len(x)).scatter_reduce(0, corners.reshape(-1), value, "amax")
 
         deepest = largest(depth)
-        place = torch.arange(depth.numel(), device=x.device).reshape(-1, 4)
-        axis = directions.reshape(-1, 3)[largest(torch.where(depth == deepest[corners], place, 0))]
+        index = torch.arange(depth.numel(), device=x.device).reshape(-1, 4)
+        axis = directions.reshape(-1, 3)[largest(torch.where(depth == deepest[corners], index, 0))]
         along = (directions * axis[corners]).sum(dim=2)
         share = along.square()  # The wider a wedge is, the more of a way out it leaves.
         lack = largest(torch.where(along < 0, 0.5 * share, 0.0) * (depth + deepest[corners]))
@@ -143,9 +143,9 @@ class SelfContact:
         room = LEAST_ROOM
         while room < len(corners):
             room *= ROOM_GROWTH
-        pad, more = torch.nn.functional.pad, room - len(corners)
-        padded = [pad(each, (0, 0, 0, more)) for each in (corners, weight, self._plane)]
-        return *padded, starts, pad(slots, (0, 4 * more))
+        pad, padding = torch.nn.functional.pad, room - len(corners)
+        padded = [pad(array, (0, 0, 0, padding)) for array in (corners, weight, self._plane)]
+        return *padded, starts, pad(slots, (0, 4 * padding))
 
     def aimed(self, *aims: Tensor) -> SelfContact:
         """The term of other pairs, given `with_room`."""

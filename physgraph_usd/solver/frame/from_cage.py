@@ -94,9 +94,9 @@ class MovingFrames:
         """Scale the detail of free vertices by a gain at each cage vertex, shape (C,); 1 everywhere changes nothing."""
         if np.all(gain == 1.0):
             return fine
-        more = torch.as_tensor(self._level.from_coarse @ gain).to(fine).unsqueeze(1)
+        factor = torch.as_tensor(self._level.from_coarse @ gain).to(fine).unsqueeze(1)
         smooth = self._level.smooth_base.apply(coarse)
-        return torch.where(self._level.free, smooth + more * (fine - smooth), fine)
+        return torch.where(self._level.free, smooth + factor * (fine - smooth), fine)
 
     def _turned(
         self, before: Float[Tensor, "coarse 3 3"], after: Float[Tensor, "coarse 3 3"]
@@ -104,8 +104,8 @@ class MovingFrames:
         """Rotation of the cage frames, interpolated to the fine vertices; identity if either frame is degenerate."""
         turned = torch.einsum("cij,ckj->cik", after, before)
         volume = (torch.linalg.cross(turned[:, 0], turned[:, 1]) * turned[:, 2]).sum(dim=1)
-        whole = (volume > 0.5).unsqueeze(1).unsqueeze(2)
-        turned = torch.where(whole, turned, torch.eye(3, dtype=turned.dtype, device=turned.device))
+        sound = (volume > 0.5).unsqueeze(1).unsqueeze(2)
+        turned = torch.where(sound, turned, torch.eye(3, dtype=turned.dtype, device=turned.device))
         first, last = (self._level.base.apply(turned[:, :, column].contiguous()) for column in (0, 2))
         return orthonormal(last, first)
 
@@ -121,14 +121,14 @@ class Followers:
         ends = np.concatenate([edges, edges[:, ::-1]])
         idle = ((level.vertex_area == 0) & (level.pin < 1.0 - PIN_MARGIN)).cpu().numpy()
         ends = ends[idle[ends[:, 0]] & (ends[:, 0] != ends[:, 1])]
-        self._which, row = np.unique(ends[:, 0], return_inverse=True)
+        self._idle, row = np.unique(ends[:, 0], return_inverse=True)
         rest = level.rest.double().cpu().numpy()
         length = np.linalg.norm(rest[ends[:, 0]] - rest[ends[:, 1]], axis=1)
         near = 1.0 / np.maximum(length, SAME_POINT * float(level.spacing.mean()))
-        beside = sp.csr_matrix((near, (row, ends[:, 1])), shape=(len(self._which), level.vertex_count))
+        beside = sp.csr_matrix((near, (row, ends[:, 1])), shape=(len(self._idle), level.vertex_count))
         # Parts without any adjacent cloth stay: the margin makes the matrix invertible.
-        degree = sp.diags(np.bincount(row, near, len(self._which)) * (1.0 + 1e-9))
-        self._inverse = splu(sp.csc_matrix(degree - beside[:, self._which])) if len(row) else None
+        degree = sp.diags(np.bincount(row, near, len(self._idle)) * (1.0 + 1e-9))
+        self._inverse = splu(sp.csc_matrix(degree - beside[:, self._idle])) if len(row) else None
         self._fixed = np.flatnonzero(~level.free.cpu().numpy().ravel())
         self._place_fixed = sp.csr_matrix(level.from_coarse[self._fixed])
         self._beside, self._from_coarse = sp.csr_matrix(beside @ sp.diags(1.0 - idle)), level.from_coarse
@@ -148,7 +148,7 @@ class Followers:
         out[self._fixed] = self._place_fixed @ coarse
         if self._inverse is not None:
             base = self._from_coarse @ coarse
-            out[self._which] = base[self._which] + self._inverse.solve(self._beside @ (out - base))
+            out[self._idle] = base[self._idle] + self._inverse.solve(self._beside @ (out - base))
         self._rigid.place(out, self._from_coarse, coarse)
         return out
 
@@ -264,5 +264,5 @@ def parts_of(level: Level, rigid: np.ndarray, span: slice) -> list[np.ndarray]:
     numbers = np.zeros(level.from_coarse.shape[1])
     columns = np.unique(level.from_coarse[span].indices)
     numbers[columns.min() : columns.min() + len(rigid)] = rigid
-    own = np.asarray(level.from_coarse[span] @ numbers).ravel().round().astype(np.int64)
-    return [np.flatnonzero(own == number) + span.start for number in range(int(rigid.max()) + 1)]
+    part = np.asarray(level.from_coarse[span] @ numbers).ravel().round().astype(np.int64)
+    return [np.flatnonzero(part == number) + span.start for number in range(int(rigid.max()) + 1)]

@@ -76,8 +76,8 @@ class Group:
             device: "cpu" or a CUDA device.
             threads: Most threads per kernel on the CPU.
         """
-        about = [recentred(garment) for garment in garments]
-        levels = build_levels(about, refinements, dtype=dtype, device=device, threads=threads)
+        centred = [recentred(garment) for garment in garments]
+        levels = build_levels(centred, refinements, dtype=dtype, device=device, threads=threads)
         meshes = [chain[-1].mesh if chain else g.mesh for g, chain in zip(garments, refinements, strict=True)]
         return Group(
             tuple(garments),
@@ -99,7 +99,7 @@ class Group:
     @cached_property
     def outward(self) -> Float[Tensor, " garments"]:
         """Sign of each garment's normals: 1 for outward, -1 for inward."""
-        return torch.tensor([-1.0 if each.flipped else 1.0 for each in self.garments], device=self.levels[0].device)
+        return torch.tensor([-1.0 if g.flipped else 1.0 for g in self.garments], device=self.levels[0].device)
 
     def tensor(self, array: np.ndarray) -> Tensor:
         """An array in the type and on the device of the solve."""
@@ -115,12 +115,12 @@ class Group:
         """The lasting terms of each level, new ones when a material changes."""
         key = tuple((frame.fabric, frame.guide) for frame in frames)
         if key not in self._forces:
-            known = [each for last in self._forces.values() for each in last] if self.settings.rough else []
-            lent = [each.lends() for each in known] or [None] * len(self.levels)
-            given, places = (self.garments, tuple(frames), self.gravity), zip(self.levels, self.guide_maps, strict=True)
-            made = [LevelForces(*place, *given, lent=each) for place, each in zip(places, lent, strict=True)]
+            last = [forces for levels in self._forces.values() for forces in levels] if self.settings.rough else []
+            lent = [forces.lends() for forces in last] or [None] * len(self.levels)
+            levels, common = zip(self.levels, self.guide_maps, lent, strict=True), (tuple(frames), self.gravity)
+            forces = [LevelForces(level, guide, self.garments, *common, lent=terms) for level, guide, terms in levels]
             self._forces.clear()
-            self._forces[key] = made
+            self._forces[key] = forces
         return self._forces[key]
 
     @property
@@ -156,13 +156,19 @@ class Group:
         itself = settings.cloth != "off" and self.cloth.meets.any()
         if not len(self.levels[0].triangles) or not (itself or touching or any(self.seams)):
             return None
-        fabrics = [each.fabric for each in frame.garments]
-        settings = settings.scaled(self.spacings[0], stretch=max(each.stretch for each in fabrics))
-        place = {"edge": self.spacings[0], "origin": cage.origin, "settings": settings}
-        bodies = FrameBodies.begin(touching, cage.points, **place) if touching else None
-        cloths = {"thickness": [each.thickness for each in fabrics], "settings": settings, "seams": self.seams}
-        cloths["given_up"] = given_up
-        return FrameContact(self.levels, cage.points, bodies=bodies, cloth=self.cloth, **cloths)
+        points, origin, edge = cage.points, cage.origin, self.spacings[0]
+        settings = settings.scaled(edge, stretch=max(garment.fabric.stretch for garment in frame.garments))
+        bodies = FrameBodies.begin(touching, points, edge=edge, origin=origin, settings=settings) if touching else None
+        return FrameContact(
+            self.levels,
+            points,
+            bodies=bodies,
+            cloth=self.cloth,
+            thickness=[garment.fabric.thickness for garment in frame.garments],
+            settings=settings,
+            seams=self.seams,
+            given_up=given_up,
+        )
 
     def upsampled(self, frames: Sequence[GarmentFrame]) -> list[np.ndarray]:
         """World positions of each garment [m] on its cage's smooth surface, unsolved."""
@@ -195,24 +201,20 @@ class Group:
         _, contact, origin = self.potential(frames, touching)
         if contact is None:
             return list(wanted), {}
-        begun, target = (self.tensor(np.concatenate(each) - origin) for each in (start, wanted))
-        moved, _ = contact.finish(contact.at(self.levels[-1]).moved(Placed(begun), target))
+        x, target = (self.tensor(np.concatenate(points) - origin) for points in (start, wanted))
+        moved, _ = contact.finish(contact.at(self.levels[-1]).moved(Placed(x), target))
         apart = (moved - target).double().cpu().numpy()
         pairs = zip(wanted, self.levels[-1].spans, strict=True)
-        return [each + apart[span] for each, span in pairs], contact.measure(moved)[0]
+        return [points + apart[span] for points, span in pairs], contact.measure(moved)[0]
 
     def systems(self, frames: Sequence[GarmentFrame]) -> tuple[list[System], Float[Tensor, "coarse 3"]]:
         """The problem of one frame without its solve, for charts and benchmarks.
 
-        Args:
-            frames: The garments at one time code.
-
         Returns:
             One system per level, coarsest first, and the recentred coarse positions [m].
         """
-        modules, coarse = self.modules(frames)
-        pairs = zip(self.forces_for(frames), modules, strict=True)
-        return [own.system_in(module) for own, module in pairs], coarse
+        lasting, (modules, coarse) = self.forces_for(frames), self.modules(frames)
+        return [forces.system_in(module) for forces, module in zip(lasting, modules, strict=True)], coarse
 
     def potential(
         self, frames: Sequence[GarmentFrame], touching: Sequence[Touching] = ()

@@ -33,7 +33,7 @@ class SolvedFrame:
         points: Fine positions [m].
         crossing: Whether each fine vertex belongs to cloth that crosses cloth.
         first: Whether no frame was solved before.
-        whole: As `SolveSettings.whole`, at the end of the solve; False too if the time limit stopped the frame.
+        is_reusable: As in `SolveSettings` at the end of the solve; False too if the time limit stopped the frame.
     """
 
     time: float | None
@@ -45,7 +45,7 @@ class SolvedFrame:
     state: FrameState
     crossing: np.ndarray
     first: bool = False
-    whole: bool = True
+    is_reusable: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,10 +89,10 @@ class Origin:
         Infinite if more than poses changed. A change of the air counts as far as it moves cloth. Gravity counts as a
         body: the end of its direction at a distance of one metre.
         """
-        known = [each for each in self.frames if each is not None]
+        starts = [start for start in self.frames if start is not None]
         down = gravity / max(float(np.linalg.norm(gravity)), 1e-30)
-        farthest = float(np.linalg.norm(self.motion.turn @ down - down)) if len(known) == len(part) else np.inf
-        for index, last in zip(part, known, strict=False):
+        farthest = float(np.linalg.norm(self.motion.turn @ down - down)) if len(starts) == len(part) else np.inf
+        for index, last in zip(part, starts, strict=False):
             if last.part != part or not set_alike(frame.garments[index], last.frame) or set(near) != set(last.near):
                 return np.inf
             farthest = max(farthest, bodies_moved(last, frame.colliders, near, along=self.motion))
@@ -102,9 +102,11 @@ class Origin:
     @property
     def colliders(self) -> Sequence[Pose | None]:
         """Poses of all bodies in the start frame; () without one frame that all garments start from."""
-        known = [each for each in self.frames if each is not None]
-        one = self.state is not None and len(known) == len(self.frames) and len({each.time for each in known}) == 1
-        return known[0].colliders if one else ()
+        starts = [start for start in self.frames if start is not None]
+        is_common = (
+            self.state is not None and len(starts) == len(self.frames) and len({start.time for start in starts}) == 1
+        )
+        return starts[0].colliders if is_common else ()
 
     def elapsed(self, time: float | None, seconds: float) -> float:
         """Longest time from a garment's start frame to a time code [s]; 0 without either, and across a jump.
@@ -112,20 +114,20 @@ class Origin:
         Args:
             seconds: Length of one time code [s].
         """
-        starts = [each.time for each in self.frames if each is not None and each.time is not None]
-        passed = 0.0 if time is None or not starts else time - min(starts)
+        times = [start.time for start in self.frames if start is not None and start.time is not None]
+        passed = 0.0 if time is None or not times else time - min(times)
         return seconds * passed if abs(passed) > SAME_TIME else 0.0
 
-    def telemetry(self, walked_from: float | None) -> dict[str, object]:
+    def telemetry(self, prerolled_from: float | None) -> dict[str, object]:
         """Telemetry of the start, given the time code from which a cold frame's cage was advanced, or None."""
-        found: dict[str, object] = {"start": "cold: the time between samples is too long"} if self.gap else {}
-        if walked_from is not None:
-            found["start"] = f"cold: the cage walked here from time code {named_time(walked_from)}"
+        entries: dict[str, object] = {"start": "cold: the time between samples is too long"} if self.gap else {}
+        if prerolled_from is not None:
+            entries["start"] = f"cold: the cage walked here from time code {named_time(prerolled_from)}"
         if self.broken is not None:
-            found["broken_before"] = self.broken
+            entries["broken_before"] = self.broken
         if self.jumped is not None:
-            found |= {"jumped_from": self.jumped, "start": "cold: the first frame is unlike the others"}
-        return found
+            entries |= {"jumped_from": self.jumped, "start": "cold: the first frame is unlike the others"}
+        return entries
 
 
 def origin_of(
@@ -145,22 +147,22 @@ def origin_of(
         edge: Mean edge of the cages [m].
         gap: Whether the time between samples is too long.
     """
-    near_by = {"near": near, "edge": edge}
-    broken, jumped = _broken(part, frame, memories, **near_by), jumped_from(part, frame, memories, **near_by)
-    frames = tuple(each.last if broken is None else each.before for each in memories)
+    broken = _broken(part, frame, memories, near=near, edge=edge)
+    jumped = jumped_from(part, frame, memories, near=near, edge=edge)
+    frames = tuple(memory.last if broken is None else memory.before for memory in memories)
     frames = frames if jumped is None else (None,) * len(part)
-    known = [each for each in frames if each is not None]
-    state = None if gap or len(known) < len(part) else join([each.state for each in known])
-    motion = _motion(known, [frame.garments[index] for index in part]) if state is not None else AT_REST
-    if state is not None and any(each.part != part for each in known):
+    starts = [start for start in frames if start is not None]
+    state = None if gap or len(starts) < len(part) else join([start.state for start in starts])
+    motion = _motion(starts, [frame.garments[index] for index in part]) if state is not None else AT_REST
+    if state is not None and any(start.part != part for start in starts):
         state = replace(state, clean=False)  # Garments solved apart may cross.
     return Origin(frames, None if state is None else state.carried(motion), motion, broken, jumped, gap)
 
 
-def _motion(known: Sequence[SolvedFrame], now: Sequence[GarmentFrame]) -> Rigid:
+def _motion(starts: Sequence[SolvedFrame], garments: Sequence[GarmentFrame]) -> Rigid:
     """The rigid motion closest to the cages' motion; identity if garments start from different frames."""
-    before, after = ([each.points for each in frames] for frames in ([each.frame for each in known], now))
-    if len({each.time for each in known}) > 1 or any(a.shape != b.shape for a, b in zip(before, after, strict=True)):
+    before, after = ([frame.points for frame in frames] for frames in ([start.frame for start in starts], garments))
+    if len({start.time for start in starts}) > 1 or any(a.shape != b.shape for a, b in zip(before, after, strict=True)):
         return AT_REST
     return best_motion(np.concatenate(before), np.concatenate(after))
 
@@ -169,7 +171,9 @@ def _broken(
     part: tuple[int, ...], frame: Frame, memories: Sequence[GarmentHistory], *, near: Sequence[int], edge: float
 ) -> float | None:
     """Time code of the last frame, if only the last frame's input left its place."""
-    pairs = [(each.last, each.before) for each in memories if each.last is not None and each.before is not None]
+    pairs = [
+        (memory.last, memory.before) for memory in memories if memory.last is not None and memory.before is not None
+    ]
     return _elsewhere(part, frame, pairs, near=near, edge=edge) if len(pairs) == len(part) else None
 
 
@@ -177,9 +181,11 @@ def jumped_from(
     part: tuple[int, ...], frame: Frame, memories: Sequence[GarmentHistory], *, near: Sequence[int], edge: float
 ) -> float | None:
     """Time code of the first frame, if garments' input jumped from the first frame to the second and stays there."""
-    pairs = [(each.before, each.last) for each in memories if each.last is not None and each.before is not None]
-    begun = len(pairs) == len(part) and all(first.first for first, _ in pairs)
-    return _elsewhere(part, frame, pairs, near=near, edge=edge) if begun else None
+    pairs = [
+        (memory.before, memory.last) for memory in memories if memory.last is not None and memory.before is not None
+    ]
+    is_second = len(pairs) == len(part) and all(first.first for first, _ in pairs)
+    return _elsewhere(part, frame, pairs, near=near, edge=edge) if is_second else None
 
 
 def _elsewhere(
@@ -198,28 +204,30 @@ def _elsewhere(
         edge: Mean edge of the cages [m]; a smaller move is no break: the cloth follows the move.
     """
 
-    def moved(known: SolvedFrame, now: GarmentFrame, some: Sequence[int]) -> float:
-        return max(cage_moved(known, now), bodies_moved(known, frame.colliders, some))
+    def moved(start: SolvedFrame, garment: GarmentFrame, bodies: Sequence[int]) -> float:
+        return max(cage_moved(start, garment), bodies_moved(start, frame.colliders, bodies))
 
-    for index, (odd, other) in zip(part, pairs, strict=True):
-        now, some = frame.garments[index], sorted({*near, *odd.near, *other.near})
-        away = moved(odd, now, some)
-        if away > edge and moved(other, now, some) < RETURNED * away:
-            return odd.time
+    for index, (first, second) in zip(part, pairs, strict=True):
+        garment, bodies = frame.garments[index], sorted({*near, *first.near, *second.near})
+        away = moved(first, garment, bodies)
+        if away > edge and moved(second, garment, bodies) < RETURNED * away:
+            return first.time
     return None
 
 
 def is_same(part: tuple[int, ...], frame: Frame, memories: Sequence[GarmentHistory], near: Sequence[int]) -> bool:
     """Whether garments and nearby bodies are unchanged and were solved together."""
-    for index, each in zip(part, (each.last for each in memories), strict=True):
-        if each is None or each.part != part or near != each.near or not each.whole:
+    for index, last in zip(part, (memory.last for memory in memories), strict=True):
+        if last is None or last.part != part or near != last.near or not last.is_reusable:
             return False
-        now, then = frame.garments[index], each.frame
-        if not (set_alike(now, then) and np.array_equal(now.points, then.points)):
+        garment, earlier = frame.garments[index], last.frame
+        if not (set_alike(garment, earlier) and np.array_equal(garment.points, earlier.points)):
             return False
-        if not (_pushed_alike(now.acceleration, then.acceleration) and _pushed_alike(now.load, then.load)):
+        if not (
+            _pushed_alike(garment.acceleration, earlier.acceleration) and _pushed_alike(garment.load, earlier.load)
+        ):
             return False
-        poses = [(each.colliders[body], frame.colliders[body]) for body in near]
+        poses = [(last.colliders[body], frame.colliders[body]) for body in near]
         if not all(a is not None and b is not None and a.equals(b) for a, b in poses):
             return False
     return True
@@ -230,13 +238,13 @@ def _pushed_alike(a: np.ndarray | None, b: np.ndarray | None) -> bool:
     return a is b or (a is not None and b is not None and np.array_equal(a, b))
 
 
-def air_moved(before: GarmentFrame, now: GarmentFrame) -> float:
+def air_moved(before: GarmentFrame, after: GarmentFrame) -> float:
     """Largest distance by which a change of the air's load moves the cloth against its guide [m]."""
-    if before.load is now.load:
+    if before.load is after.load:
         return 0.0
-    calm = np.zeros_like(now.points)
-    start, end = (calm if frame.load is None else frame.load for frame in (before, now))
-    return float(np.linalg.norm(end - start, axis=1).max(initial=0.0)) / max(now.guide, 1e-30)
+    calm = np.zeros_like(after.points)
+    start, end = (calm if frame.load is None else frame.load for frame in (before, after))
+    return float(np.linalg.norm(end - start, axis=1).max(initial=0.0)) / max(after.guide, 1e-30)
 
 
 def set_alike(a: GarmentFrame, b: GarmentFrame) -> bool:
@@ -244,20 +252,20 @@ def set_alike(a: GarmentFrame, b: GarmentFrame) -> bool:
     return (a.fabric, a.guide, a.detail, a.offset) == (b.fabric, b.guide, b.detail, b.offset)
 
 
-def cage_moved(known: SolvedFrame, now: GarmentFrame) -> float:
+def cage_moved(start: SolvedFrame, garment: GarmentFrame) -> float:
     """Largest move of a garment's cage points since a frame [m]; infinite if not a length."""
-    if now.points.shape != known.frame.points.shape:
+    if garment.points.shape != start.frame.points.shape:
         return np.inf
-    far = float(np.linalg.norm(now.points - known.frame.points, axis=1).max(initial=0.0))
+    far = float(np.linalg.norm(garment.points - start.frame.points, axis=1).max(initial=0.0))
     return far if np.isfinite(far) else np.inf
 
 
 def bodies_moved(
-    known: SolvedFrame, colliders: Sequence[Pose | None], near: Sequence[int], *, along: Rigid = AT_REST
+    start: SolvedFrame, colliders: Sequence[Pose | None], near: Sequence[int], *, along: Rigid = AT_REST
 ) -> float:
     """Largest deviation of bodies from a rigid motion since a frame [m]; infinite if not comparable."""
     farthest = 0.0
     for body in near:
-        before, after = known.colliders[body], colliders[body]
+        before, after = start.colliders[body], colliders[body]
         farthest = max(farthest, np.inf if before is None or after is None else after.moved(before, along))
     return farthest

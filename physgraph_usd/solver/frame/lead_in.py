@@ -15,7 +15,7 @@ from .refiner import Refiner
 from .settings import SolveSettings
 
 
-def cages_walked(
+def prerolled_cages(
     scene: Scene,
     settings: SolveSettings,
     frame_at: Callable[[float | None], Frame],
@@ -36,8 +36,8 @@ def cages_walked(
     """
     if len(times) < 2 or settings.temporal == "off" or settings.contact.cloth != "pairs":
         return None
-    alone = [0] * len(scene.garments)
-    return lead_in(Refiner(scene, settings, levels=alone, device=device, threads=threads), frame_at, times)
+    unrefined = [0] * len(scene.garments)
+    return lead_in(Refiner(scene, settings, levels=unrefined, device=device, threads=threads), frame_at, times)
 
 
 def lead_in(
@@ -66,10 +66,10 @@ def lead_in(
     back = 0
     while not _is_clean(cages, frame_at, times[max(last - back, 0)]) and back < last:
         back = max(2 * back, 1)
-    begun = max(last - back, 0)
-    for time in times[begun + 1 :]:
+    start = max(last - back, 0)
+    for time in times[start + 1 :]:
         _solve(cages, frame_at, time)
-    return cages, times[begun]
+    return cages, times[start]
 
 
 def _crosses(cages: Refiner, frame: Frame) -> bool:

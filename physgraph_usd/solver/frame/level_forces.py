@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import torch
@@ -94,7 +93,7 @@ class LevelForces:
 
     @cached_property
     def _in_plane(self) -> ElasticTerms:
-        fabrics = tuple(replace(each, bend=0.0, weft_bend=None) for each in self._elastic)
+        fabrics = tuple(replace(fabric, bend=0.0, weft_bend=None) for fabric in self._elastic)
         if self.lent is not None and self.lent.in_plane.fabrics == fabrics:
             return self.lent.in_plane
         level = self.plain.eased(fabrics)
@@ -105,7 +104,7 @@ class LevelForces:
         fabrics = self._elastic
         if self.lent is not None and self.lent.bending.fabrics == fabrics:
             return self.lent.bending
-        raised = [each.raises_bending for each in self.garments]
+        raised = [garment.raises_bending for garment in self.garments]
         return ElasticTerms(fabrics, self.plain, (bending_term(self.plain, fabrics, raised=raised),))
 
     @cached_property
@@ -147,14 +146,14 @@ class LevelForces:
     @property
     def _elastic(self) -> tuple[Fabric, ...]:
         """The fabrics without the values that no elastic term depends on."""
-        return tuple(replace(each, density=0.0, thickness=0.0) for each in self._fabrics)
+        return tuple(replace(fabric, density=0.0, thickness=0.0) for fabric in self._fabrics)
 
     @cached_property
     def _stiffness(self) -> Float[Tensor, " vertices"]:
         """Diagonal of the Hessian at rest [N/m], positive."""
         tiny = torch.finfo(self.level.dtype).tiny
-        others = [each for each in self._module.forces if each not in (*self._in_plane.terms, *self._bending.terms)]
-        parts = [self._in_plane.stiffness, self._bending.stiffness, ForceModule(others).diagonal(self.level.rest)]
+        remaining = [term for term in self._module.forces if term not in (*self._in_plane.terms, *self._bending.terms)]
+        parts = [self._in_plane.stiffness, self._bending.stiffness, ForceModule(remaining).diagonal(self.level.rest)]
         return torch.stack(parts).sum(dim=0).clamp_min(tiny)
 
     @property
@@ -237,8 +236,7 @@ class LevelForces:
     def system_in(self, field: ForceField, metric: Preconditioner | None = None) -> System:
         """The system of the level in any field, with the level's metric by default."""
         level, metric = self.level, self.metric if metric is None else metric
-        place: dict[str, Any] = {"free": level.free, "spacing": level.spacing, "level": level}
-        return System(field, metric, **place)
+        return System(field, metric, free=level.free, spacing=level.spacing, level=level)
 
     def tether(self, stiffness: float, predicted: Float[Tensor, "vertices 3"]) -> Tether:
         """The tie to predicted positions [m], of stiffness [1/s^2]."""

@@ -43,10 +43,10 @@ class Faults:
     @staticmethod
     def of(view: LevelContact, state: ContactState) -> Faults:
         """Faults of a contact state."""
-        found, pierced, inside = state.crossings, state.pierced, state.inside
+        crossings, pierced, inside = state.crossings, state.pierced, state.inside
         if view.given_up is not None:
-            found, pierced = all_crossings(view.mesh.parts, state.corners)
-        corners = torch.cat([view.mesh.corners_of(each).long() for each in (found, pierced.crossings)])
+            crossings, pierced = all_crossings(view.mesh.parts, state.corners)
+        corners = torch.cat([view.mesh.corners_of(pairs).long() for pairs in (crossings, pierced.crossings)])
         none = corners.new_zeros(0)
         return Faults(corners, none if inside is None else torch.nonzero(inside.any(dim=0)).squeeze(1))
 
@@ -63,7 +63,7 @@ def patches_worse(view: LevelContact, x: Faults, base: Faults) -> Bool[Tensor, "
     region = torch.zeros_like(mesh.level.free[:, 0])
     region[corners[corners < count]] = True
     region, edges = mesh.grown(region, RINGS), mesh.level.edges.long()
-    across = torch.cat([corners[:, [0, place]] for place in range(1, 5)])
+    across = torch.cat([corners[:, [0, column]] for column in range(1, 5)])
     links = torch.cat([edges[region[edges].all(dim=1)], across[(across < count).all(dim=1)]])
     patch = torch.as_tensor(joined_by(links.cpu().numpy(), count), device=region.device).long()
     return region & (x.per_patch(patch) > base.per_patch(patch))[patch]
@@ -90,36 +90,40 @@ def no_worse(
         Positions [m], x itself if nothing is to change; the frames for which each cage vertex is still to follow; and
         figures for the report, {} if all cloth is as solved.
     """
-    left = (before - 1).clamp_min(0)
+    remaining = (before - 1).clamp_min(0)
     solved = Faults.of(view, view.look(x))
-    if not bool(left.any()) and not len(solved.corners):
-        return x, left, {}
+    if not bool(remaining.any()) and not len(solved.corners):
+        return x, remaining, {}
     smooth, free = view.closed(smooth), view.mesh.level.free
-    base = Faults.of(view, view.found(smooth))
+    base = Faults.of(view, view.detect(smooth))
 
-    def blended(left: Tensor) -> Tensor:
-        kept = from_coarse @ ((left == 0).double().cpu().numpy())
-        return view.closed(torch.where(free, smooth + torch.as_tensor(kept).to(x).unsqueeze(1) * (x - smooth), x))
+    def blended(remaining: Tensor) -> Tensor:
+        solved_share = from_coarse @ ((remaining == 0).double().cpu().numpy())
+        return view.closed(
+            torch.where(free, smooth + torch.as_tensor(solved_share).to(x).unsqueeze(1) * (x - smooth), x)
+        )
 
-    def longer(found: Faults) -> Tensor | None:
-        worse = patches_worse(view, found, base)
+    def longer(faults: Faults) -> Tensor | None:
+        worse = patches_worse(view, faults, base)
         share = from_coarse.T @ worse.double().cpu().numpy()
-        again = torch.as_tensor(share > 0, device=left.device)
-        return torch.where(again, torch.full_like(left, STAY), left) if bool(worse.any()) else None
+        again = torch.as_tensor(share > 0, device=remaining.device)
+        return torch.where(again, torch.full_like(remaining, STAY), remaining) if bool(worse.any()) else None
 
-    more = longer(solved)
-    if more is None and not bool(left.any()):
-        return x, left, {}
-    y, found = x, solved
+    extended = longer(solved)
+    if extended is None and not bool(remaining.any()):
+        return x, remaining, {}
+    y, faults = x, solved
     for _ in range(GROWTHS):
-        left = left if more is None else more
-        y = blended(left)
-        found = Faults.of(view, view.found(y))
-        more = longer(found)
-        if more is None:
+        remaining = remaining if extended is None else extended
+        y = blended(remaining)
+        faults = Faults.of(view, view.detect(y))
+        extended = longer(faults)
+        if extended is None:
             break
-    crossings = {name: len(each.corners) for name, each in (("solved", solved), ("subdivided", base), ("left", found))}
+    crossings = {
+        name: len(result.corners) for name, result in (("solved", solved), ("subdivided", base), ("left", faults))
+    }
     if crossings["left"] > crossings["solved"] and not bool(before.any()):
-        return x, torch.zeros_like(left), {}
-    share = np.asarray(from_coarse @ (left > 0).double().cpu().numpy())
-    return unhindered(y), left, {"vertices": int((share > 0).sum()), **crossings}
+        return x, torch.zeros_like(remaining), {}
+    share = np.asarray(from_coarse @ (remaining > 0).double().cpu().numpy())
+    return unhindered(y), remaining, {"vertices": int((share > 0).sum()), **crossings}

@@ -30,11 +30,11 @@ def refuse_swallowed(problem: Problem) -> None:
         SolveError: Some cloth is wholly in a body.
     """
     swallowed = [] if problem.contact is None else problem.contact.swallowed
-    for garment, each, (deep, body) in zip(problem.group.garments, problem.frame.garments, swallowed, strict=False):
-        size = float(np.linalg.norm(extent(each.points))) if deep else 0.0
+    for garment, frame, (deep, body) in zip(problem.group.garments, problem.frame.garments, swallowed, strict=False):
+        size = float(np.linalg.norm(extent(frame.points))) if deep else 0.0
         if deep > size:
-            what = f"it is {1e3 * deep:.4g} mm deep in <{body}>, and only {1e3 * size:.4g} mm large"
-            raise SolveError(f"{named([garment], problem.frame.at)}: {what}; mend the one or the other there")
+            fault = f"it is {1e3 * deep:.4g} mm deep in <{body}>, and only {1e3 * size:.4g} mm large"
+            raise SolveError(f"{named([garment], problem.frame.at)}: {fault}; mend the one or the other there")
 
 
 def scaled(problem: Problem, x: Placed) -> Placed:
@@ -45,11 +45,11 @@ def scaled(problem: Problem, x: Placed) -> Placed:
     """
     group, view = problem.group, problem.view(problem.finest)
     pairs = zip(problem.frame.garments, group.garments, strict=True)
-    gain = np.concatenate([each.detail * garment.detail_scale for each, garment in pairs])
+    gain = np.concatenate([frame.detail * garment.detail_scale for frame, garment in pairs])
     result = group.moving_frames.scaled(problem.aim, x, gain)
     if not bool((result.abs() <= FARTHEST).all()):
-        what = f"the refined cloth is not finite or beyond {FARTHEST:g} m; lower physgraph:refine:detail"
-        raise SolveError(f"{named(group.garments, problem.frame.at)}: {what} or detailScale")
+        fault = f"the refined cloth is not finite or beyond {FARTHEST:g} m; lower physgraph:refine:detail"
+        raise SolveError(f"{named(group.garments, problem.frame.at)}: {fault} or detailScale")
     return x if result is x else unhindered(result) if view is None else view.moved(x, result)
 
 
@@ -62,7 +62,7 @@ def patched(problem: Problem, x: Placed) -> tuple[Placed, Tensor, dict[str, int]
     return no_worse(view, x, smooth, from_coarse=level.from_coarse, before=problem.following)
 
 
-def state_left(problem: Problem, x: Placed, memory: Any, following: Tensor) -> FrameState:
+def next_state(problem: Problem, x: Placed, memory: Any, following: Tensor) -> FrameState:
     """State for the start of the next frame.
 
     Args:
@@ -72,17 +72,17 @@ def state_left(problem: Problem, x: Placed, memory: Any, following: Tensor) -> F
     """
     view, cage = problem.view(problem.finest), problem.cage
     fine = x.double() + torch.as_tensor(cage.origin).to(x.device)
-    lost = None if problem.contact is None else problem.contact.given_up
+    given_up = None if problem.contact is None else problem.contact.given_up
     state = None if view is None else view.look(x)
     exempt = None if state is None else state.exempt
     return FrameState(
         coarse=torch.as_tensor(cage.world),
         fine=fine,
         inside=torch.zeros_like(x[:, 0], dtype=torch.bool) if exempt is None else exempt[: len(x)],
-        given_up=torch.zeros_like(cage.points[:, 0], dtype=torch.bool) if lost is None else lost,
+        given_up=torch.zeros_like(cage.points[:, 0], dtype=torch.bool) if given_up is None else given_up,
         following=following,
-        held=problem.start.held,
-        clean=lost is None and state is not None and state.is_clean,
+        still_frames=problem.start.still_frames,
+        clean=given_up is None and state is not None and state.is_clean,
         curvature=None if memory is None else Curvature(memory, len(x)),
     )
 
@@ -102,7 +102,7 @@ def telemetry_of(problem: Problem, x: Tensor, module: ForceModule, *, reports: S
         "sharp_folds": sharp_folds(finest, x),
         "strain": edge_strain(finest, x),
         "remaining_mm": round(1e3 * problem.group.spacings[-1] * reports[-1].remaining_move, 4) if reports else 0.0,
-        "start": problem.start.why,
+        "start": problem.start.reason,
     }
 
 

@@ -36,7 +36,7 @@ class LevelProblem:
     Attributes:
         lasting: Terms that last as long as the materials.
         module: All terms without contact.
-        alone: The system without contact, tied to the start in a warm frame.
+        without_contact: The system without contact, tied to the start in a warm frame.
         integrator: Makes the steps.
         untangler: Makes the steps to pull crossings apart.
         budget: Stopping criteria.
@@ -47,7 +47,7 @@ class LevelProblem:
 
     lasting: LevelForces
     module: ForceModule
-    alone: System
+    without_contact: System
     view: LevelContact | None
     integrator: Integrator
     untangler: Integrator
@@ -78,17 +78,17 @@ class LevelProblem:
             last: The last round's system, whose metric may be reused.
         """
         if not touched and view.seam is None:
-            return self.alone
-        field, metric = self.alone.field, self.alone.metric
+            return self.without_contact
+        field, metric = self.without_contact.field, self.without_contact.metric
         assert isinstance(field, ForceModule)
         assert isinstance(metric, Metric)
-        held = metric if view.seam is None else metric.merged(view.seam.label)
+        preconditioner = metric if view.seam is None else metric.merged(view.seam.label)
         if touched:
             stiff = 3.0 * torch.stack([term.diagonal(x) for term in touched]).sum(dim=0)
-            known = None if last is None or view.look(x).hopeful.count else last.metric
-            held = HeldMetric.of(held, stiff, known)
+            last_metric = None if last is None or view.look(x).hopeful.count else last.metric
+            preconditioner = HeldMetric.of(preconditioner, stiff, last_metric)
         joined = field.joined_by(touched)
-        return self.lasting.system_in(joined if view.seam is None else SewnForces(joined, view.seam), held)
+        return self.lasting.system_in(joined if view.seam is None else SewnForces(joined, view.seam), preconditioner)
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,11 +99,11 @@ class Problem:
         began: Start of the frame's computation [s].
         aim: The cage followed by the fine cloth [m].
         forces: The lasting terms of each level, coarsest first.
-        walked: Cages advanced from an earlier frame [m], for a cold start; or None.
+        prerolled: Cages advanced from an earlier frame [m], for a cold start; or None.
         before: Fine positions in the last frame [m], float64; None without a last frame.
         inside: Mask of the vertices inside a body in the last frame; None if none was.
         tether: Stiffness of the tie to the start [1/s^2]; None without tie.
-        known: Curvature learned in the last frame, or None.
+        last_curvature: Curvature learned in the last frame, or None.
         following: As in `FrameState`, after the last frame, shape (C,).
     """
 
@@ -115,11 +115,11 @@ class Problem:
     forces: Sequence[LevelForces]
     contact: FrameContact | None
     start: Start
-    walked: Float[Tensor, "coarse 3"] | None
+    prerolled: Float[Tensor, "coarse 3"] | None
     before: Placed | None
     inside: Bool[Tensor, " vertices"] | None
     tether: float | None
-    known: Curvature | None
+    last_curvature: Curvature | None
     following: Int[Tensor, " coarse"]
 
     @property
@@ -135,8 +135,8 @@ class Problem:
     @property
     def hopeless(self) -> bool:
         """Whether all cloth is given up: it is not solved, and follows the subdivided cage."""
-        lost = None if self.contact is None else self.contact.given_up
-        return lost is not None and bool(lost.all())
+        given_up = None if self.contact is None else self.contact.given_up
+        return given_up is not None and bool(given_up.all())
 
     @property
     def subdivided(self) -> Placed:
@@ -162,8 +162,8 @@ class Problem:
     @property
     def _first_cage(self) -> Float[Tensor, "coarse 3"]:
         """Start of the cage's level [m]: advanced from an earlier frame, or untangled."""
-        if self.walked is not None:
-            return self.walked
+        if self.prerolled is not None:
+            return self.prerolled
         return self.aim if self.contact is None else self.contact.untangled
 
     @property
@@ -181,32 +181,40 @@ class Problem:
         from_cage = not self.warm and (self.group.settings.method.nested or self.crossed)
         return range(0 if from_cage else self.finest, self.finest + 1)
 
-    def level(self, index: int, *, since: float) -> LevelProblem:
+    def level(self, index: int, *, start_time: float) -> LevelProblem:
         """One level.
 
         Args:
             index: Number of the level.
-            since: Time at which the frame was ready to be solved [s].
+            start_time: Time at which the frame was ready to be solved [s].
         """
         lasting, settings = self.forces[index], self.group.settings
         module = lasting.module(self.aim, self.frame.garments)
         tie = None if self.tether is None or self.start.detailed is None else (self.tether, self.start.detailed)
-        alone = lasting.system(module, tie, rough=settings.rough)
-        budget = settings.budget(self.finest - index, since, warm=self.warm)
+        without_contact = lasting.system(module, tie, rough=settings.rough)
+        budget = settings.budget(self.finest - index, start_time, warm=self.warm)
         budget = replace(budget, steps=0) if self.start.rests else budget
-        who = (self.group.integrator, self.group.untangler)
-        problem = LevelProblem(lasting, module, alone, self.view(index), *who, budget, self.group.outward)
-        return replace(problem, curvature=self._curvature) if index == self.finest else problem
+        return LevelProblem(
+            lasting,
+            module,
+            without_contact,
+            self.view(index),
+            self.group.integrator,
+            self.group.untangler,
+            budget,
+            self.group.outward,
+            curvature=self._curvature if index == self.finest else None,
+        )
 
     @property
     def _curvature(self) -> Any:
         """The last frame's integrator memory, transported to this frame; None for cold starts and changed garments."""
-        known, rotation, integrator = self.known, self.start.rotation, self.group.integrator
-        if known is None or rotation is None or self.start.rests or known.vertices != len(rotation):
+        curvature, rotation, integrator = self.last_curvature, self.start.rotation, self.group.integrator
+        if curvature is None or rotation is None or self.start.rests or curvature.vertices != len(rotation):
             return None
-        if not np.array_equal(known.turn, np.eye(3)):
-            rotation = rotation @ torch.as_tensor(known.turn).to(rotation)
-        return integrator.transported(known.memory, rotation) if isinstance(integrator, Transporting) else None
+        if not np.array_equal(curvature.turn, np.eye(3)):
+            rotation = rotation @ torch.as_tensor(curvature.turn).to(rotation)
+        return integrator.transported(curvature.memory, rotation) if isinstance(integrator, Transporting) else None
 
     def placed(self, x: Placed) -> list[np.ndarray]:
         """World positions of each garment [m], given those of the finest level."""
@@ -214,7 +222,7 @@ class Problem:
         points = group.followers.placed(x, self.cage.origin, self.cage.world)
         return [points[span] for span in group.levels[-1].spans]
 
-    def begun(
+    def level_start(
         self, index: int, below: Float[Tensor, "below 3"] | None
     ) -> tuple[Float[Tensor, "vertices 3"], Float[Tensor, "vertices 3"] | None]:
         """Start of a level [m], and the move to remove a coarser mesh's facets; None in a warm frame.
@@ -249,13 +257,15 @@ def begin(group: Group, frame: FrameInput, last: FrameState | None) -> Problem:
     """
     began = time.perf_counter()
     forces, cage, settings = group.forces_for(frame.garments), group.cage(frame.garments), group.settings
-    known = None if settings.temporal == "off" else last
-    places = None if last is None else last.about(cage.origin)
-    before = None if places is None else places[1]
+    history = None if settings.temporal == "off" else last
+    last_positions = None if last is None else last.about(cage.origin)
+    before = None if last_positions is None else last_positions[1]
     moved = frame.moved if settings.temporal == "tether" else np.inf  # Only the tether slows the cloth down.
-    reset = {"frames": group.moving_frames, "reset": settings.reset, "moved": moved}
-    start = Start("cold") if known is None or places is None else start_of(places, known.held, cage, **reset)
-    contact = group.contact(frame, cage, given_up=frame.given_up if known is None else known.given_up)
+    start = Start("cold")
+    if history is not None and last_positions is not None:
+        frames, reset = group.moving_frames, settings.reset
+        start = start_of(last_positions, history.still_frames, cage, frames=frames, reset=reset, moved=moved)
+    contact = group.contact(frame, cage, given_up=frame.given_up if history is None else history.given_up)
     if contact is not None and last is not None and last.clean and before is not None:
         contact.at(group.levels[-1]).remember(before)
     return Problem(
@@ -267,10 +277,10 @@ def begin(group: Group, frame: FrameInput, last: FrameState | None) -> Problem:
         forces=forces,
         contact=contact,
         start=start,
-        walked=None if frame.walked is None else group.tensor(frame.walked - cage.origin),
+        prerolled=None if frame.prerolled is None else group.tensor(frame.prerolled - cage.origin),
         before=before,
         inside=last.inside if last is not None and bool(last.inside.any()) else None,
         tether=start.slowed * settings.tether * frame.rate**2 if settings.temporal == "tether" else None,
-        known=None if known is None else known.curvature,
-        following=torch.zeros_like(cage.points[:, 0], dtype=torch.int64) if known is None else known.following,
+        last_curvature=None if history is None else history.curvature,
+        following=torch.zeros_like(cage.points[:, 0], dtype=torch.int64) if history is None else history.following,
     )

@@ -61,7 +61,7 @@ class Refiner:
         self.scene, self._settings, self._heat_map = scene, settings, heat_map
         self._memories = (GarmentHistory(),) * len(scene.garments)
         self._time: float | None = None
-        self._walked: tuple[Sequence[np.ndarray | None], float] | None = None
+        self._prerolled: tuple[Sequence[np.ndarray | None], float] | None = None
         self._clock = clock_of(device)
         self._seconds: list[float] = []  # Durations of completed frames.
 
@@ -82,16 +82,16 @@ class Refiner:
     def forget(self) -> None:
         """Start the next frame cold, like the first."""
         self._cloth.bodies.forget()
-        self._memories, self._time, self._walked = (GarmentHistory(),) * len(self._memories), None, None
+        self._memories, self._time, self._prerolled = (GarmentHistory(),) * len(self._memories), None, None
 
-    def begin_at(self, cages: Refiner, *, since: float) -> None:
+    def start_from_cages(self, cages: Refiner, *, time_code: float) -> None:
         """Start the first frame, if cold, with the cage advanced by another refiner.
 
         Args:
             cages: A refiner of the same scene without subdivision, after solving the first frame.
-            since: The start time code of the advance, for the report.
+            time_code: The start time code of the advance, for the report.
         """
-        self._walked = [None if each.last is None else each.last.points for each in cages._memories], since
+        self._prerolled = [None if memory.last is None else memory.last.points for memory in cages._memories], time_code
 
     def use(self, settings: SolveSettings) -> None:
         """Solve all following frames with new settings, the next frame cold; levels and metrics are kept."""
@@ -100,15 +100,19 @@ class Refiner:
 
     def fork(self, settings: SolveSettings) -> Refiner:
         """A refiner continuing from this one's last frame with new settings; levels, metrics and bodies are shared."""
-        other = copy(self)
-        other._settings = settings
-        return other
+        forked = copy(self)
+        forked._settings = settings
+        return forked
 
-    def go_on_from(self, other: Refiner) -> None:
+    def continue_from(self, refiner: Refiner) -> None:
         """Start the next frame from the last frame of a refiner of the same meshes; its result is not reused."""
-        lasts = [None if each.last is None else replace(each.last, whole=False) for each in other._memories]
-        self._memories = tuple(replace(each, last=last) for each, last in zip(other._memories, lasts, strict=True))
-        self._time = other._time
+        lasts = [
+            None if memory.last is None else replace(memory.last, is_reusable=False) for memory in refiner._memories
+        ]
+        self._memories = tuple(
+            replace(memory, last=last) for memory, last in zip(refiner._memories, lasts, strict=True)
+        )
+        self._time = refiner._time
 
     def parts_of(self, frame: Frame) -> list[tuple[int, ...]]:
         """Numbers of the garments solved together in a frame."""
@@ -159,19 +163,19 @@ class Refiner:
     def _solve(self, frame: Frame, wanted: Sequence[bool] | None) -> State:
         refuse_far(self.scene, frame)
         gap = self._is_gap(frame.time)
-        if self._settings.temporal == "off" or not any(each.last for each in self._memories):
+        if self._settings.temporal == "off" or not any(memory.last for memory in self._memories):
             self._cloth.bodies.forget()  # Without history the result depends on this frame only, to the bit.
         self._cloth.bodies.pose(frame.colliders)
         count = len(frame.garments)
-        asked = [True] * count if wanted is None else list(wanted)
-        now = {"gap": gap, "walked": self._walked, "limit": self._limit}
-        answers, reused = SceneFrame(self._cloth, self._settings, frame, self._memories, **now).solve(asked)
-        self._memories = tuple(answers[k].memory if k in answers else each for k, each in enumerate(self._memories))
-        self._time, self._walked = frame.time, None
-        points = [answers[index].points if index in answers and asked[index] else None for index in range(count)]
+        requested = [True] * count if wanted is None else list(wanted)
+        scene_frame = SceneFrame(self._cloth, self._settings, frame, self._memories, gap, self._prerolled, self._limit)
+        answers, reused = scene_frame.solve(requested)
+        self._memories = tuple(answers[k].memory if k in answers else memory for k, memory in enumerate(self._memories))
+        self._time, self._prerolled = frame.time, None
+        points = [answers[index].points if index in answers and requested[index] else None for index in range(count)]
         absent: dict[str, object] = {"start": "left out: the garment has no sample here"}
         telemetry = [absent if points[index] is None else answers[index].telemetry for index in range(count)]
-        heat = [self.heat(index, each) for index, each in enumerate(points)] if self._heat_map else []
+        heat = [self.heat(index, positions) for index, positions in enumerate(points)] if self._heat_map else []
         return State(frame.time, tuple(points), tuple(telemetry), tuple(reused), tuple(heat))
 
     def energy(self, frame: Frame, points: Sequence[np.ndarray]) -> float:
@@ -196,16 +200,19 @@ class Refiner:
             For each garment its positions, and contact and crossings as in telemetry: empty without possible contact.
         """
         refuse_far(self.scene, frame)
-        found: list[tuple[np.ndarray | None, dict[str, Any]]] = [(each, {}) for each in wanted]
+        results: list[tuple[np.ndarray | None, dict[str, Any]]] = [(positions, {}) for positions in wanted]
         for part in self.parts_of(frame):
-            sides = [[each for each in (side[index] for index in part) if each is not None] for side in (start, wanted)]
+            sides = [
+                [positions for positions in (side[index] for index in part) if positions is not None]
+                for side in (start, wanted)
+            ]
             if all(len(side) == len(part) for side in sides):
                 frames = [frame.garments[index] for index in part]
                 touching = self.touching(part, frame)
                 moved, contact = self.group_of(part).moved_safely(frames, *sides, touching=touching)
-                for index, each in zip(part, moved, strict=True):
-                    found[index] = each, contact
-        return found
+                for index, positions in zip(part, moved, strict=True):
+                    results[index] = positions, contact
+        return results
 
     def heat(self, index: int, points: np.ndarray | None) -> dict[str, np.ndarray] | None:
         """A garment's depth in bodies and its crossings in the last frame; None without positions [m]."""

@@ -52,18 +52,19 @@ class SceneCloth:
                 raise GarmentError(garment.path, f"the rest shape's {wrong}", remedy=remedy)
         self.scene, self.refinements = scene, refine_garments(scene.garments, levels)
         self.bodies = Bodies(scene.colliders, device=device, threads=threads)
-        self._place, self._device = {"dtype": dtype, "device": device, "threads": threads}, device
+        self._dtype, self._device, self._threads = dtype, device, threads
         self._groups: dict[tuple[int, ...], Group] = {}
-        self._parts = {together: TouchingGroups(scene.garments, together=together) for together in (False, True)}
+        self._parts = {joint: TouchingGroups(scene.garments, joint=joint) for joint in (False, True)}
 
     def group(self, part: tuple[int, ...], settings: SolveSettings) -> Group:
         """The group of garments solved together, built on first use; levels and metrics are kept."""
-        known = self._groups.get(part)
-        if known is None:
+        group = self._groups.get(part)
+        if group is None:
             garments = [self.scene.garments[index] for index in part]
             chains = [self.refinements[index] for index in part]
-            known = Group.of(garments, chains, self.scene.gravity, settings, **self._place)
-        self._groups[part] = known if known.settings is settings else replace(known, settings=settings)
+            gravity, dtype, device, threads = self.scene.gravity, self._dtype, self._device, self._threads
+            group = Group.of(garments, chains, gravity, settings, dtype=dtype, device=device, threads=threads)
+        self._groups[part] = group if group.settings is settings else replace(group, settings=settings)
         return self._groups[part]
 
     def parts_of(self, frame: Frame, settings: SolveSettings) -> list[tuple[int, ...]]:
@@ -76,12 +77,12 @@ class SceneCloth:
 
     def near(self, part: Sequence[int], frames: Sequence[GarmentFrame], settings: SolveSettings) -> tuple[int, ...]:
         """Numbers of the bodies within reach of garments."""
-        found: set[int] = set()
+        near: set[int] = set()
         for index, frame in zip(part, frames, strict=True):
             garment = self.scene.garments[index]
             if garment.colliders and settings.contact.sees_bodies:
-                found |= set(self.bodies.near(garment, bounds_of(frame.points), reach_of(garment, frame)))
-        return tuple(sorted(found))
+                near |= set(self.bodies.near(garment, bounds_of(frame.points), reach_of(garment, frame)))
+        return tuple(sorted(near))
 
     def reached(
         self,
@@ -91,12 +92,12 @@ class SceneCloth:
         settings: SolveSettings,
     ) -> set[int]:
         """Numbers of the bodies whose bounds meet the solved cloth, given the cloth's positions [m]."""
-        found: set[int] = set()
+        reached: set[int] = set()
         for index, frame, solved in zip(part, frames, points, strict=True):
             garment = self.scene.garments[index]
             if garment.colliders and settings.contact.form != "off":
-                found |= set(self.bodies.near(garment, bounds_of(solved), frame.offset))
-        return found
+                reached |= set(self.bodies.near(garment, bounds_of(solved), frame.offset))
+        return reached
 
     def touching(
         self,
@@ -107,12 +108,12 @@ class SceneCloth:
         origin: Origin | None = None,
     ) -> tuple[Touching, ...]:
         """Surfaces of bodies, and the distance kept from each by each garment; with their places in the start frame."""
-        felt = [self.scene.garments[index].colliders for index in part]
-        pairs = zip(felt, frames, strict=True)
+        colliders = [self.scene.garments[index].colliders for index in part]
+        pairs = zip(colliders, frames, strict=True)
         offsets = [[frame.offset if body in bodies else None for body in near] for bodies, frame in pairs]
-        known = () if origin is None else origin.colliders
+        before = () if origin is None else origin.colliders
         motion = AT_REST if origin is None else origin.motion
-        return self.bodies.touching(near, offsets, before=known, motion=motion)
+        return self.bodies.touching(near, offsets, before=before, motion=motion)
 
     def heat(
         self, index: int, points: np.ndarray, crossing: np.ndarray | None, settings: SolveSettings
@@ -125,7 +126,7 @@ class SceneCloth:
             crossing: Whether each vertex belongs to cloth that crosses cloth, shape (V,); None for no vertex.
         """
         near = self.bodies.near(self.scene.garments[index], bounds_of(points), 0.0)
-        surfaces = [each.surface for each in self.bodies.touching(near, [[0.0] * len(near)])]
+        surfaces = [body.surface for body in self.bodies.touching(near, [[0.0] * len(near)])]
         crosses = body_crossings(self.group((index,), settings).levels[-1], surfaces, points)
         crosses = crosses if crossing is None else crosses | crossing
         depth = penetration_map(surfaces, points, device=self._device)
@@ -134,11 +135,11 @@ class SceneCloth:
 
 def _loads(frames: Sequence[GarmentFrame]) -> dict[str, object]:
     """Telemetry: the largest acceleration that is felt, relative to gravity, and load of the air; empty without any."""
-    felt = [frame.acceleration / GRAVITY for frame in frames if frame.acceleration is not None]
+    accelerations = [frame.acceleration / GRAVITY for frame in frames if frame.acceleration is not None]
     air = [frame.load for frame in frames if frame.load is not None]
     largest = {
         name: max(float(np.linalg.norm(field, axis=1).max(initial=0.0)) for field in fields)
-        for name, fields in (("inertia", felt), ("air", air))
+        for name, fields in (("inertia", accelerations), ("air", air))
         if fields
     }
     return {name: float(f"{value:.3g}") for name, value in largest.items()}
@@ -167,7 +168,7 @@ class SceneFrame:
         cloth: Levels, groups and bodies of the scene; the bodies are posed.
         memories: GarmentHistory of each garment's last frames.
         gap: Whether the time since the last frame is too long for a warm start.
-        walked: World positions of each cage [m] advanced here by another refiner, and the start time code; or None.
+        prerolled: World positions of each cage [m] advanced here by another refiner, and the start time code; or None.
         limit: Time limit of the frame [s], for the report.
     """
 
@@ -176,16 +177,16 @@ class SceneFrame:
     frame: Frame
     memories: Sequence[GarmentHistory]
     gap: bool
-    walked: tuple[Sequence[np.ndarray | None], float] | None
+    prerolled: tuple[Sequence[np.ndarray | None], float] | None
     limit: float
 
-    def solve(self, asked: Sequence[bool]) -> tuple[dict[int, Answer], list[bool]]:
+    def solve(self, requested: Sequence[bool]) -> tuple[dict[int, Answer], list[bool]]:
         """Answers by garment, of the requested parts; and for all garments whether the answers equal the last frame's.
 
         Raises:
             SolveError: No garment could be solved.
         """
-        found, reused = dict[int, Answer](), [False] * len(asked)
+        answers, reused = dict[int, Answer](), [False] * len(requested)
         unsolved = dict[tuple[int, ...], SolveError]()
         for part in self.cloth.parts_of(self.frame, self.settings):
             near = self.cloth.near(part, [self.frame.garments[index] for index in part], self.settings)
@@ -193,18 +194,18 @@ class SceneFrame:
             same = is_same(part, self.frame, memories, near) and not self._jumped(part, near)
             for index in part:
                 reused[index] = same and self.memories[index].solved
-            if not any(asked[index] for index in part):
+            if not any(requested[index] for index in part):
                 continue
             try:
                 with At(prims=tuple(self.cloth.scene.garments[index].path for index in part)):
-                    found |= zip(part, self._answer(part, near, same=same), strict=True)
+                    answers |= zip(part, self._answer(part, near, same=same), strict=True)
             except SolveError as error:
                 unsolved[part] = error
-        if unsolved and not found:
+        if unsolved and not answers:
             raise next(iter(unsolved.values()))
         for part, error in unsolved.items():
-            found |= zip(part, self._on_cages(part, error), strict=True)
-        return found, reused
+            answers |= zip(part, self._on_cages(part, error), strict=True)
+        return answers, reused
 
     def _answer(self, part: tuple[int, ...], near: tuple[int, ...], *, same: bool) -> list[Answer]:
         """Garments upsampled, reused, or solved."""
@@ -217,7 +218,9 @@ class SceneFrame:
         memories = [self.memories[index] for index in part]
         entry: dict[str, object] = {"start": "reused: the input equals the last frame's"}
         return [
-            Answer(each.last.points, entry, replace(each, solved=True)) for each in memories if each.last is not None
+            Answer(memory.last.points, entry, replace(memory, solved=True))
+            for memory in memories
+            if memory.last is not None
         ]
 
     def _on_cages(self, part: tuple[int, ...], error: SolveError) -> list[Answer]:
@@ -225,46 +228,46 @@ class SceneFrame:
         entry: dict[str, object] = {"start": "not solved: it follows its cage", "not_solved": str(error)}
         points = self.cloth.group(part, self.settings).upsampled([self.frame.garments[index] for index in part])
         memories = [replace(self.memories[index], solved=False) for index in part]
-        return [Answer(x, entry, each) for x, each in zip(points, memories, strict=True)]
+        return [Answer(x, entry, memory) for x, memory in zip(points, memories, strict=True)]
 
     def _solve_part(self, part: tuple[int, ...], near: tuple[int, ...]) -> list[Answer]:
         """Solve garments together; bodies reached only by the solved cloth are added, and the solve is repeated."""
         frames, memories = [self.frame.garments[index] for index in part], [self.memories[index] for index in part]
         group = self.cloth.group(part, self.settings)
         origin = origin_of(part, self.frame, memories, near=near, edge=group.spacings[0], gap=self.gap)
-        cage = None if origin.state is not None else self._cage_walked(part)
+        cage = None if origin.state is not None else self._prerolled_cage(part)
         elapsed = origin.elapsed(self.frame.time, self.cloth.scene.seconds)
         at = None if self.frame.time is None else float(self.frame.time)
         while True:
             touching = self.cloth.touching(part, frames, near, origin=origin)
             moved = origin.moved(part, self.frame, near, self.cloth.scene.gravity)
-            walked = None if cage is None else cage[0]
-            given = FrameInput(frames, at, touching, moved, walked=walked, elapsed=elapsed)
+            prerolled = None if cage is None else cage[0]
+            frame_input = FrameInput(frames, at, touching, moved, prerolled=prerolled, elapsed=elapsed)
             try:
-                solved = solve_soundly(group, given, origin.state)
+                solved = solve_soundly(group, frame_input, origin.state)
             except RunawayError as error:
                 return self._on_cages(part, error)
-            more = self.cloth.reached(part, frames, solved.points, self.settings)
-            if more <= set(near):
+            reached = self.cloth.reached(part, frames, solved.points, self.settings)
+            if reached <= set(near):
                 break
-            near = tuple(sorted({*near, *more}))
+            near = tuple(sorted({*near, *reached}))
         self._refuse_strayed(part, solved.points)
         entry = solved.telemetry | self._surroundings(part, near)
-        begun = origin.telemetry(None if cage is None else cage[1])
-        entry |= begun | ({"start": solved.telemetry["start"]} if solved.telemetry["start"] != "cold" else {})
+        start = origin.telemetry(None if cage is None else cage[1])
+        entry |= start | ({"start": solved.telemetry["start"]} if solved.telemetry["start"] != "cold" else {})
         cut = is_over()
         entry |= {"time_limit": float(f"{self.limit:.3g}")} if cut else {}
         entry |= _loads(frames)
         states = split(solved.state, group.levels[0].spans, group.levels[-1].spans)
-        found = list[Answer]()
-        for place, (index, memory) in enumerate(zip(part, memories, strict=True)):
+        answers = list[Answer]()
+        for number, (index, memory) in enumerate(zip(part, memories, strict=True)):
             at = self.frame.time, self.frame.garments[index], self.frame.colliders, near, part
-            points, crossing = solved.points[place], solved.crossing[place]
-            ends = {"first": memory.last is None, "whole": self.settings.whole and not cut}
-            now = SolvedFrame(*at, points, states[place], crossing, **ends)
-            before = memory.last if origin.broken is None else origin.frames[place]
-            found.append(Answer(points, entry, GarmentHistory(now, before)))
-        return found
+            points, crossing = solved.points[number], solved.crossing[number]
+            first, is_reusable = memory.last is None, self.settings.is_reusable and not cut
+            solved_frame = SolvedFrame(*at, points, states[number], crossing, first, is_reusable)
+            before = memory.last if origin.broken is None else origin.frames[number]
+            answers.append(Answer(points, entry, GarmentHistory(solved_frame, before)))
+        return answers
 
     def _jumped(self, part: tuple[int, ...], near: tuple[int, ...]) -> bool:
         """Whether the last frame, a candidate for reuse, started from a first frame at a different place."""
@@ -273,19 +276,19 @@ class SceneFrame:
 
     def _surroundings(self, part: tuple[int, ...], near: Sequence[int]) -> dict[str, object]:
         """Telemetry: paths of the bodies near garments, and of garments solved together."""
-        found: dict[str, object] = {}
+        entries: dict[str, object] = {}
         if any(self.cloth.scene.garments[index].colliders for index in part):
-            found["near"] = [self.cloth.scene.colliders[each].path for each in near]
+            entries["near"] = [self.cloth.scene.colliders[body].path for body in near]
         if len(part) > 1:
-            found["together"] = [self.cloth.scene.garments[index].path for index in part]
-        return found
+            entries["together"] = [self.cloth.scene.garments[index].path for index in part]
+        return entries
 
-    def _cage_walked(self, part: tuple[int, ...]) -> tuple[np.ndarray, float] | None:
+    def _prerolled_cage(self, part: tuple[int, ...]) -> tuple[np.ndarray, float] | None:
         """World positions of cages advanced to this frame by another refiner [m], and the start time code."""
-        if self.walked is None:
+        if self.prerolled is None:
             return None
-        found = [each for each in (self.walked[0][index] for index in part) if each is not None]
-        return (np.concatenate(found), self.walked[1]) if len(found) == len(part) else None
+        cages = [cage for cage in (self.prerolled[0][index] for index in part) if cage is not None]
+        return (np.concatenate(cages), self.prerolled[1]) if len(cages) == len(part) else None
 
     def _refuse_strayed(self, part: tuple[int, ...], points: Sequence[np.ndarray]) -> None:
         for index, fine in zip(part, points, strict=True):

@@ -45,7 +45,7 @@ class SolveSettings:
         reset: Thresholds for a cold start.
         cancelled: Asked before each step whether the result is no longer needed; or None.
         rough: Whether a new material uses the last material's Cholesky factor as preconditioner.
-        shown: Called with the positions of each garment [m], by path, after each round of the finest level; or None.
+        show_round: Called after each round of the finest level with the positions of each garment [m] by path; or None.
         ended: Called with the finest level's `LevelProblem` and the final positions [m] after each solve of that level,
             so that the caller can solve it on; or None.
     """
@@ -61,16 +61,18 @@ class SolveSettings:
     contact: ContactSettings = field(default_factory=ContactSettings)
     cancelled: Callable[[], bool] | None = None
     rough: bool = False
-    shown: Callable[[Mapping[str, np.ndarray]], None] | None = None
+    show_round: Callable[[Mapping[str, np.ndarray]], None] | None = None
     ended: Callable[[Any, Any], None] | None = None
 
     @property
-    def whole(self) -> bool:
+    def is_reusable(self) -> bool:
         """Whether the solve is neither rough nor cancelled: such a result may be reused for equal input."""
         return not (self.rough or (self.cancelled is not None and self.cancelled()))
 
     def budget(self, below: int, clock: float, *, warm: bool) -> Budget:
         """The budget of a level, as for `level_budget`."""
-        limits = {"seconds": None if self.budget_ms is None else 1e-3 * self.budget_ms, "cancelled": self.cancelled}
-        found = level_budget(self.steps, self.tolerance, below, warm=warm, clock=clock, **limits)
-        return replace(found, hurried=self.rough)
+        seconds, cancelled = None if self.budget_ms is None else 1e-3 * self.budget_ms, self.cancelled
+        budget = level_budget(
+            self.steps, self.tolerance, below, warm=warm, clock=clock, seconds=seconds, cancelled=cancelled
+        )
+        return replace(budget, hurried=self.rough)

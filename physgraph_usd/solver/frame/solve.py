@@ -32,7 +32,7 @@ from ..level import Placed, unhindered
 from ..scene import GIVEN_UP
 from .group import Group
 from .level_forces import blame
-from .outcome import measured, patched, refuse_swallowed, scaled, state_left, telemetry_of
+from .outcome import measured, next_state, patched, refuse_swallowed, scaled, telemetry_of
 from .problem import LevelProblem, Problem, begin
 from .values import FrameInput, FrameState, Solved
 
@@ -65,35 +65,35 @@ def solve_frame(group: Group, frame: FrameInput, last: FrameState | None, *, few
     refuse_swallowed(problem)
     prepared = time.perf_counter()
     try:
-        problem, reports = _with_cage_untangled(problem, since=prepared, fewer_than=fewer_than)
+        problem, reports = _with_cage_untangled(problem, start_time=prepared, fewer_than=fewer_than)
         if problem.hopeless:
-            x, made, module, memory = problem.subdivided, [], problem.module, None
+            x, level_reports, module, memory = problem.subdivided, [], problem.module, None
         else:
-            x, made, module, memory = _solve_levels(problem, since=prepared, fewer_than=fewer_than)
+            x, level_reports, module, memory = _solve_levels(problem, start_time=prepared, fewer_than=fewer_than)
     except SolveError as error:
         broken = blame(group.garments, problem.forces[-1], problem.cage.points, error=error, at=frame.at)
         raise SolveError(broken) from error
-    finish, shown = dict[str, object](), x
+    finish, visible = dict[str, object](), x
     if problem.contact is not None:
-        shown, finish = problem.contact.finish(x)
-        x = shown if problem.contact.is_out(shown) else x  # What is pushed out in vain is not carried on.
-    solution = scaled(problem, shown)
-    shown, following, figures = patched(problem, solution)
-    left = state_left(problem, x, memory, following)
+        visible, finish = problem.contact.finish(x)
+        x = visible if problem.contact.is_out(visible) else x  # What is pushed out in vain is not carried on.
+    solution = scaled(problem, visible)
+    visible, following, figures = patched(problem, solution)
+    state = next_state(problem, x, memory, following)
     solved = time.perf_counter()
-    telemetry = telemetry_of(problem, solution, module, reports=[*reports, *made])
+    telemetry = telemetry_of(problem, solution, module, reports=[*reports, *level_reports])
     telemetry |= {"start": GIVEN_UP} if problem.hopeless else {}
-    contact, crossing = measured(problem, shown)
+    contact, crossing = measured(problem, visible)
     telemetry |= {"contact": contact | finish} if contact else {}
     telemetry |= {"follows_cage": figures} if figures else {}
     marks = (problem.began, prepared, solved, time.perf_counter())
     pairs = zip(("prepare", "solve", "measure"), marks, marks[1:], strict=False)
     telemetry["milliseconds"] = {name: round(1e3 * (end - start), 3) for name, start, end in pairs}
-    return Solved(problem.placed(shown), left, telemetry, [crossing[span] for span in group.levels[-1].spans])
+    return Solved(problem.placed(visible), state, telemetry, [crossing[span] for span in group.levels[-1].spans])
 
 
 def _solve_levels(
-    problem: Problem, *, since: float, fewer_than: float
+    problem: Problem, *, start_time: float, fewer_than: float
 ) -> tuple[Placed, list[LevelReport], ForceModule, Any]:
     """Solve the levels of a frame, coarsest first; arguments as for `_with_cage_untangled`.
 
@@ -103,25 +103,25 @@ def _solve_levels(
     settings, x, reports = problem.group.settings, None, list[LevelReport]()
     module, memory = ForceModule(()), None
     for index in problem.levels:
-        level = problem.level(index, since=since)
-        if index == problem.finest and settings.shown is not None:
-            level = replace(level, show=partial(_show, problem, settings.shown))
-        x, made, module, memory = solve_one_level(level, *problem.begun(index, x))
+        level = problem.level(index, start_time=start_time)
+        if index == problem.finest and settings.show_round is not None:
+            level = replace(level, show=partial(_show, problem, settings.show_round))
+        x, level_reports, module, memory = solve_one_level(level, *problem.level_start(index, x))
         if index == problem.finest and settings.ended is not None:
             settings.ended(level, x)
         if index < problem.finest:
-            made[-1].energies = module.energies(x)
+            level_reports[-1].energies = module.energies(x)
             if level.view is not None and level.view.look(x).hopeful.count >= fewer_than:
                 raise WorseStartError
-        reports += made
+        reports += level_reports
     assert x is not None
     return x, reports, module, memory
 
 
-def _show(problem: Problem, shown: Callable[[Mapping[str, np.ndarray]], None], x: Placed) -> None:
-    """Show positions of the finest level [m], as `SolveSettings.shown`."""
+def _show(problem: Problem, show: Callable[[Mapping[str, np.ndarray]], None], x: Placed) -> None:
+    """Show positions of the finest level [m], as `SolveSettings.show_round`."""
     paths = [garment.path for garment in problem.group.garments]
-    shown(dict(zip(paths, problem.placed(scaled(problem, x)), strict=True)))
+    show(dict(zip(paths, problem.placed(scaled(problem, x)), strict=True)))
 
 
 def solve_one_level(
@@ -144,8 +144,8 @@ def solve_one_level(
         x = view.moved(x, x + smoothing) if level.index else x
         terms = view.terms(x)
         x = view.moved(x, leave_saddle(problem.system(view, terms, x), level, x, outward=problem.outward))
-    carry, last, terms, made, blocked, touched, integrator = None, None, (), 0, False, False, problem.integrator
-    left = [view.look(x).hopeful.count]
+    carry, last, terms, steps, blocked, touched, integrator = None, None, (), 0, False, False, problem.integrator
+    counts = [view.look(x).hopeful.count]
     while True:
         terms = view.terms(x)
         touched = touched or bool(terms)
@@ -153,21 +153,21 @@ def solve_one_level(
         resume = _resumed(problem, x) if last is None else carry if system.has_same_metric(last) else None
         shrunk = HELD_TOLERANCE if isinstance(system.metric, HeldMetric) else 1.0
         in_bodies = sum(view.look(x).in_bodies)
-        of_round = budget.for_round(
-            made=made, touching=bool(terms), in_bodies=in_bodies > 0, blocked=blocked, shrunk=shrunk
+        round_budget = budget.for_round(
+            steps=steps, touching=bool(terms), in_bodies=in_bodies > 0, blocked=blocked, shrunk=shrunk
         )
-        carry, report = descend(system, integrator, x, level=level.index, budget=of_round, resume=resume)
+        carry, report = descend(system, integrator, x, level=level.index, budget=round_budget, resume=resume)
         report.remaining_move = _smooth_move(system, carry, report)
         reports.append(report)
-        made += report.steps
+        steps += report.steps
         wanted = carry.x
-        begun, x, last = x, view.moved(x, wanted, stuck=_is_stuck(left)), system
+        previous, x, last = x, view.moved(x, wanted, stuck=_is_stuck(counts)), system
         blocked = x is not wanted
         if problem.show is not None:
             problem.show(x)
-        missing = _missing(begun, x, wanted) if blocked else 0.0
-        emerging, left = sum(view.look(x).in_bodies) < in_bodies, [*left, view.look(x).hopeful.count]
-        if budget.ends(report, made=made, touched=touched, emerging=emerging, missing=missing, stuck=_is_stuck(left)):
+        emerging, counts = sum(view.look(x).in_bodies) < in_bodies, [*counts, view.look(x).hopeful.count]
+        missing, stuck = _missing(previous, x, wanted) if blocked else 0.0, _is_stuck(counts)
+        if budget.ends(report, steps=steps, touched=touched, emerging=emerging, missing=missing, stuck=stuck):
             memory = _curvature(integrator, carry)
             break
         if carry.setbacks >= PATIENCE:
@@ -177,20 +177,20 @@ def solve_one_level(
     return x, reports, problem.module.joined_by(terms), memory
 
 
-def _is_stuck(left: Sequence[int]) -> bool:
+def _is_stuck(counts: Sequence[int]) -> bool:
     """Whether crossings are left, and in none of the last `STALLED` rounds fewer than before.
 
     Args:
-        left: Number of crossings at the start and after each round.
+        counts: Number of crossings at the start and after each round.
     """
-    return len(left) > STALLED and 0 < min(left[:-STALLED]) <= min(left[-STALLED:])
+    return len(counts) > STALLED and 0 < min(counts[:-STALLED]) <= min(counts[-STALLED:])
 
 
 def _solve_without_contact(
     problem: LevelProblem, x: Tensor, smoothing: Tensor | None
 ) -> tuple[Placed, list[LevelReport], ForceModule, Any]:
     """Solve a level without contact detection; arguments and results of `solve_one_level`."""
-    system, level, resume = problem.alone, problem.level, _resumed(problem, x)
+    system, level, resume = problem.without_contact, problem.level, _resumed(problem, x)
     x = x if smoothing is None else leave_saddle(system, level, x + smoothing, outward=problem.outward)
     carry, report = descend(system, problem.integrator, x, level=level.index, budget=problem.budget, resume=resume)
     placed = unhindered(carry.x)
@@ -216,25 +216,27 @@ def _curvature(integrator: Integrator, carry: Carry) -> Any:
     return integrator.curvature(carry) if isinstance(integrator, Transporting) else None
 
 
-def _with_cage_untangled(problem: Problem, *, since: float, fewer_than: float) -> tuple[Problem, list[LevelReport]]:
+def _with_cage_untangled(
+    problem: Problem, *, start_time: float, fewer_than: float
+) -> tuple[Problem, list[LevelReport]]:
     """A cold frame that starts at its untangled cage, and a report per round.
 
     Pieces of cloth that are mostly tangled afterwards are given up.
 
     Args:
-        since: Time at which the frame was ready to be solved [s].
+        start_time: Time at which the frame was ready to be solved [s].
         fewer_than: As in `solve_frame`.
     """
     contact = problem.contact
     if contact is None or problem.warm or not contact.crossed:
         return problem, []
-    level = problem.level(0, since=since)
-    view, start = level.view, problem.begun(0, None)[0]
+    level = problem.level(0, start_time=start_time)
+    view, start = level.view, problem.level_start(0, None)[0]
     assert view is not None
     x, reports = _untangle(level, view, Placed(view.closed(start)), view.drawn, most=UNTANGLINGS)
     if view.look(x).hopeful.count >= fewer_than:
         raise WorseStartError
-    return replace(problem, contact=contact.after_cage(x), walked=x), reports
+    return replace(problem, contact=contact.after_cage(x), prerolled=x), reports
 
 
 def _untangle(
@@ -252,7 +254,7 @@ def _untangle(
     level, budget = problem.level, problem.budget
     reports: list[LevelReport] = []
     short, counts = budget.for_untangling(), [view.look(x).hopeful.count]
-    for left in reversed(range(most)):
+    for rounds_left in reversed(range(most)):
         if is_over() or not counts[-1]:
             break
         terms = view.terms(x)
@@ -262,7 +264,7 @@ def _untangle(
         reports.append(report)
         counts.append(view.look(x).hopeful.count)
         gone = counts[-1 - STALLED] - counts[-1] if len(counts) > STALLED else math.inf
-        if counts[-1] * STALLED > gone * left and view.tangled_pieces(x) is not None:
+        if counts[-1] * STALLED > gone * rounds_left and view.tangled_pieces(x) is not None:
             break
     return x, reports
 
@@ -297,15 +299,15 @@ def solve_soundly(group: Group, frame: FrameInput, last: FrameState | None) -> S
         RunawayError: Both results have more energy than the upsampled cage, self contact included.
     """
     solved = solve_frame(group, frame, last)
-    why = _unsound(solved.telemetry)
+    reason = _unsound(solved.telemetry)
     settings = group.settings
-    ended_early = is_over() or settings.budget_ms is not None or settings.steps == 0 or not settings.whole
-    if not why or (last is None and frame.walked is None) or ended_early:
+    ended_early = is_over() or settings.budget_ms is not None or settings.steps == 0 or not settings.is_reusable
+    if not reason or (last is None and frame.prerolled is None) or ended_early:
         return solved
     if last is not None and last.wait:
         return _waiting(solved, last.failures, last.wait - 1)
     given_up = None if last is None else last.given_up
-    again = replace(frame, moved=np.inf, walked=None, elapsed=0.0, given_up=given_up)
+    again = replace(frame, moved=np.inf, prerolled=None, elapsed=0.0, given_up=given_up)
     failures = 1 if last is None else last.failures + 1
     wait = min(2**failures - 1, MOST_WAIT)
     crossings = 0 if "follows_cage" in solved.telemetry else _crossings(solved.telemetry, given_up=True)
@@ -314,9 +316,9 @@ def solve_soundly(group: Group, frame: FrameInput, last: FrameState | None) -> S
     except WorseStartError:
         return _waiting(solved, failures, wait)
     if _is_better(fresh.telemetry, solved.telemetry):
-        return replace(fresh, telemetry=fresh.telemetry | {"start": f"cold: started anew, since {why}"})
-    if all(_excess(each.telemetry, whole=True) > 0.0 for each in (solved, fresh)):
-        raise RunawayError(f"{why}, and a start from the cage ends no better")
+        return replace(fresh, telemetry=fresh.telemetry | {"start": f"cold: started anew, since {reason}"})
+    if all(_excess(result.telemetry, self_contact=True) > 0.0 for result in (solved, fresh)):
+        raise RunawayError(f"{reason}, and a start from the cage ends no better")
     return _waiting(solved, failures, wait)
 
 
@@ -365,14 +367,14 @@ def _given_up(telemetry: Mapping[str, Any]) -> int:
 def _through_bodies(telemetry: Mapping[str, Any]) -> int:
     """Sum over bodies of the result's crossings beyond `MORE` times those of the upsampled cage."""
     bodies = telemetry.get("contact", {}).get("bodies", {}).values()
-    return sum(max(each["after"]["crossings"] - MORE * each["before"]["crossings"], 0) for each in bodies)
+    return sum(max(body["after"]["crossings"] - MORE * body["before"]["crossings"], 0) for body in bodies)
 
 
-def _excess(telemetry: Mapping[str, Any], *, whole: bool = False) -> float:
+def _excess(telemetry: Mapping[str, Any], *, self_contact: bool = False) -> float:
     """Energy of the result above its upsampled cage's, with or without self contact [J]; 0 if below or equal."""
     sides = telemetry["energy_joules"]
-    before = {name: value for name, value in sides["input"].items() if whole or name != "self_contact"}
-    size = sum(abs(each) for each in (*before.values(), *sides["output"].values()))
+    before = {name: value for name, value in sides["input"].items() if self_contact or name != "self_contact"}
+    size = sum(abs(value) for value in (*before.values(), *sides["output"].values()))
     return max(_energy(telemetry) - sum(before.values()) - EQUAL_ENERGY * size, 0.0)
 
 

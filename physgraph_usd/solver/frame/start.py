@@ -24,16 +24,16 @@ class Start:
     """Start of a frame's solve.
 
     Attributes:
-        why: "warm", or "at rest" or "cold" with the reason.
+        reason: "warm", or "at rest" or "cold" with the reason.
         detailed: The finest vertices with the last frame's detail [m], shape (V, 3); None in a cold start.
-        held: Number of frames with a held pose of everything felt by the cloth.
+        still_frames: Number of frames with a held pose of everything felt by the cloth.
         slowed: Resulting factor of the tether stiffness; from `SLOWEST` on the cloth rests.
         rotation: Rotation of the detail at each vertex, shape (V, 3, 3); None in a cold start.
     """
 
-    why: str
+    reason: str
     detailed: Float[Tensor, "vertices 3"] | None = None
-    held: int = 0
+    still_frames: int = 0
     slowed: float = 1.0
     rotation: Float[Tensor, "vertices 3 3"] | None = None
 
@@ -44,8 +44,8 @@ class Start:
 
 
 def start_of(
-    places: tuple[Float[Tensor, "coarse 3"], Float[Tensor, "vertices 3"]],
-    held: int,
+    last_positions: tuple[Float[Tensor, "coarse 3"], Float[Tensor, "vertices 3"]],
+    still_frames: int,
     cage: Cage,
     *,
     frames: MovingFrames,
@@ -55,30 +55,30 @@ def start_of(
     """Carry the last frame's detail along, unless the cage jumped.
 
     Args:
-        places: Cage and fine positions in the last frame, about the cage's origin [m].
-        held: As in `Start`, of the last frame.
+        last_positions: Cage and fine positions in the last frame, about the cage's origin [m].
+        still_frames: As in `Start`, of the last frame.
         reset: Thresholds for a cold start.
         moved: Largest motion of nearby bodies since [m]; infinite if more than poses changed.
     """
-    before, fine = (x.to(cage.points) for x in places)
+    before, fine = (x.to(cage.points) for x in last_positions)
     detailed, rotation, motion, turn, farthest = frames.predict(before, fine, cage.points)
     if motion > reset.move or turn > reset.turn:
         return Start(f"cold: the cage moved {motion:.3g} edges and turned {np.degrees(turn):.3g} degrees")
-    held, slowed = slowing(held, max(farthest, moved) / frames.edge)
-    why = f"at rest: the pose has been held for {held} frames" if slowed >= SLOWEST else "warm"
-    return Start(why, detailed, held, slowed, rotation)
+    still_frames, slowed = slowing(still_frames, max(farthest, moved) / frames.edge)
+    reason = f"at rest: the pose has been held for {still_frames} frames" if slowed >= SLOWEST else "warm"
+    return Start(reason, detailed, still_frames, slowed, rotation)
 
 
-def slowing(held: int, motion: float) -> tuple[int, float]:
+def slowing(still_frames: int, motion: float) -> tuple[int, float]:
     """Number of frames of a held pose including now, and the resulting factor of the tether stiffness.
 
     The factor is bounded to keep the cloth faster than slow motion of the cage or of touching bodies.
 
     Args:
-        held: Number of frames before.
+        still_frames: Number of frames before.
         motion: Largest motion of a cage or body point since, in mean cage edges.
     """
     if motion >= STILL:
         return 0, 1.0
-    held += 1
-    return held, min(SLOWEST, (STILL / max(motion, 1e-9)) ** 2)
+    still_frames += 1
+    return still_frames, min(SLOWEST, (STILL / max(motion, 1e-9)) ** 2)

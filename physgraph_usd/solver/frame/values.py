@@ -26,7 +26,7 @@ class FrameInput:
         at: The time code, for errors.
         touching: Surfaces within reach of the garments.
         moved: Largest motion of the surfaces since the last frame [m]; infinite if more than poses changed.
-        walked: World positions of cages advanced from an earlier frame [m], shape (C, 3), for a cold start; or None.
+        prerolled: World positions of cages advanced from an earlier frame [m], shape (C, 3), for a cold start; or None.
         elapsed: Time since the start frame [s]; 0 for a cold start.
         given_up: As `FrameState.given_up`, for a start from the cage.
     """
@@ -35,7 +35,7 @@ class FrameInput:
     at: float | None = None
     touching: Sequence[Touching] = ()
     moved: float = np.inf
-    walked: np.ndarray | None = None
+    prerolled: np.ndarray | None = None
     elapsed: float = 0.0
     given_up: Bool[Tensor, " coarse"] | None = None
 
@@ -85,7 +85,7 @@ class FrameState:
         inside: Mask of the vertices inside a body, shape (V,), bool.
         given_up: Mask of the pieces of the cage that are given up, shape (C,), bool.
         following: Frames for which each cage vertex's cloth still follows the subdivided cage, as in `no_worse`.
-        held: Number of frames of a held pose.
+        still_frames: Number of frames of a held pose.
         clean: Whether nothing crosses and is given up, neither garments solved together nor bodies.
         failures: Consecutive starts from the cage that did not cure an unsound result.
         wait: Frames until the next start from the cage.
@@ -97,7 +97,7 @@ class FrameState:
     inside: Bool[Tensor, " vertices"]
     given_up: Bool[Tensor, " coarse"]
     following: Int[Tensor, " coarse"]
-    held: int = 0
+    still_frames: int = 0
     clean: bool = False
     failures: int = 0
     wait: int = 0
@@ -108,8 +108,8 @@ class FrameState:
         if motion is AT_REST:
             return self
         coarse, fine = (torch.as_tensor(motion(x.cpu().numpy())).to(x) for x in (self.coarse, self.fine))
-        known = self.curvature
-        turned = None if known is None else replace(known, turn=motion.turn @ known.turn)
+        curvature = self.curvature
+        turned = None if curvature is None else replace(curvature, turn=motion.turn @ curvature.turn)
         return replace(self, coarse=coarse, fine=fine, curvature=turned)
 
     def about(self, origin: np.ndarray) -> tuple[Float[Tensor, "coarse 3"], Placed]:
@@ -143,14 +143,14 @@ def join(parts: Sequence[FrameState]) -> FrameState:
     """Join the states of several garments."""
     if len(parts) == 1:
         return parts[0]
-    one = parts[0].curvature if all(part.curvature is parts[0].curvature for part in parts) else None
+    curvature = parts[0].curvature if all(part.curvature is parts[0].curvature for part in parts) else None
     return FrameState(
         **{name: torch.cat([getattr(part, name) for part in parts]) for name in (*_COARSE, *_FINE)},
-        held=min(part.held for part in parts),
+        still_frames=min(part.still_frames for part in parts),
         clean=all(part.clean for part in parts),
         failures=max(part.failures for part in parts),
         wait=max(part.wait for part in parts),
-        curvature=one,
+        curvature=curvature,
     )
 
 

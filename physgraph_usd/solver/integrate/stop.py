@@ -76,23 +76,23 @@ class Budget:
     warm: bool = False
     hurried: bool = False
 
-    def for_round(self, *, made: int, touching: bool, in_bodies: bool, blocked: bool, shrunk: float) -> Budget:
+    def for_round(self, *, steps: int, touching: bool, in_bodies: bool, blocked: bool, shrunk: float) -> Budget:
         """The budget of a round.
 
         Args:
-            made: Number of steps in all earlier rounds.
+            steps: Number of steps in all earlier rounds.
             touching: Whether there is contact.
             in_bodies: Whether cloth is inside or through a body: the way out changes every few steps.
             blocked: Whether the last round's move was blocked.
             shrunk: Factor of the tolerance: a metric with contact underestimates moves.
         """
-        first, remaining = not made, max(self.steps, self.touching) - made
+        first, remaining = not steps, max(self.steps, self.touching) - steps
         longest = ROUND if blocked or first else CLEAR_ROUND
         longest = HURRIED if self.hurried and first else min(longest, remaining) if touching else FREE_ROUND
         longest = self.steps if first and self.warm and not (self.hurried or in_bodies) else longest
-        steps, tolerance = min(longest, self.steps), shrunk * self.tolerance
+        limit, tolerance = min(longest, self.steps), shrunk * self.tolerance
         rest, least = (self.rest, self.least) if first else (1.0, 0)
-        return replace(self, steps=steps, tolerance=tolerance, rest=rest, least=least)
+        return replace(self, steps=limit, tolerance=tolerance, rest=rest, least=least)
 
     def for_untangling(self) -> Budget:
         """The budget of an untangling round, without a tolerance: contours shorten in small moves."""
@@ -112,25 +112,30 @@ class Budget:
         return "budget" if self.is_spent(steps) else ""
 
     def ends(
-        self, report: Ended, *, made: int, touched: bool, emerging: bool, missing: float, stuck: bool = False
+        self, report: Ended, *, steps: int, touched: bool, emerging: bool, missing: float, stuck: bool = False
     ) -> bool:
         """Whether no further round of the level follows.
 
         Args:
             report: Report of the last round.
-            made: Number of steps in all rounds.
+            steps: Number of steps in all rounds.
             touched: Whether any round had contact.
             emerging: Whether less cloth is inside or through a body than before the last round.
             missing: Part of the last round's moves that was blocked.
             stuck: Whether crossings are left, and the last rounds did not reduce them.
         """
-        if stuck and made >= self.stuck:
+        if stuck and steps >= self.stuck:
             return True
         if report.stopped == "budget" or not report.steps or (report.stopped == "tolerance" and not missing):
             return True
-        if self.warm and not emerging and missing <= LEAST_MISSING and (report.stopped == "seen" or made >= self.steps):
+        if (
+            self.warm
+            and not emerging
+            and missing <= LEAST_MISSING
+            and (report.stopped == "seen" or steps >= self.steps)
+        ):
             return True
-        return made >= (max(self.steps, self.touching) if touched and not self.hurried else self.steps)
+        return steps >= (max(self.steps, self.touching) if touched and not self.hurried else self.steps)
 
     def is_spent(self, steps: int) -> bool:
         """Whether no further step may begin after ``steps`` steps, whatever the cloth's state."""

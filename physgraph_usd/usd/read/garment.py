@@ -154,7 +154,7 @@ class GarmentReader:
         return min(value, self.fitting) if self.values.found[name].source == "fallback" else value
 
     def contact_notices(self) -> list[Notice]:
-        """A notice of a thickness, and an offset from bodies that it feels, large for the garment when it begins."""
+        """Notices of a thickness or an offset from colliders that is large for the garment in its first frame."""
         notices, time, most = [], next(iter(self.source.times), None), 1e3 * self.fitting
         for row in (GARMENT[name] for name in ("thickness", "contact:offset")[: 2 if self.garment.colliders else 1]):
             value, limited = (
@@ -239,12 +239,8 @@ def _motion(
     def read(time: float) -> np.ndarray:
         return weld.joined(place(points.read(time)[0], to_metres(prim, metres, time)))
 
-    pace: dict[str, Any] = {
-        "edges": weld.mesh.half_edges.edges,
-        "frame": FrameGrid.of(stage).length,
-        "seconds": 1.0 / stage.GetTimeCodesPerSecond(),
-    }
-    return CageMotion(times, read, **pace) if times else None
+    edges, frame, seconds = weld.mesh.half_edges.edges, FrameGrid.of(stage).length, 1.0 / stage.GetTimeCodesPerSecond()
+    return CageMotion(times, read, edges=edges, frame=frame, seconds=seconds) if times else None
 
 
 def _animation(

@@ -93,7 +93,7 @@ class CageMotion:
         return [(a, b, c) for a, b, c in found if a is not None and c is not None]
 
     def _beside(self, time: float, by: float) -> float | None:
-        """The nearest sample that is at least so far after a time code, or before it; None without any."""
+        """The nearest sample at least ``by`` time codes after a time code, or before if negative; None without one."""
         wanted = time + by - np.sign(by) * SAME_TIME
         number = bisect_left(self._times, wanted) if by > 0 else bisect_right(self._times, wanted) - 1
         return self._times[number] if 0 <= number < len(self._times) else None

@@ -164,6 +164,15 @@ def run(thing: Any, budgets: list[int], *, clock: Any, most_ms: float) -> dict[i
     return results
 
 
+def arrays_of(runs: list[dict[int, tuple[np.ndarray, float]]]) -> dict[str, Any]:
+    """Positions [m] of the last run, and times of all runs [ms], of the budgets that all runs have, by name."""
+    arrays: dict[str, Any] = {}
+    for steps in set.intersection(*(set(run) for run in runs)):
+        arrays[f"x_0_{steps}"] = runs[-1][steps][0]
+        arrays[f"ms_0_{steps}"] = np.array([run[steps][1] for run in runs])
+    return arrays
+
+
 def main() -> None:
     """Solve with every budget and write positions and times."""
     parser = argparse.ArgumentParser()
@@ -178,11 +187,7 @@ def main() -> None:
     level = Finest(np.load(arguments.problem))
     budgets = [int(steps) for steps in arguments.steps.split(",")]
     runs = [run(build(level), budgets, clock=clock, most_ms=arguments.most_ms) for _ in range(arguments.repeats)]
-    results: dict[str, Any] = {}
-    for steps in set.intersection(*(set(run) for run in runs)):
-        results[f"x_0_{steps}"] = runs[-1][steps][0]
-        results[f"ms_0_{steps}"] = np.array([run[steps][1] for run in runs])
-    np.savez(arguments.result, **results)
+    np.savez(arguments.result, **arrays_of(runs))
 
 
 if __name__ == "__main__":

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -138,6 +139,31 @@ def solve(levels: list[Level], maps: list[sp.csr_matrix], steps: int, *, nested:
     return x
 
 
+def measured(
+    levels: list[Level],
+    maps: list[sp.csr_matrix],
+    budgets: list[int],
+    *,
+    clock: Callable[[], float],
+    repeats: int,
+    most_ms: float,
+) -> dict[str, Any]:
+    """Positions [m] and times [ms] of each budget, on the finest level alone and nested, by name."""
+    arrays: dict[str, Any] = {}
+    for nested in (False, True):
+        solve(levels, maps, 1, nested=nested)
+        for steps in budgets:
+            spent, x = [], levels[-1].base
+            for _ in range(repeats):
+                began = clock()
+                x = solve(levels, maps, steps, nested=nested)
+                spent.append(1e3 * (clock() - began))
+            arrays[f"x_{nested:d}_{steps}"], arrays[f"ms_{nested:d}_{steps}"] = x, np.array(spent)
+            if 2.0 * min(spent) > most_ms:
+                break
+    return arrays
+
+
 def main() -> None:
     """Solve with every budget and write positions and times."""
     parser = argparse.ArgumentParser()
@@ -159,19 +185,9 @@ def main() -> None:
         sp.csr_matrix((problem[f"map_values{i}"], problem[f"map_columns{i}"], problem[f"map_starts{i}"]))
         for i in range(1, count)
     ]
-    results: dict[str, Any] = {}
-    for nested in (False, True):
-        solve(levels, maps, 1, nested=nested)
-        for steps in map(int, arguments.steps.split(",")):
-            spent, x = [], levels[-1].base
-            for _ in range(arguments.repeats):
-                began = clock()
-                x = solve(levels, maps, steps, nested=nested)
-                spent.append(1e3 * (clock() - began))
-            results[f"x_{nested:d}_{steps}"], results[f"ms_{nested:d}_{steps}"] = x, np.array(spent)
-            if 2.0 * min(spent) > arguments.most_ms:
-                break
-    np.savez(arguments.result, **results)
+    budgets = [int(steps) for steps in arguments.steps.split(",")]
+    arrays = measured(levels, maps, budgets, clock=clock, repeats=arguments.repeats, most_ms=arguments.most_ms)
+    np.savez(arguments.result, **arrays)
 
 
 if __name__ == "__main__":

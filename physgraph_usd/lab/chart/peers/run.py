@@ -84,22 +84,30 @@ def parse_peers(values: Sequence[str]) -> list[tuple[Peer, str]]:
 def measure_peers(bench: CurveBench, peers: Sequence[tuple[Peer, str]], *, clock_name: str) -> None:
     """Measure peers, each with its Python, on the frames of a bench by a clock that is "wall" or "cpu"."""
     for (peer, python), frame in product(peers, bench.frames):
-        key = {"method": peer.name, "frame": frame.time}
-        if bench.journal.one("point", **key) or bench.journal.one("failed", **key):
+        if any(bench.journal.one(kind, method=peer.name, frame=frame.time) for kind in ("point", "failed")):
             continue
         bench.clock.say(peer.name)
         try:
             results = _run(peer, python, bench.timed, frame, plan=bench.plan, clock_name=clock_name)
         except SolveError as error:
-            bench.journal.add("failed", steps=0, error=str(error), **key)
+            bench.journal.add("failed", steps=0, error=str(error), method=peer.name, frame=frame.time)
             continue
         for nested, steps, points, times in results:
-            key["method"] = f"{peer.name}, nested" if nested else peer.name
             judged = bench.judged(frame, points)
-            about = {"integrator": peer.name, "nested": nested, "note": peer.note, "made": steps}
             for repeat, ms in enumerate(times):
-                first = {} if repeat else judged
-                bench.journal.add("point", **key, steps=steps, repeat=repeat, ms=ms, **about, **first)
+                bench.journal.add(
+                    "point",
+                    method=f"{peer.name}, nested" if nested else peer.name,
+                    frame=frame.time,
+                    steps=steps,
+                    repeat=repeat,
+                    ms=ms,
+                    integrator=peer.name,
+                    nested=nested,
+                    note=peer.note,
+                    made=steps,
+                    **({} if repeat else judged),
+                )
 
 
 def _run(
