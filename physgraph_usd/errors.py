@@ -81,8 +81,8 @@ class GarmentError(StageError):
     def __init__(self, path: str, problem: str, *, time: float | None = None, remedy: str = "") -> None:
         """Compose the message from place, problem and remedy."""
         self.path, self.problem, self.time, self.remedy = path, problem, time, remedy
-        where = f"<{path}>" if time is None else f"<{path}> at time code {named_time(time)}"
-        super().__init__(f"{where}: {problem}" + (f"; {remedy}" if remedy else ""))
+        location = f"<{path}>" if time is None else f"<{path}> at time code {named_time(time)}"
+        super().__init__(f"{location}: {problem}" + (f"; {remedy}" if remedy else ""))
 
 
 class SchemaError(StageError):
@@ -115,8 +115,8 @@ class UnexpectedError(PhysGraphError):
         """Compose the message, in one line, from place, exception and remedy."""
         self.kind, self.text, self.trace = kind, " ".join(text.split())[:LONGEST_TEXT], trace
         self.place = Place() if place is None else place
-        what = f"unexpected {kind}: {self.text}" + (f" ({self.place.code})" if self.place.code else "")
-        super().__init__(f"{self.place.named()}{what}; {self._remedy()}")
+        fault = f"unexpected {kind}: {self.text}" + (f" ({self.place.code})" if self.place.code else "")
+        super().__init__(f"{self.place.named()}{fault}; {self._remedy()}")
 
     def _remedy(self) -> str:
         options = ["--frames"] * (self.place.time is not None) + ["--garment"] * bool(self.place.prims)
@@ -181,8 +181,8 @@ def place_of(error: BaseException, *, time: float | None = None) -> Place:
     if isinstance(error, GarmentError):
         at = at | {"prims": (error.path,)} | ({} if error.time is None else {"time": error.time})
     lines = _OF_PACKAGE.findall("".join(traceback.format_exception(error)))
-    own = [(file.replace("\\", "/"), line, name) for file, line, name in lines]
-    code = "{}, line {}, in {}".format(*own[-1]) if own else ""
+    own_frames = [(file.replace("\\", "/"), line, name) for file, line, name in lines]
+    code = "{}, line {}, in {}".format(*own_frames[-1]) if own_frames else ""
     return Place(tuple(at.get("prims", ())), at.get("time", time), code)
 
 

@@ -14,36 +14,36 @@ PRINTED_IN_FULL = ("problem", "defects", "warnings", "notes", "command", "exit_c
 """Entries of the result that `details` leaves out."""
 
 
-def summary(found: Mapping[str, Any]) -> Iterator[str]:
+def summary(inspected: Mapping[str, Any]) -> Iterator[str]:
     """Lines for a first look: garments, bodies, problems, warnings, cost, and the command to run.
 
     Args:
-        found: Result of `inspect_shot`.
+        inspected: Result of `inspect_shot`.
     """
-    yield _heading(found)
-    if "garments" in found:
-        yield from _listed("garments", [_garment(each) for each in found["garments"]])
-        yield from _listed("bodies", found["colliders"])
+    yield _heading(inspected)
+    if "garments" in inspected:
+        yield from _listed("garments", [_garment(garment) for garment in inspected["garments"]])
+        yield from _listed("bodies", inspected["colliders"])
     else:
-        yield from _listed("meshes", _meshes(found["meshes"]))
-    yield from _listed("problems", _problems(found))
-    yield from _listed("warnings", found["warnings"])
-    yield from _listed("notes", found.get("notes", ()))
-    yield from _cost(found)
+        yield from _listed("meshes", _meshes(inspected["meshes"]))
+    yield from _listed("problems", _problems(inspected))
+    yield from _listed("warnings", inspected["warnings"])
+    yield from _listed("notes", inspected.get("notes", ()))
+    yield from _cost(inspected)
     yield "details: every value and its source with --details"
-    if "command" in found:
-        yield f"command: {found['command']}"
+    if "command" in inspected:
+        yield f"command: {inspected['command']}"
 
 
-def details(found: Mapping[str, Any]) -> Iterator[str]:
+def details(inspected: Mapping[str, Any]) -> Iterator[str]:
     """Lines of everything that the summary leaves out or shortens."""
-    return outline({name: value for name, value in found.items() if name not in PRINTED_IN_FULL})
+    return outline({name: value for name, value in inspected.items() if name not in PRINTED_IN_FULL})
 
 
-def _heading(found: Mapping[str, Any]) -> str:
-    times = found.get("times")
+def _heading(inspected: Mapping[str, Any]) -> str:
+    times = inspected.get("times")
     frames = f"{counted(len(times), 'frame')}, {_range(times)}, " if times else ""
-    return f"shot: {found['shot']}, {frames}1 unit is {found['metres_per_unit']:g} m"
+    return f"shot: {inspected['shot']}, {frames}1 unit is {inspected['metres_per_unit']:g} m"
 
 
 def _range(times: Sequence[float]) -> str:
@@ -70,8 +70,8 @@ def _meshes(meshes: Sequence[Mapping[str, Any]]) -> list[str]:
     """Meshes of a stage, those most like garments first."""
     ordered = sorted(meshes, key=lambda mesh: (not mesh["garment"], mesh["form"] != "open", not mesh["samples"]))
     lines = [_mesh(mesh) for mesh in ordered[:MOST_MESHES]]
-    left = len(ordered) - len(lines)
-    return lines + ([f"and {left:,} more, which --details lists"] if left else [])
+    remaining = len(ordered) - len(lines)
+    return lines + ([f"and {remaining:,} more, which --details lists"] if remaining else [])
 
 
 def _mesh(mesh: Mapping[str, Any]) -> str:
@@ -80,22 +80,23 @@ def _mesh(mesh: Mapping[str, Any]) -> str:
     return f"{mesh['path']}: {', '.join(parts)}"
 
 
-def _problems(found: Mapping[str, Any]) -> list[str]:
+def _problems(inspected: Mapping[str, Any]) -> list[str]:
     """The reason that a shot cannot be refined, and defects of meshes."""
-    problems = [found["problem"]] if "problem" in found else []
-    faulty = [mesh for mesh in found.get("meshes", ()) if mesh["problem"] != "none"]
+    problems = [inspected["problem"]] if "problem" in inspected else []
+    faulty = [mesh for mesh in inspected.get("meshes", ()) if mesh["problem"] != "none"]
     problems += [f"{mesh['path']}: {mesh['problem']}" for mesh in faulty[:MOST_MESHES]]
-    for path, defects in found.get("defects", {}).items():
+    for path, defects in inspected.get("defects", {}).items():
         problems += [f"{path}: {defect}" for defect in defects]
     return list(dict.fromkeys(problems))
 
 
-def _cost(found: Mapping[str, Any]) -> Iterator[str]:
+def _cost(inspected: Mapping[str, Any]) -> Iterator[str]:
     """Estimates of memory, disk and time."""
-    if known := found.get("estimate"):
-        yield f"memory: {known['memory_mb']:,.0f} MB for one process; the layer: {known['layer_mb']:,.4g} MB on disk"
-    if timed := found.get("timed"):
+    if estimate := inspected.get("estimate"):
+        layer = f"the layer: {estimate['layer_mb']:,.4g} MB on disk"
+        yield f"memory: {estimate['memory_mb']:,.0f} MB for one process; {layer}"
+    if timed := inspected.get("timed"):
         seconds = [f"{timed[name]:g} s" for name in ("first_frame_seconds", "seconds_a_frame", "whole_shot_seconds")]
         yield "time: {} for the first frame, {} for each frame after it, {} for the whole shot".format(*seconds)
-    if words := found.get("from_rest", {}).get("words"):
+    if words := inspected.get("from_rest", {}).get("words"):
         yield f"distance from rest: {words}"

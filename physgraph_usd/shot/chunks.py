@@ -67,7 +67,7 @@ def frames_in_order(
         join: Joins the frames before a seam; None leaves them as solved before the seam.
     """
     ends = {index: seam for seam, before in _joined_at(seams).items() for index in before}
-    both: list[tuple[Outcome, Outcome]] = []
+    pairs: list[tuple[Outcome, Outcome]] = []
     for index in numbers:
         leave_if_asked()
         outcome = read(index, None)
@@ -76,10 +76,10 @@ def frames_in_order(
         if join is None or index not in ends:
             yield outcome
             continue
-        both.append((outcome, read(index, ends[index])))
+        pairs.append((outcome, read(index, ends[index])))
         if index + 1 == ends[index]:
-            yield from join(ends[index], both)
-            both = []
+            yield from join(ends[index], pairs)
+            pairs = []
 
 
 def _joined_at(seams: Mapping[int, int]) -> dict[int, range]:
@@ -134,9 +134,9 @@ def solve_in_chunks(
         stored = partial(frames.read, index, times[index], seam=seam)
         return _await(stored, times[index], call=calls.get(index if seam is None else seam), solved=solved)
 
-    def joined(own: Movers, seam: int, both: Both) -> Sequence[Outcome]:
+    def joined(seam_movers: Movers, seam: int, pairs: Both) -> Sequence[Outcome]:
         finished = result_of(calls[seam - 1]).get(seam) if seam - 1 in calls else None
-        joint = finished or join(both, own)
+        joint = finished or join(pairs, seam_movers)
         warn(*joint.warnings)
         return joint.frames
 
@@ -167,8 +167,8 @@ def _work(job: tuple[Any, ...], seams: Mapping[int, int], movers: Movers | None)
     def read(index: int, seam: int | None) -> Any:
         return frames.read(index, times[index], seam=seam)
 
-    def joined(seam: int, both: Both) -> Sequence[Outcome]:
-        joints[seam] = join(both, chunk_movers)
+    def joined(seam: int, pairs: Both) -> Sequence[Outcome]:
+        joints[seam] = join(pairs, chunk_movers)
         return joints[seam].frames
 
     before = [

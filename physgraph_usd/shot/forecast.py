@@ -38,16 +38,18 @@ class Forecast:
         """
         self._ends.append(seconds)
         done = len(self._ends) - 1
-        left = self._frames - done
-        if done < TIMED_FRAMES or left <= 0:
+        frames_left = self._frames - done
+        if done < TIMED_FRAMES or frames_left <= 0:
             return ""
         recent = max(round(RECENT * (done - 1)), TIMED_FRAMES - 1)
-        remaining = left * mean(b - a for a, b in zip(self._ends[-recent - 1 :], self._ends[-recent:], strict=False))
-        whole = seconds + remaining
-        is_new = not 1 / REVISED < whole / max(self._given, 1e-9) < REVISED
+        remaining = frames_left * mean(
+            b - a for a, b in zip(self._ends[-recent - 1 :], self._ends[-recent:], strict=False)
+        )
+        total = seconds + remaining
+        is_new = not 1 / REVISED < total / max(self._given, 1e-9) < REVISED
         if not is_new or (remaining < LONG_RUN and not self._given):
             return ""
-        self._given = whole
+        self._given = total
         at = clock.strftime("%H:%M", clock.localtime(clock.time() + remaining))
         minutes = f"{remaining / 60.0:.0f} min" if remaining < 5400.0 else f"{remaining / 3600.0:.1f} h"
         return f"{done} of {self._count} frames in {seconds:.0f} s: all in about {minutes} more, at {at}"

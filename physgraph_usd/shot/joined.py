@@ -56,25 +56,25 @@ class Joint:
         return [f"{jump}: {self.why}"] if self.why else []
 
 
-def join(both: Both, movers: Movers) -> Joint:
+def join(solutions: Both, movers: Movers) -> Joint:
     """Join the frames of one seam.
 
     Args:
-        both: The frames before the seam, each with the solution of the process behind the seam.
+        solutions: The frames before the seam, each with the solution of the process behind the seam.
         movers: Asked for a mover if any frame differs.
     """
     frames, mover = list[Outcome](), cache(movers)
-    for k, (earlier, after) in enumerate(both, start=1):
-        pairs, weight = list(zip(earlier.points, after.points, strict=False)), k / (len(both) + 1)
+    for k, (earlier, after) in enumerate(solutions, start=1):
+        pairs, weight = list(zip(earlier.points, after.points, strict=False)), k / (len(solutions) + 1)
         if all(a is None or b is None or np.array_equal(a, b) for a, b in pairs):
             frames.append(earlier)
             continue
         wanted = [a if a is None or b is None else between(a, b, weight) for a, b in pairs]
         near, far = [a for a, _ in pairs], [b for _, b in pairs]
-        points, why = mover()(earlier.time, *((near, far) if weight < 0.5 else (far, near)), wanted)
+        points, reason = mover()(earlier.time, *((near, far) if weight < 0.5 else (far, near)), wanted)
         leave_if_asked()  # A signal may have cut the move short.
-        if why:
-            return Joint([earlier for earlier, _ in both], why)
+        if reason:
+            return Joint([earlier for earlier, _ in solutions], reason)
         frames.append(replace(earlier, points=tuple(points), reused=(False,) * len(points)))
     return Joint(frames, "")
 

@@ -209,15 +209,15 @@ def of_inertia(garments: Sequence[Mapping[str, Any]], frames: Sequence[Mapping[s
         garments: A report's garments.
         frames: A report's frames.
     """
-    found = [
+    entries = [
         (entry["inertia"], garment["path"], frame["time"])
         for frame in frames
         for garment, entry in zip(garments, frame.get("garments", ()), strict=False)
         if entry.get("inertia")
     ]
-    if not found:
+    if not entries:
         return []
-    most, path, time = max(found, key=lambda each: each[0])
-    when = counted(len({each[2] for each in found}), "frame")
+    most, path, time = max(entries, key=lambda felt: felt[0])
+    when = counted(len({felt[2] for felt in entries}), "frame")
     text = f"inertia: in {when} cloth feels the acceleration of its animation, up to {most:.2g} times gravity beyond it"
     return [f"{text} (<{path}>{at_time(time)}); --set inertia=0 leaves it out"]

@@ -77,15 +77,15 @@ class RunIn:
             self._say(now)
         return self._read(time)
 
-    def _say(self, now: float) -> None:
+    def _say(self, moment: float) -> None:
         """Say at the start what may come, and every `EVERY_SECONDS` how far the run-in is."""
         solved, most = len(self._cold) + len(self._carried), sum(self.most)
         if not solved:
             text = f"time code {named_time(self._times[-1])} needs a run-in, for its cage crosses itself: "
             text += f"before it the cages alone are solved, at most {most} times"
-        elif now - self._messaged < EVERY_SECONDS:
+        elif moment - self._messaged < EVERY_SECONDS:
             return
         else:
             text = f"run-in: {solved} of at most {solved + most} cages solved, at most about {self.left:.0f} s left"
-        self._messaged = now
+        self._messaged = moment
         LOG.log(NOTICE, "%s", text, extra={"shot": self._shot})

@@ -139,10 +139,10 @@ class _Joins:
         """Frames by number, joined, then a check of the seams (LayerError)."""
         solver = ShotSolver(self.shot.path, self.run["levels"], self.parts[0].options(), opened=self.shot)
 
-        def joined(seam: int, both: Both) -> Sequence[Outcome]:
-            joint = join(both, solver.mover)
+        def joined(seam: int, solutions: Both) -> Sequence[Outcome]:
+            joint = join(solutions, solver.mover)
             self.warn(*joint.warnings)
-            self._measure(seam, both, joint)
+            self._measure(seam, solutions, joint)
             return joint.frames
 
         yield from frames_in_order(self._read, numbers, self.starts, join=joined)
@@ -151,18 +151,20 @@ class _Joins:
     def _read(self, index: int, seam: int | None) -> Outcome:
         time = self.run["times"][index]
         if outcome := self.chunks[index if seam is None else seam].read(index, time, seam=seam):
-            kept = () if index in self._anew and seam is None else outcome.reused  # No frame before, or not its own.
-            return replace(outcome, reused=kept or (False,) * len(outcome.reused))
+            reused = () if index in self._anew and seam is None else outcome.reused  # No frame before, or not its own.
+            return replace(outcome, reused=reused or (False,) * len(outcome.reused))
         raise LayerError(f"the result of time code {time} is gone; refine it anew by --resume")
 
-    def _measure(self, seam: int, both: Both, joint: Joint) -> None:
+    def _measure(self, seam: int, solutions: Both, joint: Joint) -> None:
         """Measure a seam; unknown if the last frame failed in either chunk."""
         after = self.run["times"][seam]
         for index, (source, mesh) in enumerate(zip(self.shot.sources, self.meshes, strict=True)):
-            moves = _moves(both, joint, index, mesh.half_edges.edges)
+            moves = _moves(solutions, joint, index, mesh.half_edges.edges)
             if moves is not None:
                 rms, largest = map(float, np.max(moves, axis=0))
-                self.seams.append(Seam(after, str(source.path), rms, largest, 0 if joint.why else len(both), joint.why))
+                self.seams.append(
+                    Seam(after, str(source.path), rms, largest, 0 if joint.why else len(solutions), joint.why)
+                )
 
     def _check(self) -> None:
         """Refuse a seam with too large a move, or an unmeasured seam although frames depend on their predecessors."""
@@ -296,45 +298,45 @@ def _make_folder(folder: Path) -> None:
         raise LayerError(f"cannot make the folder {folder}: {error.strerror}") from error
 
 
-def chunks_in(places: Sequence[str | Path], *, partial: bool = False) -> list[Chunk]:
+def chunks_in(paths: Sequence[str | Path], *, partial: bool = False) -> list[Chunk]:
     """The chunks sorted by frames; unrelated entries in a folder of chunks are ignored.
 
     Args:
-        places: Folders of chunks and chunks.
+        paths: Folders of chunks and chunks.
         partial: Whether a single place may be the folder of a stopped run's finished frames, or the run's layer.
 
     Raises:
-        UsageError: A place is no such folder, or no frame is finished.
+        UsageError: A path is no such folder, or no frame is finished.
     """
-    found: dict[Path, Chunk] = {}
-    for place in map(Path, places):
-        if partial and (folder := stopped_run(place)) is not None:
-            found[folder.resolve()] = Chunk(folder, record_in(folder))
+    chunks: dict[Path, Chunk] = {}
+    for path in map(Path, paths):
+        if partial and (folder := stopped_run(path)) is not None:
+            chunks[folder.resolve()] = Chunk(folder, record_in(folder))
             continue
-        run = record_in(place)
-        inside = [] if run or not place.is_dir() else [child for child in sorted(place.iterdir()) if record_in(child)]
+        run = record_in(path)
+        inside = [] if run or not path.is_dir() else [child for child in sorted(path.iterdir()) if record_in(child)]
         if not inside and not _is_of_chunk(run):
-            other = "; --partial takes the finished frames of a stopped run" if stopped_run(place) else ""
-            remedy = f"refine with --preroll makes one{other}"
-            raise UsageError(f"{place} is no chunk of a shot, nor a folder of chunks; {remedy}")
-        for folder in inside or [place]:
+            alternative = "; --partial takes the finished frames of a stopped run" if stopped_run(path) else ""
+            remedy = f"refine with --preroll makes one{alternative}"
+            raise UsageError(f"{path} is no chunk of a shot, nor a folder of chunks; {remedy}")
+        for folder in inside or [path]:
             if _is_of_chunk(record := record_in(folder)):
-                found[folder.resolve()] = Chunk(folder, record)
-    parts = [part for part in found.values() if part.numbers]
+                chunks[folder.resolve()] = Chunk(folder, record)
+    parts = [part for part in chunks.values() if part.numbers]
     if not parts:
-        raise UsageError(f"there are no frames to stitch in {', '.join(map(str, places)) or 'no folders'}")
+        raise UsageError(f"there are no frames to stitch in {', '.join(map(str, paths)) or 'no folders'}")
     stopped = [part for part in parts if CHUNK not in part.run]
     if stopped and len(parts) > 1:
         raise UsageError(f"{stopped[0].folder} is of a stopped run, which is no chunk; give it alone")
     return sorted(parts, key=lambda part: part.numbers)
 
 
-def stopped_run(place: Path) -> Path | None:
+def stopped_run(path: Path) -> Path | None:
     """The folder of the finished frames of a stopped run, given the folder or the run's layer; None if it is neither.
 
     A run that goes on has such a folder too.
     """
-    folder = place if place.is_dir() else frames_folder(place)
+    folder = path if path.is_dir() else frames_folder(path)
     run = record_in(folder)
     return folder if CHUNK not in run and _is_of_chunk({CHUNK: [], **run}) else None
 
@@ -424,7 +426,7 @@ def _spans(times: Sequence[float], every: Sequence[float]) -> str:
     return ", ".join(map(_span, runs))
 
 
-def _moves(both: Both, joint: Joint, index: int, edges: np.ndarray) -> list[tuple[float, float]] | None:
+def _moves(solutions: Both, joint: Joint, index: int, edges: np.ndarray) -> list[tuple[float, float]] | None:
     """Extra moves of a garment at a seam, RMS and largest, in mean edges; None if unknown.
 
     Joined frames move by equal parts of the difference plus the lag of blocked cloth; a jump moves by the whole
@@ -432,17 +434,17 @@ def _moves(both: Both, joint: Joint, index: int, edges: np.ndarray) -> list[tupl
     """
     moves, lag = [], np.zeros(1)
     jump: tuple[float, float] | None = None
-    for k, ((earlier, after), frame) in enumerate(zip(both, joint.frames, strict=True), start=1):
+    for k, ((earlier, after), frame) in enumerate(zip(solutions, joint.frames, strict=True), start=1):
         points = [outcome.points[index] if outcome.points else None for outcome in (earlier, after, frame)]
         jump, (a, b, x) = None, points
         if a is None or b is None or x is None:
             continue
         a, b = a.astype(np.float64), b.astype(np.float64)
         edge = float(np.linalg.norm(a[edges[:, 0]] - a[edges[:, 1]], axis=1).mean())
-        before, lag = lag, x - between(a, b, k / (len(both) + 1))
-        part, jump = (b - a) / (len(both) + 1), _size(b - a, edge)
+        before, lag = lag, x - between(a, b, k / (len(solutions) + 1))
+        part, jump = (b - a) / (len(solutions) + 1), _size(b - a, edge)
         moves.append(_size(part + lag - before, edge))
-        if earlier is both[-1][0]:
+        if earlier is solutions[-1][0]:
             moves.append(_size(part - lag, edge))
     if jump is None:
         return None

@@ -44,9 +44,9 @@ def preview_any(
     layer, out = Path(layer), Path(out)
     if layer.is_file() or not (layer.is_dir() or stopped_run(layer)):
         return preview(layer, out, shot=shot, times=times, **look)
-    (run, *more) = chunks_in([layer], partial=True)
-    if more:
-        raise UsageError(f"{layer} holds {len(more) + 1} chunks; name one of them")
+    (run, *further) = chunks_in([layer], partial=True)
+    if further:
+        raise UsageError(f"{layer} holds {len(further) + 1} chunks; name one of them")
     check_picture(out, times=times, overwrite=look.get("overwrite", False))
     numbers = _numbers(run, times, single=out.suffix.lower() == STILL)
     source = Path(shot) if shot is not None else run.shot
@@ -54,7 +54,9 @@ def preview_any(
     with closing(open_for(str(source), options)) as opened:
         check_same_shot(run, made_from(opened, run.folder, options))
         outcomes = [run.read(number, run.run["times"][number]) for number in numbers]
-        return draw_frames(opened, run.run["levels"], [each for each in outcomes if each], out, options=options, **look)
+        return draw_frames(
+            opened, run.run["levels"], [outcome for outcome in outcomes if outcome], out, options=options, **look
+        )
 
 
 def _numbers(run: Chunk, times: Sequence[float] | None, *, single: bool) -> list[int]:
@@ -66,6 +68,6 @@ def _numbers(run: Chunk, times: Sequence[float] | None, *, single: bool) -> list
         return finished[-1:] if single else finished
     wanted = [every.index(time) if time in every else -1 for time in times]
     if absent := [named_time(time) for time, number in zip(times, wanted, strict=True) if number not in run.kept]:
-        there = ", ".join(named_time(every[number]) for number in finished)
-        raise UsageError(f"{', '.join(absent)}: not finished in {run.folder}; finished: {there}")
+        codes = ", ".join(named_time(every[number]) for number in finished)
+        raise UsageError(f"{', '.join(absent)}: not finished in {run.folder}; finished: {codes}")
     return sorted(set(wanted))

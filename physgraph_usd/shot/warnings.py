@@ -281,39 +281,39 @@ def of_contact(garment: Mapping[str, Any], entries: Entries) -> Iterator[str]:
         counts = remaining[times[0]]
         named = [f"{text} ({before:,} in the subdivided cage)" for text, _, before in counts]
         are = "is" if len(counts) == 1 and counts[0][1] == 1 else "are"
-        together = _together(garment["path"], entries[times[0]])
-        yield WARNINGS["contact"](garment["path"], times, left=", ".join(named), are=are, together=together)
+        counted_with = _together(garment["path"], entries[times[0]])
+        yield WARNINGS["contact"](garment["path"], times, left=", ".join(named), are=are, together=counted_with)
 
 
 def of_more(report: RefineReport) -> list[str]:
     """A warning for each garment with more crossings in a frame than its subdivided cage, with the first such frame."""
-    found: dict[str, list[tuple[float | None, int, int, str]]] = {}
+    figures_of: dict[str, list[tuple[float | None, int, int, str]]] = {}
     for frame in report.frames:
         for garment, entry in zip(report.garments, frame.get("garments", ()), strict=False):
             after, before = (_crossings(entry.get("contact") or {}, side) for side in ("after", "before"))
             if after > before and is_first(garment["path"], entry):
                 figures = frame["time"], after, before, _together(garment["path"], entry)
-                found.setdefault(garment["path"], []).append(figures)
+                figures_of.setdefault(garment["path"], []).append(figures)
     warnings = []
-    for path in [garment["path"] for garment in report.garments if garment["path"] in found]:
-        frames = found[path]
-        _, after, before, together = frames[0]
-        left, are = counted(after, "crossing"), "is" if after == 1 else "are"
+    for path in [garment["path"] for garment in report.garments if garment["path"] in figures_of]:
+        frames = figures_of[path]
+        _, after, before, counted_with = frames[0]
+        remaining, are = counted(after, "crossing"), "is" if after == 1 else "are"
         times = [time for time, *_ in frames]
-        warnings.append(WARNINGS["more"](path, times, left=left, are=are, before=before, together=together))
+        warnings.append(WARNINGS["more"](path, times, left=remaining, are=are, before=before, together=counted_with))
     return warnings
 
 
 def _crossings(contact: Mapping[str, Any], side: str) -> int:
     """Crossings of cloth and with all bodies, "before" or "after"."""
     measured = [contact.get("cloth") or {}, *(contact.get("bodies") or {}).values()]
-    return sum(int(each.get(side, {}).get("crossings", 0)) for each in measured)
+    return sum(int(counts.get(side, {}).get("crossings", 0)) for counts in measured)
 
 
 def _together(path: str, entry: Mapping[str, Any]) -> str:
     """Text naming the other garments that figures of a garment count too; "" for a garment solved by itself."""
-    others = [f"<{other}>" for other in entry.get("together") or () if other != path]
-    return f", counted together with {', '.join(others)}" if others else ""
+    paths = [f"<{garment}>" for garment in entry.get("together") or () if garment != path]
+    return f", counted together with {', '.join(paths)}" if paths else ""
 
 
 def of_drawn(depths_at: Mapping[float | None, Mapping[str, float]]) -> list[str]:

@@ -105,8 +105,8 @@ def _identity(path: Path) -> object:
     return status.st_dev, status.st_ino
 
 
-def check_suffix(what: str, path: Path, known: Sequence[str]) -> None:
+def check_suffix(kind: str, path: Path, suffixes: Sequence[str]) -> None:
     """Refuse (UsageError) a file name with an unknown suffix."""
-    if path.suffix not in known:
+    if path.suffix not in suffixes:
         suffix = f"the suffix '{path.suffix}'" if path.suffix else "no suffix"
-        raise UsageError(f"{what} {path} has {suffix}; known suffixes: {', '.join(known)}")
+        raise UsageError(f"{kind} {path} has {suffix}; known suffixes: {', '.join(suffixes)}")

@@ -78,10 +78,10 @@ class Found:
         return check_limits(self.row, read_number(self.attribute, time) * self.scale, self.source)
 
 
-def check_known(what: str, word: object, known: Collection[object]) -> None:
+def check_known(kind: str, word: object, choices: Collection[object]) -> None:
     """Refuse (UsageError) an unknown word; the message lists the known words in order."""
-    if word not in known:
-        raise UsageError(f"unknown {what} '{word}'; known {what}s: {', '.join(map(str, known))}")
+    if word not in choices:
+        raise UsageError(f"unknown {kind} '{word}'; known {kind}s: {', '.join(map(str, choices))}")
 
 
 def parse_overrides(texts: Sequence[str]) -> tuple[Override, ...]:

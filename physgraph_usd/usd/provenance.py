@@ -120,9 +120,9 @@ def is_result_of(path: Path, record: Mapping[str, Any], *, settled: bool = False
         layer = Sdf.Layer.FindOrOpen(str(path))
     except USD_ERRORS:
         return False
-    found = (read_record(layer) if layer and is_only_ours(layer) else None) or {}
-    lacking = any(name in found for name in (LACKING if settled else LACKING[:2]))
-    return not lacking and all(found.get(key) == value for key, value in (read_record(expected) or {}).items())
+    recorded = (read_record(layer) if layer and is_only_ours(layer) else None) or {}
+    lacking = any(name in recorded for name in (LACKING if settled else LACKING[:2]))
+    return not lacking and all(recorded.get(key) == value for key, value in (read_record(expected) or {}).items())
 
 
 def recorded_shot(layer: Sdf.Layer) -> str | None:

@@ -191,9 +191,9 @@ def _in_view(seen: np.ndarray, triangles: np.ndarray, picture: np.ndarray) -> np
     columns, rows = seen[:, 0][triangles.T], seen[:, 1][triangles.T]
     right, below = columns.min(axis=0) > picture.shape[1], rows.min(axis=0) > picture.shape[0]
     inside = (columns.max(axis=0) >= 0) & (rows.max(axis=0) >= 0) & ~right & ~below
-    found = np.zeros(len(seen), bool)
-    found[triangles[inside]] = True
-    return np.flatnonzero(found)
+    mask = np.zeros(len(seen), bool)
+    mask[triangles[inside]] = True
+    return np.flatnonzero(mask)
 
 
 def _shade(solid: Surface, ground: Surface, view: View, visible: np.ndarray) -> np.ndarray:
@@ -247,8 +247,8 @@ def soft_light(
     points, up = np.concatenate([solid.points, ground.points]), np.tile([0.0, 1.0, 0.0], (len(ground.points), 1))
     normals = np.concatenate([vertex_normals(solid), up])
     spots, facing = np.tile(points, (2, 1)), np.concatenate([normals, -normals])
-    found = _light(solid, spots, facing, visible=visible, towards=towards, cancelled=cancelled)
-    sky, key = (values.reshape(2, -1) for values in found)
+    factors = _light(solid, spots, facing, visible=visible, towards=towards, cancelled=cancelled)
+    sky, key = (values.reshape(2, -1) for values in factors)
     mean = _mean_of_neighbours(solid, LIGHT_WIDTH * float(np.ptp(visible, axis=0).max()))
     for light in (sky, key):
         for _ in range(0 if cancelled() else LIGHT_BLUR):

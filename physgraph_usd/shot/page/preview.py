@@ -192,14 +192,14 @@ class Pictures:
         centre, angles, left_out = self._open_view(sides[-1], views, radius=radius)
         ball = centre + radius * np.concatenate([np.eye(3), -np.eye(3)])
         view = fit_view(ball, self._panel[0] / self._panel[1], azimuth=angles[0], elevation=angles[1])
-        kept = [[each for each in meshes if each.path not in left_out] for meshes in sides]
+        remaining = [[mesh for mesh in meshes if mesh.path not in left_out] for meshes in sides]
         words = f"without {', '.join(f'<{path}>' for path in left_out)}, which would hide it" if left_out else ""
         reach = 2.0 * radius
-        if not _is_open(kept[-1], centre, angles, radius=radius):
-            kept = [[_cut(each, centre, view.axes[2], CUT * radius) for each in meshes] for meshes in sides]
+        if not _is_open(remaining[-1], centre, angles, radius=radius):
+            remaining = [[_cut(mesh, centre, view.axes[2], CUT * radius) for mesh in meshes] for meshes in sides]
             reach, words = CUT * radius, "cut open before it"
         nearest = float(np.linalg.norm(centre - view.eye)) - reach
-        return self._compose(kept, close.time, replace(view, nearest=nearest), -np.inf), words
+        return self._compose(remaining, close.time, replace(view, nearest=nearest), -np.inf), words
 
     def _open_view(
         self, meshes: Sequence[DrawnMesh], views: Sequence[tuple[np.ndarray, tuple[float, float]]], *, radius: float
@@ -216,7 +216,7 @@ class Pictures:
         for drawn in (meshes, cloth):
             for centre, angles in (*views, *turned):
                 if _is_open(drawn, centre, angles, radius=radius):
-                    hidden_by = [each.path for each in meshes if not _is_open([each], centre, angles, radius=radius)]
+                    hidden_by = [mesh.path for mesh in meshes if not _is_open([mesh], centre, angles, radius=radius)]
                     return centre, angles, hidden_by
         return *views[0], []
 

@@ -296,9 +296,9 @@ def leftovers(fine: Fine) -> Iterator[Problem]:
             if len(fine.entries(attribute.GetName(), time)):
                 yield fine.problem(attribute.GetName(), "still holds the coarse mesh's entries", time)
     for attribute, value in render_values(fine.prim, None if fine.polygonal else 0):
-        found = attribute.Get()
-        if fine.polygonal and found != value:
-            yield fine.problem(attribute.GetName(), f"is {found!r}, not {value!r}: a render subdivides again")
+        authored = attribute.Get()
+        if fine.polygonal and authored != value:
+            yield fine.problem(attribute.GetName(), f"is {authored!r}, not {value!r}: a render subdivides again")
         if not fine.polygonal and not fine.layer.GetAttributeAtPath(
             fine.prim.GetPath().AppendProperty(attribute.GetName())
         ):

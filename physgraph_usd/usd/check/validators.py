@@ -67,11 +67,11 @@ def _prim_task(module: Any, rule: Callable[[Fine], Iterator[Problem]]) -> Callab
 def _errors(module: Any, name: str, problems: Iterable[Problem], site: Callable[[Sdf.Path], Any]) -> list[Any]:
     """Convert problems to UsdValidation errors, with the rule's name."""
     kinds = {"error": module.ValidationErrorType.Error, "warning": module.ValidationErrorType.Warn}
-    found = []
+    errors = []
     for problem in problems:
         message = f"<{problem.path}>{at_time(problem.time)}: {problem.message}"
-        found.append(module.ValidationError(name, kinds[problem.severity], [site(Sdf.Path(problem.path))], message))
-    return found
+        errors.append(module.ValidationError(name, kinds[problem.severity], [site(Sdf.Path(problem.path))], message))
+    return errors
 
 
 def refined(prim: Usd.Prim) -> Fine | None:

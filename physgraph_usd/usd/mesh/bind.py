@@ -133,11 +133,11 @@ class SurfaceFrames:
         return np.stack([first, np.cross(normal, first), normal], axis=1)
 
 
-def _gradient(here: np.ndarray, there: np.ndarray, slope: np.ndarray, count: int) -> sparse.csr_matrix:
+def _gradient(start: np.ndarray, end: np.ndarray, slope: np.ndarray, count: int) -> sparse.csr_matrix:
     """The matrix of least-squares derivatives along one tangent, shape (V, V)."""
-    rows = np.concatenate([here, np.arange(count)])
-    columns = np.concatenate([there, np.arange(count)])
-    values = np.concatenate([slope, -np.bincount(here, slope, count)])
+    rows = np.concatenate([start, np.arange(count)])
+    columns = np.concatenate([end, np.arange(count)])
+    values = np.concatenate([slope, -np.bincount(start, slope, count)])
     return sparse.csr_matrix((values, (rows, columns)), shape=(count, count))
 
 

@@ -31,7 +31,7 @@ class PieceKinds:
 
 
 def sort_pieces(
-    mesh: PolygonMesh, rest: Float[np.ndarray, "vertices 3"], asked: Bool[np.ndarray, " faces"]
+    mesh: PolygonMesh, rest: Float[np.ndarray, "vertices 3"], marked: Bool[np.ndarray, " faces"]
 ) -> PieceKinds:
     """Find the pieces.
 
@@ -41,7 +41,7 @@ def sort_pieces(
     Args:
         mesh: The mesh, welded.
         rest: Rest positions [m].
-        asked: Faces marked as rigid.
+        marked: Faces marked as rigid.
     """
     ends = mesh.half_edges.edges
     piece = joined_by(ends, mesh.vertex_count)
@@ -60,7 +60,7 @@ def sort_pieces(
     edge = float(length[piece[ends[:, 0]] == largest].mean())
     light = (area < LIGHT * area[largest]) & (faces > 0)
     rigid = light & ((closed & (size < SMALL * size[largest])) | (size < edge))
-    wanted = np.bincount(of_face, asked, count)
+    wanted = np.bincount(of_face, marked, count)
     rigid |= (wanted == faces) & (faces > 0)
     number = np.where(rigid, np.cumsum(rigid) - 1, -1)
     return PieceKinds((closed & ~rigid)[piece], number[piece], bool(((wanted > 0) & (wanted < faces)).any()))

@@ -311,14 +311,14 @@ def read_collider(
     instancer = instancer_above(prim, beside) or (prim if kind == "instancer" else None)
     if kind is None:
         return None, (Notice(path, None, f"{unread(prim)}; left out"),)
-    own = find_value(prim, COLLIDER["collider:offset"], overrides).at(None) or 0.0
+    own_offset = find_value(prim, COLLIDER["collider:offset"], overrides).at(None) or 0.0
     side, _ = find_token(prim, COLLIDER["collider:side"], overrides)
     notices = (
         (Notice(path, None, "a plane has no start side; its front is used"),) if (kind, side) == _PLANE_START else ()
     )
-    within = DRAWN_NEAR * max(offset + own, _LEAST_OFFSET)
+    within = DRAWN_NEAR * max(offset + own_offset, _LEAST_OFFSET)
     always = find_value(prim, COLLIDER["collider:enabled"], overrides).source != "fallback"
-    collider = Collider(path, kind if instancer is None else "mesh", own, side)
+    collider = Collider(path, kind if instancer is None else "mesh", own_offset, side)
     reader = ColliderReader(prim, collider, metres, within, always, instancer, near=near)
     if instancer is None:
         return reader, notices
@@ -411,10 +411,10 @@ def sharpness_of(mesh: UsdGeom.Mesh, vertex_count: int) -> tuple[np.ndarray, np.
             inside = ((ends >= 0) & (ends < vertex_count)).all(axis=1)
             ends, sharpness = ends[inside], sharpnesses[inside]
     corners = np.zeros(vertex_count)
-    places, sharpnesses = map(_numbers, (mesh.GetCornerIndicesAttr(), mesh.GetCornerSharpnessesAttr()), ("iu", "iuf"))
-    if len(places) == len(sharpnesses):
-        inside = (places >= 0) & (places < len(corners))
-        corners[places[inside]] = sharpnesses[inside]
+    vertices, sharpnesses = map(_numbers, (mesh.GetCornerIndicesAttr(), mesh.GetCornerSharpnessesAttr()), ("iu", "iuf"))
+    if len(vertices) == len(sharpnesses):
+        inside = (vertices >= 0) & (vertices < len(corners))
+        corners[vertices[inside]] = sharpnesses[inside]
     return ends, sharpness, corners
 
 

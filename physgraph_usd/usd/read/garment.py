@@ -112,14 +112,14 @@ class GarmentReader:
         All points of an absent garment are at one place, without contact: other garments may still have a frame.
         """
         notices: tuple[Notice, ...] = ()
-        there = time is None or not (time in self.hidden or absence(prim, time))
-        if not there:
+        is_present = time is None or not (time in self.hidden or absence(prim, time))
+        if not is_present:
             points = np.broadcast_to(self.garment.rest.mean(axis=0), self.garment.rest.shape)
         else:
             local, notices = self.points.read(time)
             points = self.weld.joined(place(local, to_metres(prim, metres, time)))
         guide, detail = (self.values.number(name, time) for name in ("guide:stiffness", "refine:detail"))
-        offset, thickness = (self.kept(name, time) for name in ("contact:offset", "thickness"))
+        offset, thickness = (self.contact_distance(name, time) for name in ("contact:offset", "thickness"))
         fabric, most = self.values.fabric(time), self._size / _THICK
         if max(thickness, offset) > most:
             message = f"contact keeps {1e3 * most:.3g} mm, a {_THICK:g}th of the cloth's size, for a thickness of"
@@ -128,15 +128,15 @@ class GarmentReader:
         half = 0.0 if self.weld.across is None else float(np.abs(self.weld.across).max())
         thickness, offset = max(min(thickness, most), 2.0 * half), min(offset, most) + half
         fabric = replace(fabric, thickness=thickness)
-        acceleration = self._felt(time, points) if there else None
-        load = self.air.load(points, time) if there and self.air is not None else None
+        acceleration = self._felt(time, points) if is_present else None
+        load = self.air.load(points, time) if is_present and self.air is not None else None
         return GarmentFrame(points, fabric, guide, detail, offset, acceleration, load), notices
 
     def _felt(self, time: float | None, points: np.ndarray) -> np.ndarray | None:
         """Acceleration of the cage felt by the cloth [m/s^2], shape (V, 3); None for slow or still cages."""
         share = self.values.number("inertia", time)
-        found = None if self.motion is None or not share else self.motion.felt(time, points)
-        return None if found is None else share * found
+        acceleration = None if self.motion is None or not share else self.motion.felt(time, points)
+        return None if acceleration is None else share * acceleration
 
     @cached_property
     def fitting(self) -> float:
@@ -148,7 +148,7 @@ class GarmentReader:
         """Diagonal of the rest shape's bounding box [m]."""
         return float(np.linalg.norm(extent(self.garment.rest)))
 
-    def kept(self, name: str, time: float | None) -> float:
+    def contact_distance(self, name: str, time: float | None) -> float:
         """Contact offset or thickness at a time code [m], by short name; unless authored, at most `fitting`."""
         value = self.values.number(name, time)
         return min(value, self.fitting) if self.values.found[name].source == "fallback" else value
@@ -158,7 +158,7 @@ class GarmentReader:
         notices, time, most = [], next(iter(self.source.times), None), 1e3 * self.fitting
         for row in (GARMENT[name] for name in ("thickness", "contact:offset")[: 2 if self.garment.colliders else 1]):
             value, limited = (
-                1e3 * metres for metres in (self.values.number(row.short, time), self.kept(row.short, time))
+                1e3 * metres for metres in (self.values.number(row.short, time), self.contact_distance(row.short, time))
             )
             if limited < value:
                 notices.append(f"{row.name} is taken as {limited:.2g} mm, not {value:g}; author it for another")

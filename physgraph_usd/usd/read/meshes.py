@@ -262,9 +262,9 @@ def color_of(stage: Usd.Stage, path: str) -> np.ndarray | None:
 def _colors(mesh: UsdGeom.Mesh, code: Usd.TimeCode, faces: int) -> np.ndarray:
     """Linear colour of each authored face, shape (F, 3): its subset's or mesh's material, displayColor, or neutral."""
     colors = np.tile(np.array(NEUTRAL), (faces, 1))
-    shown = flattened(mesh.GetDisplayColorPrimvar(), code)
-    if shown:
-        values = np.asarray(shown, dtype=float)
+    display = flattened(mesh.GetDisplayColorPrimvar(), code)
+    if display:
+        values = np.asarray(display, dtype=float)
         colors[:] = values if len(values) == faces else values.mean(axis=0)
     material_color = _material_color(mesh.GetPrim())
     if material_color is not None:

@@ -65,9 +65,9 @@ class CageMotion:
         self._keep(time, points)
         if self._stands(time, points):
             return None
-        found = [self._acceleration(*three) for three in self._around(time)]
-        known = [each for each in found if each is not None]
-        return felt(self._mean(_agreed(known))) if known else None
+        accelerations = [self._acceleration(*three) for three in self._around(time)]
+        valid = [acceleration for acceleration in accelerations if acceleration is not None]
+        return felt(self._mean(_agreed(valid))) if valid else None
 
     def _stands(self, time: float, points: np.ndarray) -> bool:
         """Whether the cage rests since the previous frame, although earlier samples moved."""
@@ -86,11 +86,11 @@ class CageMotion:
         middle = min(max(time, first), last)
         chosen = {middle}
         for by in (-self._frame, self._frame, -2.0 * self._frame, 2.0 * self._frame):
-            other = self._beside(middle, by)
-            if other is not None and first <= other <= last and len(chosen) < MOST:
-                chosen.add(other)
-        found = [(self._beside(each, -apart), each, self._beside(each, apart)) for each in sorted(chosen)]
-        return [(a, b, c) for a, b, c in found if a is not None and c is not None]
+            neighbour = self._beside(middle, by)
+            if neighbour is not None and first <= neighbour <= last and len(chosen) < MOST:
+                chosen.add(neighbour)
+        triples = [(self._beside(code, -apart), code, self._beside(code, apart)) for code in sorted(chosen)]
+        return [(a, b, c) for a, b, c in triples if a is not None and c is not None]
 
     def _beside(self, time: float, by: float) -> float | None:
         """The nearest sample at least ``by`` time codes after a time code, or before if negative; None without one."""
@@ -100,18 +100,18 @@ class CageMotion:
 
     def _acceleration(self, *three: float) -> np.ndarray | None:
         try:
-            poses = [self._at(each) for each in three]
+            poses = [self._at(code) for code in three]
         except GarmentError:  # A broken sample beside this one has its own error, at its own time code.
             return None
-        return acceleration_of(poses, [each * self._seconds for each in three])
+        return acceleration_of(poses, [code * self._seconds for code in three])
 
     def _mean(self, field: np.ndarray) -> np.ndarray:
         """A field with the mean over the neighbours mixed in, `ROUNDS` times, shape (V, 3)."""
-        count, (one, other) = len(field), self._edges.T
+        count, (start, end) = len(field), self._edges.T
         neighbours = np.bincount(self._edges.ravel(), minlength=count)[:, None]
         for _ in range(ROUNDS):
             gathered = [
-                np.bincount(one, field[other, k], count) + np.bincount(other, field[one, k], count) for k in range(3)
+                np.bincount(start, field[end, k], count) + np.bincount(end, field[start, k], count) for k in range(3)
             ]
             field = np.where(neighbours > 0, 0.5 * (field + np.stack(gathered, 1) / np.maximum(neighbours, 1)), field)
         return field
@@ -127,10 +127,10 @@ class CageMotion:
         return points
 
 
-def _agreed(found: Sequence[np.ndarray]) -> np.ndarray:
+def _agreed(accelerations: Sequence[np.ndarray]) -> np.ndarray:
     """The medoid of three accelerations at each vertex [m/s^2], shape (V, 3); of two accelerations the smaller."""
-    rows = np.arange(len(found[0]))
-    stacked = np.stack(found)  # N V 3
-    others = stacked if len(found) == MOST else np.zeros_like(stacked[:1])
-    far = np.linalg.norm(stacked[:, None] - others[None], axis=3).sum(axis=1)  # N V
+    rows = np.arange(len(accelerations[0]))
+    stacked = np.stack(accelerations)  # N V 3
+    candidates = stacked if len(accelerations) == MOST else np.zeros_like(stacked[:1])
+    far = np.linalg.norm(stacked[:, None] - candidates[None], axis=3).sum(axis=1)  # N V
     return stacked[far.argmin(axis=0), rows]

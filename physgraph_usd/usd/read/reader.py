@@ -231,7 +231,7 @@ class Shot:
 
     def offset(self, index: int, time: float | None) -> float:
         """Distance kept from colliders by a garment, by number, at a time code [m]."""
-        return self._readers[index].kept("contact:offset", time)
+        return self._readers[index].contact_distance("contact:offset", time)
 
     def with_values(self, overrides: Sequence[str]) -> Shot:
         """A copy of the shot with other ``--set`` values in its frames; values read only on opening are kept.
@@ -418,7 +418,7 @@ def _link(
     readers = _sewn(stage, readers, request, notices)
     cloth = dict.fromkeys(reader.source.path for reader in readers)
     times = [reader.source.times[0] if reader.source.times else None for reader in readers]
-    offset = min(reader.kept("contact:offset", time) for reader, time in zip(readers, times, strict=True))
+    offset = min(reader.contact_distance("contact:offset", time) for reader, time in zip(readers, times, strict=True))
     near = _swept(stage, readers, paths, request)
     bodies = []
     for path in paths:

@@ -106,7 +106,7 @@ class Animation:
 def read_rest(
     prim: Usd.Prim,
     weld: Weld,
-    asked: float | str | None,
+    rest_frame: float | str | None,
     animation: Animation,
     *,
     place: Callable[[np.ndarray], np.ndarray],
@@ -116,7 +116,7 @@ def read_rest(
 
     Args:
         weld: Faces of the cage, as authored and welded.
-        asked: Time code of the rest shape's points, `AUTO`, or None.
+        rest_frame: Time code of the rest shape's points, `AUTO`, or None.
         animation: Points over the shot.
         place: From local rest points to metres, (V, 3) to (V, 3).
         baked: Layer of baked skinning; its points are not used as rest shape.
@@ -124,14 +124,14 @@ def read_rest(
     Raises:
         GarmentError: When an authored rest shape does not fit the mesh, or the rest shape is invalid.
     """
-    edges, first, odd = weld.apart.half_edges.edges, animation.first, list[Notice]()
-    if asked == AUTO:
+    edges, first, notices_of_authored = weld.apart.half_edges.edges, animation.first, list[Notice]()
+    if rest_frame == AUTO:
         rest = _fitted(weld, animation, by=" (--rest)")
-    elif asked is not None:
-        points, notices = animation.read(float(asked))
-        source = f"edge lengths at time code {named_time(float(asked))} (--rest)"
+    elif rest_frame is not None:
+        points, notices = animation.read(float(rest_frame))
+        source = f"edge lengths at time code {named_time(float(rest_frame))} (--rest)"
         rest = Rest(_lengths_of(prim, weld, points), source, notices)
-    elif (authored := _authored(prim, len(first), odd)) is not None:
+    elif (authored := _authored(prim, len(first), notices_of_authored)) is not None:
         rest = Rest(place(authored[0]), authored[1])
     elif (default := _default_points(prim, baked)) is None:
         rest = _fitted(weld, animation)
@@ -144,7 +144,7 @@ def read_rest(
         is_frame = np.allclose(rest.points, first, rtol=_SAME_PLACE, atol=_SAME_PLACE)
         if is_frame and animation.times and baked.GetPrimAtPath(prim.GetPath()) is None:  # A bind pose is modelled.
             rest = replace(rest, points=_lengths_of(prim, weld, rest.points))
-    return _checked(prim, edges, replace(rest, notices=(*odd, *rest.notices)), first=first)
+    return _checked(prim, edges, replace(rest, notices=(*notices_of_authored, *rest.notices)), first=first)
 
 
 def _lengths_of(prim: Usd.Prim, weld: Weld, pose: np.ndarray) -> np.ndarray:
@@ -352,7 +352,7 @@ def _are_whole(lengths: Float[np.ndarray, "poses edges"]) -> Bool[np.ndarray, " 
 def pressed_folds(
     mesh: PolygonMesh,
     poses: Sequence[Float[np.ndarray, "vertices 3"]],
-    asked: Int[np.ndarray, "asked 2"],
+    pressed_edges: Int[np.ndarray, "pressed 2"],
     refused: Int[np.ndarray, "refused 2"],
 ) -> tuple[Bool[np.ndarray, " vertices"], Float[np.ndarray, "vertices 3"]] | None:
     """Vertices at pressed folds, and the pose that has the folds as they rest.
@@ -363,7 +363,7 @@ def pressed_folds(
     Args:
         mesh: The welded mesh.
         poses: Positions of its vertices.
-        asked: Vertices of the edges that are pressed, lower first.
+        pressed_edges: Vertices of the edges that are pressed, lower first.
         refused: Vertices of the edges that are not, lower first.
 
     Returns:
@@ -377,7 +377,7 @@ def pressed_folds(
         return None
     elements = elastic_elements(mesh, mesh.triangulate(poses[0]), poses[0])
     hinges = elements.hinges[~elements.twists]
-    wanted, unwanted = (find_edges(folds, np.sort(hinges[:, :2], axis=1)) >= 0 for folds in (asked, refused))
+    wanted, unwanted = (find_edges(folds, np.sort(hinges[:, :2], axis=1)) >= 0 for folds in (pressed_edges, refused))
     hinges, wanted, unwanted = (
         selection[wanted | (np.abs(hinge_geometry(poses[0], hinges)[0]) > (1.0 - KEPT) * SHARP)]
         for selection in (hinges, wanted, unwanted)

@@ -191,8 +191,8 @@ class LayerWriter:
         facts["bound"] = [str(path) for bound in self._bound.values() for path in bound.paths] or None
         if self._times is not None:
             count = len(self._shot.scene.times)
-            left = f"{count - len(self._times)} of the shot's {count} frames"
-            facts["left_out"] = {str(path): left for path in self.targets}
+            remainder = f"{count - len(self._times)} of the shot's {count} frames"
+            facts["left_out"] = {str(path): remainder for path in self.targets}
         provenance.author_record(self._stream.layer, facts | self._record | dict(lacking or {}))
         self._stream.flush()
         self._check_written()
