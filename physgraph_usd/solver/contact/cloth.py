@@ -260,19 +260,13 @@ class LevelContact:
         named = (("contact", pushes.sharing_room(x)), ("self_contact", gaps))
         return tuple(SelfContact(self.mesh.level, pairs, name) for name, pairs in named if len(pairs.corners))
 
-    def moved(self, start: Placed, wanted: Float[Tensor, "vertices 3"], *, stuck: bool = False) -> Placed:
+    def moved(self, start: Placed, wanted: Float[Tensor, "vertices 3"]) -> Placed:
         """Positions as close to the wanted as is safe [m], seams closed; without seams ``wanted`` itself if safe.
 
         In a tangle of the start, cloth may pass through itself as long as the tangle's number of crossings does not
         grow. Cloth inside a body may pass through bodies.
-
-        Args:
-            start: Positions now [m].
-            wanted: Positions wanted [m].
-            stuck: Whether tangles no longer become smaller. No cloth in them may then pass through itself, which saves
-                the search that finds out which of them would grow.
         """
-        return self._moved(start, self.closed(wanted), None, stuck=stuck)
+        return self._moved(start, self.closed(wanted), None)
 
     def carried(
         self, start: Placed, wanted: Float[Tensor, "vertices 3"], inside: Bool[Tensor, " vertices"] | None
@@ -292,7 +286,7 @@ class LevelContact:
         tangles = self.look(start).tangles
         return self._go(start, self.closed(wanted), None if tangles is None else tangles.label, None)[0]
 
-    def _moved(self, start: Placed, wanted: Tensor, start_frame: _Begin | None, *, stuck: bool = False) -> Placed:
+    def _moved(self, start: Placed, wanted: Tensor, start_frame: _Begin | None) -> Placed:
         """As `moved`; ``start_frame`` holds the corners and the exempt cloth in the start frame, or is None."""
         state = self.look(start)
         tangles = state.tangles
@@ -302,10 +296,8 @@ class LevelContact:
                 self.remember(x, tangles)
             return x
         free = tangles.label.clone()
-        if stuck:
-            free[~tangles.given_up] = -1
         x, _ = self._go(start, wanted, free, start_frame)
-        for hold_all in () if stuck else (False, True):  # First only the worse tangles are held, then all.
+        for hold_all in (False, True):  # First only the worse tangles are held, then all.
             worse = tangles.worse(self.look(x).crossings)
             if not bool(worse.any()):
                 break

@@ -161,7 +161,7 @@ def solve_one_level(
         reports.append(report)
         steps += report.steps
         wanted = carry.x
-        previous, x, last = x, view.moved(x, wanted, stuck=_is_stuck(counts)), system
+        previous, x, last = x, view.moved(x, wanted), system
         blocked = x is not wanted
         if problem.show is not None:
             problem.show(x)
@@ -181,9 +181,11 @@ def _is_stuck(counts: Sequence[int]) -> bool:
     """Whether crossings are left, and in none of the last `STALLED` rounds fewer than before.
 
     Args:
-        counts: Number of crossings at the start and after each round.
+        counts: Number of crossings at the start and after each round. With `STALLED` numbers or fewer, any crossings
+            count as stuck.
     """
-    return len(counts) > STALLED and 0 < min(counts[:-STALLED]) <= min(counts[-STALLED:])
+    late = counts[-STALLED:]
+    return min(late) > 0 and min(late) >= min(counts[:-STALLED], default=0)
 
 
 def _solve_without_contact(
