@@ -76,12 +76,21 @@ class TestContact:
             {"time": 4.0, "error": "no sample"},
         ]
         report = RefineReport("s", None, {}, garments=[{"path": "/A"}, {"path": "/B"}], frames=frames)
+        left = "crossings and vertices inside bodies are left"
         more = "in the subdivided cage: more than by subdivision alone; look at these frames"
         assert of_more(report) == [
-            f"</A> at time code 2: 1,426 crossings are left, 1,020 {more}; also at time code 3",
-            f"</B> at time code 1: 1 crossing is left, 0 {more}",
+            f"</A> at time code 2: 1,426 {left}, 1,020 {more}; also at time code 3",
+            f"</B> at time code 1: 1 {left}, 0 {more}",
         ]
         assert of_more(RefineReport("s", None, {}, garments=[{"path": "/A"}], frames=frames[:1])) == []
+
+    def test_cloth_that_came_out_of_a_body_may_cross_it_more_often(self):
+        told = entry("/Body", 1015, 1421)
+        told["contact"]["bodies"]["/Body"]["before"]["inside"] = 1926
+        assert (
+            of_more(RefineReport("s", None, {}, garments=[{"path": "/A"}], frames=[{"time": 1.0, "garments": [told]}]))
+            == []
+        )
 
     def test_it_is_the_last_line_of_a_run(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
         monkeypatch.setattr("physgraph_usd.shot.run.of_more", lambda report: ["crossings"] * bool(report.frames))

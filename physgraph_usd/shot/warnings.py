@@ -99,10 +99,11 @@ WARNINGS = {
         "--heat-map shows where, to mend the cage there",
     ),
     "more": Kind(
-        "more crossings are left than there are in the subdivided cage",
+        "more crossings and vertices inside bodies are left than there are in the subdivided cage",
         "the last line of a run. The cloth is worse there than plain subdivision: look at it before you use it. "
         "`--heat-map` writes where; mend the cage there, or refine those frames alone (`--frames`)",
-        "{left} {are} left{together}, {before:,} in the subdivided cage: more than by subdivision alone",
+        "{left:,} crossings and vertices inside bodies are left{together}, {before:,} in the subdivided cage: more than "
+        "by subdivision alone",
         "look at these frames",
     ),
     "drawn": Kind(
@@ -286,11 +287,15 @@ def of_contact(garment: Mapping[str, Any], entries: Entries) -> Iterator[str]:
 
 
 def of_more(report: RefineReport) -> list[str]:
-    """A warning for each garment with more crossings in a frame than its subdivided cage, with the first such frame."""
+    """A warning for each garment with more faults in a frame than its subdivided cage, with the first such frame.
+
+    Faults are crossings and vertices inside bodies together, as the solver compares patches of cloth: cloth that comes
+    out of a body may cross it more often than cloth that lies in it.
+    """
     figures_of: dict[str, list[tuple[float | None, int, int, str]]] = {}
     for frame in report.frames:
         for garment, entry in zip(report.garments, frame.get("garments", ()), strict=False):
-            after, before = (_crossings(entry.get("contact") or {}, side) for side in ("after", "before"))
+            after, before = (_faults(entry.get("contact") or {}, side) for side in ("after", "before"))
             if after > before and is_first(garment["path"], entry):
                 figures = frame["time"], after, before, _together(garment["path"], entry)
                 figures_of.setdefault(garment["path"], []).append(figures)
@@ -298,16 +303,16 @@ def of_more(report: RefineReport) -> list[str]:
     for path in [garment["path"] for garment in report.garments if garment["path"] in figures_of]:
         frames = figures_of[path]
         _, after, before, counted_with = frames[0]
-        remaining, are = counted(after, "crossing"), "is" if after == 1 else "are"
         times = [time for time, *_ in frames]
-        warnings.append(WARNINGS["more"](path, times, left=remaining, are=are, before=before, together=counted_with))
+        warnings.append(WARNINGS["more"](path, times, left=after, before=before, together=counted_with))
     return warnings
 
 
-def _crossings(contact: Mapping[str, Any], side: str) -> int:
-    """Crossings of cloth and with all bodies, "before" or "after"."""
+def _faults(contact: Mapping[str, Any], side: str) -> int:
+    """Crossings of cloth and with all bodies, and vertices inside bodies, "before" or "after"."""
     measured = [contact.get("cloth") or {}, *(contact.get("bodies") or {}).values()]
-    return sum(int(counts.get(side, {}).get("crossings", 0)) for counts in measured)
+    names = ("crossings", "inside", "pinched")
+    return sum(int(counts.get(side, {}).get(name, 0)) for counts in measured for name in names)
 
 
 def _together(path: str, entry: Mapping[str, Any]) -> str:
