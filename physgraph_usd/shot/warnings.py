@@ -102,8 +102,8 @@ WARNINGS = {
         "more crossings and vertices inside bodies are left than there are in the subdivided cage",
         "the last line of a run. The cloth is worse there than plain subdivision: look at it before you use it. "
         "`--heat-map` writes where; mend the cage there, or refine those frames alone (`--frames`)",
-        "{left:,} crossings and vertices inside bodies are left{together}, {before:,} in the subdivided cage: more than "
-        "by subdivision alone",
+        "{left:,} crossings and vertices inside bodies are left{together}, {before:,} in the subdivided cage: "
+        "more than by subdivision alone",
         "look at these frames",
     ),
     "drawn": Kind(
