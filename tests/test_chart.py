@@ -164,7 +164,8 @@ def test_the_page_in_a_browser(made: tuple[Path, Path, Chart]):
     _, folder, chart = made
     with opened(folder / "chart.html") as page:
         page.locator("#curves .scatterlayer .trace").first.wait_for()
-        panels, beside = 1 + len(chart.panels), 1 + len({each.method for each in chart.warm})
+        panels = 1 + len({**chart.seen, **chart.panels, **chart.likeness})
+        beside = 1 + len({each.method for each in chart.warm})
         curves = page.locator("#curves .scatterlayer .trace")
         assert page.locator("#methods button").count() == len(chart.methods)
         assert curves.count() == panels * len(chart.methods) + beside

@@ -133,7 +133,7 @@ class Artist:
 
 def colored(picture: np.ndarray) -> np.ndarray:
     """Whether each pixel of a picture has more colour than the grey of bodies, ground and background."""
-    return np.ptp(picture[:, 310:], axis=2) > 30.0  # Beside the viewer's notes.
+    return np.ptp(picture[:, 310:], axis=2) > 15.0  # Beside the viewer's notes.
 
 
 def labelled(picture: np.ndarray) -> np.ndarray:
