@@ -101,11 +101,10 @@ class TestMeshes:
     def test_a_body_in_an_offset_layer_is_posed_in_the_shots_time(self, tmp_path: Path):
         asset = new_stage(tmp_path / "body.usda", metres=1.0)
         add_box(asset, "/World/body", times=(101.0, 105.0))
-        asset.SetDefaultPrim(asset.GetPrimAtPath("/World/body"))
         asset.Save()
         stage = shot_with(tmp_path / "a.usda", metres=1.0)
         prim = stage.DefinePrim("/World/copy")
-        prim.GetReferences().AddReference("body.usda", Sdf.LayerOffset(-50.0, 0.5))
+        prim.GetReferences().AddReference("body.usda", "/World/body", Sdf.LayerOffset(-50.0, 0.5))
         mean = mesh_of(read(save(stage), 2.0)[1]).points[:, 0].mean()
         assert mean == pytest.approx(104.0)
 

@@ -1,4 +1,7 @@
-"""Reading and writing with the oldest version of USD that the package allows, and one between."""
+"""Reading and writing with the oldest version of USD that the package allows, and one between.
+
+Tests of other files also expect that all of USD's validators run; 25.5.1 lists 22 whose libraries it leaves out.
+"""
 
 from __future__ import annotations
 
@@ -12,12 +15,12 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 VERSIONS = ("24.5", "25.5.1")
 FILES = (
+    "bodies",
     "cage",
     "odd_stages",
     "overs",
     "reader",
     "schema",
-    "shot",
     "skinning",
     "subsets",
     "targets",
