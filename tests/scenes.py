@@ -14,7 +14,7 @@ import igl
 import numpy as np
 import torch
 import trimesh
-from bodies import Soup, ball, together, tube
+from bodies import BodyMesh, ball, together, tube
 from cloth import DOWN, Answer, Solver, settings_of
 from folds import EDGE, Cloth, folded, frame_with, named, square, strip
 from meshes import mesh_of
@@ -41,7 +41,7 @@ class Shot:
         return Solver(Refiner(self.scene, settings_of(**options), levels=levels, dtype=dtype, threads=threads))
 
 
-def shot(garments: Sequence[Garment], cages: Sequence[Sequence[np.ndarray]], bodies: Sequence[Soup] = ()) -> Shot:
+def shot(garments: Sequence[Garment], cages: Sequence[Sequence[np.ndarray]], bodies: Sequence[BodyMesh] = ()) -> Shot:
     """A shot of garments, their cages in each frame [m] and, where there is one, a body in each frame."""
     colliders = (Collider("/World/Body", "mesh"),) if bodies else ()
     felt = tuple(replace(garment, colliders=tuple(range(len(colliders)))) for garment in garments)
@@ -107,7 +107,7 @@ def in_tube() -> Shot:
     )
 
 
-def closed_tube() -> Soup:
+def closed_tube() -> BodyMesh:
     """An arm of 11 cm about z with its ends closed, wound outward."""
     points, faces = tube(0.055, 0.4)
     middle = np.array([[0.0, 0.0, -0.2], [0.0, 0.0, 0.2]])

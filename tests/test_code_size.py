@@ -146,7 +146,8 @@ def public_methods(kind: ast.ClassDef) -> int:
 
 def own_fields(kind: ast.ClassDef) -> int:
     """Number of fields of a class: annotated in its body, or assigned to self in its constructor."""
-    fields = {each.target.id for each in kind.body if isinstance(each, ast.AnnAssign) and hasattr(each.target, "id")}
+    targets = [each.target for each in kind.body if isinstance(each, ast.AnnAssign)]
+    fields = {target.id for target in targets if isinstance(target, ast.Name)}
     for made in kind.body:
         if isinstance(made, ast.FunctionDef) and made.name == "__init__":
             written = [each for each in ast.walk(made) if isinstance(each, ast.Attribute)]

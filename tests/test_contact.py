@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from bodies import Soup, ball, box, distances, flipped, together
+from bodies import BodyMesh, ball, box, distances, flipped, together
 from cloth import FABRIC, sheet
 from folds import frame_with, measured, named, refiner_with, square
 
@@ -40,7 +40,7 @@ SHAPES = {
     "cylinder": (up("cylinder", (0.15, 0.15, 0.1)), 0.095),
     "capsule": (up("capsule", (0.15, 0.15, 0.1)), 0.24),
 }
-MESHES: dict[str, tuple[Soup, float]] = {
+MESHES: dict[str, tuple[BodyMesh, float]] = {
     "ball": (ball(level=4), 0.19),
     "block": (box((0.3, 0.2, 0.3)), 0.095),
     "mixed": (flipped(ball(level=4), 0.5), 0.19),

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from bodies import ball
+from bodies import BodyMesh, ball
 from brute import Soup, crossings
 from folds import EDGE, SHAPES, curved, folded, levels_of, named, placed, square, strip, view_of
 from scenes import shot
@@ -141,7 +141,7 @@ class TestGivenUp:
     """Pieces of cloth that are mostly tangled after all rounds at the cage of a cold frame are given up."""
 
     @staticmethod
-    def shot_of(*shapes: str, bodies: Sequence[Soup] = ()):
+    def shot_of(*shapes: str, bodies: Sequence[BodyMesh] = ()):
         """Two large sheets that in each frame cross everywhere, along one contour, or not at all."""
         garments = [named(square(SIZE), each) for each in "AB"]
         rest = np.asarray(garments[0].rest)

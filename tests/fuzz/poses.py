@@ -49,18 +49,18 @@ def write_limb(folder: Path) -> None:
     points, quads = tube(0.05, -0.05, 0.6, 14)
     ends = np.array([points[:AROUND].mean(axis=0), points[-AROUND:].mean(axis=0)])
     first, last = np.arange(AROUND), len(points) - AROUND + np.arange(AROUND)
-    caps = [*zip(np.roll(first, -1), first, [len(points)] * AROUND, strict=True)]
-    caps += zip(last, np.roll(last, -1), [len(points) + 1] * AROUND, strict=True)
-    arm = _skinned_mesh(stage, "arm", np.concatenate([points, ends]), [*map(tuple, quads), *caps])
+    caps = [[following, corner, len(points)] for corner, following in zip(first, np.roll(first, -1), strict=True)]
+    caps += [[corner, following, len(points) + 1] for corner, following in zip(last, np.roll(last, -1), strict=True)]
+    arm = _skinned_mesh(stage, "arm", np.concatenate([points, ends]), [*quads.tolist(), *caps])
     arm.GetPrim().AddAppliedSchema(COLLIDER_API)
     inner, outer = tube(0.056, 0.0, 0.5, 12), tube(0.064, 0.08, 0.42, 9)
     cloth = np.concatenate([inner[0], outer[0]])
-    faces = [*map(tuple, inner[1]), *map(tuple, outer[1] + len(inner[0]))]
+    faces = [*inner[1].tolist(), *(outer[1] + len(inner[0])).tolist()]
     _skinned_mesh(stage, "cloth", cloth, faces).GetPrim().AddAppliedSchema("PhysGraphGarmentAPI")
     save(stage)
 
 
-def _skinned_mesh(stage: Usd.Stage, name: str, points: np.ndarray, faces: list[tuple[int, ...]]) -> UsdGeom.Mesh:
+def _skinned_mesh(stage: Usd.Stage, name: str, points: np.ndarray, faces: list[list[int]]) -> UsdGeom.Mesh:
     """A mesh bound to the joints by the place of its points [m] along x."""
     mesh = UsdGeom.Mesh.Define(stage, f"{ROOT}/{name}")
     mesh.CreatePointsAttr(vec3(points))

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from bodies import Soup
+from bodies import BodyMesh
 from folds import Cloth, frame_with, named, refiner_with
 from fuzz.poses import AROUND, BLEND, PLACES, tube
 from meshes import mesh_of
@@ -26,7 +26,7 @@ def bent(points: np.ndarray, degrees: float) -> np.ndarray:
     return points + weight * ((points - pivot) @ matrix.T + pivot - points)
 
 
-def arm(radius: float, degrees: float) -> Soup:
+def arm(radius: float, degrees: float) -> BodyMesh:
     """A closed arm, its elbow bent."""
     points, quads = tube(radius, -0.05, 0.6, 14)
     ends = np.array([points[:AROUND].mean(axis=0), points[-AROUND:].mean(axis=0)])
@@ -58,7 +58,7 @@ def faults(telemetry: dict[str, Any], side: str) -> int:
     return crossings + sum(body[side]["crossings"] + body[side]["inside"] for body in contact["bodies"].values())
 
 
-def solved(cloth: Cloth, cages: list[np.ndarray], arms: list[Soup]) -> list[tuple[int, int]]:
+def solved(cloth: Cloth, cages: list[np.ndarray], arms: list[BodyMesh]) -> list[tuple[int, int]]:
     """Faults of each frame before and after the solve."""
     solver = refiner_with([named(cloth)], ["mesh"], times=tuple(range(len(cages))))
     frames = [

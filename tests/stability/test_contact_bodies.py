@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
-from bodies import Soup, ball, box, together
+from bodies import BodyMesh, ball, box, together
 from cloth import Answer
 from folds import EDGE, frame_with, named, refiner_with, square
 
@@ -88,7 +88,7 @@ class TestNoRoom:
         assert max(moves[-3:]) < STILL
 
 
-def needles() -> Soup:
+def needles() -> BodyMesh:
     """Nine thin cones, tips up."""
     made = []
     for x in (-0.1, 0.0, 0.1):
