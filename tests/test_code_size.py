@@ -35,7 +35,7 @@ WIDE = {
     "PointTrack": 18,
     "Problem": 14,
     "Property": 14,
-    "RefineOptions": 37,
+    "RefineOptions": 38,
     "RefineReport": 23,
     "Refiner": 13,
     "Shot": 15,

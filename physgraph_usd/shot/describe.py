@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import GarmentError, StageError, named_time
+from ..errors import GarmentError, StageError, counted, named_time
 from ..solver.fabric import Fabric
 from ..solver.mesh.defects import defects, in_brief
 from ..solver.resolution import LevelChoice, choose_levels, sample_frames
@@ -28,11 +28,12 @@ from ..usd.times import within
 from ..usd.view import Stage
 from .estimate import cannot_fit, estimate
 from .notes import of_fabrics, of_slack, of_subsets, of_trims, preset_overrides
+from .opened import why_not_posed
 from .options import INTEGRATORS, RefineOptions, scene_words
 from .report import RefineReport, of_a_kind
 from .untagged import FAR, Candidate, find_candidates
 from .up_axis import across_gravity
-from .warnings import of_gravity, of_strain, of_unfelt, of_unread
+from .warnings import WARNINGS, of_gravity, of_strain, of_unfelt, of_unread
 
 MOST_ASKED = 32
 """Most open meshes tried as garments."""
@@ -71,6 +72,8 @@ def begin_report(report: RefineReport, opened: Shot, options: RefineOptions) -> 
     warnings += _unfelt(report, beside) if options.contact != "off" else []
     warnings += of_unread(candidates) if options.contact != "off" else []
     warnings += _across(opened, frames, beside)
+    if options.pose_in and (reason := why_not_posed(opened, options)):
+        warnings.append(WARNINGS["unposed"](reason=reason))
     follow = {candidate.path: candidate.follows for candidate in candidates if candidate.follows}
     slack = of_slack([garment.path for garment in opened.scene.garments], choices)
     report.note(*slack, *of_fabrics(opened.sources), *of_subsets(opened.sources), *of_trims(follow))
@@ -321,6 +324,8 @@ def _modelled(opened: Shot, report: RefineReport, options: RefineOptions) -> dic
         modelled["self contact"] = f"pairs of points, {condition}"
     if options.temporal == "tether" and len(opened.scene.times) > 1:
         modelled["tether"] = "ties each frame to the last one's detail"
+    if options.pose_in and not why_not_posed(opened, options):
+        modelled["pose in"] = f"{counted(options.pose_in, 'pose')} between the bind pose and the first frame"
     return modelled
 
 

@@ -202,6 +202,23 @@ def of_given_up(garments: Sequence[Mapping[str, Any]], frames: Sequence[Mapping[
     return [f"{text} cage crosses itself too often to be solved (<{path}>, first{at_time(time)})"]
 
 
+def of_first_pose(garments: Sequence[Mapping[str, Any]], frames: Sequence[Mapping[str, Any]]) -> list[str]:
+    """A note of skinned cloth that crosses itself in the first frame, with the option that may mend it.
+
+    Args:
+        garments: A report's garments, skinned.
+        frames: A report's frames, solved without poses before the first.
+    """
+    first: Mapping[str, Any] = next(iter(frames), {})
+    for garment, entry in zip(garments, first.get("garments", ()), strict=False):
+        left = entry.get("contact", {}).get("cloth", {}).get("after", {}).get("crossings", 0)
+        if left:
+            place = f"<{garment['path']}>{at_time(first['time'])}"
+            start = "starts it from the bind pose, where it may come out clean"
+            return [f"{place}: skinned cloth crosses itself in the first frame; --pose-in 12 {start}"]
+    return []
+
+
 def of_inertia(garments: Sequence[Mapping[str, Any]], frames: Sequence[Mapping[str, Any]]) -> list[str]:
     """A note of the frames in which cloth feels the acceleration of its cage, with the largest.
 

@@ -120,6 +120,13 @@ class RefineOptions:
         choices=("keep", "none"),
     )
     temporal: str = _solver("tether", "How a frame uses the last one.", choices=("tether", "warm", "off"))
+    pose_in: int | None = _solver(
+        None,
+        "Solve N poses between the bind pose and the first frame before that frame: skinned cloth that starts in a "
+        "bent pose then starts where it was modelled.",
+        metavar="N",
+        least=1,
+    )
     contact: str = _solver("quadratic", "How bodies push the cloth.", choices=("quadratic", "off"))
     self_contact: str = _solver("auto", "How cloth pushes cloth.", choices=("auto", "off"))
     workers: int = _solver(
@@ -186,7 +193,7 @@ class RefineOptions:
         """The options the result depends on, ready for JSON."""
         names = {name for name, option in OPTIONS.items() if option.result}
         # Unset, newer options leave the record as in older versions.
-        later = ("heat_map", "weights", "preroll", "gravity")
+        later = ("heat_map", "weights", "preroll", "gravity", "pose_in")
         names -= {name for name in later if getattr(self, name) is None or getattr(self, name) is False}
         values = {name: getattr(self, name) for name in OPTIONS if name in names}
         if self.weights:

@@ -30,7 +30,7 @@ from .farm import connected
 from .finished import made_from
 from .forecast import Forecast
 from .frames import CHUNK, FrameFolder, Outcome, frames_folder
-from .notes import of_energy, of_folds, of_following, of_given_up, of_inertia, of_rest
+from .notes import of_energy, of_first_pose, of_folds, of_following, of_given_up, of_inertia, of_rest
 from .options import RefineOptions
 from .processes import Start, separate_processes
 from .report import LOG, RefineReport, of_a_kind
@@ -239,7 +239,8 @@ class Run:
         report.warn(*of_frames(report), *of_drawn(entered), *of_loops(self._loop.gaps()))
         telemetry = report.garments, report.frames
         report.note(*of_following(*telemetry), *of_given_up(*telemetry), *of_inertia(*telemetry))
-        report.note(*of_folds(*telemetry), *of_energy(*telemetry), *of_polygons(drawn_through))
+        first_pose = of_first_pose(*telemetry) if self.shot.is_skinned and not options.pose_in else ()
+        report.note(*first_pose, *of_folds(*telemetry), *of_energy(*telemetry), *of_polygons(drawn_through))
         (report.warn if options.strict else report.note)(*of_rest(report.unsettled, len(report.frames)))
         say_what_was(report)
         report.warn(*of_more(report))  # The last line of a run.

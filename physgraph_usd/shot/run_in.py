@@ -1,14 +1,20 @@
-"""Says what a run in the middle of a shot costs before its first frame, and how much of it is left."""
+"""Solves what comes before the first frame of a run, and says what it costs and how much of it is left."""
 
 from __future__ import annotations
 
 import time as clock
 from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import replace
 from statistics import mean
 
-from ..errors import NOTICE, named_time
+import numpy as np
+
+from ..errors import NOTICE, SolveError, StageError, counted, named_time
 from ..interrupts import leave_if_asked
+from ..solver.frame.refiner import Refiner
 from ..solver.scene import Frame
+from ..usd.read.reader import Shot
 from .report import LOG
 
 EVERY_SECONDS = 10.0
@@ -89,3 +95,31 @@ class RunIn:
             text = f"run-in: {solved} of at most {solved + most} cages solved, at most about {self.left:.0f} s left"
         self._messaged = moment
         LOG.log(NOTICE, "%s", text, extra={"shot": self._shot})
+
+
+def pose_in(shot: Shot, refiner: Refiner, time: float | None, count: int) -> float:
+    """Solve poses between the bind pose and a frame of skinned cloth, so that the frame continues from the last pose.
+
+    Poses that fail are left out.
+
+    Args:
+        shot: The shot, with skinned cloth or bodies.
+        refiner: The refiner that solves the frame next.
+        time: Time code of the frame.
+        count: Number of poses; the first is the bind pose.
+
+    Returns:
+        Wall time [s].
+    """
+    began = clock.perf_counter()
+    text = f"before time code {named_time(time)}, {counted(count, 'pose')} from the bind pose on are solved"
+    LOG.log(NOTICE, "%s", text, extra={"shot": shot.path})
+    every = shot.every_time
+    spacing = min(np.diff(every), default=1.0)
+    for number in range(count):
+        leave_if_asked()
+        with suppress(SolveError, StageError):
+            frame = shot.posed_frame(time, number / count)
+            moment = None if time is None else time - (count - number) * spacing
+            refiner.solve(replace(frame, time=moment))
+    return clock.perf_counter() - began

@@ -21,10 +21,10 @@ from ..usd.read.reader import Shot
 from .frames import Outcome
 from .from_rest import FromRest
 from .joined import Mover, Positions, counts, worse
-from .opened import open_for
+from .opened import open_for, why_not_posed
 from .options import RefineOptions
 from .processes import cores
-from .run_in import RunIn
+from .run_in import RunIn, pose_in
 
 Outcomes = Generator[Outcome, None, None]
 
@@ -123,11 +123,14 @@ class ShotSolver:
         return self._opened, refiner
 
     def _begin(self, shot: Shot, refiner: Refiner, times: Sequence[float | None]) -> float:
-        """Start a shot in the middle, if its cage crosses itself, with the cage advanced from an earlier frame.
+        """Solve what comes before the first frame: poses from the bind pose, if they are requested and all is solved
+        from frame to frame; else, if the cage crosses itself, cages alone from an earlier frame.
 
         Returns:
             Wall time of the run-in [s]; 0 without one.
         """
+        if self._options.pose_in and times and not why_not_posed(shot, self._options):
+            return pose_in(shot, refiner, times[0], self._options.pose_in)
         earlier = [] if not times or times[0] is None else shot.times_until(times[0])
         run_in = RunIn(shot.frame, earlier, self._shot)
         advanced = prerolled_cages(

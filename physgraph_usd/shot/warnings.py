@@ -94,7 +94,8 @@ WARNINGS = {
     "contact": Kind(
         "crossings or vertices inside a body are left",
         "`--heat-map` writes where, so that you can mend the cage there; `physgraph:collider:side` corrects a side "
-        "that was guessed wrong. Some frames come out clean if they are refined alone (`--frames`)",
+        "that was guessed wrong. Some frames come out clean if they are refined alone (`--frames`). Skinned cloth that "
+        "is bent far in the first frame may come out clean with `--pose-in 12`",
         "{left} {are} left{together}",
         "--heat-map shows where, to mend the cage there",
     ),
@@ -105,6 +106,13 @@ WARNINGS = {
         "{left:,} crossings and vertices inside bodies are left{together}, {before:,} in the subdivided cage: "
         "more than by subdivision alone",
         "look at these frames",
+    ),
+    "unposed": Kind(
+        "`--pose-in` has no effect",
+        "it bends cloth from the bind pose of a skeleton to the first frame; leave it out for cloth that no skeleton "
+        "moves, and with `--temporal off`",
+        "--pose-in has no effect: {reason}",
+        "leave it out",
     ),
     "drawn": Kind(
         "the surface that renderers draw enters a body",

@@ -220,6 +220,22 @@ class Shot:
         refuse_falling(self.scene, frame)
         return frame
 
+    @property
+    def is_skinned(self) -> bool:
+        """Whether UsdSkel deforms a garment."""
+        return any(source.path in self._request.bake.skinned for source in self.sources)
+
+    def posed_frame(self, time: float | None, part: float) -> Frame:
+        """Read a time code with skinned cloth and bodies part of the way from the bind pose (0) to their pose then (1).
+
+        Everything else, and joints without a parent, is as at the time code.
+
+        Raises:
+            GarmentError, SchemaError, StageError: As `frame`.
+        """
+        with self._request.bake.posed(time, part):
+            return self.frame(time)
+
     def polygons(self, time: float | None) -> list[Polygons | None]:
         """Authored polygons of each collider at a time code; None for one that is drawn as authored.
 

@@ -7,9 +7,10 @@ mesh has ordinary point samples, in its own local space.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
@@ -51,10 +52,14 @@ class Skinned:
         """The prim in whose space `points` are: the skeleton, or the mesh itself without joint influences."""
         return self.skeleton if self.query.HasJointInfluences() else self.path
 
-    def points(self, time: float | None) -> Vt.Vec3fArray | None:
+    def points(self, time: float | None, posed: float = 1.0) -> Vt.Vec3fArray | None:
         """Deformed points in the space of `space`; None where the mesh has no points or UsdSkel rejects its influences.
 
         Read before baking.
+
+        Args:
+            time: A time code.
+            posed: From 0, the bind pose moved along with the root joints, to 1, the pose at the time code.
         """
         code = timecode(time)
         points = UsdGeom.PointBased(self.query.GetPrim()).GetPointsAttr().Get(code)
@@ -69,7 +74,7 @@ class Skinned:
         if not self.query.HasJointInfluences():
             return points
         # Without a bind pose, UsdSkel's Python binding gives the joints' poses in place of skinning transforms.
-        transforms: Any = self.joints.ComputeSkinningTransforms(code) if self.joints.HasBindPose() else None
+        transforms: Any = _skinning_transforms(self.joints, code, posed) if self.joints.HasBindPose() else None
         return points if transforms and self.query.ComputeSkinnedPoints(transforms, points, code) else None
 
     def bind_transform(self, code: Usd.TimeCode) -> Gf.Matrix4d:
@@ -128,15 +133,54 @@ class Bake:
             self.defaults[skinned.path] = None if isinstance(default, Sdf.ValueBlock) else default
             notices += _diagnosed(skinned, texts)
             with Usd.EditContext(self._stage, self.layer):
-                attribute = UsdGeom.PointBased(self._stage.GetPrimAtPath(skinned.path)).GetPointsAttr()
+                attribute = self._points(skinned)
                 for time, points in poses.items():
                     attribute.Set(points, timecode(time))
         return notices
 
-    def _local(self, skinned: Skinned, time: float | None) -> Vt.Vec3fArray | Sdf.ValueBlock:
+    def _points(self, skinned: Skinned) -> Usd.Attribute:
+        """The points of a baked mesh."""
+        return UsdGeom.PointBased(self._stage.GetPrimAtPath(skinned.path)).GetPointsAttr()
+
+    @contextmanager
+    def posed(self, time: float | None, part: float) -> Iterator[None]:
+        """Replace the baked points, for a while, by one sample of a pose between the bind pose (0) and theirs (1)."""
+        baked = {self._points(skinned).GetPath(): skinned for skinned in self.skinned.values()}
+        samples = {path: self._samples(path) for path in baked}
+        try:
+            for path, skinned in baked.items():
+                self._replace_samples(path, {})  # The pose is computed from the authored points.
+                self._replace_samples(path, {time: self._local(skinned, time, part)})
+            yield
+        finally:
+            for path, values in samples.items():
+                self._replace_samples(path, values)
+
+    def _samples(self, path: Sdf.Path) -> dict[float | None, Any]:
+        """The values of an attribute in the layer, by time code; the default's is None."""
+        samples: dict[float | None, Any] = {
+            time: self.layer.QueryTimeSample(path, time) for time in self.layer.ListTimeSamplesForPath(path)
+        }
+        default = self.layer.GetAttributeAtPath(path).default
+        return samples if default is None else samples | {None: default}
+
+    def _replace_samples(self, path: Sdf.Path, samples: Mapping[float | None, Any]) -> None:
+        """Make these the values of an attribute in the layer."""
+        spec = self.layer.GetAttributeAtPath(path)
+        with Sdf.ChangeBlock():
+            spec.ClearDefaultValue()
+            for time in self.layer.ListTimeSamplesForPath(path):
+                self.layer.EraseTimeSample(path, time)
+            for time, value in samples.items():
+                if time is None:
+                    spec.default = value
+                else:
+                    self.layer.SetTimeSample(path, time, value)
+
+    def _local(self, skinned: Skinned, time: float | None, posed: float = 1.0) -> Vt.Vec3fArray | Sdf.ValueBlock:
         """A mesh's deformed points in the mesh's space; as authored if UsdSkel rejects the influences."""
         code, prim = timecode(time), self._stage.GetPrimAtPath(skinned.path)
-        points = skinned.points(time)
+        points = skinned.points(time, posed)
         if points is None:
             return UsdGeom.PointBased(prim).GetPointsAttr().Get(code) or Sdf.ValueBlock()
         if skinned.space == skinned.path:
@@ -158,6 +202,33 @@ class Bake:
         skinned, code = self.skinned[path], timecode(time)
         placed = UsdGeom.XformCache(code).GetLocalToWorldTransform(self._stage.GetPrimAtPath(skinned.space))
         return skinned.bind_transform(code) * placed
+
+
+def _skinning_transforms(joints: UsdSkel.SkeletonQuery, code: Usd.TimeCode, posed: float) -> Vt.Matrix4dArray:
+    """Matrices (row vectors) of the joints from the bind pose to a pose between it (0) and that at a time code (1).
+
+    Each joint turns, moves and scales relative to its parent; joints without a parent are as at the time code.
+    """
+    if posed >= 1.0:
+        return joints.ComputeSkinningTransforms(code)
+    inverse = [matrix.GetInverse() for matrix in joints.GetJointWorldBindTransforms()]
+    places = list[Gf.Matrix4d]()  # In the skeleton's space; parents come before their children.
+    for joint, animated in enumerate(joints.ComputeJointLocalTransforms(code)):
+        parent = joints.GetTopology().GetParent(joint)
+        if parent < 0:
+            places.append(animated)
+        else:
+            bound = inverse[joint].GetInverse() * inverse[parent]
+            places.append(_between(bound, animated, posed) * places[parent])
+    return Vt.Matrix4dArray([start * place for start, place in zip(inverse, places, strict=True)])
+
+
+def _between(first: Gf.Matrix4d, second: Gf.Matrix4d, part: float) -> Gf.Matrix4d:
+    """A transform (row vectors) between two: rotations by the shortest way, translations and scales linearly."""
+    decompose, make = cast(Any, UsdSkel.DecomposeTransform), cast(Any, UsdSkel.MakeTransform)
+    (start, turn, scale), (end, last_turn, last_scale) = decompose(first), decompose(second)
+    sizes = Gf.Lerp(part, Gf.Vec3d(scale), Gf.Vec3d(last_scale))
+    return make(Gf.Lerp(part, start, end), Gf.Slerp(part, turn, last_turn), Gf.Vec3h(sizes))
 
 
 def skel_root(prim: Usd.Prim) -> Usd.Prim | None:
