@@ -19,6 +19,8 @@ from physgraph_usd.solver.collide.narrow_phase import next_slot
 from physgraph_usd.solver.collide.pairs import Pairs, Reach
 from physgraph_usd.solver.collide.parts import TASKS, Parts, Room
 from physgraph_usd.solver.collide.search import blocking_and_near, blocking_pairs, near_parts
+from physgraph_usd.solver.contact.cloth import ClothContact
+from physgraph_usd.solver.contact.springs import ClothSprings
 from physgraph_usd.solver.level import Level, build_levels
 from physgraph_usd.solver.mesh import threads
 from physgraph_usd.solver.mesh.topology import PolygonMesh
@@ -82,8 +84,8 @@ class Cloth:
     def __init__(self, shape: Shape, *, threads: int = 1) -> None:
         self.rest, faces = shape()
         mesh = PolygonMesh(np.full(len(faces), 3, np.int32), faces.ravel().astype(np.int32), len(self.rest))
-        garments = [named((mesh, self.rest), "Sheet")]
-        self.level: Level = build_levels(garments, [[]], dtype=torch.float64, threads=threads)[0]
+        self.garments = (named((mesh, self.rest), "Sheet"),)
+        self.level: Level = build_levels(self.garments, [[]], dtype=torch.float64, threads=threads)[0]
         self.parts = Parts(self.level, np.ones((1, 1), bool))
         edges, triangles = (each.numpy().astype(np.int32) for each in (self.level.edges, self.level.triangles))
         self.oracle = ipctk.CollisionMesh(np.asfortranarray(self.rest), edges, triangles)
@@ -257,3 +259,24 @@ def test_one_search_finds_what_blocks_a_move_and_what_is_near_at_its_end(shape: 
         more += len(both - expected)
     assert min(found) > 50
     assert more < 0.01 * found[0]
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_near_pairs_after_few_vertices_moved_are_those_of_a_new_search(shape: Shape):
+    """A tenth of the vertices is put back from the end of a move, and in every other move what blocks it too."""
+    cloth, rng, total = Cloth(shape), np.random.default_rng(11), 0
+    mesh = ClothContact((cloth.level,), cloth.garments).mesh(cloth.level, None, None, itself=True)
+    springs = ClothSprings(mesh, cloth.level.rest, torch.tensor([0.3 * EDGE]), None)
+    for number, (x, end) in enumerate(random_moves(cloth, 20, seed=12)):
+        start, aim = torch.as_tensor(x), torch.as_tensor(end)
+        blocking = springs.blocking(start, aim, aim, floor=0.01 * EDGE, queried=None)
+        moved = torch.zeros(len(x), dtype=torch.bool)
+        moved[blocking.corners.long().reshape(-1)] = number % 2 == 0
+        moved |= torch.as_tensor(rng.uniform(size=len(x)) < 0.1)
+        placed_back = torch.where(moved.unsqueeze(1), start, aim)
+        found = named_pairs(springs.near(placed_back, placed_back, queried=None, inside=None).pairs)
+        expected = named_pairs(near_parts(cloth.parts, placed_back, springs.reach).pairs)
+        assert len(found) == len(set(found))
+        assert set(found) == set(expected)
+        total += len(found)
+    assert total > 50

@@ -19,7 +19,7 @@ from functools import cached_property
 import numpy as np
 import torch
 import warp as wp
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ..collide.distance import weights_of
@@ -36,6 +36,8 @@ wp.set_module_options(KERNELS)
 HALF, MARGIN = 0.5, 0.1
 """Largest offset of a pair in a garment as a fraction of its distance at rest, so that a flat sheet exerts no force;
 and the search distance beyond the thickness, in edges."""
+FEW_MOVED = 0.25
+"""Largest part of the vertices that may have moved since the last search for its pairs to be kept."""
 LEAST_OFFSET = 0.25
 """Minimum offset as a fraction of the thickness, however close the parts are in the input."""
 _HALF, _MARGIN, _LEAST = (wp.constant(wp.float64(value)) for value in (HALF, MARGIN, LEAST_OFFSET))
@@ -114,6 +116,43 @@ def _required_gaps(thickness: Float[Tensor, " garments"], offsets: np.ndarray | 
     return out
 
 
+@dataclass(frozen=True, eq=False)
+class _Search:
+    """A search of near pairs.
+
+    Attributes:
+        x, version: Positions of the cloth [m], and the tensor's version then.
+        at: Positions of cloth and bodies [m], float64.
+        inside: As for `near_parts`.
+        near: The near pairs, without some with a vertex in `unknown`.
+    """
+
+    x: Float[Tensor, "vertices 3"]
+    version: int
+    at: Float[Tensor, "all 3"]
+    inside: Bool[Tensor, " all"] | None
+    near: NearAt
+    unknown: Int[Tensor, " some"] | None = None
+
+    def still_near(
+        self, at: Float[Tensor, "all 3"], inside: Bool[Tensor, " all"] | None
+    ) -> tuple[Pairs, Bool[Tensor, " all"]] | None:
+        """The pairs that are near at other positions [m] too, as none of their vertices has moved; None with few.
+
+        Returns:
+            The pairs, and a mask of the other vertices.
+        """
+        none = torch.zeros_like(at[:, 0], dtype=torch.bool)
+        before, now = (none if mask is None else mask for mask in (self.inside, inside))
+        changed = (at != self.at).any(dim=1) | (before ^ now)
+        if self.unknown is not None:
+            changed[self.unknown] = True
+        if int(changed.sum()) > FEW_MOVED * len(at):
+            return None
+        pairs = self.near.pairs
+        return pairs.where(~changed[pairs.corners.long()].any(dim=1)), changed
+
+
 class ClothSprings:
     """Finder of the contact springs of a level's cloth with itself and with bodies in one frame.
 
@@ -143,7 +182,7 @@ class ClothSprings:
         self.owner = torch.cat([level.vertex_garment, body_owner]).to(torch.int32).contiguous()
         self._rest, self._base = (torch.cat([cloth.double(), points]) for cloth in (level.rest, base))
         self._spacing = torch.nn.functional.pad(level.spacing.double(), (0, len(points)), value=torch.inf)
-        self._near: tuple[Tensor, int, NearAt] | None = None
+        self._last: _Search | None = None
 
     @cached_property
     def reach(self) -> Reach:
@@ -160,8 +199,8 @@ class ClothSprings:
 
     def cached(self, x: Float[Tensor, "vertices 3"]) -> NearAt | None:
         """Near pairs at the cloth's positions x [m], if the last search was at x; None otherwise."""
-        near = self._near
-        return near[2] if near is not None and near[0] is x and near[1] == x._version else None
+        last = self._last
+        return last.near if last is not None and last.x is x and last.version == x._version else None
 
     def near(
         self,
@@ -171,9 +210,18 @@ class ClothSprings:
         queried: Bool[Tensor, " all"] | None,
         inside: Bool[Tensor, " all"] | None,
     ) -> NearAt:
-        """Near pairs at the cloth's positions x, with bodies ``at`` [m]; masks are as for `near_parts`."""
-        near = self.cached(x) or near_parts(self._mesh.parts, at, self.reach, queried=queried, inside=inside)
-        self._near = x, x._version, near
+        """Near pairs at the cloth's positions x, with bodies ``at`` [m]; masks are as for `near_parts`.
+
+        If most vertices are where they were in the last search, only pairs of the others are searched.
+        """
+        near, parts = self.cached(x), self._mesh.parts
+        if near is not None:
+            return near
+        known = None if self._last is None or queried is not None else self._last.still_near(at, inside)
+        queried = queried if known is None else known[1]
+        near = near_parts(parts, at, self.reach, queried=queried, inside=inside)
+        near = near if known is None else NearAt(known[0].joined(near.pairs), self.reach)
+        self._last = _Search(x, x._version, at, inside, near)
         return near
 
     def blocking(
@@ -187,7 +235,7 @@ class ClothSprings:
     ) -> Pairs:
         """Pairs that block a move of cloth and bodies to an end with the cloth at x [m]; near pairs are cached."""
         pairs, near = blocking_and_near(self._mesh.parts, begin, end, self.reach, floor=floor, queried=queried)
-        self._near = x, x._version, near
+        self._last = _Search(x, x._version, end, None, near, pairs.corners.long().reshape(-1))
         return pairs
 
     def find(self, x: Float[Tensor, "all 3"], pairs: Pairs) -> NearSprings:
