@@ -149,6 +149,32 @@ class Garment:
 
 
 @dataclass(frozen=True, eq=False)
+class Limits:
+    """Distances that cloth may be from its smoothly subdivided cage, each times its painted multiplier.
+
+    Attributes:
+        max_distance: Largest distance in any direction [m]; None for no limit.
+        backstop: Largest distance inwards, against the cage's outward normals [m]; None for no limit.
+        max_distance_scale: Multiplier of ``max_distance`` at the cage's vertices, 0 to 1, shape (V,).
+        backstop_scale: Multiplier of ``backstop``, likewise.
+    """
+
+    max_distance: float | None
+    backstop: float | None
+    max_distance_scale: np.ndarray
+    backstop_scale: np.ndarray
+
+    @staticmethod
+    def are_equal(a: Limits | None, b: Limits | None) -> bool:
+        """Whether two limits are equal."""
+        if a is None or b is None:
+            return a is b
+        maps = (a.max_distance_scale, b.max_distance_scale), (a.backstop_scale, b.backstop_scale)
+        values = (a.max_distance, a.backstop) == (b.max_distance, b.backstop)
+        return values and all(x is y or np.array_equal(x, y) for x, y in maps)
+
+
+@dataclass(frozen=True, eq=False)
 class GarmentFrame:
     """One garment at one time code.
 
@@ -161,6 +187,7 @@ class GarmentFrame:
             `inertia.felt` gives it; None where it feels none.
         load: Force of the air per area at the coarse points [N/m^2], shape (V, 3), as `air.load` gives it; None for
             calm air without a difference in pressure.
+        limits: Distances that the cloth may be from its cage; None for no limits.
     """
 
     points: np.ndarray
@@ -170,6 +197,7 @@ class GarmentFrame:
     offset: float = 0.002
     acceleration: np.ndarray | None = None
     load: np.ndarray | None = None
+    limits: Limits | None = None
 
 
 @dataclass(frozen=True, eq=False)

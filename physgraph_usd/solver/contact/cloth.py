@@ -229,9 +229,15 @@ class LevelContact:
         tangles = self.look(x).tangles
         return None if tangles is None else self.mesh.pieces_with(tangles.label >= 0, over=0.5)
 
-    def pushed_out(self, x: Float[Tensor, "vertices 3"], *, vertices: bool = False) -> Float[Tensor, "vertices 3"]:
-        """As `LevelBodies.pushed_out`, or for vertices alone; x [m] itself if no cloth is inside or through a body."""
-        state = self.look(x)
+    def pushed_out(
+        self, x: Float[Tensor, "vertices 3"], state: ContactState | None = None, *, vertices: bool = False
+    ) -> Float[Tensor, "vertices 3"]:
+        """As `LevelBodies.pushed_out`, or for vertices alone; x [m] itself if no cloth is inside or through a body.
+
+        Args:
+            state: The state of x; None to look.
+        """
+        state = self.look(x) if state is None else state
         if self.bodies is None or not any(state.in_bodies):
             return x
         inside, chords = _within(self.mesh, self.bodies, state)

@@ -14,7 +14,7 @@ import numpy as np
 from ...errors import named_time
 from ..colliders.pose import Pose
 from ..rigid import AT_REST, Rigid, best_motion
-from ..scene import SAME_TIME, Frame, GarmentFrame
+from ..scene import SAME_TIME, Frame, GarmentFrame, Limits
 from .values import FrameState, join
 
 RETURNED = 0.25
@@ -249,7 +249,8 @@ def air_moved(before: GarmentFrame, after: GarmentFrame) -> float:
 
 def set_alike(a: GarmentFrame, b: GarmentFrame) -> bool:
     """Whether the artist's settings are equal in two frames."""
-    return (a.fabric, a.guide, a.detail, a.offset) == (b.fabric, b.guide, b.detail, b.offset)
+    values = (a.fabric, a.guide, a.detail, a.offset) == (b.fabric, b.guide, b.detail, b.offset)
+    return values and Limits.are_equal(a.limits, b.limits)
 
 
 def cage_moved(start: SolvedFrame, garment: GarmentFrame) -> float:

@@ -107,6 +107,11 @@ class LevelForces:
         raised = [garment.raises_bending for garment in self.garments]
         return ElasticTerms(fabrics, self.plain, (bending_term(self.plain, fabrics, raised=raised),))
 
+    @property
+    def stretch(self) -> Float[Tensor, " vertices"]:
+        """Diagonal of the Hessian of the terms in the plane at rest [N/m]."""
+        return self._in_plane.stiffness
+
     @cached_property
     def guide(self) -> Guide:
         """The guide, without a target."""

@@ -53,6 +53,16 @@ def scaled(problem: Problem, x: Placed) -> Placed:
     return x if result is x else unhindered(result) if view is None else view.moved(x, result)
 
 
+def limited(problem: Problem, x: Placed) -> Placed:
+    """The cloth within its limits [m], where possible without new crossings; `patched` is to follow."""
+    limit, view = problem.limit(problem.finest), problem.view(problem.finest)
+    wanted = x if limit is None else limit.held(x)
+    if limit is None or wanted is x or view is None:
+        return x if wanted is x else unhindered(wanted)
+    x = view.moved(x, wanted)
+    return x if (held := limit.held(x)) is x else unhindered(view.closed(held))
+
+
 def patched(problem: Problem, x: Placed) -> tuple[Placed, Tensor, dict[str, int]]:
     """The cloth with no patch worse than the subdivided cage, and more, as returned by `no_worse`."""
     view, level = problem.view(problem.finest), problem.forces[-1].level
@@ -94,8 +104,9 @@ def telemetry_of(problem: Problem, x: Tensor, module: ForceModule, *, reports: S
         x: The result [m].
         module: The terms at the finest level.
     """
-    finest = problem.forces[-1].level
+    finest, limit = problem.forces[-1].level, problem.limit(problem.finest)
     base = finest.base.apply(problem.cage.points)
+    base = base if limit is None else limit.held(base)
     return {
         "levels": [asdict(report) for report in reports],
         "energy_joules": {"input": module.energies(base), "output": module.energies(x)},

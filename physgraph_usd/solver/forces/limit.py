@@ -1,0 +1,144 @@
+"""Limits: how far cloth may be from its smoothly subdivided cage, in any direction and inwards.
+
+    |x_v - s_v| <= r_v,    n_v . (s_v - x_v) <= b_v
+
+| symbol | here | meaning |
+|---|---|---|
+| s_v | ``centre`` | the vertex on the smoothly subdivided cage [m] |
+| n_v | ``normal`` | the cage's outward unit normal there; 0 without faces of some area, then without a backstop |
+| r_v | ``radius`` | max distance, infinite for no limit [m] |
+| b_v | ``backstop`` | backstop, infinite for no limit [m] |
+
+Both sets are convex and contain s_v, so any position between a permitted position and s_v is permitted. `Limit.held`
+moves positions into both sets, and the solver keeps them there. So that cloth comes to rest before it is moved, springs
+begin at a fraction f of each limit l, and their stiffness grows with the distance u beyond:
+
+    E = sum_v k_v / 3 w_v max(u_v, 0)^3,    u_v = |x_v - s_v| - f l_v  or  n_v . (s_v - x_v) - f l_v,    w_v = (1 - f) l_v
+
+k_v is a fraction of the cloth's stiffness in its plane, which the metric knows: the springs do not slow the steps down.
+"""
+
+from __future__ import annotations
+
+import copy
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ..level import Level
+
+SOFT = 0.5
+"""Fraction f of a limit at which the springs begin."""
+STIFFNESS = 0.1
+"""Fraction of the stiffness of stretch at rest."""
+NARROWEST = 0.02
+"""Least width w, relative to the local edge length."""
+ROUNDING = 1e-3
+"""Excess over a limit that is not corrected, relative to the level's mean edge length."""
+FINEST = 1e-5
+"""Largest excess that is not corrected [m]."""
+
+
+class Limit:
+    """The limits of one level in one frame, and the springs in front of them."""
+
+    name = "limit"
+
+    def __init__(
+        self,
+        level: Level,
+        stiffness: Float[Tensor, " vertices"],
+        *,
+        centre: Float[Tensor, "vertices 3"],
+        normal: Float[Tensor, "vertices 3"],
+        radius: Float[Tensor, " vertices"] | None,
+        backstop: Float[Tensor, " vertices"] | None,
+    ) -> None:
+        """Take the limits; None for cloth without limits of a kind.
+
+        Args:
+            stiffness: Diagonal of the Hessian of stretch at rest [N/m].
+            centre: s [m].
+            normal: n.
+            radius: r [m].
+            backstop: b [m].
+        """
+        self._level, self._rounding = level, min(ROUNDING * float(level.spacing.mean()), FINEST)
+        self._centre, self._normal, self._radius, self._backstop = centre, normal, radius, backstop
+        narrowest, kinds = NARROWEST * level.spacing, list[Tensor]()
+        for limit in (radius, backstop):
+            if limit is not None:
+                kinds += [SOFT * limit, STIFFNESS * stiffness / torch.maximum((1.0 - SOFT) * limit, narrowest)]
+        self._springs = tuple(kinds)  # f l [m] and k / w [N/m^2] of each kind of limit.
+
+    @property
+    def aims(self) -> tuple[Tensor, ...]:
+        """All that changes from frame to frame."""
+        return self._centre, *((self._normal,) if self._backstop is not None else ()), *self._springs
+
+    def aimed(self, *aims: Tensor) -> Limit:
+        """The springs with other `aims`."""
+        limit = copy.copy(self)
+        limit._centre, *others = aims
+        if self._backstop is not None:
+            limit._normal, *others = others
+        limit._springs = tuple(others)
+        return limit
+
+    def _lags(self, x: Float[Tensor, "vertices 3"]) -> list[tuple[Tensor, Tensor]]:
+        """Distance [m] from the centre and its gradient, for each kind of limit."""
+        away, lags = x - self._centre, list[tuple[Tensor, Tensor]]()
+        if self._radius is not None:
+            far = away.square().sum(dim=1, keepdim=True).sqrt()
+            lags.append((far, away / far.clamp_min(torch.finfo(x.dtype).tiny)))
+        if self._backstop is not None:
+            lags.append((-(away * self._normal).sum(dim=1, keepdim=True), -self._normal))
+        return lags
+
+    def add_force(self, x: Float[Tensor, "vertices 3"], force: Float[Tensor, "vertices 3"]) -> Float[Tensor, ""]:
+        """Add the force [N] in place and return the energy [J]."""
+        energy = x.new_zeros((), dtype=torch.float64)
+        for (far, along), begin, rate in zip(self._lags(x), self._springs[::2], self._springs[1::2], strict=True):
+            beyond = (far - begin.unsqueeze(1)).clamp_min(0.0)
+            push = rate.unsqueeze(1) * beyond * beyond
+            force -= push * along
+            energy = energy + torch.dot(push.reshape(-1), beyond.reshape(-1)).double() / 3.0
+        return energy
+
+    def diagonal(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " vertices"]:
+        """2/3 k u / w of each spring, without the turn of its direction [N/m]."""
+        total = torch.zeros_like(x[:, 0])
+        for (far, along), begin, rate in zip(self._lags(x), self._springs[::2], self._springs[1::2], strict=True):
+            total += 2.0 / 3.0 * rate * (far[:, 0] - begin).clamp_min(0.0) * along.square().sum(dim=1)
+        return total
+
+    def rest_springs(self) -> tuple[float, float]:
+        """None: cloth at rest is at its centre."""
+        return 0.0, 0.0
+
+    def excess(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " vertices"]:
+        """Distance beyond the limits [m]; 0 at vertices that the solve does not move."""
+        over = torch.zeros_like(x[:, 0])
+        for (far, _), limit in zip(self._lags(x), self._kinds, strict=True):
+            over = torch.maximum(over, far[:, 0] - limit)
+        return torch.where(self._level.free[:, 0], over, 0.0)
+
+    def held(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
+        """Positions moved into the limits [m], x itself if none is beyond."""
+        if not bool((self.excess(x) > self._rounding).any()):
+            return x
+        away = x - self._centre
+        if self._backstop is not None:
+            deep = -(away * self._normal).sum(dim=1) - self._backstop
+            away = away + deep.clamp_min(0.0).unsqueeze(1) * self._normal
+        if self._radius is not None:
+            far = away.square().sum(dim=1).sqrt().clamp_min(torch.finfo(x.dtype).tiny)
+            away = away * (self._radius / far).clamp_max(1.0).unsqueeze(1)
+        beyond = (self.excess(x) > 0.0).unsqueeze(1)
+        return torch.where(beyond, self._centre + away, x)
+
+    @property
+    def _kinds(self) -> list[Tensor]:
+        """The limits of each kind [m]."""
+        return [limit for limit in (self._radius, self._backstop) if limit is not None]
