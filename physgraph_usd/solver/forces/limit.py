@@ -22,6 +22,8 @@ from __future__ import annotations
 
 import copy
 
+import numpy as np
+import scipy.sparse as sp
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -30,7 +32,7 @@ from ..level import Level
 
 SOFT = 0.5
 """Fraction f of a limit at which the springs begin."""
-STIFFNESS = 0.1
+STIFFNESS = {"distance": 0.003, "backstop": 0.1}
 """Fraction of the stiffness of stretch at rest."""
 NARROWEST = 0.02
 """Least width w, relative to the local edge length."""
@@ -67,9 +69,9 @@ class Limit:
         self._level, self._rounding = level, min(ROUNDING * float(level.spacing.mean()), FINEST)
         self._centre, self._normal, self._radius, self._backstop = centre, normal, radius, backstop
         narrowest, kinds = NARROWEST * level.spacing, list[Tensor]()
-        for limit in (radius, backstop):
+        for limit, part in zip((radius, backstop), STIFFNESS.values(), strict=True):
             if limit is not None:
-                kinds += [SOFT * limit, STIFFNESS * stiffness / torch.maximum((1.0 - SOFT) * limit, narrowest)]
+                kinds += [SOFT * limit, part * stiffness / torch.maximum((1.0 - SOFT) * limit, narrowest)]
         self._springs = tuple(kinds)  # f l [m] and k / w [N/m^2] of each kind of limit.
 
     @property
@@ -123,6 +125,31 @@ class Limit:
         for (far, _), limit in zip(self._lags(x), self._kinds, strict=True):
             over = torch.maximum(over, far[:, 0] - limit)
         return torch.where(self._level.free[:, 0], over, 0.0)
+
+    def in_front(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
+        """Positions moved out to the backstop [m], x itself if none is behind."""
+        if self._backstop is None:
+            return x
+        deep = -((x - self._centre) * self._normal).sum(dim=1) - self._backstop
+        deep = torch.where(self._level.free[:, 0], deep.clamp_min(0.0), 0.0)
+        return x + deep.unsqueeze(1) * self._normal if bool((deep > self._rounding).any()) else x
+
+    def scaled(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
+        """Positions with the distance to the centre scaled down evenly around vertices too far [m], or x itself.
+
+        The scale at a vertex of the cage is the least one needed by the vertices that depend on it, and is linear
+        between: folds become shallower, and no sharper.
+        """
+        if self._radius is None:
+            return x
+        away, free, matrix = x - self._centre, self._level.free[:, 0], sp.csc_matrix(self._level.from_coarse)
+        far = away.square().sum(dim=1).sqrt()
+        if not bool((free & (far > self._radius + self._rounding)).any()):
+            return x
+        needed = torch.where(free & (far > self._radius), self._radius / far, 1.0).double().cpu().numpy()
+        least = np.minimum.reduceat(needed[matrix.indices], matrix.indptr[:-1])
+        scale = torch.as_tensor(self._level.from_coarse @ least).to(x).unsqueeze(1)
+        return torch.where(free.unsqueeze(1) & (scale < 1.0), self._centre + scale * away, x)
 
     def held(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
         """Positions moved into the limits [m], x itself if none is beyond."""

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..contact.cloth import LevelContact
+from ..contact.cloth_mesh import RINGS
 from ..forces.limit import Limit
 from ..level import Level
 from ..mesh.stencil import add_at
@@ -27,8 +28,9 @@ def limit_of(
 ) -> Limit | None:
     """The limits of a level in one frame; None if no garment has limits.
 
-    Where the subdivided cage is inside a body, distances are from its place moved out of the body. Vertices sewn
-    together have the smallest of their limits.
+    Contact has precedence where the subdivided cage crosses something: within `RINGS` rings of its crossings with cloth
+    there is no limit, and where it is inside or through a body, distances are from its place moved out of the body.
+    Vertices sewn together have the smallest of their limits.
 
     Args:
         frames: The garments in that frame.
@@ -45,7 +47,13 @@ def limit_of(
         if view.seam is not None:
             centre, normal = view.closed(centre), torch.nn.functional.normalize(view.closed(normal), dim=1)
             radius, backstop = (None if limit is None else view.seam.least(limit) for limit in (radius, backstop))
-        centre = view.pushed_out(centre, view.detect(centre)) if view.frame is not None else centre
+        state = view.detect(centre)
+        if state.crossings.count:
+            crossed = view.mesh.grown(view.mesh.crossed(state.crossings), RINGS)[: len(centre)]
+            radius, backstop = (
+                None if limit is None else torch.where(crossed, torch.inf, limit) for limit in (radius, backstop)
+            )
+        centre = view.pushed_out(centre, state)
     return Limit(level, lasting.stretch, centre=centre, normal=normal, radius=radius, backstop=backstop)
 
 

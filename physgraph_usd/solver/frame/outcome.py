@@ -56,7 +56,7 @@ def scaled(problem: Problem, x: Placed) -> Placed:
 def limited(problem: Problem, x: Placed) -> Placed:
     """The cloth within its limits [m], where possible without new crossings; `patched` is to follow."""
     limit, view = problem.limit(problem.finest), problem.view(problem.finest)
-    wanted = x if limit is None else limit.held(x)
+    wanted = x if limit is None else limit.scaled(limit.in_front(x))
     if limit is None or wanted is x or view is None:
         return x if wanted is x else unhindered(wanted)
     x = view.moved(x, wanted)
@@ -97,19 +97,21 @@ def next_state(problem: Problem, x: Placed, memory: Any, following: Tensor) -> F
     )
 
 
-def telemetry_of(problem: Problem, x: Tensor, module: ForceModule, *, reports: Sequence[LevelReport]) -> dict[str, Any]:
+def telemetry_of(
+    problem: Problem, x: Tensor, module: ForceModule, *, solved: Tensor, reports: Sequence[LevelReport]
+) -> dict[str, Any]:
     """Telemetry of a frame's solve and result, as plain values.
 
     Args:
         x: The result [m].
+        solved: The result before it was moved into its limits, for the energies [m].
         module: The terms at the finest level.
     """
-    finest, limit = problem.forces[-1].level, problem.limit(problem.finest)
+    finest = problem.forces[-1].level
     base = finest.base.apply(problem.cage.points)
-    base = base if limit is None else limit.held(base)
     return {
         "levels": [asdict(report) for report in reports],
-        "energy_joules": {"input": module.energies(base), "output": module.energies(x)},
+        "energy_joules": {"input": module.energies(base), "output": module.energies(solved)},
         "sharp_folds": sharp_folds(finest, x),
         "strain": edge_strain(finest, x),
         "remaining_mm": round(1e3 * problem.group.spacings[-1] * reports[-1].remaining_move, 4) if reports else 0.0,

@@ -66,8 +66,8 @@ class LevelProblem:
         return self.lasting.level
 
     def held(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
-        """Positions moved into the limits [m], x itself if none is beyond."""
-        return x if self.limit is None else self.limit.held(x)
+        """Positions moved out to the backstop [m], x itself if none is behind."""
+        return x if self.limit is None else self.limit.in_front(x)
 
     def system(
         self,
@@ -163,7 +163,7 @@ class Problem:
         """The finest vertices with the last frame's detail, moved from their last positions as far as allowed [m]."""
         view, warm, limit = self.view(self.finest), self.start.detailed, self.limit(self.finest)
         assert warm is not None
-        warm = warm if limit is None else limit.held(warm)
+        warm = warm if limit is None else limit.in_front(warm)
         if view is None or self.before is None:
             return warm
         return view.carried(self.before, warm, self.inside)

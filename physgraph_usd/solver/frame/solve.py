@@ -77,11 +77,12 @@ def solve_frame(group: Group, frame: FrameInput, last: FrameState | None, *, few
     if problem.contact is not None:
         visible, finish = problem.contact.finish(x)
         x = visible if problem.contact.is_out(visible) else x  # What is pushed out in vain is not carried on.
-    solution = limited(problem, scaled(problem, visible))
+    unlimited = scaled(problem, visible)
+    solution = limited(problem, unlimited)
     visible, following, figures = patched(problem, solution)
     state = next_state(problem, x, memory, following)
     solved = time.perf_counter()
-    telemetry = telemetry_of(problem, solution, module, reports=[*reports, *level_reports])
+    telemetry = telemetry_of(problem, solution, module, solved=unlimited, reports=[*reports, *level_reports])
     telemetry |= {"start": GIVEN_UP} if problem.hopeless else {}
     contact, crossing = measured(problem, visible)
     telemetry |= {"contact": contact | finish} if contact else {}
