@@ -25,14 +25,15 @@ import copy
 import numpy as np
 import scipy.sparse as sp
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..level import Level
+from ..mesh.stencil import three_columns
 
 SOFT = 0.5
 """Fraction f of a limit at which the springs begin."""
-STIFFNESS = {"distance": 0.003, "backstop": 0.1}
+STIFFNESS = {"distance": 0.001, "backstop": 0.1}
 """Fraction of the stiffness of stretch at rest."""
 NARROWEST = 0.02
 """Least width w, relative to the local edge length."""
@@ -88,32 +89,41 @@ class Limit:
         limit._springs = tuple(others)
         return limit
 
-    def _lags(self, x: Float[Tensor, "vertices 3"]) -> list[tuple[Tensor, Tensor]]:
-        """Distance [m] from the centre and its gradient, for each kind of limit."""
-        away, lags = x - self._centre, list[tuple[Tensor, Tensor]]()
+    def _lags(self, away: Float[Tensor, "vertices 3"]) -> list[tuple[Tensor, Tensor, Tensor]]:
+        """For each kind of limit: distance [m], shape (V,), a vector along its gradient, and that vector's length."""
+        lags = list[tuple[Tensor, Tensor, Tensor]]()
         if self._radius is not None:
-            far = away.square().sum(dim=1, keepdim=True).sqrt()
-            lags.append((far, away / far.clamp_min(torch.finfo(x.dtype).tiny)))
+            far = torch.linalg.vector_norm(away, dim=1)
+            lags.append((far, away, far.clamp_min(torch.finfo(away.dtype).tiny)))
         if self._backstop is not None:
-            lags.append((-(away * self._normal).sum(dim=1, keepdim=True), -self._normal))
+            deep = -torch.linalg.vecdot(away, self._normal)
+            lags.append((deep, self._normal, torch.full_like(deep, -1.0)))
         return lags
+
+    def _pushes(self, away: Float[Tensor, "vertices 3"]) -> list[tuple[Tensor, Tensor, Tensor, Tensor]]:
+        """For each kind of limit: u and k / w, and vector and length of `_lags`."""
+        springs = zip(self._lags(away), self._springs[::2], self._springs[1::2], strict=True)
+        return [((far - begin).clamp_min(0.0), rate, along, length) for (far, along, length), begin, rate in springs]
 
     def add_force(self, x: Float[Tensor, "vertices 3"], force: Float[Tensor, "vertices 3"]) -> Float[Tensor, ""]:
         """Add the force [N] in place and return the energy [J]."""
         energy = x.new_zeros((), dtype=torch.float64)
-        for (far, along), begin, rate in zip(self._lags(x), self._springs[::2], self._springs[1::2], strict=True):
-            beyond = (far - begin.unsqueeze(1)).clamp_min(0.0)
-            push = rate.unsqueeze(1) * beyond * beyond
-            force -= push * along
-            energy = energy + torch.dot(push.reshape(-1), beyond.reshape(-1)).double() / 3.0
+        for beyond, rate, along, length in self._pushes(x - self._centre):
+            push = rate * beyond * beyond
+            force.addcmul_(three_columns(push / length), along, value=-1.0)
+            energy = energy + torch.dot(push, beyond).double() / 3.0
         return energy
+
+    def split(self, x: Float[Tensor, "vertices 3"]) -> tuple[Float[Tensor, " parts"], Int[Tensor, " parts"]]:
+        """Energy of each spring [J] at positions x [m], and the garment of its vertex."""
+        pushes = self._pushes(x - self._centre)
+        energies = [rate * beyond**3 / 3.0 for beyond, rate, _, _ in pushes]
+        return torch.cat(energies), self._level.vertex_garment.repeat(len(pushes))
 
     def diagonal(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " vertices"]:
         """2/3 k u / w of each spring, without the turn of its direction [N/m]."""
-        total = torch.zeros_like(x[:, 0])
-        for (far, along), begin, rate in zip(self._lags(x), self._springs[::2], self._springs[1::2], strict=True):
-            total += 2.0 / 3.0 * rate * (far[:, 0] - begin).clamp_min(0.0) * along.square().sum(dim=1)
-        return total
+        pushes = self._pushes(x - self._centre)
+        return torch.stack([2.0 / 3.0 * rate * beyond for beyond, rate, _, _ in pushes]).sum(dim=0)
 
     def rest_springs(self) -> tuple[float, float]:
         """None: cloth at rest is at its centre."""
@@ -122,8 +132,8 @@ class Limit:
     def excess(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " vertices"]:
         """Distance beyond the limits [m]; 0 at vertices that the solve does not move."""
         over = torch.zeros_like(x[:, 0])
-        for (far, _), limit in zip(self._lags(x), self._kinds, strict=True):
-            over = torch.maximum(over, far[:, 0] - limit)
+        for (far, _, _), limit in zip(self._lags(x - self._centre), self._kinds, strict=True):
+            over = torch.maximum(over, far - limit)
         return torch.where(self._level.free[:, 0], over, 0.0)
 
     def in_front(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:

@@ -59,6 +59,8 @@ def limited(problem: Problem, x: Placed) -> Placed:
     wanted = x if limit is None else limit.scaled(limit.in_front(x))
     if limit is None or wanted is x or view is None:
         return x if wanted is x else unhindered(wanted)
+    if view.look(wanted := view.closed(wanted)).is_clean:
+        return unhindered(wanted)
     x = view.moved(x, wanted)
     return x if (held := limit.held(x)) is x else unhindered(view.closed(held))
 
