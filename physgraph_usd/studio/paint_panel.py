@@ -23,6 +23,8 @@ MULTIPLIED = {
     "bendScale": ("bendStiffness",),
     "detailScale": ("refine:detail",),
     "guideScale": ("guide:stiffness",),
+    "maxDistanceScale": ("maxDistance",),
+    "backstopScale": ("backstop",),
     "easeScale": ("rest:weftEase", "rest:warpEase"),
 }
 """Values that each map multiplies, by the schema's short names."""
@@ -78,6 +80,8 @@ class PaintPanel:
         labels = " and ".join(TUNABLES[name].label for name in names)
         idle = names and not any(session.value(self._desk.garment, name) for name in names)
         verb = "which are 0: raise one of them" if len(names) > 1 else "which is 0: raise it"
+        if names and all(session.value(self._desk.garment, name) is None for name in names):
+            verb = "which is unset: set it"
         remark = f"No effect yet: the map multiplies {labels}, {verb} under Values." if idle else ""
         put(self._remark, content=small(remark, "remark") if remark else "")
 

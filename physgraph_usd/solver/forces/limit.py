@@ -9,13 +9,16 @@
 | r_v | ``radius`` | max distance, infinite for no limit [m] |
 | b_v | ``backstop`` | backstop, infinite for no limit [m] |
 
-Both sets are convex and contain s_v, so any position between a permitted position and s_v is permitted. `Limit.held`
-moves positions into both sets, and the solver keeps them there. So that cloth comes to rest before it is moved, springs
-begin at a fraction f of each limit l, and their stiffness grows with the distance u beyond:
+Both sets are convex and contain s_v, so any position between a permitted position and s_v is permitted.
 
-    E = sum_v k_v / 3 w_v max(u_v, 0)^3,    u_v = |x_v - s_v| - f l_v  or  n_v . (s_v - x_v) - f l_v,    w_v = (1 - f) l_v
+Springs begin at a fraction f of each limit l, and their stiffness grows with the distance u beyond:
 
-k_v is a fraction of the cloth's stiffness in its plane, which the metric knows: the springs do not slow the steps down.
+    E = sum_v k_v / 3 w_v max(u_v, 0)^3,    w_v = (1 - f) l_v
+    u_v = |x_v - s_v| - f l_v    or    u_v = n_v . (s_v - x_v) - f l_v
+
+The springs of the max distance are soft: cloth that is held firmly within a small distance takes up its surplus length in
+sharp ripples. What they leave is scaled down evenly at the end of a frame (`Limit.scaled`), so folds get shallower and no
+sharper. The springs of the backstop act like contact, and what they leave is moved out to it (`Limit.in_front`).
 """
 
 from __future__ import annotations
@@ -34,7 +37,8 @@ from ..mesh.stencil import three_columns
 SOFT = 0.5
 """Fraction f of a limit at which the springs begin."""
 STIFFNESS = {"distance": 0.001, "backstop": 0.1}
-"""Fraction of the stiffness of stretch at rest."""
+"""k_v of each kind of limit, as a fraction of the stiffness of stretch at rest. The skirt at 3 mm, with 10% of the edges
+folded by over 20 degrees without a limit, has 0.8, 1.8, 5.9, 10, 12 and 16% at 0, 0.0003, 0.001, 0.002, 0.003 and 0.01."""
 NARROWEST = 0.02
 """Least width w, relative to the local edge length."""
 ROUNDING = 1e-3
