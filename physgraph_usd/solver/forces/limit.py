@@ -16,9 +16,9 @@ Springs begin at a fraction f of each limit l, and their stiffness grows with th
     E = sum_v k_v / 3 w_v max(u_v, 0)^3,    w_v = (1 - f) l_v
     u_v = |x_v - s_v| - f l_v    or    u_v = n_v . (s_v - x_v) - f l_v
 
-The springs of the max distance are soft: cloth that is held firmly within a small distance takes up its surplus length in
-sharp ripples. What they leave is scaled down evenly at the end of a frame (`Limit.scaled`), so folds get shallower and no
-sharper. The springs of the backstop act like contact, and what they leave is moved out to it (`Limit.in_front`).
+The springs of the max distance are soft: cloth that is held firmly within a small distance takes up its surplus length
+in sharp ripples. What they leave is scaled down evenly at the end of a frame (`Limit.scaled`), so folds get shallower
+and no sharper. The springs of the backstop act like contact, and what they leave is moved out to it (`in_front`).
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ from ..mesh.stencil import three_columns
 
 SOFT = 0.5
 """Fraction f of a limit at which the springs begin."""
-STIFFNESS = {"distance": 0.001, "backstop": 0.1}
-"""k_v of each kind of limit, as a fraction of the stiffness of stretch at rest. The skirt at 3 mm, with 10% of the edges
-folded by over 20 degrees without a limit, has 0.8, 1.8, 5.9, 10, 12 and 16% at 0, 0.0003, 0.001, 0.002, 0.003 and 0.01."""
+FIRMNESS = {"distance": 0.001, "backstop": 0.1}
+"""k_v of each kind of limit, as a fraction of the stiffness of stretch at rest. Of the skirt's edges 10% are folded by
+over 20 degrees without a limit, and at 3 mm 0.8, 1.8, 5.9, 10, 12 and 16% with 0, 0.0003, 0.001, 0.002, 0.003, 0.01."""
 NARROWEST = 0.02
 """Least width w, relative to the local edge length."""
-ROUNDING = 1e-3
+TOLERATED = 1e-3
 """Excess over a limit that is not corrected, relative to the level's mean edge length."""
-FINEST = 1e-5
+MOST_TOLERATED = 1e-5
 """Largest excess that is not corrected [m]."""
 
 
@@ -71,10 +71,10 @@ class Limit:
             radius: r [m].
             backstop: b [m].
         """
-        self._level, self._rounding = level, min(ROUNDING * float(level.spacing.mean()), FINEST)
+        self._level, self._tolerated = level, min(TOLERATED * float(level.spacing.mean()), MOST_TOLERATED)
         self._centre, self._normal, self._radius, self._backstop = centre, normal, radius, backstop
         narrowest, kinds = NARROWEST * level.spacing, list[Tensor]()
-        for limit, part in zip((radius, backstop), STIFFNESS.values(), strict=True):
+        for limit, part in zip((radius, backstop), FIRMNESS.values(), strict=True):
             if limit is not None:
                 kinds += [SOFT * limit, part * stiffness / torch.maximum((1.0 - SOFT) * limit, narrowest)]
         self._springs = tuple(kinds)  # f l [m] and k / w [N/m^2] of each kind of limit.
@@ -146,7 +146,7 @@ class Limit:
             return x
         deep = -((x - self._centre) * self._normal).sum(dim=1) - self._backstop
         deep = torch.where(self._level.free[:, 0], deep.clamp_min(0.0), 0.0)
-        return x + deep.unsqueeze(1) * self._normal if bool((deep > self._rounding).any()) else x
+        return x + deep.unsqueeze(1) * self._normal if bool((deep > self._tolerated).any()) else x
 
     def scaled(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
         """Positions with the distance to the centre scaled down evenly around vertices too far [m], or x itself.
@@ -158,7 +158,7 @@ class Limit:
             return x
         away, free, matrix = x - self._centre, self._level.free[:, 0], sp.csc_matrix(self._level.from_coarse)
         far = away.square().sum(dim=1).sqrt()
-        if not bool((free & (far > self._radius + self._rounding)).any()):
+        if not bool((free & (far > self._radius + self._tolerated)).any()):
             return x
         needed = torch.where(free & (far > self._radius), self._radius / far, 1.0).double().cpu().numpy()
         least = np.minimum.reduceat(needed[matrix.indices], matrix.indptr[:-1])
@@ -167,7 +167,7 @@ class Limit:
 
     def held(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
         """Positions moved into the limits [m], x itself if none is beyond."""
-        if not bool((self.excess(x) > self._rounding).any()):
+        if not bool((self.excess(x) > self._tolerated).any()):
             return x
         away = x - self._centre
         if self._backstop is not None:

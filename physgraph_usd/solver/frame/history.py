@@ -249,8 +249,9 @@ def air_moved(before: GarmentFrame, after: GarmentFrame) -> float:
 
 def set_alike(a: GarmentFrame, b: GarmentFrame) -> bool:
     """Whether the artist's settings are equal in two frames."""
-    values = (a.fabric, a.guide, a.detail, a.offset) == (b.fabric, b.guide, b.detail, b.offset)
-    return values and Limits.are_equal(a.limits, b.limits)
+    if not Limits.are_equal(a.limits, b.limits):
+        return False
+    return (a.fabric, a.guide, a.detail, a.offset) == (b.fabric, b.guide, b.detail, b.offset)
 
 
 def cage_moved(start: SolvedFrame, garment: GarmentFrame) -> float:

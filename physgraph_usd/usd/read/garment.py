@@ -209,7 +209,7 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], samples: Samples, re
     notices = [*samples.notices(str(prim.GetPath()), absent), *cage.notices, *bent_notices, *placement]
     values = find_values(prim, request.units, request.overrides)
     constants, of_constants = _constants(prim, request)
-    painted, cut = _painted(prim, weld, notices, values=values, overrides=request.overrides)
+    painted, cut, scales = _painted(prim, weld, notices, values=values, overrides=request.overrides)
     subsets = read_subsets(prim, cage.kept_faces[weld.faces], units=request.units, time=times[0] if times else None)
     pieces = _pieces(prim, weld, rest.points, subsets.faces, notices)
     grain, lies = read_grain(prim, weld, rest.points, kept=cage.kept_faces, up=request.units.up, painted=cut)
@@ -236,7 +236,6 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], samples: Samples, re
     )
     motion = _motion(prim, points, weld, times=every, metres=request.units.metres)
     air = Air(values, garment, request.units.up, 1.0 / prim.GetStage().GetTimeCodesPerSecond())
-    scales = tuple(-weld.largest(-cut[name]) for name in _LIMIT_SCALES)  # On a welded border the least holds.
     return GarmentReader(garment, source, values, points, weld, notices, samples.hidden, motion, air, scales)
 
 
@@ -392,8 +391,9 @@ def _rest(prim: Usd.Prim, weld: Weld, animation: Animation, request: Request, *,
 
 def _painted(
     prim: Usd.Prim, weld: Weld, notices: list[Notice], *, values: Values, overrides: Sequence[Override]
-) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """The painted arrays of a garment by field name, times the relative thickness, and the grain's by schema name.
+) -> tuple[dict[str, Any], dict[str, np.ndarray], tuple[np.ndarray, ...]]:
+    """The painted arrays of a garment by field name, times the relative thickness, the grain's by schema name, and the
+    limits' at the solved vertices.
 
     Adds to the notices.
     """
@@ -409,7 +409,8 @@ def _painted(
     arrays["stretch_scale"] = arrays["stretch_scale"] * values.thickness_scale("stretchStiffness")
     arrays["bend_scale"] = arrays["bend_scale"] * values.thickness_scale("bendStiffness")
     joined = {name: weld.largest(arrays[name]) if name == "pin" else weld.joined(arrays[name]) for name in names}
-    return joined, {name: arrays[name] for name in cut}
+    least = tuple(-weld.largest(-arrays[name]) for name in _LIMIT_SCALES)  # Of what is joined.
+    return joined, {name: arrays[name] for name in cut if name not in _LIMIT_SCALES}, least
 
 
 def _at_open_borders(prim: Usd.Prim, weld: Weld) -> np.ndarray:
@@ -503,7 +504,7 @@ def read_painted(
         message = f"{len(values)} values with {interpolation} interpolation on {count} points"
         raise SchemaError(f"{location} has {message}; author one value per point (vertex) or one for all (constant)")
     notices: tuple[Notice, ...] = ()
-    if row.maximum == 1.0 and (values > 1.0).any():  # Painted weights may exceed 1 by rounding.
+    if row is GARMENT["pin"] and (values > 1.0).any():  # Painted weights may exceed 1 by rounding.
         message = f"{row.name} goes up to {values.max():g}; values over 1 are taken as 1"
         values, notices = np.minimum(values, 1.0), (Notice(str(prim.GetPath()), None, message),)
     for index in (int(values.argmin()), int(values.argmax())) if count else ():  # Both find NaN first.
