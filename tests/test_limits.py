@@ -283,7 +283,7 @@ def test_force_is_minus_the_gradient_of_the_energy(sheet: tuple[Garment, list[np
             assert float(force[vertex, axis]) == pytest.approx(-float(gradient[vertex, axis]), rel=1e-4, abs=1e-9)
 
 
-def shot_with(folder: Path, **values: float | dict[float, float]) -> Path:
+def shot_with(folder: Path, **values: float | dict[float, float]) -> str:
     stage = new_stage(folder / "s.usda")
     mesh = add_sheet(stage)
     for name, value in values.items():
