@@ -100,10 +100,10 @@ def _refine(shot: Path, out: Path, **options: Any) -> Finished:
 
 def _points(frames: Finished, index: int, *, seam: int | None = None) -> np.ndarray:
     """World positions [m] of the first garment in a frame by number, shape (V, 3)."""
-    outcome = frames.read(index, None, seam=seam)
-    assert outcome is not None
-    assert outcome.points[0] is not None
-    return outcome.points[0].astype(np.float64)
+    result = frames.read(index, None, seam=seam)
+    assert result is not None
+    assert result.garments[0].points is not None
+    return result.garments[0].points.astype(np.float64)
 
 
 def _apart(one: np.ndarray, other: np.ndarray, edges: np.ndarray) -> tuple[float, float]:

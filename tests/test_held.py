@@ -166,8 +166,8 @@ def held(name: str, place: Path, *, level: int, frames: int = 15) -> Moves:
     refiner = Refiner(shot.scene, settings, levels=[level] * len(shot.scene.garments), device="cpu", threads=THREADS)
     given = [shot.frame(time) for time in times]
     given += [_held(given[-1], count) for count in range(1, frames + 1)]
-    solved = [refiner.solve(frame).points for frame in given][-LAST - 1 :]
-    points = [np.concatenate([each for each in garments if each is not None]) for garments in solved]
+    solved = [refiner.solve(frame).garments for frame in given][-LAST - 1 :]
+    points = [np.concatenate([each.points for each in garments if each.points is not None]) for garments in solved]
     moves = [np.linalg.norm(after - before, axis=1) for before, after in pairwise(points)]
     farthest = float(np.mean([each.max() for each in moves]))
     return Moves(len(points[0]), farthest, float(np.mean([np.count_nonzero(each > 1e-3) for each in moves])))

@@ -43,9 +43,9 @@ def solve(
     """Positions of the garments in each frame, and the first garment's telemetry."""
     scene = Scene(tuple(garments), DOWN, tuple(float(frame.time or 0.0) for frame in frames), tuple(colliders))
     refiner = Refiner(scene, settings_of(integrator="physgraph"), levels=[level] * len(garments))
-    states = [refiner.solve(frame) for frame in frames]
-    points = [[x for x in state.points if x is not None] for state in states]
-    return points, [dict(state.telemetry[0]) for state in states]
+    results = [refiner.solve(frame).garments for frame in frames]
+    points = [[garment.points for garment in garments if garment.points is not None] for garments in results]
+    return points, [garments[0].telemetry for garments in results]
 
 
 def level_of(garment: Garment, level: int = 2) -> Level:

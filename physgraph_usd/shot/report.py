@@ -13,6 +13,7 @@ from typing import Any
 
 from ..errors import named, place_of
 from ..interrupts import SIGNALLED
+from ..solver.scene import Result
 from ..usd.write.atomic import write_text
 from ..version import __version__
 from .plain_json import to_json
@@ -136,6 +137,11 @@ class RefineReport:
             for contact_part in (contact.get("cloth"), *contact.get("bodies", {}).values())
         ]
         return [contact_part[side]["crossings"] for contact_part in measured if contact_part]
+
+    def add(self, result: Result) -> None:
+        """Add a frame: its telemetry, and that of each garment if the frame could be solved."""
+        garments = {"garments": [garment.telemetry for garment in result.garments]} if result.garments else {}
+        self.frames.append({"time": result.time, **result.telemetry, **garments})
 
     def measured(self, frame: Mapping[str, Any]) -> list[dict[str, Any]]:
         """Measurements of contact in a frame: one per garment or group of garments solved together."""

@@ -17,8 +17,8 @@ from ..interrupts import leave_if_asked
 from ..solver.frame.lead_in import prerolled_cages
 from ..solver.frame.refiner import Refiner
 from ..solver.mesh.kernels import device_of, start_warp
+from ..solver.scene import Result
 from ..usd.read.reader import Shot
-from .frames import Outcome
 from .from_rest import FromRest
 from .joined import Mover, Positions, counts, worse
 from .opened import open_for, why_not_posed
@@ -26,7 +26,7 @@ from .options import RefineOptions
 from .processes import cores
 from .run_in import RunIn, pose_in
 
-Outcomes = Generator[Outcome, None, None]
+Results = Generator[Result, None, None]
 
 
 def prepare_device(device: str) -> str:
@@ -61,7 +61,7 @@ class ShotSolver:
         opened = {"_opened": None, "_refiner": None}
         return self.__dict__ | opened | {"_shot": os.path.abspath(self._shot), "_options": options}
 
-    def __call__(self, times: Sequence[float | None]) -> Outcomes:
+    def __call__(self, times: Sequence[float | None]) -> Results:
         """Solve time codes in order; a failed one yields its error, the next starts from the last solved frame."""
         shot, refiner = self._built()
         seconds = self._begin(shot, refiner, times)
@@ -72,14 +72,13 @@ class ShotSolver:
                 with At(time=time):
                     frame = shot.frame(time)
                     read_ms = round(1e3 * (clock.perf_counter() - began), 3)
-                    state = refiner.solve(frame, sampled_at(shot, time))
-                record = {"time": time, "read_ms": read_ms, "garments": list(state.telemetry)} | before
-                outcome = Outcome(time, state.points, state.reused, record, state.heat)
+                    result = refiner.solve(frame, sampled_at(shot, time))
+                result = dataclasses.replace(result, telemetry={"read_ms": read_ms, **before})
             except (SolveError, StageError) as error:
-                outcome = Outcome(time, (), (), {"time": time, "error": str(error)})
+                result = Result(time, telemetry={"error": str(error)})
             leave_if_asked()  # A signal may have cut the frame short.
             before = {}
-            yield outcome
+            yield result
         self._refiner = refiner
 
     def mover(self) -> Mover:

@@ -124,7 +124,7 @@ class PaintPanel:
         if at is None or self._name == OFF:
             return
         garment, cage = session.garments[index], session.shot.scene.garments[index]
-        points = np.asarray(session.solve().points[index])
+        points = np.asarray(session.solve().garments[index].points)
         stroke = self._stroke
         if stroke is None or (stroke.garment, stroke.name) != (garment, self._name):
             stroke = Stroke(garment, self._name, session.painted(garment, self._name))
@@ -142,7 +142,7 @@ class PaintPanel:
 
     def _say_value(self, session: TuneSession, index: int, at: np.ndarray, values: np.ndarray) -> None:
         """Draw the rings at a place in the scene [m], and write a map's value there."""
-        points = np.asarray(session.solve().points[index])
+        points = np.asarray(session.solve().garments[index].points)
         near = np.linalg.norm(points - self._desk.picture.world(at), axis=1).argmin()
         found = on_fine(values, session.refinements[index])[near]
         unit = GARMENT[self._name].unit
@@ -158,7 +158,7 @@ class PaintPanel:
 
     def _hit(self, session: TuneSession, index: int, origin: np.ndarray, along: np.ndarray) -> np.ndarray | None:
         """The first intersection of a ray of the scene and a garment's refined cloth, in the scene [m]; or None."""
-        points, picture = session.solve().points[index], self._desk.picture
+        points, picture = session.solve().garments[index].points, self._desk.picture
         if points is None:
             return None
         chain, cage = session.refinements[index], session.shot.scene.garments[index]

@@ -132,9 +132,9 @@ class Problem:
     def next(self, frame: Frame) -> Solved:
         """Solve a frame from the previous result, with the settings in use."""
         before, began, worked = _waited(), time.perf_counter(), time.process_time()
-        state = self.refiner.solve(frame)
+        garments = self.refiner.solve(frame).garments
         after, elapsed, worked = _waited(), time.perf_counter() - began, time.process_time() - worked
-        entries: list[Any] = list({id(entry): entry for entry in state.telemetry}.values())
+        entries = list({id(garment.telemetry): garment.telemetry for garment in garments}.values())
         spent = {
             name: sum(entry.get("milliseconds", {}).get(name, 0.0) for entry in entries)
             for name in ("prepare", "solve")
@@ -144,7 +144,7 @@ class Problem:
         steps = sum(report["steps"] for report in reports if report["level"] == last)
         waited = None if before is None or after is None else after - before
         busy = worked / elapsed if self._clock == "cpu" else 1.0
-        points = tuple(p for p in state.points if p is not None)
+        points = tuple(garment.points for garment in garments if garment.points is not None)
         prepared = busy * spent["prepare"]
         return Solved(points, prepared + busy * spent["solve"], prepared, 1e3 * elapsed, steps, waited)
 
