@@ -119,7 +119,8 @@ def test_a_frame_above_its_input_is_told_of():
         return {"energy_joules": {"input": {"stretch": before}, "output": {"stretch": after}}}
 
     found = {1.0: energies(1e-3, 1e-3), 2.0: energies(1.9e-5, 3.2e-4), 3.0: energies(1e-3, 1.1e-3), 4.0: {}}
-    (said,) = of_energy([{"path": "/A"}], [{"time": time, "garments": [each]} for time, each in found.items()])
+    frames = [{"time": time, "garments": [entry]} for time, entry in found.items()]
+    (said,) = of_energy(RefineReport("s", None, {}, garments=[{"path": "/A"}], frames=frames))
     assert said.startswith("2 frames ended with more energy than the upsampled cage, </A> at time code 2: 0.00032 J")
 
 

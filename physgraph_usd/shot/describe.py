@@ -86,7 +86,7 @@ def begin_report(report: RefineReport, opened: Shot, options: RefineOptions) -> 
 
 def say_what_was(report: RefineReport) -> None:
     """Report who made the steps, and list self contact as left out if no frame needed it."""
-    entries = [entry for frame in report.frames for entry in frame.get("garments", ())]
+    entries = [entry for _, _, entry in report.entries()]
     _say_who_integrated(report, entries)
     if any(entry.get("contact", {}).get("cloth", {}).get("near") for entry in entries):
         return

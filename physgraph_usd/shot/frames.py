@@ -287,18 +287,19 @@ class FrameFolder(Finished):
             LayerError: The disk is full, or the folder is gone or taken by a new run: a task on a remote machine may
                 outlast its run.
         """
-        entries = [{"telemetry": garment.telemetry, "reused": garment.reused} for garment in result.garments]
-        arrays: dict[str, Any] = {"record": json.dumps({"telemetry": result.telemetry, "garments": entries})}
+        arrays = dict[str, Any]()
         for k, garment in enumerate(result.garments):
             arrays |= {} if garment.points is None else {f"points{k}": garment.points}
             arrays |= {f"heat{k}.{name}": values for name, values in garment.heat.items()}
+        entries = [{"telemetry": garment.telemetry, "reused": garment.reused} for garment in result.garments]
+        record = json.dumps({"telemetry": result.telemetry, "garments": entries})
         file = self._file(index, seam, _DONE if result.garments else _FAILED)
         temporary = temporary_path(file, suffix="")
         try:
             if (self.folder / RUN).read_text(encoding="utf-8") != self._run:
                 raise LayerError(f"{self.folder} is another run's by now")
             with make_file(temporary) as stream:
-                np.savez(stream, **arrays)
+                np.savez(stream, record=record, **arrays)
             temporary.replace(file)
         except OSError as error:
             raise LayerError(f"cannot write {file}: {error.strerror}") from error

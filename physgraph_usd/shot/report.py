@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -145,10 +145,16 @@ class RefineReport:
 
     def measured(self, frame: Mapping[str, Any]) -> list[dict[str, Any]]:
         """Measurements of contact in a frame: one per garment or group of garments solved together."""
-        paths = [garment["path"] for garment in self.garments]
-        entries = list(zip(paths, frame.get("garments", ()), strict=False))
-        first_entries = [entry for path, entry in entries if is_first(path, entry)]
-        return [entry["contact"] for entry in first_entries if entry.get("contact")]
+        entries = [entry for garment, entry in self.garments_in(frame) if is_first(garment["path"], entry)]
+        return [entry["contact"] for entry in entries if entry.get("contact")]
+
+    def garments_in(self, frame: Mapping[str, Any]) -> list[tuple[dict[str, Any], dict[str, Any]]]:
+        """Each garment with its telemetry in a frame; [] for a frame that could not be solved."""
+        return list(zip(self.garments, frame.get("garments", ()), strict=False))
+
+    def entries(self) -> Iterator[tuple[dict[str, Any], dict[str, Any], dict[str, Any]]]:
+        """Each frame with each garment and the garment's telemetry there, frame by frame."""
+        return ((frame, garment, entry) for frame in self.frames for garment, entry in self.garments_in(frame))
 
     def fail(self, error: Exception) -> None:
         """Record the error that ends the run."""

@@ -237,10 +237,9 @@ class Run:
             report.note(*of_a_kind(map(str, writer.notes)))
         report.seconds |= {"close": clock.perf_counter() - start, "write": written}
         report.warn(*of_frames(report), *of_drawn(entered), *of_loops(self._loop.gaps()))
-        telemetry = report.garments, report.frames
-        report.note(*of_following(*telemetry), *of_given_up(*telemetry), *of_inertia(*telemetry))
-        first_pose = of_first_pose(*telemetry) if self.shot.is_skinned and not options.pose_in else ()
-        report.note(*first_pose, *of_folds(*telemetry), *of_energy(*telemetry), *of_polygons(drawn_through))
+        report.note(*of_following(report), *of_given_up(report), *of_inertia(report))
+        report.note(*(of_first_pose(report) if self.shot.is_skinned and not options.pose_in else ()))
+        report.note(*of_folds(report), *of_energy(report), *of_polygons(drawn_through))
         (report.warn if options.strict else report.note)(*of_rest(report.unsettled, len(report.frames)))
         say_what_was(report)
         report.warn(*of_more(report))  # The last line of a run.

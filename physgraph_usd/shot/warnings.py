@@ -301,12 +301,11 @@ def of_more(report: RefineReport) -> list[str]:
     out of a body may cross it more often than cloth that lies in it.
     """
     figures_of: dict[str, list[tuple[float | None, int, int, str]]] = {}
-    for frame in report.frames:
-        for garment, entry in zip(report.garments, frame.get("garments", ()), strict=False):
-            after, before = (_faults(entry.get("contact") or {}, side) for side in ("after", "before"))
-            if after > before and is_first(garment["path"], entry):
-                figures = frame["time"], after, before, _together(garment["path"], entry)
-                figures_of.setdefault(garment["path"], []).append(figures)
+    for frame, garment, entry in report.entries():
+        after, before = (_faults(entry.get("contact") or {}, side) for side in ("after", "before"))
+        if after > before and is_first(garment["path"], entry):
+            figures = frame["time"], after, before, _together(garment["path"], entry)
+            figures_of.setdefault(garment["path"], []).append(figures)
     warnings = []
     for path in [garment["path"] for garment in report.garments if garment["path"] in figures_of]:
         frames = figures_of[path]
