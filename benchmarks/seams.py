@@ -26,8 +26,7 @@ from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.shot.frames import Finished
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.refine import refine_shot
-from physgraph_usd.shot.run import fine_meshes
-from physgraph_usd.solver.level import refine_garments
+from physgraph_usd.solver.level import fine_meshes, refine_garments
 from physgraph_usd.usd.read.reader import open_shot
 
 CASES: tuple[tuple[str, int, dict[str, Any]], ...] = (("sleeve", 1, {}), ("swatch", 1, {}), ("flag", 1, {}))

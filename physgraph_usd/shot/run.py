@@ -13,11 +13,10 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import NOTICE, SolveError, counted, named_time
-from ..solver.level import refine_garments
+from ..solver.level import fine_meshes, refine_garments
 from ..solver.mesh.kernels import cards_for, kernels_are_compiled
 from ..solver.mesh.subdivide import Refinement
-from ..solver.mesh.topology import PolygonMesh
-from ..solver.scene import Garment, Result
+from ..solver.scene import Result
 from ..usd.provenance import CROSSED, FAILED, UNSETTLED, UNSOLVED
 from ..usd.read.reader import Shot
 from ..usd.times import none_within, within
@@ -324,11 +323,6 @@ def numbers_in(every: Sequence[float], frames: tuple[float, float] | None) -> ra
     if not times:
         raise none_within(every, frames)
     return range(every.index(times[0]), every.index(times[-1]) + 1)
-
-
-def fine_meshes(garments: Sequence[Garment], refinements: Sequence[Sequence[Refinement]]) -> list[PolygonMesh]:
-    """The finest mesh of each garment."""
-    return [[cage, *steps][-1].mesh for cage, steps in zip(garments, refinements, strict=True)]
 
 
 def peak_memory_mb() -> float | None:

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import LayerError, UsageError, counted, named_time
-from ..solver.level import refine_garments
+from ..solver.level import fine_meshes, refine_garments
 from ..solver.scene import Result
 from ..usd.read.reader import Shot
 from .chunks import frames_in_order
@@ -31,7 +31,7 @@ from .opened import open_for
 from .options import RefineOptions
 from .refine import check_places, running, write_all
 from .report import RefineReport
-from .run import Run, Stored, fine_meshes, numbers_in
+from .run import Run, Stored, numbers_in
 from .solve import ShotSolver
 from .warnings import WARNINGS
 
@@ -158,13 +158,12 @@ class _Joins:
     def _measure(self, seam: int, solutions: Both, joint: Joint) -> None:
         """Measure a seam; unknown if the last frame failed in either chunk."""
         after = self.run["times"][seam]
-        for index, (source, mesh) in enumerate(zip(self.shot.sources, self.meshes, strict=True)):
-            moves = _moves(solutions, joint, index, mesh.half_edges.edges)
+        for index, garment in enumerate(self.shot.scene.garments):
+            moves = _moves(solutions, joint, index, self.meshes[index].half_edges.edges)
             if moves is not None:
                 rms, largest = map(float, np.max(moves, axis=0))
-                self.seams.append(
-                    Seam(after, str(source.path), rms, largest, 0 if joint.why else len(solutions), joint.why)
-                )
+                frames = 0 if joint.why else len(solutions)
+                self.seams.append(Seam(after, garment.path, rms, largest, frames, joint.why))
 
     def _check(self) -> None:
         """Refuse a seam with too large a move, or an unmeasured seam although frames depend on their predecessors."""

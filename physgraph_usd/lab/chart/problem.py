@@ -21,7 +21,7 @@ from ...solver.frame.refiner import Refiner
 from ...solver.frame.settings import SolveSettings
 from ...solver.frame.solve import solve_frame
 from ...solver.frame.values import FrameInput, FrameState
-from ...solver.level import Level
+from ...solver.level import Level, fine_meshes
 from ...solver.resolution import edge_strain
 from ...solver.scene import Frame, Scene
 
@@ -115,14 +115,13 @@ class Problem:
     @property
     def vertex_count(self) -> int:
         """Number of fine vertices."""
-        chains = zip(self.scene.garments, self.refiner.refinements, strict=True)
-        return sum(chain[-1].mesh.vertex_count if chain else garment.mesh.vertex_count for garment, chain in chains)
+        return sum(mesh.vertex_count for mesh in fine_meshes(self.scene.garments, self.refiner.refinements))
 
     @cached_property
     def triangles(self) -> tuple[np.ndarray, ...]:
         """Vertices of each fine triangle, shape (T, 3), one array a garment."""
-        chains = zip(self.scene.garments, self.refiner.refinements, strict=True)
-        return tuple((chain[-1].mesh if chain else garment.mesh).triangulate().triangles for garment, chain in chains)
+        meshes = fine_meshes(self.scene.garments, self.refiner.refinements)
+        return tuple(mesh.triangulate().triangles for mesh in meshes)
 
     def solve(self, frame: Frame, settings: SolveSettings) -> Solved:
         """Solve a frame from a cold start."""

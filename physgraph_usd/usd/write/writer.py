@@ -177,7 +177,8 @@ class LayerWriter:
         for bound in self._bound.values():
             bound.finish()
         self._keep_twins()
-        facts = _facts(self._shot, self.targets, self._stream.target)
+        sources = {str(mesh.target): self._shot.sources[index] for index, mesh in self._meshes.items()}
+        facts = _facts(self._shot, sources, self._stream.target)
         facts["bound"] = [str(path) for bound in self._bound.values() for path in bound.paths] or None
         if self._times is not None:
             count = len(self._shot.scene.times)
@@ -328,13 +329,12 @@ class _RefinedMesh:
         return [Notice(str(self.target), None, f"{message} without a cut, and the shot has no velocities there")]
 
 
-def _facts(shot: Shot, targets: Sequence[Sdf.Path], out: Path | None) -> dict[str, Any]:
-    """Entries of the record about the garments and their shot."""
-    pairs = zip(targets, shot.sources, strict=False)
+def _facts(shot: Shot, sources: Mapping[str, GarmentSource], out: Path | None) -> dict[str, Any]:
+    """Entries of the record about the garments, by path of the fine mesh, and their shot."""
     return {
         "shot": None if shot.view.root.anonymous else provenance.asset_path(shot.path, out and out.parent),
-        "garments": [str(path) for path in targets],
-        "left_out": {str(path): source.left_out_words for path, source in pairs if source.left_out} or None,
+        "garments": list(sources),
+        "left_out": {path: source.left_out_words for path, source in sources.items() if source.left_out} or None,
         "variants": shot.selections or None,
     }
 
