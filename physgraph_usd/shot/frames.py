@@ -159,7 +159,8 @@ class Finished:
         """Refuse (ValueError) points of the wrong shape: kernels index points by face corners, without checks."""
         if garments and self.counts and len(garments) != len(self.counts):
             raise ValueError(f"points of {len(garments)} garments, not of {len(self.counts)}")
-        for points, count in zip((garment.points for garment in garments), self.counts, strict=False):
+        for index, count in enumerate(self.counts if garments else ()):
+            points = garments[index].points
             if points is not None and (
                 points.shape != (count, 3) or points.dtype.kind != "f" or not np.isfinite(points).all()
             ):
