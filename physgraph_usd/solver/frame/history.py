@@ -7,14 +7,14 @@ and comes back, the solution of the broken frame is no start. The frame before i
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from ...errors import named_time
 from ..colliders.pose import Pose
 from ..rigid import AT_REST, Rigid, best_motion
-from ..scene import SAME_TIME, Frame, Garment, GarmentFrame, Limits
+from ..scene import SAME_TIME, Frame, Garment, GarmentFrame, GarmentResult, Limits
 from .values import FrameState, join
 
 RETURNED = 0.25
@@ -55,11 +55,13 @@ class GarmentHistory:
     Attributes:
         last: The last solved frame.
         before: The start frame of ``last``.
+        result: The last result, which may be no solution.
         solved: Whether the last result is a solution.
     """
 
     last: SolvedFrame | None = None
     before: SolvedFrame | None = None
+    result: GarmentResult = field(default_factory=lambda: GarmentResult(None))
     solved: bool = True
 
 

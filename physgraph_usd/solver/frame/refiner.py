@@ -171,10 +171,9 @@ class Refiner:
         self._cloth.bodies.pose(frame.colliders)
         members = self._members(frame)
         scene_frame = SceneFrame(self._cloth, self._settings, frame, members, gap, self._prerolled, self._limit)
-        answers = scene_frame.solve([True] * len(members) if wanted is None else wanted)
-        self._memories = tuple(answer.history for answer in answers)
+        self._memories = tuple(scene_frame.solve([True] * len(members) if wanted is None else wanted))
         self._time, self._prerolled = frame.time, None
-        results = [answer.result for answer in answers]
+        results = [memory.result for memory in self._memories]
         if self._heat_map:
             results = [replace(result, heat=self.heat(index, result.points)) for index, result in enumerate(results)]
         return Result(frame.time, tuple(results))

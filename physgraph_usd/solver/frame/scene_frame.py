@@ -134,14 +134,6 @@ def _loads(members: Sequence[Member]) -> dict[str, object]:
 
 
 @dataclass(frozen=True, eq=False)
-class Answer:
-    """One garment's result in a frame, and its history for the next frame."""
-
-    result: GarmentResult
-    history: GarmentHistory
-
-
-@dataclass(frozen=True, eq=False)
 class SceneFrame:
     """One frame of a scene, to be solved part by part.
 
@@ -161,20 +153,20 @@ class SceneFrame:
     prerolled: tuple[Sequence[np.ndarray | None], float] | None
     limit: float
 
-    def solve(self, requested: Sequence[bool]) -> list[Answer]:
-        """An answer for each garment; those not requested have no points, and parts without a request are not solved.
+    def solve(self, requested: Sequence[bool]) -> list[GarmentHistory]:
+        """The history of each garment, with its result; parts without a requested garment are not solved.
 
         Raises:
             SolveError: No garment could be solved.
         """
-        solved, skipped = dict[int, Answer](), dict[int, Answer]()
+        solved, skipped = dict[int, GarmentHistory](), dict[int, GarmentHistory]()
         unsolved = list[tuple[list[Member], SolveError]]()
         for part in self.cloth.parts_of(self.frame, self.settings):
             members = [self.members[number] for number in part]
             near = self.cloth.near(members, self.settings)
             same = is_same(members, self.frame, near) and not self._jumped(members, near)
             if not any(requested[number] for number in part):
-                skipped |= {m.number: Answer(_left_out(reused=same and m.history.solved), m.history) for m in members}
+                skipped |= {m.number: _left_out(m.history, reused=same and m.history.solved) for m in members}
                 continue
             try:
                 with At(prims=tuple(member.garment.path for member in members)):
@@ -185,13 +177,13 @@ class SceneFrame:
             raise unsolved[0][1]
         for members, error in unsolved:
             solved |= self._on_cages(members, error)
-        for number, answer in solved.items():
+        for number, history in solved.items():
             if not requested[number]:
-                solved[number] = replace(answer, result=_left_out(reused=answer.result.reused))
-        return [answer for _, answer in sorted((solved | skipped).items())]
+                solved[number] = _left_out(history, reused=history.result.reused)
+        return [history for _, history in sorted((solved | skipped).items())]
 
-    def _solve_part(self, members: Sequence[Member], near: tuple[int, ...], *, same: bool) -> dict[int, Answer]:
-        """Answers by number of garments upsampled, reused, or solved together."""
+    def _solve_part(self, members: Sequence[Member], near: tuple[int, ...], *, same: bool) -> dict[int, GarmentHistory]:
+        """Histories by number of garments upsampled, reused, or solved together."""
         first = members[0]
         if has_collapsed(first.garment, first.frame.points):  # The next frame starts from the last solved frame.
             entry = {
@@ -199,29 +191,27 @@ class SceneFrame:
                 "collapsed": size_left(first.garment, first.frame.points),
             }
             points = self.cloth.upsampled(first.number, first.frame.points)
-            return {first.number: Answer(GarmentResult(points, entry), replace(first.history, solved=False))}
+            return {first.number: replace(first.history, result=GarmentResult(points, entry), solved=False)}
         if not same:
             return self._solve_together(members, near)
         entry: dict[str, object] = {"start": "reused: the input equals the last frame's"}
-        return {
-            member.number: Answer(
-                GarmentResult(member.history.last.points, entry, member.history.solved),
-                replace(member.history, solved=True),
-            )
-            for member in members
-            if member.history.last is not None
-        }
+        histories = dict[int, GarmentHistory]()
+        for number, history in ((member.number, member.history) for member in members):
+            if history.last is not None:
+                result = GarmentResult(history.last.points, entry, history.solved)
+                histories[number] = replace(history, result=result, solved=True)
+        return histories
 
-    def _on_cages(self, members: Sequence[Member], error: SolveError) -> dict[int, Answer]:
+    def _on_cages(self, members: Sequence[Member], error: SolveError) -> dict[int, GarmentHistory]:
         """Unsolvable garments, on their cages' smooth surface; the next frame starts from an earlier frame."""
         entry: dict[str, object] = {"start": "not solved: it follows its cage", "not_solved": str(error)}
         points = self._group(members).upsampled([member.frame for member in members])
         return {
-            member.number: Answer(GarmentResult(positions, entry), replace(member.history, solved=False))
+            member.number: replace(member.history, result=GarmentResult(positions, entry), solved=False)
             for member, positions in zip(members, points, strict=True)
         }
 
-    def _solve_together(self, members: Sequence[Member], near: tuple[int, ...]) -> dict[int, Answer]:
+    def _solve_together(self, members: Sequence[Member], near: tuple[int, ...]) -> dict[int, GarmentHistory]:
         """Solve garments together; bodies reached only by the solved cloth are added, and the solve is repeated."""
         group, frames = self._group(members), [member.frame for member in members]
         origin = origin_of(members, self.frame, near=near, edge=group.spacings[0], gap=self.gap)
@@ -248,15 +238,15 @@ class SceneFrame:
         states = split(solved.state, group.levels[0].spans, group.levels[-1].spans)
         frame, part = self.frame, tuple(member.number for member in members)
         is_reusable = self.settings.is_reusable and "time_limit" not in entry
-        answers = dict[int, Answer]()
+        histories = dict[int, GarmentHistory]()
         for number, member in enumerate(members):
             points, last = solved.points[number], member.history.last
             self._refuse_strayed(member, points)
             at, state, crossing = (frame.time, member.frame, frame.colliders), states[number], solved.crossing[number]
             solved_frame = SolvedFrame(*at, near, part, points, state, crossing, last is None, is_reusable)
             before = last if origin.broken is None else origin.frames[number]
-            answers[member.number] = Answer(GarmentResult(points, entry), GarmentHistory(solved_frame, before))
-        return answers
+            histories[member.number] = GarmentHistory(solved_frame, before, GarmentResult(points, entry))
+        return histories
 
     def _group(self, members: Sequence[Member]) -> Group:
         """The group of garments solved together."""
@@ -289,6 +279,6 @@ class SceneFrame:
             raise SolveError(f"<{member.garment.path}>{when}: {wrong}")
 
 
-def _left_out(*, reused: bool) -> GarmentResult:
-    """The result of a garment that was not requested."""
-    return GarmentResult(None, {"start": "left out: the garment has no sample here"}, reused)
+def _left_out(history: GarmentHistory, *, reused: bool) -> GarmentHistory:
+    """The history of a garment whose result was not requested."""
+    return replace(history, result=GarmentResult(None, {"start": "left out: the garment has no sample here"}, reused))
