@@ -198,9 +198,11 @@ class LevelForces:
         if all(frame.acceleration is None and frame.load is None for frame in frames):
             return None
         loads = [np.zeros_like(frame.points) if frame.load is None else frame.load for frame in frames]
-        felt = [np.zeros_like(frame.points) if frame.acceleration is None else frame.acceleration for frame in frames]
+        accelerations = [
+            np.zeros_like(frame.points) if frame.acceleration is None else frame.acceleration for frame in frames
+        ]
         density = self._coarse_density
-        load, acceleration = (torch.as_tensor(np.concatenate(fields)).to(density) for fields in (loads, felt))
+        load, acceleration = (torch.as_tensor(np.concatenate(fields)).to(density) for fields in (loads, accelerations))
         return load - density * acceleration
 
     @cached_property
