@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from shlex import join
 from typing import Any
 
-from ..errors import counted
+from ..errors import counted, named_time
 from ..solver.fabric import NAMED, PRESETS, WORN, Fabric
 from ..solver.resolution import SHARP_FRACTION, LevelChoice
 from ..solver.scene import GIVEN_UP
@@ -174,19 +174,15 @@ def of_given_up(report: RefineReport) -> list[str]:
     return [f"{text} cage crosses itself too often to be solved (<{path}>, first{at_time(time)})"]
 
 
-def of_first_pose(report: RefineReport) -> list[str]:
-    """A note of skinned cloth that crosses itself in the first frame, with the option that may mend it.
-
-    Args:
-        report: A report of skinned garments, solved without poses before the first frame.
-    """
-    for garment, entry in report.garments_in(report.frames[0]) if report.frames else ():
-        left = entry.get("contact", {}).get("cloth", {}).get("after", {}).get("crossings", 0)
-        if left:
-            place = f"<{garment['path']}>{at_time(report.frames[0]['time'])}"
-            start = "starts it from the bind pose, where it may come out clean"
-            return [f"{place}: skinned cloth crosses itself in the first frame; --pose-in 12 {start}"]
-    return []
+def of_poses(report: RefineReport) -> list[str]:
+    """A note of a first frame that continues from poses between the bind pose and it, without being requested."""
+    first = report.frames[0] if report.frames else {}
+    if not first.get("poses"):
+        return []
+    poses = f"{counted(first['poses'], 'pose')} between the bind pose and it"
+    return [
+        f"time code {named_time(first['time'])} continues from {poses}, since it crossed itself without them"
+    ]
 
 
 def of_inertia(report: RefineReport) -> list[str]:

@@ -30,7 +30,7 @@ MOST_NAMED = 3
 """Most prims, parts or time codes named in one warning."""
 _OF_PRIM = re.compile(r"<([^>]+)>(?=[: ])")
 _ALSO, _DIFFERS = re.compile(r"; also (?:at|in) .*$"), re.compile(r"<[^>]*>|[-+]?\d[\d,]*(?:\.\d+)?(?:e[-+]?\d+)?")
-_FRAME: dict[str, Any] = {"time": None, "read_ms": None, "run_in_ms": None, "garments": [], "error": ""}
+_FRAME: dict[str, Any] = {"time": None, "read_ms": None, "run_in_ms": None, "poses": None, "garments": [], "error": ""}
 
 
 def is_first(path: str, entry: Mapping[str, Any]) -> bool:

@@ -29,7 +29,7 @@ from .farm import connected
 from .finished import made_from
 from .forecast import Forecast
 from .frames import CHUNK, FrameFolder, frames_folder
-from .notes import of_energy, of_first_pose, of_folds, of_following, of_given_up, of_inertia, of_rest
+from .notes import of_energy, of_folds, of_following, of_given_up, of_inertia, of_poses, of_rest
 from .options import RefineOptions
 from .processes import Start, separate_processes
 from .report import LOG, RefineReport, of_a_kind
@@ -237,7 +237,7 @@ class Run:
         report.seconds |= {"close": clock.perf_counter() - start, "write": written}
         report.warn(*of_frames(report), *of_drawn(entered), *of_loops(self._loop.gaps()))
         report.note(*of_following(report), *of_given_up(report), *of_inertia(report))
-        report.note(*(of_first_pose(report) if self.shot.is_skinned and not options.pose_in else ()))
+        report.note(*(of_poses(report) if options.pose_in is None else ()))
         report.note(*of_folds(report), *of_energy(report), *of_polygons(drawn_through))
         (report.warn if options.strict else report.note)(*of_rest(report.unsettled, len(report.frames)))
         say_what_was(report)

@@ -94,8 +94,7 @@ WARNINGS = {
     "contact": Kind(
         "crossings or vertices inside a body are left",
         "`--heat-map` writes where, so that you can mend the cage there; `physgraph:collider:side` corrects a side "
-        "that was guessed wrong. Some frames come out clean if they are refined alone (`--frames`). Skinned cloth that "
-        "is bent far in the first frame may come out clean with `--pose-in 12`",
+        "that was guessed wrong. Some frames come out clean if they are refined alone (`--frames`)",
         "{left} {are} left{together}",
         "--heat-map shows where, to mend the cage there",
     ),
@@ -302,7 +301,7 @@ def of_more(report: RefineReport) -> list[str]:
     """
     figures_of: dict[str, list[tuple[float | None, int, int, str]]] = {}
     for frame, garment, entry in report.entries():
-        after, before = (_faults(entry.get("contact") or {}, side) for side in ("after", "before"))
+        after, before = (faults_of(entry.get("contact") or {}, side) for side in ("after", "before"))
         if after > before and is_first(garment["path"], entry):
             figures = frame["time"], after, before, _together(garment["path"], entry)
             figures_of.setdefault(garment["path"], []).append(figures)
@@ -315,7 +314,7 @@ def of_more(report: RefineReport) -> list[str]:
     return warnings
 
 
-def _faults(contact: Mapping[str, Any], side: str) -> int:
+def faults_of(contact: Mapping[str, Any], side: str) -> int:
     """Crossings of cloth and with all bodies, and vertices inside bodies, "before" or "after"."""
     measured = [contact.get("cloth") or {}, *(contact.get("bodies") or {}).values()]
     names = ("crossings", "inside", "pinched")
