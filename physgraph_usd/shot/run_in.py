@@ -114,7 +114,7 @@ def pose_in(
         refiner: The refiner that solves the frame next.
         time: Time code of the frame.
         count: Number of poses; the first is the bind pose.
-        while_clean: Whether to end at a pose in which cloth crosses cloth.
+        while_clean: Whether to end at a pose in which cloth crosses anything.
 
     Returns:
         Wall time [s], and whether all poses were solved.
@@ -130,7 +130,7 @@ def pose_in(
             frame = shot.posed_frame(time, number / count)
             moment = None if time is None else time - (count - number) * spacing
             result = refiner.solve(replace(frame, time=moment))
-            if while_clean and crossings_of_cloth(result):
+            if while_clean and faults(result):
                 return clock.perf_counter() - began, False
     return clock.perf_counter() - began, True
 

@@ -152,8 +152,8 @@ class ShotSolver:
     ) -> tuple[Refiner, Result, dict[str, object]]:
         """A first frame of skinned cloth that crosses itself, solved once more after poses from the bind pose.
 
-        The second result is used if it has fewer faults. There is none if a pose has crossings: limbs that go through a
-        body are no better on the way.
+        The second result is used if it has fewer faults. There is none if a pose has faults: limbs that go through a
+        body do so on the way too.
 
         Args:
             refiner: The refiner after the frame.
