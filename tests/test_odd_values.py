@@ -21,6 +21,7 @@ from stages import (
     save,
     sheet_points,
     sheet_shot,
+    vec3,
 )
 
 from physgraph_usd.errors import GarmentError, StageError
@@ -74,11 +75,21 @@ def test_a_rest_shape_that_is_no_array_is_refused_by_name(tmp_path: Path, name: 
         open_shot(save(stage))
 
 
-def test_a_body_whose_faces_are_a_single_number_is_left_out_by_name(tmp_path: Path):
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        ("faceVertexIndices", "int"),
+        ("faceVertexIndices", "float[]"),
+        ("faceVertexCounts", "string[]"),
+        ("points", "string[]"),
+        ("points", "matrix4d"),
+    ],
+)
+def test_a_body_whose_points_or_faces_are_of_another_type_is_left_out_by_name(tmp_path: Path, name: str, kind: str):
     stage = new_stage(tmp_path / "s.usda")
     add_sheet(stage, CLOTH)
     add_sheet(stage, "/World/floor", tagged=False).GetPrim().AddAppliedSchema(COLLIDER_API)
-    retype(stage, "/World/floor.faceVertexIndices", "int", 7)
+    retype(stage, f"/World/floor.{name}", kind, VALUES[kind])
     report = refine(Path(save(stage)), tmp_path / "fine.usdc", level=1, steps=1)
     assert any("its points and faces do not fit together" in str(each) for each in report.warnings)
 
@@ -190,3 +201,19 @@ def test_points_of_a_skinned_mesh_that_are_no_positions_are_refused_by_type(tmp_
     shot = skinned_with_points(tmp_path / "s.usda", kind, VALUES[kind], blend=blend)
     with pytest.raises(GarmentError, match=r"</World/rig/cloth>.*points is a .*author point3f\[\]"):
         open_shot(shot)
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [("points", "float"), ("points", "string[]"), ("uVertexCount", "string"), ("vVertexCount", "int[]")],
+)
+def test_a_surface_that_is_not_read_may_have_values_of_another_type(tmp_path: Path, name: str, kind: str):
+    stage = new_stage(tmp_path / "s.usda")
+    add_sheet(stage, CLOTH)
+    patch = UsdGeom.NurbsPatch.Define(stage, "/World/patch")
+    patch.CreatePointsAttr(vec3(sheet_points()))
+    patch.CreateUVertexCountAttr(5)
+    patch.CreateVVertexCountAttr(4)
+    retype(stage, f"/World/patch.{name}", kind, VALUES[kind])
+    report = refine(Path(save(stage)), tmp_path / "fine.usdc", level=1, steps=1)
+    assert not report.failed
