@@ -27,6 +27,7 @@ from stages import (
 from physgraph_usd.errors import GarmentError, StageError
 from physgraph_usd.usd.check.validate import validate_layer
 from physgraph_usd.usd.read.reader import open_shot
+from physgraph_usd.usd.read.survey import survey
 from physgraph_usd.usd.stage import LONGEST_REASON, read_units
 
 CLOTH = "/World/cloth"
@@ -217,3 +218,10 @@ def test_a_surface_that_is_not_read_may_have_values_of_another_type(tmp_path: Pa
     retype(stage, f"/World/patch.{name}", kind, VALUES[kind])
     report = refine(Path(save(stage)), tmp_path / "fine.usdc", level=1, steps=1)
     assert not report.failed
+
+
+def test_a_transform_in_units_that_are_no_length_overflows_no_volume(tmp_path: Path):
+    """Warnings are errors in tests, and NumPy warns of a determinant that overflows."""
+    stage = new_stage(tmp_path / "s.usda", metres=1e300)
+    add_sheet(stage, CLOTH)
+    assert [mesh.path for mesh in survey(save(stage)).meshes] == [CLOTH]
