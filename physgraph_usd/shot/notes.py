@@ -180,9 +180,7 @@ def of_poses(report: RefineReport) -> list[str]:
     if not first.get("poses"):
         return []
     poses = f"{counted(first['poses'], 'pose')} between the bind pose and it"
-    return [
-        f"time code {named_time(first['time'])} continues from {poses}, since it crossed itself without them"
-    ]
+    return [f"time code {named_time(first['time'])} continues from {poses}, since it crossed itself without them"]
 
 
 def of_inertia(report: RefineReport) -> list[str]:
