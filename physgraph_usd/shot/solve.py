@@ -169,10 +169,10 @@ class ShotSolver:
         posed = refiner.fork(self._options.solve_settings())
         posed.forget()
         seconds, all_clean = pose_in(shot, posed, frame.time, MOST_POSES, while_clean=True)
-        told: dict[str, object] = {RUN_IN: round(1e3 * seconds, 3)}
+        telemetry: dict[str, object] = {RUN_IN: round(1e3 * seconds, 3)}
         again = posed.solve(frame, sampled_at(shot, frame.time)) if all_clean else result
         is_better = faults(again) < faults(result)
-        return (posed, again, told | {POSES: MOST_POSES}) if is_better else (refiner, result, told)
+        return (posed, again, telemetry | {POSES: MOST_POSES}) if is_better else (refiner, result, telemetry)
 
 
 def sampled_at(shot: Shot, time: float | None) -> list[bool]:
