@@ -3,6 +3,7 @@
     python -m benchmarks.numbers [--only NAME]... [--jobs 16] [--json FIGURES.json]
         [--out benchmarks/results/numbers.md]
     python -m benchmarks.numbers --count        numbers by room only
+    python -m benchmarks.numbers --path         files and kinds of records of a warm frame only
 
 Numbers of contact, collide, frame and integrate (`benchmarks.constants`) are halved and doubled, one at a time, in a
 running process; whole numbers stay 1 or more. Every variant refines some frames of each scene with three ripples, and
@@ -38,6 +39,7 @@ from pxr import Usd, UsdGeom, Vt
 
 from benchmarks.constants import Number, changed, numbers_in
 from benchmarks.effects import BASE_RIPPLES, TIMES, counted, key_of, page
+from benchmarks.frame_path import text_of_path
 from benchmarks.judge_shot import Job, judged, layer_over, offsets, rippled
 from benchmarks.rows import code_of, say
 from benchmarks.verdicts import Values
@@ -97,15 +99,20 @@ class Variant:
 @click.option("--json", "file", type=click.Path(path_type=Path), help="Keep raw figures here, and go on from them.")
 @click.option("--out", type=click.Path(path_type=Path), help="Write the tables here too.")
 @click.option("--count", "only_count", is_flag=True, help="Print numbers by room only.")
+@click.option("--path", "only_path", is_flag=True, help="Print files and records of a warm frame only.")
 def main(
     names: Sequence[str],
     *,
     scenes: Sequence[str],
     out: Path | None,
     only_count: bool,
+    only_path: bool,
     **options: Any,
 ) -> None:
     """Print, and write, what each number does."""
+    if only_path:
+        say(text_of_path())
+        return
     every = numbers_in(HERE)
     numbers = [each for each in every if each.room in ROOMS and (not names or each.name in names)]
     text = counted(every)
