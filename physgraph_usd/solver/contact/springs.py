@@ -143,8 +143,8 @@ class _Search:
             The pairs, and a mask of the other vertices.
         """
         none = torch.zeros_like(at[:, 0], dtype=torch.bool)
-        before, now = (none if mask is None else mask for mask in (self.inside, inside))
-        changed = (at != self.at).any(dim=1) | (before ^ now)
+        inside_before, inside_now = (none if mask is None else mask for mask in (self.inside, inside))
+        changed = (at != self.at).any(dim=1) | (inside_before ^ inside_now)
         if self.unknown is not None:
             changed[self.unknown] = True
         if int(changed.sum()) > FEW_MOVED * len(at):
@@ -217,10 +217,10 @@ class ClothSprings:
         near, parts = self.cached(x), self._mesh.parts
         if near is not None:
             return near
-        known = None if self._last is None or queried is not None else self._last.still_near(at, inside)
-        queried = queried if known is None else known[1]
+        unmoved = None if self._last is None or queried is not None else self._last.still_near(at, inside)
+        queried = queried if unmoved is None else unmoved[1]
         near = near_parts(parts, at, self.reach, queried=queried, inside=inside)
-        near = near if known is None else NearAt(known[0].joined(near.pairs), self.reach)
+        near = near if unmoved is None else NearAt(unmoved[0].joined(near.pairs), self.reach)
         self._last = _Search(x, x._version, at, inside, near)
         return near
 
