@@ -143,13 +143,14 @@ def run(shot: Shot, first: int, count: int, *, level: int) -> Sums:
     for time_code in shot.scene.times[first : first + count]:
         frame = shot.frame(time_code)
         began = time.perf_counter()
-        state = refiner.solve(frame)
+        garments = refiner.solve(frame).garments
+        points = [garment.points for garment in garments]
         spent.append(time.perf_counter() - began)
-        details.append(detail_of(refiner, frame, state.points))
-        sums.counted += _counted(refiner, state.points)
-        for entry in groups_of(state.telemetry):
+        details.append(detail_of(refiner, frame, points))
+        sums.counted += _counted(refiner, points)
+        for entry in groups_of([garment.telemetry for garment in garments]):
             sums.add(entry)
-        sums.vertices += sum(len(points) for points in state.points if points is not None)
+        sums.vertices += sum(len(x) for x in points if x is not None)
     sums.seconds = sorted(spent)[len(spent) // 2]
     sums.jumps = jumps(np.array(details))
     return sums

@@ -57,4 +57,6 @@ def taken(arguments: Sequence[str], option: str, count: int) -> float:
         if by_workers:
             return time.perf_counter() - began
         frames = json.loads(Path(f"{out}.json").read_text("utf-8"))["frames"][1:]
-        return statistics.median(sum(sum(each["milliseconds"].values()) for each in groups_of(f)) for f in frames)
+        return statistics.median(
+            sum(sum(each["milliseconds"].values()) for each in groups_of(f["garments"])) for f in frames
+        )

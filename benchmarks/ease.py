@@ -18,7 +18,6 @@ from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -33,7 +32,7 @@ from physgraph_usd.shot.solve import prepare_device
 from physgraph_usd.solver.fabric import PRESETS
 from physgraph_usd.solver.frame.refiner import Refiner
 from physgraph_usd.solver.level import Level, build_levels, refine_garments
-from physgraph_usd.solver.scene import State
+from physgraph_usd.solver.scene import Result
 from physgraph_usd.usd.read.reader import Shot, open_shot
 
 EASES = (0.0, 2.0, 4.0)
@@ -61,9 +60,9 @@ class Eased:
     crossings: int
 
 
-def crossings_of(state: State, when: str = "after") -> int:
+def crossings_of(result: Result, when: str = "after") -> int:
     """Edges through faces of cloth in a frame."""
-    contacts: list[Any] = [each.get("contact", {}) for each in state.telemetry]
+    contacts = [garment.telemetry.get("contact", {}) for garment in result.garments]
     return sum(each["cloth"][when]["crossings"] for each in contacts if "cloth" in each)
 
 
@@ -74,11 +73,11 @@ def of_shot(shot: Shot, times: Sequence[float], level: Level) -> Eased:
     for time in times:
         frame = shot.frame(time)
         began = clock.process_time()
-        state = refiner.solve(frame)
+        result = refiner.solve(frame)
         seconds.append(clock.process_time() - began)
         loop.append(level.smooth_from_coarse @ frame.garments[0].points)
-        fine.append(state.points[0])
-        crossings += crossings_of(state)
+        fine.append(result.garments[0].points)
+        crossings += crossings_of(result)
     return Eased(np.array(loop), np.array(fine), statistics.median(seconds[1:] or seconds), crossings)
 
 

@@ -251,7 +251,7 @@ def timed(
     for n, cage in enumerate(cages):
         poses: tuple[Pose, ...] = tuple(body.pose((n + 1) / RATE) for body in stage.bodies) if touches else ()
         began = clock.perf_counter()
-        (points,) = refiner.solve(Frame(float(n), (GarmentFrame(cage, fabric),), poses)).points
+        points = refiner.solve(Frame(float(n), (GarmentFrame(cage, fabric),), poses)).garments[0].points
         assert points is not None  # The garment is in every frame.
         yield points, 1e3 * (clock.perf_counter() - began)
 
@@ -413,8 +413,8 @@ def paired_rows(scene: str, fabric: str, *, frames: int) -> list[list[str]]:
         pairs = zip(cages, felt, strict=True)
         inputs = [GarmentFrame(cage, values, guide, acceleration=pushed) for cage, pushed in pairs]
         refiner = Refiner(Scene((garment_of(stage, LEVEL),), GRAVITY), SolveSettings())
-        states = refiner.refine(Frame(float(n), (one,)) for n, one in enumerate(inputs))
-        fine = np.array([state.points[0] for state in states])[late]
+        results = refiner.refine(Frame(float(n), (one,)) for n, one in enumerate(inputs))
+        fine = np.array([result.garments[0].points for result in results])[late]
         detail = fine - linear
         bands = [np.mean([judge.amplitudes(x) for x in field], axis=0) for field in (detail, true_detail)]
         far = [1e3 * np.sqrt(((x - truth[late]) ** 2).sum(axis=2).mean()) for x in (smooth, fine)]

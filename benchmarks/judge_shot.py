@@ -279,14 +279,15 @@ def judged(job: Job) -> dict[str, float | None]:
         solver = ShotSolver(file, [job.level] * len(shot.scene.garments), job.options, opened=shot)
         times = list(shot.scene.times)[job.first :][: job.count or None]
         with OwnRest(job.level, job.rest_steps) as rest:
-            for number, (outcome, milliseconds) in enumerate(_timed(solver(times), rest.begin)):
-                if error := outcome.record.get("error"):
-                    raise ValueError(f"frame {outcome.time:g}: {error}")
-                motion.add([each.points for each in shot.frame(outcome.time).garments], outcome.points)
-                frames.append(groups_of(outcome.record))
+            for number, (result, milliseconds) in enumerate(_timed(solver(times), rest.begin)):
+                if error := result.telemetry.get("error"):
+                    raise ValueError(f"frame {result.time:g}: {error}")
+                fine = [garment.points for garment in result.garments]
+                motion.add([each.points for each in shot.frame(result.time).garments], fine)
+                frames.append(groups_of([garment.telemetry for garment in result.garments]))
                 spent.append(milliseconds)
                 if job.positions:
-                    points.append(outcome.points)
+                    points.append(fine)
                 if number >= len(times) - job.rest:
                     rest.add()
         shot.close()
@@ -328,11 +329,11 @@ def write_positions(
     np.savez(file, points=np.array(joined, np.float32), triangles=np.concatenate(triangles))
 
 
-def _timed(outcomes: Iterable[Any], begin: Callable[[], None]) -> Iterator[tuple[Any, float]]:
+def _timed(results: Iterable[Any], begin: Callable[[], None]) -> Iterator[tuple[Any, float]]:
     """Each frame with the processor time spent on reading and solving the frame [ms]; ``begin`` is called before it."""
     begin()
     began = time.process_time()
-    for each in outcomes:
+    for each in results:
         yield each, 1e3 * (time.process_time() - began)
         begin()
         began = time.process_time()
@@ -367,9 +368,9 @@ def _energy(group: dict[str, Any]) -> float:
     return sum(value for name, value in group["energy_joules"]["output"].items() if name != "tether")
 
 
-def groups_of(frame: dict[str, Any]) -> list[dict[str, Any]]:
+def groups_of(garments: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Entries of a frame's report, one per group of garments solved together; each garment of a group repeats its."""
-    solved = [each for each in frame["garments"] if each.get("energy_joules")]
+    solved = [entry for entry in garments if entry.get("energy_joules")]
     return list({json.dumps([each["milliseconds"], each["energy_joules"]]): each for each in solved}.values())
 
 

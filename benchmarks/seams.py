@@ -26,8 +26,7 @@ from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.shot.frames import Finished
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.refine import refine_shot
-from physgraph_usd.shot.run import fine_meshes
-from physgraph_usd.solver.level import refine_garments
+from physgraph_usd.solver.level import fine_meshes, refine_garments
 from physgraph_usd.usd.read.reader import open_shot
 
 CASES: tuple[tuple[str, int, dict[str, Any]], ...] = (("sleeve", 1, {}), ("swatch", 1, {}), ("flag", 1, {}))
@@ -100,10 +99,10 @@ def _refine(shot: Path, out: Path, **options: Any) -> Finished:
 
 def _points(frames: Finished, index: int, *, seam: int | None = None) -> np.ndarray:
     """World positions [m] of the first garment in a frame by number, shape (V, 3)."""
-    outcome = frames.read(index, None, seam=seam)
-    assert outcome is not None
-    assert outcome.points[0] is not None
-    return outcome.points[0].astype(np.float64)
+    result = frames.read(index, None, seam=seam)
+    assert result is not None
+    assert result.garments[0].points is not None
+    return result.garments[0].points.astype(np.float64)
 
 
 def _apart(one: np.ndarray, other: np.ndarray, edges: np.ndarray) -> tuple[float, float]:

@@ -62,7 +62,7 @@ def frozen() -> tuple[int, int]:
     """Frames of a still shot that are the first one's bytes, and all of its frames."""
     shot = opened("frozen", 1)
     refiner = Refiner(shot.scene, RefineOptions().solve_settings(), threads=CORES)
-    states = [np.asarray(refiner.solve(shot.frame(time)).points[0]).tobytes() for time in shot.scene.times]
+    states = [np.asarray(refiner.solve(shot.frame(time)).garments[0].points).tobytes() for time in shot.scene.times]
     return sum(state == states[0] for state in states), len(states)
 
 
@@ -73,11 +73,11 @@ def measure(shot: Shot, temporal: str, stiffness: float) -> tuple[float, float]:
     details, energies = [], []
     for time in shot.scene.times[:FRAMES]:
         frame = shot.frame(time)
-        state = refiner.solve(frame)
-        details.append(detail_of(refiner, frame, state.points))
-        entry = state.telemetry[0]
+        garments = refiner.solve(frame).garments
+        details.append(detail_of(refiner, frame, [garment.points for garment in garments]))
+        entry = garments[0].telemetry
         if "energy_joules" in entry:
-            energies.append(sum(entry["energy_joules"]["output"].values()))  # type: ignore[index]
+            energies.append(sum(entry["energy_joules"]["output"].values()))
     jerk: np.ndarray = np.diff(np.asarray(details, dtype=np.float64), 3, axis=0)
     edges = np.mean([mean_fine_edge(refiner, index) for index in range(len(shot.scene.garments))])
     return float(np.sqrt((jerk**2).sum(axis=-1).mean()) / edges), float(np.mean(energies))

@@ -62,7 +62,7 @@ def main(
     with tempfile.TemporaryDirectory() as made:
         for name, session in sessions(names, folder, Path(made), device=device):
             session.set_time(session.times[len(session.times) // 2])
-            count = sum(len(points) for points in session.settle().points if points is not None)
+            count = sum(len(each.points) for each in session.settle().garments if each.points is not None)
             chance = random.Random(1)
             tried = [(TUNABLES[MOVED[k % len(MOVED)]], chance.random()) for k in range(moves)]
             clock = time.process_time if processor else time.perf_counter

@@ -37,7 +37,7 @@ def settings_of(*, integrator: str = "quasi-newton", **options: Any) -> SolveSet
 
 
 class Answer(NamedTuple):
-    """A state of which every garment was solved."""
+    """A result of which every garment was solved."""
 
     time: float | None
     points: tuple[np.ndarray, ...]
@@ -52,10 +52,11 @@ class Solver:
         self.refinements, self.forget, self._refiner = refiner.refinements, refiner.forget, refiner
 
     def solve(self, frame: Frame) -> Answer:
-        state = self._refiner.solve(frame)
-        points = tuple(points for points in state.points if points is not None)
-        assert len(points) == len(state.points)
-        return Answer(state.time, points, state.telemetry, state.reused)
+        result = self._refiner.solve(frame)
+        points = tuple(garment.points for garment in result.garments if garment.points is not None)
+        assert len(points) == len(result.garments)
+        telemetry, reused = zip(*((garment.telemetry, garment.reused) for garment in result.garments), strict=True)
+        return Answer(result.time, points, telemetry, reused)
 
     def refine(self, frames: Iterable[Frame]) -> Iterator[Answer]:
         return (self.solve(frame) for frame in frames)

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 
 from physgraph_usd.errors import GarmentError
-from physgraph_usd.shot.frames import Outcome
+from physgraph_usd.solver.scene import GarmentResult, Result
 
 
-def counting(times: Sequence[float | None]) -> Iterator[Outcome]:
+def counting(times: Sequence[float | None]) -> Iterator[Result]:
     """A solver whose points tell how many frames its process had solved before."""
     for before, time in enumerate(times):
-        yield Outcome(time, (np.full((2, 3), before),), (False,), {"time": time})
+        yield Result(time, (GarmentResult(np.full((2, 3), before)),))
 
 
 def as_named(kind: str, *_: object) -> Any:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, Vt
 from stages import new_stage, sheet_faces, vec3
 
 from physgraph_usd.solver.mesh.subdivide import Refinement, subdivide_times
+from physgraph_usd.solver.scene import GarmentResult, Result
 from physgraph_usd.usd.check.validate import validate_layer
 from physgraph_usd.usd.mesh.attributes import vertex_values
 from physgraph_usd.usd.read.reader import Shot, open_shot
@@ -106,6 +108,11 @@ def fine_points(shot: Shot, refinements: Sequence[Sequence[Refinement]], time: f
     return [vertex_values(steps, garment.points) for steps, garment in zip(refinements, garments, strict=True)]
 
 
+def result_of(time: float | None, points: Sequence[np.ndarray | None], **values: Any) -> Result:
+    """A result of fine points, world metres, with further values alike for all garments."""
+    return Result(time, tuple(GarmentResult(array, **values) for array in points))
+
+
 def write_layer(path: Path, out: Path, *, level: int = 1, **options: object) -> Path:
     """Refine a shot linearly into a layer."""
     write_shot(open_shot(str(path), level=level), out, **options)  # type: ignore[arg-type]
@@ -117,7 +124,7 @@ def write_shot(shot: Shot, out: Path, *, times: Sequence[float | None] = (), **o
     refinements = refine_all(shot)
     with LayerWriter(shot, refinements, out, **options) as writer:  # type: ignore[arg-type]
         for time in times or shot.scene.times or (None,):
-            writer.write(time, fine_points(shot, refinements, time))
+            writer.write(result_of(time, fine_points(shot, refinements, time)))
     return writer
 
 

@@ -73,12 +73,12 @@ def run(after: int, *, glitch: str = "", at: int = AT, first: int = 0) -> list[t
             points[what] = change(points[what])
         cloth = GarmentFrame(points["cage"], PRESETS["jersey"])
         try:
-            state = refiner.solve(Frame(float(index), (cloth,), (Pose(points["ball"], faces),)))
+            (solved,) = refiner.solve(Frame(float(index), (cloth,), (Pose(points["ball"], faces),))).garments
         except PhysGraphError:
             told.append(told[-1] if told else (cloth.points, {}))
             continue
-        assert state.points[0] is not None
-        told.append((state.points[0], dict(state.telemetry[0])))
+        assert solved.points is not None
+        told.append((solved.points, solved.telemetry))
     return told
 
 

@@ -67,10 +67,10 @@ class TestFarmFolder:
 
         times = [float(time) for time in range(8)]
         with FrameFolder(tmp_path / "f", {}) as frames:
-            outcomes = list(
+            results = list(
                 solve_in_chunks(counting, times, frames, workers=2, preroll=3, start=start, movers=None, warn=print)
             )
-        assert [int(np.asarray(outcome.points[0])[0, 0]) for outcome in outcomes] == [0, 1, 2, 3, 3, 4, 5, 6]
+        assert [int(np.asarray(result.garments[0].points)[0, 0]) for result in results] == [0, 1, 2, 3, 3, 4, 5, 6]
         monkeypatch.setattr("physgraph_usd.shot.chunks.LATE_SECONDS", 0.1)
         with FrameFolder(tmp_path / "f", {}) as frames, pytest.raises(SolveError, match="the result of time code 0"):
             next(solve_in_chunks(counting, times, frames, workers=1, start=start, movers=None, warn=print))
@@ -79,12 +79,12 @@ class TestFarmFolder:
     def test_a_task_that_outlasts_its_run_writes_nothing_into_another(self, tmp_path: Path):
         with FrameFolder(tmp_path / "f", {"level": 2}) as frames:
             outlasting = pickle.loads(pickle.dumps(frames))
-        outcome = next(counting([0.0]))
+        result = next(counting([0.0]))
         with pytest.raises(LayerError):
-            outlasting.write(0, outcome)
+            outlasting.write(0, result)
         with FrameFolder(tmp_path / "f", {"level": 3}) as other:
             with pytest.raises(LayerError, match="another run's by now"):
-                outlasting.write(0, outcome)
+                outlasting.write(0, result)
             assert other.read(0, 0.0) is None
 
 

@@ -29,7 +29,7 @@ from physgraph_usd.shot.options import OPTIONS
 
 ROOT = Path(__file__).resolve().parents[1]
 TUTORIALS = tuple(f"tutorials/{name}" for name in ("first_shot", "look", "farm", "solver"))
-HOW_TO = ("tune", "symptoms", "handoff", "trouble", "batch", "farm", "hooks")
+HOW_TO = ("tune", "symptoms", "limits", "handoff", "trouble", "batch", "farm", "hooks")
 REFERENCE = ("commands", "attributes", "fabrics", "presets", "swatches", "layers", "report", "api", "glossary")
 EXPLANATION = ("comparison", "solver", "contact", "chart", "learned", "results")
 KINDS = {"Tutorials": TUTORIALS, "How-to": HOW_TO, "Reference": REFERENCE, "Explanation": EXPLANATION}

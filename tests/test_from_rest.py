@@ -33,7 +33,7 @@ def followed(shot: Path, steps: int, *, measured: bool = True) -> tuple[list[np.
     settings = replace(settings, ended=found.note) if measured else settings
     refiner, points = Refiner(opened.scene, settings, levels=[1], threads=1), []
     for time in opened.scene.times:
-        points.append(refiner.solve(opened.frame(time)).points[0])
+        points.append(refiner.solve(opened.frame(time)).garments[0].points)
         if measured:
             found.measure()
     opened.close()

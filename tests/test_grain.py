@@ -157,7 +157,7 @@ def test_ease_folds_cloth_whose_cage_is_at_rest():
     bumps = {}
     for ease in (0.0, 0.04):
         refiner = Refiner(Scene((garment,), np.zeros(3)), SolveSettings())
-        fine = refiner.solve(Frame(None, (GarmentFrame(points, Fabric(warp_ease=ease)),))).points[0]
+        fine = refiner.solve(Frame(None, (GarmentFrame(points, Fabric(warp_ease=ease)),))).garments[0].points
         assert fine is not None
         height = fine[:, 2].copy()
         bumps[ease] = np.abs(height).max()
@@ -181,7 +181,7 @@ def test_folds_are_where_the_uneven_ease_is():
         grain = Grain(np.broadcast_to(ALONG, (mesh.face_count, 3)), scale, 0 * scale)
         garment = replace(garment_of(mesh, points), grain=grain, level=1)
         refiner = Refiner(Scene((garment,), np.zeros(3)), SolveSettings())
-        fine = refiner.solve(Frame(None, (GarmentFrame(points, Fabric(warp_ease=0.04)),))).points[0]
+        fine = refiner.solve(Frame(None, (GarmentFrame(points, Fabric(warp_ease=0.04)),))).garments[0].points
         assert fine is not None
         level = build_levels([garment], refine_garments([garment], [1]), dtype=torch.float64)[-1]
         ends = level.edges.numpy()

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from bodies import tube
-from layers import COAT, TIMES, errors, fine_points, make_shot, open_over, refine_all
+from layers import COAT, TIMES, errors, fine_points, make_shot, open_over, refine_all, result_of
 from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 from shots import CLOTH, cloth_shot, faults, refine
 from stages import COLLIDER_API
@@ -39,8 +39,7 @@ def write(shot_file: Path, out: Path, heat: Mapping[Any, dict[str, Any] | None],
     steps = refine_all(shot)
     with LayerWriter(shot, steps, out, **options) as writer:  # type: ignore[arg-type]
         for time in shot.scene.times or (None,):
-            given = [heat[time]] if time in heat else ()
-            writer.write(time, fine_points(shot, steps, time), heat=given)
+            writer.write(result_of(time, fine_points(shot, steps, time), heat=heat.get(time) or {}))
     return out
 
 

@@ -135,6 +135,23 @@ def test_short_shots_and_broken_neighbours_have_none() -> None:
     assert CageMotion([*map(float, range(9))], broken, **PACE).felt(4.0, np.zeros((1, 3))) is None
 
 
+@pytest.mark.parametrize("farthest", [np.nan, np.inf, 1e300])
+def test_a_position_out_of_bounds_is_not_felt_beside_it(farthest: float) -> None:
+    """Warnings are errors in tests: numbers of that size overflow when they are squared."""
+    path = np.zeros(13)
+    path[6] = farthest
+    motion = motion_of(path)
+    assert all(at(motion, path, time) is None for time in range(13) if time != 6)
+
+
+@pytest.mark.parametrize("far", [1e37, -1e289])
+def test_time_codes_too_far_from_0_to_differ_have_no_acceleration(far: float) -> None:
+    times = np.array(sorted([far, 1.0, 3.0, 5.0]))
+    motion = motion_of(np.arange(4.0), times)
+    for number, time in enumerate(times):
+        assert motion.felt(time, np.array([[float(number), 0.0, 0.0]])) is None
+
+
 def test_cloth_is_drawn_against_the_acceleration_by_its_density_over_the_guide() -> None:
     mesh, rest = sheet(6, 5)
     still = frame_of(rest)

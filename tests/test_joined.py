@@ -10,22 +10,22 @@ import numpy as np
 from shots import cloth_shot
 
 from physgraph_usd.shot.chunks import frames_in_order
-from physgraph_usd.shot.frames import Outcome
 from physgraph_usd.shot.joined import join
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.solve import ShotSolver
+from physgraph_usd.solver.scene import GarmentResult, Result
 from physgraph_usd.usd.read.reader import open_shot
 
 
-def outcome(time: float, height: float, *, kept: bool = False) -> Outcome:
+def result(time: float, height: float, *, kept: bool = False) -> Result:
     """A triangle at a height."""
     points = np.array([[0.0, 0.0, height], [1.0, 0.0, height], [0.0, 1.0, height]])
-    return Outcome(time, (points,), (kept,), {"time": time})
+    return Result(time, (GarmentResult(points, reused=kept),))
 
 
-def read(index: int, seam: int | None) -> Outcome:
+def read(index: int, seam: int | None) -> Result:
     """A cloth at rest at zero, which another process has at a height in the first three frames, and goes on there."""
-    return outcome(float(index), 0.0 if seam is None and index < 3 else 1.0, kept=True)
+    return result(float(index), 0.0 if seam is None and index < 3 else 1.0, kept=True)
 
 
 class Passing:
@@ -38,9 +38,9 @@ class Passing:
         return wanted, self.why
 
 
-def heights(found: list[Outcome]) -> list[float]:
+def heights(found: list[Result]) -> list[float]:
     """Of each frame."""
-    return [float(np.asarray(each.points[0])[0, 2]) for each in found]
+    return [float(np.asarray(each.garments[0].points)[0, 2]) for each in found]
 
 
 def test_cloth_that_would_cross_jumps_and_is_told_of():
@@ -48,7 +48,7 @@ def test_cloth_that_would_cross_jumps_and_is_told_of():
         join([(read(k, None), read(k, 3)) for k in range(3)], lambda: Passing("</a> would have 3 edges through cloth"))
     ]
     found = list(frames_in_order(read, range(5), {3: 0}, join=lambda *_: joints[0].frames))
-    assert [each.reused for each in found] == [(True,), (True,), (True,), (False,), (True,)]
+    assert [each.garments[0].reused for each in found] == [True, True, True, False, True]
     assert heights(found) == [0.0, 0.0, 0.0, 1.0, 1.0]
     (said,) = joints[0].warnings
     assert "after time code 2" in said

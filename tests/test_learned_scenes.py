@@ -69,7 +69,7 @@ def test_a_frame_whose_rounds_undo_one_another_comes_to_rest_by_quasi_newton(sam
     found = []
     for time in (11.0, 12.0, 13.0):
         frame = shot.frame(time)
-        points = [each for each in refiner.solve(frame).points if each is not None]
+        points = [each.points for each in refiner.solve(frame).garments if each.points is not None]
         found.append(judge(refiner, frame, points).energy)
     assert found[1] < 1.25 * found[2]
 

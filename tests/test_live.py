@@ -90,8 +90,8 @@ def session(shot: Path, tmp_path: Path) -> Iterator[TuneSession]:
 
 
 def points(shown: Shown) -> np.ndarray:
-    assert shown.points[0] is not None
-    return shown.points[0]
+    assert shown.garments[0].points is not None
+    return shown.garments[0].points
 
 
 def test_the_cloth_is_the_sessions(process: Process, session: TuneSession):

@@ -112,7 +112,7 @@ def test_what_is_out_of_limits_is_refused_by_name(stage: Usd.Stage, value: float
         ("bendStiffness", "cannot read 'bendStiffness'"),
         (
             "bendStifness=1",
-            "unknown attribute 'bendStifness'; did you mean bendStiffness\\? known attributes: bendScale, ",
+            "unknown attribute 'bendStifness'; did you mean bendStiffness\\? known attributes: backstop, ",
         ),
         ("physgraph:material:bendingStiffness=1", "did you mean bendStiffness"),
         (

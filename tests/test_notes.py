@@ -15,6 +15,7 @@ from stages import add_sheet, author, new_stage, save
 from physgraph_usd.errors import UsageError
 from physgraph_usd.shot.notes import of_given_up
 from physgraph_usd.shot.refine import inspect_shot
+from physgraph_usd.shot.report import RefineReport
 from physgraph_usd.solver.fabric import NAMED, PRESETS, WORN
 from physgraph_usd.solver.scene import GIVEN_UP
 from physgraph_usd.usd.read.reader import open_shot
@@ -113,7 +114,9 @@ def test_cloth_that_is_not_solved_is_named_with_its_frames():
         {"time": time, "garments": [{"start": start}]}
         for time, start in ((1.0, "cold"), (2.0, GIVEN_UP), (3.0, GIVEN_UP))
     ]
-    (note,) = of_given_up([{"path": "/dress"}], frames)
+    report = RefineReport("s", None, {}, garments=[{"path": "/dress"}], frames=frames)
+    (note,) = of_given_up(report)
     assert note.startswith("in 2 frames cloth is its subdivided cage")
     assert "</dress>, first at time code 2" in note
-    assert of_given_up([{"path": "/dress"}], frames[:1]) == []
+    report.frames = frames[:1]
+    assert of_given_up(report) == []

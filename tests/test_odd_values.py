@@ -7,15 +7,27 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fuzz.damage import replace
+from fuzz.damage import VALUES, replace
 from layers import COAT, dress_up, errors, make_shot, write_layer
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, Vt
 from shots import refine
-from stages import COLLIDER_API, add_sheet, new_stage, save, sheet_shot
+from stages import (
+    COLLIDER_API,
+    add_sheet,
+    add_skeleton,
+    bind_skin,
+    new_stage,
+    said,
+    save,
+    sheet_points,
+    sheet_shot,
+    vec3,
+)
 
 from physgraph_usd.errors import GarmentError, StageError
 from physgraph_usd.usd.check.validate import validate_layer
 from physgraph_usd.usd.read.reader import open_shot
+from physgraph_usd.usd.read.survey import survey
 from physgraph_usd.usd.stage import LONGEST_REASON, read_units
 
 CLOTH = "/World/cloth"
@@ -64,11 +76,21 @@ def test_a_rest_shape_that_is_no_array_is_refused_by_name(tmp_path: Path, name: 
         open_shot(save(stage))
 
 
-def test_a_body_whose_faces_are_a_single_number_is_left_out_by_name(tmp_path: Path):
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        ("faceVertexIndices", "int"),
+        ("faceVertexIndices", "float[]"),
+        ("faceVertexCounts", "string[]"),
+        ("points", "string[]"),
+        ("points", "matrix4d"),
+    ],
+)
+def test_a_body_whose_points_or_faces_are_of_another_type_is_left_out_by_name(tmp_path: Path, name: str, kind: str):
     stage = new_stage(tmp_path / "s.usda")
     add_sheet(stage, CLOTH)
     add_sheet(stage, "/World/floor", tagged=False).GetPrim().AddAppliedSchema(COLLIDER_API)
-    retype(stage, "/World/floor.faceVertexIndices", "int", 7)
+    retype(stage, f"/World/floor.{name}", kind, VALUES[kind])
     report = refine(Path(save(stage)), tmp_path / "fine.usdc", level=1, steps=1)
     assert any("its points and faces do not fit together" in str(each) for each in report.warnings)
 
@@ -154,3 +176,52 @@ def test_a_reference_to_a_name_with_a_null_byte_is_told(tmp_path: Path):
     shot.write_text(text)
     with pytest.raises(StageError, match="Could not open asset"):
         refine(shot, tmp_path / "fine.usda")
+
+
+def skinned_with_points(path: Path, kind: str, value: object, *, blend: bool) -> str:
+    """A sheet on a skeleton, with a blend shape if wanted, whose points are a value of another type."""
+    stage, offsets = new_stage(path), 0.1 * np.ones_like(sheet_points())
+    add_skeleton(stage, "/World/rig", (1.0, 2.0), blend=blend)
+    mesh = add_sheet(stage, "/World/rig/cloth", times=())
+    bind_skin(mesh, "/World/rig", joints=[0] * len(offsets), blend=offsets if blend else None)
+    retype(stage, "/World/rig/cloth.points", kind, value)
+    return save(stage)
+
+
+@pytest.mark.parametrize("blend", [False, True], ids=["joints", "shape"])
+def test_points_in_double_precision_are_not_skinned_with_a_word(tmp_path: Path, blend: bool):
+    value = Vt.Vec3dArray.FromNumpy(sheet_points().astype(np.float64))
+    with closing(open_shot(skinned_with_points(tmp_path / "s.usda", "double3[]", value, blend=blend))) as shot:
+        assert "</World/rig/cloth>: is not skinned and stays in its bind pose, because its points are of" in said(shot)
+        np.testing.assert_array_equal(shot.frame(None).garments[0].points, sheet_points())
+
+
+@pytest.mark.parametrize("kind", ["float", "matrix4d", "string[]"])
+@pytest.mark.parametrize("blend", [False, True], ids=["joints", "shape"])
+def test_points_of_a_skinned_mesh_that_are_no_positions_are_refused_by_type(tmp_path: Path, kind: str, blend: bool):
+    shot = skinned_with_points(tmp_path / "s.usda", kind, VALUES[kind], blend=blend)
+    with pytest.raises(GarmentError, match=r"</World/rig/cloth>.*points is a .*author point3f\[\]"):
+        open_shot(shot)
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [("points", "float"), ("points", "string[]"), ("uVertexCount", "string"), ("vVertexCount", "int[]")],
+)
+def test_a_surface_that_is_not_read_may_have_values_of_another_type(tmp_path: Path, name: str, kind: str):
+    stage = new_stage(tmp_path / "s.usda")
+    add_sheet(stage, CLOTH)
+    patch = UsdGeom.NurbsPatch.Define(stage, "/World/patch")
+    patch.CreatePointsAttr(vec3(sheet_points()))
+    patch.CreateUVertexCountAttr(5)
+    patch.CreateVVertexCountAttr(4)
+    retype(stage, f"/World/patch.{name}", kind, VALUES[kind])
+    report = refine(Path(save(stage)), tmp_path / "fine.usdc", level=1, steps=1)
+    assert not report.failed
+
+
+def test_a_transform_in_units_that_are_no_length_overflows_no_volume(tmp_path: Path):
+    """Warnings are errors in tests, and NumPy warns of a determinant that overflows."""
+    stage = new_stage(tmp_path / "s.usda", metres=1e300)
+    add_sheet(stage, CLOTH)
+    assert [mesh.path for mesh in survey(save(stage)).meshes] == [CLOTH]

@@ -133,7 +133,7 @@ def test_a_sleeve_deep_in_the_body_ends_with_no_more_crossings(tmp_path: Path):
     """
     shot = open_shot(str(write_sample("tshirt", tmp_path)))
     refiner = Refiner(shot.scene, RefineOptions().solve_settings(), levels=[2])
-    telemetry: dict[str, Any] = refiner.solve(shot.frame(36.0)).telemetry[0]
+    telemetry = refiner.solve(shot.frame(36.0)).garments[0].telemetry
     contact = telemetry["contact"]
     assert contact["cloth"]["before"]["crossings"] > 200
     assert contact["cloth"]["after"]["crossings"] <= contact["cloth"]["before"]["crossings"]

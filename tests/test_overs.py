@@ -21,7 +21,7 @@ from layers import (
     write_layer,
     write_shot,
 )
-from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdSkel
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdSkel, Vt
 from stages import add_skeleton, clip_shot, skinned_points
 
 from physgraph_usd.errors import LayerError
@@ -350,3 +350,19 @@ def test_validate_names_a_mesh_broken_by_the_faces_of_a_refined_one(dressed: Pat
     (problem,) = [each for each in validate_layer(out) if each.rule == "other_meshes"]
     assert problem.path == "/World/other.faceVertexIndices"
     assert "composed from a refined mesh" in problem.message
+
+
+def test_faults_of_the_shot_inside_an_instance_that_is_opened_are_the_shots(dressed: Path, tmp_path: Path) -> None:
+    """USD's validators pass over what is inside of an instance, here a subset with more faces than the mesh has."""
+    stage = Usd.Stage.Open(str(dressed))
+    coat = UsdGeom.Mesh(stage.GetPrimAtPath(COAT))
+    UsdGeom.Subset.CreateGeomSubset(coat, "back", "face", Vt.IntArray([3, 4, 5]), "materialBind", "nonOverlapping")
+    twin = UsdGeom.Mesh(stage.DefinePrim("/World/other", "Mesh"))
+    twin.GetPrim().GetReferences().AddInternalReference(COAT)
+    twin.CreateFaceVertexCountsAttr([3])
+    twin.CreateFaceVertexIndicesAttr([0, 1, 2])
+    twin.GetPrim().SetInstanceable(True)
+    stage.Save()
+    write_shot(open_shot(str(dressed), garments=[COAT], level=1), tmp_path / "out.usdc")
+    assert not open_over(dressed, tmp_path / "out.usdc").GetPrimAtPath("/World/other").IsInstance()
+    assert errors(tmp_path / "out.usdc", dressed) == []

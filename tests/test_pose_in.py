@@ -1,8 +1,9 @@
-"""Skinned cloth reaches its first frame from the bind pose (`--pose-in`)."""
+"""Skinned cloth reaches its first frame from the bind pose, if it would cross itself there or `--pose-in` asks."""
 
 from __future__ import annotations
 
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +12,14 @@ import pytest
 pytest.importorskip("pxr", reason="shots are read with usd-core")
 
 from fuzz.poses import ROOT, write_limb
-from pxr import Gf, Usd, UsdGeom, UsdSkel, Vt
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
 from shots import cloth_shot
 
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.refine import refine_shot
-from physgraph_usd.usd.read.reader import open_shot
+from physgraph_usd.shot.report import RefineReport
+from physgraph_usd.shot.run_in import MOST_POSES
+from physgraph_usd.usd.read.reader import Shot, open_shot
 
 BEND = 100.0
 """Angle between upper and lower limb [degrees]."""
@@ -69,15 +72,38 @@ def test_halfway_the_limb_is_bent_by_half(limb: Path):
     assert bend(cage_at(limb, 0.5)) == pytest.approx(BEND / 2.0, abs=1.0)
 
 
-def test_cloth_that_crosses_itself_in_the_bent_first_frame_comes_out_clean(limb: Path, tmp_path: Path):
+def crossings(report: RefineReport) -> int:
+    """Crossings of cloth in the first frame."""
+    return report.frames[0]["garments"][0]["contact"]["cloth"]["after"]["crossings"]
+
+
+def test_cloth_that_crosses_itself_in_the_bent_first_frame_continues_from_the_bind_pose(limb: Path, tmp_path: Path):
     options = RefineOptions(level=1, frames=(1.0, 1.0))
-    posed = RefineOptions(level=1, frames=(1.0, 1.0), pose_in=8)
-    reports = [refine_shot(limb, tmp_path / f"{k}.usdc", each) for k, each in enumerate((options, posed))]
-    left = [report.frames[0]["garments"][0]["contact"]["cloth"]["after"]["crossings"] for report in reports]
-    assert left[1] == 0 < left[0]
-    assert [any("--pose-in 12" in note for note in report.notes) for report in reports] == [True, False]
-    assert reports[1].frames[0]["run_in_ms"] > 0
-    assert reports[1].modelled["pose in"] == "8 poses between the bind pose and the first frame"
+    never, automatic, requested = (
+        refine_shot(limb, tmp_path / f"{poses}.usdc", replace(options, pose_in=poses)) for poses in (0, None, 8)
+    )
+    assert crossings(automatic) == crossings(requested) == 0 < crossings(never)
+    assert [report.frames[0].get("poses") for report in (never, automatic, requested)] == [None, MOST_POSES, 8]
+    assert [any("bind pose" in note for note in report.notes) for report in (never, automatic)] == [False, True]
+    assert automatic.frames[0]["run_in_ms"] > 0
+    assert requested.modelled["pose in"] == "8 poses between the bind pose and the first frame"
+
+
+def test_the_first_result_stays_where_a_pose_crosses_itself(
+    limb: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Poses that are solved from no frame to no frame, each from its cage, cross themselves on the way."""
+    options = RefineOptions(level=1, frames=(1.0, 2.0))
+    never = refine_shot(limb, tmp_path / "never.usdc", replace(options, pose_in=0))
+    posed_frame = Shot.posed_frame
+    monkeypatch.setattr(Shot, "posed_frame", lambda shot, time, part: posed_frame(shot, time, 1.0))
+    vain = refine_shot(limb, tmp_path / "vain.usdc", options)
+    assert crossings(vain) == crossings(never)
+    assert "poses" not in vain.frames[0]
+    layers = [Sdf.Layer.FindOrOpen(str(tmp_path / f"{name}.usdc")) for name in ("never", "vain")]
+    for time in (1.0, 2.0):
+        first, second = (np.array(layer.QueryTimeSample(f"{ROOT}/cloth.points", time)) for layer in layers)
+        assert np.array_equal(first, second)
 
 
 def test_without_a_skeleton_it_is_said_that_it_has_no_effect(tmp_path: Path):

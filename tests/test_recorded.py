@@ -68,9 +68,9 @@ def test_what_a_card_records_reads_nothing_back(tmp_path: Path, monkeypatch: pyt
     monkeypatch.setattr(SelfContact, "aims", SelfContact.with_room)
     shot = open_for(str(write_sample("skirt", tmp_path)), RefineOptions(level=1))
     solver = ShotSolver(str(tmp_path / "skirt.usdc"), [1], RefineOptions(level=1), opened=shot)
-    outcomes = [*solver(list(shot.scene.times)[30:33])]
+    results = [*solver(list(shot.scene.times)[30:33])]
     shot.close()
-    assert all("error" not in each.record for each in outcomes)
+    assert not any(result.telemetry.get("error") for result in results)
     assert {name.split(".")[0] for name in called} == {"total_of", "MovingFrames", "Metric"}
     assert called["total_of.<locals>.total"] > 10
 

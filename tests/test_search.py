@@ -170,12 +170,14 @@ def list_items(first: wp.int32, count: wp.array(dtype=wp.int32), out: wp.array(d
 
 
 def test_threads_that_count_at_once_share_no_place():
+    """Two threads that share a place count once. On a busy machine they seldom run at once, so it is tried often."""
     size, count = 2**22, torch.zeros(1, dtype=torch.int32)
-    for _ in range(3):  # The first launch tells how long an item takes.
-        out = torch.full((size,), -1, dtype=torch.int32)
+    out = torch.full((size,), -1, dtype=torch.int32)
+    for _ in range(50):  # The first launch tells how long an item takes.
         given = [wp.from_torch(count.zero_()), wp.from_torch(out)]
         threads.run(list_items, size, given, device="cpu", threads=4)  # pyright: ignore[reportArgumentType]
-        assert torch.equal(out.sort().values, torch.arange(size, dtype=torch.int32))
+        assert int(count) == size
+    assert torch.equal(out.sort().values, torch.arange(size, dtype=torch.int32))
 
 
 @pytest.mark.parametrize("tasks", [1, TASKS])

@@ -41,11 +41,12 @@ def _edges(shot: Path, options: RefineOptions, *, first: int, count: int) -> Ite
     chains = [subdivide_times(garment.mesh, level) for garment in garments]
     folds = [sharp_folds(garment.mesh, chain) for garment, chain in zip(garments, chains, strict=True)]
     solver = ShotSolver(str(shot), [level] * len(garments), options, opened=opened)
-    for outcome in solver(list(opened.scene.times)[first : first + count]):
-        assert "error" not in outcome.record
-        frame = opened.frame(outcome.time)
+    for result in solver(list(opened.scene.times)[first : first + count]):
+        assert "error" not in result.telemetry
+        frame = opened.frame(result.time)
         bodies = [np.asarray(pose.points) for pose in frame.colliders if pose is not None]
-        for each, fold, chain, fine in zip(frame.garments, folds, chains, outcome.points, strict=True):
+        for each, fold, chain, solved in zip(frame.garments, folds, chains, result.garments, strict=True):
+            fine = solved.points
             assert fine is not None
             half = chain[-1].mesh.half_edges
             middle = fine[half.edges[half.count == 2]].mean(axis=1)

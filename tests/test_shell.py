@@ -63,6 +63,20 @@ def test_it_is_closed_and_as_thick_as_asked(tmp_path: Path, how: str):
     assert not errors(tmp_path / "shell.usda", shot)
 
 
+@pytest.mark.parametrize("orientation", ["rightHanded", "leftHanded"])
+def test_normals_of_its_polygons_point_outwards(tmp_path: Path, orientation: str):
+    shot = cloth_shot(tmp_path / "shot.usda")
+    stage = Usd.Stage.Open(str(shot))
+    UsdGeom.Mesh(stage.GetPrimAtPath(CLOTH)).CreateOrientationAttr(orientation)
+    stage.Save()
+    refine(shelled(shot), tmp_path / "shell.usda", scheme="none")
+    stage = open_over(shot, tmp_path / "shell.usda")
+    normals = np.asarray(UsdGeom.Mesh(stage.GetPrimAtPath(CLOTH)).GetNormalsAttr().Get(LATE))
+    outer, inner = np.split(polygons(stage)[1], 2)
+    outwards = np.concatenate([outer - inner, inner - outer])
+    assert np.einsum("vx,vx->v", normals, outwards).min() > 0.0
+
+
 def test_uvs_and_subsets_are_the_sheets_on_both_sides_and_on_the_rims(tmp_path: Path):
     shot = cloth_shot(tmp_path / "shot.usda")
     stage = Usd.Stage.Open(str(shot))

@@ -52,10 +52,10 @@ def points(layer: Path, time: float) -> np.ndarray:
 
 def solved(chunk: Path, time: float) -> np.ndarray:
     """World positions [m] of the sheet in a chunk."""
-    outcome = Finished(chunk).read(TIMES.index(time), time)
-    assert outcome is not None
-    assert outcome.points[0] is not None
-    return outcome.points[0]
+    result = Finished(chunk).read(TIMES.index(time), time)
+    assert result is not None
+    assert result.garments[0].points is not None
+    return result.garments[0].points
 
 
 def points_in(stage: Usd.Stage, path: str, time: float) -> Any:

@@ -105,10 +105,11 @@ class TestPartialLayer:
             points.Set(points.Get(3.0), time)
         stage.Save()
         refine(shot, chunk, frames=(1.0, 6.0), preroll=0)
-        solved = Finished(chunk).read(3, 4.0)
-        assert solved is not None
-        assert solved.points[0] is not None
-        assert solved.reused == (True,)
+        result = Finished(chunk).read(3, 4.0)
+        assert result is not None
+        (solved,) = result.garments
+        assert solved.points is not None
+        assert solved.reused
         (chunk / "2.npz").unlink()
         done = run("stitch", chunk, "-o", tmp_path / "all.usdc")
         assert done.exit_code == 2
@@ -116,7 +117,7 @@ class TestPartialLayer:
         assert "leave them out by --partial" in done.stderr
         assert run("stitch", chunk, "-o", part, "--partial").exit_code == 0
         assert sample_times(part)[:3] == (1.0, 2.0, 4.0)
-        assert np.allclose(fine(shot, part, 4.0), solved.points[0], rtol=0, atol=1e-7)
+        assert np.allclose(fine(shot, part, 4.0), solved.points, rtol=0, atol=1e-7)
         assert faults(part, shot) == []
 
     def test_frames_choose_among_the_finished_ones(self, stopped: tuple[Path, Path], tmp_path: Path):

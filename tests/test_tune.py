@@ -50,8 +50,8 @@ def session(shot: Path) -> Iterator[TuneSession]:
 
 
 def points(shown: Shown) -> np.ndarray:
-    assert shown.points[0] is not None
-    return shown.points[0]
+    assert shown.garments[0].points is not None
+    return shown.garments[0].points
 
 
 def test_a_value_is_solved_from_where_the_cloth_was(session: TuneSession):
@@ -59,7 +59,7 @@ def test_a_value_is_solved_from_where_the_cloth_was(session: TuneSession):
     session.set_value(CLOTH, "guide:stiffness", 100.0)
     after = session.solve()
     assert (before.settled, after.settled) == (True, False)
-    assert after.telemetry[0]["start"] == "warm"
+    assert after.garments[0].telemetry["start"] == "warm"
     assert np.abs(points(after) - points(before)).max() > 1e-5
     assert session.solve() is after
 
@@ -77,7 +77,7 @@ def test_a_settled_frame_is_what_refine_gives_from_the_same_state(session: TuneS
     settled = session.settle()
     exact = own.fork(replace(session.solver._settings, temporal="warm"))
     state = exact.solve(session.shot.frame(session.time))
-    (known,) = state.points
+    known = state.garments[0].points
     assert known is not None
     assert np.linalg.norm(known - points(settled), axis=1).max() < 0.1 * EDGE / 4
     assert settled.settled
@@ -344,7 +344,7 @@ def test_the_range_is_solved_as_refine_solves_it(session: TuneSession, shot: Pat
         refiner = Refiner(opened.scene, RefineOptions().solve_settings(), levels=session.setting.levels)
         states = list(refiner.refine(opened.frame(time) for time in session.codes))
     session.set_time(session.codes[-1])
-    (last,) = states[-1].points
+    last = states[-1].garments[0].points
     assert last is not None
     assert np.abs(points(session.solve()) - last).max() < 1e-6
     session.set_value(CLOTH, "bendStiffness", STIFF)

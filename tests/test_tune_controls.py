@@ -32,7 +32,7 @@ def shot(tmp_path: Path) -> Path:
 
 def cloth(session: TuneSession) -> np.ndarray:
     """The settled cloth [m], shape (V, 3)."""
-    points = session.settle().points[0]
+    points = session.settle().garments[0].points
     assert points is not None
     return points
 

@@ -12,7 +12,6 @@ import time as clock
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
-from dataclasses import replace
 from functools import partial
 from itertools import chain, pairwise
 from math import inf
@@ -22,7 +21,8 @@ import numpy as np
 
 from ..errors import SolveError
 from ..interrupts import leave_if_asked
-from .frames import FrameFolder, Outcome
+from ..solver.scene import Result
+from .frames import FrameFolder
 from .joined import Both, Joint, Movers, join
 from .processes import POLL_SECONDS, Start, memory_is_named, result_of
 
@@ -31,11 +31,11 @@ PREROLL = 6
 
 LATE_SECONDS = 60.0
 """Longest time for a file to appear after its process has ended [s]: network file systems cache missing files."""
-Solver = Callable[[Sequence[float | None]], Iterator[Outcome]]
+Solver = Callable[[Sequence[float | None]], Iterator[Result]]
 """Solves time codes in order; must be picklable to run in several processes."""
-Read = Callable[[int, int | None], Outcome]
+Read = Callable[[int, int | None], Result]
 """Reads a frame by number, solved as usual (None) or in the pre-roll of the chunk that starts at a number."""
-Join = Callable[[int, Both], Iterable[Outcome]]
+Join = Callable[[int, Both], Iterable[Result]]
 """Joins the frames before the seam at a number."""
 
 
@@ -57,7 +57,7 @@ def _ranges(numbers: Sequence[int]) -> list[range]:
 
 def frames_in_order(
     read: Read, numbers: Iterable[int], seams: Mapping[int, int], *, join: Join | None
-) -> Generator[Outcome, None, None]:
+) -> Generator[Result, None, None]:
     """Yield frames in order, those before each seam joined.
 
     Args:
@@ -67,16 +67,16 @@ def frames_in_order(
         join: Joins the frames before a seam; None leaves them as solved before the seam.
     """
     ends = {index: seam for seam, before in _joined_at(seams).items() for index in before}
-    pairs: list[tuple[Outcome, Outcome]] = []
+    pairs: list[tuple[Result, Result]] = []
     for index in numbers:
         leave_if_asked()
-        outcome = read(index, None)
-        if index in seams:  # "Reused" refers to the last pre-roll frame, not to the previous frame here.
-            outcome = replace(outcome, reused=(False,) * len(outcome.reused))
+        result = read(index, None)
+        if index in seams:
+            result = result.as_changed()
         if join is None or index not in ends:
-            yield outcome
+            yield result
             continue
-        pairs.append((outcome, read(index, ends[index])))
+        pairs.append((result, read(index, ends[index])))
         if index + 1 == ends[index]:
             yield from join(ends[index], pairs)
             pairs = []
@@ -99,7 +99,7 @@ def solve_in_chunks(
     only: Sequence[int] | None = None,
     preroll: int = PREROLL,
     start: Start | None = None,
-) -> Generator[Outcome, None, None]:
+) -> Generator[Result, None, None]:
     """Solve all time codes except the kept ones, in this process or in several, and yield all in order.
 
     Args:
@@ -130,11 +130,11 @@ def solve_in_chunks(
         called = [start(_work, (solver, list(times), chunk, frames, preroll), seams, movers) for chunk in chunks]
         calls = {k: call for chunk, call in zip(chunks, called, strict=True) for part in chunk for k in part}
 
-    def read(index: int, seam: int | None) -> Outcome:
+    def read(index: int, seam: int | None) -> Result:
         stored = partial(frames.read, index, times[index], seam=seam)
         return _await(stored, times[index], call=calls.get(index if seam is None else seam), solved=solved)
 
-    def joined(seam_movers: Movers, seam: int, pairs: Both) -> Sequence[Outcome]:
+    def joined(seam_movers: Movers, seam: int, pairs: Both) -> Sequence[Result]:
         finished = result_of(calls[seam - 1]).get(seam) if seam - 1 in calls else None
         joint = finished or join(pairs, seam_movers)
         warn(*joint.warnings)
@@ -150,8 +150,8 @@ def _solve(
     for part in chunk:
         first = max(0, part.start - preroll)
         with memory_is_named():
-            for index, outcome in enumerate(solver(times[first : part.stop]), start=first):
-                frames.write(index, outcome, seam=part.start if index < part.start else None)
+            for index, result in enumerate(solver(times[first : part.stop]), start=first):
+                frames.write(index, result, seam=part.start if index < part.start else None)
                 yield index
 
 
@@ -167,7 +167,7 @@ def _work(job: tuple[Any, ...], seams: Mapping[int, int], movers: Movers | None)
     def read(index: int, seam: int | None) -> Any:
         return frames.read(index, times[index], seam=seam)
 
-    def joined(seam: int, pairs: Both) -> Sequence[Outcome]:
+    def joined(seam: int, pairs: Both) -> Sequence[Result]:
         joints[seam] = join(pairs, chunk_movers)
         return joints[seam].frames
 
@@ -181,11 +181,11 @@ def _work(job: tuple[Any, ...], seams: Mapping[int, int], movers: Movers | None)
 
 
 def _await(
-    stored: Callable[[], Outcome | None], time: float | None, *, call: Future[Any] | None, solved: Iterator[int]
-) -> Outcome:
+    stored: Callable[[], Result | None], time: float | None, *, call: Future[Any] | None, solved: Iterator[int]
+) -> Result:
     """A result once ``call``, or ``solved`` in this process, has stored it."""
     latest = inf
-    while (outcome := stored()) is None:
+    while (result := stored()) is None:
         leave_if_asked()
         if clock.monotonic() > latest or (call is None and next(solved, None) is None):
             raise SolveError(f"a worker ended without the result of time code {time}")
@@ -194,4 +194,4 @@ def _await(
             latest = min(latest, clock.monotonic() + LATE_SECONDS)
         if call is not None:
             clock.sleep(POLL_SECONDS)
-    return outcome
+    return result

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from itertools import pairwise, zip_longest
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from ..errors import GarmentError
 from ..solver.frame.settings import Reset
-from ..solver.scene import SAME_TIME, Frame, mean_edge
+from ..solver.scene import SAME_TIME, Frame, Result, mean_edge
 from ..usd.read.reader import Shot
-from .frames import Outcome
 
 JUMP = Reset().move
 """Least deviation of a step from its neighbouring steps to count as a jump, RMS over a garment's points, in mean cage
@@ -39,16 +38,17 @@ class Cuts:
             for index, source in enumerate(opened.sources)
         ]
 
-    def __call__(self, records: Sequence[Mapping[str, Any]]) -> list[bool]:
-        """For each garment, whether the cloth jumps to the last telemetry record, or was solved anew there."""
-        before, current = (list(record.get("garments", ())) for record in ({}, *records)[-2:])
-        return [
-            records[-1]["time"] in jumps
+    def __call__(self, records: Sequence[Mapping[str, Any]]) -> set[int]:
+        """Numbers of the garments whose cloth jumps to the last telemetry record, or was solved anew there."""
+        entries = [record["garments"] for record in records[-2:] if record.get("garments")]
+        return {
+            index
+            for index, entry in enumerate(records[-1]["garments"])
+            if records[-1]["time"] in self._jumps[index]
             or _STARTED_ANEW in str(entry.get("start", ""))
             or "broken_before" in entry
-            or any("collapsed" in telemetry or "not_solved" in telemetry for telemetry in (earlier, entry))
-            for jumps, earlier, entry in zip_longest(self._jumps, before[: len(current)], current, fillvalue={})
-        ]
+            or any("collapsed" in garments[index] or "not_solved" in garments[index] for garments in entries)
+        }
 
 
 def jumps(opened: Shot, index: int) -> frozenset[float]:
@@ -117,21 +117,21 @@ class Loop:
         """Start without a result; ``levels``: the number of subdivisions of each garment."""
         self._shot, self._levels = opened, levels
         self._times: list[float | None] = []
-        self._ends: list[Outcome] = []
+        self._ends: list[Result] = []
 
-    def add(self, outcome: Outcome) -> None:
+    def add(self, result: Result) -> None:
         """Take the result of the next time code."""
-        self._times.append(outcome.time)
-        self._ends = [*self._ends[:1], outcome]
+        self._times.append(result.time)
+        self._ends = [*self._ends[:1], result]
 
     def gaps(self) -> dict[str, float]:
         """Distance between first and last result [m] of each garment in a loop, by path, if visible."""
-        if len(self._times) < _LEAST or not all(outcome.points for outcome in self._ends):
+        if len(self._times) < _LEAST or not all(result.garments for result in self._ends):
             return {}
-        frames = [self._shot.frame(outcome.time) for outcome in self._ends]
+        frames = [self._shot.frame(result.time) for result in self._ends]
         closing = {}
         for index, garment in enumerate(self._shot.scene.garments):
-            gap = _apart(*(outcome.points[index] for outcome in self._ends))
+            gap = _apart(*(result.garments[index].points for result in self._ends))
             if gap > OPEN * mean_edge(garment) / 2 ** self._levels[index] and self._is_loop(index, frames):
                 closing[garment.path] = gap
         return closing

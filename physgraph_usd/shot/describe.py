@@ -50,14 +50,13 @@ def begin_report(report: RefineReport, opened: Shot, options: RefineOptions) -> 
     """
     first, frames = _first_frame(opened), sample_frames(opened.every_time, opened.frame)
     choices = choose_levels(opened.scene, frames)
-    parts = zip(opened.scene.garments, opened.sources, first.garments, choices, strict=True)
     written = "--velocities" if options.velocities else "none"
     report.garments = [
-        _garment(*part)
-        | {"colliders": _felt(opened, part[0])}
-        | {"velocities": "written anew, as the shot has them" if part[1].velocities else written}
+        _garment(reader.garment, reader.source, first.garments[index], choices[index])
+        | {"colliders": _felt(opened, reader.garment)}
+        | {"velocities": "written anew, as the shot has them" if reader.source.velocities else written}
         | {"bound": [_bound(target) for target in opened.targets if target.garment == index]}
-        for index, part in enumerate(parts)
+        for index, reader in enumerate(opened.readers)
     ]
     bound = sum(len(target.points) for target in opened.targets)
     report.estimate = estimate(opened.scene.garments, **_run(opened, report, options), bound=bound).plain()
@@ -86,7 +85,7 @@ def begin_report(report: RefineReport, opened: Shot, options: RefineOptions) -> 
 
 def say_what_was(report: RefineReport) -> None:
     """Report who made the steps, and list self contact as left out if no frame needed it."""
-    entries = [entry for frame in report.frames for entry in frame.get("garments", ())]
+    entries = [entry for _, _, entry in report.entries()]
     _say_who_integrated(report, entries)
     if any(entry.get("contact", {}).get("cloth", {}).get("near") for entry in entries):
         return
@@ -286,8 +285,8 @@ def _across(opened: Shot, frames: Sequence[Frame], beside: Sequence[Candidate]) 
 def _strained(opened: Shot, report: RefineReport, frames: Sequence[Frame]) -> list[str]:
     """Add to the report the garment parts not sized like their rest shape; returns a warning."""
     parts_of = _strained_parts(opened, frames)
-    for garment, parts in zip(report.garments, parts_of.values(), strict=True):
-        garment["strained"] = [dataclasses.asdict(part) for part in parts]
+    for garment in report.garments:
+        garment["strained"] = [dataclasses.asdict(part) for part in parts_of[garment["path"]]]
     return of_strain(parts_of, _rests(opened.sources))
 
 
@@ -299,10 +298,13 @@ def _rests(garments: Iterable[GarmentSource]) -> dict[str, str]:
 def _strained_parts(opened: Shot, frames: Sequence[Frame]) -> dict[str, list[StrainedPart]]:
     """By path of each garment, the parts not sized like the rest shape."""
     return {
-        garment.path: strained_parts(
-            garment, [frame.garments[k].points for frame in frames], source.subsets, up=-opened.scene.gravity
+        reader.garment.path: strained_parts(
+            reader.garment,
+            [frame.garments[index].points for frame in frames],
+            reader.source.subsets,
+            up=-opened.scene.gravity,
         )
-        for k, (garment, source) in enumerate(zip(opened.scene.garments, opened.sources, strict=True))
+        for index, reader in enumerate(opened.readers)
     }
 
 

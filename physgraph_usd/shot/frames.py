@@ -24,6 +24,7 @@ import numpy as np
 from filelock import BaseFileLock, FileLock, Timeout
 
 from ..errors import LayerError, UsageError, counted
+from ..solver.scene import GarmentResult, Result
 from ..usd.write.atomic import FRAMES_SUFFIX, HOST, check_no_link, make_file, temporary_path, write_text
 
 RUN = "run.json"
@@ -44,25 +45,6 @@ _NAME = re.compile(r"(\d+)(?:\.before(\d+))?(\.failed)?\.npz")
 """Name of a frame's file: number, number of the first frame after the pre-roll if in one, and whether it failed."""
 _OURS = re.compile(rf"({_NAME.pattern}|run\.json)(\.[\w-]+\.\d+\.tmp)?")
 """File names of finished frames and of the record, including temporary names while writing."""
-
-
-@dataclass(frozen=True, eq=False)
-class Outcome:
-    """The result of one time code.
-
-    Attributes:
-        time: The time code; None for a shot without samples.
-        points: Fine world positions [m] of each garment, None for a garment without a sample; () if the solve failed.
-        reused: For each garment, True if the previous frame's points were kept.
-        record: Telemetry, or {"error": message}, ready for JSON.
-        heat: Heat maps of each garment by name, None for a garment without a sample; () if not requested.
-    """
-
-    time: float | None
-    points: tuple[np.ndarray | None, ...]
-    reused: tuple[bool, ...]
-    record: dict[str, object]
-    heat: tuple[dict[str, np.ndarray] | None, ...] = ()
 
 
 def frames_folder(layer: Path) -> Path:
@@ -154,7 +136,7 @@ class Finished:
     def _file(self, index: int, seam: int | None, suffix: str) -> Path:
         return self.folder / (f"{index}" + ("" if seam is None else f".before{seam}") + suffix)
 
-    def read(self, index: int, time: float | None, *, seam: int | None = None) -> Outcome | None:
+    def read(self, index: int, time: float | None, *, seam: int | None = None) -> Result | None:
         """A frame's result, or None if not finished; ``seam`` as in `write`.
 
         Raises:
@@ -167,24 +149,22 @@ class Finished:
         try:
             with np.load(file) as data:
                 record = json.loads(str(data["record"]))
-                reused = tuple(bool(value) for value in data["reused"])
-                names = [f"points{k}" for k in range(len(reused))]
-                points = tuple(data[name] if name in data.files else None for name in names)
-                heat = tuple(_heat_of(data, k) if points[k] is not None else None for k in range(int(data["heated"])))
-            self._check_points(points)
+                garments = tuple(_garment(data, k, entry) for k, entry in enumerate(record["garments"]))
+            self._check_points(garments)
         except _DAMAGED as error:
             raise LayerError(f"{file} is damaged ({error}); remove it and --resume") from error
-        return Outcome(time, points, reused, record, heat)
+        return Result(time, garments, record["telemetry"])
 
-    def _check_points(self, points: Sequence[np.ndarray | None]) -> None:
+    def _check_points(self, garments: Sequence[GarmentResult]) -> None:
         """Refuse (ValueError) points of the wrong shape: kernels index points by face corners, without checks."""
-        if points and self.counts and len(points) != len(self.counts):
-            raise ValueError(f"points of {len(points)} garments, not of {len(self.counts)}")
-        for positions, count in zip(points, self.counts, strict=False):
-            if positions is not None and (
-                positions.shape != (count, 3) or positions.dtype.kind != "f" or not np.isfinite(positions).all()
+        if garments and self.counts and len(garments) != len(self.counts):
+            raise ValueError(f"points of {len(garments)} garments, not of {len(self.counts)}")
+        for index, count in enumerate(self.counts if garments else ()):
+            points = garments[index].points
+            if points is not None and (
+                points.shape != (count, 3) or points.dtype.kind != "f" or not np.isfinite(points).all()
             ):
-                raise ValueError(f"points of shape {positions.shape}, not {count} finite positions")
+                raise ValueError(f"points of shape {points.shape}, not {count} finite positions")
 
 
 class FrameFolder(Finished):
@@ -297,7 +277,7 @@ class FrameFolder(Finished):
         """Store the absolute path, for processes with a different working directory."""
         return self.__dict__ | {"folder": self.folder.absolute(), "_lock": None}
 
-    def write(self, index: int, outcome: Outcome, *, seam: int | None = None) -> None:
+    def write(self, index: int, result: Result, *, seam: int | None = None) -> None:
         """Write a frame's result.
 
         Args:
@@ -308,17 +288,19 @@ class FrameFolder(Finished):
             LayerError: The disk is full, or the folder is gone or taken by a new run: a task on a remote machine may
                 outlast its run.
         """
-        arrays: dict[str, Any] = {f"points{k}": p for k, p in enumerate(outcome.points) if p is not None}
-        maps = [(k, name, values) for k, heat in enumerate(outcome.heat) for name, values in (heat or {}).items()]
-        arrays |= {f"heat{k}.{name}": values for k, name, values in maps} | {"heated": np.array(len(outcome.heat))}
-        arrays |= {"record": json.dumps(outcome.record), "reused": np.array(outcome.reused, dtype=bool)}
-        file = self._file(index, seam, _DONE if outcome.points else _FAILED)
+        arrays = dict[str, Any]()
+        for k, garment in enumerate(result.garments):
+            arrays |= {} if garment.points is None else {f"points{k}": garment.points}
+            arrays |= {f"heat{k}.{name}": values for name, values in garment.heat.items()}
+        entries = [{"telemetry": garment.telemetry, "reused": garment.reused} for garment in result.garments]
+        record = json.dumps({"telemetry": result.telemetry, "garments": entries})
+        file = self._file(index, seam, _DONE if result.garments else _FAILED)
         temporary = temporary_path(file, suffix="")
         try:
             if (self.folder / RUN).read_text(encoding="utf-8") != self._run:
                 raise LayerError(f"{self.folder} is another run's by now")
             with make_file(temporary) as stream:
-                np.savez(stream, **arrays)
+                np.savez(stream, record=record, **arrays)
             temporary.replace(file)
         except OSError as error:
             raise LayerError(f"cannot write {file}: {error.strerror}") from error
@@ -347,10 +329,11 @@ class FrameFolder(Finished):
             self._release()
 
 
-def _heat_of(data: Mapping[str, np.ndarray], index: int) -> dict[str, np.ndarray]:
-    """The heat maps of one garment in a frame's file."""
+def _garment(data: Mapping[str, np.ndarray], index: int, entry: Mapping[str, Any]) -> GarmentResult:
+    """The result of one garment in a frame's file."""
     prefix = f"heat{index}."
-    return {name.removeprefix(prefix): data[name] for name in data if name.startswith(prefix)}
+    heat = {name.removeprefix(prefix): data[name] for name in data if name.startswith(prefix)}
+    return GarmentResult(data.get(f"points{index}"), entry["telemetry"], entry["reused"], heat)
 
 
 def differences(stored: Any, wanted: Any, name: str = "") -> list[str]:

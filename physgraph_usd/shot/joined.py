@@ -22,9 +22,9 @@ import numpy as np
 
 from ..errors import named_time
 from ..interrupts import leave_if_asked
-from .frames import Outcome
+from ..solver.scene import Result
 
-Both = Sequence[tuple[Outcome, Outcome]]
+Both = Sequence[tuple[Result, Result]]
 """The frames before a seam, each with the solution of the process behind the seam."""
 Positions = Sequence[np.ndarray | None]
 """Points of each garment, shape (V, 3), None for a garment without a sample."""
@@ -45,7 +45,7 @@ class Joint:
         why: Reason for a jump, or "".
     """
 
-    frames: Sequence[Outcome]
+    frames: Sequence[Result]
     why: str
 
     @property
@@ -63,9 +63,10 @@ def join(solutions: Both, movers: Movers) -> Joint:
         solutions: The frames before the seam, each with the solution of the process behind the seam.
         movers: Asked for a mover if any frame differs.
     """
-    frames, mover = list[Outcome](), cache(movers)
+    frames, mover = list[Result](), cache(movers)
     for k, (earlier, after) in enumerate(solutions, start=1):
-        pairs, weight = list(zip(earlier.points, after.points, strict=False)), k / (len(solutions) + 1)
+        garments, weight = zip(earlier.garments, after.garments, strict=False), k / (len(solutions) + 1)
+        pairs = [(a.points, b.points) for a, b in garments]
         if all(a is None or b is None or np.array_equal(a, b) for a, b in pairs):
             frames.append(earlier)
             continue
@@ -75,7 +76,8 @@ def join(solutions: Both, movers: Movers) -> Joint:
         leave_if_asked()  # A signal may have cut the move short.
         if reason:
             return Joint([earlier for earlier, _ in solutions], reason)
-        frames.append(replace(earlier, points=tuple(points), reused=(False,) * len(points)))
+        moved = zip(earlier.garments, points, strict=True)
+        frames.append(replace(earlier, garments=tuple(replace(g, points=x, reused=False) for g, x in moved)))
     return Joint(frames, "")
 
 

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from shlex import join
 from typing import Any
 
-from ..errors import counted
+from ..errors import counted, named_time
 from ..solver.fabric import NAMED, PRESETS, WORN, Fabric
 from ..solver.resolution import SHARP_FRACTION, LevelChoice
 from ..solver.scene import GIVEN_UP
@@ -14,7 +14,7 @@ from ..usd.lookup import PRESET
 from ..usd.schema import GARMENT
 from ..usd.stage import GarmentSource, at_time
 from .options import options_of
-from .report import is_first
+from .report import RefineReport, is_first
 from .settled import COLLAPSED, LIMITED, UNSOLVED, in_words
 
 EASE = 4
@@ -109,23 +109,18 @@ def of_rest(unsettled: Sequence[Mapping[str, Any]], frames: int) -> list[str]:
     return [f"{count} of {counted(frames, 'frame')} did not settle, {location} the least: {in_words(worst)}"]
 
 
-def of_energy(garments: Sequence[Mapping[str, Any]], frames: Sequence[Mapping[str, Any]]) -> list[str]:
+def of_energy(report: RefineReport) -> list[str]:
     """A note of the frames whose energy exceeds the upsampled cage's, with the frame of the largest excess.
 
     A descent never raises the energy, but a frame starts from the previous frame's detail, and push-out and untangling
     cost energy.
-
-    Args:
-        garments: A report's garments.
-        frames: A report's frames.
     """
     above = []
-    for frame in frames:
-        for garment, entry in zip(garments, frame.get("garments", ()), strict=False):
-            sides = (entry.get("energy_joules") or {}) if is_first(garment["path"], entry) else {}
-            before, after = (sum(sides.get(side, {}).values()) for side in ("input", "output"))
-            if after > (1.0 + ENERGY_ROUNDING) * before:
-                above.append((after - before, garment["path"], frame["time"], before, after))
+    for frame, garment, entry in report.entries():
+        sides = (entry.get("energy_joules") or {}) if is_first(garment["path"], entry) else {}
+        before, after = (sum(sides.get(side, {}).values()) for side in ("input", "output"))
+        if after > (1.0 + ENERGY_ROUNDING) * before:
+            above.append((after - before, garment["path"], frame["time"], before, after))
     if not above:
         return []
     _, path, time, before, after = max(above, key=lambda entry: entry[0])
@@ -134,18 +129,9 @@ def of_energy(garments: Sequence[Mapping[str, Any]], frames: Sequence[Mapping[st
     return [f"{text}, <{path}>{at_time(time)}: {energies}"]
 
 
-def of_folds(garments: Sequence[Mapping[str, Any]], frames: Sequence[Mapping[str, Any]]) -> list[str]:
-    """A note of the garment with most sharp folds, if cloth folds so sharply as to show the mesh: too coarse a level.
-
-    Args:
-        garments: A report's garments.
-        frames: A report's frames.
-    """
-    folded = [
-        (entry.get("sharp_folds", 0.0), frame["time"], garment)
-        for frame in frames
-        for garment, entry in zip(garments, frame.get("garments", ()), strict=False)
-    ]
+def of_folds(report: RefineReport) -> list[str]:
+    """A note of the garment with most sharp folds, if folds are so sharp that they show the mesh."""
+    folded = [(entry.get("sharp_folds", 0.0), frame["time"], garment) for frame, garment, entry in report.entries()]
     share, time, worst = max(folded, key=lambda entry: entry[0], default=(0.0, None, {}))
     if share <= SHARP_FRACTION:
         return []
@@ -157,17 +143,11 @@ def of_folds(garments: Sequence[Mapping[str, Any]], frames: Sequence[Mapping[str
     return [text + (f"; {finer}" if level < (GARMENT["refine:level"].maximum or 0) else "")]
 
 
-def of_following(garments: Sequence[Mapping[str, Any]], frames: Sequence[Mapping[str, Any]]) -> list[str]:
-    """A note of the frames in which part of the cloth follows its subdivided cage, with the frame of the largest part.
-
-    Args:
-        garments: A report's garments.
-        frames: A report's frames.
-    """
+def of_following(report: RefineReport) -> list[str]:
+    """A note of the frames in which cloth follows its subdivided cage, with the frame of the largest part."""
     pushed = [
         (entry["follows_cage"], garment["path"], frame["time"])
-        for frame in frames
-        for garment, entry in zip(garments, frame.get("garments", ()), strict=False)
+        for frame, garment, entry in report.entries()
         if entry.get("follows_cage") and is_first(garment["path"], entry)
     ]
     if not pushed:
@@ -182,18 +162,10 @@ def of_following(garments: Sequence[Mapping[str, Any]], frames: Sequence[Mapping
     return [f"{text} for {part['solved']:,} as solved"]
 
 
-def of_given_up(garments: Sequence[Mapping[str, Any]], frames: Sequence[Mapping[str, Any]]) -> list[str]:
-    """A note of the frames in which no cloth is solved, since it is given up.
-
-    Args:
-        garments: A report's garments.
-        frames: A report's frames.
-    """
+def of_given_up(report: RefineReport) -> list[str]:
+    """A note of the frames in which no cloth is solved, since it is given up."""
     times = [
-        (garment["path"], frame["time"])
-        for frame in frames
-        for garment, entry in zip(garments, frame.get("garments", ()), strict=False)
-        if entry.get("start") == GIVEN_UP
+        (garment["path"], frame["time"]) for frame, garment, entry in report.entries() if entry.get("start") == GIVEN_UP
     ]
     if not times:
         return []
@@ -202,34 +174,20 @@ def of_given_up(garments: Sequence[Mapping[str, Any]], frames: Sequence[Mapping[
     return [f"{text} cage crosses itself too often to be solved (<{path}>, first{at_time(time)})"]
 
 
-def of_first_pose(garments: Sequence[Mapping[str, Any]], frames: Sequence[Mapping[str, Any]]) -> list[str]:
-    """A note of skinned cloth that crosses itself in the first frame, with the option that may mend it.
-
-    Args:
-        garments: A report's garments, skinned.
-        frames: A report's frames, solved without poses before the first.
-    """
-    first: Mapping[str, Any] = next(iter(frames), {})
-    for garment, entry in zip(garments, first.get("garments", ()), strict=False):
-        left = entry.get("contact", {}).get("cloth", {}).get("after", {}).get("crossings", 0)
-        if left:
-            place = f"<{garment['path']}>{at_time(first['time'])}"
-            start = "starts it from the bind pose, where it may come out clean"
-            return [f"{place}: skinned cloth crosses itself in the first frame; --pose-in 12 {start}"]
-    return []
+def of_poses(report: RefineReport) -> list[str]:
+    """A note of a first frame that continues from poses between the bind pose and it, without being requested."""
+    first = report.frames[0] if report.frames else {}
+    if not first.get("poses"):
+        return []
+    poses = f"{counted(first['poses'], 'pose')} between the bind pose and it"
+    return [f"time code {named_time(first['time'])} continues from {poses}, since it crossed itself without them"]
 
 
-def of_inertia(garments: Sequence[Mapping[str, Any]], frames: Sequence[Mapping[str, Any]]) -> list[str]:
-    """A note of the frames in which cloth feels the acceleration of its cage, with the largest.
-
-    Args:
-        garments: A report's garments.
-        frames: A report's frames.
-    """
+def of_inertia(report: RefineReport) -> list[str]:
+    """A note of the frames in which cloth feels the acceleration of its cage, with the largest."""
     entries = [
         (entry["inertia"], garment["path"], frame["time"])
-        for frame in frames
-        for garment, entry in zip(garments, frame.get("garments", ()), strict=False)
+        for frame, garment, entry in report.entries()
         if entry.get("inertia")
     ]
     if not entries:

@@ -122,10 +122,10 @@ class RefineOptions:
     temporal: str = _solver("tether", "How a frame uses the last one.", choices=("tether", "warm", "off"))
     pose_in: int | None = _solver(
         None,
-        "Solve N poses between the bind pose and the first frame before that frame: skinned cloth that starts in a "
-        "bent pose then starts where it was modelled.",
+        "Solve N poses of skinned cloth between the bind pose and the first frame before that frame; 0: none.  "
+        "[default: 12 if cloth would cross itself in the first frame]",
         metavar="N",
-        least=1,
+        least=0,
     )
     contact: str = _solver("quadratic", "How bodies push the cloth.", choices=("quadratic", "off"))
     self_contact: str = _solver("auto", "How cloth pushes cloth.", choices=("auto", "off"))

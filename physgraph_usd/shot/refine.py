@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..errors import NOTICE, LayerError, PhysGraphError, StageError, UsageError
 from ..interrupts import SIGNALLED, exit_code_of, importing, signals_noted
+from ..solver.scene import Result
 from ..usd.files import check_targets, files_of
 from ..usd.provenance import write_root
 from ..usd.read.reader import Shot
@@ -25,7 +26,7 @@ from ..usd.write.atomic import check_folder_of, check_place
 from .describe import begin_report, describe, describe_meshes, too_large
 from .farm import shots_at_once
 from .finished import Job, check_jobs, finished, results
-from .frames import Outcome, kept_for
+from .frames import kept_for
 from .opened import open_for
 from .options import RefineOptions, json_of, picture_of
 from .processes import call_each, memory_is_named
@@ -296,13 +297,13 @@ def _write_report(report: RefineReport, path: Path, opened: Shot) -> None:
         write_folder(report, path, opened)
 
 
-def _draw_first(report: RefineReport, opened: Shot, options: RefineOptions, picture: Path, outcome: Outcome) -> None:
+def _draw_first(report: RefineReport, opened: Shot, options: RefineOptions, picture: Path, result: Result) -> None:
     """Draw the first refined frame; a picture that cannot be drawn is a warning, because the frames are worth more."""
     from .page.frames import draw_frames
 
     levels = [garment["level"] for garment in report.garments]
     try:
-        draw_frames(opened, levels, [outcome], picture, options=options, overwrite=options.overwrite)
+        draw_frames(opened, levels, [result], picture, options=options, overwrite=options.overwrite)
         LOG.log(NOTICE, "%s shows the first frame", picture, extra={"shot": report.shot})
     except (LayerError, StageError, UsageError) as error:
         report.warn(WARNINGS["undrawn"](picture=picture, error=error))

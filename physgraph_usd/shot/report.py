@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -13,6 +13,7 @@ from typing import Any
 
 from ..errors import named, place_of
 from ..interrupts import SIGNALLED
+from ..solver.scene import Result
 from ..usd.write.atomic import write_text
 from ..version import __version__
 from .plain_json import to_json
@@ -29,7 +30,7 @@ MOST_NAMED = 3
 """Most prims, parts or time codes named in one warning."""
 _OF_PRIM = re.compile(r"<([^>]+)>(?=[: ])")
 _ALSO, _DIFFERS = re.compile(r"; also (?:at|in) .*$"), re.compile(r"<[^>]*>|[-+]?\d[\d,]*(?:\.\d+)?(?:e[-+]?\d+)?")
-_FRAME: dict[str, Any] = {"time": None, "read_ms": None, "run_in_ms": None, "garments": [], "error": ""}
+_FRAME: dict[str, Any] = {"time": None, "read_ms": None, "run_in_ms": None, "poses": None, "garments": [], "error": ""}
 
 
 def is_first(path: str, entry: Mapping[str, Any]) -> bool:
@@ -137,12 +138,23 @@ class RefineReport:
         ]
         return [contact_part[side]["crossings"] for contact_part in measured if contact_part]
 
+    def add(self, result: Result) -> None:
+        """Add a frame: its telemetry, and that of each garment if the frame could be solved."""
+        garments = {"garments": [garment.telemetry for garment in result.garments]} if result.garments else {}
+        self.frames.append({"time": result.time, **result.telemetry, **garments})
+
     def measured(self, frame: Mapping[str, Any]) -> list[dict[str, Any]]:
         """Measurements of contact in a frame: one per garment or group of garments solved together."""
-        paths = [garment["path"] for garment in self.garments]
-        entries = list(zip(paths, frame.get("garments", ()), strict=False))
-        first_entries = [entry for path, entry in entries if is_first(path, entry)]
-        return [entry["contact"] for entry in first_entries if entry.get("contact")]
+        entries = [entry for garment, entry in self.garments_in(frame) if is_first(garment["path"], entry)]
+        return [entry["contact"] for entry in entries if entry.get("contact")]
+
+    def garments_in(self, frame: Mapping[str, Any]) -> list[tuple[dict[str, Any], dict[str, Any]]]:
+        """Each garment with its telemetry in a frame; [] for a frame that could not be solved."""
+        return list(zip(self.garments, frame.get("garments", ()), strict=False))
+
+    def entries(self) -> Iterator[tuple[dict[str, Any], dict[str, Any], dict[str, Any]]]:
+        """Each frame with each garment and the garment's telemetry there, frame by frame."""
+        return ((frame, garment, entry) for frame in self.frames for garment, entry in self.garments_in(frame))
 
     def fail(self, error: Exception) -> None:
         """Record the error that ends the run."""

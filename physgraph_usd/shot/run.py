@@ -13,11 +13,10 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import NOTICE, SolveError, counted, named_time
-from ..solver.level import refine_garments
+from ..solver.level import fine_meshes, refine_garments
 from ..solver.mesh.kernels import cards_for, kernels_are_compiled
 from ..solver.mesh.subdivide import Refinement
-from ..solver.mesh.topology import PolygonMesh
-from ..solver.scene import Garment
+from ..solver.scene import Result
 from ..usd.provenance import CROSSED, FAILED, UNSETTLED, UNSOLVED
 from ..usd.read.reader import Shot
 from ..usd.times import none_within, within
@@ -29,14 +28,14 @@ from .describe import say_what_was
 from .farm import connected
 from .finished import made_from
 from .forecast import Forecast
-from .frames import CHUNK, FrameFolder, Outcome, frames_folder
-from .notes import of_energy, of_first_pose, of_folds, of_following, of_given_up, of_inertia, of_rest
+from .frames import CHUNK, FrameFolder, frames_folder
+from .notes import of_energy, of_folds, of_following, of_given_up, of_inertia, of_poses, of_rest
 from .options import RefineOptions
 from .processes import Start, separate_processes
 from .report import LOG, RefineReport, of_a_kind
 from .settled import unsettled_frames
 from .skin import DrawnCloth, Shown, frames_compared, of_polygons, shown_through
-from .solve import Outcomes, ShotSolver
+from .solve import Results, ShotSolver
 from .untagged import AUTO
 from .warnings import WARNINGS, of_drawn, of_frames, of_loops, of_more
 
@@ -53,12 +52,12 @@ class Stored:
     Attributes:
         numbers: Numbers of the frames, in order.
         record: Entries of the layer's record.
-        outcomes: The frames.
+        results: The frames.
     """
 
     numbers: Sequence[int]
     record: Mapping[str, Any]
-    outcomes: Outcomes
+    results: Results
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +77,7 @@ class Run:
     options: RefineOptions
     report: RefineReport
     stored: Stored | None = None
-    show_first: Callable[[Outcome], None] | None = None
+    show_first: Callable[[Result], None] | None = None
 
     def refine(self) -> Layer | None:
         """Solve and write all frames; returns the layer if in memory.
@@ -178,10 +177,10 @@ class Run:
         preroll = PREROLL if self.options.preroll is None else self.options.preroll
         return 0 if self.options.temporal == "off" else preroll
 
-    def _solved(self, frames: FrameFolder | None) -> Outcomes:
+    def _solved(self, frames: FrameFolder | None) -> Results:
         """Frames in order, including reused frames of an interrupted run, joined if solved by several processes."""
         if self.stored is not None:
-            yield from self.stored.outcomes
+            yield from self.stored.results
             return
         if frames is None:
             yield from self.solver(self._times)
@@ -203,7 +202,7 @@ class Run:
             with closing(chunks) as solved:
                 yield from solved
 
-    def _write_frames(self, writer: LayerWriter | None, solved: Outcomes, count: int) -> None:
+    def _write_frames(self, writer: LayerWriter | None, solved: Results, count: int) -> None:
         """Write each frame as soon as solved, then close the layer; a chunk's frames are already in its folder."""
         report, options = self.report, self.options
         written, shot, began = 0.0, {"shot": report.shot}, clock.perf_counter()
@@ -211,14 +210,14 @@ class Run:
         compared = frames_compared(count if options.contact != "off" else 0)
         drawn_through, entered = list[Shown](), dict[float | None, dict[str, float]]()
         drawn = DrawnCloth(self.shot, self.solver.levels if options.report and options.scheme == "keep" else ())
-        for done, outcome in enumerate(solved, start=1):
-            written += self._write_frame(writer, outcome)
-            drawn_through += shown_through(self.shot, outcome) if done - 1 in compared else []
-            entered[outcome.time] = drawn.depths(outcome) if done - 1 in compared else {}
-            LOG.info("frame %d of %d: time code %s", done, count, named_time(outcome.time), extra=shot)
+        for done, result in enumerate(solved, start=1):
+            written += self._write_frame(writer, result)
+            drawn_through += shown_through(self.shot, result) if done - 1 in compared else []
+            entered[result.time] = drawn.depths(result) if done - 1 in compared else {}
+            LOG.info("frame %d of %d: time code %s", done, count, named_time(result.time), extra=shot)
             if message := forecast.after(clock.perf_counter() - began):
                 LOG.log(NOTICE, "%s", message, extra=shot)
-            LOG.debug("%s", outcome.record, extra=shot)
+            LOG.debug("%s", report.frames[-1], extra=shot)
             if options.progress:
                 options.progress(done, count)
         if len(report.failed) == count:
@@ -237,30 +236,28 @@ class Run:
             report.note(*of_a_kind(map(str, writer.notes)))
         report.seconds |= {"close": clock.perf_counter() - start, "write": written}
         report.warn(*of_frames(report), *of_drawn(entered), *of_loops(self._loop.gaps()))
-        telemetry = report.garments, report.frames
-        report.note(*of_following(*telemetry), *of_given_up(*telemetry), *of_inertia(*telemetry))
-        first_pose = of_first_pose(*telemetry) if self.shot.is_skinned and not options.pose_in else ()
-        report.note(*first_pose, *of_folds(*telemetry), *of_energy(*telemetry), *of_polygons(drawn_through))
+        report.note(*of_following(report), *of_given_up(report), *of_inertia(report))
+        report.note(*(of_poses(report) if options.pose_in is None else ()))
+        report.note(*of_folds(report), *of_energy(report), *of_polygons(drawn_through))
         (report.warn if options.strict else report.note)(*of_rest(report.unsettled, len(report.frames)))
         say_what_was(report)
         report.warn(*of_more(report))  # The last line of a run.
 
-    def _write_frame(self, writer: LayerWriter | None, outcome: Outcome) -> float:
+    def _write_frame(self, writer: LayerWriter | None, result: Result) -> float:
         """Write the result of one time code and record the result; returns the seconds spent writing."""
-        self.report.frames.append(outcome.record)
-        self._loop.add(outcome)
-        if not outcome.points:
-            name, error = named_time(outcome.time), str(outcome.record["error"])
+        self.report.add(result)
+        self._loop.add(result)
+        if not result.garments:
+            name, error = named_time(result.time), str(result.telemetry["error"])
             self.report.failed[name] = error
             self.report.warn(WARNINGS["failed"](name=name, error=error))
             return 0.0
         if self.show_first is not None and len(self.report.frames) == len(self.report.failed) + 1:
-            self.show_first(outcome)
+            self.show_first(result)
         if writer is None:
             return 0.0
-        start, records = clock.perf_counter(), self.report.frames
-        changed = [not reused for reused in outcome.reused]
-        writer.write(outcome.time, outcome.points, heat=outcome.heat, changed=changed, cuts=self._cuts(records[-2:]))
+        start = clock.perf_counter()
+        writer.write(result, cuts=self._cuts(self.report.frames[-2:]))
         return clock.perf_counter() - start
 
 
@@ -326,11 +323,6 @@ def numbers_in(every: Sequence[float], frames: tuple[float, float] | None) -> ra
     if not times:
         raise none_within(every, frames)
     return range(every.index(times[0]), every.index(times[-1]) + 1)
-
-
-def fine_meshes(garments: Sequence[Garment], refinements: Sequence[Sequence[Refinement]]) -> list[PolygonMesh]:
-    """The finest mesh of each garment."""
-    return [[cage, *steps][-1].mesh for cage, steps in zip(garments, refinements, strict=True)]
 
 
 def peak_memory_mb() -> float | None:

@@ -13,10 +13,15 @@ import numpy as np
 from ..errors import NOTICE, SolveError, StageError, counted, named_time
 from ..interrupts import leave_if_asked
 from ..solver.frame.refiner import Refiner
-from ..solver.scene import Frame
+from ..solver.scene import Frame, Result
 from ..usd.read.reader import Shot
 from .report import LOG
+from .warnings import faults_of
 
+RUN_IN, POSES = "run_in_ms", "poses"
+"""Entries of a frame's telemetry: wall time before it [ms], and number of poses from the bind pose on before it."""
+MOST_POSES = 12
+"""Poses from the bind pose to a first frame that crosses itself."""
 EVERY_SECONDS = 10.0
 """Time between two messages of a run-in [s]."""
 OF_COLD = 0.4
@@ -97,7 +102,9 @@ class RunIn:
         LOG.log(NOTICE, "%s", text, extra={"shot": self._shot})
 
 
-def pose_in(shot: Shot, refiner: Refiner, time: float | None, count: int) -> float:
+def pose_in(
+    shot: Shot, refiner: Refiner, time: float | None, count: int, *, while_clean: bool = False
+) -> tuple[float, bool]:
     """Solve poses between the bind pose and a frame of skinned cloth, so that the frame continues from the last pose.
 
     Poses that fail are left out.
@@ -107,19 +114,33 @@ def pose_in(shot: Shot, refiner: Refiner, time: float | None, count: int) -> flo
         refiner: The refiner that solves the frame next.
         time: Time code of the frame.
         count: Number of poses; the first is the bind pose.
+        while_clean: Whether to end at a pose in which cloth crosses anything.
 
     Returns:
-        Wall time [s].
+        Wall time [s], and whether all poses were solved.
     """
     began = clock.perf_counter()
     text = f"before time code {named_time(time)}, {counted(count, 'pose')} from the bind pose on are solved"
+    text += ", since its cloth crosses itself" if while_clean else ""
     LOG.log(NOTICE, "%s", text, extra={"shot": shot.path})
-    every = shot.every_time
-    spacing = min(np.diff(every), default=1.0)
+    spacing = min(np.diff(shot.every_time), default=1.0)
     for number in range(count):
         leave_if_asked()
         with suppress(SolveError, StageError):
             frame = shot.posed_frame(time, number / count)
             moment = None if time is None else time - (count - number) * spacing
-            refiner.solve(replace(frame, time=moment))
-    return clock.perf_counter() - began
+            result = refiner.solve(replace(frame, time=moment))
+            if while_clean and faults(result):
+                return clock.perf_counter() - began, False
+    return clock.perf_counter() - began, True
+
+
+def crossings_of_cloth(result: Result) -> int:
+    """Edges through faces of cloth in a frame; garments that are solved together each count those of all."""
+    contacts = [garment.telemetry.get("contact", {}) for garment in result.garments]
+    return sum(contact["cloth"]["after"]["crossings"] for contact in contacts if "cloth" in contact)
+
+
+def faults(result: Result) -> int:
+    """Crossings with cloth and bodies, and vertices inside bodies, in a frame; counted as in `crossings_of_cloth`."""
+    return sum(faults_of(garment.telemetry.get("contact", {}), "after") for garment in result.garments)

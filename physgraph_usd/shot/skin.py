@@ -22,13 +22,13 @@ from ..solver.colliders.pose import bounds_of
 from ..solver.contact.broad_phase import Bodies
 from ..solver.contact.measure import DEEP
 from ..solver.contact.report import penetration_map
+from ..solver.scene import Result
 from ..usd.mesh.bind import closest
 from ..usd.read.bodies import DRAWN_WITHIN, Polygons
 from ..usd.read.meshes import limit_of
 from ..usd.read.reader import Shot
 from ..usd.schema import GARMENT
 from ..usd.stage import at_time
-from .frames import Outcome
 from .options import options_of
 
 MOST_FRAMES, EVERY = 8, 8
@@ -65,16 +65,17 @@ class DrawnCloth:
         self._limits = [limit_of(shot, index, level) for index, level in enumerate(levels)]
         self._bodies = Bodies(shot.scene.colliders, device="cpu", threads=1)
 
-    def depths(self, outcome: Outcome) -> dict[str, float]:
+    def depths(self, result: Result) -> dict[str, float]:
         """Depth inside bodies of the surface drawn from each garment that contact has kept outside [m], by path.
 
         The surface is measured at the vertices of the refined cloth. Depths up to `DEEP` are left out.
         """
         deepest = dict[str, float]()
-        if not self._limits or not outcome.points:
+        if not self._limits or not result.garments:
             return deepest
-        self._bodies.pose(self._shot.frame(outcome.time).colliders)
-        for garment, cloth, limit in zip(self._shot.scene.garments, outcome.points, self._limits, strict=False):
+        self._bodies.pose(self._shot.frame(result.time).colliders)
+        for index, garment in enumerate(self._shot.scene.garments):
+            cloth, limit = result.garments[index].points, self._limits[index]
             if cloth is None or limit is None:
                 continue
             near = self._bodies.near(garment, bounds_of(cloth), 0.0)
@@ -86,18 +87,19 @@ class DrawnCloth:
         return deepest
 
 
-def shown_through(shot: Shot, outcome: Outcome) -> list[Shown]:
+def shown_through(shot: Shot, result: Result) -> list[Shown]:
     """Bodies whose polygons stand above refined cloth by more than a body's surface may be off."""
-    surfaces, bodies = [], shot.polygons(outcome.time) if outcome.points else []
-    for index, (garment, cloth) in enumerate(zip(shot.scene.garments, outcome.points, strict=False)):
+    surfaces, bodies = [], shot.polygons(result.time) if result.garments else []
+    for index, solved in enumerate(result.garments):
+        garment = shot.scene.garments[index]
         for number in garment.colliders:
             body, collider = bodies[number], shot.scene.colliders[number]
-            if cloth is None or body is None:
+            if solved.points is None or body is None:
                 continue
-            height, lift = _height(body, cloth, kept=shot.offset(index, outcome.time) + collider.offset)
+            height, lift = _height(body, solved.points, kept=shot.offset(index, result.time) + collider.offset)
             if height > DRAWN_WITHIN:
                 offset = STEP * math.ceil((lift - collider.offset) / STEP)
-                surfaces.append(Shown(garment.path, collider.path, outcome.time, height, offset))
+                surfaces.append(Shown(garment.path, collider.path, result.time, height, offset))
     return surfaces
 
 

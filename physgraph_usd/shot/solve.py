@@ -17,16 +17,16 @@ from ..interrupts import leave_if_asked
 from ..solver.frame.lead_in import prerolled_cages
 from ..solver.frame.refiner import Refiner
 from ..solver.mesh.kernels import device_of, start_warp
+from ..solver.scene import Frame, Result
 from ..usd.read.reader import Shot
-from .frames import Outcome
 from .from_rest import FromRest
 from .joined import Mover, Positions, counts, worse
 from .opened import open_for, why_not_posed
 from .options import RefineOptions
 from .processes import cores
-from .run_in import RunIn, pose_in
+from .run_in import MOST_POSES, POSES, RUN_IN, RunIn, crossings_of_cloth, faults, pose_in
 
-Outcomes = Generator[Outcome, None, None]
+Results = Generator[Result, None, None]
 
 
 def prepare_device(device: str) -> str:
@@ -61,25 +61,26 @@ class ShotSolver:
         opened = {"_opened": None, "_refiner": None}
         return self.__dict__ | opened | {"_shot": os.path.abspath(self._shot), "_options": options}
 
-    def __call__(self, times: Sequence[float | None]) -> Outcomes:
+    def __call__(self, times: Sequence[float | None]) -> Results:
         """Solve time codes in order; a failed one yields its error, the next starts from the last solved frame."""
         shot, refiner = self._built()
-        seconds = self._begin(shot, refiner, times)
-        before: dict[str, object] = {"run_in_ms": round(1e3 * seconds, 3)} if seconds else {}
+        before, first = self._begin(shot, refiner, times), True
         for time in times:
             began = clock.perf_counter()
             try:
                 with At(time=time):
                     frame = shot.frame(time)
                     read_ms = round(1e3 * (clock.perf_counter() - began), 3)
-                    state = refiner.solve(frame, sampled_at(shot, time))
-                record = {"time": time, "read_ms": read_ms, "garments": list(state.telemetry)} | before
-                outcome = Outcome(time, state.points, state.reused, record, state.heat)
+                    result = refiner.solve(frame, sampled_at(shot, time))
+                    if first:
+                        refiner, result, run_in = self._from_bind_pose(shot, refiner, frame, result)
+                        before |= run_in
+                result = dataclasses.replace(result, telemetry={"read_ms": read_ms, **before})
             except (SolveError, StageError) as error:
-                outcome = Outcome(time, (), (), {"time": time, "error": str(error)})
+                result = Result(time, telemetry={"error": str(error)})
             leave_if_asked()  # A signal may have cut the frame short.
-            before = {}
-            yield outcome
+            before, first = {}, False
+            yield result
         self._refiner = refiner
 
     def mover(self) -> Mover:
@@ -122,15 +123,16 @@ class ShotSolver:
         )
         return self._opened, refiner
 
-    def _begin(self, shot: Shot, refiner: Refiner, times: Sequence[float | None]) -> float:
-        """Solve what comes before the first frame: poses from the bind pose, if they are requested and all is solved
-        from frame to frame; else, if the cage crosses itself, cages alone from an earlier frame.
+    def _begin(self, shot: Shot, refiner: Refiner, times: Sequence[float | None]) -> dict[str, object]:
+        """Solve what comes before the first frame: poses from the bind pose, if they are requested; else, in the middle
+        of a shot whose cage crosses itself there, cages alone from an earlier frame.
 
         Returns:
-            Wall time of the run-in [s]; 0 without one.
+            Telemetry of the first frame: `RUN_IN`, and `POSES` if poses were solved.
         """
         if self._options.pose_in and times and not why_not_posed(shot, self._options):
-            return pose_in(shot, refiner, times[0], self._options.pose_in)
+            seconds, _ = pose_in(shot, refiner, times[0], self._options.pose_in)
+            return {RUN_IN: round(1e3 * seconds, 3), POSES: self._options.pose_in}
         earlier = [] if not times or times[0] is None else shot.times_until(times[0])
         run_in = RunIn(shot.frame, earlier, self._shot)
         advanced = prerolled_cages(
@@ -143,7 +145,34 @@ class ShotSolver:
         )
         if advanced is not None:
             refiner.start_from_cages(advanced[0], time_code=advanced[1])
-        return run_in.seconds
+        return {RUN_IN: round(1e3 * run_in.seconds, 3)} if run_in.seconds else {}
+
+    def _from_bind_pose(
+        self, shot: Shot, refiner: Refiner, frame: Frame, result: Result
+    ) -> tuple[Refiner, Result, dict[str, object]]:
+        """A first frame of skinned cloth that crosses itself, solved once more after poses from the bind pose.
+
+        The second result is used if it has fewer faults. There is none if a pose has faults: limbs that go through a
+        body do so on the way too.
+
+        Args:
+            refiner: The refiner after the frame.
+            result: The frame, solved from its cage.
+
+        Returns:
+            The refiner and the result to continue with, and telemetry as from `_begin`.
+        """
+        options = self._options
+        automatic = options.pose_in is None and options.self_contact != "off" and not why_not_posed(shot, options)
+        if not automatic or not crossings_of_cloth(result):
+            return refiner, result, {}
+        posed = refiner.fork(self._options.solve_settings())
+        posed.forget()
+        seconds, all_clean = pose_in(shot, posed, frame.time, MOST_POSES, while_clean=True)
+        told: dict[str, object] = {RUN_IN: round(1e3 * seconds, 3)}
+        again = posed.solve(frame, sampled_at(shot, frame.time)) if all_clean else result
+        is_better = faults(again) < faults(result)
+        return (posed, again, told | {POSES: MOST_POSES}) if is_better else (refiner, result, told)
 
 
 def sampled_at(shot: Shot, time: float | None) -> list[bool]:

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import pairwise
 from math import ceil
 from pathlib import Path
@@ -20,17 +20,18 @@ from typing import Any
 import numpy as np
 
 from ..errors import LayerError, UsageError, counted, named_time
-from ..solver.level import refine_garments
+from ..solver.level import fine_meshes, refine_garments
+from ..solver.scene import Result
 from ..usd.read.reader import Shot
 from .chunks import frames_in_order
 from .finished import check_jobs, made_from
-from .frames import CHUNK, Finished, Outcome, frames_folder, record_in
+from .frames import CHUNK, Finished, frames_folder, record_in
 from .joined import Both, Joint, between, join
 from .opened import open_for
 from .options import RefineOptions
 from .refine import check_places, running, write_all
 from .report import RefineReport
-from .run import Run, Stored, fine_meshes, numbers_in
+from .run import Run, Stored, numbers_in
 from .solve import ShotSolver
 from .warnings import WARNINGS
 
@@ -135,11 +136,11 @@ class _Joins:
         self.starts = {start: first for start, first in starts.items() if {start - 1, start} <= wanted}
         self._anew = {number for number in wanted if number in starts or number - 1 not in wanted}
 
-    def outcomes(self, numbers: Iterable[int]) -> Generator[Outcome, None, None]:
+    def results(self, numbers: Iterable[int]) -> Generator[Result, None, None]:
         """Frames by number, joined, then a check of the seams (LayerError)."""
         solver = ShotSolver(self.shot.path, self.run["levels"], self.parts[0].options(), opened=self.shot)
 
-        def joined(seam: int, solutions: Both) -> Sequence[Outcome]:
+        def joined(seam: int, solutions: Both) -> Sequence[Result]:
             joint = join(solutions, solver.mover)
             self.warn(*joint.warnings)
             self._measure(seam, solutions, joint)
@@ -148,23 +149,21 @@ class _Joins:
         yield from frames_in_order(self._read, numbers, self.starts, join=joined)
         self._check()
 
-    def _read(self, index: int, seam: int | None) -> Outcome:
+    def _read(self, index: int, seam: int | None) -> Result:
         time = self.run["times"][index]
-        if outcome := self.chunks[index if seam is None else seam].read(index, time, seam=seam):
-            reused = () if index in self._anew and seam is None else outcome.reused  # No frame before, or not its own.
-            return replace(outcome, reused=reused or (False,) * len(outcome.reused))
+        if result := self.chunks[index if seam is None else seam].read(index, time, seam=seam):
+            return result.as_changed() if index in self._anew and seam is None else result
         raise LayerError(f"the result of time code {time} is gone; refine it anew by --resume")
 
     def _measure(self, seam: int, solutions: Both, joint: Joint) -> None:
         """Measure a seam; unknown if the last frame failed in either chunk."""
         after = self.run["times"][seam]
-        for index, (source, mesh) in enumerate(zip(self.shot.sources, self.meshes, strict=True)):
-            moves = _moves(solutions, joint, index, mesh.half_edges.edges)
+        for index, garment in enumerate(self.shot.scene.garments):
+            moves = _moves(solutions, joint, index, self.meshes[index].half_edges.edges)
             if moves is not None:
                 rms, largest = map(float, np.max(moves, axis=0))
-                self.seams.append(
-                    Seam(after, str(source.path), rms, largest, 0 if joint.why else len(solutions), joint.why)
-                )
+                frames = 0 if joint.why else len(solutions)
+                self.seams.append(Seam(after, garment.path, rms, largest, frames, joint.why))
 
     def _check(self) -> None:
         """Refuse a seam with too large a move, or an unmeasured seam although frames depend on their predecessors."""
@@ -245,7 +244,7 @@ def stitch(
         joins = _Joins(parts, opened, np.inf if partial else seam_bound, report.warn, numbers)
         record = {"options": recorded, "chunks": [_span(part.times) for part in parts]}
         _make_folder(out.resolve().parent)
-        write_all(Run(opened, out, options, report, Stored(numbers, record, joins.outcomes(numbers))), out)
+        write_all(Run(opened, out, options, report, Stored(numbers, record, joins.results(numbers))), out)
     return report, joins.seams
 
 
@@ -286,7 +285,7 @@ def check_seams(
         check_same_shot(parts[0], made_from(opened, parts[0].folder, parts[0].options()))
         joins = _Joins(parts, opened, seam_bound, lambda *_: None)
         before = [k for start, first in joins.starts.items() for k in range(first, start)]
-        deque(joins.outcomes(sorted(joins.chunks.keys() & {*before})), maxlen=0)
+        deque(joins.results(sorted(joins.chunks.keys() & {*before})), maxlen=0)
     return joins.seams
 
 
@@ -435,7 +434,7 @@ def _moves(solutions: Both, joint: Joint, index: int, edges: np.ndarray) -> list
     moves, lag = [], np.zeros(1)
     jump: tuple[float, float] | None = None
     for k, ((earlier, after), frame) in enumerate(zip(solutions, joint.frames, strict=True), start=1):
-        points = [outcome.points[index] if outcome.points else None for outcome in (earlier, after, frame)]
+        points = [result.garments[index].points if result.garments else None for result in (earlier, after, frame)]
         jump, (a, b, x) = None, points
         if a is None or b is None or x is None:
             continue

@@ -53,9 +53,9 @@ def preview_any(
     options = run.options()
     with closing(open_for(str(source), options)) as opened:
         check_same_shot(run, made_from(opened, run.folder, options))
-        outcomes = [run.read(number, run.run["times"][number]) for number in numbers]
+        results = [run.read(number, run.run["times"][number]) for number in numbers]
         return draw_frames(
-            opened, run.run["levels"], [outcome for outcome in outcomes if outcome], out, options=options, **look
+            opened, run.run["levels"], [result for result in results if result], out, options=options, **look
         )
 
 

@@ -191,9 +191,10 @@ def percent(fraction: float) -> str:
 
 def _moved(before: Sequence[np.ndarray], after: Sequence[np.ndarray]) -> float:
     """Sum of the largest move of the cages and of the body [m], the last of the arrays; infinite for unlike arrays."""
-    if any(a.shape != b.shape for a, b in zip(before, after, strict=True)):
+    pairs = list(zip(before, after, strict=True))
+    if any(a.shape != b.shape for a, b in pairs):
         return np.inf
-    moves = [float(np.linalg.norm(b - a, axis=1).max(initial=0.0)) for a, b in zip(before, after, strict=True)]
+    moves = [float(np.linalg.norm(b - a, axis=1).max(initial=0.0)) for a, b in pairs]
     return max(moves[:-1], default=0.0) + moves[-1]
 
 

@@ -94,8 +94,7 @@ WARNINGS = {
     "contact": Kind(
         "crossings or vertices inside a body are left",
         "`--heat-map` writes where, so that you can mend the cage there; `physgraph:collider:side` corrects a side "
-        "that was guessed wrong. Some frames come out clean if they are refined alone (`--frames`). Skinned cloth that "
-        "is bent far in the first frame may come out clean with `--pose-in 12`",
+        "that was guessed wrong. Some frames come out clean if they are refined alone (`--frames`)",
         "{left} {are} left{together}",
         "--heat-map shows where, to mend the cage there",
     ),
@@ -301,12 +300,11 @@ def of_more(report: RefineReport) -> list[str]:
     out of a body may cross it more often than cloth that lies in it.
     """
     figures_of: dict[str, list[tuple[float | None, int, int, str]]] = {}
-    for frame in report.frames:
-        for garment, entry in zip(report.garments, frame.get("garments", ()), strict=False):
-            after, before = (_faults(entry.get("contact") or {}, side) for side in ("after", "before"))
-            if after > before and is_first(garment["path"], entry):
-                figures = frame["time"], after, before, _together(garment["path"], entry)
-                figures_of.setdefault(garment["path"], []).append(figures)
+    for frame, garment, entry in report.entries():
+        after, before = (faults_of(entry.get("contact") or {}, side) for side in ("after", "before"))
+        if after > before and is_first(garment["path"], entry):
+            figures = frame["time"], after, before, _together(garment["path"], entry)
+            figures_of.setdefault(garment["path"], []).append(figures)
     warnings = []
     for path in [garment["path"] for garment in report.garments if garment["path"] in figures_of]:
         frames = figures_of[path]
@@ -316,7 +314,7 @@ def of_more(report: RefineReport) -> list[str]:
     return warnings
 
 
-def _faults(contact: Mapping[str, Any], side: str) -> int:
+def faults_of(contact: Mapping[str, Any], side: str) -> int:
     """Crossings of cloth and with all bodies, and vertices inside bodies, "before" or "after"."""
     measured = [contact.get("cloth") or {}, *(contact.get("bodies") or {}).values()]
     names = ("crossings", "inside", "pinched")

@@ -1,7 +1,7 @@
 """Cloth and its physics, without USD: a scene and its frames in, positions out.
 
     refiner = Refiner(Scene((Garment.of("/Sheet", faces, rest),), gravity), SolveSettings())
-    fine = refiner.solve(Frame(1.0, (GarmentFrame(points, PRESETS["jersey"]),))).points[0]
+    fine = refiner.solve(Frame(1.0, (GarmentFrame(points, PRESETS["jersey"]),))).garments[0].points
 
 Names are looked up when they are first used, so importing this package imports neither torch nor Warp. docs/api.md has
 a whole example.
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from .fabric import PRESETS, Fabric
     from .frame.refiner import Refiner
     from .frame.settings import SolveSettings
-    from .scene import Frame, Garment, GarmentFrame, Scene, State
+    from .scene import Frame, Garment, GarmentFrame, GarmentResult, Result, Scene
 
 __all__ = [
     "PRESETS",
@@ -27,11 +27,12 @@ __all__ = [
     "Frame",
     "Garment",
     "GarmentFrame",
+    "GarmentResult",
     "Pose",
     "Refiner",
+    "Result",
     "Scene",
     "SolveSettings",
-    "State",
     "primitive",
 ]
 _MODULES = {
@@ -40,7 +41,7 @@ _MODULES = {
     "fabric": ("PRESETS", "Fabric"),
     "frame.refiner": ("Refiner",),
     "frame.settings": ("SolveSettings",),
-    "scene": ("Frame", "Garment", "GarmentFrame", "Scene", "State"),
+    "scene": ("Frame", "Garment", "GarmentFrame", "GarmentResult", "Result", "Scene"),
 }
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
 

@@ -22,7 +22,7 @@ from .mesh.lengths import FOLDS, LENGTHS, NORMALS, ElementValues
 from .mesh.recorded import Recordings
 from .mesh.stencil import Stencil
 from .mesh.subdivide import ControlMesh, Refinement, on_triangles, subdivide_times
-from .mesh.topology import TriangleSplit, edges_of, find_edges, sorted_rows
+from .mesh.topology import PolygonMesh, TriangleSplit, edges_of, find_edges, sorted_rows
 from .mesh.vectors import at_corners, cross, dot, inverse, mean_of, norm, product
 from .scene import Garment
 from .seen import vertex_normals
@@ -242,6 +242,11 @@ def refine_garments(garments: Sequence[Garment], levels: Sequence[int]) -> list[
         The refinements of each garment, coarsest first.
     """
     return [subdivide_times(garment.mesh, level) for garment, level in zip(garments, levels, strict=True)]
+
+
+def fine_meshes(garments: Sequence[Garment], refinements: Sequence[Sequence[Refinement]]) -> list[PolygonMesh]:
+    """The finest mesh of each garment, given its refinements, coarsest first; the cage without any."""
+    return [steps[-1].mesh if steps else cage.mesh for cage, steps in zip(garments, refinements, strict=True)]
 
 
 def build_levels(

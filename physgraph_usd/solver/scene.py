@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -149,6 +150,32 @@ class Garment:
 
 
 @dataclass(frozen=True, eq=False)
+class Limits:
+    """Distances that cloth may be from its smoothly subdivided cage, each times its painted multiplier.
+
+    Attributes:
+        max_distance: Largest distance in any direction [m]; None for no limit.
+        backstop: Largest distance inwards, against the cage's outward normals [m]; None for no limit.
+        max_distance_scale: Multiplier of ``max_distance`` at the cage's vertices, 0 to 1, shape (V,).
+        backstop_scale: Multiplier of ``backstop``, likewise.
+    """
+
+    max_distance: float | None
+    backstop: float | None
+    max_distance_scale: np.ndarray
+    backstop_scale: np.ndarray
+
+    @staticmethod
+    def are_equal(a: Limits | None, b: Limits | None) -> bool:
+        """Whether two limits are equal."""
+        if a is None or b is None:
+            return a is b
+        maps = (a.max_distance_scale, b.max_distance_scale), (a.backstop_scale, b.backstop_scale)
+        values = (a.max_distance, a.backstop) == (b.max_distance, b.backstop)
+        return values and all(x is y or np.array_equal(x, y) for x, y in maps)
+
+
+@dataclass(frozen=True, eq=False)
 class GarmentFrame:
     """One garment at one time code.
 
@@ -161,6 +188,7 @@ class GarmentFrame:
             `inertia.felt` gives it; None where it feels none.
         load: Force of the air per area at the coarse points [N/m^2], shape (V, 3), as `air.load` gives it; None for
             calm air without a difference in pressure.
+        limits: Distances that the cloth may be from its cage; None for no limits.
     """
 
     points: np.ndarray
@@ -170,6 +198,7 @@ class GarmentFrame:
     offset: float = 0.002
     acceleration: np.ndarray | None = None
     load: np.ndarray | None = None
+    limits: Limits | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,24 +236,40 @@ class Scene:
 
 
 @dataclass(frozen=True, eq=False)
-class State:
+class GarmentResult:
+    """One garment's result at one time code.
+
+    Attributes:
+        points: Fine positions [m], world space, shape (V, 3), float64; None where it was not asked for.
+        telemetry: Plain numbers and words, ready for JSON.
+        reused: Whether the input equalled the previous frame's, and its points were kept.
+        heat: Heat maps where they were asked for: "penetration", depth in the deepest body [mm], and "crossing", 1 at
+            corners of what crosses a face and 0 elsewhere, each of shape (V,), float32.
+    """
+
+    points: np.ndarray | None
+    telemetry: dict[str, Any] = field(default_factory=dict)
+    reused: bool = False
+    heat: dict[str, np.ndarray] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
     """The result at one time code.
 
     Attributes:
         time: The stage's own time code; None for a shot without samples.
-        points: Fine positions [m], world space, shape (V, 3), float64, per garment; None where it was not asked for.
-        telemetry: Plain numbers and words per garment, ready for JSON.
-        reused: For each garment, True when its input equalled the previous frame's and its points were kept.
-        heat: Per garment, where a heat map was asked for: "penetration", depth in the deepest body [mm], and
-            "crossing", 1 at corners of what crosses a face and 0 elsewhere, each of shape (V,), float32; what is not
-            known is left out. None as in points; () when none was asked for.
+        garments: One entry per garment of the scene, in its order; () if the frame could not be solved.
+        telemetry: Values of the whole frame, ready for JSON; "error", a message, if it could not be solved.
     """
 
     time: float | None
-    points: tuple[np.ndarray | None, ...]
-    telemetry: tuple[dict[str, object], ...] = field(default=())
-    reused: tuple[bool, ...] = field(default=())
-    heat: tuple[dict[str, np.ndarray] | None, ...] = field(default=())
+    garments: tuple[GarmentResult, ...] = ()
+    telemetry: dict[str, Any] = field(default_factory=dict)
+
+    def as_changed(self) -> Result:
+        """This result with no garment reused: to be written after another frame than the one solved before it."""
+        return replace(self, garments=tuple(replace(garment, reused=False) for garment in self.garments))
 
 
 def recentred(garment: Garment) -> Garment:

@@ -80,8 +80,8 @@ class Answers(Watcher):
 
     def show(self, shown: Shown) -> None:
         """Answer with a solved frame."""
-        found = zip(self._session.garments, shown.points, strict=True)
-        self._answer({path: each for path, each in found if each is not None}, settled=shown.settled)
+        points = {path: garment.points for path, garment in zip(self._session.garments, shown.garments, strict=True)}
+        self._answer({path: x for path, x in points.items() if x is not None}, settled=shown.settled)
 
     def fail(self, error: PhysGraphError) -> None:
         """Answer with an error."""

@@ -83,8 +83,8 @@ def distances(refiner: Refiner, frame: Frame, index: int, points: np.ndarray) ->
 
 def crossings(refiner: Refiner, frame: Frame, index: int, points: np.ndarray) -> np.ndarray:
     """1 at fine vertices in crossings with cloth or bodies, else 0, shape (V,)."""
-    found = refiner.heat(index, points)
-    return np.zeros(len(points)) if found is None else np.maximum(found["crossing"], found["penetration"] > 0)
+    heat = refiner.heat(index, points)
+    return np.maximum(heat["crossing"], heat["penetration"] > 0)
 
 
 Finder = Callable[[Refiner, Frame, int, np.ndarray], np.ndarray]
@@ -122,7 +122,7 @@ def find_map(
 
     A ``stroke`` stands in for the session's map.
     """
-    points = shown.points[index]
+    points = shown.garments[index].points
     if name == PLAIN or points is None:
         return None
     if name in MEASURED:

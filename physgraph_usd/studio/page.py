@@ -14,6 +14,7 @@ import numpy as np
 
 from ..errors import LayerError, PhysGraphError
 from ..interrupts import leave_if_asked
+from ..solver.scene import GarmentResult
 from .camera import Camera
 from .desk import Desk, in_order, put, small
 from .guard import guarded_server
@@ -69,7 +70,7 @@ class TunePage(Watcher):
         self._solved: tuple[Setting, float | None] | None = None
         self._build()
         frame = session.shot.frame(session.time)
-        picture.draw(Shown(frame, (None,) * len(session.garments), (), 0.0, False))
+        picture.draw(Shown(frame, (GarmentResult(None),) * len(session.garments), 0.0, False))
         self._say(FIRST, WORKING)
         self.loop.start()
 
@@ -197,7 +198,7 @@ def serve(session: TuneSession, *, port: int = 8080, say: Callable[[str], None])
 
 def figures(shown: Shown, index: int) -> dict[str, str]:
     """Figures of a solved garment in words, by name, as in a report."""
-    points, entry = shown.points[index], shown.telemetry[index]
+    points, entry = shown.garments[index].points, shown.garments[index].telemetry
     lines = {"Vertices": f"{0 if points is None else len(points):,}"}
     if "energy_joules" in entry:
         lines["Energy"] = f"{1e3 * sum(entry['energy_joules']['output'].values()):.4g} mJ"

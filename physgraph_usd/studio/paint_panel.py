@@ -10,7 +10,7 @@ from ..usd.schema import GARMENT
 from .brush import ERASE, PAINT, READ, SMOOTH, Brush, Stroke, gradient, hit
 from .camera import Camera
 from .desk import Desk, in_order, put, small
-from .maps import find_map
+from .maps import PLAIN, find_map
 from .session import TuneSession
 from .values import MAPS, TUNABLES, on_fine
 from .view_panel import ViewPanel
@@ -24,6 +24,8 @@ MULTIPLIED = {
     "bendScale": ("bendStiffness",),
     "detailScale": ("refine:detail",),
     "guideScale": ("guide:stiffness",),
+    "maxDistanceScale": ("maxDistance",),
+    "backstopScale": ("backstop",),
     "easeScale": ("rest:weftEase", "rest:warpEase"),
 }
 """Values that each map multiplies, by the schema's short names."""
@@ -81,6 +83,8 @@ class PaintPanel:
         labels = " and ".join(TUNABLES[name].label for name in names)
         idle = names and not any(session.value(self._desk.garment, name) for name in names)
         verb = "which are 0: raise one of them" if len(names) > 1 else "which is 0: raise it"
+        if names and all(session.value(self._desk.garment, name) is None for name in names):
+            verb = "which is unset: set it"
         remark = f"No effect yet: the map multiplies {labels}, {verb} under Values." if idle else ""
         put(self._remark, content=small(remark, "remark") if remark else "")
 
@@ -105,7 +109,10 @@ class PaintPanel:
                 self.touch(session, index, origin, along=along)
             self.lift(session)
 
-        self._desk.ask(touch if self._name != OFF else lambda session: self._read_map(session, origin, along))
+        if self._name != OFF:
+            self._desk.ask(touch)
+        elif self._desk.picture.view.map != PLAIN:
+            self._desk.ask(lambda session: self._read_map(session, origin, along))
 
     def _dragged(self, index: int, event: Any, mode: str | None) -> None:
         origin = np.asarray(event.client.camera.position)
@@ -122,7 +129,7 @@ class PaintPanel:
         if at is None or self._name == OFF:
             return
         garment, cage = session.garments[index], session.shot.scene.garments[index]
-        points = np.asarray(session.solve().points[index])
+        points = np.asarray(session.solve().garments[index].points)
         stroke = self._stroke
         if stroke is None or (stroke.garment, stroke.name) != (garment, self._name):
             stroke = Stroke(garment, self._name, session.painted(garment, self._name))
@@ -161,7 +168,7 @@ class PaintPanel:
 
     def _nearest(self, session: TuneSession, index: int, at: np.ndarray) -> int:
         """The vertex of a garment's refined cloth that is nearest to a place in the scene [m], shape (3,)."""
-        points = np.asarray(session.solve().points[index])
+        points = np.asarray(session.solve().garments[index].points)
         return int(np.linalg.norm(points - self._desk.picture.world(at), axis=1).argmin())
 
     def lift(self, session: TuneSession) -> None:
@@ -172,7 +179,7 @@ class PaintPanel:
 
     def _hit(self, session: TuneSession, index: int, origin: np.ndarray, along: np.ndarray) -> np.ndarray | None:
         """The first intersection of a ray of the scene and a garment's refined cloth, in the scene [m]; or None."""
-        points, picture = session.solve().points[index], self._desk.picture
+        points, picture = session.solve().garments[index].points, self._desk.picture
         if points is None:
             return None
         chain, cage = session.refinements[index], session.shot.scene.garments[index]

@@ -106,8 +106,9 @@ class Picture:
         """Draw a frame, or cages if no refined cloth exists; ``kept`` is the frame kept as A."""
         with self._server.atomic():  # Pictures between two states are never drawn.
             self.bar = None
-            garments = range(len(shown.points))
-            columns = self.view.columns if any(each is not None for each in shown.points) else (CAGE,)
+            garments = range(len(shown.garments))
+            is_solved = any(garment.points is not None for garment in shown.garments)
+            columns = self.view.columns if is_solved else (CAGE,)
             self._scene.remove_by_name("wires")
             self._skins.touched = [f"{FINE}/{index}" for index in garments] if self.paintable else []
             self._columns = []
@@ -205,8 +206,8 @@ class Picture:
         if column == SUBDIVISION and self._session.refinements[index]:
             return self._session.solver.refiner.group_of((index,)).levels[-1].smooth_from_coarse @ given
         solved = {FINE: shown, KEPT: kept}.get(column)
-        found = None if solved is None else solved.points[index]
-        return given if column in (CAGE, SUBDIVISION) else None if found is None else self._rendered(index, found)
+        fine = None if solved is None else solved.garments[index].points
+        return given if column in (CAGE, SUBDIVISION) else None if fine is None else self._rendered(index, fine)
 
     def _side(self, points: np.ndarray, corners: np.ndarray, column: str) -> np.ndarray:
         """Faces or edges of a column, shape (N, k): all, or with a wipe those partly on its side."""
@@ -227,7 +228,7 @@ class Picture:
 
     def _draw_trims(self, shown: Shown, index: int, *, at: np.ndarray) -> list[str]:
         """Draw the meshes that hang on a refined garment; returns the names of what is drawn."""
-        points, steps, named = shown.points[index], self._session.refinements[index], list[str]()
+        points, steps, named = shown.garments[index].points, self._session.refinements[index], list[str]()
         if points is None:
             return named
         if index not in self._bindings or self._bindings[index][0] != len(steps):

@@ -209,8 +209,8 @@ class TuneSession(Tuning):
         began = clock.perf_counter()
         self._prepare()
         rough = rough and self.solver.begun  # A first frame is as `refine` solves it.
-        state = self.solver.solve(self.shot, self.time, rough=rough, seen=seen, cancelled=cancelled)
-        shown = Shown.of(self.shot.frame(self.time), state, began=began, settled=not (rough or cancelled()))
+        result = self.solver.solve(self.shot, self.time, rough=rough, seen=seen, cancelled=cancelled)
+        shown = Shown.of(self.shot.frame(self.time), result, began=began, settled=not (rough or cancelled()))
         self._shown = self.setting, shown
         if shown.settled:
             self._steps.keep_last(Take(Start(self.setting, self.shot, copy(self.solver)), shown))

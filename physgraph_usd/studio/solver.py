@@ -14,7 +14,7 @@ from ..shot.solve import sampled_at
 from ..solver.frame.lead_in import prerolled_cages
 from ..solver.frame.refiner import Refiner
 from ..solver.frame.settings import SolveSettings
-from ..solver.scene import Frame, State
+from ..solver.scene import Frame, Result
 from ..usd.read.reader import Shot
 
 Seen = Callable[[Mapping[str, np.ndarray]], None]
@@ -64,7 +64,7 @@ class FrameSolver:
         rough: bool = False,
         seen: Seen = lambda _: None,
         cancelled: Callable[[], bool] = lambda: False,
-    ) -> State:
+    ) -> Result:
         """Solve a frame from the last result, which may be rough or cancelled.
 
         Args:
@@ -88,9 +88,9 @@ class FrameSolver:
             self.refiner.use(settings)
             self._lead_in(shot, time)
             seen(self.smooth(frame))
-        state = self.refiner.solve(frame, sampled_at(shot, time))
+        result = self.refiner.solve(frame, sampled_at(shot, time))
         self._at = (time,)
-        return state
+        return result
 
     def smooth(self, frame: Frame) -> dict[str, np.ndarray]:
         """The smooth surface of each cage [m], by path."""

@@ -6,11 +6,8 @@ import time as clock
 from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
-from typing import Any
 
-import numpy as np
-
-from ..solver.scene import Frame, State
+from ..solver.scene import Frame, GarmentResult, Result
 from ..usd.read.reader import Shot
 from .setting import Setting
 from .solver import FrameSolver
@@ -30,23 +27,20 @@ class Shown:
 
     Attributes:
         frame: The input: cages, values and bodies.
-        points: Fine positions of each garment [m], world space; None for one without a sample here.
-        telemetry: The solver's figures of each garment, as in a report's frame.
+        garments: The result of each garment, without points for one without a sample here.
         seconds: Wall time of reading and solving.
         settled: Whether the frame is solved as ``refine`` solves it.
     """
 
     frame: Frame
-    points: tuple[np.ndarray | None, ...]
-    telemetry: tuple[dict[str, Any], ...]
+    garments: tuple[GarmentResult, ...]
     seconds: float
     settled: bool
 
     @staticmethod
-    def of(frame: Frame, state: State, *, began: float, settled: bool) -> Shown:
+    def of(frame: Frame, result: Result, *, began: float, settled: bool) -> Shown:
         """A frame and the solver's result; reading ``began`` at that `time.perf_counter` value."""
-        seconds = clock.perf_counter() - began
-        return Shown(frame, state.points, tuple(map(dict, state.telemetry)), seconds, settled)
+        return Shown(frame, result.garments, clock.perf_counter() - began, settled)
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,8 +67,8 @@ class Start:
         solver, began = copy(self.solver), clock.perf_counter()
         if cold:
             solver.feel(contact=self.setting.contact)
-        state = solver.solve(self.shot, time, cancelled=cancelled)
-        shown = Shown.of(self.shot.frame(time), state, began=began, settled=not cancelled())
+        result = solver.solve(self.shot, time, cancelled=cancelled)
+        shown = Shown.of(self.shot.frame(time), result, began=began, settled=not cancelled())
         return Take(replace(self, solver=solver), shown)
 
 

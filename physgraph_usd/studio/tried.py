@@ -89,7 +89,7 @@ class TriedShot:
     def _of_subsets(self, values: Mapping[str, Mapping[str, float]]) -> dict[str, dict[str, float]]:
         """The values of subsets of other fabrics, in proportion to their garments', by prim path."""
         found = dict[str, dict[str, float]]()
-        for garment, source in zip(self.opened.scene.garments, self.opened.sources, strict=True):
+        for garment, source in ((reader.garment, reader.source) for reader in self.opened.readers):
             tried, scale = values.get(garment.path, {}), garment.fabric_scale
             if scale is not None:
                 for name in filter(None, source.fabrics):

@@ -79,6 +79,12 @@ def _percent(value: float | None) -> float | None:
     return None if value is None else 100.0 * value
 
 
+def _limits(frame: GarmentFrame) -> tuple[float | None, float | None]:
+    """Max distance and backstop in a frame [m]."""
+    limits = frame.limits
+    return (None, None) if limits is None else (limits.max_distance, limits.backstop)
+
+
 TUNABLES: dict[str, Tunable] = {
     each.name: each
     for each in (
@@ -93,6 +99,8 @@ TUNABLES: dict[str, Tunable] = {
         Tunable("thickness", "mm", 1e3, lambda f: f.fabric.thickness),
         Tunable("stretchLimit", "%", 1.0, lambda f: _percent(f.fabric.stretch_limit), decades=False),
         Tunable("guide:stiffness", "N/m³", 1.0, lambda f: f.guide),
+        Tunable("maxDistance", "mm", 1e3, lambda f: _limits(f)[0], decades=False),
+        Tunable("backstop", "mm", 1e3, lambda f: _limits(f)[1], decades=False),
         Tunable("refine:detail", "", 1.0, lambda f: f.detail, decades=False),
         Tunable("contact:offset", "mm", 1e3, lambda f: f.offset),
     )
@@ -111,6 +119,8 @@ SAYS = {
     "thickness": "Higher: layers and folds keep farther apart.",
     "stretchLimit": "Cloth resists far more beyond this strain.",
     "guide:stiffness": "Higher: closer to the animation, with shallower folds.",
+    "maxDistance": "Lower: no place farther from the smooth animation; folds get shallower.",
+    "backstop": "Lower: no place deeper inside the smooth animation.",
     "refine:detail": "Times the folds that were added; 0: a smooth surface.",
     "contact:offset": "Higher: cloth keeps farther off the bodies.",
 }

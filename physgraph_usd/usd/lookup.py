@@ -75,7 +75,8 @@ class Found:
             return check_limits(self.row, self.compute(time), self.source)
         if self.attribute is None:
             return self.constant
-        return check_limits(self.row, read_number(self.attribute, time) * self.scale, self.source)
+        source = self.source + (at_time(time) if self.animated else "")
+        return check_limits(self.row, read_number(self.attribute, time) * self.scale, source)
 
 
 def check_known(kind: str, word: object, choices: Collection[object]) -> None:
@@ -255,6 +256,7 @@ def check_limits(row: Property, value: float, source: str) -> float:
         low = -math.inf if row.minimum is None else row.minimum
         high = math.inf if row.maximum is None else row.maximum
         allowed = f"[{low:g}, {high:g}]" + (f" {row.unit}" if row.unit else "")
+        allowed += "" if row.fallback is not None else ", or left out"
         raise SchemaError(f"{source}: {row.name} is {value:.7g}; it must be finite and in {allowed}")
     if row.type == "int" and value != round(value):
         raise SchemaError(f"{source}: {row.name} is {value:g}; it must be a whole number")

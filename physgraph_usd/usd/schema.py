@@ -203,6 +203,18 @@ PROPERTIES: tuple[Property, ...] = (
         "Guide Stiffness", REFINEMENT, (10.0, 1e6),
     ),
     Property(
+        GARMENT_API, "physgraph:maxDistance", "float", None, "m", 0.0, 1000.0,
+        "Largest distance of the refined cloth from the subdivided animation, in any direction. Held in every frame. "
+        "Without a value, there is no limit.",
+        "Max Distance", REFINEMENT, (0.0, 0.1),
+    ),
+    Property(
+        GARMENT_API, "physgraph:backstop", "float", None, "m", 0.0, 1000.0,
+        "Largest distance of the refined cloth from the subdivided animation inwards, against its normals. Held in "
+        "every frame. Without a value, there is no limit.",
+        "Backstop", REFINEMENT, (0.0, 0.1),
+    ),
+    Property(
         GARMENT_API, "physgraph:inertia", "float", 1.0, "", 0.0, 1.0,
         "Share of the animation's acceleration beyond gravity that the cloth feels. 0 leaves it out.",
         "Inertia", REFINEMENT, (0.0, 1.0),
@@ -274,6 +286,14 @@ PROPERTIES: tuple[Property, ...] = (
     _scale(
         "guideScale", "Guide Stiffness Scale", 1.0, most=1e4, soft=10.0,
         doc="Painted multiplier of the guide stiffness. " + PER_VERTEX,
+    ),
+    _scale(
+        "maxDistanceScale", "Max Distance Scale", 1.0, most=1.0, soft=1.0,
+        doc="Painted multiplier of the max distance. 0 keeps the cloth on the subdivided animation. " + PER_VERTEX,
+    ),
+    _scale(
+        "backstopScale", "Backstop Scale", 1.0, most=1.0, soft=1.0,
+        doc="Painted multiplier of the backstop. " + PER_VERTEX,
     ),
     _scale(
         "easeScale", "Ease Scale", 1.0, most=100.0, soft=10.0,

@@ -82,6 +82,14 @@ SLIDERS = (
         "How firmly the fine cloth follows the coarse animation",
     ),
     Slider(
+        "max_distance", "maxDistance", "Max Distance", "mm", 1e3, 50.0, (0.0, 1e6), (0.0, 100.0),
+        "Largest distance of the fine cloth from the smooth coarse animation",
+    ),
+    Slider(
+        "backstop", "backstop", "Backstop", "mm", 1e3, 10.0, (0.0, 1e6), (0.0, 100.0),
+        "Largest distance of the fine cloth inside the smooth coarse animation",
+    ),
+    Slider(
         "offset", "contact:offset", "Offset", "mm", 1e3, 2.0, (0.0, 1e4), (0.1, 30.0),
         "Distance kept from colliders",
     ),

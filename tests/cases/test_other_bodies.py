@@ -303,8 +303,8 @@ class TestSearch:
 
 
 def test_cloth_between_two_bodies_that_overlap_is_pinched_as_between_parts_of_one(tmp_path: Path):
-    """A trouser leg round a thigh that is 6 mm deep in a seat: what has no room is pinched, and no more than before."""
-    made, radius, deep = new_stage(tmp_path / "shot.usda"), 0.08, 0.006
+    """A trouser leg round a thigh that is 8 mm deep in a seat: what has no room is pinched, and no more than before."""
+    made, radius, deep = new_stage(tmp_path / "shot.usda"), 0.08, 0.008
     points, faces = tube(radius + 0.003, -0.1, 0.1, around=16, rows=5)
     add_moving(made, SKIRT, (points[:, [1, 0, 2]], [face[::-1] for face in faces]), points[:, [1, 0, 2]])
     thigh = UsdGeom.Cylinder.Define(made, "/World/thigh")

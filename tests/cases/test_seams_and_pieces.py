@@ -289,7 +289,7 @@ class TestPieces:
             rims = []
             for each in (garment, replace(garment, closed=None)):
                 scene = replace(opened.scene, garments=(each,))
-                points = Refiner(scene, settings_of(), levels=[LEVEL]).solve(frame).points[0]
+                points = Refiner(scene, settings_of(), levels=[LEVEL]).solve(frame).garments[0].points
                 assert points is not None
                 radius = np.linalg.norm(points[: 2 * count, ::2], axis=1).reshape(2, -1)[:, :16]
                 rims.append(float(radius[0].mean() - radius[1].mean()))

@@ -50,8 +50,10 @@ def _authored(draft: Draft) -> None:
     stage = draft.open()
     ways = ("spoil", "spoil", "resize", "empty", "block", "retype", "remove", "interpolation", "elementSize")
     for _ in range(draft.pick([1, 1, 2, 4])):
-        prim = draft.pick([prim for prim in stage.Traverse() if prim.GetAuthoredAttributes()])
-        attribute, how = draft.pick(prim.GetAuthoredAttributes()), draft.pick(ways)
+        prims = [prim for prim in stage.Traverse() if prim.GetAuthoredAttributes()]
+        if not prims:  # The last attribute is removed.
+            break
+        attribute, how = draft.pick(draft.pick(prims).GetAuthoredAttributes()), draft.pick(ways)
         draft.said.append(f"{attribute.GetPath()}: {how}")
         _broken(draft, stage, attribute, how)
     draft.save(stage, "saved")

@@ -21,7 +21,7 @@ from ...solver.frame.refiner import Refiner
 from ...solver.frame.settings import SolveSettings
 from ...solver.frame.solve import solve_frame
 from ...solver.frame.values import FrameInput, FrameState
-from ...solver.level import Level
+from ...solver.level import Level, fine_meshes
 from ...solver.resolution import edge_strain
 from ...solver.scene import Frame, Scene
 
@@ -115,14 +115,13 @@ class Problem:
     @property
     def vertex_count(self) -> int:
         """Number of fine vertices."""
-        chains = zip(self.scene.garments, self.refiner.refinements, strict=True)
-        return sum(chain[-1].mesh.vertex_count if chain else garment.mesh.vertex_count for garment, chain in chains)
+        return sum(mesh.vertex_count for mesh in fine_meshes(self.scene.garments, self.refiner.refinements))
 
     @cached_property
     def triangles(self) -> tuple[np.ndarray, ...]:
         """Vertices of each fine triangle, shape (T, 3), one array a garment."""
-        chains = zip(self.scene.garments, self.refiner.refinements, strict=True)
-        return tuple((chain[-1].mesh if chain else garment.mesh).triangulate().triangles for garment, chain in chains)
+        meshes = fine_meshes(self.scene.garments, self.refiner.refinements)
+        return tuple(mesh.triangulate().triangles for mesh in meshes)
 
     def solve(self, frame: Frame, settings: SolveSettings) -> Solved:
         """Solve a frame from a cold start."""
@@ -132,9 +131,9 @@ class Problem:
     def next(self, frame: Frame) -> Solved:
         """Solve a frame from the previous result, with the settings in use."""
         before, began, worked = _waited(), time.perf_counter(), time.process_time()
-        state = self.refiner.solve(frame)
+        garments = self.refiner.solve(frame).garments
         after, elapsed, worked = _waited(), time.perf_counter() - began, time.process_time() - worked
-        entries: list[Any] = list({id(entry): entry for entry in state.telemetry}.values())
+        entries = list({id(garment.telemetry): garment.telemetry for garment in garments}.values())
         spent = {
             name: sum(entry.get("milliseconds", {}).get(name, 0.0) for entry in entries)
             for name in ("prepare", "solve")
@@ -144,7 +143,7 @@ class Problem:
         steps = sum(report["steps"] for report in reports if report["level"] == last)
         waited = None if before is None or after is None else after - before
         busy = worked / elapsed if self._clock == "cpu" else 1.0
-        points = tuple(p for p in state.points if p is not None)
+        points = tuple(garment.points for garment in garments if garment.points is not None)
         prepared = busy * spent["prepare"]
         return Solved(points, prepared + busy * spent["solve"], prepared, 1e3 * elapsed, steps, waited)
 

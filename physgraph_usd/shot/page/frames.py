@@ -9,22 +9,22 @@ from typing import Any
 
 from ...errors import LayerError
 from ...solver.level import refine_garments
+from ...solver.scene import Result
 from ...usd.read.reader import Shot
 from ...usd.write.writer import LayerWriter
-from ..frames import Outcome
 from ..options import RefineOptions
 from .preview import preview
 
 
 def draw_frames(
-    shot: Shot, levels: Sequence[int], outcomes: Sequence[Outcome], out: Path, *, options: RefineOptions, **look: Any
+    shot: Shot, levels: Sequence[int], results: Sequence[Result], out: Path, *, options: RefineOptions, **look: Any
 ) -> Path:
     """Draw solved frames of an open shot beside its input, by way of a temporary layer.
 
     Args:
         shot: The shot, open.
         levels: Subdivisions of each garment.
-        outcomes: The frames, in order; all are solved.
+        results: The frames, in order; all are solved.
         out: Picture to write.
         options: The run's options.
         look: Size, camera and overwriting, as in `preview`.
@@ -37,7 +37,7 @@ def draw_frames(
         LayerError: The picture cannot be written.
         StageError: The shot shows no mesh.
     """
-    times = [outcome.time for outcome in outcomes if outcome.time is not None]
+    times = [result.time for result in results if result.time is not None]
     refinements = refine_garments(shot.scene.garments, levels)
     try:
         with TemporaryDirectory(prefix="physgraph-usd-") as folder:
@@ -46,8 +46,8 @@ def draw_frames(
                 shot, refinements, layer, mode=options.mode, scheme=options.scheme, times=times or None
             )
             with writer:
-                for outcome in outcomes:
-                    writer.write(outcome.time, outcome.points)
+                for result in results:
+                    writer.write(result.as_changed())
                 writer.close()
             return preview(layer, out, shot=shot.path, times=times or None, **look)
     except OSError as error:

@@ -16,6 +16,7 @@ from ...solver.frame.scene_frame import SceneCloth
 from ...solver.frame.settings import SolveSettings
 from ...solver.level import Level, build_levels, hinge_geometry, refine_garments
 from ...solver.mesh.elements import hinges_of
+from ...solver.mesh.weld import Weld
 from ...solver.scene import recentred
 from ...usd.read.meshes import RefinedLayer
 from ...usd.read.reader import Shot
@@ -87,12 +88,13 @@ def close_up(report: RefineReport, shot: Shot) -> CloseUp | None:
     remaining = {name: count for name, count in _left(report, frame).items() if count}
     frame = frame if remaining else max(frames, key=_bending)
     layer, time = RefinedLayer(report.out), frame["time"]
-    welds = [source.weld.subdivided(level)[1] for source, level in zip(shot.sources, _levels(report), strict=True)]
-    points = [layer.points(shot, index, time) for index in range(len(welds))]
-    if any(positions is None for positions in points):
-        return None
-    pairs = zip(welds, points, strict=True)  # A shell's outer side comes first.
-    cloth = [weld.joined(positions[: len(weld.number)]) for weld, positions in pairs if positions is not None]
+    welds, cloth = list[Weld](), list[np.ndarray]()
+    for index, garment in enumerate(report.garments):
+        weld, points = shot.sources[index].weld.subdivided(garment["level"])[1], layer.points(shot, index, time)
+        if points is None:
+            return None
+        welds.append(weld)
+        cloth.append(weld.joined(points[: len(weld.number)]))  # A shell's outer side comes first.
     marks = _faults(report, shot, time, cloth) if remaining else []
     caption = "The worst place: " + "; ".join(f"{count:,} {name}" for name, count in remaining.items())
     if not any(mark.any() for mark in marks):
@@ -135,10 +137,7 @@ def _faults(report: RefineReport, shot: Shot, time: float | None, points: Sequen
     )
     crossing = np.zeros(level.vertex_count, bool)
     crossing[level.edges.numpy()[crossing_pairs.edge.numpy()]] = True
-    heat = [
-        cloth.heat(i, positions, crossing[span], SolveSettings())
-        for i, (positions, span) in enumerate(zip(points, level.spans, strict=True))
-    ]
+    heat = [cloth.heat(i, points[i], crossing[span], SolveSettings()) for i, span in enumerate(level.spans)]
     return [(maps["penetration"] > 0) + 1.0 * (maps["crossing"] > 0) for maps in heat]
 
 

@@ -160,7 +160,7 @@ class LevelContact:
         self._queried = None if self.given_up is None else ~self.given_up
         self._base, self._settings, self._thickness = base, settings, thickness
         self._all_bodies = None if bodies is None else LevelBodies(level, bodies, self.mesh.pieces)
-        self._looked: ContactState | None = None
+        self._looked = tuple[ContactState, ...]()
         self.came_near: bool | None = None
 
     @cached_property
@@ -193,14 +193,18 @@ class LevelContact:
         return self.detect(x, self._doubtful if self.given_up is None else None)
 
     def look(self, x: Float[Tensor, "vertices 3"]) -> ContactState:
-        """Crossings at x [m]; cached for the same tensor until its version changes."""
-        if self._looked is None or self._looked.x is not x or self._looked.version != x._version:
-            self._looked = self.detect(x)
-        return self._looked
+        """Crossings at x [m]; cached for the last two tensors until their versions change."""
+        known = next((state for state in self._looked if state.x is x and state.version == x._version), None)
+        return self._keep(self.detect(x)) if known is None else known
+
+    def _keep(self, state: ContactState) -> ContactState:
+        """The state, kept for `look`."""
+        self._looked = (state, *self._looked[:1])
+        return state
 
     def remember(self, x: Float[Tensor, "vertices 3"], given_up: Tangles | None = None) -> None:
         """Record that only given-up cloth crosses at x [m], as after a safe move from a clean state."""
-        self._looked = ContactState.clean(x, self._corners(x), given_up)
+        self._keep(ContactState.clean(x, self._corners(x), given_up))
 
     def _corners(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "all 3"]:
         """Corners of the cloth, then of the bodies in this frame [m], float64."""
@@ -229,9 +233,15 @@ class LevelContact:
         tangles = self.look(x).tangles
         return None if tangles is None else self.mesh.pieces_with(tangles.label >= 0, over=0.5)
 
-    def pushed_out(self, x: Float[Tensor, "vertices 3"], *, vertices: bool = False) -> Float[Tensor, "vertices 3"]:
-        """As `LevelBodies.pushed_out`, or for vertices alone; x [m] itself if no cloth is inside or through a body."""
-        state = self.look(x)
+    def pushed_out(
+        self, x: Float[Tensor, "vertices 3"], state: ContactState | None = None, *, vertices: bool = False
+    ) -> Float[Tensor, "vertices 3"]:
+        """As `LevelBodies.pushed_out`, or for vertices alone; x [m] itself if no cloth is inside or through a body.
+
+        Args:
+            state: The state of x; None to look.
+        """
+        state = self.look(x) if state is None else state
         if self.bodies is None or not any(state.in_bodies):
             return x
         inside, chords = _within(self.mesh, self.bodies, state)

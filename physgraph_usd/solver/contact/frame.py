@@ -203,8 +203,9 @@ class FrameContact:
         Args:
             x: The result [m].
         """
-        view = self.at(self._levels[-1])
-        return measured(view, view.closed(self._levels[-1].base.apply(self._coarse)), x)
+        view, level = self.at(self._levels[-1]), self._levels[-1]
+        before, smooth = (view.closed(base.apply(self._coarse)) for base in (level.base, level.smooth_base))
+        return measured(view, before, x, smooth=smooth)
 
 
 def _moves(start: Tensor, end: Tensor) -> dict[str, object]:

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ..collide.crossings import all_crossings, crossings
+from ..collide.crossings import Crossings, all_crossings, crossings
 from ..colliders.mesh import MeshSurface
 from ..level import Level
 from .bodies import LevelBodies
@@ -21,7 +21,11 @@ from .measure import Penetration, depths, penetration
 
 
 def measured(
-    view: LevelContact, before: Float[Tensor, "vertices 3"], x: Float[Tensor, "vertices 3"]
+    view: LevelContact,
+    before: Float[Tensor, "vertices 3"],
+    x: Float[Tensor, "vertices 3"],
+    *,
+    smooth: Float[Tensor, "vertices 3"],
 ) -> tuple[dict[str, object], Bool[Tensor, " vertices"]]:
     """Penetrations and crossings before and after, and a mask of the vertices of crossing cloth after.
 
@@ -31,14 +35,19 @@ def measured(
         view: The finest level's cloth.
         before: The upsampled cage [m].
         x: The result [m].
+        smooth: The smoothly subdivided cage [m], measured as "before" if the result has more faults than the upsampled
+            cage: cloth may follow it, and tangled cages cross a little more or less often when smooth.
     """
     first, last = view.at_base if torch.equal(before, view.at_base.x) else view.of_cage(before), view.look(x)
+    contours = last.hopeful if view.given_up is None else crossings(view.mesh.parts, x)
+    base = _crossed_before(view, first)
+    if contours.count + sum(last.in_bodies) > base.count + sum(first.in_bodies):
+        before, first = smooth, view.detect(smooth)
+        base = _crossed_before(view, first)
     figures: dict[str, object] = {}
     if view.bodies is not None:
         figures["bodies"] = _of_bodies(view.bodies, before, first, x, last)
-    contours = last.hopeful if view.given_up is None else crossings(view.mesh.parts, x)
     if view.keeps_sides:
-        base = first.crossings if view.given_up is None else crossings(view.mesh.parts, before)
         crossed = {
             name: {"crossings": state.count, "between_garments": int(np.triu(view.mesh.between(state), 1).sum())}
             for name, state in (("before", base), ("after", contours))
@@ -47,6 +56,10 @@ def measured(
         near = bool(view.came_near) or any(state["crossings"] for state in crossed.values())
         figures["cloth"] = {"near": near, **crossed}
     return figures, view.mesh.crossed(contours)
+
+
+def _crossed_before(view: LevelContact, state: ContactState) -> Crossings:
+    return state.crossings if view.given_up is None else crossings(view.mesh.parts, state.x)
 
 
 def _of_bodies(

@@ -79,6 +79,12 @@ class Seam:
         out[self._sewn] = torch.where(self._free, first + self._mean.apply(points - first), points)
         return out if self._between is None else self._between.placed(out)
 
+    def least(self, values: Float[Tensor, " vertices"]) -> Float[Tensor, " vertices"]:
+        """Values with the least of those sewn together at each; ends of edges have the least on the edge, too."""
+        value = values if self._between is None else self._between.least(values)
+        label = torch.as_tensor(self.label, device=value.device).long()
+        return torch.full_like(value, torch.inf).scatter_reduce(0, label, value, "amin")[label]
+
     def shared(self, force: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
         """Forces on sewn points, A^T F; zero on points sewn to a fixed vertex."""
         out = force.clone() if self._between is None else self._between.handed_on(force)
@@ -107,6 +113,11 @@ class _Between:
         start = x[self._start]
         x[self._vertex] = torch.where(self._free, start + self._part * (x[self._end] - start), x[self._vertex])
         return x
+
+    def least(self, values: Tensor) -> Tensor:
+        """Values with those of the vertices at the ends of their edges, if less."""
+        ends = torch.cat([self._start, self._end])
+        return values.scatter_reduce(0, ends.long(), values[self._vertex].repeat(2), "amin")
 
     def handed_on(self, force: Tensor) -> Tensor:
         """Forces with the vertices' forces moved to the ends of their edges."""

@@ -21,7 +21,7 @@ from ..forces.guide import GuideMap
 from ..forces.seam import Seam, level_seams
 from ..integrate.base import Integrator, System
 from ..integrate.quasi_newton import QuasiNewton
-from ..level import Level, Placed, build_levels, unhindered
+from ..level import Level, Placed, build_levels, fine_meshes, unhindered
 from ..mesh.subdivide import Refinement
 from ..scene import Garment, GarmentFrame, recentred
 from .from_cage import Followers, MovingFrames
@@ -78,7 +78,6 @@ class Group:
         """
         centred = [recentred(garment) for garment in garments]
         levels = build_levels(centred, refinements, dtype=dtype, device=device, threads=threads)
-        meshes = [chain[-1].mesh if chain else g.mesh for g, chain in zip(garments, refinements, strict=True)]
         return Group(
             tuple(garments),
             gravity,
@@ -86,7 +85,7 @@ class Group:
             levels,
             guide_maps=[GuideMap(level) for level in levels],
             moving_frames=MovingFrames(levels[0], levels[-1]),
-            followers=Followers(levels[-1], garments, meshes),
+            followers=Followers(levels[-1], garments, fine_meshes(garments, refinements)),
             cloth=ClothContact(levels, tuple(garments)),
             seams=level_seams(levels, garments),
         )
@@ -203,9 +202,8 @@ class Group:
             return list(wanted), {}
         x, target = (self.tensor(np.concatenate(points) - origin) for points in (start, wanted))
         moved, _ = contact.finish(contact.at(self.levels[-1]).moved(Placed(x), target))
-        apart = (moved - target).double().cpu().numpy()
-        pairs = zip(wanted, self.levels[-1].spans, strict=True)
-        return [points + apart[span] for points, span in pairs], contact.measure(moved)[0]
+        points = np.concatenate(wanted) + (moved - target).double().cpu().numpy()
+        return [points[span] for span in self.levels[-1].spans], contact.measure(moved)[0]
 
     def systems(self, frames: Sequence[GarmentFrame]) -> tuple[list[System], Float[Tensor, "coarse 3"]]:
         """The problem of one frame without its solve, for charts and benchmarks.

@@ -7,14 +7,14 @@ and comes back, the solution of the broken frame is no start. The frame before i
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from ...errors import named_time
 from ..colliders.pose import Pose
 from ..rigid import AT_REST, Rigid, best_motion
-from ..scene import SAME_TIME, Frame, GarmentFrame
+from ..scene import SAME_TIME, Frame, Garment, GarmentFrame, GarmentResult, Limits
 from .values import FrameState, join
 
 RETURNED = 0.25
@@ -55,12 +55,31 @@ class GarmentHistory:
     Attributes:
         last: The last solved frame.
         before: The start frame of ``last``.
+        result: The last result, which may be no solution.
         solved: Whether the last result is a solution.
     """
 
     last: SolvedFrame | None = None
     before: SolvedFrame | None = None
+    result: GarmentResult = field(default_factory=lambda: GarmentResult(None))
     solved: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class Member:
+    """One garment in a frame, alone or with others that are solved together.
+
+    Attributes:
+        number: Number of the garment in the scene.
+        garment: Its constant data.
+        frame: Its values in the frame.
+        history: Its last frames.
+    """
+
+    number: int
+    garment: Garment
+    frame: GarmentFrame
+    history: GarmentHistory
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,20 +102,22 @@ class Origin:
     jumped: float | None
     gap: bool
 
-    def moved(self, part: tuple[int, ...], frame: Frame, near: Sequence[int], gravity: np.ndarray) -> float:
+    def moved(self, members: Sequence[Member], frame: Frame, near: Sequence[int], gravity: np.ndarray) -> float:
         """Largest motion of nearby bodies since the start frame, relative to the cages [m].
 
         Infinite if more than poses changed. A change of the air counts as far as it moves cloth. Gravity counts as a
         body: the end of its direction at a distance of one metre.
         """
-        starts = [start for start in self.frames if start is not None]
+        part = tuple(member.number for member in members)
         down = gravity / max(float(np.linalg.norm(gravity)), 1e-30)
-        farthest = float(np.linalg.norm(self.motion.turn @ down - down)) if len(starts) == len(part) else np.inf
-        for index, last in zip(part, starts, strict=False):
-            if last.part != part or not set_alike(frame.garments[index], last.frame) or set(near) != set(last.near):
+        farthest = float(np.linalg.norm(self.motion.turn @ down - down))
+        for member, start in zip(members, self.frames, strict=True):
+            if start is None or start.part != part or set(near) != set(start.near):
                 return np.inf
-            farthest = max(farthest, bodies_moved(last, frame.colliders, near, along=self.motion))
-            farthest = max(farthest, air_moved(last.frame, frame.garments[index]))
+            if not set_alike(member.frame, start.frame):
+                return np.inf
+            farthest = max(farthest, bodies_moved(start, frame.colliders, near, along=self.motion))
+            farthest = max(farthest, air_moved(start.frame, member.frame))
         return farthest
 
     @property
@@ -130,30 +151,23 @@ class Origin:
         return entries
 
 
-def origin_of(
-    part: tuple[int, ...],
-    frame: Frame,
-    memories: Sequence[GarmentHistory],
-    *,
-    near: Sequence[int],
-    edge: float,
-    gap: bool,
-) -> Origin:
+def origin_of(members: Sequence[Member], frame: Frame, *, near: Sequence[int], edge: float, gap: bool) -> Origin:
     """Choose the frame to start from.
 
     Args:
-        part: Numbers of the garments.
+        members: The garments.
         near: Numbers of the bodies within reach.
         edge: Mean edge of the cages [m].
         gap: Whether the time between samples is too long.
     """
-    broken = _broken(part, frame, memories, near=near, edge=edge)
-    jumped = jumped_from(part, frame, memories, near=near, edge=edge)
-    frames = tuple(memory.last if broken is None else memory.before for memory in memories)
-    frames = frames if jumped is None else (None,) * len(part)
+    broken = _broken(members, frame, near=near, edge=edge)
+    jumped = jumped_from(members, frame, near=near, edge=edge)
+    frames = tuple(member.history.last if broken is None else member.history.before for member in members)
+    frames = frames if jumped is None else (None,) * len(members)
     starts = [start for start in frames if start is not None]
-    state = None if gap or len(starts) < len(part) else join([start.state for start in starts])
-    motion = _motion(starts, [frame.garments[index] for index in part]) if state is not None else AT_REST
+    state = None if gap or len(starts) < len(members) else join([start.state for start in starts])
+    motion = _motion(starts, [member.frame for member in members]) if state is not None else AT_REST
+    part = tuple(member.number for member in members)
     if state is not None and any(start.part != part for start in starts):
         state = replace(state, clean=False)  # Garments solved apart may cross.
     return Origin(frames, None if state is None else state.carried(motion), motion, broken, jumped, gap)
@@ -167,39 +181,32 @@ def _motion(starts: Sequence[SolvedFrame], garments: Sequence[GarmentFrame]) -> 
     return best_motion(np.concatenate(before), np.concatenate(after))
 
 
-def _broken(
-    part: tuple[int, ...], frame: Frame, memories: Sequence[GarmentHistory], *, near: Sequence[int], edge: float
-) -> float | None:
+def _broken(members: Sequence[Member], frame: Frame, *, near: Sequence[int], edge: float) -> float | None:
     """Time code of the last frame, if only the last frame's input left its place."""
-    pairs = [
-        (memory.last, memory.before) for memory in memories if memory.last is not None and memory.before is not None
-    ]
-    return _elsewhere(part, frame, pairs, near=near, edge=edge) if len(pairs) == len(part) else None
+    moves = [(last, before, garment) for before, last, garment in _moves(members)]
+    return _elsewhere(moves, frame, near=near, edge=edge) if len(moves) == len(members) else None
 
 
-def jumped_from(
-    part: tuple[int, ...], frame: Frame, memories: Sequence[GarmentHistory], *, near: Sequence[int], edge: float
-) -> float | None:
+def jumped_from(members: Sequence[Member], frame: Frame, *, near: Sequence[int], edge: float) -> float | None:
     """Time code of the first frame, if garments' input jumped from the first frame to the second and stays there."""
-    pairs = [
-        (memory.before, memory.last) for memory in memories if memory.last is not None and memory.before is not None
-    ]
-    is_second = len(pairs) == len(part) and all(first.first for first, _ in pairs)
-    return _elsewhere(part, frame, pairs, near=near, edge=edge) if is_second else None
+    moves = _moves(members)
+    is_second = len(moves) == len(members) and all(first.first for first, *_ in moves)
+    return _elsewhere(moves, frame, near=near, edge=edge) if is_second else None
+
+
+def _moves(members: Sequence[Member]) -> list[tuple[SolvedFrame, SolvedFrame, GarmentFrame]]:
+    """The start frame of the last frame, the last frame and this frame of each garment with both."""
+    histories = [(member.history.before, member.history.last, member.frame) for member in members]
+    return [(before, last, frame) for before, last, frame in histories if before is not None and last is not None]
 
 
 def _elsewhere(
-    part: tuple[int, ...],
-    frame: Frame,
-    pairs: Sequence[tuple[SolvedFrame, SolvedFrame]],
-    *,
-    near: Sequence[int],
-    edge: float,
+    moves: Sequence[tuple[SolvedFrame, SolvedFrame, GarmentFrame]], frame: Frame, *, near: Sequence[int], edge: float
 ) -> float | None:
     """Time code of the first of two earlier frames, if the input was in another place in that frame only.
 
     Args:
-        pairs: The two frames of each garment.
+        moves: The two frames of each garment, and its values in this frame.
         near: Numbers of the bodies within reach.
         edge: Mean edge of the cages [m]; a smaller move is no break: the cloth follows the move.
     """
@@ -207,20 +214,22 @@ def _elsewhere(
     def moved(start: SolvedFrame, garment: GarmentFrame, bodies: Sequence[int]) -> float:
         return max(cage_moved(start, garment), bodies_moved(start, frame.colliders, bodies))
 
-    for index, (first, second) in zip(part, pairs, strict=True):
-        garment, bodies = frame.garments[index], sorted({*near, *first.near, *second.near})
+    for first, second, garment in moves:
+        bodies = sorted({*near, *first.near, *second.near})
         away = moved(first, garment, bodies)
         if away > edge and moved(second, garment, bodies) < RETURNED * away:
             return first.time
     return None
 
 
-def is_same(part: tuple[int, ...], frame: Frame, memories: Sequence[GarmentHistory], near: Sequence[int]) -> bool:
+def is_same(members: Sequence[Member], frame: Frame, near: Sequence[int]) -> bool:
     """Whether garments and nearby bodies are unchanged and were solved together."""
-    for index, last in zip(part, (memory.last for memory in memories), strict=True):
+    part = tuple(member.number for member in members)
+    for member in members:
+        garment, last = member.frame, member.history.last
         if last is None or last.part != part or near != last.near or not last.is_reusable:
             return False
-        garment, earlier = frame.garments[index], last.frame
+        earlier = last.frame
         if not (set_alike(garment, earlier) and np.array_equal(garment.points, earlier.points)):
             return False
         if not (
@@ -249,6 +258,8 @@ def air_moved(before: GarmentFrame, after: GarmentFrame) -> float:
 
 def set_alike(a: GarmentFrame, b: GarmentFrame) -> bool:
     """Whether the artist's settings are equal in two frames."""
+    if not Limits.are_equal(a.limits, b.limits):
+        return False
     return (a.fabric, a.guide, a.detail, a.offset) == (b.fabric, b.guide, b.detail, b.offset)
 
 

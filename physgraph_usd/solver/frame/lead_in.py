@@ -93,7 +93,8 @@ def _is_clean(cages: Refiner, frame_at: Callable[[float | None], Frame], time: f
 def _solve(cages: Refiner, frame_at: Callable[[float | None], Frame], time: float) -> list[dict[str, Any]]:
     """Telemetry of each garment with cloth contact; empty for an unsolvable frame."""
     try:
-        state: Any = cages.solve(frame_at(time))
+        result = cages.solve(frame_at(time))
     except (SolveError, StageError):
         return []
-    return [entry for entry in state.telemetry if "cloth" in entry.get("contact", {})]
+    entries = [garment.telemetry for garment in result.garments]
+    return [entry for entry in entries if "cloth" in entry.get("contact", {})]

@@ -107,6 +107,11 @@ class LevelForces:
         raised = [garment.raises_bending for garment in self.garments]
         return ElasticTerms(fabrics, self.plain, (bending_term(self.plain, fabrics, raised=raised),))
 
+    @property
+    def stretch(self) -> Float[Tensor, " vertices"]:
+        """Diagonal of the Hessian of the terms in the plane at rest [N/m]."""
+        return self._in_plane.stiffness
+
     @cached_property
     def guide(self) -> Guide:
         """The guide, without a target."""
@@ -192,14 +197,13 @@ class LevelForces:
         """Load of the air, minus the acceleration that cloth feels times its density, at each cage vertex [N/m^2]."""
         if all(frame.acceleration is None and frame.load is None for frame in frames):
             return None
+        loads = [np.zeros_like(frame.points) if frame.load is None else frame.load for frame in frames]
+        accelerations = [
+            np.zeros_like(frame.points) if frame.acceleration is None else frame.acceleration for frame in frames
+        ]
         density = self._coarse_density
-
-        def stacked(fields: Sequence[np.ndarray | None]) -> Float[Tensor, "coarse 3"]:
-            pairs = zip(fields, frames, strict=True)
-            values = [np.zeros_like(frame.points) if field is None else field for field, frame in pairs]
-            return torch.as_tensor(np.concatenate(values)).to(density)
-
-        return stacked([frame.load for frame in frames]) - density * stacked([frame.acceleration for frame in frames])
+        load, acceleration = (torch.as_tensor(np.concatenate(fields)).to(density) for fields in (loads, accelerations))
+        return load - density * acceleration
 
     @cached_property
     def _coarse_density(self) -> Float[Tensor, "coarse 3"]:

@@ -53,6 +53,18 @@ def scaled(problem: Problem, x: Placed) -> Placed:
     return x if result is x else unhindered(result) if view is None else view.moved(x, result)
 
 
+def limited(problem: Problem, x: Placed) -> Placed:
+    """The cloth within its limits [m], where possible without new crossings; `patched` is to follow."""
+    limit, view = problem.limit(problem.finest), problem.view(problem.finest)
+    wanted = x if limit is None else limit.scaled(limit.in_front(x))
+    if limit is None or wanted is x or view is None:
+        return x if wanted is x else unhindered(wanted)
+    if view.look(wanted := view.closed(wanted)).is_clean:
+        return unhindered(wanted)
+    x = view.moved(x, wanted)
+    return x if (held := limit.held(x)) is x else unhindered(view.closed(held))
+
+
 def patched(problem: Problem, x: Placed) -> tuple[Placed, Tensor, dict[str, int]]:
     """The cloth with no patch worse than the subdivided cage, and more, as returned by `no_worse`."""
     view, level = problem.view(problem.finest), problem.forces[-1].level
@@ -87,18 +99,21 @@ def next_state(problem: Problem, x: Placed, memory: Any, following: Tensor) -> F
     )
 
 
-def telemetry_of(problem: Problem, x: Tensor, module: ForceModule, *, reports: Sequence[LevelReport]) -> dict[str, Any]:
+def telemetry_of(
+    problem: Problem, x: Tensor, module: ForceModule, *, solved: Tensor, reports: Sequence[LevelReport]
+) -> dict[str, Any]:
     """Telemetry of a frame's solve and result, as plain values.
 
     Args:
         x: The result [m].
+        solved: The result before it was moved into its limits, for the energies [m].
         module: The terms at the finest level.
     """
     finest = problem.forces[-1].level
     base = finest.base.apply(problem.cage.points)
     return {
         "levels": [asdict(report) for report in reports],
-        "energy_joules": {"input": module.energies(base), "output": module.energies(x)},
+        "energy_joules": {"input": module.energies(base), "output": module.energies(solved)},
         "sharp_folds": sharp_folds(finest, x),
         "strain": edge_strain(finest, x),
         "remaining_mm": round(1e3 * problem.group.spacings[-1] * reports[-1].remaining_move, 4) if reports else 0.0,

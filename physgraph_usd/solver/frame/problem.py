@@ -17,6 +17,7 @@ from ..contact.cloth import LevelContact
 from ..contact.frame import FrameContact
 from ..contact.metric import HeldMetric
 from ..forces.base import ForceModule
+from ..forces.limit import Limit
 from ..forces.seam import SewnForces
 from ..forces.self_contact import SelfContact
 from ..integrate.base import Integrator, System, Transporting
@@ -25,6 +26,7 @@ from ..integrate.stop import Budget
 from ..level import Level, Placed
 from .group import Group
 from .level_forces import LevelForces
+from .limits import limit_of
 from .start import Start, start_of
 from .values import Cage, Curvature, FrameInput, FrameState
 
@@ -43,6 +45,7 @@ class LevelProblem:
         outward: As in `leave_saddle`.
         show: Called with the positions after each round [m]; or None.
         curvature: The last frame's integrator memory, transported to this frame; or None.
+        limit: Limits of the distance to the subdivided cage; None without.
     """
 
     lasting: LevelForces
@@ -55,11 +58,16 @@ class LevelProblem:
     outward: Float[Tensor, " garments"]
     show: Callable[[Placed], None] | None = None
     curvature: Any = None
+    limit: Limit | None = None
 
     @property
     def level(self) -> Level:
         """The level itself."""
         return self.lasting.level
+
+    def held(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:
+        """Positions moved out to the backstop [m], x itself if none is behind."""
+        return x if self.limit is None else self.limit.in_front(x)
 
     def system(
         self,
@@ -153,8 +161,9 @@ class Problem:
     @cached_property
     def carried(self) -> Float[Tensor, "vertices 3"]:
         """The finest vertices with the last frame's detail, moved from their last positions as far as allowed [m]."""
-        view, warm = self.view(self.finest), self.start.detailed
+        view, warm, limit = self.view(self.finest), self.start.detailed, self.limit(self.finest)
         assert warm is not None
+        warm = warm if limit is None else limit.in_front(warm)
         if view is None or self.before is None:
             return warm
         return view.carried(self.before, warm, self.inside)
@@ -175,6 +184,18 @@ class Problem:
         """Contact of a level's cloth."""
         return None if self.contact is None else self.contact.at(self.forces[index].level)
 
+    def limit(self, index: int) -> Limit | None:
+        """Limits of a level's cloth; None without."""
+        if index not in self._limits:
+            arguments = self.forces[index], self.frame.garments, self.cage.points
+            self._limits[index] = limit_of(*arguments, outward=self.group.outward, view=self.view(index))
+        return self._limits[index]
+
+    @cached_property
+    def _limits(self) -> dict[int, Limit | None]:
+        """Results of `limit`."""
+        return {}
+
     @property
     def levels(self) -> range:
         """Numbers of the levels to solve: all in a cold frame if nested or with crossings to untangle."""
@@ -188,8 +209,9 @@ class Problem:
             index: Number of the level.
             start_time: Time at which the frame was ready to be solved [s].
         """
-        lasting, settings = self.forces[index], self.group.settings
+        lasting, settings, limit = self.forces[index], self.group.settings, self.limit(index)
         module = lasting.module(self.aim, self.frame.garments)
+        module = module if limit is None else module.joined_by([limit])
         tie = None if self.tether is None or self.start.detailed is None else (self.tether, self.start.detailed)
         without_contact = lasting.system(module, tie, rough=settings.rough)
         budget = settings.budget(self.finest - index, start_time, warm=self.warm)
@@ -204,6 +226,7 @@ class Problem:
             budget,
             self.group.outward,
             curvature=self._curvature if index == self.finest else None,
+            limit=limit,
         )
 
     @property

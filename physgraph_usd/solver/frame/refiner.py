@@ -14,9 +14,9 @@ import torch
 from ..contact.bodies import Touching
 from ..deadline import clock_of, ends_after
 from ..mesh.subdivide import Refinement
-from ..scene import Frame, Scene, State, refuse_far
+from ..scene import Frame, Result, Scene, refuse_far
 from .group import Group
-from .history import GarmentHistory
+from .history import GarmentHistory, Member
 from .scene_frame import SceneCloth, SceneFrame
 from .settings import SolveSettings
 
@@ -51,7 +51,7 @@ class Refiner:
             dtype: Scalar type of the solve.
             device: "cpu" or a CUDA device.
             threads: Most threads per kernel on the CPU; the result does not depend on the number.
-            heat_map: Whether states hold a heat map.
+            heat_map: Whether results hold a heat map.
 
         Raises:
             GarmentError: A rest shape is invalid.
@@ -106,11 +106,9 @@ class Refiner:
 
     def continue_from(self, refiner: Refiner) -> None:
         """Start the next frame from the last frame of a refiner of the same meshes; its result is not reused."""
-        lasts = [
-            None if memory.last is None else replace(memory.last, is_reusable=False) for memory in refiner._memories
-        ]
         self._memories = tuple(
-            replace(memory, last=last) for memory, last in zip(refiner._memories, lasts, strict=True)
+            memory if memory.last is None else replace(memory, last=replace(memory.last, is_reusable=False))
+            for memory in refiner._memories
         )
         self._time = refiner._time
 
@@ -121,11 +119,16 @@ class Refiner:
     def touching(self, part: tuple[int, ...], frame: Frame) -> tuple[Touching, ...]:
         """The surfaces within reach of garments solved together in a frame."""
         self._cloth.bodies.pose(frame.colliders)
-        frames = [frame.garments[index] for index in part]
-        return self._cloth.touching(part, frames, self._cloth.near(part, frames, self._settings))
+        every = self._members(frame)
+        members = [every[index] for index in part]
+        return self._cloth.touching(members, self._cloth.near(members, self._settings))
 
-    def refine(self, frames: Iterable[Frame]) -> Iterator[State]:
-        """Solve frames in order, one state per frame.
+    def _members(self, frame: Frame) -> list[Member]:
+        """Each garment with its values in a frame and its history, in the scene's order."""
+        return list(map(Member, range(len(frame.garments)), self.scene.garments, frame.garments, self._memories))
+
+    def refine(self, frames: Iterable[Frame]) -> Iterator[Result]:
+        """Solve frames in order, one result per frame.
 
         Raises:
             SolveError: A term of the potential is not finite.
@@ -133,7 +136,7 @@ class Refiner:
         for frame in frames:
             yield self.solve(frame)
 
-    def solve(self, frame: Frame, wanted: Sequence[bool] | None = None) -> State:
+    def solve(self, frame: Frame, wanted: Sequence[bool] | None = None) -> Result:
         """Solve one frame, starting from the last solved frame if useful.
 
         Unsolvable garments follow their cages, if at least one garment was solved.
@@ -147,10 +150,10 @@ class Refiner:
         """
         began = self._clock()
         with ends_after(self._limit, self._clock):
-            state = self._solve(frame, wanted)
-        if not any("time_limit" in entry for entry in state.telemetry):
+            result = self._solve(frame, wanted)
+        if not any("time_limit" in garment.telemetry for garment in result.garments):
             self._seconds.append(self._clock() - began)
-        return state
+        return result
 
     @property
     def _limit(self) -> float:
@@ -160,23 +163,20 @@ class Refiner:
         count = sum(chain[-1].mesh.vertex_count for chain in self.refinements if chain)
         return max(LEAST_LIMIT + LIMIT_PER_VERTEX * count, LIMIT * median(self._seconds or [0.0]))
 
-    def _solve(self, frame: Frame, wanted: Sequence[bool] | None) -> State:
+    def _solve(self, frame: Frame, wanted: Sequence[bool] | None) -> Result:
         refuse_far(self.scene, frame)
         gap = self._is_gap(frame.time)
         if self._settings.temporal == "off" or not any(memory.last for memory in self._memories):
             self._cloth.bodies.forget()  # Without history the result depends on this frame only, to the bit.
         self._cloth.bodies.pose(frame.colliders)
-        count = len(frame.garments)
-        requested = [True] * count if wanted is None else list(wanted)
-        scene_frame = SceneFrame(self._cloth, self._settings, frame, self._memories, gap, self._prerolled, self._limit)
-        answers, reused = scene_frame.solve(requested)
-        self._memories = tuple(answers[k].memory if k in answers else memory for k, memory in enumerate(self._memories))
+        members = self._members(frame)
+        scene_frame = SceneFrame(self._cloth, self._settings, frame, members, gap, self._prerolled, self._limit)
+        self._memories = tuple(scene_frame.solve([True] * len(members) if wanted is None else wanted))
         self._time, self._prerolled = frame.time, None
-        points = [answers[index].points if index in answers and requested[index] else None for index in range(count)]
-        absent: dict[str, object] = {"start": "left out: the garment has no sample here"}
-        telemetry = [absent if points[index] is None else answers[index].telemetry for index in range(count)]
-        heat = [self.heat(index, positions) for index, positions in enumerate(points)] if self._heat_map else []
-        return State(frame.time, tuple(points), tuple(telemetry), tuple(reused), tuple(heat))
+        results = [memory.result for memory in self._memories]
+        if self._heat_map:
+            results = [replace(result, heat=self.heat(index, result.points)) for index, result in enumerate(results)]
+        return Result(frame.time, tuple(results))
 
     def energy(self, frame: Frame, points: Sequence[np.ndarray]) -> float:
         """Energy [J] of all garments at given world positions [m], with contact detected again."""
@@ -214,11 +214,11 @@ class Refiner:
                     results[index] = positions, contact
         return results
 
-    def heat(self, index: int, points: np.ndarray | None) -> dict[str, np.ndarray] | None:
-        """A garment's depth in bodies and its crossings in the last frame; None without positions [m]."""
+    def heat(self, index: int, points: np.ndarray | None) -> dict[str, np.ndarray]:
+        """A garment's depth in bodies and its crossings in the last frame; {} without positions [m]."""
         memory = self._memories[index]
         crossing = memory.last.crossing if memory.solved and memory.last is not None else None
-        return None if points is None else self._cloth.heat(index, points, crossing, self._settings)
+        return {} if points is None else self._cloth.heat(index, points, crossing, self._settings)
 
     def _is_gap(self, time: float | None) -> bool:
         """Whether the time since the last frame is too long to start from it."""

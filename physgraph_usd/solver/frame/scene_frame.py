@@ -18,10 +18,10 @@ from ..deadline import is_over
 from ..inertia import GRAVITY
 from ..level import refine_garments
 from ..rigid import AT_REST
-from ..scene import Frame, GarmentFrame, Scene, out_of_bounds
+from ..scene import Frame, GarmentResult, Scene, out_of_bounds
 from ..strain import has_collapsed, size_left, strayed
 from .group import Group
-from .history import GarmentHistory, Origin, SolvedFrame, is_same, jumped_from, origin_of
+from .history import GarmentHistory, Member, Origin, SolvedFrame, is_same, jumped_from, origin_of
 from .settings import SolveSettings
 from .solve import RunawayError, solve_soundly
 from .values import FrameInput, split
@@ -75,42 +75,30 @@ class SceneCloth:
         """A cage's positions [m] on its subdivided mesh, linearly."""
         return reduce(lambda x, step: np.asarray(step.linear @ x), self.refinements[index], points)
 
-    def near(self, part: Sequence[int], frames: Sequence[GarmentFrame], settings: SolveSettings) -> tuple[int, ...]:
+    def near(self, members: Sequence[Member], settings: SolveSettings) -> tuple[int, ...]:
         """Numbers of the bodies within reach of garments."""
         near: set[int] = set()
-        for index, frame in zip(part, frames, strict=True):
-            garment = self.scene.garments[index]
-            if garment.colliders and settings.contact.sees_bodies:
-                near |= set(self.bodies.near(garment, bounds_of(frame.points), reach_of(garment, frame)))
+        for member in members:
+            if member.garment.colliders and settings.contact.sees_bodies:
+                reach = reach_of(member.garment, member.frame)
+                near |= set(self.bodies.near(member.garment, bounds_of(member.frame.points), reach))
         return tuple(sorted(near))
 
-    def reached(
-        self,
-        part: Sequence[int],
-        frames: Sequence[GarmentFrame],
-        points: Sequence[np.ndarray],
-        settings: SolveSettings,
-    ) -> set[int]:
+    def reached(self, members: Sequence[Member], points: Sequence[np.ndarray], settings: SolveSettings) -> set[int]:
         """Numbers of the bodies whose bounds meet the solved cloth, given the cloth's positions [m]."""
         reached: set[int] = set()
-        for index, frame, solved in zip(part, frames, points, strict=True):
-            garment = self.scene.garments[index]
-            if garment.colliders and settings.contact.form != "off":
-                reached |= set(self.bodies.near(garment, bounds_of(solved), frame.offset))
+        for member, solved in zip(members, points, strict=True):
+            if member.garment.colliders and settings.contact.form != "off":
+                reached |= set(self.bodies.near(member.garment, bounds_of(solved), member.frame.offset))
         return reached
 
     def touching(
-        self,
-        part: Sequence[int],
-        frames: Sequence[GarmentFrame],
-        near: Sequence[int],
-        *,
-        origin: Origin | None = None,
+        self, members: Sequence[Member], near: Sequence[int], *, origin: Origin | None = None
     ) -> tuple[Touching, ...]:
         """Surfaces of bodies, and the distance kept from each by each garment; with their places in the start frame."""
-        colliders = [self.scene.garments[index].colliders for index in part]
-        pairs = zip(colliders, frames, strict=True)
-        offsets = [[frame.offset if body in bodies else None for body in near] for bodies, frame in pairs]
+        offsets = [
+            [member.frame.offset if body in member.garment.colliders else None for body in near] for member in members
+        ]
         before = () if origin is None else origin.colliders
         motion = AT_REST if origin is None else origin.motion
         return self.bodies.touching(near, offsets, before=before, motion=motion)
@@ -133,10 +121,10 @@ class SceneCloth:
         return {"penetration": depth, "crossing": crosses.astype(np.float32)}
 
 
-def _loads(frames: Sequence[GarmentFrame]) -> dict[str, object]:
+def _loads(members: Sequence[Member]) -> dict[str, object]:
     """Telemetry: the largest acceleration that is felt, relative to gravity, and load of the air; empty without any."""
-    accelerations = [frame.acceleration / GRAVITY for frame in frames if frame.acceleration is not None]
-    air = [frame.load for frame in frames if frame.load is not None]
+    accelerations = [m.frame.acceleration / GRAVITY for m in members if m.frame.acceleration is not None]
+    air = [member.frame.load for member in members if member.frame.load is not None]
     largest = {
         name: max(float(np.linalg.norm(field, axis=1).max(initial=0.0)) for field in fields)
         for name, fields in (("inertia", accelerations), ("air", air))
@@ -146,27 +134,12 @@ def _loads(frames: Sequence[GarmentFrame]) -> dict[str, object]:
 
 
 @dataclass(frozen=True, eq=False)
-class Answer:
-    """One garment's frame.
-
-    Attributes:
-        points: Fine positions [m], world space.
-        telemetry: Entries for the report.
-        memory: GarmentHistory for the next frame.
-    """
-
-    points: np.ndarray
-    telemetry: dict[str, object]
-    memory: GarmentHistory
-
-
-@dataclass(frozen=True, eq=False)
 class SceneFrame:
     """One frame of a scene, to be solved part by part.
 
     Attributes:
         cloth: Levels, groups and bodies of the scene; the bodies are posed.
-        memories: GarmentHistory of each garment's last frames.
+        members: The garments in this frame, in the scene's order.
         gap: Whether the time since the last frame is too long for a warm start.
         prerolled: World positions of each cage [m] advanced here by another refiner, and the start time code; or None.
         limit: Time limit of the frame [s], for the report.
@@ -175,125 +148,137 @@ class SceneFrame:
     cloth: SceneCloth
     settings: SolveSettings
     frame: Frame
-    memories: Sequence[GarmentHistory]
+    members: Sequence[Member]
     gap: bool
     prerolled: tuple[Sequence[np.ndarray | None], float] | None
     limit: float
 
-    def solve(self, requested: Sequence[bool]) -> tuple[dict[int, Answer], list[bool]]:
-        """Answers by garment, of the requested parts; and for all garments whether the answers equal the last frame's.
+    def solve(self, requested: Sequence[bool]) -> list[GarmentHistory]:
+        """The history of each garment, with its result; parts without a requested garment are not solved.
 
         Raises:
             SolveError: No garment could be solved.
         """
-        answers, reused = dict[int, Answer](), [False] * len(requested)
-        unsolved = dict[tuple[int, ...], SolveError]()
+        solved, skipped = dict[int, GarmentHistory](), dict[int, GarmentHistory]()
+        unsolved = list[tuple[list[Member], SolveError]]()
         for part in self.cloth.parts_of(self.frame, self.settings):
-            near = self.cloth.near(part, [self.frame.garments[index] for index in part], self.settings)
-            memories = [self.memories[index] for index in part]
-            same = is_same(part, self.frame, memories, near) and not self._jumped(part, near)
-            for index in part:
-                reused[index] = same and self.memories[index].solved
-            if not any(requested[index] for index in part):
+            members = [self.members[number] for number in part]
+            near = self.cloth.near(members, self.settings)
+            same = is_same(members, self.frame, near) and not self._jumped(members, near)
+            if not any(requested[number] for number in part):
+                skipped |= {m.number: _left_out(m.history, reused=same and m.history.solved) for m in members}
                 continue
             try:
-                with At(prims=tuple(self.cloth.scene.garments[index].path for index in part)):
-                    answers |= zip(part, self._answer(part, near, same=same), strict=True)
+                with At(prims=tuple(member.garment.path for member in members)):
+                    solved |= self._solve_part(members, near, same=same)
             except SolveError as error:
-                unsolved[part] = error
-        if unsolved and not answers:
-            raise next(iter(unsolved.values()))
-        for part, error in unsolved.items():
-            answers |= zip(part, self._on_cages(part, error), strict=True)
-        return answers, reused
+                unsolved.append((members, error))
+        if unsolved and not solved:
+            raise unsolved[0][1]
+        for members, error in unsolved:
+            solved |= self._on_cages(members, error)
+        for number, history in solved.items():
+            if not requested[number]:
+                solved[number] = _left_out(history, reused=history.result.reused)
+        return [history for _, history in sorted((solved | skipped).items())]
 
-    def _answer(self, part: tuple[int, ...], near: tuple[int, ...], *, same: bool) -> list[Answer]:
-        """Garments upsampled, reused, or solved."""
-        first, points = self.cloth.scene.garments[part[0]], self.frame.garments[part[0]].points
-        if has_collapsed(first, points):  # Solved alone; the next frame starts from the last solved frame.
-            entry = {"start": "not solved: the cage has collapsed", "collapsed": size_left(first, points)}
-            return [Answer(self.cloth.upsampled(part[0], points), entry, replace(self.memories[part[0]], solved=False))]
+    def _solve_part(self, members: Sequence[Member], near: tuple[int, ...], *, same: bool) -> dict[int, GarmentHistory]:
+        """Histories by number of garments upsampled, reused, or solved together."""
+        first = members[0]
+        if has_collapsed(first.garment, first.frame.points):  # The next frame starts from the last solved frame.
+            entry = {
+                "start": "not solved: the cage has collapsed",
+                "collapsed": size_left(first.garment, first.frame.points),
+            }
+            points = self.cloth.upsampled(first.number, first.frame.points)
+            return {first.number: replace(first.history, result=GarmentResult(points, entry), solved=False)}
         if not same:
-            return self._solve_part(part, near)
-        memories = [self.memories[index] for index in part]
+            return self._solve_together(members, near)
         entry: dict[str, object] = {"start": "reused: the input equals the last frame's"}
-        return [
-            Answer(memory.last.points, entry, replace(memory, solved=True))
-            for memory in memories
-            if memory.last is not None
-        ]
+        histories = dict[int, GarmentHistory]()
+        for number, history in ((member.number, member.history) for member in members):
+            if history.last is not None:
+                result = GarmentResult(history.last.points, entry, history.solved)
+                histories[number] = replace(history, result=result, solved=True)
+        return histories
 
-    def _on_cages(self, part: tuple[int, ...], error: SolveError) -> list[Answer]:
+    def _on_cages(self, members: Sequence[Member], error: SolveError) -> dict[int, GarmentHistory]:
         """Unsolvable garments, on their cages' smooth surface; the next frame starts from an earlier frame."""
         entry: dict[str, object] = {"start": "not solved: it follows its cage", "not_solved": str(error)}
-        points = self.cloth.group(part, self.settings).upsampled([self.frame.garments[index] for index in part])
-        memories = [replace(self.memories[index], solved=False) for index in part]
-        return [Answer(x, entry, memory) for x, memory in zip(points, memories, strict=True)]
+        points = self._group(members).upsampled([member.frame for member in members])
+        return {
+            member.number: replace(member.history, result=GarmentResult(positions, entry), solved=False)
+            for member, positions in zip(members, points, strict=True)
+        }
 
-    def _solve_part(self, part: tuple[int, ...], near: tuple[int, ...]) -> list[Answer]:
+    def _solve_together(self, members: Sequence[Member], near: tuple[int, ...]) -> dict[int, GarmentHistory]:
         """Solve garments together; bodies reached only by the solved cloth are added, and the solve is repeated."""
-        frames, memories = [self.frame.garments[index] for index in part], [self.memories[index] for index in part]
-        group = self.cloth.group(part, self.settings)
-        origin = origin_of(part, self.frame, memories, near=near, edge=group.spacings[0], gap=self.gap)
-        cage = None if origin.state is not None else self._prerolled_cage(part)
+        group, frames = self._group(members), [member.frame for member in members]
+        origin = origin_of(members, self.frame, near=near, edge=group.spacings[0], gap=self.gap)
+        cage = None if origin.state is not None else self._prerolled_cage(members)
         elapsed = origin.elapsed(self.frame.time, self.cloth.scene.seconds)
         at = None if self.frame.time is None else float(self.frame.time)
         while True:
-            touching = self.cloth.touching(part, frames, near, origin=origin)
-            moved = origin.moved(part, self.frame, near, self.cloth.scene.gravity)
+            touching = self.cloth.touching(members, near, origin=origin)
+            moved = origin.moved(members, self.frame, near, self.cloth.scene.gravity)
             prerolled = None if cage is None else cage[0]
             frame_input = FrameInput(frames, at, touching, moved, prerolled=prerolled, elapsed=elapsed)
             try:
                 solved = solve_soundly(group, frame_input, origin.state)
             except RunawayError as error:
-                return self._on_cages(part, error)
-            reached = self.cloth.reached(part, frames, solved.points, self.settings)
+                return self._on_cages(members, error)
+            reached = self.cloth.reached(members, solved.points, self.settings)
             if reached <= set(near):
                 break
             near = tuple(sorted({*near, *reached}))
-        self._refuse_strayed(part, solved.points)
-        entry = solved.telemetry | self._surroundings(part, near)
         start = origin.telemetry(None if cage is None else cage[1])
-        entry |= start | ({"start": solved.telemetry["start"]} if solved.telemetry["start"] != "cold" else {})
-        cut = is_over()
-        entry |= {"time_limit": float(f"{self.limit:.3g}")} if cut else {}
-        entry |= _loads(frames)
+        entry = solved.telemetry | self._surroundings(members, near) | start
+        entry |= {"start": solved.telemetry["start"]} if solved.telemetry["start"] != "cold" else {}
+        entry |= ({"time_limit": float(f"{self.limit:.3g}")} if is_over() else {}) | _loads(members)
         states = split(solved.state, group.levels[0].spans, group.levels[-1].spans)
-        answers = list[Answer]()
-        for number, (index, memory) in enumerate(zip(part, memories, strict=True)):
-            at = self.frame.time, self.frame.garments[index], self.frame.colliders, near, part
-            points, crossing = solved.points[number], solved.crossing[number]
-            first, is_reusable = memory.last is None, self.settings.is_reusable and not cut
-            solved_frame = SolvedFrame(*at, points, states[number], crossing, first, is_reusable)
-            before = memory.last if origin.broken is None else origin.frames[number]
-            answers.append(Answer(points, entry, GarmentHistory(solved_frame, before)))
-        return answers
+        frame, part = self.frame, tuple(member.number for member in members)
+        is_reusable = self.settings.is_reusable and "time_limit" not in entry
+        histories = dict[int, GarmentHistory]()
+        for number, member in enumerate(members):
+            points, last = solved.points[number], member.history.last
+            self._refuse_strayed(member, points)
+            at, state, crossing = (frame.time, member.frame, frame.colliders), states[number], solved.crossing[number]
+            solved_frame = SolvedFrame(*at, near, part, points, state, crossing, last is None, is_reusable)
+            before = last if origin.broken is None else origin.frames[number]
+            histories[member.number] = GarmentHistory(solved_frame, before, GarmentResult(points, entry))
+        return histories
 
-    def _jumped(self, part: tuple[int, ...], near: tuple[int, ...]) -> bool:
+    def _group(self, members: Sequence[Member]) -> Group:
+        """The group of garments solved together."""
+        return self.cloth.group(tuple(member.number for member in members), self.settings)
+
+    def _jumped(self, members: Sequence[Member], near: tuple[int, ...]) -> bool:
         """Whether the last frame, a candidate for reuse, started from a first frame at a different place."""
-        memories, edge = [self.memories[index] for index in part], self.cloth.group(part, self.settings).spacings[0]
-        return jumped_from(part, self.frame, memories, near=near, edge=edge) is not None
+        return jumped_from(members, self.frame, near=near, edge=self._group(members).spacings[0]) is not None
 
-    def _surroundings(self, part: tuple[int, ...], near: Sequence[int]) -> dict[str, object]:
+    def _surroundings(self, members: Sequence[Member], near: Sequence[int]) -> dict[str, object]:
         """Telemetry: paths of the bodies near garments, and of garments solved together."""
         entries: dict[str, object] = {}
-        if any(self.cloth.scene.garments[index].colliders for index in part):
+        if any(member.garment.colliders for member in members):
             entries["near"] = [self.cloth.scene.colliders[body].path for body in near]
-        if len(part) > 1:
-            entries["together"] = [self.cloth.scene.garments[index].path for index in part]
+        if len(members) > 1:
+            entries["together"] = [member.garment.path for member in members]
         return entries
 
-    def _prerolled_cage(self, part: tuple[int, ...]) -> tuple[np.ndarray, float] | None:
+    def _prerolled_cage(self, members: Sequence[Member]) -> tuple[np.ndarray, float] | None:
         """World positions of cages advanced to this frame by another refiner [m], and the start time code."""
         if self.prerolled is None:
             return None
-        cages = [cage for cage in (self.prerolled[0][index] for index in part) if cage is not None]
-        return (np.concatenate(cages), self.prerolled[1]) if len(cages) == len(part) else None
+        cages = [cage for cage in (self.prerolled[0][member.number] for member in members) if cage is not None]
+        return (np.concatenate(cages), self.prerolled[1]) if len(cages) == len(members) else None
 
-    def _refuse_strayed(self, part: tuple[int, ...], points: Sequence[np.ndarray]) -> None:
-        for index, fine in zip(part, points, strict=True):
-            last = self.memories[index].last
-            before = None if last is None else last.frame.points
-            if wrong := strayed(self.frame.garments[index].points, fine, before=before):
-                when = "" if self.frame.time is None else f" at time code {named_time(self.frame.time)}"
-                raise SolveError(f"<{self.cloth.scene.garments[index].path}>{when}: {wrong}")
+    def _refuse_strayed(self, member: Member, points: np.ndarray) -> None:
+        before = None if member.history.last is None else member.history.last.frame.points
+        if wrong := strayed(member.frame.points, points, before=before):
+            when = "" if self.frame.time is None else f" at time code {named_time(self.frame.time)}"
+            raise SolveError(f"<{member.garment.path}>{when}: {wrong}")
+
+
+def _left_out(history: GarmentHistory, *, reused: bool) -> GarmentHistory:
+    """The history of a garment whose result was not requested."""
+    return replace(history, result=GarmentResult(None, {"start": "left out: the garment has no sample here"}, reused))

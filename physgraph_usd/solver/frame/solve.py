@@ -32,7 +32,7 @@ from ..level import Placed, unhindered
 from ..scene import GIVEN_UP
 from .group import Group
 from .level_forces import blame
-from .outcome import measured, next_state, patched, refuse_swallowed, scaled, telemetry_of
+from .outcome import limited, measured, next_state, patched, refuse_swallowed, scaled, telemetry_of
 from .problem import LevelProblem, Problem, begin
 from .values import FrameInput, FrameState, Solved
 
@@ -77,11 +77,12 @@ def solve_frame(group: Group, frame: FrameInput, last: FrameState | None, *, few
     if problem.contact is not None:
         visible, finish = problem.contact.finish(x)
         x = visible if problem.contact.is_out(visible) else x  # What is pushed out in vain is not carried on.
-    solution = scaled(problem, visible)
+    unlimited = scaled(problem, visible)
+    solution = limited(problem, unlimited)
     visible, following, figures = patched(problem, solution)
     state = next_state(problem, x, memory, following)
     solved = time.perf_counter()
-    telemetry = telemetry_of(problem, solution, module, reports=[*reports, *level_reports])
+    telemetry = telemetry_of(problem, solution, module, solved=unlimited, reports=[*reports, *level_reports])
     telemetry |= {"start": GIVEN_UP} if problem.hopeless else {}
     contact, crossing = measured(problem, visible)
     telemetry |= {"contact": contact | finish} if contact else {}
@@ -141,7 +142,7 @@ def solve_one_level(
         return _solve_without_contact(problem, x, smoothing)
     x, reports = _untangle(problem, view, Placed(view.closed(x)), view.moved, most=WARM_UNTANGLINGS)
     if smoothing is not None:
-        x = view.moved(x, x + smoothing) if level.index else x
+        x = view.moved(x, problem.held(x + smoothing)) if level.index else x
         terms = view.terms(x)
         x = view.moved(x, leave_saddle(problem.system(view, terms, x), level, x, outward=problem.outward))
     carry, last, terms, steps, blocked, touched, integrator = None, None, (), 0, False, False, problem.integrator
@@ -160,7 +161,7 @@ def solve_one_level(
         report.remaining_move = _smooth_move(system, carry, report)
         reports.append(report)
         steps += report.steps
-        wanted = carry.x
+        wanted = problem.held(carry.x)
         previous, x, last = x, view.moved(x, wanted), system
         blocked = x is not wanted
         if problem.show is not None:
@@ -172,7 +173,7 @@ def solve_one_level(
             break
         if carry.setbacks >= PATIENCE:
             integrator, carry = problem.untangler, None
-        elif blocked:  # The guard's corrections do not apply to the blocked positions.
+        elif x is not carry.x:  # The guard's corrections do not apply to other positions.
             carry = None if carry.setbacks else replace(carry, x=x)
     return x, reports, problem.module.joined_by(terms), memory
 
@@ -193,9 +194,9 @@ def _solve_without_contact(
 ) -> tuple[Placed, list[LevelReport], ForceModule, Any]:
     """Solve a level without contact detection; arguments and results of `solve_one_level`."""
     system, level, resume = problem.without_contact, problem.level, _resumed(problem, x)
-    x = x if smoothing is None else leave_saddle(system, level, x + smoothing, outward=problem.outward)
+    x = x if smoothing is None else leave_saddle(system, level, problem.held(x + smoothing), outward=problem.outward)
     carry, report = descend(system, problem.integrator, x, level=level.index, budget=problem.budget, resume=resume)
-    placed = unhindered(carry.x)
+    placed = unhindered(problem.held(carry.x))
     if problem.show is not None:
         problem.show(placed)
     return placed, [report], problem.module, _curvature(problem.integrator, carry)

@@ -177,11 +177,29 @@ def _on_whole_stage(layer: Sdf.Layer, shot: StageView) -> list[Problem]:
     shot_stage, composed = shot.open(), shot.open(over=[layer])
     with quiet():
         problems = [*_named("other_meshes", other_meshes(layer, composed, shot_stage, refined=_refined(layer)))]
-    return problems + _own_validators(layer, shot_stage, composed)
+    opened = _opened_instances(layer)
+    return problems + _own_validators(layer, shot.open(over=[opened]), composed)
+
+
+def _opened_instances(layer: Sdf.Layer) -> Sdf.Layer:
+    """A layer that opens the instances that a refined layer opens: USD's validators pass over what is inside of one."""
+    opened, paths = Sdf.Layer.CreateAnonymous(".usda"), list[Sdf.Path | str]()
+    layer.Traverse(Sdf.Path.absoluteRootPath, paths.append)
+    specs = (layer.GetPrimAtPath(path) for path in paths if Sdf.Path(path).IsPrimPath())
+    for spec in specs:
+        if spec is not None and spec.HasInfo("instanceable") and not spec.instanceable:
+            Sdf.CreatePrimInLayer(opened, spec.path).instanceable = False
+    return opened
 
 
 def _own_validators(layer: Sdf.Layer, shot: Usd.Stage, composed: Usd.Stage) -> list[Problem]:
-    """Problems found by USD's validators, as far as available, in the layer over its shot but not in the shot."""
+    """Problems found by USD's validators, as far as available, in the layer over its shot but not in the shot.
+
+    Args:
+        layer: The refined layer.
+        shot: The shot, with the instances opened that the layer opens.
+        composed: The layer over its shot.
+    """
     module = _usd_validation()
     if module is None:
         return []

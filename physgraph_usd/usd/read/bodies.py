@@ -197,11 +197,16 @@ class ColliderReader:
     def _mesh(
         self, matrix: np.ndarray, time: float | None, skinned: np.ndarray | None
     ) -> tuple[Pose | None, tuple[Notice, ...]]:
-        points = _array(UsdGeom.PointBased(self.prim).GetPointsAttr(), time)
+        points = positions(self.prim, time)
         read = _surface_of_tets(self, time) if UsdGeom.TetMesh(self.prim) else _topology(self.prim, time)
         counts, indices, holes = read
-        usable = points.ndim == 2 and points.shape[1] == 3 and len(indices) and counts.sum() == len(indices)
-        if not usable or counts.min() < 0 or indices.min() < 0 or indices.max() >= len(points):
+        if (
+            not len(indices)
+            or counts.sum() != len(indices)
+            or counts.min() < 0
+            or indices.min() < 0
+            or indices.max() >= len(points)
+        ):
             return None, (self._out(time, "its points and faces do not fit together"),)
         faces = self._faces_of(points, (counts, indices, holes))
         triangles = faces.wound[self.collider.side in FIXED and is_flipped(self.prim, matrix)]
@@ -226,8 +231,9 @@ class ColliderReader:
         if self._faces is None or not all(map(np.array_equal, self._faces.authored, authored)):
             counts, indices, holes = authored
             attribute = UsdGeom.PointBased(self.prim).GetPointsAttr()
-            first = np.asarray(attribute.Get(Usd.TimeCode.EarliestTime()), dtype=np.float64)
-            first = np.nan_to_num(first if first.shape == points.shape else points).astype(np.float64)
+            first = np.asarray(attribute.Get(Usd.TimeCode.EarliestTime()))
+            fits = first.shape == points.shape and first.dtype.kind in "fiu"
+            first = np.nan_to_num((first if fits else points).astype(np.float64))
             polygons, within = PolygonMesh(counts, indices, len(points)), self.within / self._scale()
             drawn = surface_of(self.prim, polygons, first, holes=holes, within=within)
             triangles = drawn.mesh.triangulate().triangles
@@ -284,8 +290,13 @@ def authored_points(body: ColliderReader, time: float | None) -> np.ndarray:
     if body.collider.kind != "mesh" or body.instancer is not None:
         pose = body.pose(time)[0]
         return np.zeros((0, 3)) if pose is None else pose.points
-    points = np.asarray(_array(UsdGeom.PointBased(body.prim).GetPointsAttr(), time), dtype=np.float64)
-    return place(points.reshape(-1, 3), body._matrix(timecode(time)))
+    return place(positions(body.prim, time).astype(np.float64), body._matrix(timecode(time)))
+
+
+def positions(prim: Usd.Prim, time: float | None) -> np.ndarray:
+    """A prim's authored points at a time code in stage units, shape (V, 3); V is 0 if they are no positions."""
+    points = _array(UsdGeom.PointBased(prim).GetPointsAttr(), time)
+    return points if points.ndim == 2 and points.shape[1] == 3 else np.zeros((0, 3))
 
 
 def read_collider(
@@ -425,8 +436,8 @@ def _surface_of_tets(body: ColliderReader, time: float | None) -> tuple[np.ndarr
     """
     mesh = UsdGeom.TetMesh(body.prim)
     surface, tets = (
-        _array(mesh.GetSurfaceFaceVertexIndicesAttr(), time),
-        _array(mesh.GetTetVertexIndicesAttr(), time),
+        _array(mesh.GetSurfaceFaceVertexIndicesAttr(), time, "iu"),
+        _array(mesh.GetTetVertexIndicesAttr(), time, "iu"),
     )
     if not len(surface) and len(tets):
         if body._tets is None or not np.array_equal(body._tets[0], tets):
@@ -441,19 +452,20 @@ def _topology(prim: Usd.Prim, time: float | None) -> tuple[np.ndarray, ...]:
     """Counts, corners and holes of a Mesh's faces at a time code."""
     mesh = UsdGeom.Mesh(prim)
     attributes = (mesh.GetFaceVertexCountsAttr(), mesh.GetFaceVertexIndicesAttr(), mesh.GetHoleIndicesAttr())
-    return tuple(_array(attribute, time) for attribute in attributes)
+    return tuple(_numbers(attribute, "iu", time) for attribute in attributes)
 
 
-def _numbers(attribute: Usd.Attribute, kinds: str) -> np.ndarray:
+def _numbers(attribute: Usd.Attribute, kinds: str, time: float | None = None) -> np.ndarray:
     """An attribute's list of numbers of some of numpy's kinds; empty for anything else."""
-    array = _array(attribute, None)
-    return array if array.ndim == 1 and array.dtype.kind in kinds else np.zeros(0, np.int32)
+    array = _array(attribute, time, kinds)
+    return array if array.ndim == 1 else np.zeros(0, np.int32)
 
 
-def _array(attribute: Usd.Attribute, time: float | None) -> np.ndarray:
-    """An attribute's array at a time code; empty if missing or a single value."""
+def _array(attribute: Usd.Attribute, time: float | None, kinds: str = "fiu") -> np.ndarray:
+    """An attribute's array of numbers of some of numpy's kinds at a time code; empty for anything else."""
     value = value_at(attribute, time)
-    return np.zeros(0, np.int32) if np.ndim(value) == 0 else np.asarray(value)
+    array = np.zeros(0, np.int32) if np.ndim(value) == 0 else np.asarray(value)
+    return array if array.dtype.kind in kinds else np.zeros(0, np.int32)
 
 
 def _measures(prim: Usd.Prim, time: float | None) -> tuple[str, np.ndarray, np.ndarray | None]:

@@ -83,10 +83,12 @@ def find_colliders(
     Raises:
         AbsentError: When a named collider does not exist.
     """
-    collider_lists = (
-        [_colliders_named(stage, wanted, overrides)] if wanted else felt_by(stage, garments, overrides=overrides)
+    felt = (
+        [_colliders_named(stage, wanted, overrides)]
+        if wanted
+        else felt_by(stage, garments, overrides=overrides).values()
     )
-    chosen = {path for paths in collider_lists for path in paths} - {*without, *(prim.GetPath() for prim in garments)}
+    chosen = {path for paths in felt for path in paths} - {*without, *(prim.GetPath() for prim in garments)}
     return [prim for prim in traverse(stage) if prim.GetPath() in chosen]
 
 
@@ -96,15 +98,15 @@ def felt_by(
     wanted: Sequence[str] = (),
     *,
     overrides: Sequence[Override] = (),
-) -> list[frozenset[Sdf.Path]]:
-    """For each garment, paths of the bodies felt by the garment; arguments as for ``find_colliders``.
+) -> dict[Sdf.Path, frozenset[Sdf.Path]]:
+    """Paths of the bodies felt by each garment, by its path; arguments as for ``find_colliders``.
 
     Raises:
         AbsentError: When a collider in ``wanted`` does not exist.
         StageError: When a target of the garment's ``physgraph:colliders`` does not exist.
     """
     paths_of: dict[tuple[str, ...], frozenset[Sdf.Path]] = {}  # Many garments name the same colliders, or none.
-    path_sets = []
+    felt: dict[Sdf.Path, frozenset[Sdf.Path]] = {}
     for garment in garments:
         named = tuple(wanted or map(str, targets_of(garment, _COLLIDERS_RELATIONSHIP)))
         if named not in paths_of:
@@ -114,8 +116,8 @@ def felt_by(
                 if wanted:
                     raise
                 raise StageError(f"<{garment.GetPath()}>.{_COLLIDERS_RELATIONSHIP}: {error}") from error
-        path_sets.append(paths_of[named])
-    return path_sets
+        felt[garment.GetPath()] = paths_of[named]
+    return felt
 
 
 def _colliders_named(stage: Usd.Stage, named: Sequence[str], overrides: Sequence[Override]) -> frozenset[Sdf.Path]:
@@ -332,24 +334,24 @@ def _mesh_list(stage: Usd.Stage) -> str:
     return f"meshes: {', '.join(meshes[:_SHOWN]) or 'none'}{unlisted}"
 
 
-def read_apart(stage: Usd.Stage, garments: Sequence[Usd.Prim]) -> tuple[list[dict[Sdf.Path, str]], list[Notice]]:
+def read_apart(
+    stage: Usd.Stage, garments: Sequence[Usd.Prim]
+) -> tuple[dict[Sdf.Path, dict[Sdf.Path, str]], list[Notice]]:
     """Gprims never touched by each garment, by ``physgraph:contact:exclude``: a hand in a pocket, a belt in a loop.
 
     Two garments are apart when either excludes the other; a garment is never apart from itself, see selfCollision.
 
     Returns:
-        For each garment, the gprims, each with the excluding target; and a notice for each missing target.
+        The gprims of each garment by its path, each with the excluding target; and a notice for each missing target.
     """
-    excluded, notices = [], []
+    excluded, notices = dict[Sdf.Path, dict[Sdf.Path, str]](), []
     for prim in garments:
-        targets, new_notices = _excluded_by(stage, prim)
-        excluded.append(targets)
+        excluded[prim.GetPath()], new_notices = _excluded_by(stage, prim)
         notices += new_notices
-    numbers = {prim.GetPath(): index for index, prim in enumerate(garments)}
-    for garment, targets in zip(numbers, excluded, strict=True):
+    for garment, targets in excluded.items():
         targets.pop(garment, None)
-        for path in [path for path in targets if path in numbers]:
-            excluded[numbers[path]].setdefault(garment, targets[path])
+        for path in [path for path in targets if path in excluded]:
+            excluded[path].setdefault(garment, targets[path])
     return excluded, notices
 
 

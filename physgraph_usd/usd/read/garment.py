@@ -18,7 +18,7 @@ from ...solver.mesh.borders import open_edges
 from ...solver.mesh.subdivide import SHARPNESS
 from ...solver.mesh.topology import PolygonMesh, find_edges
 from ...solver.mesh.weld import Weld, seam_reach, weld, weld_skins
-from ...solver.scene import Garment, GarmentFrame, mean_edge
+from ...solver.scene import Garment, GarmentFrame, Limits, mean_edge
 from ..lookup import Found, Override, bound_materials, check_limits, find_value
 from ..mesh.pieces import sort_pieces
 from ..schema import GARMENT
@@ -56,6 +56,7 @@ WORD = re.compile("[A-Z]?[a-z]+|[A-Z]+(?![a-z])")
 _THICK = 10.0
 """Inverse of the largest contact distance relative to the cloth's size. Beyond, all vertices are near all vertices,
 with V^2 pairs, and cloth pushed out by more than its size loses the shot's shape."""
+_LIMIT_SCALES = ("maxDistanceScale", "backstopScale")
 _PER_VERTEX = {UsdGeom.Tokens.vertex, UsdGeom.Tokens.varying}
 
 
@@ -94,6 +95,7 @@ class GarmentReader:
         hidden: Time codes of samples of the garment while invisible.
         motion: Acceleration of its cage; None for a still one.
         air: Pressure and wind on it.
+        limit_scales: Multipliers of max distance and backstop at the solved vertices, each of shape (V,).
     """
 
     garment: Garment
@@ -105,6 +107,7 @@ class GarmentReader:
     hidden: frozenset[float] = frozenset()
     motion: CageMotion | None = None
     air: Air | None = None
+    limit_scales: tuple[np.ndarray, ...] = ()
 
     def frame(self, prim: Usd.Prim, metres: float, time: float | None) -> tuple[GarmentFrame, tuple[Notice, ...]]:
         """The garment at a time code, and notices of repairs.
@@ -130,7 +133,13 @@ class GarmentReader:
         fabric = replace(fabric, thickness=thickness)
         acceleration = self._felt(time, points) if is_present else None
         load = self.air.load(points, time) if is_present and self.air is not None else None
-        return GarmentFrame(points, fabric, guide, detail, offset, acceleration, load), notices
+        limits = self._limits(time)
+        return GarmentFrame(points, fabric, guide, detail, offset, acceleration, load, limits), notices
+
+    def _limits(self, time: float | None) -> Limits | None:
+        """Limits of the distance to the subdivided cage at a time code; None without any."""
+        distance, backstop = (self.values.found[name].at(time) for name in ("maxDistance", "backstop"))
+        return None if distance is backstop is None else Limits(distance, backstop, *self.limit_scales)
 
     def _felt(self, time: float | None, points: np.ndarray) -> np.ndarray | None:
         """Acceleration of the cage felt by the cloth [m/s^2], shape (V, 3); None for slow or still cages."""
@@ -200,7 +209,7 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], samples: Samples, re
     notices = [*samples.notices(str(prim.GetPath()), absent), *cage.notices, *bent_notices, *placement]
     values = find_values(prim, request.units, request.overrides)
     constants, of_constants = _constants(prim, request)
-    painted, cut = _painted(prim, weld, notices, values=values, overrides=request.overrides)
+    painted, cut, scales = _painted(prim, weld, notices, values=values, overrides=request.overrides)
     subsets = read_subsets(prim, cage.kept_faces[weld.faces], units=request.units, time=times[0] if times else None)
     pieces = _pieces(prim, weld, rest.points, subsets.faces, notices)
     grain, lies = read_grain(prim, weld, rest.points, kept=cage.kept_faces, up=request.units.up, painted=cut)
@@ -227,7 +236,7 @@ def read_garment(prim: Usd.Prim, roots: Sequence[Sdf.Path], samples: Samples, re
     )
     motion = _motion(prim, points, weld, times=every, metres=request.units.metres)
     air = Air(values, garment, request.units.up, 1.0 / prim.GetStage().GetTimeCodesPerSecond())
-    return GarmentReader(garment, source, values, points, weld, notices, samples.hidden, motion, air)
+    return GarmentReader(garment, source, values, points, weld, notices, samples.hidden, motion, air, scales)
 
 
 def _motion(
@@ -382,14 +391,15 @@ def _rest(prim: Usd.Prim, weld: Weld, animation: Animation, request: Request, *,
 
 def _painted(
     prim: Usd.Prim, weld: Weld, notices: list[Notice], *, values: Values, overrides: Sequence[Override]
-) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """The painted arrays of a garment by field name, times the relative thickness, and the grain's by schema name.
+) -> tuple[dict[str, Any], dict[str, np.ndarray], tuple[np.ndarray, ...]]:
+    """The painted arrays of a garment by field name, times the relative thickness, the grain's by schema name, and the
+    limits' at the solved vertices.
 
     Adds to the notices.
     """
     names = {"stretch_scale": "stretchScale", "bend_scale": "bendScale", "guide_scale": "guideScale"}
     names |= {"detail_scale": "detailScale", "pin": "pin"}
-    cut = ("easeScale", "gather", "grain")
+    cut = ("easeScale", "gather", "grain", *_LIMIT_SCALES)
     arrays = {}
     for name, short in (names | dict(zip(cut, cut, strict=True))).items():
         arrays[name], new_notices = read_painted(prim, short, weld.apart.vertex_count, overrides=overrides)
@@ -399,7 +409,8 @@ def _painted(
     arrays["stretch_scale"] = arrays["stretch_scale"] * values.thickness_scale("stretchStiffness")
     arrays["bend_scale"] = arrays["bend_scale"] * values.thickness_scale("bendStiffness")
     joined = {name: weld.largest(arrays[name]) if name == "pin" else weld.joined(arrays[name]) for name in names}
-    return joined, {name: arrays[name] for name in cut}
+    least = tuple(-weld.largest(-arrays[name]) for name in _LIMIT_SCALES)  # Of what is joined.
+    return joined, {name: arrays[name] for name in cut if name not in _LIMIT_SCALES}, least
 
 
 def _at_open_borders(prim: Usd.Prim, weld: Weld) -> np.ndarray:

@@ -55,6 +55,7 @@ _FRAME_VALUES = (
     *(*STIFFNESSES, *_WOVEN, "density", "thickness", *_EASE),
     *("guide:stiffness", "refine:detail", "inertia", "contact:offset"),
     *("pressure", "wind:speed", "wind:heading", "wind:turbulence"),
+    *("maxDistance", "backstop"),
 )
 DENSITY = "physics:density"
 YOUNGS = "physics:youngsModulus"

@@ -9,6 +9,7 @@ import numpy as np
 
 from ...errors import GarmentError
 from ...solver.inertia import acceleration_of, felt
+from ...solver.scene import out_of_bounds
 from ..times import SAME_TIME
 
 MOST = 3
@@ -99,11 +100,15 @@ class CageMotion:
         return self._times[number] if 0 <= number < len(self._times) else None
 
     def _acceleration(self, *three: float) -> np.ndarray | None:
+        """Acceleration over three time codes; None if so far from 0 that they are one time, or a pose is unusable."""
+        first, middle, last = (code * self._seconds for code in three)
+        if not first < middle < last:
+            return None
         try:
             poses = [self._at(code) for code in three]
         except GarmentError:  # A broken sample beside this one has its own error, at its own time code.
             return None
-        return acceleration_of(poses, [code * self._seconds for code in three])
+        return None if any(map(out_of_bounds, poses)) else acceleration_of(poses, (first, middle, last))
 
     def _mean(self, field: np.ndarray) -> np.ndarray:
         """A field with the mean over the neighbours mixed in, `ROUNDS` times, shape (V, 3)."""

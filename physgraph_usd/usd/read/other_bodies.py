@@ -13,10 +13,10 @@ from ...errors import GarmentError
 from ...solver.colliders.pose import Collider, Pose
 from ...solver.colliders.primitives import tessellated
 from ..lookup import with_ancestors
-from ..stage import TRAVERSAL, pxr_errors, quiet, timecode, value_at
+from ..stage import TRAVERSAL, pxr_errors, quiet, timecode
 from ..times import motion_of
 from .absence import visibility_varies
-from .bodies import ColliderReader, kind_of, parts_of
+from .bodies import ColliderReader, kind_of, parts_of, positions
 from .find import BODIES, MARKS, has_schema, why_not_drawn
 from .garment import is_visible
 from .placement import place, to_metres
@@ -145,10 +145,9 @@ def _moves(prim: Usd.Prim, reader: ColliderReader) -> bool:
 
 def _points(prim: Usd.Prim, metres: float, time: float | None) -> np.ndarray:
     """World positions of a prim's own points [m], shape (N, 3); empty without."""
-    points = np.asarray(value_at(UsdGeom.PointBased(prim).GetPointsAttr(), time) or [], np.float64).reshape(-1, 3)
     matrix = np.array(UsdGeom.XformCache(timecode(time)).GetLocalToWorldTransform(prim), np.float64).T
     matrix[:3] *= metres
-    return place(points, matrix)
+    return place(positions(prim, time).astype(np.float64), matrix)
 
 
 def _rough(prim: Usd.Prim, metres: float, time: float | None) -> Pose:
@@ -157,8 +156,9 @@ def _rough(prim: Usd.Prim, metres: float, time: float | None) -> Pose:
     if UsdGeom.PointBased(prim):
         points = _points(prim, metres, time)
         net = UsdGeom.NurbsPatch(prim)
-        shape = (net.GetVVertexCountAttr().Get() or 0, net.GetUVertexCountAttr().Get() or 0) if net else (0, 0)
-        if np.prod(shape) == len(points) and min(shape) > 1:
+        counts = (net.GetVVertexCountAttr().Get(), net.GetUVertexCountAttr().Get()) if net else ()
+        shape = tuple(count for count in counts if isinstance(count, int))
+        if len(shape) > 1 and np.prod(shape) == len(points) and min(shape) > 1:
             ids = np.arange(len(points), dtype=np.int32).reshape(shape)
             a, b, c, d = (corner.ravel() for corner in (ids[:-1, :-1], ids[:-1, 1:], ids[1:, 1:], ids[1:, :-1]))
             triangles = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])

@@ -74,12 +74,12 @@ def is_flipped(prim: Usd.Prim, matrix: np.ndarray) -> bool:
     """Whether the authored winding is clockwise seen from outside, in world space."""
     left_handed = UsdGeom.Gprim(prim).GetOrientationAttr().Get(Usd.TimeCode.EarliestTime()) == UsdGeom.Tokens.leftHanded
     linear = matrix[:3, :3] / max(float(np.abs(matrix[:3, :3]).max()), np.finfo(float).tiny)
-    return left_handed != bool(np.linalg.det(linear) < 0)
+    return left_handed != bool(np.linalg.slogdet(linear)[0] < 0)
 
 
 def check_placement(prim: Usd.Prim, metres: float, times: Sequence[float]) -> tuple[Notice, ...]:
     """A notice of a switch in mirroring; GarmentError for an invalid transform."""
-    mirrored = [bool(np.linalg.det(to_metres(prim, metres, time)[:3, :3]) < 0) for time in times]
+    mirrored = [bool(np.linalg.slogdet(to_metres(prim, metres, time)[:3, :3])[0] < 0) for time in times]
     switches = [
         time for time, current, previous in zip(times[1:], mirrored[1:], mirrored, strict=False) if current != previous
     ]

@@ -82,6 +82,7 @@ class Shot:
         view: The stage's view before baking and muting.
         unsaved: Names of the stage's layers with unsaved content.
         scene: Constant data of the shot.
+        readers: Readers of the garments, in the scene's order, each with the garment and its source.
         sources: Place of each garment on the stage, in the scene's order.
         colliders: Paths of the collider prims found.
         selections: Active variant selections the garments depend on, as paths `/World/coat{fit=loose}`.
@@ -110,11 +111,11 @@ class Shot:
         self.warnings: list[Notice] = []
         self.metres_per_unit, self.gravity_source = request.units.metres, request.units.gravity_source
         times = tuple(sorted({time for reader in readers for time in reader.source.times}))
-        self.sources: tuple[GarmentSource, ...] = tuple(reader.source for reader in readers)
         colliders = tuple(body.collider for body in bodies)
         seconds, gravity = 1.0 / stage.GetTimeCodesPerSecond(), request.units.gravity
         self.scene = Scene(tuple(reader.garment for reader in readers), gravity, times, colliders, seconds)
-        self._readers, self._bodies, self._request = tuple(readers), tuple(bodies), request
+        self.readers, self._bodies, self._request = tuple(readers), tuple(bodies), request
+        self.sources: tuple[GarmentSource, ...] = tuple(reader.source for reader in readers)
 
     def to_metres(self, index: int, time: float | None) -> np.ndarray:
         """Matrix from a garment's local space to world metres, by number, (4, 4), float64: ``world = M @ [local; 1]``.
@@ -130,7 +131,7 @@ class Shot:
         Raises:
             GarmentError: The points are broken.
         """
-        reader = self._readers[index]
+        reader = self.readers[index]
         return reader.weld.joined(reader.points.read(time)[0])
 
     def cage(self, index: int, time: float | None) -> np.ndarray:
@@ -169,10 +170,15 @@ class Shot:
             GarmentError: A target lies too far from its garment, changes its topology, or cannot be placed.
             SchemaError: An attribute is invalid.
         """
-        pairs = zip(self.sources, self.scene.garments, strict=True)
         # The first sample of the whole shot: the pose must not depend on the frame range.
-        firsts = [min((*source.times, *source.left_out), default=None) for source in self.sources]
-        garments = [(source.path, garment.mesh, first) for (source, garment), first in zip(pairs, firsts, strict=True)]
+        garments = [
+            (
+                reader.source.path,
+                reader.garment.mesh,
+                min((*reader.source.times, *reader.source.left_out), default=None),
+            )
+            for reader in self.readers
+        ]
         with pxr_errors(f"cannot read {self.path}"):
             return read_targets(
                 self.stage,
@@ -203,8 +209,8 @@ class Shot:
         leave_if_asked()
         garments, notices = [], []
         with pxr_errors(f"cannot read {self.path}" + at_time(time)):
-            for index, reader in enumerate(self._readers):
-                prim = self.stage.GetPrimAtPath(self.sources[index].path)
+            for reader in self.readers:
+                prim = self.stage.GetPrimAtPath(reader.source.path)
                 garment, new_notices = reader.frame(prim, self.metres_per_unit, time)
                 garments.append(garment)
                 notices += new_notices
@@ -247,7 +253,7 @@ class Shot:
 
     def offset(self, index: int, time: float | None) -> float:
         """Distance kept from colliders by a garment, by number, at a time code [m]."""
-        return self._readers[index].contact_distance("contact:offset", time)
+        return self.readers[index].contact_distance("contact:offset", time)
 
     def with_values(self, overrides: Sequence[str]) -> Shot:
         """A copy of the shot with other ``--set`` values in its frames; values read only on opening are kept.
@@ -258,21 +264,18 @@ class Shot:
         parsed = parse_overrides(overrides)
         check_overrides(parsed, [source.path for source in self.sources], [Sdf.Path(path) for path in self.colliders])
         changed = copy(self)
-        lookups = [
-            find_values(self.stage.GetPrimAtPath(source.path), self._request.units, parsed) for source in self.sources
-        ]
-        changed._readers = tuple(
-            replace(reader, values=values) for reader, values in zip(self._readers, lookups, strict=True)
-        )
-        changed.sources = tuple(
-            replace(source, sources=source.sources | values.sources, animated=values.animated)
-            for source, values in zip(self.sources, lookups, strict=True)
-        )
+        readers = []
+        for reader in self.readers:
+            source = reader.source
+            values = find_values(self.stage.GetPrimAtPath(source.path), self._request.units, parsed)
+            source = replace(source, sources=source.sources | values.sources, animated=values.animated)
+            readers.append(replace(reader, values=values, source=source))
+        changed.readers, changed.sources = tuple(readers), tuple(reader.source for reader in readers)
         return changed
 
     def close(self) -> None:
         """Release the stage; nothing can be read afterwards."""
-        self._readers, self._bodies = (), ()
+        self.readers, self._bodies = (), ()
         del self.stage, self.view, self._request
 
 
@@ -417,8 +420,7 @@ def _contacts(
     on = [prim for prim in prims if is_on(prim, GARMENT["enabled"], request.overrides)]
     near, (excluded, new_notices) = felt_by(stage, on, wanted, overrides=request.overrides), read_apart(stage, on)
     notices += [*(_left_out(prim, "is disabled") for prim in prims if prim not in on), *new_notices]
-    pairs = zip(on, near, excluded, strict=True)
-    return {prim.GetPath(): _Contact(bodies, targets) for prim, bodies, targets in pairs}
+    return {path: _Contact(near[path], excluded[path]) for path in near}
 
 
 def _link(
@@ -433,8 +435,7 @@ def _link(
     """Readers of the sewn garments, each with the indices of the garment's colliders, and readers of the colliders."""
     readers = _sewn(stage, readers, request, notices)
     cloth = dict.fromkeys(reader.source.path for reader in readers)
-    times = [reader.source.times[0] if reader.source.times else None for reader in readers]
-    offset = min(reader.contact_distance("contact:offset", time) for reader, time in zip(readers, times, strict=True))
+    offset = min(reader.contact_distance("contact:offset", next(iter(reader.source.times), None)) for reader in readers)
     near = _swept(stage, readers, paths, request)
     bodies = []
     for path in paths:
@@ -509,8 +510,7 @@ def _every_time(sources: Iterable[GarmentSource]) -> tuple[float, ...]:
 
 def _cages(stage: Usd.Stage, readers: Sequence[GarmentReader], metres: float, time: float | None) -> list[np.ndarray]:
     """The cage of each garment at a time code [m]."""
-    prims = [stage.GetPrimAtPath(reader.source.path) for reader in readers]
-    return [reader.frame(prim, metres, time)[0].points for reader, prim in zip(readers, prims, strict=True)]
+    return [reader.frame(stage.GetPrimAtPath(reader.source.path), metres, time)[0].points for reader in readers]
 
 
 def _with_sides(
@@ -547,11 +547,11 @@ def _timing(
 ) -> list[Notice]:
     """Notices of samples of garments and their bodies with mismatched timing."""
     garments = [(stage.GetPrimAtPath(reader.source.path), reader.source) for reader in readers]
-    felt_by = [
-        [number for number, reader in enumerate(readers) if index in reader.garment.colliders]
-        for index in range(len(bodies))
+    colliding = [
+        (body, [number for number, reader in enumerate(readers) if index in reader.garment.colliders])
+        for index, body in enumerate(bodies)
     ]
-    return timing_notices(garments, [*zip(bodies, felt_by, strict=True)], bake)
+    return timing_notices(garments, colliding, bake)
 
 
 def _read(

@@ -65,10 +65,9 @@ class _Cloth:
         self._owner = np.repeat(np.arange(len(garments)), np.diff(self._starts))
         self._reach = np.asarray(reaches)[self._owner]
         self._rest = np.concatenate([garment.rest for garment in garments])
-        edges = [open_edges(garment.mesh) + start for garment, start in zip(garments, self._starts, strict=False)]
-        self._borders = np.concatenate(edges)
-        used = [np.unique(garment.mesh.indices) + start for garment, start in zip(garments, self._starts, strict=False)]
-        self._used = np.concatenate(used)
+        meshes = [(garment.mesh, self._starts[index]) for index, garment in enumerate(garments)]
+        self._borders = np.concatenate([open_edges(mesh) + start for mesh, start in meshes])
+        self._used = np.concatenate([np.unique(mesh.indices) + start for mesh, start in meshes])
 
     def together(self, cages: Cages) -> np.ndarray:
         """World positions of all vertices [m], NaN for absent garments."""
@@ -121,8 +120,7 @@ class _Cloth:
         for used in (pairs.ravel(), between.edge.ravel()):
             out[used] = closed[used]
         out[between.vertex] = between.place(closed)
-        spans = [out[a:b] for a, b in zip(self._starts[:-1], self._starts[1:], strict=True)]
-        pieces = zip(self._garments, spans, strict=True)
+        pieces = zip(self._garments, np.split(out, self._starts[1:-1]), strict=True)
         return [replace(piece, sewn_at=at) if np.isfinite(at).any() else piece for piece, at in pieces]
 
     def notices(self, points: np.ndarray, beside: OnEdge) -> list[Notice]:
@@ -135,7 +133,7 @@ class _Cloth:
         partner = np.full(len(points), -1)
         partner[beside.vertex] = self._owner[beside.edge[:, 0]]
         along = self._borders[is_matched[self._borders].all(axis=1)]
-        for garment, index in zip(self._garments, range(len(self._garments)), strict=True):
+        for index, garment in enumerate(self._garments):
             own_edges = along[self._owner[along[:, 0]] == index]
             if len(own_edges) < LONG:
                 continue

@@ -62,7 +62,7 @@ class Skinned:
             posed: From 0, the bind pose moved along with the root joints, to 1, the pose at the time code.
         """
         code = timecode(time)
-        points = UsdGeom.PointBased(self.query.GetPrim()).GetPointsAttr().Get(code)
+        points = _points(self.query.GetPrim(), code)
         if not points:
             return None
         animation, mapper = self.joints.GetAnimQuery(), self.query.GetBlendShapeMapper()
@@ -182,7 +182,7 @@ class Bake:
         code, prim = timecode(time), self._stage.GetPrimAtPath(skinned.path)
         points = skinned.points(time, posed)
         if points is None:
-            return UsdGeom.PointBased(prim).GetPointsAttr().Get(code) or Sdf.ValueBlock()
+            return _points(prim, code) or Sdf.ValueBlock()
         if skinned.space == skinned.path:
             return points
         transforms = UsdGeom.XformCache(code)
@@ -257,6 +257,12 @@ def find_skinned(stage: Usd.Stage, paths: Iterable[Sdf.Path]) -> tuple[dict[Sdf.
     return skins, notices
 
 
+def _points(prim: Usd.Prim, code: Usd.TimeCode) -> Vt.Vec3fArray | None:
+    """A mesh's authored points; None without any, or if the value is of another type."""
+    points = UsdGeom.PointBased(prim).GetPointsAttr().Get(code)
+    return points if isinstance(points, Vt.Vec3fArray) else None
+
+
 def _skinned(query: UsdSkel.SkinningQuery, joints: UsdSkel.SkeletonQuery) -> Skinned:
     """A mesh and its motion, from UsdSkel's queries."""
     prim, played = query.GetPrim(), joints.GetAnimQuery()
@@ -300,15 +306,18 @@ def _target(prim: Usd.Prim | None, name: str) -> Sdf.Path | None:
 
 
 def _rejected(skinned: Skinned) -> list[Notice]:
-    """A notice of joint influences or of a bind pose that UsdSkel rejects; empty if the mesh is skinned."""
+    """A notice of points, of joint influences or of a bind pose that UsdSkel rejects; empty if the mesh is skinned."""
     prim, time = skinned.query.GetPrim(), next(iter(skinned.motion.times), None)
     points = value_at(UsdGeom.PointBased(prim).GetPointsAttr(), time) if UsdGeom.PointBased(prim) else None
+    if points is not None and not isinstance(points, Vt.Vec3fArray):
+        message = "is not skinned and stays in its bind pose, because its points are of another type; author point3f[]"
+        return [Notice(str(skinned.path), None, message)]
     with quiet() as diagnostics:
         if not points or skinned.points(time) is not None:
             return []
         texts = [in_brief(diagnostic.commentary).rstrip(".") for diagnostic in diagnostics.TakeUncoalescedDiagnostics()]
     indices, size = skinned.query.GetJointIndicesPrimvar(), skinned.query.GetNumInfluencesPerComponent()
-    count, remainder = divmod(len(value_at(indices.GetAttr(), time) or ()), len(points))
+    count, remainder = divmod(np.size(value_at(indices.GetAttr(), time) or ()), len(points))
     reason = f"UsdSkel rejects its joint influences: {texts[0]}" if texts else "UsdSkel rejects them"
     remedy = (
         "bind it again" if remainder or count in (0, size) else f"set elementSize of its joint influences to {count}"

@@ -9,6 +9,7 @@ from pxr import Sdf, Usd, UsdGeom, Vt
 from scipy.spatial.transform import Rotation
 
 from ...solver.mesh.subdivide import Refinement
+from ...solver.scene import GarmentResult
 from ..instances import instance_reach
 from ..mesh.bind import Follower
 from ..read.bindings import GarmentBindings, PlacedTarget
@@ -63,10 +64,12 @@ class TargetTracks:
         """Paths of the targets."""
         return [target.path for target in self._bindings.targets]
 
-    def write(self, time: float | None, points: np.ndarray, *, changed: bool, cut: bool) -> None:
-        """Write a time code, given points of the refined garment [m], world space, shape (V, 3)."""
-        for track, placed in zip(self._tracks, self._bindings.at(time, points), strict=True):
-            track.write(time, placed, changed=changed, cut=cut)
+    def write(self, time: float | None, garment: GarmentResult, *, cut: bool) -> None:
+        """Write a time code at which the garment has points."""
+        if garment.points is None:
+            return
+        for track, placed in zip(self._tracks, self._bindings.at(time, garment.points), strict=True):
+            track.write(time, placed, changed=not garment.reused, cut=cut)
 
     def finish(self) -> None:
         """Author pending samples at the end."""

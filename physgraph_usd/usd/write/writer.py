@@ -6,7 +6,7 @@ once, when the writer opens; points, normals, extent and velocities per time cod
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
@@ -18,6 +18,7 @@ from pxr import Sdf, Usd, UsdGeom
 
 from ...errors import LayerError
 from ...solver.mesh.subdivide import Refinement
+from ...solver.scene import GarmentResult, Result
 from .. import provenance
 from ..check.validate import check_layer
 from ..files import check_targets, files_of
@@ -126,44 +127,33 @@ class LayerWriter:
         outside = {*source.times, *source.left_out}.difference(within(source.times, span))
         return within(source.absent, span), sorted(outside)
 
-    def write(
-        self,
-        time: float | None,
-        points: Sequence[np.ndarray | None],
-        *,
-        changed: Sequence[bool] | None = None,
-        cuts: Sequence[bool] = (),
-        heat: Sequence[Mapping[str, np.ndarray] | None] = (),
-    ) -> None:
-        """Write one time code.
+    def write(self, result: Result, *, cuts: Collection[int] = ()) -> None:
+        """Write one time code; garments without points have no sample there.
 
         Args:
-            time: The stage's own time code, later than the last; None once, for a shot without samples.
-            points: Per garment, fine points [m], world space, shape (V_fine, 3), or None for a garment without a sample
-                at this time.
-            changed: Per garment, False when the points are known to equal the previous sample's.
-            cuts: Per garment, whether the cloth jumps here from the previous sample; () for none.
-            heat: Per garment, heat maps by name, each of shape (V_fine,), or None; () for no heat maps.
+            result: The result at a time code later than the last; of time None once, for a shot without samples.
+            cuts: Numbers of the garments whose cloth jumps here from the previous sample.
 
         Raises:
             LayerError: A point is not finite, counts do not match, times do not ascend, or the disk is full.
         """
         if not self._open:
             raise LayerError(f"{self._stream.target} is closed; nothing more can be written to it")
+        time = result.time
         if self._time == np.inf or (time is not None and time <= self._time):
             raise LayerError(f"time code {time} does not come after {self._time:g}; write times in ascending order")
-        _check_sizes(self._meshes, len(self._shot.sources), points, heat=heat, time=time)
+        if len(result.garments) != len(self._shot.sources):
+            raise LayerError(f"results of {len(result.garments)} garments for {len(self._shot.sources)} garments")
+        for index, mesh in self._meshes.items():
+            mesh.check(result.garments[index], time)
         if self._time == -np.inf:
             frame = self._shot.frame(time)
             for index in self._meshes:
                 source, garment = self._shot.sources[index], self._shot.scene.garments[index]
                 author_used_values(self._stream, source, garment, frame.garments[index])
         for index, mesh in self._meshes.items():
-            if (array := points[index]) is not None:
-                different = True if changed is None else bool(changed[index])
-                cut = bool(cuts) and cuts[index]
-                mesh.write(time, array, (heat[index] if heat else None) or {}, changed=different, cut=cut)
-                self._bound[index].write(time, array, changed=different, cut=cut)
+            mesh.write(time, result.garments[index], cut=index in cuts)
+            self._bound[index].write(time, result.garments[index], cut=index in cuts)
         self._time = np.inf if time is None else time
 
     @property
@@ -187,7 +177,8 @@ class LayerWriter:
         for bound in self._bound.values():
             bound.finish()
         self._keep_twins()
-        facts = _facts(self._shot, self.targets, self._stream.target)
+        sources = {str(mesh.target): self._shot.sources[index] for index, mesh in self._meshes.items()}
+        facts = _facts(self._shot, sources, self._stream.target)
         facts["bound"] = [str(path) for bound in self._bound.values() for path in bound.paths] or None
         if self._times is not None:
             count = len(self._shot.scene.times)
@@ -304,29 +295,29 @@ class _RefinedMesh:
         self._bounds = BoundsAbove(stream, shot.stage, source.path, purpose=purpose)
         self._shot, self._index = shot, index
 
-    def write(
-        self, time: float | None, points: np.ndarray, heat: Mapping[str, np.ndarray], *, changed: bool, cut: bool
-    ) -> None:
-        """Write one time code; arguments as in `LayerWriter.write`."""
+    def write(self, time: float | None, garment: GarmentResult, *, cut: bool) -> None:
+        """Write the garment's result at one time code, if it has points; ``cut`` as in `PointTrack.write`."""
+        if (points := garment.points) is None:
+            return
         weld, to_world = self._weld, self._shot.to_metres(self._index, time)
         across = 0.0 if weld.across is None else weld.across[:, None] * weld.split(self._middle_normals(points))
         points = weld.split(points) + across
-        maps = {name: self._weld.split(values) for name, values in heat.items()}
+        maps = {name: self._weld.split(values) for name, values in garment.heat.items()}
         if self._shell is not None:
             thickness = self._shot.sources[self._index].shell * np.sign(np.linalg.det(to_world[:3, :3]))
             points = self._shell.thickened(points, self._sheet_normals(points), thickness)
             maps = {name: values[self._shell.vertex] for name, values in maps.items()}
-        self._track.write(time, points, to_world, changed=changed, cut=cut)
+        self._track.write(time, points, to_world, changed=not garment.reused, cut=cut)
         self._bounds.write(time, self._track.box)
         self._heat.write(time, maps)
 
-    def check(self, points: np.ndarray | None, heat: Mapping[str, np.ndarray], time: float | None) -> None:
+    def check(self, garment: GarmentResult, time: float | None) -> None:
         """Refuse points and heat maps of the wrong shape."""
-        count = self._weld.mesh.vertex_count
+        points, count = garment.points, self._weld.mesh.vertex_count
         if points is not None and points.shape != (count, 3):
             location = f"<{self.target}>" + at_time(time)
             raise LayerError(f"{location}: points have shape {points.shape}; the fine mesh has {count} vertices")
-        self._heat.check(heat, time)
+        self._heat.check(garment.heat, time)
 
     def finish(self) -> list[Notice]:
         """Author pending samples at the end; a notice of samples between cuts for which no velocity is known."""
@@ -338,30 +329,12 @@ class _RefinedMesh:
         return [Notice(str(self.target), None, f"{message} without a cut, and the shot has no velocities there")]
 
 
-def _check_sizes(
-    meshes: Mapping[int, _RefinedMesh],
-    count: int,
-    points: Sequence[np.ndarray | None],
-    *,
-    heat: Sequence[Mapping[str, np.ndarray] | None],
-    time: float | None,
-) -> None:
-    """Refuse points and heat maps not matching the garments; ``count``: the number of garments."""
-    if len(points) != count:
-        raise LayerError(f"{len(points)} arrays of points for {count} garments")
-    if heat and len(heat) != count:
-        raise LayerError(f"heat maps of {len(heat)} garments for {count} garments")
-    for index, mesh in meshes.items():
-        mesh.check(points[index], (heat[index] if heat else None) or {}, time)
-
-
-def _facts(shot: Shot, targets: Sequence[Sdf.Path], out: Path | None) -> dict[str, Any]:
-    """Entries of the record about the garments and their shot."""
-    pairs = zip(targets, shot.sources, strict=False)
+def _facts(shot: Shot, sources: Mapping[str, GarmentSource], out: Path | None) -> dict[str, Any]:
+    """Entries of the record about the garments, by path of the fine mesh, and their shot."""
     return {
         "shot": None if shot.view.root.anonymous else provenance.asset_path(shot.path, out and out.parent),
-        "garments": [str(path) for path in targets],
-        "left_out": {str(path): source.left_out_words for path, source in pairs if source.left_out} or None,
+        "garments": list(sources),
+        "left_out": {path: source.left_out_words for path, source in sources.items() if source.left_out} or None,
         "variants": shot.selections or None,
     }
 

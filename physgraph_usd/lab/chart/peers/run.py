@@ -144,9 +144,8 @@ def _results(
         kind, nested, steps = name.split("_")
         if kind == "x":
             world = data[name] + origin
-            points = {index: world[span] for index, span in zip(part, group.levels[-1].spans, strict=True)}
-            times = data[f"ms_{nested}_{steps}"].tolist()
-            yield nested == "1", int(steps), tuple(points[index] for index in sorted(points)), times
+            points = tuple(world[span] for span in group.levels[-1].spans)
+            yield nested == "1", int(steps), points, data[f"ms_{nested}_{steps}"].tolist()
 
 
 def _problem(problem: Problem, frame: Frame, part: tuple[int, ...]) -> Iterator[tuple[str, Any]]:
