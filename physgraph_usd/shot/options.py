@@ -122,8 +122,8 @@ class RefineOptions:
     temporal: str = _solver("tether", "How a frame uses the last one.", choices=("tether", "warm", "off"))
     pose_in: int | None = _solver(
         None,
-        "Solve N poses of skinned cloth between the bind pose and the first frame before that frame; 0: none.  "
-        "[default: 12 if cloth would cross itself in the first frame]",
+        "Poses of skinned cloth, between the bind pose and the first frame, that are solved before that frame; 12 by "
+        "default if the cloth would cross itself there; 0: none.",
         metavar="N",
         least=0,
     )

@@ -33,6 +33,13 @@ _ALSO, _DIFFERS = re.compile(r"; also (?:at|in) .*$"), re.compile(r"<[^>]*>|[-+]
 _FRAME: dict[str, Any] = {"time": None, "read_ms": None, "run_in_ms": None, "poses": None, "garments": [], "error": ""}
 
 
+def faults_of(contact: Mapping[str, Any], side: str) -> int:
+    """Crossings of cloth and with all bodies, and vertices inside bodies, "before" or "after"."""
+    measured = [contact.get("cloth") or {}, *(contact.get("bodies") or {}).values()]
+    names = ("crossings", "inside", "pinched")
+    return sum(int(counts.get(side, {}).get(name, 0)) for counts in measured for name in names)
+
+
 def is_first(path: str, entry: Mapping[str, Any]) -> bool:
     """Whether a garment is the first of a group solved together in a frame: the group shares energy and contact."""
     return entry.get("together", [path])[0] == path

@@ -1,4 +1,12 @@
-"""A run over an open shot: solves each frame, writes the frame at once, and records the frame in the report."""
+"""A run over an open shot.
+
+    for result in the frames, solved here or by other processes, or stored by an earlier run:
+        write the result's points into the layer
+        add its telemetry to the report
+    close the layer; warnings and notes from the telemetry go into the report
+
+Each frame is written as soon as it is solved. The frames of processes are joined where they meet (`joined`).
+"""
 
 from __future__ import annotations
 

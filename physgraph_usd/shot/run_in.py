@@ -16,7 +16,6 @@ from ..solver.frame.refiner import Refiner
 from ..solver.scene import Frame, Result
 from ..usd.read.reader import Shot
 from .report import LOG
-from .warnings import faults_of
 
 RUN_IN, POSES = "run_in_ms", "poses"
 """Entries of a frame's telemetry: wall time before it [ms], and number of poses from the bind pose on before it."""
@@ -114,7 +113,7 @@ def pose_in(
         refiner: The refiner that solves the frame next.
         time: Time code of the frame.
         count: Number of poses; the first is the bind pose.
-        while_clean: Whether to end at a pose in which cloth crosses anything.
+        while_clean: Whether to end at a pose in which cloth crosses cloth.
 
     Returns:
         Wall time [s], and whether all poses were solved.
@@ -130,7 +129,7 @@ def pose_in(
             frame = shot.posed_frame(time, number / count)
             moment = None if time is None else time - (count - number) * spacing
             result = refiner.solve(replace(frame, time=moment))
-            if while_clean and faults(result):
+            if while_clean and crossings_of_cloth(result):
                 return clock.perf_counter() - began, False
     return clock.perf_counter() - began, True
 
@@ -139,8 +138,3 @@ def crossings_of_cloth(result: Result) -> int:
     """Edges through faces of cloth in a frame; garments that are solved together each count those of all."""
     contacts = [garment.telemetry.get("contact", {}) for garment in result.garments]
     return sum(contact["cloth"]["after"]["crossings"] for contact in contacts if "cloth" in contact)
-
-
-def faults(result: Result) -> int:
-    """Crossings with cloth and bodies, and vertices inside bodies, in a frame; counted as in `crossings_of_cloth`."""
-    return sum(faults_of(garment.telemetry.get("contact", {}), "after") for garment in result.garments)

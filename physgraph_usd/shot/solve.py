@@ -24,7 +24,8 @@ from .joined import Mover, Positions, counts, worse
 from .opened import open_for, why_not_posed
 from .options import RefineOptions
 from .processes import cores
-from .run_in import MOST_POSES, POSES, RUN_IN, RunIn, crossings_of_cloth, faults, pose_in
+from .report import faults_of
+from .run_in import MOST_POSES, POSES, RUN_IN, RunIn, crossings_of_cloth, pose_in
 
 Results = Generator[Result, None, None]
 
@@ -152,8 +153,8 @@ class ShotSolver:
     ) -> tuple[Refiner, Result, dict[str, object]]:
         """A first frame of skinned cloth that crosses itself, solved once more after poses from the bind pose.
 
-        The second result is used if it has fewer faults. There is none if a pose has faults: limbs that go through a
-        body do so on the way too.
+        The second result is used if it has fewer faults. There is none if cloth crosses cloth in a pose: limbs
+        that go through a body are no better on the way.
 
         Args:
             refiner: The refiner after the frame.
@@ -169,10 +170,15 @@ class ShotSolver:
         posed = refiner.fork(self._options.solve_settings())
         posed.forget()
         seconds, all_clean = pose_in(shot, posed, frame.time, MOST_POSES, while_clean=True)
-        told: dict[str, object] = {RUN_IN: round(1e3 * seconds, 3)}
+        telemetry: dict[str, object] = {RUN_IN: round(1e3 * seconds, 3)}
         again = posed.solve(frame, sampled_at(shot, frame.time)) if all_clean else result
-        is_better = faults(again) < faults(result)
-        return (posed, again, told | {POSES: MOST_POSES}) if is_better else (refiner, result, told)
+        is_better = _faults(again) < _faults(result)
+        return (posed, again, telemetry | {POSES: MOST_POSES}) if is_better else (refiner, result, telemetry)
+
+
+def _faults(result: Result) -> int:
+    """Faults of all garments, by `faults_of`; garments that are solved together each count those of all."""
+    return sum(faults_of(garment.telemetry.get("contact", {}), "after") for garment in result.garments)
 
 
 def sampled_at(shot: Shot, time: float | None) -> list[bool]:

@@ -15,7 +15,7 @@ from ..solver.strain import MOST_STRETCHED, StrainedPart
 from ..usd.read.rest import FITTED
 from ..usd.stage import at_time
 from .options import options_of
-from .report import MOST_NAMED, RefineReport, is_first
+from .report import MOST_NAMED, RefineReport, faults_of, is_first
 from .settled import COLLAPSED, LIMITED, UNSOLVED, in_words
 from .untagged import AUTO, NEAR, Candidate, percent
 
@@ -312,13 +312,6 @@ def of_more(report: RefineReport) -> list[str]:
         times = [time for time, *_ in frames]
         warnings.append(WARNINGS["more"](path, times, left=after, before=before, together=counted_with))
     return warnings
-
-
-def faults_of(contact: Mapping[str, Any], side: str) -> int:
-    """Crossings of cloth and with all bodies, and vertices inside bodies, "before" or "after"."""
-    measured = [contact.get("cloth") or {}, *(contact.get("bodies") or {}).values()]
-    names = ("crossings", "inside", "pinched")
-    return sum(int(counts.get(side, {}).get(name, 0)) for counts in measured for name in names)
 
 
 def _together(path: str, entry: Mapping[str, Any]) -> str:

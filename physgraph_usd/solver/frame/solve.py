@@ -1,8 +1,18 @@
-"""One frame, from a cage to fine cloth: begin, descend level by level with safe moves, scale the detail, report.
+"""One frame, from a cage to fine cloth.
 
-`solve_frame` solves every frame, cold or warm. Each level begins at the coarser level's result, untangles crossings,
-and makes rounds: contact is detected, the integrator steps, and cloth moves as far as possible without new crossings.
-`solve_soundly` solves a frame once more from the cage if its result is worse than expected from there.
+    problem = begin(group, frame, last)       cage repaired, start chosen, lasting terms
+    untangle the cage                         in a cold frame whose cage crosses itself
+    for level in problem.levels:              all in a cold frame, else the finest
+        x = the coarser result, upsampled     in a warm frame the last frame's detail, moved safely
+        until converged or out of steps:      a round
+            terms = contact detected at x
+            wanted = x after the integrator's steps
+            x = as near to wanted as is possible without new crossings
+    x = out of bodies, detail scaled, within limits, worse patches on the subdivided cage
+    return points, state for the next frame, telemetry
+
+`solve_frame` solves every frame in this way. `solve_soundly` solves a frame once more from the cage if its result is
+worse than expected from there.
 """
 
 from __future__ import annotations
