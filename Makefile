@@ -2,10 +2,11 @@
 # make test       every check, and the fast tests
 # make test-all   every check, and all tests
 # make site       the documentation as a site, in build/site
-# make blender    the add-on for Blender as a zip, build/physgraph_usd-blender.zip
+# make blender    the solver, and the add-on for Blender that runs it, as a zip, build/physgraph_usd-blender.zip
 # make films      the films of README.md and the gallery and the pictures of tune; SHOTS=folder has the real shots
 # make format     let ruff rewrite what it can
 # make newest     the demo and the fast tests with the newest release of each dependency, in .venv-newest
+# SOLVER=PATH makes the add-on run a command physgraph-usd that is installed elsewhere.
 # PYTHON=python3.12 picks the interpreter of the environment; JOBS=8 the number of test processes.
 # TORCH=auto takes torch's build for this machine's card, TORCH=cu128 the one for that CUDA, TORCH=pip the one on pip's
 # index; else its CPU build.
@@ -49,10 +50,12 @@ all: $(VENV)/.dev
 site: $(VENV)/.dev
 	$(BIN)/mkdocs build --strict
 
-# The files stand at the top of the zip, as Blender wants them.
-blender:
+# The files stand at the top of the zip, as Blender wants them; solver.txt holds the path of the command.
+blender: $(if $(SOLVER),,$(VENV)/.demo)
 	@mkdir -p $(dir $(ADDON))
-	@cd plugins/blender && $(PYTHON) -m zipfile -c $(abspath $(ADDON)) *.py *.toml README.md
+	@printf '%s\n' '$(or $(SOLVER),$(CURDIR)/$(BIN)/physgraph-usd)' >$(dir $(ADDON))solver.txt
+	@cd plugins/blender && $(PYTHON) -m zipfile -c $(abspath $(ADDON)) *.py *.toml README.md \
+		$(abspath $(dir $(ADDON)))/solver.txt
 	@echo $(ADDON)
 
 # Takes the program ffmpeg and a browser.

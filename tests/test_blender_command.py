@@ -31,6 +31,18 @@ def test_the_manifest_agrees_with_the_package() -> None:
     assert manifest["type"] == "add-on"
 
 
+@pytest.mark.parametrize(("said", "exists"), [(True, True), (True, False), (False, False)])
+def test_the_solver_of_the_zip_is_the_usual_command_if_it_exists(
+    command: ModuleType, tmp_path: Path, said: bool, exists: bool
+) -> None:
+    solver = tmp_path / "physgraph-usd"
+    if said:
+        (tmp_path / command.SOLVER_FILE).write_text(f"{solver}\n", encoding="utf-8")
+    if exists:
+        solver.touch()
+    assert command.usual_command(tmp_path) == (str(solver) if exists else "physgraph-usd")
+
+
 def test_every_setting_arrives(command: ModuleType, tmp_path: Path) -> None:
     files = command.files_of_run(tmp_path, "shot", ["Coat"])
     more, values = "--device cuda --weights 'my file'", {"stretchStiffness": 30.0, "rest:weftEase": 4.7}

@@ -54,6 +54,14 @@ def test_garments_by_collection(stage: Usd.Stage) -> None:
         find_garments(stage, ["/World.collection:shoes"])
 
 
+def test_without_any_garment_the_meshes_are_listed_with_the_ways_to_name_one(tmp_path: Path) -> None:
+    plain = new_stage(tmp_path / "plain.usda")
+    add_sheet(plain, "/World/coat", tagged=False)
+    said = "--garment PATH names one, and inspect proposes some; meshes: /World/coat"
+    with pytest.raises(StageError, match=said):
+        find_garments(plain)
+
+
 @pytest.mark.parametrize(
     ("wanted", "message"),
     [

@@ -86,13 +86,15 @@ def test_a_mirror_that_pip_is_set_to_use_is_asked(checkout: Path, how: str) -> N
 
 def test_the_add_on_for_blender_is_a_zip_with_the_manifest_at_the_top(tmp_path: Path) -> None:
     place = tmp_path / "made" / "addon.zip"
-    line = ["make", "blender", f"ADDON={place}", f"PYTHON={sys.executable}"]
+    line = ["make", "blender", f"ADDON={place}", f"PYTHON={sys.executable}", "SOLVER=/studio/physgraph-usd"]
     alone = {name: value for name, value in os.environ.items() if not name.startswith("MAKE")}
     done = subprocess.run(line, cwd=ROOT, capture_output=True, text=True, check=False, env=alone)
     assert (done.returncode, done.stdout, done.stderr) == (0, f"{place}\n", "")
     folder = ROOT / "plugins" / "blender"
     there = {file.name for file in folder.iterdir() if file.is_file()}
-    assert {*zipfile.ZipFile(place).namelist()} == there
+    made = zipfile.ZipFile(place)
+    assert {*made.namelist()} == there | {"solver.txt"}
+    assert made.read("solver.txt") == b"/studio/physgraph-usd\n"
     assert "blender_manifest.toml" in there
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pxr import Usd, UsdGeom
+from shots import run
 
 from physgraph_usd.errors import UsageError
 from physgraph_usd.lab.samples import SAMPLES, write_sample
@@ -61,6 +62,12 @@ def test_same_bytes_every_time_and_soon(sample: Callable[[str], Path], name: str
     again = write_sample(name, tmp_path / "new" / "folder")
     assert time.process_time() - start < 15.0
     assert again.read_bytes() == sample(name).read_bytes()
+
+
+def test_samples_are_listed_with_descriptions() -> None:
+    done = run("sample", "--list")
+    assert done.exit_code == 0
+    assert done.stdout.splitlines() == [f"{name}: {words}" for name, words in SAMPLES.items()]
 
 
 def test_unknown_sample_is_named() -> None:

@@ -32,6 +32,15 @@ def with_metadata(path: Path, **values: object) -> Usd.Stage:
     return Usd.Stage.Open(made)
 
 
+@pytest.mark.parametrize("suffix", ["abc", "fbx", "glb"])
+def test_a_file_that_usd_does_not_read_is_refused_with_the_way_in(tmp_path: Path, suffix: str) -> None:
+    file = tmp_path / f"coat.{suffix}"
+    file.write_bytes(b"Ogawa")
+    done = run("inspect", file)
+    said = "USD reads no files of this kind; import the file into Blender, Maya or Houdini and export USD"
+    assert (done.exit_code, f"cannot open {file}: {said}" in done.stderr) == (1, True)
+
+
 @pytest.mark.parametrize("value", [0.0, -1.0, float("nan"), float("inf")])
 def test_units_that_are_no_length_are_told_and_replaced(tmp_path: Path, value: float) -> None:
     units, notices = read_units(with_metadata(tmp_path / "s.usda", metersPerUnit=value))

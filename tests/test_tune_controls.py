@@ -15,6 +15,7 @@ pytest.importorskip("PIL.Image", reason="screenshots are compared with pillow")
 from shots import CLOTH, cloth_shot
 from test_tune_page import Artist, tuned
 
+from physgraph_usd.studio.maps import stretches
 from physgraph_usd.studio.session import TuneSession
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
@@ -88,6 +89,37 @@ def test_a_brush_says_its_size_its_value_and_why_it_changes_nothing(shot: Path):
         click(artist, (520, 450))
         artist.page.get_by_text("pin under the brush: 0.25").wait_for()
         assert (session.painted(CLOTH, "pin") == 0.25).all()
+
+
+def test_a_click_reads_the_map_that_is_drawn(shot: Path):
+    with tuned(shot) as (session, artist):
+        artist.tab("Picture")
+        artist.choose("Map", "strain along weft")
+        artist.page.locator("#bar").wait_for(state="attached")
+        artist.picture()
+        click(artist, (520, 450))
+        said = artist.page.locator("#value")
+        said.wait_for()
+        name, _, value = said.inner_text().partition(" at the click: ")
+        number, unit = value.split()
+        shown = session.settle()
+        strains = stretches(session.solver.refiner, shown.frame, 0, cloth(session))[:, 1]
+        assert (name, unit) == ("strain along weft", "%")
+        assert abs(strains - float(number)).min() < 1e-3 * abs(strains).max()
+        artist.choose("Map", "none")
+        artist.until(lambda: said.count() == 0, "the value goes with the map")
+
+
+def test_a_gradient_is_painted_from_the_lowest_to_the_highest_vertex(shot: Path):
+    with tuned(shot) as (session, artist):
+        artist.tab("Paint")
+        artist.choose("Paint", "bendScale")
+        artist.type("Value", "5")
+        artist.page.get_by_role("button", name="Gradient").click()
+        artist.until(lambda: session.painted(CLOTH, "bendScale").max() > 1.0, "the map is painted")
+        height = session.shot.frame(session.time).garments[0].points[:, 1]
+        part = (height - height.min()) / np.ptp(height)
+        assert session.painted(CLOTH, "bendScale") == pytest.approx(1.0 + 4.0 * part, rel=1e-5)
 
 
 def test_no_title_is_cut(shot: Path):

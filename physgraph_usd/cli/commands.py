@@ -231,12 +231,30 @@ def validate(layer: str, *, shot: str | None, as_json: bool) -> None:
     sys.exit(DONE if is_valid else FAILED)
 
 
+def _list_samples(context: click.Context, _: click.Parameter, wanted: bool) -> None:
+    """Print every sample with its description and end, if wanted."""
+    if wanted:
+        from ..lab.samples import SAMPLES
+
+        for name, words in SAMPLES.items():
+            click.echo(f"{name}: {words}")
+        context.exit()
+
+
 @click.command()
 @click.argument("name", default="sleeve")
 @out_option("DIR", "Folder to write into.")
 @overwrite_option
+@click.option(
+    "--list",
+    is_flag=True,
+    is_eager=True,
+    expose_value=False,
+    callback=_list_samples,
+    help="Print every NAME with a description.",
+)
 def sample(name: str, out: Path, *, overwrite: bool) -> None:
-    """Write the sample shot NAME and print its path; an unknown name lists all names."""
+    """Write the sample shot NAME and print its path."""
     from ..lab.samples import write_sample
 
     click.echo(write_sample(name, out, overwrite=overwrite))

@@ -85,6 +85,12 @@ def mirrored(rest: np.ndarray, right: np.ndarray) -> np.ndarray:
     return np.asarray(cKDTree(rest).query(image)[1])
 
 
+def gradient(points: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """Height of each vertex, 0 at the lowest and 1 at the highest, shape (V,); 1 everywhere in a level garment."""
+    height = points @ up - (points @ up).min()
+    return height / height.max() if height.max() > 0.0 else np.ones(len(points))
+
+
 def neighbour_mean(mesh: PolygonMesh, values: np.ndarray) -> np.ndarray:
     """Mean over each vertex's neighbours, or the vertex's value without neighbours, shape (V,)."""
     near = adjacency(mesh.half_edges.edges, mesh.vertex_count)

@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 
 from ..usd.schema import GARMENT
-from .brush import ERASE, PAINT, READ, SMOOTH, Brush, Stroke, hit
+from .brush import ERASE, PAINT, READ, SMOOTH, Brush, Stroke, gradient, hit
 from .camera import Camera
 from .desk import Desk, in_order, put, small
+from .maps import PLAIN, find_map
 from .session import TuneSession
 from .values import MAPS, TUNABLES, on_fine
 from .view_panel import ViewPanel
@@ -55,6 +56,8 @@ class PaintPanel:
         self._mirror = gui.add_checkbox("Mirror", False, hint="Paints the other side too, mirrored at rest.")
         flood = gui.add_button("Fill", hint="Gives every vertex the value.")
         desk.press(flood, self._fill)
+        hint = "From the value at the highest vertex to the value that changes nothing at the lowest."
+        desk.press(gui.add_button("Gradient", hint=hint), self._gradient)
         hint = "Exchanges the value and the value that changes nothing, and those between."
         desk.press(gui.add_button("Invert", hint=hint), self._invert)
         camera.on_click(self._clicked)
@@ -108,6 +111,8 @@ class PaintPanel:
 
         if self._name != OFF:
             self._desk.ask(touch)
+        elif self._desk.picture.view.map != PLAIN:
+            self._desk.ask(lambda session: self._read_map(session, origin, along))
 
     def _dragged(self, index: int, event: Any, mode: str | None) -> None:
         origin = np.asarray(event.client.camera.position)
@@ -142,13 +147,29 @@ class PaintPanel:
 
     def _say_value(self, session: TuneSession, index: int, at: np.ndarray, values: np.ndarray) -> None:
         """Draw the rings at a place in the scene [m], and write a map's value there."""
-        points = np.asarray(session.solve().garments[index].points)
-        near = np.linalg.norm(points - self._desk.picture.world(at), axis=1).argmin()
-        found = on_fine(values, session.refinements[index])[near]
+        found = on_fine(values, session.refinements[index])[self._nearest(session, index, at)]
         unit = GARMENT[self._name].unit
         put(self._read, content=small(f"{self._name} under the brush: {found:.3g} {unit}".strip(), "read"))
         self._at = at
         self._draw_rings()
+
+    def _read_map(self, session: TuneSession, origin: np.ndarray, along: np.ndarray) -> None:
+        """Write the value of the map that is drawn, where a ray of the picture meets refined cloth first."""
+        hits = {index: self._hit(session, index, origin, along) for index in range(len(session.garments))}
+        far = {index: float(np.linalg.norm(at - origin)) for index, at in hits.items() if at is not None}
+        if not far:
+            return
+        index = min(far, key=far.__getitem__)
+        found = find_map(session, session.solve(), index, self._desk.picture.view.map)
+        if found is not None:
+            drawn, values = found
+            value = values[self._nearest(session, index, np.asarray(hits[index]))]
+            self._view.say(f"{drawn.name} at the click: {value:.3g} {drawn.unit}".strip())
+
+    def _nearest(self, session: TuneSession, index: int, at: np.ndarray) -> int:
+        """The vertex of a garment's refined cloth that is nearest to a place in the scene [m], shape (3,)."""
+        points = np.asarray(session.solve().garments[index].points)
+        return int(np.linalg.norm(points - self._desk.picture.world(at), axis=1).argmin())
 
     def lift(self, session: TuneSession) -> None:
         """End a stroke: its map is tried."""
@@ -175,6 +196,13 @@ class PaintPanel:
             garment = self._desk.garment
             values = np.full_like(session.painted(garment, self._name), self._limited())
             session.paint(garment, self._name, values)
+
+    def _gradient(self, session: TuneSession) -> None:
+        if self._name != OFF:
+            garment, idle = self._desk.garment, float(GARMENT[self._name].fallback or 0.0)
+            points = session.shot.frame(session.time).garments[self._desk.index].points
+            rise = gradient(points, self._desk.picture.axes[1])
+            session.paint(garment, self._name, idle + rise * (self._limited() - idle))
 
     def _invert(self, session: TuneSession) -> None:
         if self._name != OFF:

@@ -6,12 +6,14 @@ from dataclasses import asdict, fields, replace
 from typing import Any
 
 from .camera import Camera
-from .desk import Desk, put
+from .desk import Desk, put, small
 from .maps import NAMES, Map
 from .session import TuneSession
 from .view import KEPT, SHOWS, View
 
 COMPARED = "A | B keeps the present cloth as A if there is no A yet; B is what is tuned."
+
+COLOURED = "Colours of the refined cloth. Click on the cloth for the value there."
 
 
 class ViewPanel:
@@ -31,11 +33,13 @@ class ViewPanel:
             "wiped": gui.add_checkbox("Wipe", view.wiped, hint="First and last at one place, split by the slider."),
             "wipe": gui.add_slider("Wipe at", 0.0, 1.0, 0.01, view.wipe),
             "wires": gui.add_checkbox("Wireframe", view.wires, hint="Key: G."),
-            "map": gui.add_dropdown("Map", NAMES, initial_value=view.map, hint="Colours of the refined cloth."),
+            "map": gui.add_dropdown(
+                "Map", NAMES, initial_value=view.map, hint="Colours of refined cloth. Click it for values."
+            ),
         }
         for name, control in self._controls.items():
             desk.on(control, lambda session, value, name=name: self._choose(session, name, value))
-        self._bar = gui.add_html("")
+        self._bar, self._read = gui.add_html(""), gui.add_html("")
         desk.press(gui.add_button("Keep as A", hint="Keeps values and cloth to compare with. Key: K."), self._keep)
         desk.press(gui.add_button("Exchange A and B", hint="B is what is tuned. Key: X."), TuneSession.swap)
         desk.key("Wireframe", "G", lambda session: self.set(wires=not desk.picture.view.wires))
@@ -50,6 +54,11 @@ class ViewPanel:
             self._camera.frame()
         for name, value in changes.items():
             put(self._controls[name], value=value)
+        put(self._read, content="")
+
+    def say(self, words: str) -> None:
+        """Write the value of the map at a place, until the view changes."""
+        put(self._read, content=small(words, "value"))
 
     def update(self) -> None:
         """Write the colour bar of the map that is drawn."""

@@ -313,7 +313,8 @@ PROPERTIES: tuple[Property, ...] = (
     ),
     _scale(
         "pin", "Pin", 0.0, most=1.0, soft=1.0,
-        doc="1 at vertices that follow the coarse cloth exactly, 0 at free vertices. " + PER_VERTEX,
+        doc="1 at vertices that follow the coarse cloth exactly, 0 at free vertices, between 0 and 1 for soft pins. "
+        + PER_VERTEX,
     ),
     Property(
         COLLIDER_API, "physgraph:collider:enabled", "bool", True, "", None, None,

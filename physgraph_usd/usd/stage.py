@@ -25,6 +25,8 @@ _PARSER_RULE = re.compile(r"parse error matching \S.*?(?= at '| at line|$)")
 USD_ERRORS: tuple[type[Exception], ...] = (Tf.ErrorException, *filter(None, [getattr(Tf, "CppException", None)]))
 """Exceptions of pxr; the second exists since USD 24.11, for truncated files."""
 MOST_REASONS, LONGEST_REASON = 4, 300
+_NO_FORMAT = "Cannot determine file format"
+NO_READER = "USD reads no files of this kind; import the file into Blender, Maya or Houdini and export USD"
 _WARNED = re.compile(r"(?:In <([^>]*)>: )?(.*(?:sublayer|asset|ycle|prim).*)")
 UP_AXIS = "upAxis of the stage"
 """Default source of gravity's direction."""
@@ -192,7 +194,8 @@ def reason_of(error: Exception) -> str:
     if not isinstance(error, Tf.ErrorException):
         return f"the file is damaged or was cut short while it was read: {in_brief(text.partition(' - ')[0])}"
     reasons = [part.split(" : ", 1)[-1].strip().strip("'").strip() for part in text.split("\n\tError in ")]
-    reasons = list(dict.fromkeys(in_brief(reason) for reason in reasons if reason))
+    reasons = [NO_READER if reason.startswith(_NO_FORMAT) else in_brief(reason) for reason in reasons if reason]
+    reasons = list(dict.fromkeys(reasons))
     return "; ".join(reasons[:MOST_REASONS]) + _others(max(len(reasons) - MOST_REASONS, 0)) or "USD gave no reason"
 
 

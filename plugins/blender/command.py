@@ -17,6 +17,8 @@ PRESETS += ("worn-denim", "crisp-cotton", "soft-jersey")
 """The fabrics of `physgraph-usd tag --preset`."""
 OF_BLENDER = ("MATERIALX_SEARCH_PATH", "PXR_MTLX_STDLIB_SEARCH_PATHS")
 """What Blender sets for its own USD, of another version than the command's."""
+COMMAND, SOLVER_FILE = "physgraph-usd", "solver.txt"
+"""Name of the command on the search path, and the file beside the add-on that `make blender` writes the path into."""
 IN_PART = 3
 """Exit code of a run that refined some of its frames."""
 LONGEST_STEM = 60
@@ -24,6 +26,13 @@ WARNING = "warning: "
 PROGRESS = re.compile(r"^\s*(\d+)%\s+(.*)$")
 PATIENCE_SECONDS = 5.0
 """How long a command that was told to end may take to clear up."""
+
+
+def usual_command(folder: Path) -> str:
+    """The command that a folder's `SOLVER_FILE` names, if it exists, else its name on the search path."""
+    file = folder / SOLVER_FILE
+    path = file.read_text(encoding="utf-8").strip() if file.is_file() else ""
+    return path if path and Path(path).is_file() else COMMAND
 
 
 class Slider(NamedTuple):

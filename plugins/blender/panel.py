@@ -1,10 +1,12 @@
 """What the artist sees: the preferences, the settings of a scene, and the panel in the 3D view's sidebar."""
 
 # No `from __future__ import annotations` here: Blender reads the properties from the annotations themselves.
+from pathlib import Path
+
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, PointerProperty, StringProperty
 
-from .command import PRESETS, SLIDERS, Settings
+from .command import PRESETS, SLIDERS, Settings, usual_command
 from .live_view import AHEAD, PHYSGRAPH_OT_keep, PHYSGRAPH_OT_live, last_failure, now_live, send
 from .refine import PHYSGRAPH_OT_refine, command_of, now_running
 
@@ -23,7 +25,7 @@ class PhysGraphPreferences(bpy.types.AddonPreferences):
     command: StringProperty(
         name="Command",
         description="The command physgraph-usd: its path, or its name where it is on the search path",
-        default="physgraph-usd",
+        default=usual_command(Path(__file__).parent),
         subtype="FILE_PATH",
     )
 

@@ -51,7 +51,8 @@ def find_garments(stage: Usd.Stage, wanted: Sequence[str] = ()) -> list[Usd.Prim
     garments = [prim for prim in traverse(stage) if has_schema(prim, GARMENT_API) and not _hidden_level(prim)]
     if not garments:
         raise StageError(
-            f"no prim has {GARMENT_API} and no garment was named; --garment PATH names one; {_mesh_list(stage)}"
+            f"no prim has {GARMENT_API} and no garment was named; --garment PATH names one, and inspect proposes some; "
+            + _mesh_list(stage)
         )
     for prim in garments:
         if not UsdGeom.Mesh(prim):
