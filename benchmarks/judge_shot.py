@@ -280,11 +280,11 @@ def judged(job: Job) -> dict[str, float | None]:
         times = list(shot.scene.times)[job.first :][: job.count or None]
         with OwnRest(job.level, job.rest_steps) as rest:
             for number, (result, milliseconds) in enumerate(_timed(solver(times), rest.begin)):
-                if error := result.telemetry.get("error"):
+                error, fine, telemetry = _parts_of(result)
+                if error:
                     raise ValueError(f"frame {result.time:g}: {error}")
-                fine = [garment.points for garment in result.garments]
                 motion.add([each.points for each in shot.frame(result.time).garments], fine)
-                frames.append(groups_of([garment.telemetry for garment in result.garments]))
+                frames.append(groups_of(telemetry))
                 spent.append(milliseconds)
                 if job.positions:
                     points.append(fine)
@@ -327,6 +327,15 @@ def write_positions(
         raise ValueError("a garment has no sample in a frame")
     joined = [np.concatenate([np.asarray(each) for each in points]) for points in frames]
     np.savez(file, points=np.array(joined, np.float32), triangles=np.concatenate(triangles))
+
+
+def _parts_of(result: Any) -> tuple[str, list[np.ndarray], list[dict[str, Any]]]:
+    """Error or "", fine points [m] and telemetry of each garment in a `Result`, or an `Outcome` of older versions."""
+    if hasattr(result, "record"):
+        return result.record.get("error", ""), list(result.points), result.record.get("garments", [])
+    garments = result.garments
+    error = result.telemetry.get("error", "")
+    return error, [garment.points for garment in garments], [garment.telemetry for garment in garments]
 
 
 def _timed(results: Iterable[Any], begin: Callable[[], None]) -> Iterator[tuple[Any, float]]:
