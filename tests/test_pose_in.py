@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -15,10 +16,14 @@ from fuzz.poses import ROOT, write_limb
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
 from shots import cloth_shot
 
+from physgraph_usd.errors import SolveError
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.refine import refine_shot
 from physgraph_usd.shot.report import RefineReport
 from physgraph_usd.shot.run_in import MOST_POSES
+from physgraph_usd.solver.frame.refiner import Refiner
+from physgraph_usd.solver.frame.settings import SolveSettings
+from physgraph_usd.solver.scene import Frame, Result
 from physgraph_usd.usd.read.reader import Shot, open_shot
 
 BEND = 100.0
@@ -104,6 +109,36 @@ def test_the_first_result_stays_where_a_pose_crosses_itself(
     for time in (1.0, 2.0):
         first, second = (np.array(layer.QueryTimeSample(f"{ROOT}/cloth.points", time)) for layer in layers)
         assert np.array_equal(first, second)
+
+
+def test_a_frame_that_fails_after_the_poses_keeps_its_first_result(
+    limb: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    fork = Refiner.fork
+
+    def broken(refiner: Refiner, settings: SolveSettings) -> Refiner:
+        forked = fork(refiner, settings)
+
+        def solve_poses_only(frame: Frame, wanted: Sequence[bool] | None = None) -> Result:
+            if frame.time == 1.0:
+                raise SolveError("not finite")
+            return type(forked).solve(forked, frame, wanted)
+
+        monkeypatch.setattr(forked, "solve", solve_poses_only)
+        return forked
+
+    monkeypatch.setattr(Refiner, "fork", broken)
+    report = refine_shot(limb, tmp_path / "out.usdc", RefineOptions(level=1, frames=(1.0, 1.0)))
+    assert report.failed == {}
+    assert crossings(report) > 0
+    assert report.frames[0]["run_in_ms"] > 0
+
+
+def test_a_frame_that_reached_its_limit_of_time_gets_no_poses(limb: Path, tmp_path: Path):
+    options = RefineOptions(level=1, frames=(1.0, 1.0), frame_limit=0.01)
+    report = refine_shot(limb, tmp_path / "out.usdc", options)
+    assert crossings(report) > 0
+    assert "run_in_ms" not in report.frames[0]
 
 
 def test_without_a_skeleton_it_is_said_that_it_has_no_effect(tmp_path: Path):

@@ -14,6 +14,7 @@ import pytest
 from shots import CLOTH, cloth_shot, faults, refine, run, sample_times
 from stages import add_mesh, new_stage, save, sheet_faces, sheet_points
 
+from physgraph_usd.shot import settled
 from physgraph_usd.shot.notes import of_energy
 from physgraph_usd.shot.report import RefineReport
 from physgraph_usd.shot.warnings import WARNINGS, Entries, of_contact, of_more
@@ -195,3 +196,8 @@ def test_nothing_newly_crosses_wherever_a_frame_is_stopped(
         for frame in report.frames:
             cloth = frame["garments"][0]["contact"]["cloth"]
             assert cloth["after"]["crossings"] <= cloth["before"]["crossings"]
+
+
+def test_a_frame_that_reached_its_limit_before_any_level_is_said_in_words():
+    entry = {"start": "given up", "levels": [], "time_limit": 0.01}
+    assert str(settled.unsettled(entry, 2e-3)) == "no level was solved (stopped by time limit)"

@@ -72,7 +72,7 @@ def of_fabrics(sources: Iterable[GarmentSource]) -> list[str]:
 
 
 def of_subsets(sources: Iterable[GarmentSource]) -> list[str]:
-    """Notes on the subsets of faces with another fabric than their garment, one note per subset."""
+    """A note for each subset of faces with a fabric of its own."""
     return [
         f"<{source.path.AppendChild(name) if name else source.path}>: {words}"
         for source in sources
@@ -81,7 +81,7 @@ def of_subsets(sources: Iterable[GarmentSource]) -> list[str]:
 
 
 def preset_overrides(sources: Iterable[GarmentSource]) -> list[str]:
-    """Values of ``--set`` that choose a preset for the garments named like one."""
+    """Values of ``--set`` that choose presets for garments by words in the garments' names."""
     return [f"{source.path}.{PRESET}={preset}" for source, _, preset in _named(sources)]
 
 
@@ -130,7 +130,7 @@ def of_energy(report: RefineReport) -> list[str]:
 
 
 def of_folds(report: RefineReport) -> list[str]:
-    """A note of the garment with most sharp folds, if folds are so sharp that they show the mesh."""
+    """A note of the garment with most sharp folds, if sharp folds show the mesh."""
     folded = [(entry.get("sharp_folds", 0.0), frame["time"], garment) for frame, garment, entry in report.entries()]
     share, time, worst = max(folded, key=lambda entry: entry[0], default=(0.0, None, {}))
     if share <= SHARP_FRACTION:
@@ -175,12 +175,14 @@ def of_given_up(report: RefineReport) -> list[str]:
 
 
 def of_poses(report: RefineReport) -> list[str]:
-    """A note of a first frame that continues from poses between the bind pose and it, without being requested."""
+    """A note of a first frame for which poses from the bind pose on were solved without a request."""
     first = report.frames[0] if report.frames else {}
     if not first.get("poses"):
         return []
-    poses = f"{counted(first['poses'], 'pose')} between the bind pose and it"
-    return [f"time code {named_time(first['time'])} continues from {poses}, since it crossed itself without them"]
+    poses = f"{counted(first['poses'], 'pose')} from the bind pose on"
+    return [
+        f"time code {named_time(first['time'])} is solved after {poses}, since cloth crossed itself without the poses"
+    ]
 
 
 def of_inertia(report: RefineReport) -> list[str]:

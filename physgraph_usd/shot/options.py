@@ -306,7 +306,7 @@ def json_of(report: Path) -> Path:
 
 
 def scene_words(options: RefineOptions) -> list[str]:
-    """Command-line arguments for the Scene options that differ from their defaults."""
+    """Command-line arguments of the Scene options without default values."""
     words = []
     for field in dataclasses.fields(options):
         value, option = getattr(options, field.name), OPTIONS[field.name]

@@ -1,4 +1,4 @@
-"""Solves what comes before the first frame of a run, and says what it costs and how much of it is left."""
+"""Solves poses and cages before the first frame of a run, and reports the time spent and left."""
 
 from __future__ import annotations
 
@@ -18,9 +18,10 @@ from ..usd.read.reader import Shot
 from .report import LOG
 
 RUN_IN, POSES = "run_in_ms", "poses"
-"""Entries of a frame's telemetry: wall time before it [ms], and number of poses from the bind pose on before it."""
+"""Entries of a frame's telemetry: wall time of the run-in [ms], and number of poses from the bind pose on."""
 MOST_POSES = 12
-"""Poses from the bind pose to a first frame that crosses itself."""
+"""Poses from the bind pose to a first frame that crosses itself. A sleeve in two layers, bent by 100 degrees, comes out
+clean after 12 and not after 6; three poses of people after 6, 12 and 24."""
 EVERY_SECONDS = 10.0
 """Time between two messages of a run-in [s]."""
 OF_COLD = 0.4

@@ -16,7 +16,7 @@ class Unsettled:
     """A garment's frame that did not settle.
 
     Attributes:
-        remaining_move: RMS of H0^-1 F at the level, in local edge lengths; None if the frame was not solved.
+        remaining_move: RMS of H0^-1 F at the level, in local edge lengths; None if no level was solved.
         stopped: Reason for the end of the steps, as in `LevelReport`, or `COLLAPSED`, `LIMITED` or `UNSOLVED`.
         size: Size of a collapsed cage relative to its rest shape.
         error: Reason for an unsolved frame, else "".
@@ -35,6 +35,8 @@ class Unsettled:
         if self.size is not None:
             return f"the cage has shrunk to {100.0 * self.size:.2g}% of its rest shape's size"
         reason = "no step lowers the energy" if self.stopped == "stalled" else f"stopped by {self.stopped}"
+        if self.remaining_move is None:
+            return f"no level was solved ({reason})"
         return f"level {self.level} would still move by {self.remaining_move:.2g} edges ({reason})"
 
 

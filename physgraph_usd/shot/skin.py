@@ -142,7 +142,7 @@ def frames_compared(count: int) -> range:
 
 
 def of_polygons(surfaces: Sequence[Shown]) -> list[str]:
-    """A note of the bodies that viewports without subdivision show through garments, with offsets that hide them."""
+    """A note of bodies shown through garments by viewports without subdivision, with sufficient offsets."""
     if not surfaces:
         return []
     worst = max(surfaces, key=lambda surface: surface.height)

@@ -6,6 +6,7 @@ import dataclasses
 import os
 import time as clock
 from collections.abc import Generator, Sequence
+from contextlib import suppress
 from functools import partial
 from statistics import mean
 from typing import Any
@@ -153,8 +154,8 @@ class ShotSolver:
     ) -> tuple[Refiner, Result, dict[str, object]]:
         """A first frame of skinned cloth that crosses itself, solved once more after poses from the bind pose.
 
-        The second result is used if it has fewer faults. There is none if cloth crosses cloth in a pose: limbs
-        that go through a body are no better on the way.
+        The second result is used if it has fewer faults. The frame is not solved again if cloth crosses cloth in a
+        pose, as where limbs go through a body, or if the first solve reached its limit of time.
 
         Args:
             refiner: The refiner after the frame.
@@ -165,13 +166,16 @@ class ShotSolver:
         """
         options = self._options
         automatic = options.pose_in is None and options.self_contact != "off" and not why_not_posed(shot, options)
-        if not automatic or not crossings_of_cloth(result):
+        late = any("time_limit" in garment.telemetry for garment in result.garments)
+        if not automatic or late or not crossings_of_cloth(result):
             return refiner, result, {}
-        posed = refiner.fork(self._options.solve_settings())
+        posed = refiner.fork(options.solve_settings())
         posed.forget()
         seconds, all_clean = pose_in(shot, posed, frame.time, MOST_POSES, while_clean=True)
         telemetry: dict[str, object] = {RUN_IN: round(1e3 * seconds, 3)}
-        again = posed.solve(frame, sampled_at(shot, frame.time)) if all_clean else result
+        again = result
+        with suppress(SolveError):  # The first result is there.
+            again = posed.solve(frame, sampled_at(shot, frame.time)) if all_clean else result
         is_better = _faults(again) < _faults(result)
         return (posed, again, telemetry | {POSES: MOST_POSES}) if is_better else (refiner, result, telemetry)
 

@@ -24,7 +24,7 @@ RESOLVED = 0.1
 """Part of an edge that single precision must tell apart where the farthest vertex is: about the garment's mean the
 solver's positions have 24 bits, and with less than that nothing of the cloth is left in them."""
 FALLS = 4.0
-"""Largest distance that a garment may sink, in its diameters. Cloth over one diameter off its cage is invalid."""
+"""Largest distance that a garment may sink, in diameters. Cloth over one diameter off the cage is invalid."""
 SPECK = 0.1
 """Size under which a garment's units are in doubt before its guide is [m]."""
 OUTGROWN = 1e3
@@ -268,7 +268,7 @@ class Result:
     telemetry: dict[str, Any] = field(default_factory=dict)
 
     def as_changed(self) -> Result:
-        """This result with no garment reused: to be written after another frame than the one solved before it."""
+        """The result with no garment reused, to be written after any frame."""
         return replace(self, garments=tuple(replace(garment, reused=False) for garment in self.garments))
 
 

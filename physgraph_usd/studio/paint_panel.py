@@ -78,7 +78,7 @@ class PaintPanel:
         self._draw_rings()
 
     def update(self, session: TuneSession) -> None:
-        """Say why the map that is painted changes nothing, if so."""
+        """Give the reason if the painted map has no effect."""
         names = MULTIPLIED.get(self._name, ())
         labels = " and ".join(TUNABLES[name].label for name in names)
         idle = names and not any(session.value(self._desk.garment, name) for name in names)

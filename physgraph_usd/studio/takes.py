@@ -97,7 +97,7 @@ class Takes:
         return self._kept.get(setting, {}).get(time)
 
     def keep_last(self, take: Take) -> None:
-        """Keep a take as the only one of its setting."""
+        """Keep a take and drop all others of the same setting."""
         self._kept.pop(take.setting, None)
         self._kept[take.setting] = {take.shown.frame.time: take}
         self._drop_settings()

@@ -124,7 +124,8 @@ class _Search:
         x, version: Positions of the cloth [m], and the tensor's version then.
         at: Positions of cloth and bodies [m], float64.
         inside: As for `near_parts`.
-        near: The near pairs, without some with a vertex in `unknown`.
+        near: The near pairs; incomplete at the vertices in `unknown`.
+        unknown: Vertices of pairs that blocked the move to these positions; None without a move.
     """
 
     x: Float[Tensor, "vertices 3"]
@@ -137,10 +138,14 @@ class _Search:
     def still_near(
         self, at: Float[Tensor, "all 3"], inside: Bool[Tensor, " all"] | None
     ) -> tuple[Pairs, Bool[Tensor, " all"]] | None:
-        """The pairs that are near at other positions [m] too, as none of their vertices has moved; None with few.
+        """The near pairs of vertices with equal positions here and in the search; None if `FEW_MOVED` is exceeded.
+
+        Args:
+            at: Positions of cloth and bodies [m], float64.
+            inside: As for `near_parts`.
 
         Returns:
-            The pairs, and a mask of the other vertices.
+            The pairs, and a mask of the vertices whose pairs must be searched.
         """
         none = torch.zeros_like(at[:, 0], dtype=torch.bool)
         inside_before, inside_now = (none if mask is None else mask for mask in (self.inside, inside))

@@ -48,7 +48,7 @@ MOST_TOLERATED = 1e-5
 
 
 class Limit:
-    """The limits of one level in one frame, and the springs in front of them."""
+    """Limits of a level's cloth in a frame, with springs in front."""
 
     name = "limit"
 

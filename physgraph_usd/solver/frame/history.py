@@ -67,13 +67,13 @@ class GarmentHistory:
 
 @dataclass(frozen=True, eq=False)
 class Member:
-    """One garment in a frame, alone or with others that are solved together.
+    """A garment in a frame.
 
     Attributes:
         number: Number of the garment in the scene.
-        garment: Its constant data.
-        frame: Its values in the frame.
-        history: Its last frames.
+        garment: Constant data.
+        frame: Values in the frame.
+        history: Last frames.
     """
 
     number: int

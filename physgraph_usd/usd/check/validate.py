@@ -182,7 +182,7 @@ def _on_whole_stage(layer: Sdf.Layer, shot: StageView) -> list[Problem]:
 
 
 def _opened_instances(layer: Sdf.Layer) -> Sdf.Layer:
-    """A layer that opens the instances that a refined layer opens: USD's validators pass over what is inside of one."""
+    """A layer that opens the same instances as a refined layer: USD's validators skip the contents of instances."""
     opened, paths = Sdf.Layer.CreateAnonymous(".usda"), list[Sdf.Path | str]()
     layer.Traverse(Sdf.Path.absoluteRootPath, paths.append)
     specs = (layer.GetPrimAtPath(path) for path in paths if Sdf.Path(path).IsPrimPath())

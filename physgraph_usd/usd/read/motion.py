@@ -100,7 +100,7 @@ class CageMotion:
         return self._times[number] if 0 <= number < len(self._times) else None
 
     def _acceleration(self, *three: float) -> np.ndarray | None:
-        """Acceleration over three time codes; None if so far from 0 that they are one time, or a pose is unusable."""
+        """Acceleration over three time codes; None if rounding makes two times equal, or a pose is unusable."""
         first, middle, last = (code * self._seconds for code in three)
         if not first < middle < last:
             return None
