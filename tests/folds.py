@@ -13,12 +13,13 @@ from meshes import grid
 from sheets import garment_of
 
 from physgraph_usd.solver.collide.distance import weights
-from physgraph_usd.solver.collide.pairs import NearPairs, Reach
+from physgraph_usd.solver.collide.pairs import Reach
 from physgraph_usd.solver.collide.parts import Parts
 from physgraph_usd.solver.collide.search import near_parts
 from physgraph_usd.solver.colliders.pose import Collider, Pose
 from physgraph_usd.solver.contact.cloth import ClothContact, LevelContact
 from physgraph_usd.solver.contact.settings import ContactSettings
+from physgraph_usd.solver.contact.springs import NearSprings
 from physgraph_usd.solver.fabric import Fabric
 from physgraph_usd.solver.forces.seam import Seam
 from physgraph_usd.solver.frame.refiner import Refiner
@@ -174,7 +175,7 @@ def measured(answer: Answer, which: str = "after", body: int = 0) -> dict[str, A
     return list(answer.telemetry[0]["contact"]["bodies"].values())[body][which]
 
 
-def near_pairs(parts: Parts, x: torch.Tensor, near: Reach) -> NearPairs:
+def near_pairs(parts: Parts, x: torch.Tensor, near: Reach) -> NearSprings:
     """The pairs found near one another, with their shortest vectors, without those that only rest distances let in."""
     at, pairs = x.double(), near_parts(parts, x, near).pairs
     weight, corners = weights(at, pairs.corners, pairs.face), pairs.corners.long()
@@ -182,4 +183,5 @@ def near_pairs(parts: Parts, x: torch.Tensor, near: Reach) -> NearPairs:
     of_face = radius[:, 0] + radius[:, 1:].amax(dim=1)
     of_edges = radius[:, :2].amax(dim=1) + radius[:, 2:].amax(dim=1)
     kept = torch.nonzero(way.norm(dim=1) < torch.where(pairs.face, of_face, of_edges)).squeeze(1)
-    return NearPairs(pairs.corners[kept], weight[kept].to(x), way[kept].to(x), pairs.face[kept])
+    of_kept = (weight[kept].to(x), way[kept].to(x), pairs.face[kept], radius.new_zeros(len(kept)))
+    return NearSprings(pairs.corners[kept], *of_kept)

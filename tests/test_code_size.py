@@ -33,7 +33,6 @@ WIDE = {
     "PlainMesh": 16,
     "Point": 25,
     "PointTrack": 18,
-    "Problem": 14,
     "Property": 14,
     "RefineOptions": 38,
     "RefineReport": 23,

@@ -20,8 +20,8 @@ from physgraph_usd.lab.methods.paper_steps import LearnedPaper
 from physgraph_usd.lab.methods.random_networks import random_network
 from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.solver.frame.group import Group
+from physgraph_usd.solver.frame.problem import begin
 from physgraph_usd.solver.frame.solve import solve_frame
-from physgraph_usd.solver.frame.values import FrameInput
 from physgraph_usd.solver.integrate.weights import shipped_network
 from physgraph_usd.solver.level import refine_garments
 from physgraph_usd.solver.mesh.topology import PolygonMesh
@@ -67,7 +67,7 @@ def test_s33_a_solved_frame_agrees_and_repeats() -> None:
     answers = []
     for device in ("cpu", "cuda", "cuda"):
         one, frames = cloth(device, torch.float64, steps=60, tolerance=1e-7)
-        answers.append(solve_frame(one, FrameInput(frames), None).points[0])
+        answers.append(solve_frame(begin(one, frames))[0].points)
     here, there, again = answers
     assert there.tobytes() == again.tobytes()
     assert np.abs(here - there).max() < 1e-3 * EDGE / 4
@@ -105,12 +105,12 @@ def test_sewn_cloth_agrees_and_repeats() -> None:
     for device in ("cpu", "cuda", "cuda"):
         settings = settings_of(steps=60, tolerance=1e-6)
         one = Group.of(garments, chains, down, settings, dtype=torch.float32, device=device)
-        answers.append(solve_frame(one, FrameInput(frames), None))
-    assert not any(crossing.any() for answer in answers for crossing in answer.crossing)
-    assert np.abs(answers[1].points[0] - answers[0].points[0]).max() < 1e-3 * 0.05
-    assert np.array_equal(answers[1].points[0], answers[2].points[0])
+        answers.append(solve_frame(begin(one, frames))[0])
+    assert not any(answer.crossing.any() for answer in answers)
+    assert np.abs(answers[1].points - answers[0].points).max() < 1e-3 * 0.05
+    assert np.array_equal(answers[1].points, answers[2].points)
     pairs = np.argwhere(np.triu(np.linalg.norm(points[:, None] - points, axis=2) < 1e-9, 1))
-    assert np.array_equal(answers[1].points[0][pairs[:, 0]], answers[1].points[0][pairs[:, 1]])
+    assert np.array_equal(answers[1].points[pairs[:, 0]], answers[1].points[pairs[:, 1]])
 
 
 @pytest.mark.parametrize("integrator", ["quasi-newton", "physgraph"])

@@ -20,10 +20,10 @@ from physgraph_usd.solver.forces import elastic_terms
 from physgraph_usd.solver.forces.bending import Bending
 from physgraph_usd.solver.forces.membrane import in_plane_terms
 from physgraph_usd.solver.frame.group import Group
+from physgraph_usd.solver.frame.problem import begin
 from physgraph_usd.solver.frame.refiner import Refiner
 from physgraph_usd.solver.frame.settings import SolveSettings
 from physgraph_usd.solver.frame.solve import solve_frame
-from physgraph_usd.solver.frame.values import FrameInput
 from physgraph_usd.solver.integrate import method_named
 from physgraph_usd.solver.level import Level, build_levels, refine_garments
 from physgraph_usd.solver.mesh.weld import unwelded
@@ -230,10 +230,8 @@ def test_a_mixed_group_is_what_its_garments_are_alone():
         garments = [garment_of(mesh, points) for _ in chosen]
         refinements = refine_garments(garments, [1] * len(garments))
         group = Group.of(garments, refinements, np.array([0, 0, -9.81]), settings, dtype=torch.float32, device="cpu")
-        solved = solve_frame(group, FrameInput(chosen), None)
-        shapes, energies = solved.points, solved.telemetry["energy_joules"]
-        assert isinstance(energies, dict)
-        return shapes, energies["output"]
+        solved, telemetry = solve_frame(begin(group, chosen))
+        return group.per_garment(solved.points), telemetry["energy_joules"]["output"]
 
     together, energies = solve(frames)
     assert {"stretch", "membrane"} <= set(energies)

@@ -21,7 +21,7 @@ from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.solver.frame import start
 from physgraph_usd.solver.frame.refiner import Refiner
 from physgraph_usd.solver.frame.start import STILL, slowing
-from physgraph_usd.solver.frame.values import FrameState, join, split
+from physgraph_usd.solver.frame.state import State, join, split
 from physgraph_usd.solver.scene import Frame
 
 MESH, REST = sheet(8, 8, 0.05)
@@ -48,7 +48,17 @@ class TestState:
     def test_garments_that_join_count_from_the_last_to_move(self):
         coarse, fine = (torch.zeros(count, 3) for count in (2, 4))
         one, other = (
-            FrameState(coarse, fine, fine[:, 0] > 0, coarse[:, 0] > 0, coarse[:, 0].long(), held) for held in (7, 2)
+            State(
+                fine.numpy(),
+                crossing=np.zeros(4, bool),
+                coarse=coarse,
+                fine=fine,
+                inside=fine[:, 0] > 0,
+                given_up=coarse[:, 0] > 0,
+                following=coarse[:, 0].long(),
+                still_frames=held,
+            )
+            for held in (7, 2)
         )
         both = join([one, other])
         assert both.still_frames == 2

@@ -19,9 +19,10 @@ from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.refine import refine_shot
 from physgraph_usd.solver.contact.settings import ContactSettings
 from physgraph_usd.solver.frame.group import Group
+from physgraph_usd.solver.frame.problem import begin
 from physgraph_usd.solver.frame.solve import WorseStartError, solve_frame, solve_soundly
-from physgraph_usd.solver.frame.start import STILL, Start, start_of
-from physgraph_usd.solver.frame.values import Cage, FrameInput, FrameState, Solved
+from physgraph_usd.solver.frame.start import STILL
+from physgraph_usd.solver.frame.state import State
 from physgraph_usd.solver.integrate.stop import UNTANGLINGS, WARM_UNTANGLINGS
 from physgraph_usd.solver.level import refine_garments
 from physgraph_usd.solver.scene import GarmentFrame
@@ -30,29 +31,23 @@ from physgraph_usd.solver.seen import normal_angles
 MESH, REST = sheet(8, 6)
 
 
-def begun(group: Group, state: FrameState, cage: Cage) -> Start:
-    """Where a frame starts, with no body that has moved."""
-    given = {"frames": group.moving_frames, "reset": group.settings.reset}
-    return start_of(state.about(cage.origin), state.still_frames, cage, **given, moved=0.0)
-
-
 @pytest.mark.parametrize(("moved", "still"), [(0.9, True), (1.1, False)])
 def test_a_pose_is_held_while_its_cage_hardly_moves(moved: float, still: bool):
     group, points = group_of(MESH, REST, level=1), wave(REST)
-    state = solve_frame(group, FrameInput(frame_of(points).garments), None).state
+    state, _ = solve_frame(begin(group, frame_of(points).garments))
     edge = float(group.levels[0].spacing.mean())
-    cage = group.cage(frame_of(points + np.array([0.0, moved * STILL * edge, 0.0])).garments)
-    start = begun(group, state, cage)
+    frames = frame_of(points + np.array([0.0, moved * STILL * edge, 0.0])).garments
+    start = begin(group, frames, state, moved=0.0).start
     assert (start.reason, start.still_frames) == ("warm", int(still))
 
 
 def test_what_rests_stays_until_it_is_moved_by_more_than_it_rested_with():
     """The cage is bent by ever more: until twice the tolerance is left, no step is made."""
     group = group_of(MESH, REST, steps=400, tolerance=1e-3, contact=ContactSettings(), temporal="warm")
-    state, made = solve_frame(group, FrameInput(frame_of(wave(REST)).garments), None).state, []
+    (state, _), made = solve_frame(begin(group, frame_of(wave(REST)).garments)), []
     for bend in np.linspace(0.0, 0.001, 15):
         points = wave(REST) + bend * np.sin(20.0 * REST[:, [0]]) * np.array([0.0, 1.0, 0.0])
-        levels = solve_frame(group, FrameInput(frame_of(points).garments), state).telemetry["levels"]
+        levels = solve_frame(begin(group, frame_of(points).garments, state))[1]["levels"]
         made.append((sum(level["steps"] for level in levels), levels[-1]["remaining_move"]))
     stayed = [left for steps, left in made if not steps]
     assert max(stayed) > 1.5e-3, made
@@ -107,17 +102,17 @@ def test_a_warm_frame_ends_where_nothing_is_seen_to_move():
     """A sheet that is hardly squeezed more ends soon, and its folds stay; one that is squeezed much goes on."""
     mesh, rest = sheet(10, 10)
     group = group_of(mesh, rest, level=1, dtype=torch.float32, steps=200, tolerance=0.0, integrator="physgraph")
-    state = solve_frame(group, FrameInput(frame_of(wave(rest)).garments), None).state
+    state, _ = solve_frame(begin(group, frame_of(wave(rest)).garments))
     made, further = list[int](), list[float]()
     for squeeze in (0.1001, 0.16):
-        given = FrameInput(frame_of(wave(rest, squeeze=squeeze)).garments, elapsed=1 / 24)
-        solved = solve_frame(group, given, state)
-        (round_,) = solved.telemetry["levels"]
+        frames = frame_of(wave(rest, squeeze=squeeze)).garments
+        solved, telemetry = solve_frame(begin(group, frames, state))
+        (round_,) = telemetry["levels"]
         assert round_["stopped"] == "seen"
         made.append(round_["steps"])
-        rest_of_it = solve_frame(group, given, solved.state)
+        rest_of_it, _ = solve_frame(begin(group, frames, solved))
         triangles = group.levels[-1].triangles.numpy()
-        further.append(float(np.median(normal_angles(solved.points[0], rest_of_it.points[0], triangles))))
+        further.append(float(np.median(normal_angles(solved.points, rest_of_it.points, triangles))))
     assert 4 <= made[0] < made[1] < 200
     assert max(further) < 1.0  # degrees
 
@@ -130,14 +125,12 @@ def test_a_garment_that_turns_folds_like_one_that_does_not():
     upsampled = np.zeros(0)
     for step in (0.0, 0.5):
         group = group_of(mesh, rest, level=1, dtype=torch.float32, gravity=np.zeros(3), integrator="physgraph")
-        state, solved = None, None
+        state = None
         for number, points in enumerate(squeezed):
             turn = turned_about_y(step * number)
-            given = FrameInput([GarmentFrame(points @ turn.T, FABRIC, GUIDE)], elapsed=0.0 if state is None else 1 / 24)
-            solved = solve_frame(group, given, state)
-            state = solved.state
-        assert solved is not None
-        ends.append(solved.points[0] @ turned_about_y(step * (len(squeezed) - 1)))
+            state, _ = solve_frame(begin(group, [GarmentFrame(points @ turn.T, FABRIC, GUIDE)], state))
+        assert state is not None
+        ends.append(state.points @ turned_about_y(step * (len(squeezed) - 1)))
         upsampled = group.upsampled([GarmentFrame(squeezed[-1], FABRIC, GUIDE)])[0]
     apart, detail = (np.linalg.norm(ends[0] - other, axis=1) for other in (ends[1], upsampled))
     assert np.median(apart) < 0.02 * np.median(detail)
@@ -155,14 +148,11 @@ def test_frames_in_a_row_come_nearer_to_rest_with_the_curvature_of_the_last():
 
     def energy(steps: int, *, forget: bool) -> float:
         group = group_of(mesh, rest, level=2, dtype=torch.float32, steps=steps, integrator="physgraph")
-        state, solved = None, None
+        state, telemetry = None, dict[str, Any]()
         for points in squeezed:
             state = state if state is None or not forget else replace(state, curvature=None)
-            given = FrameInput([GarmentFrame(points, FABRIC, GUIDE)], elapsed=0.0 if state is None else 1 / 24)
-            solved = solve_frame(group, given, state)
-            state = solved.state
-        assert solved is not None
-        return sum(solved.telemetry["energy_joules"]["output"].values())
+            state, telemetry = solve_frame(begin(group, [GarmentFrame(points, FABRIC, GUIDE)], state))
+        return sum(telemetry["energy_joules"]["output"].values())
 
     least = energy(300, forget=False)
     assert energy(8, forget=False) - least < 0.9 * (energy(8, forget=True) - least)
@@ -180,42 +170,42 @@ def test_layers_that_are_shaken_end_about_as_low_as_by_quasi_newton(sample: Call
 
 
 @pytest.fixture(scope="module")
-def layers() -> tuple[Group, FrameInput, FrameState]:
+def layers() -> tuple[Group, list[GarmentFrame], State]:
     """Two level sheets 2 cm apart, and what their frame leaves to the next."""
     garments = [named(square(6), name) for name in ("Upper", "Lower")]
     cages = [garments[0].rest + np.array([0.0, 0.02, 0.0]), garments[1].rest]
     settings = settings_of(contact=ContactSettings())
     chains = refine_garments(garments, [1, 1])
     group = Group.of(garments, chains, DOWN, settings, dtype=torch.float32, device="cpu")
-    frame = FrameInput([GarmentFrame(cage, FABRIC, GUIDE) for cage in cages])
-    return group, frame, solve_frame(group, frame, None).state
+    frames = [GarmentFrame(cage, FABRIC, GUIDE) for cage in cages]
+    return group, frames, solve_frame(begin(group, frames))[0]
 
 
-def crossings(solved: Solved) -> int:
-    return solved.telemetry["contact"]["cloth"]["after"]["crossings"]
+def crossings(telemetry: dict[str, Any]) -> int:
+    return telemetry["contact"]["cloth"]["after"]["crossings"]
 
 
 @pytest.mark.parametrize(("twist", "why"), [(3.0, "it kept "), (0.0, "it ended with ")])
 def test_cloth_caught_on_the_wrong_side_is_started_anew(
-    layers: tuple[Group, FrameInput, FrameState], twist: float, why: str
+    layers: tuple[Group, list[GarmentFrame], State], twist: float, why: str
 ):
     """The last frame had the lower sheet above the upper one, or twisted through it."""
-    group, frame, state = layers
+    group, frames, state = layers
     lower, lifted = group.levels[-1].spans[1], torch.zeros_like(state.fine)
     at = state.fine[lower]
     lifted[lower, 1] = (0.02 if twist else 0.04) + twist * at[:, 0] * at[:, 2]
     caught = replace(state, fine=state.fine + lifted, clean=False)
-    alone, mended = solve_frame(group, frame, caught), solve_soundly(group, frame, caught)
-    assert ("follows_cage" in alone.telemetry) == (twist > 0.0)
+    alone, mended = (solve(begin(group, frames, caught))[1] for solve in (solve_frame, solve_soundly))
+    assert ("follows_cage" in alone) == (twist > 0.0)
     assert crossings(alone) == crossings(mended) == 0
-    assert "follows_cage" not in mended.telemetry
-    assert mended.telemetry["start"].startswith(f"cold: started anew, since {why}")
-    energies = [sum(each.telemetry["energy_joules"]["output"].values()) for each in (mended, alone)]
+    assert "follows_cage" not in mended
+    assert mended["start"].startswith(f"cold: started anew, since {why}")
+    energies = [sum(each["energy_joules"]["output"].values()) for each in (mended, alone)]
     assert energies[0] < 0.1 * energies[1]
 
 
 @pytest.fixture(scope="module")
-def stuck() -> tuple[Group, FrameInput]:
+def stuck() -> tuple[Group, list[GarmentFrame]]:
     """Two pressed sheets, held at their borders, that stand in one another: nothing can take them apart."""
     flat = square(16)
     _, rest = flat
@@ -227,21 +217,19 @@ def stuck() -> tuple[Group, FrameInput]:
     group = Group.of(garments, chains, DOWN, settings, dtype=torch.float32, device="cpu")
     edge = 2.0 * away.max() / 16
     cages = rest, rest[:, [0, 2, 1]] * [1.0, -1.0, 1.0] + edge * np.array([0.2, 0.3, 0.4])
-    return group, FrameInput([GarmentFrame(cage * [0.92, 1.0, 1.0], FABRIC, GUIDE) for cage in cages])
+    return group, [GarmentFrame(cage * [0.92, 1.0, 1.0], FABRIC, GUIDE) for cage in cages]
 
 
-def test_a_level_ends_early_where_crossings_do_not_become_fewer(stuck: tuple[Group, FrameInput]):
+def test_a_level_ends_early_where_crossings_do_not_become_fewer(stuck: tuple[Group, list[GarmentFrame]]):
     """Beside the rounds that untangle, of 4 steps, 25 at the cage and 4 at each level, a level makes 24 steps."""
-    group, frame = stuck
-    solved = solve_frame(group, frame, None)
-    steps = [sum(report["steps"] for report in solved.telemetry["levels"] if report["level"] == n) for n in (0, 1)]
-    assert crossings(solved) > 0
+    _, telemetry = solve_frame(begin(*stuck))
+    steps = [sum(report["steps"] for report in telemetry["levels"] if report["level"] == n) for n in (0, 1)]
+    assert crossings(telemetry) > 0
     assert steps[0] <= 24 + 4 * (UNTANGLINGS + WARM_UNTANGLINGS)
     assert steps[1] <= 24 + 4 * WARM_UNTANGLINGS
 
 
-def test_a_start_from_a_cage_that_crosses_as_often_is_dropped(stuck: tuple[Group, FrameInput]):
+def test_a_start_from_a_cage_that_crosses_as_often_is_dropped(stuck: tuple[Group, list[GarmentFrame]]):
     """Finer levels only cross more often: a result with a single crossing is not to be had from there."""
-    group, frame = stuck
     with pytest.raises(WorseStartError):
-        solve_frame(group, frame, None, fewer_than=1)
+        solve_frame(begin(*stuck), fewer_than=1)

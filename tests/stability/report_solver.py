@@ -20,8 +20,8 @@ from test_starts import ball, squeezed
 from physgraph_usd.errors import SolveError
 from physgraph_usd.lab.methods import METHODS
 from physgraph_usd.solver.fabric import Fabric
+from physgraph_usd.solver.frame.problem import begin
 from physgraph_usd.solver.frame.solve import solve_frame
-from physgraph_usd.solver.frame.values import FrameInput
 from physgraph_usd.solver.integrate.base import Carry
 from physgraph_usd.solver.integrate.descend import solve_level
 from physgraph_usd.solver.integrate.guard import Guard
@@ -274,10 +274,9 @@ def s36_drift(method: str) -> Result:
     group = group_of(mesh, rest, level=2, integrator=method, steps=12, tolerance=0.0)
     frame, state, outputs, energies = GarmentFrame(wave(rest), FABRIC, GUIDE), None, [], []
     for _ in range(11):
-        found = solve_frame(group, FrameInput([frame]), state)
-        state = found.state
-        outputs.append(found.points[0])
-        energies.append(total(found.telemetry, "output"))
+        state, telemetry = solve_frame(begin(group, [frame], state))
+        outputs.append(state.points)
+        energies.append(total(telemetry, "output"))
     changes = [rms(after - before) for before, after in pairwise(outputs)]
     risen = any(after > before + 1e-9 * abs(before) for before, after in pairwise(energies))
     ratio = changes[-1] / changes[0] if changes[0] else 0.0

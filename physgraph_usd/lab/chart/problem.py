@@ -17,10 +17,11 @@ import torch
 from ...shot.options import RefineOptions
 from ...solver.contact.settings import ContactSettings
 from ...solver.forces.base import ForceModule
+from ...solver.frame.problem import begin
 from ...solver.frame.refiner import Refiner
 from ...solver.frame.settings import SolveSettings
 from ...solver.frame.solve import solve_frame
-from ...solver.frame.values import FrameInput, FrameState
+from ...solver.frame.state import State
 from ...solver.level import Level, fine_meshes
 from ...solver.resolution import edge_strain
 from ...solver.scene import Frame, Scene
@@ -148,8 +149,8 @@ class Problem:
         return Solved(points, prepared + busy * spent["solve"], prepared, 1e3 * elapsed, steps, waited)
 
     def go_on(
-        self, frame: Frame, settings: SolveSettings, states: Sequence[FrameState | None]
-    ) -> tuple[tuple[np.ndarray, ...], list[FrameState]]:
+        self, frame: Frame, settings: SolveSettings, states: Sequence[State | None]
+    ) -> tuple[tuple[np.ndarray, ...], list[State]]:
         """Continue a frame from the state of each part; cold for a state None.
 
         Returns:
@@ -160,9 +161,10 @@ class Problem:
         after = []
         for part, state in zip(self.refiner.parts_of(frame), states, strict=True):
             frames, touching = [frame.garments[index] for index in part], self.refiner.touching(part, frame)
-            solved = solve_frame(self.refiner.group_of(part), FrameInput(frames, frame.time, touching), state)
-            points.update(zip(part, solved.points, strict=True))
-            after.append(solved.state)
+            group = self.refiner.group_of(part)
+            solved, _ = solve_frame(begin(group, frames, state, at=frame.time, touching=touching))
+            points.update(zip(part, group.per_garment(solved.points), strict=True))
+            after.append(solved)
         return tuple(points[index] for index in sorted(points)), after
 
     def judge(self, frame: Frame, points: Sequence[np.ndarray], settings: SolveSettings = COLD) -> Judgement:

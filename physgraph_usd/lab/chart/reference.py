@@ -19,7 +19,7 @@ import numpy as np
 
 from ...errors import counted
 from ...solver.frame.settings import SolveSettings
-from ...solver.frame.values import FrameState
+from ...solver.frame.state import State
 from ...solver.scene import Frame
 from ...solver.seen import normal_angles
 from ..methods import METHODS
@@ -160,7 +160,7 @@ class _Descent:
 
     def __init__(self, problem: Problem, frame: Frame, settings: SolveSettings, *, start: float) -> None:
         self._problem, self._frame, self._settings, self._start = problem, frame, settings, start
-        self._states: Sequence[FrameState | None] = [None] * len(problem.refiner.parts_of(frame))
+        self._states: Sequence[State | None] = [None] * len(problem.refiner.parts_of(frame))
         self.by, self.energy = "", math.inf
         self.energies: dict[str, float] = {}
         self.points: tuple[np.ndarray, ...] = ()

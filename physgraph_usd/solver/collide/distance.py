@@ -108,7 +108,7 @@ def _closest(
 def weights(
     x: Float[Tensor, "vertices 3"], corners: Int[Tensor, "pairs 4"], face: Bool[Tensor, " pairs"], *, threads: int = 1
 ) -> Float[Tensor, "pairs 4"]:
-    """Weights of corners in the shortest vector from each pair's second part to its first, as in `NearPairs`.
+    """Weights of corners in the shortest vector from each pair's second part to its first, as `NearSprings`.
 
     Args:
         x: Positions [m], float64.

@@ -78,25 +78,3 @@ class NearAt:
         parts keep at least half the floor.
         """
         return move.norm(dim=1) > (self.reach.play - 0.5 * floor).clamp_min(0.0)
-
-
-@dataclass(frozen=True, eq=False)
-class NearPairs:
-    """Near pairs of parts, and the shortest vectors between them.
-
-    Attributes:
-        corners: A vertex and the corners of a face, or the ends of two edges, shape (N, 4), int32.
-        weight: Weights of the corners in the shortest vector from the second part to the first; rows sum to 0, shape
-            (N, 4).
-        separation: Shortest vector [m], shape (N, 3).
-        face: True for a vertex and a face, shape (N,).
-    """
-
-    corners: Int[Tensor, "pairs 4"]
-    weight: Float[Tensor, "pairs 4"]
-    separation: Float[Tensor, "pairs 3"]
-    face: Bool[Tensor, " pairs"]
-
-    def where(self, selected: Int[Tensor, " kept"]) -> NearPairs:
-        """The selected pairs."""
-        return NearPairs(self.corners[selected], self.weight[selected], self.separation[selected], self.face[selected])

@@ -13,7 +13,7 @@ area, or a third of the least of the cloth corners' areas.
 # pyright: reportArgumentType=false, reportIndexIssue=false
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 
 import numpy as np
@@ -23,7 +23,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ..collide.distance import weights_of
-from ..collide.pairs import NearAt, NearPairs, Pairs, Reach
+from ..collide.pairs import NearAt, Pairs, Reach
 from ..collide.search import blocking_and_near, near_parts
 from ..forces.self_contact import PairConstraints
 from ..mesh.kernels import KERNELS
@@ -91,18 +91,27 @@ def _find_springs(
 
 @dataclass(frozen=True, eq=False)
 class NearSprings:
-    """Near pairs and their offsets.
+    """Near pairs of parts, the shortest vectors between them, and the distances to keep.
 
     Attributes:
+        corners: A vertex and the corners of a face, or the ends of two edges, shape (N, 4), int32.
+        weight: Weights of the corners in the shortest vector from the second part to the first; rows sum to 0, shape
+            (N, 4).
+        separation: Shortest vector [m], shape (N, 3).
+        face: True for a vertex and a face, shape (N,).
         offset: Distance to keep [m], shape (N,).
     """
 
-    near: NearPairs
+    corners: Int[Tensor, "pairs 4"]
+    weight: Float[Tensor, "pairs 4"]
+    separation: Float[Tensor, "pairs 3"]
+    face: Bool[Tensor, " pairs"]
     offset: Float[Tensor, " pairs"]
 
     def where(self, selected: Bool[Tensor, " pairs"]) -> NearSprings:
         """The selected springs."""
-        return NearSprings(self.near.where(torch.nonzero(selected).squeeze(1)), self.offset[selected])
+        rows = torch.nonzero(selected).squeeze(1)  # One conversion for all fields.
+        return NearSprings(*(getattr(self, field.name)[rows] for field in fields(self)))
 
 
 def _required_gaps(thickness: Float[Tensor, " garments"], offsets: np.ndarray | None) -> Float[Tensor, "all all"]:
@@ -261,23 +270,21 @@ class ClothSprings:
         inputs += [argument(pairs.corners, wp.vec4i), argument(pairs.face)]
         inputs += [argument(weight, wp.vec4d), argument(separation, wp.vec3d), argument(offset), argument(is_near)]
         run(_find_springs, count, inputs, device=str(device), threads=self._mesh.level.threads)
-        rows = torch.nonzero(is_near).squeeze(1)  # One conversion for all fields.
-        near = NearPairs(pairs.corners[rows], weight[rows], separation[rows], pairs.face[rows])
-        return NearSprings(near, offset[rows])
+        return NearSprings(pairs.corners, weight, separation, pairs.face, offset).where(is_near)
 
-    def constraints(self, springs: NearSprings, x: Float[Tensor, "all 3"], stiffness: float) -> PairConstraints:
+    def constraints(self, near: NearSprings, x: Float[Tensor, "all 3"], stiffness: float) -> PairConstraints:
         """The springs as constraints of the contact force; a body's part of a pair is constant.
 
         Args:
             x: Positions of cloth and bodies [m], float64.
             stiffness: Stiffness by area [N/m^3].
         """
-        near, count = springs.near, self._mesh.level.vertex_count
+        count = self._mesh.level.vertex_count
         normal = torch.nn.functional.normalize(near.separation, dim=1, eps=1e-300)
         corners = near.corners.long()
         least = torch.where(corners < count, self._area[corners.clamp_max(count - 1)], torch.inf)
         share = torch.where(near.face & (corners[:, 0] < count), least[:, 0], least.amin(dim=1) / 3.0)
-        return self._mesh.anchored(near.corners, near.weight, normal, springs.offset, stiffness * share, x)
+        return self._mesh.anchored(near.corners, near.weight, normal, near.offset, stiffness * share, x)
 
     def sided(
         self, near: NearSprings, exempt: Bool[Tensor, " all"] | None
@@ -288,10 +295,9 @@ class ClothSprings:
         vertices, may point either way; from a vertex outside to a face it points out. Springs of vertices on a face
         have no direction.
         """
-        pairs, count = near.near, self._mesh.level.vertex_count
-        corners = pairs.corners.long()
-        with_body, of_vertex = corners.amax(dim=1) >= count, pairs.face & (corners[:, 0] < count)
-        touching = with_body & (pairs.separation.norm(dim=1) < ON_SURFACE)
+        count, corners = self._mesh.level.vertex_count, near.corners.long()
+        with_body, of_vertex = corners.amax(dim=1) >= count, near.face & (corners[:, 0] < count)
+        touching = with_body & (near.separation.norm(dim=1) < ON_SURFACE)
         out = torch.zeros((len(self._keep) - self._cloths, count), dtype=torch.bool, device=corners.device)
         on = corners[touching & of_vertex]
         out[self.owner[on[:, 3]].long() - self._cloths, on[:, 0]] = True

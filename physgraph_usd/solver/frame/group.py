@@ -27,7 +27,21 @@ from ..scene import Garment, GarmentFrame, recentred
 from .from_cage import Followers, MovingFrames
 from .level_forces import LevelForces
 from .settings import SolveSettings
-from .values import Cage, FrameInput
+
+
+@dataclass(frozen=True, eq=False)
+class Cage:
+    """Positions of a group's cages.
+
+    Attributes:
+        world: World positions [m], shape (C, 3), float64.
+        origin: Mean of the world positions [m], shape (3,).
+        points: Positions relative to the origin [m], in the scalar type of the solve.
+    """
+
+    world: np.ndarray
+    origin: np.ndarray
+    points: Float[Tensor, "coarse 3"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,6 +114,10 @@ class Group:
         """Sign of each garment's normals: 1 for outward, -1 for inward."""
         return torch.tensor([-1.0 if g.flipped else 1.0 for g in self.garments], device=self.levels[0].device)
 
+    def per_garment(self, points: Float[np.ndarray, "vertices 3"]) -> list[np.ndarray]:
+        """The rows of each garment."""
+        return [points[span] for span in self.levels[-1].spans]
+
     def tensor(self, array: np.ndarray) -> Tensor:
         """An array in the type and on the device of the solve."""
         return torch.as_tensor(array, dtype=self.levels[0].dtype, device=self.levels[0].device)
@@ -138,32 +156,34 @@ class Group:
 
     def contact(
         self,
-        frame: FrameInput,
+        frames: Sequence[GarmentFrame],
         cage: Cage,
         *,
+        touching: Sequence[Touching] = (),
         settings: ContactSettings | None = None,
         given_up: Bool[Tensor, " coarse"] | None = None,
     ) -> FrameContact | None:
         """Contact of a frame's cloth, or None without possible contact.
 
         Args:
+            touching: Surfaces within reach of the garments.
             settings: Contact settings; the group's own when None.
             given_up: As for `FrameContact`.
         """
         settings = settings or self.settings.contact
-        touching = frame.touching if settings.form != "off" else ()
+        touching = touching if settings.form != "off" else ()
         itself = settings.cloth != "off" and self.cloth.meets.any()
         if not len(self.levels[0].triangles) or not (itself or touching or any(self.seams)):
             return None
         points, origin, edge = cage.points, cage.origin, self.spacings[0]
-        settings = settings.scaled(edge, stretch=max(garment.fabric.stretch for garment in frame.garments))
+        settings = settings.scaled(edge, stretch=max(garment.fabric.stretch for garment in frames))
         bodies = FrameBodies.begin(touching, points, edge=edge, origin=origin, settings=settings) if touching else None
         return FrameContact(
             self.levels,
             points,
             bodies=bodies,
             cloth=self.cloth,
-            thickness=[garment.fabric.thickness for garment in frame.garments],
+            thickness=[garment.fabric.thickness for garment in frames],
             settings=settings,
             seams=self.seams,
             given_up=given_up,
@@ -173,8 +193,7 @@ class Group:
         """World positions of each garment [m] on its cage's smooth surface, unsolved."""
         cage, finest = self.cage(frames), self.levels[-1]
         smooth = unhindered(finest.smooth_base.apply(cage.points))
-        points = self.followers.placed(smooth, cage.origin, cage.world)
-        return [points[span] for span in finest.spans]
+        return self.per_garment(self.followers.placed(smooth, cage.origin, cage.world))
 
     def energies(
         self, frames: Sequence[GarmentFrame], points: Sequence[np.ndarray], touching: Sequence[Touching] = ()
@@ -203,7 +222,7 @@ class Group:
         x, target = (self.tensor(np.concatenate(points) - origin) for points in (start, wanted))
         moved, _ = contact.finish(contact.at(self.levels[-1]).moved(Placed(x), target))
         points = np.concatenate(wanted) + (moved - target).double().cpu().numpy()
-        return [points[span] for span in self.levels[-1].spans], contact.measure(moved)[0]
+        return self.per_garment(points), contact.measure(moved)[0]
 
     def systems(self, frames: Sequence[GarmentFrame]) -> tuple[list[System], Float[Tensor, "coarse 3"]]:
         """The problem of one frame without its solve, for charts and benchmarks.
@@ -219,7 +238,7 @@ class Group:
     ) -> tuple[ForceModule, FrameContact | None, np.ndarray]:
         """The finest level's forces in a frame, the contact, and the origin's world position [m], to judge results."""
         cage = self.cage(frames)
-        contact = self.contact(FrameInput(frames, touching=touching), cage)
+        contact = self.contact(frames, cage, touching=touching)
         aim = cage.points if contact is None else contact.aim
         return self.forces_for(frames)[-1].module(aim, frames), contact, cage.origin
 

@@ -15,7 +15,7 @@ from ...errors import named_time
 from ..colliders.pose import Pose
 from ..rigid import AT_REST, Rigid, best_motion
 from ..scene import SAME_TIME, Frame, Garment, GarmentFrame, GarmentResult, Limits
-from .values import FrameState, join
+from .state import State, join
 
 RETURNED = 0.25
 """Tolerance for the input's return after a broken frame, as a fraction of the move into the broken frame. Even motion
@@ -30,8 +30,6 @@ class SolvedFrame:
         colliders: Poses of all of the scene's bodies.
         near: Numbers of the bodies within reach.
         part: Numbers of the garments solved together.
-        points: Fine positions [m].
-        crossing: Whether each fine vertex belongs to cloth that crosses cloth.
         first: Whether no frame was solved before.
         is_reusable: As in `SolveSettings` at the end of the solve; False too if the time limit stopped the frame.
     """
@@ -41,9 +39,7 @@ class SolvedFrame:
     colliders: Sequence[Pose | None]
     near: tuple[int, ...]
     part: tuple[int, ...]
-    points: np.ndarray
-    state: FrameState
-    crossing: np.ndarray
+    state: State
     first: bool = False
     is_reusable: bool = True
 
@@ -96,7 +92,7 @@ class Origin:
     """
 
     frames: tuple[SolvedFrame | None, ...]
-    state: FrameState | None
+    state: State | None
     motion: Rigid
     broken: float | None
     jumped: float | None

@@ -20,7 +20,7 @@ from ..scene import FARTHEST
 from .level_forces import named
 from .no_worse import no_worse
 from .problem import Problem
-from .values import Curvature, FrameState
+from .state import Curvature, State
 
 
 def refuse_swallowed(problem: Problem) -> None:
@@ -30,11 +30,11 @@ def refuse_swallowed(problem: Problem) -> None:
         SolveError: Some cloth is wholly in a body.
     """
     swallowed = [] if problem.contact is None else problem.contact.swallowed
-    for garment, frame, (deep, body) in zip(problem.group.garments, problem.frame.garments, swallowed, strict=False):
+    for garment, frame, (deep, body) in zip(problem.group.garments, problem.frames, swallowed, strict=False):
         size = float(np.linalg.norm(extent(frame.points))) if deep else 0.0
         if deep > size:
             fault = f"it is {1e3 * deep:.4g} mm deep in <{body}>, and only {1e3 * size:.4g} mm large"
-            raise SolveError(f"{named([garment], problem.frame.at)}: {fault}; mend the one or the other there")
+            raise SolveError(f"{named([garment], problem.at)}: {fault}; mend the one or the other there")
 
 
 def scaled(problem: Problem, x: Placed) -> Placed:
@@ -44,12 +44,12 @@ def scaled(problem: Problem, x: Placed) -> Placed:
         SolveError: The cloth is not finite or out of bounds.
     """
     group, view = problem.group, problem.view(problem.finest)
-    pairs = zip(problem.frame.garments, group.garments, strict=True)
+    pairs = zip(problem.frames, group.garments, strict=True)
     gain = np.concatenate([frame.detail * garment.detail_scale for frame, garment in pairs])
     result = group.moving_frames.scaled(problem.aim, x, gain)
     if not bool((result.abs() <= FARTHEST).all()):
         fault = f"the refined cloth is not finite or beyond {FARTHEST:g} m; lower physgraph:refine:detail"
-        raise SolveError(f"{named(group.garments, problem.frame.at)}: {fault} or detailScale")
+        raise SolveError(f"{named(group.garments, problem.at)}: {fault} or detailScale")
     return x if result is x else unhindered(result) if view is None else view.moved(x, result)
 
 
@@ -68,26 +68,33 @@ def limited(problem: Problem, x: Placed) -> Placed:
 def patched(problem: Problem, x: Placed) -> tuple[Placed, Tensor, dict[str, int]]:
     """The cloth with no patch worse than the subdivided cage, and more, as returned by `no_worse`."""
     view, level = problem.view(problem.finest), problem.forces[-1].level
+    none = torch.zeros_like(problem.cage.points[:, 0], dtype=torch.int64)
+    before = none if problem.last is None else problem.last.following
     if view is None:
-        return x, problem.following, {}
-    smooth = problem.subdivided
-    return no_worse(view, x, smooth, from_coarse=level.from_coarse, before=problem.following)
+        return x, before, {}
+    return no_worse(view, x, problem.subdivided, from_coarse=level.from_coarse, before=before)
 
 
-def next_state(problem: Problem, x: Placed, memory: Any, following: Tensor) -> FrameState:
-    """State for the start of the next frame.
+def next_state(
+    problem: Problem, x: Placed, visible: Placed, memory: Any, *, following: Tensor, crossing: np.ndarray
+) -> State:
+    """The cloth after the frame.
 
     Args:
-        x: The result [m].
+        x: The solved cloth [m], from which the next frame starts.
+        visible: The result [m]: its detail scaled, and more.
         memory: The integrator's memory, or None.
-        following: As in `FrameState`.
+        following: As in `State`.
+        crossing: As in `State`.
     """
     view, cage = problem.view(problem.finest), problem.cage
     fine = x.double() + torch.as_tensor(cage.origin).to(x.device)
     given_up = None if problem.contact is None else problem.contact.given_up
     state = None if view is None else view.look(x)
     exempt = None if state is None else state.exempt
-    return FrameState(
+    return State(
+        points=problem.placed(visible),
+        crossing=crossing,
         coarse=torch.as_tensor(cage.world),
         fine=fine,
         inside=torch.zeros_like(x[:, 0], dtype=torch.bool) if exempt is None else exempt[: len(x)],
@@ -131,7 +138,11 @@ def measured(problem: Problem, x: Tensor) -> tuple[dict[str, object], np.ndarray
         Plain values, and whether each vertex belongs to crossing cloth, shape (V,), bool.
     """
     group, settings = problem.group, problem.group.settings.contact.to_measure()
-    judge = problem.contact if settings is None else group.contact(problem.frame, problem.cage, settings=settings)
+    judge = (
+        problem.contact
+        if settings is None
+        else group.contact(problem.frames, problem.cage, touching=problem.touching, settings=settings)
+    )
     if judge is None:
         return {}, np.zeros(len(x), bool)
     values, crossing = judge.measure(x)

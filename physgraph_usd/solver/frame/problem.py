@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
+from ..contact.bodies import Touching
 from ..contact.cloth import LevelContact
 from ..contact.frame import FrameContact
 from ..contact.metric import HeldMetric
@@ -24,11 +25,12 @@ from ..integrate.base import Integrator, System, Transporting
 from ..integrate.metric import Metric
 from ..integrate.stop import Budget
 from ..level import Level, Placed
-from .group import Group
+from ..scene import GarmentFrame
+from .group import Cage, Group
 from .level_forces import LevelForces
 from .limits import limit_of
 from .start import Start, start_of
-from .values import Cage, Curvature, FrameInput, FrameState
+from .state import State
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,30 +107,32 @@ class Problem:
 
     Attributes:
         began: Start of the frame's computation [s].
-        aim: The cage followed by the fine cloth [m].
-        forces: The lasting terms of each level, coarsest first.
+        frames: The garments at this time code.
+        at: The time code, for errors; None without one.
+        touching: Surfaces within reach of the garments.
+        last: The cloth after the last frame; None for a cold start.
         prerolled: Cages advanced from an earlier frame [m], for a cold start; or None.
-        before: Fine positions in the last frame [m], float64; None without a last frame.
-        inside: Mask of the vertices inside a body in the last frame; None if none was.
+        forces: The lasting terms of each level, coarsest first.
         tether: Stiffness of the tie to the start [1/s^2]; None without tie.
-        last_curvature: Curvature learned in the last frame, or None.
-        following: As in `FrameState`, after the last frame, shape (C,).
     """
 
     began: float
     group: Group
-    frame: FrameInput
+    frames: Sequence[GarmentFrame]
+    at: float | None
+    touching: Sequence[Touching]
     cage: Cage
-    aim: Float[Tensor, "coarse 3"]
+    last: State | None
+    prerolled: Float[Tensor, "coarse 3"] | None
     forces: Sequence[LevelForces]
     contact: FrameContact | None
     start: Start
-    prerolled: Float[Tensor, "coarse 3"] | None
-    before: Placed | None
-    inside: Bool[Tensor, " vertices"] | None
     tether: float | None
-    last_curvature: Curvature | None
-    following: Int[Tensor, " coarse"]
+
+    @property
+    def aim(self) -> Float[Tensor, "coarse 3"]:
+        """The cage followed by the fine cloth [m]."""
+        return self.cage.points if self.contact is None else self.contact.aim
 
     @property
     def warm(self) -> bool:
@@ -156,7 +160,7 @@ class Problem:
     @property
     def module(self) -> ForceModule:
         """All terms of the frame at the finest level, without contact."""
-        return self.forces[-1].module(self.aim, self.frame.garments)
+        return self.forces[-1].module(self.aim, self.frames)
 
     @cached_property
     def carried(self) -> Float[Tensor, "vertices 3"]:
@@ -164,9 +168,10 @@ class Problem:
         view, warm, limit = self.view(self.finest), self.start.detailed, self.limit(self.finest)
         assert warm is not None
         warm = warm if limit is None else limit.in_front(warm)
-        if view is None or self.before is None:
+        if view is None or self.last is None:
             return warm
-        return view.carried(self.before, warm, self.inside)
+        inside = self.last.inside if bool(self.last.inside.any()) else None
+        return view.carried(self.last.about(self.cage.origin)[1], warm, inside)
 
     @property
     def _first_cage(self) -> Float[Tensor, "coarse 3"]:
@@ -187,7 +192,7 @@ class Problem:
     def limit(self, index: int) -> Limit | None:
         """Limits of a level's cloth; None without."""
         if index not in self._limits:
-            arguments = self.forces[index], self.frame.garments, self.cage.points
+            arguments = self.forces[index], self.frames, self.cage.points
             self._limits[index] = limit_of(*arguments, outward=self.group.outward, view=self.view(index))
         return self._limits[index]
 
@@ -210,7 +215,7 @@ class Problem:
             start_time: Time at which the frame was ready to be solved [s].
         """
         lasting, settings, limit = self.forces[index], self.group.settings, self.limit(index)
-        module = lasting.module(self.aim, self.frame.garments)
+        module = lasting.module(self.aim, self.frames)
         module = module if limit is None else module.joined_by([limit])
         tie = None if self.tether is None or self.start.detailed is None else (self.tether, self.start.detailed)
         without_contact = lasting.system(module, tie, rough=settings.rough)
@@ -232,18 +237,17 @@ class Problem:
     @property
     def _curvature(self) -> Any:
         """The last frame's integrator memory, transported to this frame; None for cold starts and changed garments."""
-        curvature, rotation, integrator = self.last_curvature, self.start.rotation, self.group.integrator
+        curvature = None if self.last is None else self.last.curvature
+        rotation, integrator = self.start.rotation, self.group.integrator
         if curvature is None or rotation is None or self.start.rests or curvature.vertices != len(rotation):
             return None
         if not np.array_equal(curvature.turn, np.eye(3)):
             rotation = rotation @ torch.as_tensor(curvature.turn).to(rotation)
         return integrator.transported(curvature.memory, rotation) if isinstance(integrator, Transporting) else None
 
-    def placed(self, x: Placed) -> list[np.ndarray]:
-        """World positions of each garment [m], given those of the finest level."""
-        group = self.group
-        points = group.followers.placed(x, self.cage.origin, self.cage.world)
-        return [points[span] for span in group.levels[-1].spans]
+    def placed(self, x: Placed) -> Float[np.ndarray, "vertices 3"]:
+        """World positions [m] of the finest level's vertices, given those about the cages' mean."""
+        return self.group.followers.placed(x, self.cage.origin, self.cage.world)
 
     def level_start(
         self, index: int, below: Float[Tensor, "below 3"] | None
@@ -272,38 +276,53 @@ class Problem:
         return x, smoothing
 
 
-def begin(group: Group, frame: FrameInput, last: FrameState | None) -> Problem:
+def begin(
+    group: Group,
+    frames: Sequence[GarmentFrame],
+    last: State | None = None,
+    *,
+    at: float | None = None,
+    touching: Sequence[Touching] = (),
+    moved: float = np.inf,
+    elapsed: float = 0.0,
+    prerolled: Float[np.ndarray, "coarse 3"] | None = None,
+    given_up: Bool[Tensor, " coarse"] | None = None,
+) -> Problem:
     """Prepare a frame for solving.
 
     Args:
-        last: State left by the last frame, or None for a cold start.
+        group: Garments solved together.
+        frames: The garments at this time code.
+        last: The cloth after the last frame; None for a cold start.
+        at: The time code, for errors.
+        touching: Surfaces within reach of the garments.
+        moved: Largest motion of the surfaces since the last frame [m]; infinite if more than poses changed.
+        elapsed: Time since the last frame [s]; 0 for 1/24 s.
+        prerolled: World positions of cages advanced from an earlier frame [m], for a cold start; or None.
+        given_up: As in `State`, for a start from the cage.
     """
-    began = time.perf_counter()
-    forces, cage, settings = group.forces_for(frame.garments), group.cage(frame.garments), group.settings
-    history = None if settings.temporal == "off" else last
-    last_positions = None if last is None else last.about(cage.origin)
-    before = None if last_positions is None else last_positions[1]
-    moved = frame.moved if settings.temporal == "tether" else np.inf  # Only the tether slows the cloth down.
+    began, settings = time.perf_counter(), group.settings
+    last = None if settings.temporal == "off" else last
+    forces, cage = group.forces_for(frames), group.cage(frames)
+    contact = group.contact(frames, cage, touching=touching, given_up=given_up if last is None else last.given_up)
     start = Start("cold")
-    if history is not None and last_positions is not None:
-        frames, reset = group.moving_frames, settings.reset
-        start = start_of(last_positions, history.still_frames, cage, frames=frames, reset=reset, moved=moved)
-    contact = group.contact(frame, cage, given_up=frame.given_up if history is None else history.given_up)
-    if contact is not None and last is not None and last.clean and before is not None:
-        contact.at(group.levels[-1]).remember(before)
+    if last is not None:
+        if settings.temporal != "tether":  # Only the tether slows the cloth down.
+            moved = np.inf
+        start = start_of(last, cage, group.moving_frames, reset=settings.reset, moved=moved)
+        if contact is not None and last.clean:
+            contact.at(group.levels[-1]).remember(last.about(cage.origin)[1])
     return Problem(
         began,
         group,
-        frame,
+        frames,
+        at,
+        touching,
         cage,
-        aim=cage.points if contact is None else contact.aim,
-        forces=forces,
-        contact=contact,
-        start=start,
-        prerolled=None if frame.prerolled is None else group.tensor(frame.prerolled - cage.origin),
-        before=before,
-        inside=last.inside if last is not None and bool(last.inside.any()) else None,
-        tether=start.slowed * settings.tether * frame.rate**2 if settings.temporal == "tether" else None,
-        last_curvature=None if history is None else history.curvature,
-        following=torch.zeros_like(cage.points[:, 0], dtype=torch.int64) if history is None else history.following,
+        last,
+        None if prerolled is None else group.tensor(prerolled - cage.origin),
+        forces,
+        contact,
+        start,
+        tether=start.slowed * settings.tether / (elapsed or 1.0 / 24.0) ** 2 if settings.temporal == "tether" else None,
     )

@@ -91,7 +91,10 @@ class Refiner:
             cages: A refiner of the same scene without subdivision, after solving the first frame.
             time_code: The start time code of the advance, for the report.
         """
-        self._prerolled = [None if memory.last is None else memory.last.points for memory in cages._memories], time_code
+        self._prerolled = (
+            [None if memory.last is None else memory.last.state.points for memory in cages._memories],
+            time_code,
+        )
 
     def use(self, settings: SolveSettings) -> None:
         """Solve all following frames with new settings, the next frame cold; levels and metrics are kept."""
@@ -217,7 +220,7 @@ class Refiner:
     def heat(self, index: int, points: np.ndarray | None) -> dict[str, np.ndarray]:
         """A garment's depth in bodies and its crossings in the last frame; {} without positions [m]."""
         memory = self._memories[index]
-        crossing = memory.last.crossing if memory.solved and memory.last is not None else None
+        crossing = memory.last.state.crossing if memory.solved and memory.last is not None else None
         return {} if points is None else self._cloth.heat(index, points, crossing, self._settings)
 
     def _is_gap(self, time: float | None) -> bool:

@@ -22,9 +22,10 @@ from ..scene import Frame, GarmentResult, Scene, out_of_bounds
 from ..strain import has_collapsed, size_left, strayed
 from .group import Group
 from .history import GarmentHistory, Member, Origin, SolvedFrame, is_same, jumped_from, origin_of
+from .problem import begin
 from .settings import SolveSettings
 from .solve import RunawayError, solve_soundly
-from .values import FrameInput, split
+from .state import split
 
 
 class SceneCloth:
@@ -198,7 +199,7 @@ class SceneFrame:
         histories = dict[int, GarmentHistory]()
         for number, history in ((member.number, member.history) for member in members):
             if history.last is not None:
-                result = GarmentResult(history.last.points, entry, history.solved)
+                result = GarmentResult(history.last.state.points, entry, history.solved)
                 histories[number] = replace(history, result=result, solved=True)
         return histories
 
@@ -214,38 +215,42 @@ class SceneFrame:
     def _solve_together(self, members: Sequence[Member], near: tuple[int, ...]) -> dict[int, GarmentHistory]:
         """Solve garments together; bodies reached only by the solved cloth are added, and the solve is repeated."""
         group, frames = self._group(members), [member.frame for member in members]
-        origin = origin_of(members, self.frame, near=near, edge=group.spacings[0], gap=self.gap)
+        scene, frame = self.cloth.scene, self.frame
+        origin = origin_of(members, frame, near=near, edge=group.spacings[0], gap=self.gap)
         cage = None if origin.state is not None else self._prerolled_cage(members)
-        elapsed = origin.elapsed(self.frame.time, self.cloth.scene.seconds)
-        at = None if self.frame.time is None else float(self.frame.time)
         while True:
-            touching = self.cloth.touching(members, near, origin=origin)
-            moved = origin.moved(members, self.frame, near, self.cloth.scene.gravity)
-            prerolled = None if cage is None else cage[0]
-            frame_input = FrameInput(frames, at, touching, moved, prerolled=prerolled, elapsed=elapsed)
+            problem = begin(
+                group,
+                frames,
+                origin.state,
+                at=None if frame.time is None else float(frame.time),
+                touching=self.cloth.touching(members, near, origin=origin),
+                moved=origin.moved(members, frame, near, scene.gravity),
+                elapsed=origin.elapsed(frame.time, scene.seconds),
+                prerolled=None if cage is None else cage[0],
+            )
             try:
-                solved = solve_soundly(group, frame_input, origin.state)
+                solved, telemetry = solve_soundly(problem)
             except RunawayError as error:
                 return self._on_cages(members, error)
-            reached = self.cloth.reached(members, solved.points, self.settings)
+            states = split(solved, group.levels[0].spans, group.levels[-1].spans)
+            reached = self.cloth.reached(members, [state.points for state in states], self.settings)
             if reached <= set(near):
                 break
             near = tuple(sorted({*near, *reached}))
         start = origin.telemetry(None if cage is None else cage[1])
-        entry = solved.telemetry | self._surroundings(members, near) | start
-        entry |= {"start": solved.telemetry["start"]} if solved.telemetry["start"] != "cold" else {}
+        entry = telemetry | self._surroundings(members, near) | start
+        entry |= {"start": telemetry["start"]} if telemetry["start"] != "cold" else {}
         entry |= ({"time_limit": float(f"{self.limit:.3g}")} if is_over() else {}) | _loads(members)
-        states = split(solved.state, group.levels[0].spans, group.levels[-1].spans)
-        frame, part = self.frame, tuple(member.number for member in members)
+        part = tuple(member.number for member in members)
         is_reusable = self.settings.is_reusable and "time_limit" not in entry
         histories = dict[int, GarmentHistory]()
-        for number, member in enumerate(members):
-            points, last = solved.points[number], member.history.last
-            self._refuse_strayed(member, points)
-            at, state, crossing = (frame.time, member.frame, frame.colliders), states[number], solved.crossing[number]
-            solved_frame = SolvedFrame(*at, near, part, points, state, crossing, last is None, is_reusable)
-            before = last if origin.broken is None else origin.frames[number]
-            histories[member.number] = GarmentHistory(solved_frame, before, GarmentResult(points, entry))
+        for member, state, begun in zip(members, states, origin.frames, strict=True):
+            self._refuse_strayed(member, state.points)
+            last, at = member.history.last, (frame.time, member.frame, frame.colliders)
+            solved_frame = SolvedFrame(*at, near, part, state, last is None, is_reusable)
+            before = last if origin.broken is None else begun
+            histories[member.number] = GarmentHistory(solved_frame, before, GarmentResult(state.points, entry))
         return histories
 
     def _group(self, members: Sequence[Member]) -> Group:

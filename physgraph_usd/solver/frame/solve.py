@@ -1,6 +1,6 @@
 """One frame, from a cage to fine cloth.
 
-    problem = begin(group, frame, last)       cage repaired, start chosen, lasting terms
+    problem = begin(group, frames, last)      cage repaired, start chosen, lasting terms
     untangle the cage                         in a cold frame whose cage crosses itself
     for level in problem.levels:              all in a cold frame, else the finest
         x = the coarser result, upsampled     in a warm frame the last frame's detail, moved safely
@@ -40,11 +40,10 @@ from ..integrate.saddle import leave_saddle
 from ..integrate.stop import UNTANGLINGS, WARM_UNTANGLINGS
 from ..level import Placed, unhindered
 from ..scene import GIVEN_UP
-from .group import Group
 from .level_forces import blame
 from .outcome import limited, measured, next_state, patched, refuse_swallowed, scaled, telemetry_of
 from .problem import LevelProblem, Problem, begin
-from .values import FrameInput, FrameState, Solved
+from .state import State
 
 EQUAL_ENERGY = 1e-3
 """Fraction of the energies' size below which two energies count as equal: sums are in single precision."""
@@ -59,19 +58,19 @@ class WorseStartError(Exception):
     """A coarse level crosses as often as the result to be replaced: finer levels cross more often still."""
 
 
-def solve_frame(group: Group, frame: FrameInput, last: FrameState | None, *, fewer_than: float = math.inf) -> Solved:
+def solve_frame(problem: Problem, *, fewer_than: float = math.inf) -> tuple[State, dict[str, Any]]:
     """Solve one frame.
 
     Args:
-        group: Garments solved together.
-        last: State left by the last frame, or None for a cold start.
         fewer_than: Crossings of a coarse level from which on the frame is not wanted.
+
+    Returns:
+        The cloth after the frame, and telemetry as plain values.
 
     Raises:
         SolveError: A term of the potential is not finite, or cloth lies wholly in a body.
         WorseStartError: A coarse level has ``fewer_than`` crossings or more.
     """
-    problem = begin(group, frame, last)
     refuse_swallowed(problem)
     prepared = time.perf_counter()
     try:
@@ -81,7 +80,8 @@ def solve_frame(group: Group, frame: FrameInput, last: FrameState | None, *, few
         else:
             x, level_reports, module, memory = _solve_levels(problem, start_time=prepared, fewer_than=fewer_than)
     except SolveError as error:
-        broken = blame(group.garments, problem.forces[-1], problem.cage.points, error=error, at=frame.at)
+        garments, forces = problem.group.garments, problem.forces[-1]
+        broken = blame(garments, forces, problem.cage.points, error=error, at=problem.at)
         raise SolveError(broken) from error
     finish, visible = dict[str, object](), x
     if problem.contact is not None:
@@ -90,7 +90,6 @@ def solve_frame(group: Group, frame: FrameInput, last: FrameState | None, *, few
     unlimited = scaled(problem, visible)
     solution = limited(problem, unlimited)
     visible, following, figures = patched(problem, solution)
-    state = next_state(problem, x, memory, following)
     solved = time.perf_counter()
     telemetry = telemetry_of(problem, solution, module, solved=unlimited, reports=[*reports, *level_reports])
     telemetry |= {"start": GIVEN_UP} if problem.hopeless else {}
@@ -100,7 +99,7 @@ def solve_frame(group: Group, frame: FrameInput, last: FrameState | None, *, few
     marks = (problem.began, prepared, solved, time.perf_counter())
     pairs = zip(("prepare", "solve", "measure"), marks, marks[1:], strict=False)
     telemetry["milliseconds"] = {name: round(1e3 * (end - start), 3) for name, start, end in pairs}
-    return Solved(problem.placed(visible), state, telemetry, [crossing[span] for span in group.levels[-1].spans])
+    return next_state(problem, x, visible, memory, following=following, crossing=crossing), telemetry
 
 
 def _solve_levels(
@@ -132,7 +131,7 @@ def _solve_levels(
 def _show(problem: Problem, show: Callable[[Mapping[str, np.ndarray]], None], x: Placed) -> None:
     """Show positions of the finest level [m], as `SolveSettings.show_round`."""
     paths = [garment.path for garment in problem.group.garments]
-    show(dict(zip(paths, problem.placed(scaled(problem, x)), strict=True)))
+    show(dict(zip(paths, problem.group.per_garment(problem.placed(scaled(problem, x))), strict=True)))
 
 
 def solve_one_level(
@@ -292,7 +291,7 @@ class RunawayError(SolveError):
     """Cloth ending with more energy than its upsampled cage, from any start."""
 
 
-def solve_soundly(group: Group, frame: FrameInput, last: FrameState | None) -> Solved:
+def solve_soundly(problem: Problem) -> tuple[State, dict[str, Any]]:
     """Solve a frame, and once more from the cage if the result is unsound.
 
     A result is unsound if patches of it follow the subdivided cage, if cloth crosses cloth, or a body over `MORE` times
@@ -303,41 +302,35 @@ def solve_soundly(group: Group, frame: FrameInput, last: FrameState | None) -> S
     energy is above the cage's, and the second is lower. The second solve ends at a coarse level with as many crossings
     of cloth as the first result: finer levels have more.
 
-    Args:
-        group: Garments solved together.
-        last: State left by the last frame, or None for a cold start.
+    Returns:
+        As `solve_frame`.
 
     Raises:
         SolveError: As `solve_frame`.
         RunawayError: Both results have more energy than the upsampled cage, self contact included.
     """
-    solved = solve_frame(group, frame, last)
-    reason = _unsound(solved.telemetry)
+    state, telemetry = solve_frame(problem)
+    reason, group, last = _unsound(telemetry), problem.group, problem.last
     settings = group.settings
     ended_early = is_over() or settings.budget_ms is not None or settings.steps == 0 or not settings.is_reusable
-    if not reason or (last is None and frame.prerolled is None) or ended_early:
-        return solved
+    if not reason or (last is None and problem.prerolled is None) or ended_early:
+        return state, telemetry
     if last is not None and last.wait:
-        return _waiting(solved, last.failures, last.wait - 1)
+        return replace(state, failures=last.failures, wait=last.wait - 1), telemetry
     given_up = None if last is None else last.given_up
-    again = replace(frame, moved=np.inf, prerolled=None, elapsed=0.0, given_up=given_up)
+    from_cage = begin(group, problem.frames, at=problem.at, touching=problem.touching, given_up=given_up)
     failures = 1 if last is None else last.failures + 1
-    wait = min(2**failures - 1, MOST_WAIT)
-    crossings = 0 if "follows_cage" in solved.telemetry else _crossings(solved.telemetry, given_up=True)
+    waiting = replace(state, failures=failures, wait=min(2**failures - 1, MOST_WAIT))
+    crossings = 0 if "follows_cage" in telemetry else _crossings(telemetry, given_up=True)
     try:
-        fresh = solve_frame(group, again, None, fewer_than=crossings or math.inf)
+        fresh, other = solve_frame(from_cage, fewer_than=crossings or math.inf)
     except WorseStartError:
-        return _waiting(solved, failures, wait)
-    if _is_better(fresh.telemetry, solved.telemetry):
-        return replace(fresh, telemetry=fresh.telemetry | {"start": f"cold: started anew, since {reason}"})
-    if all(_excess(result.telemetry, self_contact=True) > 0.0 for result in (solved, fresh)):
+        return waiting, telemetry
+    if _is_better(other, telemetry):
+        return fresh, other | {"start": f"cold: started anew, since {reason}"}
+    if all(_excess(result, self_contact=True) > 0.0 for result in (telemetry, other)):
         raise RunawayError(f"{reason}, and a start from the cage ends no better")
-    return _waiting(solved, failures, wait)
-
-
-def _waiting(solved: Solved, failures: int, wait: int) -> Solved:
-    """The result, with the number of unsuccessful starts from the cage, and of frames until the next such start."""
-    return replace(solved, state=replace(solved.state, failures=failures, wait=wait))
+    return waiting, telemetry
 
 
 def _unsound(telemetry: Mapping[str, Any]) -> str:

@@ -9,8 +9,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from .from_cage import MovingFrames
+from .group import Cage
 from .settings import Reset
-from .values import Cage
+from .state import State
 
 STILL = 0.02
 """Largest motion of cage and bodies between samples, in mean cage edges, for a held pose: slow settling is visible in a
@@ -43,28 +44,20 @@ class Start:
         return self.slowed >= SLOWEST
 
 
-def start_of(
-    last_positions: tuple[Float[Tensor, "coarse 3"], Float[Tensor, "vertices 3"]],
-    still_frames: int,
-    cage: Cage,
-    *,
-    frames: MovingFrames,
-    reset: Reset,
-    moved: float = np.inf,
-) -> Start:
+def start_of(last: State, cage: Cage, frames: MovingFrames, *, reset: Reset, moved: float = np.inf) -> Start:
     """Carry the last frame's detail along, unless the cage jumped.
 
     Args:
-        last_positions: Cage and fine positions in the last frame, about the cage's origin [m].
-        still_frames: As in `Start`, of the last frame.
+        last: The cloth after the last frame.
+        frames: Frames of the cage, to carry the detail.
         reset: Thresholds for a cold start.
         moved: Largest motion of nearby bodies since [m]; infinite if more than poses changed.
     """
-    before, fine = (x.to(cage.points) for x in last_positions)
+    before, fine = (x.to(cage.points) for x in last.about(cage.origin))
     detailed, rotation, motion, turn, farthest = frames.predict(before, fine, cage.points)
     if motion > reset.move or turn > reset.turn:
         return Start(f"cold: the cage moved {motion:.3g} edges and turned {np.degrees(turn):.3g} degrees")
-    still_frames, slowed = slowing(still_frames, max(farthest, moved) / frames.edge)
+    still_frames, slowed = slowing(last.still_frames, max(farthest, moved) / frames.edge)
     reason = f"at rest: the pose has been held for {still_frames} frames" if slowed >= SLOWEST else "warm"
     return Start(reason, detailed, still_frames, slowed, rotation)
 

@@ -1,4 +1,4 @@
-"""Input, state and result of a frame's solve: immutable values."""
+"""The state of refined cloth after a frame: an immutable value, from which the next frame starts."""
 
 from __future__ import annotations
 
@@ -11,53 +11,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ..contact.bodies import Touching
 from ..level import Placed
 from ..rigid import AT_REST, Rigid
-from ..scene import GarmentFrame
-
-
-@dataclass(frozen=True, eq=False)
-class FrameInput:
-    """Input of a group for one frame.
-
-    Attributes:
-        garments: The garments at this time code.
-        at: The time code, for errors.
-        touching: Surfaces within reach of the garments.
-        moved: Largest motion of the surfaces since the last frame [m]; infinite if more than poses changed.
-        prerolled: World positions of cages advanced from an earlier frame [m], shape (C, 3), for a cold start; or None.
-        elapsed: Time since the start frame [s]; 0 for a cold start.
-        given_up: As `FrameState.given_up`, for a start from the cage.
-    """
-
-    garments: Sequence[GarmentFrame]
-    at: float | None = None
-    touching: Sequence[Touching] = ()
-    moved: float = np.inf
-    prerolled: np.ndarray | None = None
-    elapsed: float = 0.0
-    given_up: Bool[Tensor, " coarse"] | None = None
-
-    @property
-    def rate(self) -> float:
-        """Samples per second since the start frame; 24 where no time is known."""
-        return 1.0 / (self.elapsed or 1.0 / 24.0)
-
-
-@dataclass(frozen=True, eq=False)
-class Cage:
-    """Positions of a group's cages.
-
-    Attributes:
-        world: World positions [m], shape (C, 3), float64.
-        origin: Mean of the world positions [m], shape (3,).
-        points: Positions relative to the origin [m], in the scalar type of the solve.
-    """
-
-    world: np.ndarray
-    origin: np.ndarray
-    points: Float[Tensor, "coarse 3"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,10 +31,12 @@ class Curvature:
 
 
 @dataclass(frozen=True, eq=False)
-class FrameState:
-    """State passed from frame to frame.
+class State:
+    """Refined cloth after a frame, of one garment or of several solved together.
 
     Attributes:
+        points: The visible result, world positions [m], shape (V, 3), with vertices that the solve does not move.
+        crossing: Whether each vertex belongs to cloth that crosses cloth, shape (V,).
         coarse: Cage positions [m], world space, float64, shape (C, 3).
         fine: Fine positions [m], world space, float64, shape (V, 3).
         inside: Mask of the vertices inside a body, shape (V,), bool.
@@ -92,6 +49,8 @@ class FrameState:
         curvature: Of the last frame's descent, the same object for all garments solved together; None without.
     """
 
+    points: Float[np.ndarray, "vertices 3"]
+    crossing: Bool[np.ndarray, " vertices"]
     coarse: Float[Tensor, "coarse 3"]
     fine: Float[Tensor, "vertices 3"]
     inside: Bool[Tensor, " vertices"]
@@ -103,8 +62,8 @@ class FrameState:
     wait: int = 0
     curvature: Curvature | None = None
 
-    def carried(self, motion: Rigid) -> FrameState:
-        """This state after a rigid motion."""
+    def carried(self, motion: Rigid) -> State:
+        """This state after a rigid motion of everything but the visible result."""
         if motion is AT_REST:
             return self
         coarse, fine = (torch.as_tensor(motion(x.cpu().numpy())).to(x) for x in (self.coarse, self.fine))
@@ -118,34 +77,21 @@ class FrameState:
         return coarse, Placed(fine)
 
 
-@dataclass(frozen=True, eq=False)
-class Solved:
-    """One frame of a group.
-
-    Attributes:
-        points: World positions of each garment [m].
-        state: FrameState for the next frame.
-        telemetry: Plain values.
-        crossing: For each garment, whether each vertex belongs to cloth that crosses cloth, shape (V,), bool.
-    """
-
-    points: list[np.ndarray]
-    state: FrameState
-    telemetry: dict[str, Any]
-    crossing: list[np.ndarray]
+_COARSE, _FINE = ("coarse", "given_up", "following"), ("fine", "inside", "points", "crossing")
+"""Fields of `State` with a row for each vertex of the cage, and of the finest level."""
 
 
-_COARSE, _FINE = ("coarse", "given_up", "following"), ("fine", "inside")
-"""Fields of `FrameState` with a row for each vertex of the cage, and of the finest level."""
+def _together(fields: Sequence[Any]) -> Any:
+    return np.concatenate(fields) if isinstance(fields[0], np.ndarray) else torch.cat(list(fields))
 
 
-def join(parts: Sequence[FrameState]) -> FrameState:
+def join(parts: Sequence[State]) -> State:
     """Join the states of several garments."""
     if len(parts) == 1:
         return parts[0]
     curvature = parts[0].curvature if all(part.curvature is parts[0].curvature for part in parts) else None
-    return FrameState(
-        **{name: torch.cat([getattr(part, name) for part in parts]) for name in (*_COARSE, *_FINE)},
+    return State(
+        **{name: _together([getattr(part, name) for part in parts]) for name in (*_COARSE, *_FINE)},
         still_frames=min(part.still_frames for part in parts),
         clean=all(part.clean for part in parts),
         failures=max(part.failures for part in parts),
@@ -154,7 +100,7 @@ def join(parts: Sequence[FrameState]) -> FrameState:
     )
 
 
-def split(state: FrameState, coarse: Sequence[slice], fine: Sequence[slice]) -> list[FrameState]:
+def split(state: State, coarse: Sequence[slice], fine: Sequence[slice]) -> list[State]:
     """The state of each garment of a group.
 
     Args:
