@@ -368,7 +368,10 @@ def _figures(frames: Sequence[list[dict[str, Any]]], spent: Sequence[float], job
         "cloth": sum(each["crossings"] for each in cloth),
         "bodies": sum(each["crossings"] for each in bodies),
         "inside": sum(each["inside"] for each in bodies),
-        "remaining": max(each["levels"][-1]["remaining_move"] for groups, _ in pairs for each in groups),
+        "remaining": max(
+            (each["levels"][-1]["remaining_move"] for groups, _ in pairs for each in groups if each["levels"]),
+            default=0.0,
+        ),
     }
 
 
