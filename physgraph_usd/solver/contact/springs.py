@@ -100,9 +100,9 @@ class NearSprings:
     near: NearPairs
     offset: Float[Tensor, " pairs"]
 
-    def where(self, selected: Bool[Tensor, " pairs"]) -> NearSprings:
+    def where(self, selected: Int[Tensor, " kept"]) -> NearSprings:
         """The selected springs."""
-        return NearSprings(self.near.where(torch.nonzero(selected).squeeze(1)), self.offset[selected])
+        return NearSprings(self.near.where(selected), self.offset[selected])
 
 
 def _required_gaps(thickness: Float[Tensor, " garments"], offsets: np.ndarray | None) -> Float[Tensor, "all all"]:
@@ -298,4 +298,5 @@ class ClothSprings:
         either = torch.nn.functional.pad(out.any(dim=0), (0, len(self.owner) - count))
         either = either if exempt is None else either | exempt
         sided = ~with_body | (~touching & (of_vertex | ~either[corners].any(dim=1)))
-        return near.where(sided), with_body[sided], out
+        kept = torch.nonzero(sided).squeeze(1)  # One conversion for all fields.
+        return near.where(kept), with_body[kept], out
