@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,11 @@ from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.solver.frame.group import Group
 from physgraph_usd.solver.frame.problem import begin
 from physgraph_usd.solver.frame.solve import solve_frame
+from physgraph_usd.solver.integrate import METHODS
+from physgraph_usd.solver.integrate.ahead import STEPS_AHEAD
+from physgraph_usd.solver.integrate.base import Carry
+from physgraph_usd.solver.integrate.descend import LevelReport, descend
+from physgraph_usd.solver.integrate.stop import SEEN_STEPS, Budget
 from physgraph_usd.solver.integrate.weights import shipped_network
 from physgraph_usd.solver.level import refine_garments
 from physgraph_usd.solver.mesh.topology import PolygonMesh
@@ -111,6 +117,44 @@ def test_sewn_cloth_agrees_and_repeats() -> None:
     assert np.array_equal(answers[1].points, answers[2].points)
     pairs = np.argwhere(np.triu(np.linalg.norm(points[:, None] - points, axis=2) < 1e-9, 1))
     assert np.array_equal(answers[1].points[pairs[:, 0]], answers[1].points[pairs[:, 1]])
+
+
+def descended(budget: Budget) -> tuple[Carry, LevelReport]:
+    """A descent of the waved sheet by the learned method on the card."""
+    one, frames = cloth("cuda", torch.float32)
+    systems, coarse = one.systems(frames)
+    x = one.levels[-1].base.apply(coarse)
+    return descend(systems[-1], METHODS["physgraph"].build(), x, level=0, budget=budget)
+
+
+@pytest.mark.parametrize("budget", [Budget(22), Budget(60, 1e-2), Budget(60, warm=True)])
+def test_steps_ahead_are_those_made_one_at_a_time(budget: Budget, monkeypatch: pytest.MonkeyPatch) -> None:
+    answers = []
+    for most in (1, 2, SEEN_STEPS):
+        monkeypatch.setitem(STEPS_AHEAD, "cuda", most)
+        carry, report = descended(budget)
+        answers.append((carry.x.cpu().numpy().tobytes(), carry.energy, vars(report) | {"milliseconds": 0.0}))
+    assert answers[0] == answers[1] == answers[2]
+
+
+@pytest.mark.parametrize(("warm", "more"), [(False, 3), (True, 9)])
+def test_a_descent_waits_once_for_several_steps(warm: bool, more: int) -> None:
+    """Further waits: for the start's energy and for whether its and the end's positions are finite, and for motion."""
+    steps = 6 * SEEN_STEPS
+    one, frames = cloth("cuda", torch.float32)
+    systems, coarse = one.systems(frames)
+    system, x, integrator = systems[-1], one.levels[-1].base.apply(coarse), METHODS["physgraph"].build()
+    for _ in range(2):  # What is kept is made, and what is recorded is recorded.
+        descend(system, integrator, x, level=0, budget=Budget(steps, warm=warm))
+    torch.cuda.set_sync_debug_mode("warn")
+    try:
+        with warnings.catch_warnings(record=True) as waits:
+            warnings.simplefilter("always")
+            _, report = descend(system, integrator, x, level=0, budget=Budget(steps, warm=warm))
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    assert report.movers == {"physgraph": report.steps}
+    assert 0 < len(waits) <= report.steps // SEEN_STEPS + more, [str(wait.message) for wait in waits]
 
 
 @pytest.mark.parametrize("integrator", ["quasi-newton", "physgraph"])

@@ -31,7 +31,8 @@ class Crossings:
 
     def where(self, selected: Bool[Tensor, " crossings"]) -> Crossings:
         """The selected crossings."""
-        return Crossings(self.edge[selected], self.face[selected])
+        kept = torch.nonzero(selected).squeeze(1)  # One conversion for both fields.
+        return Crossings(self.edge[kept], self.face[kept])
 
     @staticmethod
     def none(device: torch.device) -> Crossings:
@@ -97,8 +98,9 @@ def all_crossings(
     edges, faces = parts.starts
     of_edge, of_face = torch.bucketize(edge, edges, right=True), torch.bucketize(face, faces, right=True)
     with_body = (of_edge > 0) | (of_face > 0)
-    cloth_edge, body = (of_edge == 0)[with_body], torch.maximum(of_edge, of_face)[with_body] - 1
-    in_cloth, with_bodies = Crossings(edge, face).where(~with_body), Crossings(edge, face).where(with_body)
+    in_cloth, rows = Crossings(edge, face).where(~with_body), torch.nonzero(with_body).squeeze(1)
+    with_bodies = Crossings(edge[rows], face[rows])
+    cloth_edge, body = (of_edge == 0)[rows], torch.maximum(of_edge, of_face)[rows] - 1
     if queried is not None:
         corners = torch.cat([parts.level.edges[in_cloth.edge], parts.level.triangles[in_cloth.face]], dim=1).long()
         in_cloth = in_cloth.where(queried[corners].any(dim=1))

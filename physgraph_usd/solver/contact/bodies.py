@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import reduce
+from functools import cached_property, reduce
 
 import numpy as np
 import torch
@@ -91,12 +91,10 @@ class FrameBodies:
             settings: Contact settings, with the stiffness in SI.
         """
         surfaces = [body.surface for body in touching]
-        shifts = tuple(torch.as_tensor(origin - surface.origin).to(coarse) for surface in surfaces)
-        earlier = [body.before for body in touching if body.before is not None]
-        points, before = (
-            torch.as_tensor(np.concatenate(corners) - origin, dtype=torch.float64, device=coarse.device)
-            for corners in ([surface.world for surface in surfaces], earlier or [np.zeros((0, 3))])
-        )
+        shifts = torch.as_tensor(np.stack([origin - surface.origin for surface in surfaces])).to(coarse).unbind()
+        now, earlier = [surface.world for surface in surfaces], [b.before for b in touching if b.before is not None]
+        corners = torch.as_tensor(np.concatenate([*now, *earlier]) - origin, dtype=torch.float64, device=coarse.device)
+        points, before = corners.tensor_split([sum(map(len, now))])
         sides = tuple(_start_sides(surface, coarse + shift) for surface, shift in zip(surfaces, shifts, strict=True))
         longest = settings.way_out * edge
         complete = len(earlier) == len(touching)
@@ -189,8 +187,12 @@ class LevelBodies:
 
     def _feels(self, index: int) -> Bool[Tensor, " vertices"]:
         """Mask of the vertices of garments that do not ignore a body."""
-        by_garment = torch.as_tensor(np.isfinite(self.frame.touching[index].offset), device=self.level.rest.device)
-        return by_garment[self.level.vertex_garment.long()]
+        return self._felt[index][self.level.vertex_garment.long()]
+
+    @cached_property
+    def _felt(self) -> Bool[Tensor, "bodies garments"]:
+        """Whether each body is felt by each garment."""
+        return torch.as_tensor(np.isfinite(self.frame.offsets.T), device=self.level.rest.device)
 
     def _behind(self, index: int, x: Tensor, vertices: Tensor) -> Bool[Tensor, " points"]:
         """Mask of the vertices, at positions x [m], that are inside or behind a body."""

@@ -315,12 +315,17 @@ class LevelContact:
             x, _ = self._go(start, wanted, free, start_frame)
         return x
 
+    @cached_property
+    def _kept_gap(self) -> float:
+        """Gap kept by safe moves [m]."""
+        return KEPT_GAP * float(self._thickness.min())
+
     def _go(self, start: Placed, aim: Tensor, tangle: Tensor | None, start_frame: _Begin | None) -> tuple[Placed, bool]:
         """As `moved`, without a promise for pairs in one tangle; and whether all pairs with bodies are proved apart."""
         state, end, springs = self.look(start), self._corners(aim), self._springs
         begin, exempt = start_frame or (state.corners, state.exempt)
         near = springs.cached(start) if start_frame is None else None
-        promise = Promise(self.mesh, self.seam, KEPT_GAP * float(self._thickness.min()), tangle, exempt)
+        promise = Promise(self.mesh, self.seam, self._kept_gap, tangle, exempt)
         if near is None and tangle is None and exempt is None:
             blocking = springs.blocking(begin, end, aim, floor=promise.floor, queried=self._queried)
         else:

@@ -47,7 +47,8 @@ class HeldMetric:
 
     def serves(self, stiff: Float[Tensor, " vertices"]) -> bool:
         """True if K contains enough of the given stiffness [N/m]."""
-        return float((stiff - self.stiff).clamp_min(0.0).sum()) <= MISSING * float(stiff.sum())
+        missing, needed = torch.stack([(stiff - self.stiff).clamp_min(0.0).sum(), stiff.sum()]).tolist()
+        return missing <= MISSING * needed
 
     @property
     def diagonal(self) -> Float[Tensor, " vertices"]:

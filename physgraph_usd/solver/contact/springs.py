@@ -108,10 +108,9 @@ class NearSprings:
     face: Bool[Tensor, " pairs"]
     offset: Float[Tensor, " pairs"]
 
-    def where(self, selected: Bool[Tensor, " pairs"]) -> NearSprings:
+    def where(self, selected: Int[Tensor, " kept"]) -> NearSprings:
         """The selected springs."""
-        rows = torch.nonzero(selected).squeeze(1)  # One conversion for all fields.
-        return NearSprings(*(getattr(self, field.name)[rows] for field in fields(self)))
+        return NearSprings(*(getattr(self, field.name)[selected] for field in fields(self)))
 
 
 def _required_gaps(thickness: Float[Tensor, " garments"], offsets: np.ndarray | None) -> Float[Tensor, "all all"]:
@@ -270,7 +269,8 @@ class ClothSprings:
         inputs += [argument(pairs.corners, wp.vec4i), argument(pairs.face)]
         inputs += [argument(weight, wp.vec4d), argument(separation, wp.vec3d), argument(offset), argument(is_near)]
         run(_find_springs, count, inputs, device=str(device), threads=self._mesh.level.threads)
-        return NearSprings(pairs.corners, weight, separation, pairs.face, offset).where(is_near)
+        rows = torch.nonzero(is_near).squeeze(1)  # One conversion for all fields.
+        return NearSprings(pairs.corners, weight, separation, pairs.face, offset).where(rows)
 
     def constraints(self, near: NearSprings, x: Float[Tensor, "all 3"], stiffness: float) -> PairConstraints:
         """The springs as constraints of the contact force; a body's part of a pair is constant.
@@ -304,4 +304,5 @@ class ClothSprings:
         either = torch.nn.functional.pad(out.any(dim=0), (0, len(self.owner) - count))
         either = either if exempt is None else either | exempt
         sided = ~with_body | (~touching & (of_vertex | ~either[corners].any(dim=1)))
-        return near.where(sided), with_body[sided], out
+        kept = torch.nonzero(sided).squeeze(1)  # One conversion for all fields.
+        return near.where(kept), with_body[kept], out

@@ -100,6 +100,11 @@ class System:
         """Evaluations, metric solves and failed evaluations so far."""
         return self.evaluations, self.metric_solves, self.failed
 
+    @counted.setter
+    def counted(self, counted: tuple[int, int, int]) -> None:
+        """Go back to earlier counts, for discarded steps."""
+        self.evaluations, self.metric_solves, self.failed = counted
+
     def has_same_metric(self, system: System) -> bool:
         """Whether curvature information from another system is valid for this system."""
         return self.metric is system.metric
@@ -180,7 +185,7 @@ class Carry:
 
     Attributes:
         x: Positions [m].
-        energy: Energy at x [J].
+        energy: Energy at x [J]; not a number while unread.
         force: Force at x [N].
         preconditioned: H0^-1 F at x [m], if known.
         mover: Maker of the last step: the integrator's name, "truncated", "halved", "quartered", "fallback" or
@@ -188,6 +193,7 @@ class Carry:
         memory: The integrator's own state.
         setbacks: Consecutive corrections by the guard, up to this step.
         remaining: `System.remaining_move` at x, if known.
+        unread: Energy and remaining move at x while they are on the device only (`ahead.read`), float64; or None.
     """
 
     x: Float[Tensor, "vertices 3"]
@@ -198,6 +204,7 @@ class Carry:
     memory: Any = None
     setbacks: int = 0
     remaining: float | None = None
+    unread: Float[Tensor, " 2"] | None = None
 
     def moved_by(self, mover: str) -> Carry:
         """This carry with a different mover."""

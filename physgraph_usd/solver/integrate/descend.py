@@ -13,6 +13,7 @@ from torch import Tensor
 
 from ...errors import SolveError
 from ..level import Level
+from .ahead import Steps
 from .base import Carry, Integrator, System, resumed
 from .stop import SEEN_PART, SEEN_STEPS, SEEN_TURN, Budget
 
@@ -88,8 +89,9 @@ def descend(
     report.energy_before = carry.energy
     movers: Counter[str] = Counter()
     motion = VisibleMotion(system.level, carry.x) if budget.warm and system.level is not None else None
-    while not (stopped := _reason_to_stop(system, carry, report.steps, budget)):
-        carry = integrator.step(system, carry)
+    steps = Steps(system, integrator, budget)
+    while not (stopped := _reason_to_stop(system, carry, report.steps, budget, next_is_made=steps.next_is_made)):
+        carry = steps.after(carry, report.steps)
         movers[carry.mover] += 1
         report.steps += 1
         if motion is not None and motion.has_ended(carry.x, report.steps) and not carry.setbacks:
@@ -106,8 +108,10 @@ def descend(
     return carry, report
 
 
-def _reason_to_stop(system: System, carry: Carry, steps: int, budget: Budget) -> str:
-    return "stalled" if carry.mover == "stayed" else budget.reason(steps, lambda: _remaining_move(system, carry))
+def _reason_to_stop(system: System, carry: Carry, steps: int, budget: Budget, *, next_is_made: bool = False) -> str:
+    if carry.mover == "stayed":
+        return "stalled"
+    return budget.reason(steps, lambda: _remaining_move(system, carry), next_is_made=next_is_made)
 
 
 def _remaining_move(system: System, carry: Carry) -> float:

@@ -35,7 +35,7 @@ from .network import (
     in_rows,
     pairs_in,
 )
-from .secants import SECANTS, SLOTS, WEIGHTS, Secants
+from .secants import SECANTS, WEIGHTS, Secants
 from .vertex_frame import VertexFrame
 
 _NORMAL = """
@@ -117,7 +117,7 @@ class FusedPhysgraph:
         number, index, pair = (wp.zeros(1, dtype=kind, device=device) for kind in (wp.float32, wp.int32, wp.vec2i))
         rows, at_once = vectors(self._rows), block_size(device)
         pack, fused = pack_kernel(network.config.vectors), fused_kernel(network.config)
-        inputs = [vertices, 0, 0, index, number, number, *[none] * 7, rows]
+        inputs = [vertices, 0, 0, 0, index, number, number, *[none] * 7, rows]
         self._pack = Launch(pack, vertices, inputs, device=device, threads=threads, at_once=at_once)
         learned = [argument(self._weights), argument(self._bias), longest, none, none]
         inputs = [vertices, rows, number, number, index, pair, index, index, *learned]
@@ -137,7 +137,7 @@ class FusedPhysgraph:
         fields = secants.fields.view(-1, 3)
         packed = [past.garment, secants.weights.view(-1), past.stiffness, fields, x]
         packed += [past.force, past.image, past.force1, past.image1, past.image2]
-        self._pack(dict(enumerate([secants.newest, secants.count, *packed], start=1)))
+        self._pack(dict(enumerate([secants.slots, secants.newest, secants.count, *packed], start=1)))
         move, moved = torch.empty_like(x), torch.empty_like(x)
         changed = {2: past.spacing, 3: past.reach, 9: self.bias_at(past.step), 11: move, 12: moved}
         if frame is not None:
@@ -236,12 +236,12 @@ _VECTOR_SOURCES = {
     "x": "at((const float*)x.data, vertex)",
 }
 _PACK = (
-    f"constexpr int SECANTS = {SECANTS}, SLOTS = {SLOTS}, WEIGHTS = {WEIGHTS};"
+    f"constexpr int SECANTS = {SECANTS}, WEIGHTS = {WEIGHTS};"
     """
 const float *moves[SECANTS], *images[SECANTS], *all = (const float*)fields.data;
 for (int i = 0; i < SECANTS; ++i) {
-    const int slot = (newest + SLOTS - i) % SLOTS;
-    moves[i] = all + 3 * (size_t)slot * vertices, images[i] = all + 3 * (size_t)(2 * SLOTS + slot) * vertices;
+    const int slot = (newest + slots - i) % slots;
+    moves[i] = all + 3 * (size_t)slot * vertices, images[i] = all + 3 * (size_t)(2 * slots + slot) * vertices;
 }
 const Number softness = 1.0f / load(stiffness);
 const float* soft = (const float*)&softness;
@@ -269,14 +269,16 @@ def pack_kernel(names: tuple[str, ...]) -> wp.Kernel:
     lines += [f"row[{row}] = {_VECTOR_SOURCES[name]};\n" for name, row in table.items()]
     name = f"pack_{hashlib.sha256(repr(names).encode()).hexdigest()[:16]}"
 
-    def of_block(block, vertices, newest, secants, garment, weights, stiffness, fields, x, f, g, f1, g1, g2, rows): ...
+    def of_block(
+        block, vertices, slots, newest, secants, garment, weights, stiffness, fields, x, f, g, f1, g1, g2, rows
+    ): ...
 
-    def pack(first, vertices, newest, secants, garment, weights, stiffness, fields, x, f, g, f1, g1, g2, rows):
+    def pack(first, vertices, slots, newest, secants, garment, weights, stiffness, fields, x, f, g, f1, g1, g2, rows):
         block = first + wp.tid()
-        write(block, vertices, newest, secants, garment, weights, stiffness, fields, x, f, g, f1, g1, g2, rows)
+        write(block, vertices, slots, newest, secants, garment, weights, stiffness, fields, x, f, g, f1, g1, g2, rows)
 
     number, index, vector = (wp.array(dtype=kind) for kind in (wp.float32, wp.int32, wp.vec3f))
-    kinds = (wp.int32, wp.int32, wp.int32, index, number, number, *[vector] * 7, wp.array(dtype=wp.vec4f))
+    kinds = (*[wp.int32] * 4, index, number, number, *[vector] * 7, wp.array(dtype=wp.vec4f))
     source = at_once(_PACK + "".join([*lines, "}\n"]), "vertices", torch.float32)
     write = native(of_block, name, source, *kinds)
     return kernel(pack, name, *kinds)

@@ -9,6 +9,7 @@ from typing import Any
 from jaxtyping import Float
 from torch import Tensor
 
+from .ahead import Ahead
 from .base import Carry, Integrator, System, Transporting, followed, resumed
 from .quasi_newton import backtrack, truncated
 
@@ -26,6 +27,8 @@ class Guard:
     to follow an external step. After a replaced step the integrator restarts, because its memory was misleading. After
     `PATIENCE` consecutive corrections the spare integrator, if given, makes the level's remaining steps.
     ``Carry.mover`` names the mover.
+
+    The steps of an integrator that can make them `ahead` are checked several at a time, with the same result.
     """
 
     def __init__(self, inner: Integrator, *, spare: Integrator | None = None) -> None:
@@ -54,7 +57,21 @@ class Guard:
         spare = self._spare_of(carry)
         if spare is not None:
             return replace(spare.step(system, carry), setbacks=carry.setbacks)
-        proposed = self._inner.step(system, carry)
+        return self.checked(system, carry, self._inner.step(system, carry))
+
+    def most_ahead(self, carry: Carry) -> int:
+        """Most steps of the wrapped integrator; 1 for the spare."""
+        if self._spare_of(carry) is not None or not isinstance(self._inner, Ahead):
+            return 1
+        return self._inner.most_ahead(carry)
+
+    def ahead(self, system: System, carry: Carry) -> Carry:
+        """A step of the wrapped integrator, unread."""
+        assert isinstance(self._inner, Ahead)
+        return self._inner.ahead(system, carry)
+
+    def checked(self, system: System, carry: Carry, proposed: Carry) -> Carry:
+        """The wrapped integrator's step, unless it raises the energy; then a corrected one."""
         if math.isfinite(proposed.energy) and proposed.energy <= carry.energy:
             return proposed
         corrected = replace(self._corrected(system, carry, proposed), setbacks=carry.setbacks + 1)

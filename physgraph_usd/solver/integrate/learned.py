@@ -13,6 +13,7 @@ The network sees a `System` only.
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache, partial
@@ -24,10 +25,11 @@ from torch import Tensor, nn
 
 from ...errors import SolveError
 from ..level import Level
+from .ahead import read
 from .base import Carry, System
 from .fused import Past, fused_physgraph
 from .network import Physgraph
-from .quasi_newton import Secant, StepHistory, secant_direction
+from .quasi_newton import SECANTS, Secant, StepHistory, secant_direction
 from .secants import SecantProducts, Secants, rotated_fields, secant_products
 from .vertex_frame import VertexFrame
 
@@ -74,10 +76,18 @@ class LearnedMetric:
         if isinstance(memory, _FusedHistory):
             secants = _products_of(system).directed(memory.secants, force, image, is_new=False)
             memory = replace(memory, secants=secants)
-        return self._carry(system, x, (energy, force, image), memory)
+        return read([self._unread(system, x, (energy, force, image), memory)])[0]
 
     def step(self, system: System, carry: Carry) -> Carry:
         """One step along the network's combination."""
+        return read([self.ahead(system, carry)])[0]
+
+    def most_ahead(self, carry: Carry) -> int:
+        """Steps after which the carry's secants are still in the ring."""
+        return carry.memory.secants.slots - SECANTS if isinstance(carry.memory, _FusedHistory) else 1
+
+    def ahead(self, system: System, carry: Carry) -> Carry:
+        """`step` without waiting for its numbers."""
         if not isinstance(carry.memory, _FusedHistory):
             move = self.propose(system, carry)
             return self._reached(system, carry, carry.x + move, move)
@@ -86,10 +96,10 @@ class LearnedMetric:
 
     def follow(self, system: System, carry: Carry, x: Float[Tensor, "vertices 3"]) -> Carry:
         """Evaluate x [m] and remember the displacement to x as a step of the network."""
-        return self._reached(system, carry, x, x - carry.x)
+        return read([self._reached(system, carry, x, x - carry.x)])[0]
 
     def _reached(self, system: System, carry: Carry, x: Tensor, move: Tensor) -> Carry:
-        """The carry at x [m], a displacement away from the previous carry."""
+        """The unread carry at x [m], a displacement away from the previous carry."""
         energy, force = system.evaluated(x)
         image = system.apply_short_inverse(force)
         assert carry.preconditioned is not None
@@ -101,13 +111,13 @@ class LearnedMetric:
             yields, image_change = carry.force - force, carry.preconditioned - image
             secant = Secant(move, yields, image_change, partial(garment_dot, system.level))
             memory = carry.memory.after(carry, secant)
-        return self._carry(system, x, (energy, force, image), memory)
+        return self._unread(system, x, (energy, force, image), memory)
 
-    def _carry(self, system: System, x: Tensor, evaluated: tuple[Tensor, Tensor, Tensor], memory: Any) -> Carry:
-        """A carry, given energy [J], force [N] and H0^-1 F [m] at x [m]; on a card one wait for both numbers."""
+    def _unread(self, system: System, x: Tensor, evaluated: tuple[Tensor, Tensor, Tensor], memory: Any) -> Carry:
+        """An unread carry, given energy [J], force [N] and H0^-1 F [m] at x [m]."""
         energy, force, image = evaluated
-        energy, remaining = torch.stack([energy, system.relative_move(image.detach())]).tolist()
-        return Carry(x, energy, force, image, self.name, memory, remaining=remaining)
+        numbers = torch.stack([energy, system.relative_move(image.detach())])
+        return Carry(x, math.nan, force, image, self.name, memory, unread=numbers)
 
     def propose(self, system: System, carry: Carry) -> Float[Tensor, "vertices 3"]:
         """The displacement of the next step [m]."""

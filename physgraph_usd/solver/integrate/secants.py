@@ -31,10 +31,9 @@ from torch import Tensor
 from ..mesh.formula import at_once, kernel, native, one_by_one
 from ..mesh.kernels import KERNELS
 from ..mesh.threads import Launch, argument, run
+from .ahead import STEPS_AHEAD
 from .quasi_newton import SECANTS
 
-SLOTS = SECANTS + 1
-"""Slots of the ring buffer: the secants of a carry, and a free slot for the next step's secant."""
 CHUNK = {"cpu": 1024, "cuda": 64}
 """Vertices per item of the product kernel, by device type."""
 SUMS = 4 * SECANTS + 2
@@ -43,15 +42,15 @@ WEIGHTS = 2 * SECANTS + 1
 """Coefficients of a direction: of g, of the images z and of the moves s, newest first."""
 
 _PRODUCTS = (
-    f"constexpr int SECANTS = {SECANTS}, SLOTS = {SLOTS}, SUMS = {SUMS};"
+    f"constexpr int SECANTS = {SECANTS}, SUMS = {SUMS};"
     """
 const int since = 3 * bounds.data[block][0], until = 3 * bounds.data[block][1];
 const float *f = (const float*)force.data, *g = (const float*)image.data, *all = (const float*)fields.data;
 const size_t size = 3 * (size_t)vertices;
-const float *s[SECANTS], *y[SECANTS], *z = all + (2 * SLOTS + newest) * size;
+const float *s[SECANTS], *y[SECANTS], *z = all + (2 * slots + newest) * size;
 for (int i = 0; i < SECANTS; ++i) {
-    const int slot = (newest + SLOTS - (i < secants ? i : 0)) % SLOTS;
-    s[i] = all + slot * size, y[i] = all + (SLOTS + slot) * size;
+    const int slot = (newest + slots - (i < secants ? i : 0)) % slots;
+    s[i] = all + slot * size, y[i] = all + (slots + slot) * size;
 }
 Number sum[SUMS] = {};
 for (int at = since; at < until; at += BLOCK) {
@@ -80,15 +79,15 @@ wp.set_module_options(KERNELS)
 
 
 def _products_kernel() -> wp.Kernel:
-    """The kernel of (first, vertices, newest, secants, bounds, force, image, fields, partial); an item is a chunk."""
+    """The kernel of (first, vertices, slots, newest, secants, bounds, force, image, fields, partial), by chunk."""
 
-    def of_chunk(block, vertices, newest, secants, bounds, force, image, fields, partial): ...
+    def of_chunk(block, vertices, slots, newest, secants, bounds, force, image, fields, partial): ...
 
-    def secant_products(first, vertices, newest, secants, bounds, force, image, fields, partial):
-        add(first + wp.tid(), vertices, newest, secants, bounds, force, image, fields, partial)
+    def secant_products(first, vertices, slots, newest, secants, bounds, force, image, fields, partial):
+        add(first + wp.tid(), vertices, slots, newest, secants, bounds, force, image, fields, partial)
 
     pair, vector, total = (wp.array(dtype=kind) for kind in (wp.vec2i, wp.vec3f, wp.float64))
-    kinds = *[wp.int32] * 3, pair, vector, vector, vector, total
+    kinds = *[wp.int32] * 4, pair, vector, vector, vector, total
     add = native(of_chunk, "secant_products", at_once(_PRODUCTS, "bounds.shape[0]", torch.float32), *kinds)
     return kernel(secant_products, "secant_products", *kinds)
 
@@ -188,8 +187,9 @@ class Secants:
     """The secants of a carry, and the direction that follows from them and the carry's force.
 
     Attributes:
-        fields: Moves s [m], differences y of negative forces [N], and their images z [m], shape (3, `SLOTS`, V, 3). All
-            carries of a descent share them; a carry from which two steps made a secant keeps the second.
+        fields: Moves s [m], differences y of negative forces [N], and their images z [m], shape (3, slots, V, 3). All
+            carries of a descent share them. The newest secant of a step overwrites the oldest of the ring, so a carry's
+            own secants last for as many further steps as there are slots beyond `SECANTS`.
         newest: Slot of the newest secant.
         count: Number of secants.
         gram: Products of the secants with one another, and which have an effect, per garment, float64.
@@ -205,11 +205,17 @@ class Secants:
     @staticmethod
     def none(x: Float[Tensor, "vertices 3"], garments: int) -> Secants:
         """No secants: the direction is H0^-1 F."""
-        fields = torch.empty((3, SLOTS, *x.shape), dtype=x.dtype, device=x.device)
+        slots = SECANTS + STEPS_AHEAD[x.device.type]
+        fields = torch.empty((3, slots, *x.shape), dtype=x.dtype, device=x.device)
         gram = torch.zeros(garments * (2 * SECANTS**2 + SECANTS), dtype=torch.float64, device=x.device)
         weights = torch.zeros((garments, WEIGHTS), dtype=torch.float32, device=x.device)
         weights[:, 0] = 1.0
         return Secants(fields, 0, 0, gram, weights)
+
+    @property
+    def slots(self) -> int:
+        """Secants that the fields have room for."""
+        return self.fields.shape[1]
 
     def after(self, move: Tensor, forces: tuple[Tensor, Tensor], images: tuple[Tensor, Tensor]) -> Secants:
         """With a newest secant.
@@ -219,7 +225,7 @@ class Secants:
             forces: F before and after [N].
             images: H0^-1 F before and after [m].
         """
-        newest = (self.newest + 1) % SLOTS
+        newest = (self.newest + 1) % self.slots
         moves, yields, moved = self.fields[:, newest]
         moves.copy_(move)
         torch.sub(*forces, out=yields)
@@ -249,7 +255,7 @@ class SecantProducts:
         vector, total = wp.zeros(1, dtype=wp.vec3f, device=device), argument(self._sums)
         weight = wp.zeros(1, dtype=wp.float32, device=device)
         partial = argument(self._partial)
-        inputs = [0, 0, 0, self._bounds, vector, vector, vector, partial]
+        inputs = [0, 0, 0, 0, self._bounds, vector, vector, vector, partial]
         self._products = Launch(_PRODUCTS_KERNEL, len(bounds), inputs, device=device, threads=threads)
         inputs = [self._ends, partial, total]
         self._add_up = Launch(add_up, len(self._sums), inputs, device=device, threads=threads)
@@ -270,7 +276,8 @@ class SecantProducts:
         if not secants.count:
             return secants
         fields = secants.fields.view(-1, 3)
-        self._products({0: len(force), 1: secants.newest, 2: secants.count, 4: force, 5: image, 6: fields})
+        numbers = (len(force), secants.slots, secants.newest, secants.count)
+        self._products({**dict(enumerate(numbers)), 5: force, 6: image, 7: fields})
         self._add_up({})
         gram, weights = torch.empty_like(secants.gram), torch.empty_like(secants.weights)
         self._combine(dict(enumerate([secants.count, int(is_new), self._sums, secants.gram, gram, weights.view(-1)])))

@@ -56,7 +56,7 @@ class Budget:
         tolerance: Stop when the RMS of H0^-1 F is under this many local edge lengths; 0 for never.
         deadline: `time.perf_counter` value after which only the first `least` steps may begin, or None.
         rest: Remaining move, in tolerances, below which no step is made from the start: cloth nearly at rest stays.
-        cancelled: Called before each step; True if the result is no longer needed; or None.
+        cancelled: Called before each step is made; True if the result is no longer needed; or None.
         least: Number of steps exempt from the deadline.
         touching: Most steps with contact, if more.
         stuck: Number of steps after which a level ends if its number of crossings does not fall.
@@ -98,18 +98,19 @@ class Budget:
         """The budget of an untangling round, without a tolerance: contours shorten in small moves."""
         return replace(self, steps=min(ROUND, self.steps), tolerance=0.0, least=0)
 
-    def reason(self, steps: int, remaining: Callable[[], float]) -> str:
+    def reason(self, steps: int, remaining: Callable[[], float], *, next_is_made: bool = False) -> str:
         """Reason to stop: "tolerance", "steps" or "budget"; "" to continue.
 
         Args:
             steps: Number of steps made.
             remaining: Gives the remaining move, in local edge lengths.
+            next_is_made: Whether the next step is made already, so that the time does not matter.
         """
         if self.tolerance > 0 and remaining() < self.tolerance * (1.0 if steps else self.rest):
             return "tolerance"
         if steps >= self.steps:
             return "steps"
-        return "budget" if self.is_spent(steps) else ""
+        return "budget" if not next_is_made and self.is_spent(steps) else ""
 
     def ends(
         self, report: Ended, *, steps: int, touched: bool, emerging: bool, missing: float, stuck: bool = False
