@@ -256,9 +256,10 @@ class LevelContact:
         near, with_body, touching = springs.sided(near, state.exempt)
         every = springs.constraints(near, at, stiffness)
         pushes, gaps = every.where(with_body), every.where(~with_body)
-        if self.bodies is not None and (any(state.in_bodies) or bool(touching.any())):
+        if self.bodies is not None and (any(state.in_bodies) or touching is not None):
             within, chords = _within(self.mesh, self.bodies, state)
-            pushes = pushes.with_more(self.bodies.pulls(x, within | touching, chords))
+            within = within if touching is None else within | touching
+            pushes = pushes.with_more(self.bodies.pulls(x, within, chords))
         if tangles is not None:  # Crossing parts have no side to keep.
             corners = gaps.corners.long()
             sided = ~self.mesh.crossed(state.crossings)[corners].any(dim=1)

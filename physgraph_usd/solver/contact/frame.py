@@ -59,7 +59,8 @@ class FrameContact:
         self._last_given_up = given_up
         self._levels, self._coarse, self._settings = tuple(levels), coarse, settings
         self._bodies, self._cloth, self._seams = bodies, cloth, seams
-        self._thickness = torch.tensor(thickness, dtype=coarse.dtype, device=coarse.device)
+        thick = torch.tensor(thickness, dtype=coarse.dtype)
+        self._thickness, self._gap = thick.to(coarse.device), float(thick.mean())
         self._views: dict[int, LevelContact] = {}
 
     @property
@@ -126,7 +127,7 @@ class FrameContact:
         queried = None if self.given_up is None else ~self.given_up
         if queried is not None:
             contours = contours.where(queried[mesh.corners_of(contours)].any(dim=1))
-        apart, remaining = drawn_apart(mesh, aim, contours, gap=float(self._thickness.mean()), queried=queried)
+        apart, remaining = drawn_apart(mesh, aim, contours, gap=self._gap, queried=queried)
         pair = (aim if remaining else apart), apart
         aim, apart = (points if seam is None or points is self._coarse else seam.closed(points) for points in pair)
         return aim, apart

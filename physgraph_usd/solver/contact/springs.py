@@ -288,12 +288,12 @@ class ClothSprings:
 
     def sided(
         self, near: NearSprings, exempt: Bool[Tensor, " all"] | None
-    ) -> tuple[NearSprings, Bool[Tensor, " springs"], Bool[Tensor, "bodies vertices"]]:
+    ) -> tuple[NearSprings, Bool[Tensor, " springs"], Bool[Tensor, "bodies vertices"] | None]:
         """Springs with a certain direction, a mask of springs with bodies, and the vertices on each body's faces.
 
         Where cloth goes through a body (`exempt`) or lies on it, the shortest vector between edges, or from the body's
         vertices, may point either way; from a vertex outside to a face it points out. Springs of vertices on a face
-        have no direction.
+        have no direction. The vertices are None without any.
         """
         count, corners = self._mesh.level.vertex_count, near.corners.long()
         with_body, of_vertex = corners.amax(dim=1) >= count, near.face & (corners[:, 0] < count)
@@ -305,4 +305,4 @@ class ClothSprings:
         either = either if exempt is None else either | exempt
         sided = ~with_body | (~touching & (of_vertex | ~either[corners].any(dim=1)))
         kept = torch.nonzero(sided).squeeze(1)  # One conversion for all fields.
-        return near.where(kept), with_body[kept], out
+        return near.where(kept), with_body[kept], out if len(on) else None
