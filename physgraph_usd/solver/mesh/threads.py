@@ -56,6 +56,8 @@ class Launch:
         command = wp.launch(kernel, dim=self._size, inputs=[0, *inputs], device=device, record_cmd=True)
         self._command: wp.Launch | None = command if self._size else None
         self._call = None if self._command is None or self._device is not None else _Call(self._command)
+        if self._command is not None and self._call is None:
+            _separate_arguments(self._command)
         self._slices: list[_Call] = []
 
     def change(self, changed: Mapping[int, Any]) -> None:
@@ -63,14 +65,11 @@ class Launch:
         if self._command is None:
             return
         if self._call is None:
-            kinds = self._command.kernel.adj.args
             for position, value in changed.items():
-                packed = value
-                if isinstance(value, Tensor):
-                    packed = argument(value, kinds[position + 1].type.dtype)
-                    if packed.ndim != 1:
-                        raise ValueError("a kernel reads arrays of one dimension only")
-                self._command.set_param_at_index(position + 1, packed)
+                if isinstance(value, Tensor):  # In place: to pack an argument takes longer than many kernels.
+                    self._command.params[position + 2].data = _address(value)
+                else:
+                    self._command.set_param_at_index(position + 1, value)
         for call in (self._call, *self._slices) if self._call is not None else ():
             call.change(changed)
 
@@ -123,9 +122,7 @@ class _Call:
         """Replace some inputs, as in `Launch.change`."""
         for position, value in changed.items():
             if isinstance(value, Tensor):
-                if not value.is_contiguous():
-                    raise ValueError("a kernel reads contiguous tensors only")
-                getattr(self._packed, self._names[position + 1]).data = value.data_ptr()
+                getattr(self._packed, self._names[position + 1]).data = _address(value)
             else:
                 plain = value.__ctype__() if isinstance(value, wp.array) else value
                 setattr(self._packed, self._names[position + 1], plain)
@@ -143,6 +140,27 @@ class _Call:
     def launch(self) -> None:
         """Run the kernel on this thread; Python's lock is free meanwhile."""
         self._forward(ctypes.byref(self._bounds), ctypes.byref(self._packed))
+
+
+def _separate_arguments(command: wp.Launch) -> None:
+    """Give a launch on a card its own structure for each array, to be changed in place; Warp shares an array's."""
+    parameters: Any = command.params
+    addresses: Any = command.params_addr
+    for number, shared in enumerate(parameters):
+        if number and isinstance(shared, ctypes.Structure):
+            parameters[number] = type(shared).from_buffer_copy(shared)
+            addresses[number] = ctypes.c_void_p(ctypes.addressof(parameters[number]))
+
+
+def _address(tensor: Tensor) -> int:
+    """Address of a tensor's first element.
+
+    Raises:
+        ValueError: The tensor is not contiguous.
+    """
+    if not tensor.is_contiguous():
+        raise ValueError("a kernel reads contiguous tensors only")
+    return tensor.data_ptr()
 
 
 def run(kernel: wp.Kernel, size: int, inputs: Sequence[Any], *, device: str, threads: int = 1) -> None:
