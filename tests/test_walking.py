@@ -8,7 +8,20 @@ import numpy as np
 import pytest
 import torch
 from brute import Soup, crossings
-from folds import SHAPES, folded, frame_with, levels_of, named, near_pairs, placed, refiner_with, square, strip
+from folds import (
+    EDGE,
+    SHAPES,
+    folded,
+    frame_with,
+    levels_of,
+    named,
+    near_pairs,
+    placed,
+    refiner_with,
+    square,
+    strip,
+    view_of,
+)
 from meshes import grid
 
 from physgraph_usd.solver.collide.pairs import Reach
@@ -95,6 +108,24 @@ class TestNearPairs:
         at_rest = (found.weight.double().unsqueeze(2) * rest[found.corners.long()]).sum(dim=1).norm(dim=1)
         # The closest points at rest are others: they are no farther apart than these.
         assert bool((found.separation.norm(dim=1) < 0.5 * at_rest + 1e-6).all())
+
+    @pytest.mark.parametrize("moved", [0.02, 0.2, 0.9])
+    def test_pairs_kept_from_the_last_search_and_new_ones_are_those_of_a_new_search(self, moved: float):
+        """A part of the vertices moves a little after a search; with most of them moved, all pairs are searched."""
+        garment = named(strip(8, 3))
+        levels = levels_of(garment)
+        x = placed(levels[-1], SHAPES["crumpled"])
+        seeded = torch.Generator().manual_seed(1)
+        chosen = torch.rand((len(x), 1), generator=seeded) < moved
+        other = x + 0.1 * EDGE * torch.randn(x.shape, generator=seeded).to(x) * chosen
+
+        def springs(*shapes: torch.Tensor) -> list[tuple[int, ...]]:
+            view = view_of(levels, [garment], thickness=0.01)
+            *_, terms = [view.terms(shape) for shape in shapes]
+            return sorted(tuple(row) for term in terms for row in term.gaps.corners.tolist())
+
+        assert len(springs(other)) > 100
+        assert springs(x, other) == springs(other) != springs(x)
 
 
 def parts_of(corners: list[int], split: int) -> frozenset[frozenset[int]]:
