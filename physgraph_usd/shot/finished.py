@@ -16,6 +16,7 @@ from ..usd.provenance import asset_path, file_hashes, is_result_of, mute_refined
 from ..usd.stage import open_stage
 from ..usd.view import StageView
 from ..version import __version__, code_digest
+from .findings.table import FINDINGS
 from .frames import frames_folder
 from .options import PICTURE, RefineOptions
 from .report import LOG, RefineReport
@@ -59,7 +60,7 @@ def finished(shot: str | Path, out: Path, options: RefineOptions) -> RefineRepor
         return None
     if not is_result_of(out, wanted, settled=options.strict):
         return None
-    report.warn(f"{out} is taken as done: the same files, options and version made it")
+    report.warn(FINDINGS["taken_as_done"](out=out))
     report.out = out
     return report
 

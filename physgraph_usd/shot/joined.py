@@ -23,6 +23,7 @@ import numpy as np
 from ..errors import named_time
 from ..interrupts import leave_if_asked
 from ..solver.scene import Result
+from .findings.table import FINDINGS, Text
 
 Both = Sequence[tuple[Result, Result]]
 """The frames before a seam, each with the solution of the process behind the seam."""
@@ -49,11 +50,10 @@ class Joint:
     why: str
 
     @property
-    def warnings(self) -> list[str]:
+    def warnings(self) -> list[Text]:
         """A warning if the cloth jumps."""
         last = named_time(self.frames[-1].time)
-        jump = f"the cloth jumps after time code {last}, where the work of two processes meets"
-        return [f"{jump}: {self.why}"] if self.why else []
+        return [FINDINGS["seam_jump"](last=last, why=self.why)] if self.why else []
 
 
 def join(solutions: Both, movers: Movers) -> Joint:

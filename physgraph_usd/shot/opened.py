@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from ..usd.read.reader import Shot
 from ..usd.view import Stage
+from .findings.untagged import open_with_colliders
 from .options import RefineOptions
-from .untagged import open_with_colliders
 
 
 def open_for(shot: str | Stage, options: RefineOptions) -> Shot:
@@ -26,10 +26,3 @@ def open_for(shot: str | Stage, options: RefineOptions) -> Shot:
         rest_frame=options.rest_frame,
         gravity=options.gravity,
     )
-
-
-def why_not_posed(shot: Shot, options: RefineOptions) -> str:
-    """Why requested poses from the bind pose to the first frame are not solved; "" if they are."""
-    if options.temporal == "off":
-        return "--temporal off solves each frame by itself"
-    return "" if shot.is_skinned else "no garment is skinned"

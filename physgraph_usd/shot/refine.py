@@ -25,13 +25,13 @@ from ..usd.view import Layer, Stage
 from ..usd.write.atomic import check_folder_of, check_place
 from .describe import begin_report, describe, describe_meshes, too_large
 from .farm import shots_at_once
+from .findings.table import FINDINGS
 from .finished import Job, check_jobs, finished, results
 from .frames import kept_for
 from .opened import open_for
 from .options import RefineOptions, json_of, picture_of
 from .processes import call_each, memory_is_named
 from .report import DONE, LOG, RefineReport, is_of_failure
-from .warnings import WARNINGS
 
 if TYPE_CHECKING:
     from .run import Run
@@ -161,7 +161,7 @@ def running(
                 raise large
             with importing():
                 from ..solver.integrate.factors import FACTOR
-            report.warn(*warnings, *([] if FACTOR == "cholespy" else [WARNINGS["slower"]()]))
+            report.warn(*warnings, *([] if FACTOR == "cholespy" else [FINDINGS["slower"]()]))
             yield opened, report
 
 
@@ -306,7 +306,7 @@ def _draw_first(report: RefineReport, opened: Shot, options: RefineOptions, pict
         draw_frames(opened, levels, [result], picture, options=options, overwrite=options.overwrite)
         LOG.log(NOTICE, "%s shows the first frame", picture, extra={"shot": report.shot})
     except (LayerError, StageError, UsageError) as error:
-        report.warn(WARNINGS["undrawn"](picture=picture, error=error))
+        report.warn(FINDINGS["undrawn"](picture=picture, error=error))
 
 
 def _write_failure(report: RefineReport, options: RefineOptions) -> None:

@@ -22,8 +22,8 @@ from ..solver.scene import Frame, Result
 from ..usd.read.reader import Shot
 from .from_rest import FromRest
 from .joined import Mover, Positions, counts, worse
-from .opened import open_for, why_not_posed
-from .options import RefineOptions
+from .opened import open_for
+from .options import RefineOptions, why_not_posed
 from .processes import cores
 from .report import faults_of
 from .run_in import MOST_POSES, POSES, RUN_IN, RunIn, crossings_of_cloth, pose_in

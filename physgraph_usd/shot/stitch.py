@@ -24,6 +24,7 @@ from ..solver.level import fine_meshes, refine_garments
 from ..solver.scene import Result
 from ..usd.read.reader import Shot
 from .chunks import frames_in_order
+from .findings.table import FINDINGS
 from .finished import check_jobs, made_from
 from .frames import CHUNK, Finished, frames_folder, record_in
 from .joined import Both, Joint, between, join
@@ -33,7 +34,6 @@ from .refine import check_places, running, write_all
 from .report import RefineReport
 from .run import Run, Stored, numbers_in
 from .solve import ShotSolver
-from .warnings import WARNINGS
 
 SEAM_BOUND = 0.05
 """Largest increase of a frame's move by a seam, RMS over a garment, in mean fine edges; figures in `docs/farm.md`."""
@@ -240,7 +240,7 @@ def stitch(
         if missing:
             every, count = parts[0].run["times"], len(numbers) + len(missing)
             spans = _spans([every[number] for number in missing], every)
-            report.warn(WARNINGS["partial"](count=len(numbers), frames=counted(count, "frame"), missing=spans))
+            report.warn(FINDINGS["partial"](count=len(numbers), frames=counted(count, "frame"), missing=spans))
         joins = _Joins(parts, opened, np.inf if partial else seam_bound, report.warn, numbers)
         record = {"options": recorded, "chunks": [_span(part.times) for part in parts]}
         _make_folder(out.resolve().parent)
