@@ -9,6 +9,7 @@ Odd or repaired contents of a stage are reported by the stage's reader, as `usd.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from shlex import join
@@ -89,7 +90,7 @@ class Text(str):
     """The text of a finding.
 
     Attributes:
-        kind: Title of the finding.
+        kind: Sentence of the finding, with figures in braces.
         options: Options of `RefineOptions` that mend the cause.
     """
 
@@ -105,21 +106,21 @@ class Finding:
         level: `WARNING`, `NOTE` or `STRICT`.
         before: Test before the first frame; yields the figures of each occurrence.
         after: Test after the last frame, likewise. A finding without a test is reported where it happens.
-        title: Title in docs/trouble.md.
         advice: Advice in docs/trouble.md.
         sentence: The text, with figures in braces.
         remedy: The remedy in brief, with figures in braces, or "".
         options: The options of the remedy, with figures in braces.
+        title: The sentence in docs/trouble.md; "" for the sentence itself, without figures.
     """
 
     level: str = WARNING
     before: Test | None = None
     after: Test | None = None
-    title: str
     advice: str
     sentence: str
     remedy: str = ""
     options: Mapping[str, str] = field(default_factory=dict)
+    title: str = ""
 
     def __call__(self, path: str = "", times: Sequence[float | None] = (), **figures: Any) -> Text:
         """The text of one occurrence.
@@ -133,7 +134,7 @@ class Finding:
         location = (f"<{path}>" if path else "") + at_time(first)
         parts = [self.sentence.format(**figures), self.remedy.format(**figures), _also(later)]
         text = Text((f"{location}: " if location else "") + "; ".join(filter(None, parts)))
-        text.kind = self.title
+        text.kind = self.sentence
         text.options = {name: value.format(**figures) for name, value in self.options.items()}
         return text
 
@@ -159,9 +160,15 @@ def advice_tables() -> str:
     """All warnings and all notes with advice, as two tables in Markdown."""
     tables = []
     for levels, heading in (((WARNING,), ""), ((NOTE, STRICT), "Notes say that nothing is wrong:\n\n")):
-        rows = [f"| {entry.title} | {entry.advice} |" for entry in FINDINGS.values() if entry.level in levels]
+        rows = [f"| {_constant(entry)} | {entry.advice} |" for entry in FINDINGS.values() if entry.level in levels]
         tables.append(heading + "\n".join(["| it says | do |", "|---|---|", *rows]) + "\n")
     return "\n".join(tables)
+
+
+def _constant(finding: Finding) -> str:
+    """The sentence of a finding without its figures."""
+    dotted = re.sub(r"<?\{[^}]*\}>?", "...", finding.sentence)
+    return finding.title or re.sub(r"\.\.\.(:? ?\.\.\.)+", "...", dotted)
 
 
 def preset_overrides(sources: Iterable[GarmentSource]) -> list[str]:
@@ -508,7 +515,6 @@ def _more(facts: Facts) -> Iterator[Figures]:
 FINDINGS = {
     "strained": Finding(
         before=_strained,
-        title="in most frames the cage has not its rest shape's size",
         advice="refined cloth takes the size of its rest shape. `--rest auto` fits one to the shot, or author "
         "`primvars:rest` in the cloth's own size",
         sentence="in most frames the cage has not its rest shape's size, which refined cloth takes: {parts}",
@@ -517,14 +523,12 @@ FINDINGS = {
     ),
     "unfelt": Finding(
         before=_unfelt,
-        title="cloth is inside or near a body that it does not feel",
         advice="use `--collider auto`, or the command that the warning names",
         sentence="cloth is inside or within {near:.0f} mm of {bodies} that it does not feel, for {why}: {named}",
         remedy="give --collider {auto}, or by name {options}",
     ),
     "unread": Finding(
         before=_unread,
-        title="a shape that is not read may touch cloth",
         advice="convert it to a mesh, or put a mesh in its place; curves and points that lie on the cloth can "
         "follow it by `--bind`",
         sentence="{named} may touch cloth and {are} not read",
@@ -532,7 +536,6 @@ FINDINGS = {
     ),
     "gravity": Finding(
         before=_across_gravity,
-        title="gravity pulls across it",
         advice="correct the stage's `upAxis`, or give `--gravity` the axis. If the body lies down and gravity is "
         "right, no action is needed",
         sentence="it and <{body}> inside it stand along {axis}, but gravity is {pull} by {source}",
@@ -541,66 +544,55 @@ FINDINGS = {
     ),
     "unposed": Finding(
         before=_unposed,
-        title="`--pose-in` has no effect",
         advice="it bends cloth from the bind pose of a skeleton to the first frame; leave it out for cloth that no "
         "skeleton moves, and with `--temporal off`",
         sentence="--pose-in has no effect: {reason}",
         remedy="leave it out",
     ),
     "slower": Finding(
-        title="cholespy is not installed",
         advice="install it, if it has a wheel for your system; solves then take less time",
         sentence="cholespy is not installed: matrices are factorised by scipy, which is slower",
     ),
     "taken_as_done": Finding(
-        title="is taken as done",
         advice="no action needed; `--overwrite` instead of `--resume` refines the shot again",
         sentence="{out} is taken as done: the same files, options and version made it",
     ),
     "solved_anew": Finding(
-        title="finished frames are solved anew",
         advice="`--resume` instead of `--overwrite` uses them",
         sentence="{dropped} of a run that was interrupted {are} solved anew",
         remedy="--resume would have used {them}",
     ),
     "resumed": Finding(
-        title="frames are those of a run that was interrupted",
         advice="no action needed; folds may differ slightly from an uninterrupted run",
         sentence="{kept} are those of a run that was interrupted; the others are solved{again}",
         remedy="folds that can lie in several ways may lie otherwise there than in an undisturbed run",
     ),
     "partial": Finding(
-        title="the layer has a part of the frames",
         advice="`stitch --partial` leaves out the frames that are not finished. `refine --resume` solves them",
         sentence="the layer has {count} of {frames}; not finished: {missing}",
         remedy="refine --resume solves them",
     ),
     "undrawn": Finding(
-        title="the first frame is not drawn",
         advice="the text after it says why; the frames are refined without the picture",
         sentence="the first frame is not drawn into {picture}: {error}",
     ),
     "failed": Finding(
-        title="no sample is written at time code",
         advice="that frame failed, for the reason that follows; mend the input and run again",
         sentence="no sample is written at time code {name}: {error}",
     ),
     "seam_jump": Finding(
-        title="the cloth jumps where the work of two processes meets",
         advice="the text after it says why the two solutions cannot be blended; refine the frames again with a "
         "longer pre-roll or with fewer `--workers`",
         sentence="the cloth jumps after time code {last}, where the work of two processes meets: {why}",
     ),
     "broken_before": Finding(
         after=_jumps("broken_before"),
-        title="leaves its place for this frame alone",
         advice="mend the cage or the body in that frame; the next frame starts from the frame before it",
         sentence="the garment or a body leaves its place for this frame alone",
         remedy="mend it. Time code {next} starts from the frame before it",
     ),
     "jumped_from": Finding(
         after=_jumps("jumped_from"),
-        title="jumps from this first frame to the next",
         advice="if the first frame is broken, leave it out with `--frames`",
         sentence="the garment or a body jumps from this first frame to the next",
         remedy="if it is broken, leave it out with --frames. Time code {next} starts anew",
@@ -615,7 +607,6 @@ FINDINGS = {
     ),
     "limited": Finding(
         after=_unsolved(LIMITED),
-        title="the frame reached its limit of time",
         advice="the frame took over 20 times the processor time of the others, or more than `--frame-limit`, and "
         "was stopped. The cloth is valid but has not converged, and depends on the processor's speed. On a "
         "graphics card wall time counts, and other programs change it too. The next frame continues from there. "
@@ -625,14 +616,12 @@ FINDINGS = {
     ),
     "unsolved": Finding(
         after=_unsolved(COLLAPSED, UNSOLVED),
-        title="it follows its cage there, not solved",
         advice="the text before it says why; mend the animation there, or leave the frame out with `--frames`",
         sentence="{how}; it follows its cage there, not solved",
         remedy="cache that frame again, or leave it out with --frames",
     ),
     "drawn": Finding(
         after=_drawn_inside,
-        title="the surface that renderers draw enters a body",
         advice="renderers subdivide the refined cloth, and over a body's sharp edges the surface is rounder than "
         "the body. `--scheme none` writes polygons, which stay outside. This is measured only with `--report`",
         sentence="the surface that renderers draw from it is up to {depth:.1f} mm inside a body",
@@ -641,7 +630,6 @@ FINDINGS = {
     ),
     "open_loop": Finding(
         after=_open_loops,
-        title="cage and bodies close a loop, but the cloth does not",
         advice="if the shot is played as a loop, the cloth jumps there. `--temporal off` solves each frame by "
         "itself and closes the loop, with less continuity between frames. A shot that plays once needs no change",
         sentence="cage and bodies close a loop, but the cloth ends {gap:.1f} mm from where it begins",
@@ -651,16 +639,15 @@ FINDINGS = {
     "slack": Finding(
         level=NOTE,
         before=_tight,
-        title="this cage has no slack",
         advice="the cage is as long as the cloth, so refined cloth has no folds of its own. "
         "[Ease](fabrics.md#ease-folds-that-the-cage-does-not-show) makes the cloth longer than the cage",
         sentence="{garments}: {cages} no slack: expect what subdivision gives",
         remedy="for folds give --set weftEase={ease}",
+        title="this cage has no slack",
     ),
     "preset": Finding(
         level=NOTE,
         before=_like_presets,
-        title="named like a preset",
         advice="no fabric is authored; the options of the note choose the preset",
         sentence="named like {preset}: {garments}",
         remedy="{options} refines {them} so",
@@ -675,16 +662,15 @@ FINDINGS = {
     "trims": Finding(
         level=NOTE,
         before=_trims,
-        title="stays as it is beside the refined cloth",
         advice="a mesh, curves or points that lie on the garment keep their own animation; `--bind` makes them "
         "follow the refined cloth",
         sentence="{trims} {stay} beside the refined {cloth}",
         remedy="{options} carries {them} along",
+        title="stays as it is beside the refined cloth",
     ),
     "follows_cage": Finding(
         level=NOTE,
         after=_following,
-        title="part of the cloth follows its subdivided cage",
         advice="the solution had more crossings there than the subdivided cage; `--heat-map` writes where",
         sentence="in {frames} part of the cloth follows its subdivided cage, where the solution crosses more often: "
         "{vertices} of {place}, with {left:,} crossings for {solved:,} as solved",
@@ -692,7 +678,6 @@ FINDINGS = {
     "given_up": Finding(
         level=NOTE,
         after=_given_up,
-        title="cloth is its subdivided cage, without folds",
         advice="the cage crosses itself too often to be solved; mend the animation there",
         sentence="in {frames} cloth is its subdivided cage, without folds: the cage crosses itself too often to be "
         "solved ({first})",
@@ -700,7 +685,6 @@ FINDINGS = {
     "inertia": Finding(
         level=NOTE,
         after=_inertia,
-        title="cloth feels the acceleration of its animation",
         advice="fast animation pulls the cloth back; `--set inertia=0` leaves the pull out",
         sentence="inertia: in {frames} cloth feels the acceleration of its animation, up to {acceleration:.2g} times "
         "gravity beyond it ({place})",
@@ -709,7 +693,6 @@ FINDINGS = {
     "poses": Finding(
         level=NOTE,
         after=_poses,
-        title="is solved after poses from the bind pose on",
         advice="the first frame crossed itself; `--pose-in 0` leaves the poses out",
         sentence="time code {time} is solved after {poses} from the bind pose on, since cloth crossed itself "
         "without the poses",
@@ -717,7 +700,6 @@ FINDINGS = {
     "folds": Finding(
         level=NOTE,
         after=_folds,
-        title="edges fold by more than 45 degrees, so the mesh shows",
         advice="give the `--level` that the note names, or accept that folds are polygons",
         sentence="level: {share:.0%} of the edges of {place} fold by more than 45 degrees, so the mesh shows{further}",
         remedy="{finer}",
@@ -725,7 +707,6 @@ FINDINGS = {
     "energy": Finding(
         level=NOTE,
         after=_energy,
-        title="ended with more energy than the upsampled cage",
         advice="cloth was pushed out of bodies or untangled there, or did not converge; look at these frames",
         sentence="{frames} ended with more energy than the upsampled cage, {place}: {after:.3g} J, the cage's "
         "{before:.3g} J",
@@ -733,7 +714,6 @@ FINDINGS = {
     "shown": Finding(
         level=NOTE,
         after=_shown,
-        title="viewports that draw a body unsubdivided show it through cloth",
         advice="renderers that subdivide the body do not; the note has the contact offset that hides the body "
         "everywhere",
         sentence="viewports that draw <{body}> unsubdivided show it through {garments} by up to {height:.1f} mm{when}",
@@ -742,14 +722,12 @@ FINDINGS = {
     "unsettled": Finding(
         level=STRICT,
         after=_moving,
-        title="did not settle",
-        advice="the frame kept its last state before it was at rest; more `--steps` bring it nearer. With `--strict` this is a "
-        "warning",
+        advice="the frame kept its last state before it was at rest; more `--steps` bring it nearer. With `--strict` "
+        "this is a warning",
         sentence="{count} of {frames} did not settle, {place} the least: {how}",
     ),
     "more": Finding(
         after=_more,
-        title="more crossings and vertices inside bodies are left than there are in the subdivided cage",
         advice="the last line of a run. The cloth is worse there than plain subdivision: look at it before you use "
         "it. `--heat-map` writes where; mend the cage there, or refine those frames alone (`--frames`)",
         sentence="{left:,} crossings and vertices inside bodies are left{together}, {before:,} in the subdivided "

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 COLLAPSED, LIMITED, UNSOLVED = "collapsed", "time limit", "not solved"
@@ -11,42 +10,8 @@ FAR = 50.0
 """Remaining move [tolerances] above which a level is unsolved: by default a visible tenth of a fine edge."""
 
 
-@dataclass(frozen=True)
-class Unsettled:
-    """A garment's frame that did not settle.
-
-    Attributes:
-        remaining_move: RMS of H0^-1 F at the level, in local edge lengths; None if no level was solved.
-        stopped: Reason for the end of the steps, as in `LevelReport`, or `COLLAPSED`, `LIMITED` or `UNSOLVED`.
-        size: Size of a collapsed cage relative to its rest shape.
-        error: Reason for an unsolved frame, else "".
-    """
-
-    level: int
-    remaining_move: float | None
-    stopped: str
-    size: float | None = None
-    error: str = ""
-
-    def __str__(self) -> str:
-        """Description in words."""
-        if self.error:
-            return self.error
-        if self.size is not None:
-            return f"the cage has shrunk to {100.0 * self.size:.2g}% of its rest shape's size"
-        reason = "no step lowers the energy" if self.stopped == "stalled" else f"stopped by {self.stopped}"
-        if self.remaining_move is None:
-            return f"no level was solved ({reason})"
-        return f"level {self.level} would still move by {self.remaining_move:.2g} edges ({reason})"
-
-
-def in_words(entry: Mapping[str, Any]) -> str:
-    """An entry of `unsettled_frames` in words."""
-    return str(Unsettled(**{field.name: entry[field.name] for field in fields(Unsettled)}))
-
-
-def unsettled(entry: Mapping[str, Any], tolerance: float) -> Unsettled | None:
-    """The unsettled state of a garment's frame, or None if settled.
+def unsettled(entry: Mapping[str, Any], tolerance: float) -> dict[str, Any] | None:
+    """Why a garment's frame is unsettled, or None if it is settled.
 
     A frame is unsettled if a level's last descent ended because no step lowered the energy although the level was not
     at rest, or if the finest level's remaining move exceeds `FAR` tolerances. A collapsed cage is not solved at all.
@@ -54,40 +19,49 @@ def unsettled(entry: Mapping[str, Any], tolerance: float) -> Unsettled | None:
     Args:
         entry: The garment's telemetry in the frame.
         tolerance: Tolerance of the solve, in local edge lengths.
+
+    Returns:
+        Plain values, as in the report: ``level`` and its ``remaining_move`` in local edge lengths, RMS of H0^-1 F, None
+        if no level was solved; ``stopped``, the reason for the end of the steps, as in `LevelReport`, or `COLLAPSED`,
+        `LIMITED` or `UNSOLVED`; ``size`` of a collapsed cage relative to its rest shape; ``error``, the reason for an
+        unsolved frame, else "".
     """
+    state = {"level": 0, "remaining_move": None, "stopped": "", "size": None, "error": ""}
+    moves = {level["level"]: float(level["remaining_move"]) for level in entry.get("levels", ())}
+    ends = {level["level"]: str(level["stopped"]) for level in entry.get("levels", ())}
+    finest = max(moves, default=0)
     if "not_solved" in entry:
-        return Unsettled(0, None, UNSOLVED, error=str(entry["not_solved"]))
+        return state | {"stopped": UNSOLVED, "error": str(entry["not_solved"])}
     if "collapsed" in entry:
-        return Unsettled(0, None, COLLAPSED, float(entry["collapsed"]))
-    last = {level["level"]: level for level in entry.get("levels", ())}
+        return state | {"stopped": COLLAPSED, "size": float(entry["collapsed"])}
     if "time_limit" in entry:
-        level = max(last, default=0)
-        return Unsettled(level, float(last[level]["remaining_move"]) if last else None, LIMITED)
-    finest = max(last, default=0)
-    for level in sorted(last, reverse=True):
-        remaining, stopped = float(last[level]["remaining_move"]), str(last[level]["stopped"])
-        far = level == finest and not remaining <= FAR * max(tolerance, 1e-6)
-        if far or (stopped == "stalled" and remaining > tolerance):
-            return Unsettled(level, remaining, stopped)
+        return state | {"level": finest, "remaining_move": moves.get(finest), "stopped": LIMITED}
+    for level in sorted(moves, reverse=True):
+        far = level == finest and not moves[level] <= FAR * max(tolerance, 1e-6)
+        if far or (ends[level] == "stalled" and moves[level] > tolerance):
+            return state | {"level": level, "remaining_move": moves[level], "stopped": ends[level]}
     return None
+
+
+def in_words(state: Mapping[str, Any]) -> str:
+    """Why a frame is unsettled, by `unsettled`, in words."""
+    if state["error"]:
+        return str(state["error"])
+    if state["size"] is not None:
+        return f"the cage has shrunk to {100.0 * state['size']:.2g}% of its rest shape's size"
+    reason = "no step lowers the energy" if state["stopped"] == "stalled" else f"stopped by {state['stopped']}"
+    if state["remaining_move"] is None:
+        return f"no level was solved ({reason})"
+    return f"level {state['level']} would still move by {state['remaining_move']:.2g} edges ({reason})"
 
 
 def unsettled_frames(
     garments: Sequence[Mapping[str, Any]], frames: Sequence[Mapping[str, Any]], *, tolerance: float
 ) -> list[dict[str, Any]]:
-    """All unsettled frames, garment by garment.
-
-    Args:
-        garments: A report's garments, with paths.
-        frames: The same report's frames.
-        tolerance: Tolerance of the solve, in local edge lengths.
-
-    Returns:
-        Plain values: path, time and the fields of `Unsettled`.
-    """
+    """All unsettled frames of a report, garment by garment: path, time and the values of `unsettled`."""
     return [
-        {"path": garment["path"], "time": frame["time"], **asdict(garment_unsettled)}
+        {"path": garment["path"], "time": frame["time"], **state}
         for index, garment in enumerate(garments)
         for frame in frames
-        if "garments" in frame and (garment_unsettled := unsettled(frame["garments"][index], tolerance))
+        if "garments" in frame and (state := unsettled(frame["garments"][index], tolerance))
     ]
