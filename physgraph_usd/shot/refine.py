@@ -17,21 +17,19 @@ from typing import TYPE_CHECKING, Any
 from ..errors import NOTICE, LayerError, PhysGraphError, StageError, UsageError
 from ..interrupts import SIGNALLED, exit_code_of, importing, signals_noted
 from ..solver.scene import Result
-from ..usd.files import check_targets, files_of
+from ..usd.files import files_of
 from ..usd.provenance import write_root
 from ..usd.read.reader import Shot
 from ..usd.stage import shot_name
 from ..usd.view import Layer, Stage
-from ..usd.write.atomic import check_folder_of, check_place
+from ..usd.write.atomic import check_folder_of
 from .describe import begin_report, describe, describe_meshes, too_large
-from .farm import shots_at_once
 from .findings.table import FINDINGS
-from .finished import Job, check_jobs, finished, results
 from .frames import kept_for
-from .opened import open_for
+from .job import Job, check_jobs, check_new, check_of_stage, check_places, finished, open_for, results
 from .options import RefineOptions, json_of, picture_of
-from .processes import call_each, memory_is_named
 from .report import DONE, LOG, RefineReport, is_of_failure
+from .workers import call_each, memory_is_named, shots_at_once
 
 if TYPE_CHECKING:
     from .run import Run
@@ -66,7 +64,7 @@ def refine_shot(shot: str | Path, out: str | Path, options: RefineOptions = DEFA
     with running(str(shot), options, out=out) as (opened, report):
         if options.dry_run:
             return report
-        _check_new(out, options)
+        check_new(out, options)
         with importing():
             from .run import Run
         picture = picture_of(options)
@@ -128,7 +126,7 @@ def refine_stage(
         SolveError: No frame could be solved.
         LayerError: The layer is invalid, or the report cannot be written.
     """
-    _check_of_stage(stage, options)
+    check_of_stage(stage, options)
     with running(stage, options, on_report=on_report) as (opened, report):
         with importing():
             from .run import Run
@@ -215,42 +213,6 @@ def refine_shots(
         return call_each(refine, calls, workers=at_once, cards=cards_for(options.device))
 
     return results(jobs, solve)
-
-
-def check_places(out: Path, options: RefineOptions) -> None:
-    """Refuse unwritable outputs before the work, not after an hour of frames."""
-    if not options.resume:
-        _check_new(out, options)
-    for _, path in options.targets(out):
-        if path != out or options.preroll is None:  # A chunk is a folder.
-            check_place(path)
-
-
-def _check_new(out: Path, options: RefineOptions) -> None:
-    for _, path in options.targets(out):
-        _check_none(path, options)
-
-
-def _check_none(path: Path, options: RefineOptions) -> None:
-    if path.is_file() and not (options.overwrite or is_of_failure(path)):
-        raise UsageError(f"{path} exists; choose another name or replace it by --overwrite")
-
-
-def _check_of_stage(stage: Stage, options: RefineOptions) -> None:
-    """Refuse options not applicable to an open stage, and a report over a file of the stage."""
-    options.check()
-    if options.workers > 1:
-        raise UsageError(f"workers is {options.workers}: an open stage lives in one process; save it, or take 1")
-    for name in ("resume", "dry_run", "root", "scheduler", "preroll", "preview"):
-        if getattr(options, name):
-            raise UsageError(f"{name} is for layers on disk; an open stage is refined into a layer in memory")
-    if options.report is not None:
-        report = Path(options.report)
-        if json_of(report) != report:
-            raise UsageError(f"the report of an open stage is a file: {report} does not end with .json")
-        check_targets([("the report", report)], files_of(stage))
-        check_place(report)
-        _check_none(report, options)
 
 
 def inspect_shot(shot: str | Path | Stage, *, timed: bool = False, **reading: Any) -> dict[str, Any]:

@@ -35,18 +35,17 @@ from ..usd.write.writer import LayerWriter
 from .chunks import PREROLL, solve_in_chunks
 from .cuts import Cuts, Loop
 from .describe import say_what_was
-from .farm import connected
+from .estimate import Forecast
 from .findings.drawn import Compared
 from .findings.table import FINDINGS, Facts, found
 from .findings.unsettled import unsettled_frames
 from .findings.untagged import AUTO
-from .finished import made_from
-from .forecast import Forecast
 from .frames import CHUNK, FrameFolder, frames_folder
+from .job import made_from
 from .options import RefineOptions
-from .processes import Start, separate_processes
 from .report import LOG, RefineReport, of_a_kind
 from .solve import Results, ShotSolver
+from .workers import Start, connected, separate_processes
 
 try:
     import resource

@@ -23,14 +23,12 @@ from ..errors import LayerError, UsageError, counted, named_time
 from ..solver.level import fine_meshes, refine_garments
 from ..solver.scene import Result
 from ..usd.read.reader import Shot
-from .chunks import frames_in_order
+from .chunks import Both, Joint, between, frames_in_order, join
 from .findings.table import FINDINGS
-from .finished import check_jobs, made_from
 from .frames import CHUNK, Finished, frames_folder, record_in
-from .joined import Both, Joint, between, join
-from .opened import open_for
+from .job import check_jobs, check_places, made_from, open_for
 from .options import RefineOptions
-from .refine import check_places, running, write_all
+from .refine import running, write_all
 from .report import RefineReport
 from .run import Run, Stored, numbers_in
 from .solve import ShotSolver
