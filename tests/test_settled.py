@@ -15,6 +15,7 @@ import pytest
 from shots import CLOTH, cloth_shot, faults, refine, run, sample_times
 from stages import add_mesh, new_stage, save, sheet_faces, sheet_points
 
+import physgraph_usd
 from physgraph_usd.shot.findings.table import FINDINGS, Facts, texts
 from physgraph_usd.shot.findings.unsettled import in_words, unsettled
 from physgraph_usd.shot.report import RefineReport
@@ -59,6 +60,12 @@ def told(name: str, frames: list[dict[str, Any]], *paths: str) -> list[str]:
 
 def frames_of(*entries: dict[str, Any]) -> list[dict[str, Any]]:
     return [{"time": time, "garments": [entry]} for time, entry in enumerate(entries, start=1)]
+
+
+def test_a_finding_without_a_test_is_reported_somewhere():
+    sources = [file.read_text("utf-8") for file in Path(physgraph_usd.__file__).parent.rglob("*.py")]
+    for name, finding in FINDINGS.items():
+        assert bool(finding.before) + bool(finding.after) + any(f'FINDINGS["{name}"]' in text for text in sources) == 1
 
 
 class TestContact:

@@ -29,7 +29,7 @@ from .findings.table import Facts, found, preset_overrides
 from .findings.untagged import FAR, find_candidates
 from .findings.up_axis import pull_of
 from .options import INTEGRATORS, RefineOptions, scene_words, why_not_posed
-from .report import RefineReport, of_a_kind
+from .report import RefineReport, levels_of, of_a_kind
 
 MOST_ASKED = 32
 """Most open meshes tried as garments."""
@@ -116,9 +116,8 @@ def too_large(opened: Shot, report: RefineReport, options: RefineOptions) -> Gar
 
 def _run(opened: Shot, report: RefineReport, options: RefineOptions) -> dict[str, Any]:
     """Levels, frame count and worker count of a run."""
-    levels = [garment["level"] for garment in report.garments]
     times = opened.scene.times if options.preroll is None else within(opened.scene.times, options.frames)
-    return {"levels": levels, "frames": max(len(times), 1), "workers": options.workers}
+    return {"levels": levels_of(report.garments), "frames": max(len(times), 1), "workers": options.workers}
 
 
 def describe(opened: Shot, options: RefineOptions) -> dict[str, Any]:

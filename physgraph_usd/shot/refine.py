@@ -28,7 +28,7 @@ from .findings.table import FINDINGS
 from .frames import kept_for
 from .job import Job, check_jobs, check_new, check_of_stage, check_places, finished, open_for, results
 from .options import RefineOptions, json_of, picture_of
-from .report import DONE, LOG, RefineReport, is_of_failure
+from .report import DONE, LOG, RefineReport, is_of_failure, levels_of
 from .workers import call_each, memory_is_named, shots_at_once
 
 if TYPE_CHECKING:
@@ -242,8 +242,7 @@ def inspect_shot(shot: str | Path | Stage, *, timed: bool = False, **reading: An
             if timed and "problem" not in plan:
                 from .solve import time_frames
 
-                levels = [garment["level"] for garment in plan["garments"]]
-                plan |= time_frames(opened, options, levels)
+                plan |= time_frames(opened, options, levels_of(plan["garments"]))
             return plan
     except StageError as error:
         plan = describe_meshes(source, str(error), options)
@@ -263,9 +262,8 @@ def _draw_first(report: RefineReport, opened: Shot, options: RefineOptions, pict
     """Draw the first refined frame; a picture that cannot be drawn is a warning, because the frames are worth more."""
     from .page.frames import draw_frames
 
-    levels = [garment["level"] for garment in report.garments]
     try:
-        draw_frames(opened, levels, [result], picture, options=options, overwrite=options.overwrite)
+        draw_frames(opened, levels_of(report.garments), [result], picture, options=options, overwrite=options.overwrite)
         LOG.log(NOTICE, "%s shows the first frame", picture, extra={"shot": report.shot})
     except (LayerError, StageError, UsageError) as error:
         report.warn(FINDINGS["undrawn"](picture=picture, error=error))

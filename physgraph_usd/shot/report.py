@@ -45,6 +45,11 @@ def is_first(path: str, entry: Mapping[str, Any]) -> bool:
     return entry.get("together", [path])[0] == path
 
 
+def levels_of(garments: Iterable[Mapping[str, Any]]) -> list[int]:
+    """Number of subdivisions of each of a report's garments."""
+    return [garment["level"] for garment in garments]
+
+
 def is_of_failure(path: Path) -> bool:
     """Whether a file is the report of a failed run, replaceable by the next run."""
     try:

@@ -43,7 +43,7 @@ from .findings.untagged import AUTO
 from .frames import CHUNK, FrameFolder, frames_folder
 from .job import made_from
 from .options import RefineOptions
-from .report import LOG, RefineReport, of_a_kind
+from .report import LOG, RefineReport, levels_of, of_a_kind
 from .solve import Results, ShotSolver
 from .workers import Start, connected, separate_processes
 
@@ -192,8 +192,7 @@ class Run:
         options = self.options
         if AUTO in options.colliders:
             options = dataclasses.replace(options, colliders=self.shot.colliders)
-        levels = [garment["level"] for garment in self.report.garments]
-        return ShotSolver(self.shot.path, levels, options, opened=self.shot)
+        return ShotSolver(self.shot.path, levels_of(self.report.garments), options, opened=self.shot)
 
     @cached_property
     def _cuts(self) -> Cuts:

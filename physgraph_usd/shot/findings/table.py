@@ -685,7 +685,7 @@ FINDINGS = {
     "inertia": Finding(
         level=NOTE,
         after=_inertia,
-        advice="fast animation pulls the cloth back; `--set inertia=0` leaves the pull out",
+        advice="fast animation pulls the cloth back; the option of the note leaves the pull out",
         sentence="inertia: in {frames} cloth feels the acceleration of its animation, up to {acceleration:.2g} times "
         "gravity beyond it ({place})",
         remedy="--set inertia=0 leaves it out",
