@@ -25,7 +25,7 @@ from ..usd.stage import GarmentSource
 from ..usd.times import within
 from ..usd.view import Stage
 from .estimate import cannot_fit, estimate
-from .findings.table import Facts, found, preset_overrides
+from .findings.table import Facts, preset_overrides, warnings_and_notes
 from .findings.untagged import FAR, find_candidates
 from .findings.up_axis import pull_of
 from .options import INTEGRATORS, RefineOptions, scene_words, why_not_posed
@@ -54,8 +54,14 @@ def begin_report(report: RefineReport, opened: Shot, options: RefineOptions) -> 
         | {"bound": [_bound(target) for target in opened.targets if target.garment == index]}
         for index, reader in enumerate(opened.readers)
     ]
-    bound = sum(len(target.points) for target in opened.targets)
-    report.estimate = estimate(opened.scene.garments, **_run(opened, report, options), bound=bound).plain()
+    size = estimate(
+        opened.scene.garments,
+        levels_of(report.garments),
+        frames=_frame_count(opened, options),
+        workers=options.workers,
+        bound=sum(len(target.points) for target in opened.targets),
+    )
+    report.estimate = size.plain()
     strained, candidates = _strained_parts(opened, frames), find_candidates(opened)
     facts = Facts(
         report=report,
@@ -76,7 +82,7 @@ def begin_report(report: RefineReport, opened: Shot, options: RefineOptions) -> 
         for candidate in candidates
         if not candidate.reason.startswith(FAR)
     }
-    warnings, notes = found(facts, before=True)
+    warnings, notes = warnings_and_notes(facts, before=True)
     report.note(*notes)
     report.modelled = _modelled(opened, report, options)
     report.left_out = _left_out(opened, report)
@@ -111,13 +117,14 @@ def _say_who_integrated(report: RefineReport, entries: Sequence[dict[str, Any]])
 
 def too_large(opened: Shot, report: RefineReport, options: RefineOptions) -> GarmentError | None:
     """The error naming a run too large for this machine's memory, or None."""
-    return cannot_fit(opened.scene.garments, **_run(opened, report, options))
+    frames, levels = _frame_count(opened, options), levels_of(report.garments)
+    return cannot_fit(opened.scene.garments, levels, frames=frames, workers=options.workers)
 
 
-def _run(opened: Shot, report: RefineReport, options: RefineOptions) -> dict[str, Any]:
-    """Levels, frame count and worker count of a run."""
+def _frame_count(opened: Shot, options: RefineOptions) -> int:
+    """Number of frames of a run."""
     times = opened.scene.times if options.preroll is None else within(opened.scene.times, options.frames)
-    return {"levels": levels_of(report.garments), "frames": max(len(times), 1), "workers": options.workers}
+    return max(len(times), 1)
 
 
 def describe(opened: Shot, options: RefineOptions) -> dict[str, Any]:
@@ -180,7 +187,7 @@ def _proposal(shot: str | Stage, meshes: Sequence[str], options: RefineOptions) 
                 strained={path: strained[path] for path in paths},
             )
             named = dataclasses.replace(options, garments=paths, colliders=[body.path for body in facts.unfelt])
-            return _command(opened, garments, named, found(facts, before=True)[0])
+            return _command(opened, garments, named, warnings_and_notes(facts, before=True)[0])
     except StageError:
         return ""
 

@@ -119,12 +119,12 @@ def results(
     reports = [finished(*job) for job in jobs]
     solved = solve([job for job, report in zip(jobs, reports, strict=True) if report is None])
 
-    def each() -> Generator[RefineReport | PhysGraphError, None, None]:
+    def in_order() -> Generator[RefineReport | PhysGraphError, None, None]:
         with closing(solved):
             for report in reports:
                 yield next(solved) if report is None else report
 
-    return each()
+    return in_order()
 
 
 def check_places(out: Path, options: RefineOptions) -> None:

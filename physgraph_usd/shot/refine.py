@@ -8,10 +8,9 @@ from __future__ import annotations
 import dataclasses
 import time as clock
 from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import ExitStack, closing, contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from functools import partial
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 from ..errors import NOTICE, LayerError, PhysGraphError, StageError, UsageError
@@ -148,10 +147,7 @@ def running(
     """Open a shot and begin its report; a run ended by a signal or any exception writes the report if requested."""
     report = RefineReport(shot_name(shot), None, options.plain(), options.value_sources())
     began = clock.perf_counter()
-    with ExitStack() as ends:
-        if on_report is not None:
-            ends.callback(on_report, report)
-        ends.push(partial(_record_end, report, options, out))
+    try:
         with signals_noted(), memory_is_named(), closing(open_for(shot, options)) as opened:
             warnings = begin_report(report, opened, options)
             report.seconds["open"] = clock.perf_counter() - began
@@ -161,17 +157,19 @@ def running(
                 from ..solver.integrate.factors import FACTOR
             report.warn(*warnings, *([] if FACTOR == "cholespy" else [FINDINGS["slower"]()]))
             yield opened, report
+    except BaseException as error:
+        _record_end(report, options, out, error)
+        raise
+    finally:
+        if on_report is not None:
+            on_report(report)
 
 
-def _record_end(
-    report: RefineReport,
-    options: RefineOptions,
-    out: Path | None,
-    kind: type[BaseException] | None,
-    error: BaseException | None,
-    trace: TracebackType | None,
-) -> None:
-    """Record the exception or signal that ends a run, and write the report if requested; the exception goes on."""
+def _record_end(report: RefineReport, options: RefineOptions, out: Path | None, error: BaseException) -> None:
+    """Record the exception or signal that ends a run, and write the report if requested.
+
+    The file is written unless it is protected, and errors here give way to the run's error.
+    """
     if isinstance(error, Exception):
         report.fail(error)
     elif (code := exit_code_of(error)) is not None:
@@ -179,7 +177,11 @@ def _record_end(
         report.signal, report.error = code - SIGNALLED, f"interrupted, {folder_text or 'no frame is kept'}"
     else:
         return
-    _write_failure(report, options)
+    if options.report is not None and not options.dry_run:
+        file = json_of(Path(options.report))
+        with suppress(LayerError):
+            if options.overwrite or not file.exists() or is_of_failure(file):
+                report.write(file)
 
 
 def refine_shots(
@@ -267,12 +269,3 @@ def _draw_first(report: RefineReport, opened: Shot, options: RefineOptions, pict
         LOG.log(NOTICE, "%s shows the first frame", picture, extra={"shot": report.shot})
     except (LayerError, StageError, UsageError) as error:
         report.warn(FINDINGS["undrawn"](picture=picture, error=error))
-
-
-def _write_failure(report: RefineReport, options: RefineOptions) -> None:
-    """Write the JSON of a failed run, unless over a protected file; errors here give way to the run's error."""
-    if options.report is not None and not options.dry_run:
-        file = json_of(Path(options.report))
-        with suppress(LayerError):
-            if options.overwrite or not file.exists() or is_of_failure(file):
-                report.write(file)

@@ -35,9 +35,13 @@ _FRAME: dict[str, Any] = {"time": None, "read_ms": None, "run_in_ms": None, "pos
 
 def faults_of(contact: Mapping[str, Any], side: str) -> int:
     """Crossings of cloth and with all bodies, and vertices inside bodies, "before" or "after"."""
-    measured = [contact.get("cloth") or {}, *(contact.get("bodies") or {}).values()]
     names = ("crossings", "inside", "pinched")
-    return sum(int(counts.get(side, {}).get(name, 0)) for counts in measured for name in names)
+    return sum(int(part.get(side, {}).get(name, 0)) for part in _parts_of(contact) for name in names)
+
+
+def _parts_of(contact: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """What contact was measured with: cloth, if any, and each body."""
+    return [part for part in (contact.get("cloth"), *(contact.get("bodies") or {}).values()) if part]
 
 
 def is_first(path: str, entry: Mapping[str, Any]) -> bool:
@@ -143,12 +147,7 @@ class RefineReport:
     def _crossed(self, side: str) -> list[int]:
         """Edges through faces of each measurement, "before" or "after"."""
         contacts = [contact for frame in self.frames for contact in self.measured(frame)]
-        measured = [
-            contact_part
-            for contact in contacts
-            for contact_part in (contact.get("cloth"), *contact.get("bodies", {}).values())
-        ]
-        return [contact_part[side]["crossings"] for contact_part in measured if contact_part]
+        return [part[side]["crossings"] for contact in contacts for part in _parts_of(contact)]
 
     def add(self, result: Result) -> None:
         """Add a frame: its telemetry, and that of each garment if the frame could be solved."""
@@ -191,7 +190,7 @@ class RefineReport:
     def note(self, *notes: str) -> None:
         """Add notes, and log the notes as information."""
         for note in notes:
-            self.notes.append(note)
+            self.notes.append(str(note))
             LOG.info("%s", note, extra={"shot": self.shot})
 
     def to_dict(self) -> dict[str, Any]:

@@ -37,7 +37,7 @@ from .cuts import Cuts, Loop
 from .describe import say_what_was
 from .estimate import Forecast
 from .findings.drawn import Compared
-from .findings.table import FINDINGS, Facts, found
+from .findings.table import FINDINGS, Facts, warnings_and_notes
 from .findings.unsettled import unsettled_frames
 from .findings.untagged import AUTO
 from .frames import CHUNK, FrameFolder, frames_folder
@@ -113,7 +113,7 @@ class Run:
             self._close(writer)
             layer = writer.layer if writer is not None and self.out is None else None
         facts = Facts(report=report, options=options, depths=compared.depths, shown=compared.shown, gaps=loop.gaps())
-        warnings, notes = found(facts)
+        warnings, notes = warnings_and_notes(facts)
         report.note(*notes)
         report.warn(*warnings, *map(str, self.shot.warnings[known:]))
         say_what_was(report)

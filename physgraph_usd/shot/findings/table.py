@@ -1,6 +1,6 @@
 """All findings of a run in one table: warnings and notes, each with its test; docs/trouble.md is made from the table.
 
-A finding is one entry of `FINDINGS` and the function that tests it. To add one, write both here. `found` tests all
+A finding is one entry of `FINDINGS` and the function that tests it. To add one, write both here. `warnings_and_notes` tests all
 entries before the first frame or after the last one. An entry without a test is reported where it happens, by
 ``report.warn(FINDINGS[id](...))``.
 
@@ -84,6 +84,7 @@ class Facts:
 
 
 Test = Callable[[Facts], Iterable[Figures]]
+"""Yields the figures of each occurrence of a finding."""
 
 
 class Text(str):
@@ -104,8 +105,8 @@ class Finding:
 
     Attributes:
         level: `WARNING`, `NOTE` or `STRICT`.
-        before: Test before the first frame; yields the figures of each occurrence.
-        after: Test after the last frame, likewise. A finding without a test is reported where it happens.
+        before: Test before the first frame.
+        after: Test after the last frame. A finding with neither test is reported where it happens.
         advice: Advice in docs/trouble.md.
         sentence: The text, with figures in braces.
         remedy: The remedy in brief, with figures in braces, or "".
@@ -139,7 +140,7 @@ class Finding:
         return text
 
 
-def found(facts: Facts, *, before: bool = False) -> tuple[list[Text], list[Text]]:
+def warnings_and_notes(facts: Facts, *, before: bool = False) -> tuple[list[Text], list[Text]]:
     """Warnings and notes of all findings tested before the first frame or after the last, in the table's order."""
     warnings, notes = list[Text](), list[Text]()
     for name, finding in FINDINGS.items():
