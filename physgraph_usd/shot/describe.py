@@ -62,13 +62,32 @@ def begin_report(report: RefineReport, opened: Shot, options: RefineOptions) -> 
         bound=sum(len(target.points) for target in opened.targets),
     )
     report.estimate = size.plain()
-    strained, candidates = _strained_parts(opened, frames), find_candidates(opened)
+    facts = _facts(opened, report, options, sampled=frames, choices=choices)
+    warnings, notes = warnings_and_notes(facts, before=True)
+    report.note(*notes)
+    report.modelled = _modelled(opened, report, options)
+    report.left_out = _left_out(opened, report)
+    report.variants = list(opened.selections)
+    refined = {None, *opened.scene.times}  # Frames outside the run may be broken.
+    return [str(notice) for notice in opened.warnings if notice.time in refined] + [*warnings]
+
+
+def _facts(
+    opened: Shot,
+    report: RefineReport,
+    options: RefineOptions,
+    *,
+    sampled: Sequence[Frame],
+    choices: Sequence[LevelChoice],
+) -> Facts:
+    """Facts before the first frame; the report gets those about candidates and about each garment."""
+    strained, candidates = _strained_parts(opened, sampled), find_candidates(opened)
     facts = Facts(
         report=report,
         options=options,
         shot=opened,
         sources=opened.sources,
-        sampled=frames,
+        sampled=sampled,
         choices=choices,
         candidates=candidates,
         strained=strained,
@@ -82,13 +101,7 @@ def begin_report(report: RefineReport, opened: Shot, options: RefineOptions) -> 
         for candidate in candidates
         if not candidate.reason.startswith(FAR)
     }
-    warnings, notes = warnings_and_notes(facts, before=True)
-    report.note(*notes)
-    report.modelled = _modelled(opened, report, options)
-    report.left_out = _left_out(opened, report)
-    report.variants = list(opened.selections)
-    refined = {None, *opened.scene.times}  # Frames outside the run may be broken.
-    return [str(notice) for notice in opened.warnings if notice.time in refined] + [*warnings]
+    return facts
 
 
 def say_what_was(report: RefineReport) -> None:

@@ -8,9 +8,10 @@ from __future__ import annotations
 import dataclasses
 import time as clock
 from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import closing, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from functools import partial
 from pathlib import Path
+from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 from ..errors import NOTICE, LayerError, PhysGraphError, StageError, UsageError
@@ -147,7 +148,10 @@ def running(
     """Open a shot and begin its report; a run ended by a signal or any exception writes the report if requested."""
     report = RefineReport(shot_name(shot), None, options.plain(), options.value_sources())
     began = clock.perf_counter()
-    try:
+    with ExitStack() as ends:
+        if on_report is not None:
+            ends.callback(on_report, report)
+        ends.push(partial(_record_end, report, options, out))
         with signals_noted(), memory_is_named(), closing(open_for(shot, options)) as opened:
             warnings = begin_report(report, opened, options)
             report.seconds["open"] = clock.perf_counter() - began
@@ -157,18 +161,19 @@ def running(
                 from ..solver.integrate.factors import FACTOR
             report.warn(*warnings, *([] if FACTOR == "cholespy" else [FINDINGS["slower"]()]))
             yield opened, report
-    except BaseException as error:
-        _record_end(report, options, out, error)
-        raise
-    finally:
-        if on_report is not None:
-            on_report(report)
 
 
-def _record_end(report: RefineReport, options: RefineOptions, out: Path | None, error: BaseException) -> None:
-    """Record the exception or signal that ends a run, and write the report if requested.
+def _record_end(
+    report: RefineReport,
+    options: RefineOptions,
+    out: Path | None,
+    kind: type[BaseException] | None,
+    error: BaseException | None,
+    trace: TracebackType | None,
+) -> None:
+    """Record the exception or signal that ends a run, and write the report if requested; the exception goes on.
 
-    The file is written unless it is protected, and errors here give way to the run's error.
+    A protected file is not written, and errors here give way to the run's error.
     """
     if isinstance(error, Exception):
         report.fail(error)

@@ -40,7 +40,7 @@ def faults_of(contact: Mapping[str, Any], side: str) -> int:
 
 
 def _parts_of(contact: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-    """What contact was measured with: cloth, if any, and each body."""
+    """Measurements of contact with cloth, if any, and with each body."""
     return [part for part in (contact.get("cloth"), *(contact.get("bodies") or {}).values()) if part]
 
 

@@ -1,7 +1,7 @@
 """All findings of a run in one table: warnings and notes, each with its test; docs/trouble.md is made from the table.
 
-A finding is one entry of `FINDINGS` and the function that tests it. To add one, write both here. `warnings_and_notes` tests all
-entries before the first frame or after the last one. An entry without a test is reported where it happens, by
+A finding is one entry of `FINDINGS` and the function that tests it. To add one, write both here. The tests run before
+the first frame or after the last one, by `warnings_and_notes`. An entry without a test is reported where it happens, by
 ``report.warn(FINDINGS[id](...))``.
 
 Odd or repaired contents of a stage are reported by the stage's reader, as `usd.stage.Notice`.
