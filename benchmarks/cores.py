@@ -15,7 +15,7 @@ from pathlib import Path
 from benchmarks.judge_shot import groups_of
 from benchmarks.rows import say, table
 from physgraph_usd.lab.samples import write_sample
-from physgraph_usd.shot.processes import cores
+from physgraph_usd.shot.workers import cores
 from physgraph_usd.usd.read.reader import open_shot
 
 FRAMES, SHOT = 12, 60

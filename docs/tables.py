@@ -12,7 +12,7 @@ import click
 
 from benchmarks.films import SHOWN, Shown
 from physgraph_usd.cli import main
-from physgraph_usd.shot.warnings import advice_table
+from physgraph_usd.shot.findings.table import advice_tables
 from physgraph_usd.usd.schema_files import attribute_table
 from physgraph_usd.usd.write.attribute_rules import rules_table
 
@@ -121,7 +121,7 @@ TABLES = {
     "gallery.md": film_wall,
     "layers.md": rules_table,
     "report.md": report_table,
-    "trouble.md": advice_table,
+    "trouble.md": advice_tables,
 }
 PAGES = [DOCS / name for name in TABLES]
 

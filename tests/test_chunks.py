@@ -18,7 +18,7 @@ from shots import EDGE, cloth_shot, faults, fine, interrupted, refine, run, samp
 from physgraph_usd.errors import LayerError, SolveError
 from physgraph_usd.shot.chunks import solve_in_chunks
 from physgraph_usd.shot.frames import FrameFolder
-from physgraph_usd.shot.processes import cores, memory_is_named, result_of, separate_processes
+from physgraph_usd.shot.workers import cores, memory_is_named, result_of, separate_processes
 from physgraph_usd.solver.mesh.kernels import cards_for
 
 SEAM = 5e-2

@@ -13,8 +13,7 @@ from sheets import garment_of
 from shots import cloth_shot, command, fine, refine, run
 
 from physgraph_usd.errors import GarmentError
-from physgraph_usd.shot.estimate import cannot_fit, estimate
-from physgraph_usd.shot.forecast import Forecast
+from physgraph_usd.shot.estimate import Forecast, cannot_fit, estimate
 from physgraph_usd.shot.refine import inspect_shot
 
 
@@ -52,7 +51,7 @@ def test_a_long_run_says_after_three_frames_when_it_will_end(tmp_path: Path, mon
     assert "about 4 min more" in messages(48, 2, [10.0, 20.0, 30.0])[-1]
     assert "about 4 min more" in messages(48, 1, [20.0, 25.0, 30.0])[-1]  # The first frame is no measure of the others.
     assert messages(48, 1, [0.1, 0.2, 0.3]) == [""] * 3
-    monkeypatch.setattr("physgraph_usd.shot.forecast.LONG_RUN", 0.0)
+    monkeypatch.setattr("physgraph_usd.shot.estimate.LONG_RUN", 0.0)
     shot = cloth_shot(tmp_path / "shot.usda", times=(1.0, 2.0, 3.0, 4.0, 5.0))
     done = run("refine", shot, "-o", tmp_path / "out.usdc", "--level", 0)
     assert done.exit_code == 0, done.output

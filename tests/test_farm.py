@@ -16,8 +16,7 @@ from shots import CLOTH, cloth_shot, command, faults, refine
 from stages import sheet_points, vec3
 
 from physgraph_usd.errors import PhysGraphError, UsageError
-from physgraph_usd.shot.farm import connected
-from physgraph_usd.shot.processes import result_of
+from physgraph_usd.shot.workers import connected, result_of
 from physgraph_usd.usd.read.targets import TARGETS
 
 distributed = pytest.importorskip("distributed", reason="needs Dask (extra farm)")
@@ -127,7 +126,7 @@ def test_what_ends_a_task_is_named(cluster: Any, kind: str, said: str):
 def test_workers_of_another_version_or_checkout_are_refused(
     cluster: Any, shot: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, other: Any, said: str
 ):
-    monkeypatch.setattr(f"physgraph_usd.shot.farm.{name}", other)
+    monkeypatch.setattr(f"physgraph_usd.shot.workers.{name}", other)
     with pytest.raises(UsageError, match=said):
         refine(shot, tmp_path / "fine.usdc", scheduler=cluster.scheduler_address)
 
@@ -141,7 +140,7 @@ def test_workers_of_several_threads_are_refused(shot: Path, tmp_path: Path):
 
 
 def test_a_scheduler_that_is_not_there_is_named(shot: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("physgraph_usd.shot.farm.CONNECT_SECONDS", 0.2)
+    monkeypatch.setattr("physgraph_usd.shot.workers.CONNECT_SECONDS", 0.2)
     for address in (NOWHERE, "farm"):
         with pytest.raises(UsageError, match=f"no Dask scheduler answers at {address}"):
             refine(shot, tmp_path / "fine.usdc", scheduler=address)

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from shots import cloth_shot
 
-from physgraph_usd.shot.chunks import frames_in_order
-from physgraph_usd.shot.joined import join
+from physgraph_usd.shot.chunks import frames_in_order, join
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.solve import ShotSolver
 from physgraph_usd.solver.scene import GarmentResult, Result

@@ -13,7 +13,7 @@ from shots import run
 from stages import add_sheet, author, new_stage, save
 
 from physgraph_usd.errors import UsageError
-from physgraph_usd.shot.notes import of_given_up
+from physgraph_usd.shot.findings.table import Facts, texts
 from physgraph_usd.shot.refine import inspect_shot
 from physgraph_usd.shot.report import RefineReport
 from physgraph_usd.solver.fabric import NAMED, PRESETS, WORN
@@ -115,8 +115,8 @@ def test_cloth_that_is_not_solved_is_named_with_its_frames():
         for time, start in ((1.0, "cold"), (2.0, GIVEN_UP), (3.0, GIVEN_UP))
     ]
     report = RefineReport("s", None, {}, garments=[{"path": "/dress"}], frames=frames)
-    (note,) = of_given_up(report)
+    (note,) = texts("given_up", Facts(report=report))
     assert note.startswith("in 2 frames cloth is its subdivided cage")
     assert "</dress>, first at time code 2" in note
     report.frames = frames[:1]
-    assert of_given_up(report) == []
+    assert texts("given_up", Facts(report=report)) == []

@@ -17,7 +17,8 @@ from pxr import Usd
 from sheets import garment_of
 from stages import add_sheet, author, new_stage, save
 
-from physgraph_usd.shot.notes import of_slack
+from physgraph_usd.shot.findings.table import Facts, texts
+from physgraph_usd.shot.report import RefineReport
 from physgraph_usd.solver.fabric import PRESETS, Fabric
 from physgraph_usd.solver.folds import EDGES_PER_WAVE
 from physgraph_usd.solver.level import build_levels, hinge_geometry
@@ -98,11 +99,12 @@ def test_sharp_folds_are_counted():
 @pytest.mark.parametrize("squeeze", [0.0, 0.005, 0.05])
 def test_a_cage_without_slack_is_noted_with_what_makes_folds(squeeze: float):
     choice, _ = choose(squeeze)
-    said = of_slack(["/coat"], [choice])
+    report = RefineReport("s", None, {}, garments=[{"path": "/coat"}])
+    said = texts("slack", Facts(report=report, choices=[choice]))
     assert len(said) == (squeeze < 0.01)
     assert not said or said[0].endswith("has no slack: expect what subdivision gives; for folds give --set weftEase=4")
     eased, _ = choose(squeeze, fabric=replace(FABRIC, weft_ease=0.04))
-    assert of_slack(["/coat"], [eased]) == []
+    assert texts("slack", Facts(report=report, choices=[eased])) == []
 
 
 DENIM = PRESETS["denim"]

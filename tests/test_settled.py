@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -14,10 +15,10 @@ import pytest
 from shots import CLOTH, cloth_shot, faults, refine, run, sample_times
 from stages import add_mesh, new_stage, save, sheet_faces, sheet_points
 
-from physgraph_usd.shot import settled
-from physgraph_usd.shot.notes import of_energy
+import physgraph_usd
+from physgraph_usd.shot.findings.table import FINDINGS, Facts, texts
+from physgraph_usd.shot.findings.unsettled import in_words, unsettled
 from physgraph_usd.shot.report import RefineReport
-from physgraph_usd.shot.warnings import WARNINGS, Entries, of_contact, of_more
 from physgraph_usd.solver import deadline
 
 
@@ -47,27 +48,43 @@ def test_strict_counts_in_the_exit_code(gentle: Path, tmp_path: Path, steps: int
 
 
 def entry(side: str, before: int, after: int) -> dict[str, Any]:
-    told = {"before": {"crossings": before, "inside": 0}, "after": {"crossings": after, "inside": 0}}
-    return {"contact": {"cloth": told} if side == "cloth" else {"bodies": {side: told}}}
+    measured = {"before": {"crossings": before, "inside": 0}, "after": {"crossings": after, "inside": 0}}
+    return {"contact": {"cloth": measured} if side == "cloth" else {"bodies": {side: measured}}}
+
+
+def told(name: str, frames: list[dict[str, Any]], *paths: str) -> list[str]:
+    """The texts of a finding about garments in some frames."""
+    report = RefineReport("s", None, {}, garments=[{"path": path} for path in paths], frames=frames)
+    return list(map(str, texts(name, Facts(report=report))))
+
+
+def frames_of(*entries: dict[str, Any]) -> list[dict[str, Any]]:
+    return [{"time": time, "garments": [entry]} for time, entry in enumerate(entries, start=1)]
+
+
+def test_a_finding_without_a_test_is_reported_somewhere():
+    sources = [file.read_text("utf-8") for file in Path(physgraph_usd.__file__).parent.rglob("*.py")]
+    for name, finding in FINDINGS.items():
+        assert bool(finding.before) + bool(finding.after) + any(f'FINDINGS["{name}"]' in text for text in sources) == 1
 
 
 class TestContact:
     def test_what_is_left_in_bodies_is_told_of_as_in_cloth_with_what_there_was(self):
-        remedy = WARNINGS["contact"].remedy
-        entries: Entries = {1.0: entry("/Body", 10, 1), 2.0: entry("/Body", 1196, 174), 3.0: entry("/Body", 9, 0)}
-        assert list(of_contact({"path": "/A"}, entries)) == [
+        remedy = FINDINGS["contact"].remedy
+        frames = frames_of(entry("/Body", 10, 1), entry("/Body", 1196, 174), entry("/Body", 9, 0))
+        assert told("contact", frames, "/A") == [
             f"</A> at time code 2: 174 crossings with </Body> (1,196 in the subdivided cage) are left; {remedy}; "
             "also at time code 1"
         ]
-        assert list(of_contact({"path": "/A"}, {1.0: entry("cloth", 3, 1)})) == [
+        assert told("contact", frames_of(entry("cloth", 3, 1)), "/A") == [
             f"</A> at time code 1: 1 crossing of cloth (3 in the subdivided cage) is left; {remedy}"
         ]
 
     def test_of_garments_that_are_counted_together_all_are_named(self):
-        entries: Entries = {1.0: entry("cloth", 3, 2) | {"together": ["/A", "/B"]}}
-        (said,) = of_contact({"path": "/A"}, entries)
+        frames = frames_of(entry("cloth", 3, 2) | {"together": ["/A", "/B"]})
+        (said,) = told("contact", frames, "/A")
         assert "2 crossings of cloth (3 in the subdivided cage) are left, counted together with </B>; " in said
-        assert list(of_contact({"path": "/B"}, entries)) == []
+        assert told("contact", frames, "/B") == []
 
     def test_more_crossings_than_in_the_subdivided_cage_are_told_with_the_first_frame(self):
         cloth, body = entry("cloth", 1015, 1421), entry("/Body", 5, 5)
@@ -78,14 +95,13 @@ class TestContact:
             {"time": 3.0, "garments": [entry("cloth", 9, 10), {}]},
             {"time": 4.0, "error": "no sample"},
         ]
-        report = RefineReport("s", None, {}, garments=[{"path": "/A"}, {"path": "/B"}], frames=frames)
         left = "crossings and vertices inside bodies are left"
         more = "in the subdivided cage: more than by subdivision alone; look at these frames"
-        assert of_more(report) == [
+        assert told("more", frames, "/A", "/B") == [
             f"</A> at time code 2: 1,426 {left}, 1,020 {more}; also at time code 3",
             f"</B> at time code 1: 1 {left}, 0 {more}",
         ]
-        assert of_more(RefineReport("s", None, {}, garments=[{"path": "/A"}], frames=frames[:1])) == []
+        assert told("more", frames[:1], "/A") == []
 
     def test_cloth_that_is_its_smoothly_subdivided_cage_has_no_more_crossings_than_that(self, tmp_path: Path):
         """A tangled sheet, all given up: smooth, it crosses once more than with straight sides."""
@@ -94,18 +110,16 @@ class TestContact:
         report = refine(Path(save(stage)), tmp_path / "f.usdc")
         counts = report.frames[0]["garments"][0]["contact"]["cloth"]
         assert counts["before"]["crossings"] == counts["after"]["crossings"] > 0
-        assert of_more(report) == []
+        assert texts("more", Facts(report=report)) == []
 
     def test_cloth_that_came_out_of_a_body_may_cross_it_more_often(self):
-        told = entry("/Body", 1015, 1421)
-        told["contact"]["bodies"]["/Body"]["before"]["inside"] = 1926
-        assert (
-            of_more(RefineReport("s", None, {}, garments=[{"path": "/A"}], frames=[{"time": 1.0, "garments": [told]}]))
-            == []
-        )
+        body = entry("/Body", 1015, 1421)
+        body["contact"]["bodies"]["/Body"]["before"]["inside"] = 1926
+        assert told("more", frames_of(body), "/A") == []
 
     def test_it_is_the_last_line_of_a_run(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-        monkeypatch.setattr("physgraph_usd.shot.run.of_more", lambda report: ["crossings"] * bool(report.frames))
+        more = replace(FINDINGS["more"], after=lambda _: [{}], sentence="crossings", remedy="")
+        monkeypatch.setitem(FINDINGS, "more", more)
         shot = cloth_shot(tmp_path / "s.usdc", broken={3.0: 0.5})
         done = run("refine", shot, "-o", tmp_path / "f.usdc", "--level", 1, "--steps", 0, "--strict")
         *before, last = done.stderr.splitlines()
@@ -132,7 +146,7 @@ def test_a_frame_above_its_input_is_told_of():
 
     found = {1.0: energies(1e-3, 1e-3), 2.0: energies(1.9e-5, 3.2e-4), 3.0: energies(1e-3, 1.1e-3), 4.0: {}}
     frames = [{"time": time, "garments": [entry]} for time, entry in found.items()]
-    (said,) = of_energy(RefineReport("s", None, {}, garments=[{"path": "/A"}], frames=frames))
+    (said,) = told("energy", frames, "/A")
     assert said.startswith("2 frames ended with more energy than the upsampled cage, </A> at time code 2: 0.00032 J")
 
 
@@ -200,4 +214,6 @@ def test_nothing_newly_crosses_wherever_a_frame_is_stopped(
 
 def test_a_frame_that_reached_its_limit_before_any_level_is_said_in_words():
     entry = {"start": "given up", "levels": [], "time_limit": 0.01}
-    assert str(settled.unsettled(entry, 2e-3)) == "no level was solved (stopped by time limit)"
+    state = unsettled(entry, 2e-3)
+    assert state
+    assert in_words(state) == "no level was solved (stopped by time limit)"

@@ -174,7 +174,7 @@ class TestRefused:
             stitch([*runs.chunks[:2], other], tmp_path / "joined.usdc")
 
     def test_another_checkout(self, runs: Runs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-        monkeypatch.setattr("physgraph_usd.shot.finished.code_digest", lambda: "other")
+        monkeypatch.setattr("physgraph_usd.shot.job.code_digest", lambda: "other")
         (other,) = refine_chunks(runs.shot, tmp_path, SPANS[2:])
         with pytest.raises(UsageError, match=r"were made with other code; refine one anew"):
             stitch([*runs.chunks[:2], other], tmp_path / "joined.usdc")

@@ -8,8 +8,8 @@ import pytest
 import torch
 from cloth import finest_system, group_of, sheet, wave
 
+from physgraph_usd.shot.findings.unsettled import unsettled
 from physgraph_usd.shot.options import RefineOptions
-from physgraph_usd.shot.settled import unsettled
 from physgraph_usd.solver.fabric import Fabric
 from physgraph_usd.solver.frame.refiner import Refiner
 from physgraph_usd.solver.integrate.base import Carry, System

@@ -17,8 +17,8 @@ from test_report_format import checked
 from physgraph_usd import refine_stage
 from physgraph_usd.errors import At, Place, UnexpectedError
 from physgraph_usd.shot.options import RefineOptions
-from physgraph_usd.shot.processes import result_of, separate_processes
 from physgraph_usd.shot.report import RefineReport
+from physgraph_usd.shot.workers import result_of, separate_processes
 
 BROKEN = 4.0
 """Time code at which the solver has a fault."""

@@ -22,7 +22,7 @@ from .show_file import values_for
 from .structure import DONE, FAILED, GroupedCommand, errors_named, imports_uncollected, show_trace
 
 if TYPE_CHECKING:
-    from ..shot.finished import Job
+    from ..shot.job import Job
     from ..shot.options import RefineOptions
     from ..shot.report import RefineReport
     from ..shot.summary import Row
@@ -50,7 +50,7 @@ def refine(
         jobs = _jobs(ctx, shots, out)
         _check_files(ctx, jobs, out)
         with imports_uncollected():
-            from ..shot.finished import check_jobs
+            from ..shot.job import check_jobs
 
         layers = [layer for _, layer, _ in jobs]
         verbose, log_file, in_lines = (ctx.params[name] for name in ("verbose", "log_file", "progress"))
@@ -126,7 +126,7 @@ def _each_or_none(shots: tuple[str, ...], to: Path | None, option: str, **known:
 
 def _refine_each(jobs: Sequence[Job], output: Output, *, summary: Path | None) -> int:
     """Refine the jobs and report the result of each; returns the exit code."""
-    from ..shot.finished import results
+    from ..shot.job import results
     from ..shot.summary import check_summary, exit_code_of, row_of
 
     if summary is not None:
@@ -185,7 +185,7 @@ def _solved(jobs: Sequence[Job], output: Output) -> Generator[RefineReport | Phy
     """Result of each job: a single job in this process, several in separate processes."""
     if not jobs:
         return
-    from ..shot.processes import import_ahead
+    from ..shot.workers import import_ahead
 
     if output.several or any(options.workers > 1 and not options.scheduler for *_, options in jobs):
         import_ahead()

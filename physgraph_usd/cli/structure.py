@@ -74,7 +74,7 @@ def errors_named() -> Iterator[None]:
     Raises:
         PhysGraphError: The block raised an exception.
     """
-    from ..shot.processes import memory_is_named
+    from ..shot.workers import memory_is_named
 
     of_click = (click.ClickException, click.Abort, click.exceptions.Exit, BrokenPipeError)
     with exceptions_named(besides=of_click), memory_is_named():

@@ -18,22 +18,18 @@ from ..solver.mesh.defects import defects, in_brief
 from ..solver.resolution import LevelChoice, choose_levels, sample_frames
 from ..solver.scene import Frame, Garment, GarmentFrame
 from ..solver.strain import StrainedPart, strained_parts
-from ..usd.read.find import GRAVITY_OPTION
 from ..usd.read.reader import Shot, open_shot
 from ..usd.read.survey import survey
 from ..usd.read.targets import DETAIL, FOLLOW, Target
-from ..usd.schema import GARMENT
 from ..usd.stage import GarmentSource
 from ..usd.times import within
 from ..usd.view import Stage
 from .estimate import cannot_fit, estimate
-from .notes import of_fabrics, of_slack, of_subsets, of_trims, preset_overrides
-from .opened import why_not_posed
-from .options import INTEGRATORS, RefineOptions, scene_words
-from .report import RefineReport, of_a_kind
-from .untagged import FAR, Candidate, find_candidates
-from .up_axis import across_gravity
-from .warnings import WARNINGS, of_gravity, of_strain, of_unfelt, of_unread
+from .findings.table import Facts, preset_overrides, warnings_and_notes
+from .findings.untagged import FAR, find_candidates
+from .findings.up_axis import pull_of
+from .options import INTEGRATORS, RefineOptions, scene_words, why_not_posed
+from .report import RefineReport, levels_of, of_a_kind
 
 MOST_ASKED = 32
 """Most open meshes tried as garments."""
@@ -58,29 +54,54 @@ def begin_report(report: RefineReport, opened: Shot, options: RefineOptions) -> 
         | {"bound": [_bound(target) for target in opened.targets if target.garment == index]}
         for index, reader in enumerate(opened.readers)
     ]
-    bound = sum(len(target.points) for target in opened.targets)
-    report.estimate = estimate(opened.scene.garments, **_run(opened, report, options), bound=bound).plain()
-    warnings = _strained(opened, report, frames)
-    candidates = find_candidates(opened)
+    size = estimate(
+        opened.scene.garments,
+        levels_of(report.garments),
+        frames=_frame_count(opened, options),
+        workers=options.workers,
+        bound=sum(len(target.points) for target in opened.targets),
+    )
+    report.estimate = size.plain()
+    facts = _facts(opened, report, options, sampled=frames, choices=choices)
+    warnings, notes = warnings_and_notes(facts, before=True)
+    report.note(*notes)
+    report.modelled = _modelled(opened, report, options)
+    report.left_out = _left_out(opened, report)
+    report.variants = list(opened.selections)
+    refined = {None, *opened.scene.times}  # Frames outside the run may be broken.
+    return [str(notice) for notice in opened.warnings if notice.time in refined] + [*warnings]
+
+
+def _facts(
+    opened: Shot,
+    report: RefineReport,
+    options: RefineOptions,
+    *,
+    sampled: Sequence[Frame],
+    choices: Sequence[LevelChoice],
+) -> Facts:
+    """Facts before the first frame; the report gets those about candidates and about each garment."""
+    strained, candidates = _strained_parts(opened, sampled), find_candidates(opened)
+    facts = Facts(
+        report=report,
+        options=options,
+        shot=opened,
+        sources=opened.sources,
+        sampled=sampled,
+        choices=choices,
+        candidates=candidates,
+        strained=strained,
+    )
+    for garment in report.garments:
+        garment["strained"] = [dataclasses.asdict(part) for part in strained[garment["path"]]]
+        if options.contact != "off":
+            garment["unfelt"] = [body.path for body in facts.unfelt if garment["path"] in body.shares]
     report.candidates = {
         candidate.path: f"{'taken' if candidate.is_taken else 'left'}: {candidate.reason}"
         for candidate in candidates
         if not candidate.reason.startswith(FAR)
     }
-    beside = [candidate for candidate in candidates if candidate.is_taken]
-    warnings += _unfelt(report, beside) if options.contact != "off" else []
-    warnings += of_unread(candidates) if options.contact != "off" else []
-    warnings += _across(opened, frames, beside)
-    if options.pose_in and (reason := why_not_posed(opened, options)):
-        warnings.append(WARNINGS["unposed"](reason=reason))
-    follow = {candidate.path: candidate.follows for candidate in candidates if candidate.follows}
-    slack = of_slack([garment.path for garment in opened.scene.garments], choices)
-    report.note(*slack, *of_fabrics(opened.sources), *of_subsets(opened.sources), *of_trims(follow))
-    report.modelled = _modelled(opened, report, options)
-    report.left_out = _left_out(opened, report)
-    report.variants = list(opened.selections)
-    refined = {None, *opened.scene.times}  # Frames outside the run may be broken.
-    return [str(notice) for notice in opened.warnings if notice.time in refined] + warnings
+    return facts
 
 
 def say_what_was(report: RefineReport) -> None:
@@ -109,14 +130,14 @@ def _say_who_integrated(report: RefineReport, entries: Sequence[dict[str, Any]])
 
 def too_large(opened: Shot, report: RefineReport, options: RefineOptions) -> GarmentError | None:
     """The error naming a run too large for this machine's memory, or None."""
-    return cannot_fit(opened.scene.garments, **_run(opened, report, options))
+    frames, levels = _frame_count(opened, options), levels_of(report.garments)
+    return cannot_fit(opened.scene.garments, levels, frames=frames, workers=options.workers)
 
 
-def _run(opened: Shot, report: RefineReport, options: RefineOptions) -> dict[str, Any]:
-    """Levels, frame count and worker count of a run."""
-    levels = [garment["level"] for garment in report.garments]
+def _frame_count(opened: Shot, options: RefineOptions) -> int:
+    """Number of frames of a run."""
     times = opened.scene.times if options.preroll is None else within(opened.scene.times, options.frames)
-    return {"levels": levels, "frames": max(len(times), 1), "workers": options.workers}
+    return max(len(times), 1)
 
 
 def describe(opened: Shot, options: RefineOptions) -> dict[str, Any]:
@@ -164,19 +185,22 @@ def _proposal(shot: str | Stage, meshes: Sequence[str], options: RefineOptions) 
         reading = {name: getattr(options, name) for name in ("frames", "gravity", "rest_frame")}
         with closing(open_shot(shot, garments=meshes[:MOST_ASKED], **reading)) as opened:
             sampled = sample_frames(opened.every_time, opened.frame)
-            touching = [candidate for candidate in find_candidates(opened) if candidate.is_taken]
-            lying = {path for body in touching for path in body.shares}
+            candidates = find_candidates(opened)
+            lying = {path for body in candidates for path in body.shares}
             moving = {str(source.path) for source in opened.sources if len(source.times) > 1}
             garments = [source for source in opened.sources if str(source.path) in (lying or moving)]
-            strained = _strained_parts(opened, sampled)
-            paths, bodies = [str(source.path) for source in garments], [body.path for body in touching]
-            warnings = of_strain({path: strained[path] for path in paths}, _rests(garments))
-            warnings += _across(opened, sampled, touching)
-            return (
-                _command(opened, garments, dataclasses.replace(options, garments=paths, colliders=bodies), warnings)
-                if garments
-                else ""
+            if not garments:
+                return ""
+            strained, paths = _strained_parts(opened, sampled), [str(source.path) for source in garments]
+            facts = Facts(
+                shot=opened,
+                sources=garments,
+                sampled=sampled,
+                candidates=candidates,
+                strained={path: strained[path] for path in paths},
             )
+            named = dataclasses.replace(options, garments=paths, colliders=[body.path for body in facts.unfelt])
+            return _command(opened, garments, named, warnings_and_notes(facts, before=True)[0])
     except StageError:
         return ""
 
@@ -268,33 +292,6 @@ def _bound(target: Target) -> dict[str, Any]:
     }
 
 
-def _unfelt(report: RefineReport, beside: Sequence[Candidate]) -> list[str]:
-    """Add to the report the bodies touched by garments but not used as colliders; returns a warning."""
-    for garment in report.garments:
-        garment["unfelt"] = [body.path for body in beside if garment["path"] in body.shares]
-    return of_unfelt(beside)
-
-
-def _across(opened: Shot, frames: Sequence[Frame], beside: Sequence[Candidate]) -> list[str]:
-    """A warning if bodies and garments stand across gravity and nobody chose the gravity axis."""
-    chosen = opened.gravity_source == GRAVITY_OPTION or opened.gravity_source.endswith(GARMENT["gravity"].name)
-    axes = None if chosen else across_gravity(opened.scene, frames, beside)
-    return [] if axes is None else [of_gravity(*axes, pull=_pull(opened.scene.gravity), source=opened.gravity_source)]
-
-
-def _strained(opened: Shot, report: RefineReport, frames: Sequence[Frame]) -> list[str]:
-    """Add to the report the garment parts not sized like their rest shape; returns a warning."""
-    parts_of = _strained_parts(opened, frames)
-    for garment in report.garments:
-        garment["strained"] = [dataclasses.asdict(part) for part in parts_of[garment["path"]]]
-    return of_strain(parts_of, _rests(opened.sources))
-
-
-def _rests(garments: Iterable[GarmentSource]) -> dict[str, str]:
-    """By path of each garment, the source of its rest shape."""
-    return {str(source.path): source.sources["rest"] for source in garments}
-
-
 def _strained_parts(opened: Shot, frames: Sequence[Frame]) -> dict[str, list[StrainedPart]]:
     """By path of each garment, the parts not sized like the rest shape."""
     return {
@@ -315,7 +312,7 @@ def _modelled(opened: Shot, report: RefineReport, options: RefineOptions) -> dic
     modelled = {
         **_in_plane(report),
         "bending": f"dihedral angles, {angles}",
-        "gravity": f"{_pull(opened.scene.gravity)}, by {opened.gravity_source}",
+        "gravity": f"{pull_of(opened.scene.gravity)}, by {opened.gravity_source}",
         "guide": "ties the local average to the coarse animation",
     }
     if _touching(opened) and options.contact != "off":
@@ -329,18 +326,6 @@ def _modelled(opened: Shot, report: RefineReport, options: RefineOptions) -> dic
     if options.pose_in and not why_not_posed(opened, options):
         modelled["pose in"] = f"{counted(options.pose_in, 'pose')} between the bind pose and the first frame"
     return modelled
-
-
-def _pull(gravity: np.ndarray) -> str:
-    """Strength and direction of gravity [m/s^2], shape (3,), naming the axis if gravity follows one."""
-    strength = float(np.linalg.norm(gravity))
-    if not strength:
-        return "0 m/s^2"
-    direction = gravity / strength
-    axis = int(np.abs(direction).argmax())
-    if np.abs(np.delete(direction, axis)).max() < 1e-6:
-        return f"{strength:.3g} m/s^2 towards {'-' if direction[axis] < 0 else '+'}{'XYZ'[axis]}"
-    return f"{strength:.3g} m/s^2 towards ({', '.join(f'{part:.3g}' for part in direction)})"
 
 
 def _in_plane(report: RefineReport) -> dict[str, str]:

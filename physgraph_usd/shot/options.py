@@ -21,6 +21,7 @@ from ..usd.write.atomic import ASSET_PATHS
 if TYPE_CHECKING:
     from ..solver.contact.settings import ContactSettings
     from ..solver.frame.settings import SolveSettings
+    from ..usd.read.reader import Shot
 
 INTEGRATORS = ("physgraph", "quasi-newton")
 """Names of the solver's own methods in `integrate.METHODS`; repeated here because `integrate` imports torch."""
@@ -328,3 +329,10 @@ def _text(value: Any) -> str:
 def options_of(name: str, values: Iterable[str]) -> list[str]:
     """Command-line arguments that repeat an option, once per value."""
     return [word for value in values for word in (name, value)]
+
+
+def why_not_posed(shot: Shot, options: RefineOptions) -> str:
+    """Why requested poses from the bind pose to the first frame are not solved; "" if they are."""
+    if options.temporal == "off":
+        return "--temporal off solves each frame by itself"
+    return "" if shot.is_skinned else "no garment is skinned"

@@ -17,21 +17,19 @@ from typing import TYPE_CHECKING, Any
 from ..errors import NOTICE, LayerError, PhysGraphError, StageError, UsageError
 from ..interrupts import SIGNALLED, exit_code_of, importing, signals_noted
 from ..solver.scene import Result
-from ..usd.files import check_targets, files_of
+from ..usd.files import files_of
 from ..usd.provenance import write_root
 from ..usd.read.reader import Shot
 from ..usd.stage import shot_name
 from ..usd.view import Layer, Stage
-from ..usd.write.atomic import check_folder_of, check_place
+from ..usd.write.atomic import check_folder_of
 from .describe import begin_report, describe, describe_meshes, too_large
-from .farm import shots_at_once
-from .finished import Job, check_jobs, finished, results
+from .findings.table import FINDINGS
 from .frames import kept_for
-from .opened import open_for
+from .job import Job, check_jobs, check_new, check_of_stage, check_places, finished, open_for, results
 from .options import RefineOptions, json_of, picture_of
-from .processes import call_each, memory_is_named
-from .report import DONE, LOG, RefineReport, is_of_failure
-from .warnings import WARNINGS
+from .report import DONE, LOG, RefineReport, is_of_failure, levels_of
+from .workers import call_each, memory_is_named, shots_at_once
 
 if TYPE_CHECKING:
     from .run import Run
@@ -66,7 +64,7 @@ def refine_shot(shot: str | Path, out: str | Path, options: RefineOptions = DEFA
     with running(str(shot), options, out=out) as (opened, report):
         if options.dry_run:
             return report
-        _check_new(out, options)
+        check_new(out, options)
         with importing():
             from .run import Run
         picture = picture_of(options)
@@ -128,7 +126,7 @@ def refine_stage(
         SolveError: No frame could be solved.
         LayerError: The layer is invalid, or the report cannot be written.
     """
-    _check_of_stage(stage, options)
+    check_of_stage(stage, options)
     with running(stage, options, on_report=on_report) as (opened, report):
         with importing():
             from .run import Run
@@ -161,7 +159,7 @@ def running(
                 raise large
             with importing():
                 from ..solver.integrate.factors import FACTOR
-            report.warn(*warnings, *([] if FACTOR == "cholespy" else [WARNINGS["slower"]()]))
+            report.warn(*warnings, *([] if FACTOR == "cholespy" else [FINDINGS["slower"]()]))
             yield opened, report
 
 
@@ -173,7 +171,10 @@ def _record_end(
     error: BaseException | None,
     trace: TracebackType | None,
 ) -> None:
-    """Record the exception or signal that ends a run, and write the report if requested; the exception goes on."""
+    """Record the exception or signal that ends a run, and write the report if requested; the exception goes on.
+
+    A protected file is not written, and errors here give way to the run's error.
+    """
     if isinstance(error, Exception):
         report.fail(error)
     elif (code := exit_code_of(error)) is not None:
@@ -181,7 +182,11 @@ def _record_end(
         report.signal, report.error = code - SIGNALLED, f"interrupted, {folder_text or 'no frame is kept'}"
     else:
         return
-    _write_failure(report, options)
+    if options.report is not None and not options.dry_run:
+        file = json_of(Path(options.report))
+        with suppress(LayerError):
+            if options.overwrite or not file.exists() or is_of_failure(file):
+                report.write(file)
 
 
 def refine_shots(
@@ -217,42 +222,6 @@ def refine_shots(
     return results(jobs, solve)
 
 
-def check_places(out: Path, options: RefineOptions) -> None:
-    """Refuse unwritable outputs before the work, not after an hour of frames."""
-    if not options.resume:
-        _check_new(out, options)
-    for _, path in options.targets(out):
-        if path != out or options.preroll is None:  # A chunk is a folder.
-            check_place(path)
-
-
-def _check_new(out: Path, options: RefineOptions) -> None:
-    for _, path in options.targets(out):
-        _check_none(path, options)
-
-
-def _check_none(path: Path, options: RefineOptions) -> None:
-    if path.is_file() and not (options.overwrite or is_of_failure(path)):
-        raise UsageError(f"{path} exists; choose another name or replace it by --overwrite")
-
-
-def _check_of_stage(stage: Stage, options: RefineOptions) -> None:
-    """Refuse options not applicable to an open stage, and a report over a file of the stage."""
-    options.check()
-    if options.workers > 1:
-        raise UsageError(f"workers is {options.workers}: an open stage lives in one process; save it, or take 1")
-    for name in ("resume", "dry_run", "root", "scheduler", "preroll", "preview"):
-        if getattr(options, name):
-            raise UsageError(f"{name} is for layers on disk; an open stage is refined into a layer in memory")
-    if options.report is not None:
-        report = Path(options.report)
-        if json_of(report) != report:
-            raise UsageError(f"the report of an open stage is a file: {report} does not end with .json")
-        check_targets([("the report", report)], files_of(stage))
-        check_place(report)
-        _check_none(report, options)
-
-
 def inspect_shot(shot: str | Path | Stage, *, timed: bool = False, **reading: Any) -> dict[str, Any]:
     """Plan of a refinement: garments, values and their sources, and every defect found.
 
@@ -280,8 +249,7 @@ def inspect_shot(shot: str | Path | Stage, *, timed: bool = False, **reading: An
             if timed and "problem" not in plan:
                 from .solve import time_frames
 
-                levels = [garment["level"] for garment in plan["garments"]]
-                plan |= time_frames(opened, options, levels)
+                plan |= time_frames(opened, options, levels_of(plan["garments"]))
             return plan
     except StageError as error:
         plan = describe_meshes(source, str(error), options)
@@ -301,18 +269,8 @@ def _draw_first(report: RefineReport, opened: Shot, options: RefineOptions, pict
     """Draw the first refined frame; a picture that cannot be drawn is a warning, because the frames are worth more."""
     from .page.frames import draw_frames
 
-    levels = [garment["level"] for garment in report.garments]
     try:
-        draw_frames(opened, levels, [result], picture, options=options, overwrite=options.overwrite)
+        draw_frames(opened, levels_of(report.garments), [result], picture, options=options, overwrite=options.overwrite)
         LOG.log(NOTICE, "%s shows the first frame", picture, extra={"shot": report.shot})
     except (LayerError, StageError, UsageError) as error:
-        report.warn(WARNINGS["undrawn"](picture=picture, error=error))
-
-
-def _write_failure(report: RefineReport, options: RefineOptions) -> None:
-    """Write the JSON of a failed run, unless over a protected file; errors here give way to the run's error."""
-    if options.report is not None and not options.dry_run:
-        file = json_of(Path(options.report))
-        with suppress(LayerError):
-            if options.overwrite or not file.exists() or is_of_failure(file):
-                report.write(file)
+        report.warn(FINDINGS["undrawn"](picture=picture, error=error))

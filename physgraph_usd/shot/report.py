@@ -35,14 +35,23 @@ _FRAME: dict[str, Any] = {"time": None, "read_ms": None, "run_in_ms": None, "pos
 
 def faults_of(contact: Mapping[str, Any], side: str) -> int:
     """Crossings of cloth and with all bodies, and vertices inside bodies, "before" or "after"."""
-    measured = [contact.get("cloth") or {}, *(contact.get("bodies") or {}).values()]
     names = ("crossings", "inside", "pinched")
-    return sum(int(counts.get(side, {}).get(name, 0)) for counts in measured for name in names)
+    return sum(int(part.get(side, {}).get(name, 0)) for part in _parts_of(contact) for name in names)
+
+
+def _parts_of(contact: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """Measurements of contact with cloth, if any, and with each body."""
+    return [part for part in (contact.get("cloth"), *(contact.get("bodies") or {}).values()) if part]
 
 
 def is_first(path: str, entry: Mapping[str, Any]) -> bool:
     """Whether a garment is the first of a group solved together in a frame: the group shares energy and contact."""
     return entry.get("together", [path])[0] == path
+
+
+def levels_of(garments: Iterable[Mapping[str, Any]]) -> list[int]:
+    """Number of subdivisions of each of a report's garments."""
+    return [garment["level"] for garment in garments]
 
 
 def is_of_failure(path: Path) -> bool:
@@ -138,12 +147,7 @@ class RefineReport:
     def _crossed(self, side: str) -> list[int]:
         """Edges through faces of each measurement, "before" or "after"."""
         contacts = [contact for frame in self.frames for contact in self.measured(frame)]
-        measured = [
-            contact_part
-            for contact in contacts
-            for contact_part in (contact.get("cloth"), *contact.get("bodies", {}).values())
-        ]
-        return [contact_part[side]["crossings"] for contact_part in measured if contact_part]
+        return [part[side]["crossings"] for contact in contacts for part in _parts_of(contact)]
 
     def add(self, result: Result) -> None:
         """Add a frame: its telemetry, and that of each garment if the frame could be solved."""
@@ -186,7 +190,7 @@ class RefineReport:
     def note(self, *notes: str) -> None:
         """Add notes, and log the notes as information."""
         for note in notes:
-            self.notes.append(note)
+            self.notes.append(str(note))
             LOG.info("%s", note, extra={"shot": self.shot})
 
     def to_dict(self) -> dict[str, Any]:

@@ -1,11 +1,13 @@
-"""A run over an open shot.
+"""A run over an open shot, `Run.refine`:
 
     for result in the frames, solved here or by other processes, or stored by an earlier run:
-        write the result's points into the layer
-        add its telemetry to the report
-    close the layer; warnings and notes from the telemetry go into the report
+        add its telemetry to the report, with a warning if it failed; write its points into the layer
+        compare its ends with those of a loop, and a few frames with the bodies as they are drawn
+        say how far the run is
+    close the layer with a record of what it lacks
+    add the findings about all frames to the report
 
-Each frame is written as soon as it is solved. The frames of processes are joined where they meet (`joined`).
+Each frame is written as soon as it is solved. The frames of processes are joined where they meet (`chunks`).
 """
 
 from __future__ import annotations
@@ -33,19 +35,17 @@ from ..usd.write.writer import LayerWriter
 from .chunks import PREROLL, solve_in_chunks
 from .cuts import Cuts, Loop
 from .describe import say_what_was
-from .farm import connected
-from .finished import made_from
-from .forecast import Forecast
+from .estimate import Forecast
+from .findings.drawn import Compared
+from .findings.table import FINDINGS, Facts, warnings_and_notes
+from .findings.unsettled import unsettled_frames
+from .findings.untagged import AUTO
 from .frames import CHUNK, FrameFolder, frames_folder
-from .notes import of_energy, of_folds, of_following, of_given_up, of_inertia, of_poses, of_rest
+from .job import made_from
 from .options import RefineOptions
-from .processes import Start, separate_processes
-from .report import LOG, RefineReport, of_a_kind
-from .settled import unsettled_frames
-from .skin import DrawnCloth, Shown, frames_compared, of_polygons, shown_through
+from .report import LOG, RefineReport, levels_of, of_a_kind
 from .solve import Results, ShotSolver
-from .untagged import AUTO
-from .warnings import WARNINGS, of_drawn, of_frames, of_loops, of_more
+from .workers import Start, connected, separate_processes
 
 try:
     import resource
@@ -94,34 +94,46 @@ class Run:
             SolveError: No frame could be solved.
             LayerError: The layer cannot be written.
         """
-        began = clock.perf_counter()
-        if not kernels_are_compiled():
-            LOG.info("kernels are compiled, once on this machine: some 15 s; physgraph-usd warm-up does it ahead")
-        layer = self._write_layer()
-        self.report.seconds["total"] = self.report.seconds["open"] + clock.perf_counter() - began
-        self.report.peak_memory_mb = peak_memory_mb()
-        self.report.out = self.out
+        began, report, options, count = clock.perf_counter(), self.report, self.options, len(self._numbers)
+        known = len(self.shot.warnings)  # Warnings about the shot itself are already reported.
+        measures_depth = bool(options.report) and options.scheme == "keep"
+        compared = Compared(
+            self.shot, self.solver.levels if measures_depth else (), count=count if options.contact != "off" else 0
+        )
+        loop = Loop(self.shot, self.solver.levels)
+        report.seconds["write"] = 0.0
+        with ExitStack() as stack:
+            writer, results = self._start(stack)
+            started, forecast = clock.perf_counter(), Forecast(count, options.workers)
+            for done, result in enumerate(results, start=1):
+                self._write_frame(writer, result)
+                loop.add(result)
+                compared.add(result)
+                self._say_progress(done, count, forecast.after(clock.perf_counter() - started))
+            self._close(writer)
+            layer = writer.layer if writer is not None and self.out is None else None
+        facts = Facts(report=report, options=options, depths=compared.depths, shown=compared.shown, gaps=loop.gaps())
+        warnings, notes = warnings_and_notes(facts)
+        report.note(*notes)
+        report.warn(*warnings, *map(str, self.shot.warnings[known:]))
+        say_what_was(report)
+        report.strict, report.out, report.peak_memory_mb = options.strict, self.out, peak_memory_mb()
+        report.seconds["frames"] = clock.perf_counter() - began
+        report.seconds["total"] = report.seconds["open"] + report.seconds["frames"]
         return layer
 
-    def _write_layer(self) -> Layer | None:
-        """Solve all frames and write the layer or the chunk; returns the layer if in memory."""
-        began, options = clock.perf_counter(), self.options
-        provenance = made_from(self.shot, self.out, options) | dict(self.stored.record if self.stored else {})
-        reported = len(self.shot.warnings)  # Warnings about the shot itself are already reported.
+    def _start(self, stack: ExitStack) -> tuple[LayerWriter | None, Results]:
+        """The layer's writer, None for a chunk, and the frames; ``stack`` closes both."""
+        if not kernels_are_compiled():
+            LOG.info("kernels are compiled, once on this machine: some 15 s; physgraph-usd warm-up does it ahead")
+        provenance = made_from(self.shot, self.out, self.options) | dict(self.stored.record if self.stored else {})
         refinements = refine_garments(self.shot.scene.garments, self.solver.levels)
-        with ExitStack() as stack:
-            frames = writer = None
-            if self.out is not None and self.stored is None:
-                frames = stack.enter_context(self._folder(self.out, provenance, refinements))
-            if not self._is_chunk:
-                writer = stack.enter_context(_layer_writer(self, provenance, refinements))
-            solved = stack.enter_context(closing(self._solved(frames)))
-            self._write_frames(writer, solved, len(self._numbers))
-            layer = writer.layer if writer is not None and self.out is None else None
-        self.report.strict = options.strict
-        self.report.seconds["frames"] = clock.perf_counter() - began
-        self.report.warn(*map(str, self.shot.warnings[reported:]))
-        return layer
+        frames = writer = None
+        if self.out is not None and self.stored is None:
+            frames = stack.enter_context(self._folder(self.out, provenance, refinements))
+        if not self._is_chunk:
+            writer = stack.enter_context(self._writer(provenance, refinements))
+        return writer, stack.enter_context(closing(self._results(frames)))
 
     def _folder(
         self, out: Path, provenance: dict[str, Any], refinements: Sequence[Sequence[Refinement]]
@@ -131,16 +143,30 @@ class Run:
         decides = {"levels": self.solver.levels, "times": self._times, "report": options.report is not None}
         if chunk:
             decides[CHUNK] = [self._numbers[0], self._numbers[-1] + 1]
-        meshes = fine_meshes(self.shot.scene.garments, refinements)
-        counts = [mesh.vertex_count for mesh in meshes]
         return FrameFolder(
             out if chunk else frames_folder(out),
             provenance | decides,
-            counts=counts,
+            counts=[mesh.vertex_count for mesh in fine_meshes(self.shot.scene.garments, refinements)],
             resume=options.resume,
             drop=options.overwrite,
             keep=options.keep_frames,
             stays=chunk,
+        )
+
+    def _writer(self, provenance: dict[str, Any], refinements: Sequence[Sequence[Refinement]]) -> LayerWriter:
+        """The writer of the layer."""
+        options = self.options
+        part = [time for time in (self._times[k] for k in self._numbers) if time is not None]
+        return LayerWriter(
+            self.shot,
+            refinements,
+            self.out,
+            provenance=provenance,
+            mode=options.mode,
+            scheme=options.scheme,
+            velocities=options.velocities,
+            overwrite=options.overwrite,
+            times=part if len(part) < len(self.shot.scene.times) else None,
         )
 
     @property
@@ -166,26 +192,14 @@ class Run:
         options = self.options
         if AUTO in options.colliders:
             options = dataclasses.replace(options, colliders=self.shot.colliders)
-        levels = [garment["level"] for garment in self.report.garments]
-        return ShotSolver(self.shot.path, levels, options, opened=self.shot)
+        return ShotSolver(self.shot.path, levels_of(self.report.garments), options, opened=self.shot)
 
     @cached_property
     def _cuts(self) -> Cuts:
         """Jumps of the garments, across which no velocity is taken."""
         return Cuts(self.shot, velocities=self.options.velocities)
 
-    @cached_property
-    def _loop(self) -> Loop:
-        """First and last result, compared where the shot closes."""
-        return Loop(self.shot, self.solver.levels)
-
-    @property
-    def _preroll(self) -> int:
-        """Frames solved before a chunk if frames depend on their predecessors."""
-        preroll = PREROLL if self.options.preroll is None else self.options.preroll
-        return 0 if self.options.temporal == "off" else preroll
-
-    def _solved(self, frames: FrameFolder | None) -> Results:
+    def _results(self, frames: FrameFolder | None) -> Results:
         """Frames in order, including reused frames of an interrupted run, joined if solved by several processes."""
         if self.stored is not None:
             yield from self.stored.results
@@ -193,117 +207,87 @@ class Run:
         if frames is None:
             yield from self.solver(self._times)
             return
-        _warn_of_finished(self, frames, len(self._numbers))
-        _announce_preroll(self, frames)
-        with _processes(self.options) as start:
+        options, chunk = self.options, self._is_chunk
+        preroll = PREROLL if options.preroll is None else options.preroll
+        preroll = 0 if options.temporal == "off" else preroll
+        self._say_begin(frames, preroll)
+        with _processes(options) as start:
             chunks = solve_in_chunks(
                 self.solver,
                 self._times,
                 frames,
-                workers=self.options.workers,
+                workers=options.workers,
                 only=self._numbers,
-                preroll=self._preroll,
+                preroll=preroll,
                 start=start,
-                movers=None if self._is_chunk else self.solver.mover,
+                movers=None if chunk else self.solver.mover,
                 warn=self.report.warn,
             )
             with closing(chunks) as solved:
                 yield from solved
 
-    def _write_frames(self, writer: LayerWriter | None, solved: Results, count: int) -> None:
-        """Write each frame as soon as solved, then close the layer; a chunk's frames are already in its folder."""
-        report, options = self.report, self.options
-        written, shot, began = 0.0, {"shot": report.shot}, clock.perf_counter()
-        forecast = Forecast(count, options.workers)
-        compared = frames_compared(count if options.contact != "off" else 0)
-        drawn_through, entered = list[Shown](), dict[float | None, dict[str, float]]()
-        drawn = DrawnCloth(self.shot, self.solver.levels if options.report and options.scheme == "keep" else ())
-        for done, result in enumerate(solved, start=1):
-            written += self._write_frame(writer, result)
-            drawn_through += shown_through(self.shot, result) if done - 1 in compared else []
-            entered[result.time] = drawn.depths(result) if done - 1 in compared else {}
-            LOG.info("frame %d of %d: time code %s", done, count, named_time(result.time), extra=shot)
-            if message := forecast.after(clock.perf_counter() - began):
-                LOG.log(NOTICE, "%s", message, extra=shot)
-            LOG.debug("%s", report.frames[-1], extra=shot)
-            if options.progress:
-                options.progress(done, count)
-        if len(report.failed) == count:
-            raise SolveError(next(iter(report.failed.values())))
-        report.unsettled = unsettled_frames(report.garments, report.frames, tolerance=options.tolerance)
-        start = clock.perf_counter()
-        lacking = {
-            FAILED: list(report.failed) or None,
-            UNSOLVED: sum(bool(entry["error"]) for entry in report.unsettled) or None,
-            UNSETTLED: len(report.unsettled) or None,
-            CROSSED: report.crossings if report.leaves_crossings else None,
-        }
+    def _write_frame(self, writer: LayerWriter | None, result: Result) -> None:
+        """Report the result of one time code and write it; a chunk's frames are already in its folder."""
+        report = self.report
+        report.add(result)
+        if not result.garments:
+            name, error = named_time(result.time), str(result.telemetry["error"])
+            report.failed[name] = error
+            report.warn(FINDINGS["failed"](name=name, error=error))
+            return
+        if self.show_first is not None and len(report.frames) == len(report.failed) + 1:
+            self.show_first(result)
         if writer is not None:
+            start = clock.perf_counter()
+            writer.write(result, cuts=self._cuts(report.frames[-2:]))
+            report.seconds["write"] += clock.perf_counter() - start
+
+    def _close(self, writer: LayerWriter | None) -> None:
+        """Close the layer with a record of what it lacks.
+
+        Raises:
+            SolveError: No frame could be solved.
+        """
+        report, start = self.report, clock.perf_counter()
+        if len(report.failed) == len(self._numbers):
+            raise SolveError(next(iter(report.failed.values())))
+        report.unsettled = unsettled_frames(report.garments, report.frames, tolerance=self.options.tolerance)
+        if writer is not None:
+            lacking = {
+                FAILED: list(report.failed) or None,
+                UNSOLVED: sum(bool(entry["error"]) for entry in report.unsettled) or None,
+                UNSETTLED: len(report.unsettled) or None,
+                CROSSED: report.crossings if report.leaves_crossings else None,
+            }
             writer.close(lacking=lacking)
             report.warn(*map(str, writer.notices))
             report.note(*of_a_kind(map(str, writer.notes)))
-        report.seconds |= {"close": clock.perf_counter() - start, "write": written}
-        report.warn(*of_frames(report), *of_drawn(entered), *of_loops(self._loop.gaps()))
-        report.note(*of_following(report), *of_given_up(report), *of_inertia(report))
-        report.note(*(of_poses(report) if options.pose_in is None else ()))
-        report.note(*of_folds(report), *of_energy(report), *of_polygons(drawn_through))
-        (report.warn if options.strict else report.note)(*of_rest(report.unsettled, len(report.frames)))
-        say_what_was(report)
-        report.warn(*of_more(report))  # The last line of a run.
+        report.seconds["close"] = clock.perf_counter() - start
 
-    def _write_frame(self, writer: LayerWriter | None, result: Result) -> float:
-        """Write the result of one time code and record the result; returns the seconds spent writing."""
-        self.report.add(result)
-        self._loop.add(result)
-        if not result.garments:
-            name, error = named_time(result.time), str(result.telemetry["error"])
-            self.report.failed[name] = error
-            self.report.warn(WARNINGS["failed"](name=name, error=error))
-            return 0.0
-        if self.show_first is not None and len(self.report.frames) == len(self.report.failed) + 1:
-            self.show_first(result)
-        if writer is None:
-            return 0.0
-        start = clock.perf_counter()
-        writer.write(result, cuts=self._cuts(self.report.frames[-2:]))
-        return clock.perf_counter() - start
+    def _say_begin(self, frames: FrameFolder, preroll: int) -> None:
+        """Warn if frames of an earlier run are used, or could have been; say how many a chunk solves before its own."""
+        report, early = self.report, min(preroll, self._numbers[0])
+        if frames.dropped:
+            are, them = ("is", "it") if frames.dropped == 1 else ("are", "them")
+            dropped = counted(frames.dropped, "finished frame")
+            report.warn(FINDINGS["solved_anew"](dropped=dropped, are=are, them=them))
+        elif frames.kept:
+            again = f", each stretch after {counted(preroll, 'frame')} solved again" if preroll else ""
+            kept = f"{len(frames.kept)} of {counted(len(self._numbers), 'frame')}"
+            report.warn(FINDINGS["resumed"](kept=kept, again=again))
+        if self._is_chunk and early and not frames.kept:
+            first = f"before time code {named_time(self._times[self._numbers[0]])} the pre-roll is solved"
+            LOG.log(NOTICE, "%s: %s", first, counted(early, "frame"), extra={"shot": report.shot})
 
-
-def _layer_writer(run: Run, provenance: dict[str, Any], refinements: Sequence[Sequence[Refinement]]) -> LayerWriter:
-    """The writer of the layer."""
-    options = run.options
-    part = [time for time in (run._times[k] for k in run._numbers) if time is not None]
-    return LayerWriter(
-        run.shot,
-        refinements,
-        run.out,
-        provenance=provenance,
-        mode=options.mode,
-        scheme=options.scheme,
-        velocities=options.velocities,
-        overwrite=options.overwrite,
-        times=part if len(part) < len(run.shot.scene.times) else None,
-    )
-
-
-def _warn_of_finished(run: Run, frames: FrameFolder, count: int) -> None:
-    """Warn if frames of an earlier run are used, or could have been."""
-    if frames.dropped:
-        are, them = ("is", "it") if frames.dropped == 1 else ("are", "them")
-        dropped = counted(frames.dropped, "finished frame")
-        run.report.warn(WARNINGS["solved_anew"](dropped=dropped, are=are, them=them))
-    elif frames.kept:
-        again = f", each stretch after {counted(run._preroll, 'frame')} solved again" if run._preroll else ""
-        reused = f"{len(frames.kept)} of {counted(count, 'frame')}"
-        run.report.warn(WARNINGS["resumed"](kept=reused, again=again))
-
-
-def _announce_preroll(run: Run, frames: FrameFolder) -> None:
-    """Say how many frames a chunk solves before its own."""
-    early = min(run._preroll, run._numbers[0])
-    if run._is_chunk and early and not frames.kept:
-        first = f"before time code {named_time(run._times[run._numbers[0]])} the pre-roll is solved"
-        LOG.log(NOTICE, "%s: %s", first, counted(early, "frame"), extra={"shot": run.report.shot})
+    def _say_progress(self, done: int, count: int, forecast: str) -> None:
+        """Say how many frames are done, and when all will be."""
+        frame, shot = self.report.frames[-1], {"shot": self.report.shot}
+        LOG.info("frame %d of %d: time code %s", done, count, named_time(frame["time"]), extra=shot)
+        if forecast:
+            LOG.log(NOTICE, "%s", forecast, extra=shot)
+        LOG.debug("%s", frame, extra=shot)
+        if self.options.progress:
+            self.options.progress(done, count)
 
 
 def _processes(options: RefineOptions) -> AbstractContextManager[Start | None]:

@@ -20,13 +20,13 @@ from ..solver.frame.refiner import Refiner
 from ..solver.mesh.kernels import device_of, start_warp
 from ..solver.scene import Frame, Result
 from ..usd.read.reader import Shot
+from .chunks import Mover, Positions, counts, worse
 from .from_rest import FromRest
-from .joined import Mover, Positions, counts, worse
-from .opened import open_for, why_not_posed
-from .options import RefineOptions
-from .processes import cores
+from .job import open_for
+from .options import RefineOptions, why_not_posed
 from .report import faults_of
 from .run_in import MOST_POSES, POSES, RUN_IN, RunIn, crossings_of_cloth, pose_in
+from .workers import cores
 
 Results = Generator[Result, None, None]
 

@@ -23,17 +23,15 @@ from ..errors import LayerError, UsageError, counted, named_time
 from ..solver.level import fine_meshes, refine_garments
 from ..solver.scene import Result
 from ..usd.read.reader import Shot
-from .chunks import frames_in_order
-from .finished import check_jobs, made_from
+from .chunks import Both, Joint, between, frames_in_order, join
+from .findings.table import FINDINGS
 from .frames import CHUNK, Finished, frames_folder, record_in
-from .joined import Both, Joint, between, join
-from .opened import open_for
+from .job import check_jobs, check_places, made_from, open_for
 from .options import RefineOptions
-from .refine import check_places, running, write_all
+from .refine import running, write_all
 from .report import RefineReport
 from .run import Run, Stored, numbers_in
 from .solve import ShotSolver
-from .warnings import WARNINGS
 
 SEAM_BOUND = 0.05
 """Largest increase of a frame's move by a seam, RMS over a garment, in mean fine edges; figures in `docs/farm.md`."""
@@ -240,7 +238,7 @@ def stitch(
         if missing:
             every, count = parts[0].run["times"], len(numbers) + len(missing)
             spans = _spans([every[number] for number in missing], every)
-            report.warn(WARNINGS["partial"](count=len(numbers), frames=counted(count, "frame"), missing=spans))
+            report.warn(FINDINGS["partial"](count=len(numbers), frames=counted(count, "frame"), missing=spans))
         joins = _Joins(parts, opened, np.inf if partial else seam_bound, report.warn, numbers)
         record = {"options": recorded, "chunks": [_span(part.times) for part in parts]}
         _make_folder(out.resolve().parent)

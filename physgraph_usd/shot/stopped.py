@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import UsageError, named_time
-from .finished import made_from
-from .opened import open_for
+from .job import made_from, open_for
 from .page.frames import draw_frames
 from .page.preview import STILL, check_picture, preview
 from .stitch import Chunk, check_same_shot, chunks_in, stopped_run

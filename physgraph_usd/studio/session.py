@@ -16,9 +16,9 @@ from pathlib import Path
 from shlex import join
 
 from ..errors import UsageError
+from ..shot.findings.table import Facts, texts
+from ..shot.findings.untagged import find_candidates
 from ..shot.solve import prepare_device
-from ..shot.untagged import find_candidates
-from ..shot.warnings import of_unfelt
 from ..solver.mesh.subdivide import Refinement
 from .setting import Setting
 from .solver import FrameSolver, Seen
@@ -69,7 +69,7 @@ class TuneSession(Tuning):
         if self.out.exists() and not overwrite:
             raise UsageError(f"{self.out} exists; choose another name with -o, or replace it by --overwrite")
         super().__init__(TriedShot(shot, garments=garments, colliders=colliders, bind=bind))
-        self.warning = "".join(of_unfelt([each for each in find_candidates(self.shot) if each.is_taken]))
+        self.warning = "".join(texts("unfelt", Facts(candidates=find_candidates(self.shot))))
         self.solver = FrameSolver(self.shot, self.setting.levels, contact=True, device=self._device)
         self._solves = self.setting  # What the solver was made for, or solved last.
         self._shown: tuple[Setting, Shown] | None = None

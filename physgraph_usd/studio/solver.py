@@ -9,8 +9,8 @@ from itertools import pairwise
 import numpy as np
 
 from ..shot.options import RefineOptions
-from ..shot.processes import cores
 from ..shot.solve import sampled_at
+from ..shot.workers import cores
 from ..solver.frame.lead_in import prerolled_cages
 from ..solver.frame.refiner import Refiner
 from ..solver.frame.settings import SolveSettings

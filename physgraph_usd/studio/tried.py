@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..shot.untagged import AUTO, open_with_colliders
+from ..shot.findings.untagged import AUTO, open_with_colliders
 from ..usd.read.garment import read_painted
 from ..usd.read.reader import Shot, open_shot
 from ..usd.read.subsets import SCALED

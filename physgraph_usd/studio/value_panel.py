@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from ..shot.notes import of_subsets
+from ..shot.findings.table import Facts, texts
 from ..solver.fabric import PRESETS
 from ..usd.schema import CONTACT, FABRIC, GARMENT, REFINEMENT
 from .desk import Desk, in_order, put, small
@@ -123,7 +123,7 @@ class ValuePanel:
 
     def _of_subsets(self) -> str:
         """The garment's subsets of other fabrics, as HTML."""
-        notes = of_subsets([self._desk.session.shot.sources[self._desk.index]])
+        notes = texts("subset", Facts(sources=[self._desk.session.shot.sources[self._desk.index]]))
         return "".join(
             small(f"{note}. These values hold there, and follow the garment's in proportion.") for note in notes
         )

@@ -14,10 +14,10 @@ from types import TracebackType
 from pxr import Tf
 
 from physgraph_usd.errors import GarmentError, PhysGraphError
+from physgraph_usd.shot.findings.table import Facts, texts
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.refine import inspect_shot, refine_shot
 from physgraph_usd.shot.report import RefineReport
-from physgraph_usd.shot.warnings import of_more
 from physgraph_usd.usd.check.validate import validate_layer
 
 from .files import sizes
@@ -109,7 +109,7 @@ def _checked(report: RefineReport, out: Path, shot: Path) -> tuple[str, str]:
         return "traceback", f"validate_layer: {error}"
     if errors:
         return "invalid layer", "\n".join(errors)
-    if more := of_more(report):
+    if more := texts("more", Facts(report=report)):
         return "worse", "; ".join(more)
     return ("in part" if report.failed else "done"), "; ".join(report.failed.values())
 

@@ -20,7 +20,7 @@ from test_forces_folds import TRIANGLES, hinge
 from test_guard import PROPOSALS, descent, problem
 
 from physgraph_usd.errors import GarmentError
-from physgraph_usd.shot.notes import of_folds
+from physgraph_usd.shot.findings.table import Facts, texts
 from physgraph_usd.shot.report import RefineReport
 from physgraph_usd.solver.fabric import Fabric
 
@@ -122,7 +122,8 @@ def s39_locking() -> Result:
         state = solved(mesh, rest, wave(rest, squeeze=0.2), fabric=fabric, level=1, steps=40)
         sheets = [{"path": "/World/Sheet", "level": 1, "fine_edge_mm": 500.0 * EDGE}]
         frames = [{"time": None, "garments": [state.telemetry[0]]}]
-        warned += [edges] * len(of_folds(RefineReport("s", None, {}, garments=sheets, frames=frames)))
+        report = RefineReport("s", None, {}, garments=sheets, frames=frames)
+        warned += [edges] * len(texts("folds", Facts(report=report)))
     return Result(warned == [0.5, 1.0, 2.0, 3.0], f"noted at {', '.join(f'{each:g}' for each in warned)} edges a wave")
 
 

@@ -15,10 +15,10 @@ import numpy as np
 import torch
 
 from ...errors import UsageError
+from ...shot.findings.untagged import open_with_colliders
 from ...shot.options import RefineOptions
-from ...shot.processes import cores
 from ...shot.solve import prepare_device
-from ...shot.untagged import open_with_colliders
+from ...shot.workers import cores
 from ...solver.resolution import choose_levels, sample_frames
 from ...solver.scene import Frame, Scene
 from ...usd.files import check_targets, files_of

@@ -12,7 +12,7 @@ from ...errors import LayerError, StageError
 from ...solver.level import refine_garments
 from ...usd.read.meshes import RefinedLayer
 from ...usd.read.reader import Shot
-from ..report import RefineReport
+from ..report import RefineReport, levels_of
 
 Line = list[float | None]
 """A figure in each frame, None for a frame without the value."""
@@ -67,7 +67,7 @@ def add_jerk(series: Sequence[Series], report: RefineReport, shot: Shot, layer: 
         shot: The shot, open.
     """
     written = RefinedLayer(layer)
-    chains = refine_garments(shot.scene.garments, [garment["level"] for garment in report.garments])
+    chains = refine_garments(shot.scene.garments, levels_of(report.garments))
     for index, garment_series in enumerate(series):
         garment, steps = shot.scene.garments[index], chains[index]
         edge = 1e-3 * report.garments[index]["fine_edge_mm"]

@@ -21,7 +21,7 @@ from ...solver.scene import recentred
 from ...usd.read.meshes import RefinedLayer
 from ...usd.read.reader import Shot
 from ...usd.stage import at_time
-from ..report import RefineReport
+from ..report import RefineReport, levels_of
 
 CLOSE = 0.12
 """Radius of a close picture relative to the diagonal of the mesh's bounds: large enough to show the surroundings."""
@@ -128,7 +128,7 @@ def _bending(frame: dict[str, Any]) -> float:
 
 def _faults(report: RefineReport, shot: Shot, time: float | None, points: Sequence[np.ndarray]) -> list[np.ndarray]:
     """For each garment: 1 at vertices inside bodies, plus 1 at crossing edges or faces, shape (V,)."""
-    cloth = SceneCloth(shot.scene, _levels(report), dtype=torch.float32, device="cpu", threads=1)
+    cloth = SceneCloth(shot.scene, levels_of(report.garments), dtype=torch.float32, device="cpu", threads=1)
     cloth.bodies.pose(shot.frame(time).colliders)
     level, origin = _finest(report, shot), np.concatenate(points).mean(axis=0)
     every = np.ones((len(points), len(points)), bool)
@@ -147,7 +147,7 @@ def _folds(report: RefineReport, shot: Shot, time: float | None, points: Sequenc
     Folds of the smoothly subdivided input are subtracted: the input's own corners and hems are no folds of the cloth.
     """
     folds, cages = [], shot.frame(time).garments
-    for garment, level, fine, cage in zip(shot.scene.garments, _levels(report), points, cages, strict=True):
+    for garment, level, fine, cage in zip(shot.scene.garments, levels_of(report.garments), points, cages, strict=True):
         control, coarse = garment.control, cage.points
         for step in refine_garments([garment], [level])[0]:
             smooth, control = control.subdivided(step)
@@ -172,8 +172,4 @@ def _densest(points: np.ndarray, weights: np.ndarray) -> tuple[list[int], float]
 
 def _finest(report: RefineReport, shot: Shot) -> Level:
     garments = [recentred(garment) for garment in shot.scene.garments]
-    return build_levels(garments, refine_garments(garments, _levels(report)))[-1]
-
-
-def _levels(report: RefineReport) -> list[int]:
-    return [garment["level"] for garment in report.garments]
+    return build_levels(garments, refine_garments(garments, levels_of(report.garments)))[-1]

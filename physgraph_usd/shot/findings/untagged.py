@@ -10,17 +10,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..errors import StageError, counted
-from ..solver.colliders.pose import Pose, bounds_of
-from ..solver.resolution import sample_frames
-from ..solver.scene import Garment
-from ..usd.read.other_bodies import OtherBody, other_bodies
-from ..usd.read.reader import Shot, open_shot
-from ..usd.stage import at_time
-from ..usd.view import Stage
+from ...errors import StageError, counted
+from ...solver.colliders.pose import Pose, bounds_of
+from ...solver.resolution import sample_frames
+from ...solver.scene import Garment
+from ...usd.read.other_bodies import OtherBody, other_bodies
+from ...usd.read.reader import Shot, open_shot
+from ...usd.stage import at_time
+from ...usd.view import Stage
 
 if TYPE_CHECKING:
-    from ..solver.colliders.mesh import MeshBody
+    from ...solver.colliders.mesh import MeshBody
 
 AUTO = "auto"
 """Pseudo-collider: all colliders named by the shot, and the bodies touched by garments."""
@@ -139,8 +139,8 @@ def _judged(body: OtherBody, cloth: _Cloth) -> Candidate | None:
 
     After a frame in which cloth and body are apart, frames are passed over while neither has moved far enough to meet.
     """
-    from ..solver.colliders.mesh import MeshBody
-    from ..solver.mesh.kernels import start_warp
+    from ...solver.colliders.mesh import MeshBody
+    from ...solver.mesh.kernels import start_warp
 
     start_warp()
     solid = MeshBody(device="cpu", threads=1)
@@ -207,7 +207,7 @@ def _moves_with(garment: Garment, frames: Sequence[tuple[np.ndarray, Pose]], *, 
     """
     import torch
 
-    from ..solver.colliders.mesh import MeshBody
+    from ...solver.colliders.mesh import MeshBody
 
     (cage, pose), *later = frames
     triangles = garment.mesh.triangulate(garment.rest).triangles

@@ -10,8 +10,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..solver.colliders.pose import Pose
-from ..solver.scene import Frame, Garment, Scene
+from ...solver.colliders.pose import Pose
+from ...solver.scene import Frame, Garment, Scene
 from .untagged import Candidate
 
 STANDS = 1.7
@@ -69,3 +69,15 @@ def _around(frames: Sequence[Frame], garment: int, collider: int) -> list[Pose]:
         if pose and len(corners) and (corners.min(axis=0) < middle).all() and (middle < corners.max(axis=0)).all():
             standing.append(pose)
     return standing
+
+
+def pull_of(gravity: np.ndarray) -> str:
+    """Strength and direction of gravity [m/s^2], shape (3,), naming the axis if gravity follows one."""
+    strength = float(np.linalg.norm(gravity))
+    if not strength:
+        return "0 m/s^2"
+    direction = gravity / strength
+    axis = int(np.abs(direction).argmax())
+    if np.abs(np.delete(direction, axis)).max() < 1e-6:
+        return f"{strength:.3g} m/s^2 towards {'-' if direction[axis] < 0 else '+'}{'XYZ'[axis]}"
+    return f"{strength:.3g} m/s^2 towards ({', '.join(f'{part:.3g}' for part in direction)})"

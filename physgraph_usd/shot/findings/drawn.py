@@ -10,26 +10,21 @@ surface, which is rounder, and may enter a body with sharp edges.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from shlex import join
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ..errors import counted
-from ..solver.colliders.pose import bounds_of
-from ..solver.contact.broad_phase import Bodies
-from ..solver.contact.measure import DEEP
-from ..solver.contact.report import penetration_map
-from ..solver.scene import Result
-from ..usd.mesh.bind import closest
-from ..usd.read.bodies import DRAWN_WITHIN, Polygons
-from ..usd.read.meshes import limit_of
-from ..usd.read.reader import Shot
-from ..usd.schema import GARMENT
-from ..usd.stage import at_time
-from .options import options_of
+from ...solver.colliders.pose import bounds_of
+from ...solver.contact.broad_phase import Bodies
+from ...solver.contact.measure import DEEP
+from ...solver.contact.report import penetration_map
+from ...solver.scene import Result
+from ...usd.mesh.bind import closest
+from ...usd.read.bodies import DRAWN_WITHIN, Polygons
+from ...usd.read.meshes import limit_of
+from ...usd.read.reader import Shot
 
 MOST_FRAMES, EVERY = 8, 8
 """Most frames of a run in which bodies are compared with the cloth, and least step between them: a comparison takes
@@ -56,23 +51,41 @@ class Shown:
     offset: float
 
 
-class DrawnCloth:
-    """The surfaces that renderers draw from the refined cloth of a shot."""
+class Compared:
+    """A few frames of a run, compared with the bodies as programs draw cloth and bodies.
 
-    def __init__(self, shot: Shot, levels: Sequence[int]) -> None:
-        """Take the open shot, and the number of subdivisions of each garment; () to measure none."""
-        self._shot = shot
+    Attributes:
+        shown: Bodies whose polygons stand above the cloth by more than a body's surface may be off.
+        depths: By time code, depths [m] inside bodies of the surface that renderers draw, by path of the garment.
+    """
+
+    def __init__(self, shot: Shot, levels: Sequence[int], *, count: int) -> None:
+        """Start without a frame.
+
+        Args:
+            shot: The shot, open.
+            levels: Number of subdivisions of each garment; () to measure no depths.
+            count: Number of frames of the run; 0 to compare none.
+        """
+        self._shot, self._number = shot, 0
+        self._compared = range(0, count, max(EVERY, math.ceil(count / MOST_FRAMES)))
         self._limits = [limit_of(shot, index, level) for index, level in enumerate(levels)]
         self._bodies = Bodies(shot.scene.colliders, device="cpu", threads=1)
+        self.shown, self.depths = list[Shown](), dict[float | None, dict[str, float]]()
 
-    def depths(self, result: Result) -> dict[str, float]:
+    def add(self, result: Result) -> None:
+        """Compare the next frame, if it is one of the few."""
+        self._number += 1
+        if self._number - 1 in self._compared and result.garments:
+            self.shown += self._shown(result)
+            self.depths[result.time] = self._depths(result) if self._limits else {}
+
+    def _depths(self, result: Result) -> dict[str, float]:
         """Depth inside bodies of the surface drawn from each garment that contact has kept outside [m], by path.
 
         The surface is measured at the vertices of the refined cloth. Depths up to `DEEP` are left out.
         """
         deepest = dict[str, float]()
-        if not self._limits or not result.garments:
-            return deepest
         self._bodies.pose(self._shot.frame(result.time).colliders)
         for index, garment in enumerate(self._shot.scene.garments):
             cloth, limit = result.garments[index].points, self._limits[index]
@@ -86,21 +99,19 @@ class DrawnCloth:
                 deepest[garment.path] = depth
         return deepest
 
-
-def shown_through(shot: Shot, result: Result) -> list[Shown]:
-    """Bodies whose polygons stand above refined cloth by more than a body's surface may be off."""
-    surfaces, bodies = [], shot.polygons(result.time) if result.garments else []
-    for index, solved in enumerate(result.garments):
-        garment = shot.scene.garments[index]
-        for number in garment.colliders:
-            body, collider = bodies[number], shot.scene.colliders[number]
-            if solved.points is None or body is None:
-                continue
-            height, lift = _height(body, solved.points, kept=shot.offset(index, result.time) + collider.offset)
-            if height > DRAWN_WITHIN:
-                offset = STEP * math.ceil((lift - collider.offset) / STEP)
-                surfaces.append(Shown(garment.path, collider.path, result.time, height, offset))
-    return surfaces
+    def _shown(self, result: Result) -> Iterator[Shown]:
+        """Bodies whose polygons stand above refined cloth by more than a body's surface may be off."""
+        shot, bodies = self._shot, self._shot.polygons(result.time)
+        for index, solved in enumerate(result.garments):
+            garment = shot.scene.garments[index]
+            for number in garment.colliders:
+                body, collider = bodies[number], shot.scene.colliders[number]
+                if solved.points is None or body is None:
+                    continue
+                height, lift = _height(body, solved.points, kept=shot.offset(index, result.time) + collider.offset)
+                if height > DRAWN_WITHIN:
+                    offset = STEP * math.ceil((lift - collider.offset) / STEP)
+                    yield Shown(garment.path, collider.path, result.time, height, offset)
 
 
 def _height(body: Polygons, cloth: np.ndarray, *, kept: float) -> tuple[float, float]:
@@ -134,27 +145,3 @@ def _height(body: Polygons, cloth: np.ndarray, *, kept: float) -> tuple[float, f
         nearest.distance < lift[corners].max(axis=1)
     )
     return float(nearest.distance[above].max(initial=0.0)), float(lift[corners[above]].max(initial=0.0))
-
-
-def frames_compared(count: int) -> range:
-    """Numbers of the frames compared of a run's."""
-    return range(0, count, max(EVERY, math.ceil(count / MOST_FRAMES)))
-
-
-def of_polygons(surfaces: Sequence[Shown]) -> list[str]:
-    """A note of bodies shown through garments by viewports without subdivision, with sufficient offsets."""
-    if not surfaces:
-        return []
-    worst = max(surfaces, key=lambda surface: surface.height)
-    offsets: dict[str, float] = {}
-    for surface in surfaces:
-        offsets[surface.garment] = max(offsets.get(surface.garment, 0.0), surface.offset)
-    further = len(offsets) - 1
-    through = f"<{worst.garment}>" + (f" and {counted(further, 'other garment')}" if further else "")
-    shows = f"viewports that draw <{worst.body}> unsubdivided show it through {through}"
-    return [f"{shows} by up to {1e3 * worst.height:.1f} mm{at_time(worst.time)}; {_options(offsets.items())} hides it"]
-
-
-def _options(offsets: Iterable[tuple[str, float]]) -> str:
-    name = GARMENT["contact:offset"].short
-    return join(options_of("--set", [f"{path}.{name}={offset:.4g}" for path, offset in offsets]))
