@@ -22,7 +22,7 @@ from .mesh.lengths import FOLDS, LENGTHS, NORMALS, ElementValues
 from .mesh.recorded import Recordings
 from .mesh.stencil import Stencil
 from .mesh.subdivide import ControlMesh, Refinement, on_triangles, subdivide_times
-from .mesh.topology import PolygonMesh, TriangleSplit, edges_of, find_edges, sorted_rows
+from .mesh.topology import PolygonMesh, TriangleSplit, find_edges, sorted_rows
 from .mesh.vectors import at_corners, cross, dot, inverse, mean_of, norm, product
 from .scene import Garment
 from .seen import vertex_normals
@@ -328,7 +328,7 @@ def _garment_level(
         smooth_rest=smooth_rest,
         metric=_metric_of(linear, elements, rest, smooth_rest),
         triangles=split.triangles,
-        edges=edges_of(split.triangles, mesh.vertex_count).vertices,
+        edges=elements.springs[elements.edge_spring],
         elements=elements,
         bent=garment.bent_rest | (find_edges(always, elements.hinges[:, :2]) >= 0),
         pressed=_pressed_angles(garment, elements, linear=linear, smoothing=smoothing),
@@ -473,18 +473,16 @@ def _join(
 
 
 def _joined(parts: Sequence[_GarmentLevel]) -> dict[str, np.ndarray]:
-    """Arrays of all garments by name, garment number of each element, and spring along each edge and hinge."""
+    """Arrays of all garments by name, and the garment number of each element."""
     tables = [vars(part) | vars(part.elements) | part.vertex_values for part in parts]
     names = "rest smooth_rest metric share twists bent pressed fabric stretch_scale bend_scale pin".split()
     joined = {name: np.concatenate([table[name] for table in tables]) for name in names}
-    for names, counted in ((OF_VERTICES, "rest"), (("sides",), "springs")):
+    for names, counted in ((OF_VERTICES, "rest"), (("sides", "edge_spring", "hinge_spring"), "springs")):
         starts = np.cumsum([0, *(len(table[counted]) for table in tables)])
         for name in names:
             joined[name] = np.concatenate([table[name] + start for table, start in zip(tables, starts, strict=False)])
     for name, owned in OWNED.items():
         joined[f"{name}_garment"] = np.repeat(np.arange(len(tables)), [len(table[owned]) for table in tables])
-    for name, ends in (("edge_spring", joined["edges"]), ("hinge_spring", joined["hinges"][:, :2])):
-        joined[name] = find_edges(joined["springs"], ends)
     return joined
 
 
@@ -544,6 +542,8 @@ def mean_at(elements: np.ndarray, values: np.ndarray, count: int, *, weight: np.
         count: Number of elements.
         weight: Weight of each value, shape (K,); None for equal weights.
     """
+    if (values == 1.0).all():
+        return np.ones(count)
     weight = np.ones(len(elements)) if weight is None else weight
     total = np.bincount(elements, weight, count)
     return np.divide(np.bincount(elements, weight * values, count), total, out=np.ones(count), where=total > 0)

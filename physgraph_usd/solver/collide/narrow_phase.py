@@ -202,7 +202,7 @@ def _kind_search(put: Any) -> Any:
         bits: wp.int32,
     ):
         """Call ``put`` for pairs of parts, of cluster i those whose numbers end in ``share``; returns the next key."""
-        room, size = boxes.radius[i] + boxes.radius[j], parts.clusters + 1
+        room, size, alike = boxes.radius[i] + boxes.radius[j], parts.clusters + 1, first == second and i == j
         for b in range(parts.first[first * size + i], parts.first[first * size + i + 1], ALL):
             near = boxes_near(boxes.clusters, j, boxes.parts, b, blocks_left(parts, first, i, b), room)
             while near != wp.uint64(0):
@@ -213,12 +213,13 @@ def _kind_search(put: Any) -> Any:
                 p = parts.parts[k]
                 if not (boxes.queried[j] or query.queried[p[0]] or query.queried[p[1]] or query.queried[p[2]]):
                     continue
-                for c in range(parts.first[second * size + j], parts.first[second * size + j + 1], ALL):
+                begin = wp.where(alike, k // LANES, parts.first[second * size + j])  # Each pair of edges once.
+                for c in range(begin, parts.first[second * size + j + 1], ALL):
                     partners = boxes_near(boxes.parts, k, boxes.parts, c, blocks_left(parts, second, j, c), room)
                     while partners != wp.uint64(0):
                         m = LANES * c + lowest_bit(partners)
                         partners = without_lowest(partners)
-                        if (first != second or i != j or k < m) and not shares(parts.labels[k], parts.labels[m]):
+                        if (not alike or k < m) and not shares(parts.labels[k], parts.labels[m]):
                             put(parts, query, results, key, first, k, m)
                             key += wp.int64(1)
         return key

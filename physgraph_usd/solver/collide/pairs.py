@@ -52,7 +52,7 @@ class Pairs:
         """The selected pairs."""
         if selected.dtype == torch.bool:  # One conversion for three fields.
             selected = torch.nonzero(selected).squeeze(1)
-        return Pairs(self.corners[selected], self.value[selected], self.face[selected])
+        return Pairs(*(getattr(self, field.name).index_select(0, selected) for field in fields(self)))
 
     def joined(self, pairs: Pairs) -> Pairs:
         """These pairs, followed by further pairs."""

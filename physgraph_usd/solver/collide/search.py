@@ -138,7 +138,9 @@ def blocking_pairs(
 
     blocking = Pairs.empty(0, queried.device)
     if near is not None:
-        queried_pairs = near.pairs.where(queried[near.pairs.corners.long()].any(dim=1))
+        corners = near.pairs.corners
+        are_queried = queried.index_select(0, corners.reshape(-1)).view_as(corners).any(dim=1)
+        queried_pairs = near.pairs.where(are_queried)
         blocking = _blocking_among(queried_pairs, parts, query_of(arrays(queried), kind=Ask.MOVE, floor=floor))
         queried = queried & near.leaving(end - start, floor)
     if not bool(queried.any()):

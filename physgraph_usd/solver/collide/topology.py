@@ -132,16 +132,32 @@ def halved(points: np.ndarray, group: np.ndarray, size: int) -> np.ndarray:
     Returns:
         Clusters from 0 in the order of the halves, so that clusters with consecutive numbers are near, shape (N,).
     """
-    order, count = sorted_rows(group, count=int(group.max(initial=0)) + 1), np.bincount(group)
-    ranks = np.stack([sorted_rows(np.argsort(column, kind="stable"), count=len(points)) for column in points.T])
-    while (count := count[count > 0]).max(initial=0) > size:
-        first, placed = np.cumsum(count) - count, points[order]
-        spread = np.maximum.reduceat(placed, first) - np.minimum.reduceat(placed, first)
-        cluster, axis = np.repeat(np.arange(len(count)), count), np.repeat(spread.argmax(axis=1), count)
-        order = order[np.argsort(cluster * len(points) + ranks[axis, order])]
+    count, label = np.bincount(group), group
+    sorts = [_sorted(column) for column in points.T]
+    while True:
+        sorts = [order[sorted_rows(label[order], count=len(count))] for order in sorts]
+        count = count[count > 0]
+        if count.max(initial=0) <= size:
+            break
+        last = np.cumsum(count) - 1
+        ends = [points[order[[last + 1 - count, last]], axis] for axis, order in enumerate(sorts)]
+        longest = np.argmax([high - low for low, high in ends], axis=0)
+        order = np.choose(np.repeat(longest, count), sorts)
         later = np.where(count > size, count // 2, 0)
         count = np.stack([count - later, later], axis=1).ravel()
-    return np.repeat(np.arange(len(count)), count)[sorted_rows(order, count=len(order))]
+        label = np.empty(len(points), np.int64)
+        label[order] = np.repeat(np.arange(len(count)), count)
+    cluster = np.empty(len(points), np.int64)
+    cluster[sorts[0]] = np.repeat(np.arange(len(count)), count)
+    return cluster
+
+
+def _sorted(values: np.ndarray) -> np.ndarray:
+    """The order that sorts finite values; equal ones stay in order, by a second sort faster than a stable one."""
+    order = np.argsort(values)
+    values = values[order]
+    rank = np.cumsum(np.append(False, values[1:] != values[:-1])[: len(order)])
+    return np.sort(rank * len(order) + order) - rank * len(order)
 
 
 def _blocks(cluster: np.ndarray, corners: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

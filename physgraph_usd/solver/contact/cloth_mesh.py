@@ -103,10 +103,13 @@ class ClothMesh:
         """Constraints with the bodies' corners constant at x [m]; the arguments are as for `PairConstraints`."""
         count = self.level.vertex_count
         if len(x) > count:
-            fixed = corners >= count
-            still = torch.where(fixed, weight, torch.zeros_like(weight))
-            offset = offset - (normal * (still.unsqueeze(2) * x[corners.long()]).sum(dim=1)).sum(dim=1)
-            weight, corners = weight - still, torch.where(fixed, corners.amin(dim=1, keepdim=True), corners)
+            rows = torch.nonzero(corners.amax(dim=1) >= count)[:, 0]
+            of_rows, part = corners[rows], weight[rows]
+            fixed = of_rows >= count
+            still = torch.where(fixed, part, torch.zeros_like(part))
+            height = (normal[rows] * (still.unsqueeze(2) * x[of_rows.long()]).sum(dim=1)).sum(dim=1)
+            offset, weight = offset.index_copy(0, rows, offset[rows] - height), weight.index_copy(0, rows, part - still)
+            corners = corners.index_copy(0, rows, torch.where(fixed, of_rows.amin(dim=1, keepdim=True), of_rows))
         columns = (column.to(self.level.rest).contiguous() for column in (weight, normal, offset, stiffness))
         return PairConstraints(corners.contiguous(), *columns)
 

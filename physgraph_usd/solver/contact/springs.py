@@ -110,7 +110,7 @@ class NearSprings:
 
     def where(self, selected: Int[Tensor, " kept"]) -> NearSprings:
         """The selected springs."""
-        return NearSprings(*(getattr(self, field.name)[selected] for field in fields(self)))
+        return NearSprings(*(getattr(self, field.name).index_select(0, selected) for field in fields(self)))
 
 
 def _required_gaps(thickness: Float[Tensor, " garments"], offsets: np.ndarray | None) -> Float[Tensor, "all all"]:
@@ -282,7 +282,8 @@ class ClothSprings:
         count = self._mesh.level.vertex_count
         normal = torch.nn.functional.normalize(near.separation, dim=1, eps=1e-300)
         corners = near.corners.long()
-        least = torch.where(corners < count, self._area[corners.clamp_max(count - 1)], torch.inf)
+        areas = self._area.index_select(0, corners.clamp_max(count - 1).reshape(-1)).view_as(corners)
+        least = torch.where(corners < count, areas, torch.inf)
         share = torch.where(near.face & (corners[:, 0] < count), least[:, 0], least.amin(dim=1) / 3.0)
         return self._mesh.anchored(near.corners, near.weight, normal, near.offset, stiffness * share, x)
 
@@ -303,6 +304,7 @@ class ClothSprings:
         out[self.owner[on[:, 3]].long() - self._cloths, on[:, 0]] = True
         either = torch.nn.functional.pad(out.any(dim=0), (0, len(self.owner) - count))
         either = either if exempt is None else either | exempt
-        sided = ~with_body | (~touching & (of_vertex | ~either[corners].any(dim=1)))
+        unsure = either.index_select(0, corners.reshape(-1)).view_as(corners).any(dim=1)
+        sided = ~with_body | (~touching & (of_vertex | ~unsure))
         kept = torch.nonzero(sided).squeeze(1)  # One conversion for all fields.
         return near.where(kept), with_body[kept], out if len(on) else None

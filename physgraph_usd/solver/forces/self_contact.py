@@ -48,7 +48,7 @@ class PairConstraints:
     def where(self, selected: Bool[Tensor, " gaps"]) -> PairConstraints:
         """The selected pairs."""
         numbers = torch.nonzero(selected).squeeze(1)
-        return PairConstraints(*(getattr(self, field.name)[numbers] for field in fields(self)))
+        return PairConstraints(*(getattr(self, field.name).index_select(0, numbers) for field in fields(self)))
 
     def with_more(self, added: PairConstraints) -> PairConstraints:
         """Both sets of pairs combined."""
@@ -80,7 +80,9 @@ class PairConstraints:
 
     def vectors(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, "gaps 3"]:
         """From the second point to the first [m]."""
-        return (self.weight.unsqueeze(2) * x[self.corners.long()]).sum(dim=1)
+        at = x.index_select(0, self.corners.reshape(-1)).reshape(-1, 4, 3)  # An index takes four times as long.
+        first, second, third, fourth = (self.weight.unsqueeze(2) * at).unbind(dim=1)
+        return first + second + third + fourth
 
     def penetration(self, x: Float[Tensor, "vertices 3"]) -> Float[Tensor, " gaps"]:
         """Depth of each pair below its offset [m], not below zero."""

@@ -116,10 +116,11 @@ class Followers:
     def __init__(self, level: Level, garments: Sequence[Garment], meshes: Sequence[PolygonMesh]) -> None:
         """Find the followers of a level; ``meshes`` are the garments' polygons."""
         self._rigid = RigidParts(level, garments)
-        parts = zip(meshes, level.spans, strict=True)
-        edges = np.concatenate([mesh.half_edges.edges.astype(np.int64) + span.start for mesh, span in parts])
-        ends = np.concatenate([edges, edges[:, ::-1]])
         idle = ((level.vertex_area == 0) & (level.pin < 1.0 - PIN_MARGIN)).cpu().numpy()
+        parts = [(mesh, span) for mesh, span in zip(meshes, level.spans, strict=True) if idle[span].any()]
+        edges = [mesh.half_edges.edges.astype(np.int64) + span.start for mesh, span in parts]
+        edges = np.concatenate([np.empty((0, 2), np.int64), *edges])
+        ends = np.concatenate([edges, edges[:, ::-1]])
         ends = ends[idle[ends[:, 0]] & (ends[:, 0] != ends[:, 1])]
         self._idle, row = np.unique(ends[:, 0], return_inverse=True)
         rest = level.rest.double().cpu().numpy()

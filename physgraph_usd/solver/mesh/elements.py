@@ -27,21 +27,25 @@ class ElasticElements:
 
     Attributes:
         springs: End vertices, lexicographic, shape (S, 2).
+        edge_spring: The spring along each edge of the split, ascending, shape (E,).
         sides: The spring along each side of the triangles, shape (M, 3).
         membrane: Corner vertices of triangles; the third side of a quad's triangle is a diagonal, shape (M, 3).
         share: Fraction of the area represented by a triangle: a half for a quad's triangle, shape (M,).
         face: The face of each triangle, shape (M,).
         hinges: Edge i-j, the corners k, k' of the first face opposite to the edge, and l, l' of the second; k = k' at a
             triangle, shape (H, 6).
+        hinge_spring: The spring along each hinge's edge, shape (H,).
         twists: Whether a hinge is a quad's twist about its diagonal i-j, shape (H,).
     """
 
     springs: np.ndarray
+    edge_spring: np.ndarray
     sides: np.ndarray
     membrane: np.ndarray
     share: np.ndarray
     face: np.ndarray
     hinges: np.ndarray
+    hinge_spring: np.ndarray
     twists: np.ndarray
 
 
@@ -62,19 +66,29 @@ def elastic_elements(mesh: PolygonMesh, split: TriangleSplit, rest: np.ndarray) 
     membrane = np.concatenate([split.triangles[not_quad], halves]).astype(np.int32)
     face = np.concatenate([split.face[not_quad], np.repeat(quads, 4)])
     share = np.where(np.arange(len(membrane)) < not_quad.sum(), 1.0, 0.5)
+    springs = edges_of(membrane, mesh.vertex_count)
+    single, of_halves = springs.sides[: not_quad.sum()], springs.sides[not_quad.sum() :].reshape(-1, 12)
+    around = of_halves[:, [0, 1, 3, 4]]
     first = np.searchsorted(split.face, quads)
     (i, ell, j), k = split.triangles[first].T, split.triangles[first + 1, 2]
     twist = np.stack([i, j, k, k, ell, ell], axis=1)
-    sides = hinges_of(split.triangles[not_quad], np.stack([a, b, c, d], axis=1))
-    springs = edges_of(membrane, mesh.vertex_count)
+    diagonal = np.where((i == a) | (i == c), of_halves[:, 2], of_halves[:, 11])
+    proper = (single >= 0).all(axis=1)
+    table = _faces_at_sides(split.triangles[not_quad][proper], np.stack([a, b, c, d], axis=1))
+    hinges, hinge_spring = _hinges_between(table, np.concatenate([single[proper].T.ravel(), around.T.ravel()]))
+    in_split = np.zeros(len(springs.vertices), bool)
+    for side in (single[single >= 0], around, diagonal):
+        in_split[side] = True
     return ElasticElements(
         springs=springs.vertices,
+        edge_spring=np.flatnonzero(in_split),
         sides=springs.sides,
         membrane=membrane,
         share=share,
         face=face,
-        hinges=np.concatenate([sides, twist.astype(np.int32)]),
-        twists=np.repeat([False, True], [len(sides), len(twist)]),
+        hinges=np.concatenate([hinges, twist.astype(np.int32)]),
+        hinge_spring=np.concatenate([hinge_spring, diagonal]),
+        twists=np.repeat([False, True], [len(hinges), len(twist)]),
     )
 
 
@@ -105,19 +119,34 @@ def hinges_of(triangles: np.ndarray, quads: np.ndarray | None = None) -> np.ndar
     """
     triangles = np.asarray(triangles, np.int64).reshape(-1, 3)
     a, b, c = triangles.T
-    faces = [triangles[(a != b) & (b != c) & (c != a)], np.empty((0, 4), np.int64) if quads is None else quads]
-    table = np.concatenate(
-        [np.roll(corners, -side, axis=1)[:, [0, 1, 2, -1]] for corners in faces for side in range(corners.shape[1])]
+    triangles = triangles[(a != b) & (b != c) & (c != a)]
+    table = _faces_at_sides(triangles, np.empty((0, 4), np.int64) if quads is None else quads)
+    return _hinges_between(table, paired(table[:, 0], table[:, 1], int(table.max(initial=-1)) + 1)[1])[0]
+
+
+def _faces_at_sides(triangles: np.ndarray, quads: np.ndarray) -> np.ndarray:
+    """Ends of each side of faces, by side, and the corners opposite, shape (N, 4); a triangle's corner is repeated."""
+    return np.concatenate(
+        [
+            np.roll(corners, -side, axis=1)[:, [0, 1, 2, -1]]
+            for corners in (triangles, quads)
+            for side in range(corners.shape[1])
+        ]
     )
+
+
+def _hinges_between(table: np.ndarray, edge: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The hinges as in `hinges_of`, and the edge of each, given `_faces_at_sides` and the edge along each side."""
     if not len(table):
-        return np.empty((0, 6), np.int32)
-    edge = paired(table[:, 0], table[:, 1], int(table.max()) + 1)[1]
-    order, count = sorted_rows(edge, count=len(edge)), np.bincount(edge)
-    first = (np.cumsum(count) - count)[count == 2]
+        return np.empty((0, 6), np.int32), np.empty(0, np.int32)
+    count = np.bincount(edge)
+    order, double = sorted_rows(edge, count=len(count)), count == 2
+    first = (np.cumsum(count) - count)[double]
     first_face, second_face = table[order[first]], table[order[first + 1]]
     hinges = np.concatenate([first_face, second_face[:, 2:]], axis=1).astype(np.int32)
     k, other_k, ell, other_l = hinges[:, 2:].T
-    return hinges[((k != ell) | (other_k != other_l)) & ((k != other_l) | (other_k != ell))]
+    apart = ((k != ell) | (other_k != other_l)) & ((k != other_l) | (other_k != ell))
+    return hinges[apart], np.flatnonzero(double)[apart]
 
 
 def hinge_geometry(x: np.ndarray, hinges: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

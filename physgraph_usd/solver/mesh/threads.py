@@ -110,9 +110,8 @@ class _Call:
     def __init__(self, command: wp.Launch) -> None:
         """Pack the arguments of a recorded launch, and keep it, and thus its arrays, alive."""
         self._command, self._bounds = command, command.params[0]
-        self._names = [f"argument{number}" for number in range(len(command.params) - 1)]
-        kinds = [*zip(self._names, map(type, command.params[1:]), strict=True)]
-        self._packed: Any = type("Arguments", (ctypes.Structure,), {"_fields_": kinds})()
+        packed = _packed_type(*map(type, command.params[1:]))
+        self._packed, self._names = packed(), [name for name, _ in packed._fields_]
         hooks: Any = command.hooks
         self._forward = hooks.forward
         for name, value in zip(self._names, command.params[1:], strict=True):
@@ -209,6 +208,13 @@ def current_stream(device: str) -> wp.Stream:
 @functools.lru_cache(maxsize=64)
 def _stream(device: str, handle: int) -> wp.Stream:
     return wp.Stream(device, cuda_stream=handle)
+
+
+@functools.cache
+def _packed_type(*kinds: type) -> Any:
+    """The C structure of arguments of given types: making a type takes longer than many kernels."""
+    fields = [(f"argument{number}", kind) for number, kind in enumerate(kinds)]
+    return type("Arguments", (ctypes.Structure,), {"_fields_": fields})
 
 
 @functools.cache
