@@ -46,11 +46,11 @@ def table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
     return "\n".join(lines + [f"| {' | '.join(map(str, row))} |" for row in rows])
 
 
-def code_of(*folders: Path) -> str:
-    """The first digits of a hash of the code in some folders: what another code measured does not count."""
+def code_of(*places: Path) -> str:
+    """The first digits of a hash of some files, and of the code in some folders: other code has another."""
     digest = hashlib.sha256()
-    for folder in folders:
-        for file in sorted(folder.rglob("*.py")):
+    for place in places:
+        for file in [place] if place.is_file() else sorted(place.rglob("*.py")):
             digest.update(file.read_bytes())
     return digest.hexdigest()[:12]
 

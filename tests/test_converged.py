@@ -98,4 +98,4 @@ def test_runs_beside_a_converged_run(tmp_path: Path):
 
 
 def test_default_shots_are_samples_or_real():
-    assert all(row.garments or row.source in SAMPLES for row in converged.SHOTS)
+    assert all(row.is_real or row.source in SAMPLES for row in converged.SHOTS)
