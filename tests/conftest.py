@@ -1,7 +1,5 @@
 """What all tests share: fixed seeds, the folder of real assets, and sample shots."""
 
-from __future__ import annotations
-
 import os
 import random
 import signal

@@ -1,7 +1,5 @@
 """The judge of rest: a cheap row, kept runs, and what identifies them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What a shot is made of is never written, no link is followed, and nothing goes that was not asked for."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Which way is down: as the stage says, as it was asked for, or as garments author it; and a stage that is wrong."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Values of the wrong type or size, as `python -m tests.fuzz` found them: told or refused, never a traceback."""
 
-from __future__ import annotations
-
 from contextlib import closing
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Reading a shot: what comes out is the stage's cloth, in metres, at the stage's own times."""
 
-from __future__ import annotations
-
 import contextlib
 from pathlib import Path
 

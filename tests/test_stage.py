@@ -1,7 +1,5 @@
 """Opening stages: units, axes and every way in which a file or its numbers can be broken."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

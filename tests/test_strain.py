@@ -1,13 +1,12 @@
 """Where the rest shape comes from, when it is refused, who is told that it is not the cloth's, and the fitted one."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 from cloth import sheet
+from meshes import quads_of
 from pxr import Sdf, UsdGeom
 from sheets import garment_of
 from shots import fine, refine, run, sample_times
@@ -38,10 +37,7 @@ def puffed_shot(
 ) -> str:
     """A sleeve whose default points, if any, are a plain tube and whose animation is puffed; ``odd`` scales samples."""
     stage = new_stage(path)
-    ids = np.arange(AROUND * ROWS).reshape(ROWS, AROUND)
-    across = np.roll(ids, -1, axis=1)
-    quads = np.stack([ids[:-1], ids[1:], across[1:], across[:-1]], axis=-1).reshape(-1, 4)
-    mesh = add_mesh(stage, SLEEVE, tube(1.0), quads)
+    mesh = add_mesh(stage, SLEEVE, tube(1.0), quads_of(AROUND, ROWS, closed=True, turned=True))
     if not default:
         mesh.GetPointsAttr().ClearDefault()
     for time in TIMES:

@@ -1,7 +1,5 @@
 """The judge of versions: figures of a run, and its verdicts."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

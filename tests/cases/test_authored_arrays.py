@@ -1,7 +1,5 @@
 """Arrays that a mesh brings along: rest shapes per corner, numbers of points, those of other schemas, time samples."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Frames without a garment, bodies and garments whose samples do not meet, velocities where the cloth jumps."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

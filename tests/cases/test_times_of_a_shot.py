@@ -1,7 +1,5 @@
 """Time codes at which cloth is solved: between sparse keys, at the samples of bodies, about jumps, rounded."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 

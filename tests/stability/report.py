@@ -3,8 +3,6 @@
 A cell says whether the case passed and what was measured. Cases that no integrator decides have one figure for all.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import platform

@@ -3,8 +3,6 @@
 Each takes a method's name. Bodies of the scenes are those of `test_contact_bodies.py` beside it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any

@@ -1,7 +1,5 @@
 """S17, S21, S23, S29, S30: pins in bodies, cloth without room, bodies that jump with the cloth or pass through it."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 from typing import Any
 

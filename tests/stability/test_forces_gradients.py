@@ -1,7 +1,5 @@
 """S40: every potential's gradient by finite differences in float64, on either side of its kinks."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

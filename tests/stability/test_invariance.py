@@ -1,7 +1,5 @@
 """S6, S11, S12: what must not change the answer."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
