@@ -151,12 +151,13 @@ def _elements(name: str, value: ast.expr) -> Iterator[tuple[str, int | None, flo
 
 def _together(target: ast.Tuple, value: ast.expr) -> Iterator[tuple[str, int | None, float, str]]:
     """Names assigned together, from a tuple, or numbered by a range."""
-    names = [each.id for each in target.elts if isinstance(each, ast.Name) and each.id.isupper()]
     if isinstance(value, ast.Tuple):
-        for name, part in zip(names, value.elts, strict=True):
-            yield from _elements(name, part)
+        for each, part in zip(target.elts, value.elts, strict=True):
+            if isinstance(each, ast.Name) and each.id.isupper():
+                yield from _elements(each.id, part)
     elif "range(" in ast.unparse(value):
-        yield from ((name, None, number, "a label") for number, name in enumerate(names))
+        names = [each.id for each in target.elts if isinstance(each, ast.Name)]
+        yield from ((name, None, number, "a label") for number, name in enumerate(names) if name.isupper())
 
 
 def _fields(tree: ast.Module) -> Iterator[tuple[str, float]]:

@@ -19,6 +19,7 @@ import click
 import numpy as np
 
 from benchmarks.crossing_count import crossing_count
+from benchmarks.judge_shot import groups_of
 from benchmarks.rows import say
 from benchmarks.temporal import detail_of
 from physgraph_usd.lab.samples import write_sample
@@ -173,14 +174,6 @@ def jumps(details: np.ndarray) -> int:
     if len(details) < 3:
         return 0
     return int((np.linalg.norm(np.diff(details, 2, axis=0), axis=2) > JUMP).sum())
-
-
-def groups_of(telemetry: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """What is told of each group of garments, once: those that are solved together share their levels.
-
-    Groups taken over from the frame before have none, and are left out.
-    """
-    return list({id(entry["levels"]): entry for entry in telemetry if "levels" in entry}.values())
 
 
 def _row(name: str, sums: Sums) -> str:

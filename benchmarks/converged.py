@@ -34,12 +34,10 @@ from typing import Any
 import click
 import numpy as np
 
-from benchmarks.contact_shots import SAMPLES as TOUCHING
-from benchmarks.judge_shot import Job
+from benchmarks.judge_shot import RIPPLES, Job
 from benchmarks.rows import say, table
 from benchmarks.verdicts import Band
-from benchmarks.versions import HERE, RIPPLES, Task, run_all
-from physgraph_usd.lab.samples import SAMPLES, write_sample
+from benchmarks.versions import HERE, Row, Task, chosen, job_of, names_of, run_all
 from physgraph_usd.solver.seen import folding, normal_angles
 
 CONVERGED = {"steps": 200, "tolerance": 1.2e-4, "frame_limit": 3600.0}
@@ -52,6 +50,7 @@ PHYSICS = 1
 are then made anew."""
 REST_STEPS = 1000
 """Most steps of a frame to its own rest; most end before by the tolerance. See `judge_shot.REST_STEPS`."""
+COAT = "../real/21_open_coat_skinned.usdc"
 FRAMES = 5
 """Frames of samples that are not among the default shots."""
 
@@ -75,35 +74,14 @@ SCALE = {"warm": 1e-3, "rest_before": 1e3, "rest_after": 1e3}
 """Factors from the figures' units to the table's."""
 
 
-@dataclass(frozen=True)
-class Row:
-    """A shot to judge.
-
-    Attributes:
-        name: Name in the table.
-        source: Name of the sample, or path of the real shot from the folder.
-        first: Number of the first frame.
-        count: Number of frames.
-        garments: Prim paths of the garments of a real shot.
-        bodies: Prim paths of the bodies of a real shot.
-    """
-
-    name: str
-    source: str
-    first: int = 0
-    count: int = 10
-    garments: Sequence[str] = ()
-    bodies: Sequence[str] = ()
-
-
 SHOTS = (
-    Row("dancer", "dancer"),
-    Row("skirt", "skirt"),
-    Row("sleeve", "sleeve"),
+    Row("dancer", "dancer", count=10),
+    Row("skirt", "skirt", count=10),
+    Row("sleeve", "sleeve", count=10),
     Row("layers", "layers", count=5),
     Row("block", "block", first=8, count=6),
-    Row("10", "10_style3d_skirt_twist.usdc", 19, 10, ("/shot/skirt",), ("/shot/avatar",)),
-    Row("coat", "../real/21_open_coat_skinned.usdc", 9, 7, ("/shot/hero/geo/coat",), ("/shot/hero/geo/body",)),
+    Row("10", "10_style3d_skirt_twist.usdc", first=19, count=10),
+    Row("coat", COAT, first=9, count=7, prims=(("/shot/hero/geo/coat",), ("/shot/hero/geo/body",))),
 )
 """Shots that are judged by default. The sheet over a block stands for a poncho, which hangs over a body as it does."""
 
@@ -191,26 +169,12 @@ def main(
         place = Path(temporary)
         kept = place / "kept" if keep is None else keep.resolve()
         kept.mkdir(parents=True, exist_ok=True)
-        tasks = tasks_of(trees, chosen(names, folder), Asked(**asked), place=place, folder=folder)
+        tasks = tasks_of(trees, chosen(names, folder, SHOTS, count=FRAMES), Asked(**asked), place=place, folder=folder)
         runs = run_tasks(tasks, kept, place=place, jobs=jobs, limit=limit)
     text = result_table(runs)
     say(text)
     if out is not None:
         out.write_text(text + "\n", "utf-8")
-
-
-def chosen(names: Sequence[str], folder: Path | None) -> list[Row]:
-    """The shots to judge. Missing samples and shots are named and left out."""
-    others = [Row(name, name, TOUCHING.get(name, 0), FRAMES) for name in SAMPLES]
-    by_name = {row.name: row for row in (*others, *SHOTS)}
-    rows = []
-    for name in names or [row.name for row in SHOTS if folder is not None or not row.garments]:
-        row = by_name.get(name)
-        if row is None or (row.garments and (folder is None or not (folder / row.source).exists())):
-            click.echo(f"{name} is left out: there is no such sample or real shot", err=True)
-        else:
-            rows.append(row)
-    return rows
 
 
 def tasks_of(
@@ -225,30 +189,19 @@ def tasks_of(
         place: Folder for samples.
         folder: Folder of the real shots.
     """
-    names = [tree.name if trees[k:].count(tree) == 1 else f"{tree.name} ({k})" for k, tree in enumerate(trees)]
     tasks = []
     for row in rows:
-        job = replace(job_of(row, place, folder), level=asked.level, device=asked.device)
-        job = replace(job, count=asked.frames or row.count)
+        job = replace(job_of(row, place, folder, 0), count=asked.frames or row.count)
+        job = replace(job, level=asked.level, device=asked.device)
         rest = {"rest": job.count - job.count // 2 if asked.rest else 0, "rest_steps": asked.rest_steps}
         for seed, ripple in enumerate(RIPPLES, 1) if asked.ripples else [(0, 0.0)]:
             own = replace(job, ripple=ripple, seed=seed)
             for name, integrator in zip(CONVERGED_NAMES, INTEGRATORS, strict=True) if asked.whole else ():
                 solve = CONVERGED | {"integrator": integrator}
                 tasks.append(Task(row.name, name, HERE, "", replace(own, solve=solve)))
-            tasks += [Task(row.name, name, t, "", replace(own, **rest)) for name, t in zip(names, trees, strict=True)]
+            pairs = zip(names_of(trees), trees, strict=True)
+            tasks += [Task(row.name, name, tree, "", replace(own, **rest)) for name, tree in pairs]
     return tasks
-
-
-def job_of(row: Row, place: Path, folder: Path | None) -> Job:
-    """The run of a shot with the default settings; samples are written into a folder, once."""
-    if row.garments:
-        shot = ((folder or Path()) / row.source).resolve()
-        return Job(str(shot), row.garments, row.bodies, first=row.first, count=row.count)
-    file = place / f"{row.source}.usdc"
-    if not file.exists():
-        write_sample(row.source, place)
-    return Job(str(file), first=row.first, count=row.count)
 
 
 def key_of(job: Job) -> str:

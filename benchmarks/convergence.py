@@ -13,29 +13,24 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
 import torch
 
-from physgraph_usd.lab.chart.reference import Reference
-from physgraph_usd.lab.methods import METHODS
 from physgraph_usd.lab.methods.first_order import Adam, GradientDescent
 from physgraph_usd.lab.methods.lbfgs import Lbfgs
 from physgraph_usd.lab.train.patches import PatchConfig, make_patches
 from physgraph_usd.shot.solve import prepare_device
-from physgraph_usd.solver.frame.group import Group
-from physgraph_usd.solver.frame.settings import SolveSettings
-from physgraph_usd.solver.integrate.base import Integrator, System
+from physgraph_usd.solver.integrate.base import Integrator
 from physgraph_usd.solver.integrate.descend import solve_level
 from physgraph_usd.solver.integrate.quasi_newton import QuasiNewton
 from physgraph_usd.solver.integrate.stop import Budget
 from physgraph_usd.solver.integrate.weights import NETWORKS, integrator_of, load_network
-from physgraph_usd.solver.level import refine_garments
 
 from .rows import Row, commit, say
-from .unseen import reference_of
+from .unseen import Case, plain_group, reference_of
 
 STEPS = 30
 PAPER_STEPS = 5
@@ -63,33 +58,21 @@ def main(arguments: Sequence[str] | None = None) -> None:
     prepare_device(given.device)
     say(TEXT.format(commit=commit()))
     for number, patch in enumerate(trained_like(given.device)):
-        say(f"\npatch {number}: {patch.words}, {patch.group.levels[-1].vertex_count} vertices, {patch.reference}")
+        say(f"\npatch {number}: {patch.name}, {patch.group.levels[-1].vertex_count} vertices, {patch.reference}")
         lines = curves(patch, given.weights, given.physgraph, device=given.device)
         show_table(lines)
         if given.out and number == 0:
             draw(lines, given.out)
 
 
-@dataclass(frozen=True, eq=False)
-class Problem:
-    """A cloth in one pose: levels, a system each, recentred cage [m], and the least energy known."""
-
-    words: str
-    group: Group
-    systems: list[System]
-    coarse: torch.Tensor
-    reference: Reference
-
-
-def trained_like(device: str, config: PatchConfig = CONFIG) -> Iterator[Problem]:
+def trained_like(device: str, config: PatchConfig = CONFIG) -> Iterator[Case]:
     """Patches like those that the paper's network was trained on, of another seed."""
     for patch in make_patches(config, seed=SEED):
-        garment = patch.garment
-        chains, settings = refine_garments([garment], [garment.level]), SolveSettings(METHODS["quasi-newton"])
-        group = Group.of([garment], chains, patch.gravity, settings, dtype=torch.float32, device=device)
+        garment, at = patch.garment, {"level": patch.garment.level, "device": device}
+        group = plain_group(garment, patch.gravity, torch.float32, **at)
         systems, coarse = group.systems([patch.frame])
-        known = reference_of(garment, patch.gravity, patch.frame, level=garment.level, device=device)
-        yield Problem(patch.words, group, systems, coarse, known)
+        known = reference_of(garment, patch.gravity, patch.frame, **at)
+        yield Case(patch.words, group, patch.frame, systems, coarse, known)
 
 
 def rows(short: bool) -> list[Row]:
@@ -108,7 +91,7 @@ def overtaken(lines: dict[str, list[float]]) -> list[tuple[str, int]]:
     return [(name, k) for name in others for k in range(1, PAPER_STEPS + 1) if not ours[k] < lines[name][k]]
 
 
-def curves(patch: Problem, paper: Path, own: Path, *, device: str) -> dict[str, list[float]]:
+def curves(patch: Case, paper: Path, own: Path, *, device: str) -> dict[str, list[float]]:
     """Gap against steps for every method, by its name."""
     found = {f"Adam {rate:g}": flat(patch, Adam(rate)) for rate in ADAM_RATES}
     found |= best("Adam", {rate: flat(patch, Adam(rate)) for rate in (*ADAM_RATES, *ADAM_SWEEP)})
@@ -133,7 +116,7 @@ def best(name: str, runs: dict[float, list[float]]) -> dict[str, list[float]]:
     return {f"{name}, best of {len(runs)} ({rate:g})": runs[rate]}
 
 
-def flat(patch: Problem, integrator: Integrator) -> list[float]:
+def flat(patch: Case, integrator: Integrator) -> list[float]:
     """Gap after each force evaluation at the finest level, from the upsampled cage; line searches count in full."""
     system, x = patch.systems[-1], patch.group.levels[-1].base.apply(patch.coarse)
     carry = integrator.start(system, x)
@@ -146,7 +129,7 @@ def flat(patch: Problem, integrator: Integrator) -> list[float]:
     return gaps
 
 
-def nested(patch: Problem, integrator: Integrator) -> list[float]:
+def nested(patch: Case, integrator: Integrator) -> list[float]:
     """The same through the levels, n steps at each, the evaluations at all levels counted."""
     gaps = [1.0] + [math.nan] * STEPS
     for each in range(1, STEPS // len(patch.systems) + 1):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import statistics
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -10,12 +9,10 @@ from typing import Any
 
 from benchmarks.constants import ROUND_CONTACT, Number, counts
 from benchmarks.rows import commit, table
-from benchmarks.verdicts import BETTER, EQUAL, WORSE, Values
+from benchmarks.verdicts import BETTER, EQUAL, WORSE, Values, compare, noise_of_means, pooled_deviation
 
 BASE_RIPPLES = 9
 """Ripples of the unchanged solver, more than of variants: every comparison uses their mean."""
-ERRORS, LEAST = 3.0, 0.01
-"""Standard errors, and relative difference, beyond which a difference counts."""
 SHOWN = {
     "energy": "energy",
     "crossings": "crossings",
@@ -68,11 +65,8 @@ def noise_of(runs: Sequence[Sequence[Values]], base: Sequence[Values]) -> dict[s
     noise = {}
     for name in SHOWN:
         own = _known(base, name)
-        groups = [own, *(_known(each, name) for each in runs)]
-        variances = sorted(statistics.variance(each) for each in groups if len(each) > 1)
-        kept = variances[: max(1, len(variances) - len(variances) // 10)]
         least = max(1.0, abs(statistics.fmean(own))) if name in COUNTS and own else 0.0
-        noise[name] = math.sqrt(max(least, statistics.fmean(kept) if kept else 0.0))
+        noise[name] = pooled_deviation([own, *(_known(each, name) for each in runs)], least)
     return noise
 
 
@@ -90,10 +84,7 @@ def change_of(name: str, runs: Sequence[Values], base: Sequence[Values], noise: 
     mean = statistics.fmean(before)
     difference = statistics.fmean(now) - mean
     relative = difference if name in COUNTS else difference / abs(mean) if mean else 0.0
-    error = noise * math.sqrt(1.0 / len(now) + 1.0 / len(before))
-    if abs(difference) <= max(ERRORS * error, LEAST * abs(mean)):
-        return Change(relative, EQUAL)
-    return Change(relative, BETTER if difference < 0 else WORSE)
+    return Change(relative, compare(mean, statistics.fmean(now), noise_of_means(noise, len(now), len(before))))
 
 
 class Effects:

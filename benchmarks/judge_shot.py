@@ -34,6 +34,8 @@ from physgraph_usd.shot.solve import ShotSolver, open_for
 from physgraph_usd.solver.frame import solve as frame_solve
 from physgraph_usd.solver.mesh.subdivide import smooth, subdivide_times
 
+RIPPLES = (0.15, 0.20, 0.25)
+"""Sizes of the ripples of a shot that is judged [% of the mean edge]: well below what a user can see."""
 STILL = 0.01
 """A cage stands where it moves less than this between two samples, in mean cage edges."""
 SHARP, SMOOTH = 60.0, 30.0

@@ -7,11 +7,9 @@
 
 Numbers of contact, collide, frame and integrate (`benchmarks.constants`) are halved and doubled, one at a time, in a
 running process; whole numbers stay 1 or more. Every variant refines some frames of each scene with three ripples, and
-its means are compared with those of nine ripples of the solver as it is. The noise of a figure in a scene is the
-standard deviation over ripples, pooled over all variants without the tenth that varies most; counts vary at least as
-counts of chance do. A difference is said where it exceeds three standard errors and 1%: one comparison in 370 does by
-chance. A variant whose first ripple gives equal figures to the bit has no effect in the scene, and its other ripples
-are left out.
+its means are compared with those of nine ripples of the solver as it is, beyond the noise that `benchmarks.verdicts`
+pools over all variants; counts vary at least as counts of chance do. A variant whose first ripple gives equal figures
+to the bit has no effect in the scene, and its other ripples are left out.
 With `--json` an interrupted command goes on.
 
 Scenes are a few frames at level 1: a coat over a shirt whose cages cross, a dancer, trims sewn on a garment, cloth
@@ -40,10 +38,9 @@ from pxr import Usd, UsdGeom, Vt
 from benchmarks.constants import Number, changed, numbers_in
 from benchmarks.effects import BASE_RIPPLES, TIMES, counted, key_of, page
 from benchmarks.frame_path import text_of_path
-from benchmarks.judge_shot import Job, judged, layer_over, offsets, rippled
+from benchmarks.judge_shot import RIPPLES, Job, judged, layer_over, offsets, rippled
 from benchmarks.rows import code_of, say
 from benchmarks.verdicts import Values
-from benchmarks.versions import RIPPLES
 from physgraph_usd.errors import PhysGraphError
 from physgraph_usd.lab.samples import SAMPLES, write_sample
 from physgraph_usd.usd.read.reader import open_shot

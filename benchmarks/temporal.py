@@ -12,6 +12,7 @@ import sys
 import tempfile
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import reduce
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +23,6 @@ from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.solve import prepare_device
 from physgraph_usd.solver.frame.refiner import Refiner
-from physgraph_usd.solver.mesh.subdivide import Refinement
 from physgraph_usd.solver.scene import Frame
 from physgraph_usd.usd.read.reader import Shot, open_shot
 
@@ -85,16 +85,12 @@ def measure(shot: Shot, temporal: str, stiffness: float) -> tuple[float, float]:
 
 def detail_of(refiner: Refiner, frame: Frame, points: Sequence[np.ndarray | None]) -> np.ndarray:
     """Fine positions off the upsampled cages [m], shape (vertices, 3); nan for a garment that has none."""
-    smooth = [upsampled(chain, each.points) for chain, each in zip(refiner.refinements, frame.garments, strict=True)]
+    smooth = [
+        reduce(lambda x, step: step.linear @ x, chain, each.points)
+        for chain, each in zip(refiner.refinements, frame.garments, strict=True)
+    ]
     parts = zip(points, smooth, strict=True)
     return np.concatenate([np.full_like(base, np.nan) if own is None else own - base for own, base in parts])
-
-
-def upsampled(chain: Sequence[Refinement], points: np.ndarray) -> np.ndarray:
-    """The cage placed linearly at the finest vertices [m]."""
-    for refinement in chain:
-        points = refinement.linear @ points
-    return points
 
 
 def mean_fine_edge(refiner: Refiner, index: int) -> float:

@@ -1,10 +1,14 @@
 """Whether one version's figures differ from another's by more than their noise.
 
-A shot is refined several times by each version, every time with another ripple (`benchmarks.judge_shot`). The noise of
-a figure is its spread over the ripples: half the range. One version is better or worse than another where the means
-differ by more than the sum of both spreads and by more than 1%; else they are equal within the noise. Of three values
-each from one normal distribution, one comparison in eleven passes that test by chance: a single verdict says
-little, and many of one sign, or one that a second run repeats, say much. For all figures less is better.
+A shot is refined several times by each version, every time with another ripple (`benchmarks.judge_shot`). What figures
+of one version differ by between ripples is noise. One version is better or worse than another where the means differ by
+more than the noise of their difference and by more than 1% (`compare`); else they are equal within the noise. For all
+figures less is better.
+
+The noise of a difference is the sum of both spreads, half the ranges over the ripples. Of three values each from one
+normal distribution, one comparison in eleven passes that test by chance: a single verdict says little, and many of one
+sign, or one that a second run repeats, say much. Where many variants of one version share a scene, their variances are
+pooled, and the noise is `ERRORS` standard errors (`noise_of_means`): one comparison in 370 passes by chance.
 """
 
 from __future__ import annotations
@@ -19,6 +23,8 @@ from benchmarks.rows import table
 
 LEAST = 0.01
 """Least relative difference that counts."""
+ERRORS = 3.0
+"""Standard errors that are noise, where variances are pooled."""
 BETTER, WORSE, EQUAL, UNKNOWN = "better", "worse", "equal", "-"
 
 
@@ -90,10 +96,31 @@ def verdict(before: Band | None, after: Band | None) -> str:
     """Whether a figure is better, worse or equal within the noise; "-" if a version has no such figure."""
     if before is None or after is None:
         return UNKNOWN
-    difference = after.mean - before.mean
-    if abs(difference) <= max(before.spread + after.spread, LEAST * abs(before.mean)):
+    return compare(before.mean, after.mean, before.spread + after.spread)
+
+
+def compare(before: float, after: float, noise: float) -> str:
+    """Whether a mean is better, worse or equal within the noise of their difference."""
+    if abs(after - before) <= max(noise, LEAST * abs(before)):
         return EQUAL
-    return BETTER if difference < 0 else WORSE
+    return BETTER if after < before else WORSE
+
+
+def pooled_deviation(groups: Sequence[Sequence[float]], least: float = 0.0) -> float:
+    """Standard deviation of a figure over ripples, pooled over variants without the tenth that varies most.
+
+    Args:
+        groups: Values of each variant.
+        least: Least variance.
+    """
+    variances = sorted(statistics.variance(each) for each in groups if len(each) > 1)
+    kept = variances[: max(1, len(variances) - len(variances) // 10)]
+    return math.sqrt(max(least, statistics.fmean(kept) if kept else 0.0))
+
+
+def noise_of_means(deviation: float, *counts: int) -> float:
+    """Noise of the difference of two means of so many values each."""
+    return ERRORS * deviation * math.sqrt(sum(1.0 / count for count in counts))
 
 
 def ratio(before: Band | None, after: Band | None) -> float | None:

@@ -2,7 +2,6 @@
 
     python -m benchmarks.versions OTHER... [--folder SHOTS] [--jobs 16] [--json FIGURES.json] [--out TABLE.md]
     python -m benchmarks.versions --from-json FIGURES.json      print again what was measured
-    python -m benchmarks.versions --cores                       this version on several cores, and by several processes
     python -m benchmarks.versions --device cpu --device cuda    this version on a core beside a card
 
 Each OTHER is a checkout of another version. Every shot is refined by each version with three ripples: invisible
@@ -40,16 +39,13 @@ import click
 from benchmarks import judge_shot
 from benchmarks.contact_shots import REAL
 from benchmarks.contact_shots import SAMPLES as TOUCHING
-from benchmarks.cores import compare
-from benchmarks.judge_shot import Job
+from benchmarks.judge_shot import RIPPLES, Job
 from benchmarks.rows import code_of, say
 from benchmarks.verdicts import Band, bands, overall, shot_table
 from physgraph_usd.lab import samples
 from physgraph_usd.lab.samples import SAMPLES, write_sample
 
 HERE = Path(__file__).resolve().parents[1]
-RIPPLES = (0.15, 0.20, 0.25)
-"""Displacements of the cage's vertices [% of the mean edge]: well below what a user can see."""
 REST_FRAMES = 2
 """Last frames of each run that are solved on to their own rest. A frame takes as long as some 30 default frames."""
 
@@ -63,16 +59,25 @@ class Row:
         source: Name of the sample, or path of the real shot below the folder.
         first: Number of the first frame.
         busy: Number of the first frame when only some frames are refined, where cloth touches.
+        count: Number of frames, where a judge has a number of its own; 0 for all.
         level: Subdivisions.
         seconds: Rough time of one run [s], to start long runs first.
+        prims: Prim paths of garments and of bodies of a real shot that `benchmarks.contact_shots` has not.
     """
 
     name: str
     source: str
     first: int = 0
     busy: int = 0
+    count: int = 0
     level: int = 2
     seconds: float = 60.0
+    prims: tuple[Sequence[str], Sequence[str]] = ((), ())
+
+    @property
+    def is_real(self) -> bool:
+        """Whether it is a real shot, and no sample."""
+        return self.source in REAL or bool(self.prims[0])
 
 
 SHOTS = (
@@ -133,27 +138,22 @@ class Task:
 @click.option("--json", "file", type=click.Path(path_type=Path), help="Keep raw figures here, and go on from them.")
 @click.option("--from-json", "made", type=click.Path(exists=True, path_type=Path), help="Print such a file only.")
 @click.option("--out", type=click.Path(path_type=Path), help="Write the tables here too.")
-@click.option("--cores", is_flag=True, help="This version alone, samples on several cores, instead.")
 def main(
     others: Sequence[Path],
     names: Sequence[str],
     *,
     made: Path | None,
     out: Path | None,
-    cores: bool,
     level: int | None,
     **options: Any,
 ) -> None:
     """Judge this version beside others."""
-    if cores:
-        compare(names or ("dancer", "skirt"), turns=1, level=2 if level is None else level)
-        return
     if made is not None:
         runs = json.loads(made.read_text("utf-8"))["runs"]
     elif others or len(options["devices"]) > 1:
         runs = measured([*(other.resolve() for other in others), HERE], names, level=level, **options)
     else:
-        raise click.UsageError("name a checkout of another version, two devices, --cores or --from-json")
+        raise click.UsageError("name a checkout of another version, two devices or --from-json")
     text = tables(runs)
     say(text)
     if out is not None:
@@ -177,7 +177,7 @@ def measured(
     count = jobs or (len(cores) if list(devices) == ["cpu"] else 1)
     with tempfile.TemporaryDirectory() as place:
         rows = [replace(row, level=row.level if level is None else level) for row in chosen(names, folder)]
-        found = [job_of(row, Path(place), folder, frames) for row in rows]
+        found = [replace(job_of(row, Path(place), folder, frames), rest=REST_FRAMES) for row in rows]
         tasks = [
             task for device in devices for task in tasks_of(trees, rows, [replace(j, device=device) for j in found])
         ]
@@ -202,11 +202,18 @@ def _note(line: str) -> None:
     click.echo(line, err=True)
 
 
-def chosen(names: Sequence[str], folder: Path | None) -> list[Row]:
-    """The shots to judge. Missing samples and shots are named and left out."""
-    other = [Row(name, name, busy=TOUCHING.get(name, 0)) for name in SAMPLES]
-    by_name = {row.name: row for row in (*other, *SHOTS)}
-    asked = names or [row.name for row in SHOTS if folder is not None or row.source not in REAL]
+def chosen(names: Sequence[str], folder: Path | None, shots: Sequence[Row] = SHOTS, *, count: int = 0) -> list[Row]:
+    """The shots to judge. Missing samples and shots are named and left out.
+
+    Args:
+        names: Names of the shots, or of other samples; empty for all shots that are there.
+        folder: Folder of the real shots.
+        shots: The judge's shots.
+        count: Number of frames of other samples, from where cloth touches; 0 for all.
+    """
+    other = [Row(name, name, first=TOUCHING.get(name, 0) if count else 0, count=count) for name in SAMPLES]
+    by_name = {row.name: row for row in (*other, *shots)}
+    asked = names or [row.name for row in shots if folder is not None or not row.is_real]
     rows = []
     for name in asked:
         row = by_name.get(name)
@@ -218,9 +225,7 @@ def chosen(names: Sequence[str], folder: Path | None) -> list[Row]:
 
 
 def _is_there(row: Row, folder: Path | None) -> bool:
-    if row.source in REAL:
-        return folder is not None and (folder / row.source).exists()
-    return row.source in SAMPLES
+    return row.source in SAMPLES or (row.is_real and folder is not None and (folder / row.source).exists())
 
 
 def _first_contact(row: Row) -> int:
@@ -231,21 +236,18 @@ def _first_contact(row: Row) -> int:
 def job_of(row: Row, place: Path, folder: Path | None, frames: int) -> Job:
     """The run of a shot without ripple; samples are written into a folder, once."""
     first = row.busy if frames else row.first
-    if row.source in REAL:
-        garments, bodies, _ = REAL[row.source]
+    if row.is_real:
+        garments, bodies = REAL[row.source][:2] if row.source in REAL else row.prims
         shot = (folder or Path()) / row.source
-        return Job(str(shot.resolve()), garments, bodies, first=first, count=frames, level=row.level, rest=REST_FRAMES)
+        return Job(str(shot.resolve()), garments, bodies, first=first, count=frames, level=row.level)
     file = place / f"{row.source}.usdc"
     if not file.exists():
         write_sample(row.source, place)
-    return Job(str(file), first=first, count=frames, level=row.level, rest=REST_FRAMES)
+    return Job(str(file), first=first, count=frames, level=row.level)
 
 
 def tasks_of(trees: Sequence[Path], rows: Sequence[Row], jobs: Sequence[Job]) -> list[Task]:
     """All runs in starting order: long shots first, all versions of a shot side by side."""
-    names = [
-        f"{tree.name} ({k})" if tree.name in [t.name for t in trees[:k]] else tree.name for k, tree in enumerate(trees)
-    ]
     shared = code_of(Path(samples.__file__).parent) + code_of(Path(judge_shot.__file__))
     codes = [code_of(tree / "physgraph_usd") + shared for tree in trees]
     pairs = sorted(zip(rows, jobs, strict=True), key=lambda pair: -pair[0].seconds)
@@ -253,8 +255,14 @@ def tasks_of(trees: Sequence[Path], rows: Sequence[Row], jobs: Sequence[Job]) ->
         Task(row.name, name, tree, code, replace(job, ripple=ripple, seed=seed))
         for row, job in pairs
         for seed, ripple in enumerate(RIPPLES, 1)
-        for name, tree, code in zip(names, trees, codes, strict=True)
+        for name, tree, code in zip(names_of(trees), trees, codes, strict=True)
     ]
+
+
+def names_of(trees: Sequence[Path]) -> list[str]:
+    """Names of the folders of checkouts, numbered where a name is there already."""
+    names = [tree.name for tree in trees]
+    return [f"{name} ({k})" if name in names[:k] else name for k, name in enumerate(names)]
 
 
 def identity(run: Mapping[str, Any]) -> str:

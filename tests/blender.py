@@ -1,7 +1,5 @@
 """Marks of tests that run in a process of Blender's own Python, and the add-on's modules that need none."""
 
-from __future__ import annotations
-
 import os
 import sys
 from importlib import import_module

@@ -4,8 +4,6 @@
 JSON file with the list of steps, which are the functions below with their arguments. Writes `seen.json` and `seen.npz`.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import sys

@@ -1,11 +1,10 @@
 """Small bodies for contact tests, and distances to them by another library."""
 
-from __future__ import annotations
-
 import igl
 import numpy as np
 import torch
 import trimesh
+from meshes import quads_of
 
 from physgraph_usd.solver.colliders.mesh import MeshBody, MeshSurface
 from physgraph_usd.solver.colliders.pose import Pose
@@ -31,20 +30,19 @@ def tube(radius: float = 0.1, length: float = 0.4, *, around: int = 32, rows: in
     a = 2 * np.pi * np.arange(around) / around
     z = np.linspace(-0.5 * length, 0.5 * length, rows)
     points = np.array([[radius * np.cos(t), radius * np.sin(t), h] for h in z for t in a])
-    ids = np.arange(rows * around).reshape(rows, around)
-    here, there = ids, np.roll(ids, -1, axis=1)
-    quads = np.stack([here[:-1], there[:-1], there[1:], here[1:]], axis=-1).reshape(-1, 4)
-    return points, np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]]).astype(np.int32)
+    return points, halved(quads_of(around, rows, closed=True))
+
+
+def halved(quads: np.ndarray) -> np.ndarray:
+    """Each quad cut into two triangles, shape (2 F, 3)."""
+    return np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]]).astype(np.int32)
 
 
 def pane(size: float = 1.0, cells: int = 4) -> BodyMesh:
     """An open level square at height zero whose front is up."""
     ticks = np.linspace(-0.5 * size, 0.5 * size, cells + 1)
     z, x = np.meshgrid(ticks, ticks)
-    ids = np.arange(x.size).reshape(cells + 1, cells + 1)
-    a, b, c, d = (part.ravel() for part in (ids[:-1, :-1], ids[:-1, 1:], ids[1:, 1:], ids[1:, :-1]))
-    faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]).astype(np.int32)
-    return np.stack([x.ravel(), np.zeros(x.size), z.ravel()], axis=1), faces
+    return np.stack([x.ravel(), np.zeros(x.size), z.ravel()], axis=1), halved(quads_of(cells + 1, cells + 1))
 
 
 def together(*bodies: BodyMesh) -> BodyMesh:

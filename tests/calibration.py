@@ -4,8 +4,6 @@ Run ``python tests/calibration.py benchmarks/results/calibration.md`` in an envi
 it takes about half a minute on two cores.
 """
 
-from __future__ import annotations
-
 import sys
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,13 +1,12 @@
 """What all tests share: fixed seeds, the folder of real assets, and sample shots."""
 
-from __future__ import annotations
-
 import os
 import random
 import signal
 import threading
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 # Tests run side by side, each on one core, and so do the commands that they start. numpy reads this as it is imported.
 os.environ["OPENBLAS_NUM_THREADS"] = "1"
@@ -19,6 +18,9 @@ from hypothesis import settings
 from shapes import check_shapes
 
 from physgraph_usd.solver.mesh.kernels import start_warp
+
+if TYPE_CHECKING:
+    from pxr import Usd
 
 ROOT = Path(__file__).resolve().parents[1]
 SEED = 20
@@ -71,6 +73,14 @@ def sample(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
         return written[name]
 
     return write
+
+
+@pytest.fixture
+def stage(tmp_path: Path) -> "Usd.Stage":
+    """A stage in metres with a root transform ``/World``, in a file of its own."""
+    from stages import new_stage
+
+    return new_stage(tmp_path / "s.usda")
 
 
 @pytest.fixture

@@ -1,7 +1,5 @@
 """Energies and forces of terms, and finite differences of energies."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

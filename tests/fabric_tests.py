@@ -9,8 +9,6 @@ the shadow's share of the ring between them. A disc comes to rest in several num
 a few percent: it is started in some, and as in a laboratory the mean counts.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Stand-ins for what runs in processes of its own, in a module that a worker process imports fast."""
 
-from __future__ import annotations
-
 import os
 import signal
 from collections.abc import Iterator, Sequence

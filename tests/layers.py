@@ -1,7 +1,5 @@
 """Small shots for the tests of written layers, and a refinement of them that needs no solver."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

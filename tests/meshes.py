@@ -1,7 +1,5 @@
 """Small meshes and hypothesis strategies that the mesh tests share."""
 
-from __future__ import annotations
-
 import numpy as np
 from hypothesis import strategies as st
 
@@ -29,6 +27,19 @@ def grid(columns: int, rows: int, cells: str = "quads") -> tuple[PolygonMesh, np
             faces += [[a, b, c, d]] if whole else [[a, b, c], [a, c, d]]
     x, y = np.meshgrid(np.arange(columns + 1.0), np.arange(rows + 1.0))
     return mesh_of(faces), np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], axis=1)
+
+
+def quads_of(across: int, rows: int, *, closed: bool = False, turned: bool = False) -> np.ndarray:
+    """Quads between rows of vertices that are numbered row by row, shape (F, 4).
+
+    A quad begins at a vertex, goes on to the next of its row and then to the row after; ``turned`` to the row first.
+    ``closed`` rows end at their first vertex.
+    """
+    ids = np.arange(across * rows).reshape(rows, across)
+    last = slice(None if closed else -1)
+    following = np.roll(ids, -1, axis=1)[:, last]
+    quads = np.stack([ids[:-1, last], following[:-1], following[1:], ids[1:, last]], axis=-1).reshape(-1, 4)
+    return quads[:, [0, 3, 2, 1]] if turned else quads
 
 
 def cube() -> tuple[PolygonMesh, np.ndarray]:

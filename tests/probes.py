@@ -5,8 +5,6 @@ stiffness matrix C from the energies: so C is what the sheet shows to an experim
 The bending probe does the same with the three uniform curvatures. The strips are solved to rest.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 

@@ -3,8 +3,6 @@
 A refined scene is solved once in a process and must not be changed.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
@@ -17,7 +15,7 @@ import trimesh
 from bodies import BodyMesh, ball, together, tube
 from cloth import DOWN, Answer, Solver, settings_of
 from folds import EDGE, Cloth, folded, frame_with, named, square, strip
-from meshes import mesh_of
+from meshes import mesh_of, quads_of
 
 from physgraph_usd.solver.colliders.pose import Collider
 from physgraph_usd.solver.frame.refiner import Refiner
@@ -90,12 +88,8 @@ def sleeve(around: int = 12, rows: int = 8, *, edge: float = 0.03) -> Cloth:
     angle = 2 * np.pi * np.arange(around) / around
     ring = 0.06 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
     points = np.concatenate([ring + np.array([0.0, 0.0, edge * (row - 0.5 * rows)]) for row in range(rows + 1)])
-    faces = []
-    for row in range(rows):
-        for column in range(around):
-            a, b = row * around + column, row * around + (column + 1) % around
-            faces += [[a, b, b + around], [a, b + around, a + around]]
-    return mesh_of(faces), points
+    quads = quads_of(around, rows + 1, closed=True)
+    return mesh_of(quads[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3).tolist()), points
 
 
 def in_tube() -> Shot:

@@ -5,8 +5,6 @@ functions are wrapped after the import, where a kernel is an object of Warp's an
 keeps its promise depends on types and shapes alone, so that each combination of them is checked once.
 """
 
-from __future__ import annotations
-
 import inspect
 import sys
 from collections.abc import Callable, Hashable, Iterator, Mapping

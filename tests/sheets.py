@@ -1,7 +1,5 @@
 """Flat sheets of several mesh kinds, and single levels built from them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any

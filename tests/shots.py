@@ -1,7 +1,5 @@
 """Small shots to refine end to end, and what can be read back from the layers."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from collections.abc import Sequence

@@ -7,8 +7,6 @@ Prints a line a signal and fails where a run goes on for longer than `MOST_SECON
 that is more, or ends with another code than a shell's for the signal.
 """
 
-from __future__ import annotations
-
 import argparse
 import signal
 import subprocess

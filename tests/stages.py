@@ -1,7 +1,5 @@
 """Small parametric stages for tests: one sheet of cloth that waves, under every convention that shots come in."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from functools import cache
 from importlib import import_module
@@ -10,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from meshes import quads_of
 from numpy.typing import ArrayLike
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdSkel, Vt
 
@@ -52,8 +51,7 @@ def sheet_points(time: float | None = None, size: tuple[int, int] = SIZE) -> np.
 
 def sheet_faces(kind: str = "quads", size: tuple[int, int] = SIZE) -> tuple[np.ndarray, np.ndarray]:
     """Counts and indices that cover the sheet with one of ``KINDS``; faces turn counterclockwise about +z."""
-    ids = np.arange((size[0] + 1) * (size[1] + 1)).reshape(size[1] + 1, size[0] + 1)
-    quads = np.stack([ids[:-1, :-1], ids[:-1, 1:], ids[1:, 1:], ids[1:, :-1]], axis=-1).reshape(-1, 4).tolist()
+    quads = quads_of(size[0] + 1, size[1] + 1).tolist()
     if kind == "triangles":
         faces = [part for a, b, c, d in quads for part in ([a, b, c], [a, c, d])]
     elif kind == "mixed":

@@ -1,13 +1,12 @@
 """Air: wind and a difference in pressure push cloth off its animation, as far as its guide lets them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from cloth import frame_of, refiner_of, sheet
+from meshes import quads_of
 from pxr import Usd, UsdGeom
 from sheets import garment_of
 from stages import add_mesh, new_stage, save, vec3
@@ -75,11 +74,8 @@ def ball(path: Path, *, up: str = "Y", orientation: str = "rightHanded") -> str:
     longitude, latitude = np.meshgrid(2.0 * np.pi * np.arange(16) / 16, np.pi * np.arange(1, 8) / 8)
     ring = np.stack([np.sin(latitude) * np.cos(longitude), np.cos(latitude), np.sin(latitude) * np.sin(longitude)], -1)
     points = 0.2 * np.concatenate([ring.reshape(-1, 3), [[0.0, 1.0, 0.0], [0.0, -1.0, 0.0]]])
-    ids = np.arange(112).reshape(7, 16)
-    right = np.roll(ids, -1, axis=1)
-    quads = np.stack([ids[:-1], right[:-1], right[1:], ids[1:]], axis=-1).reshape(-1, 4)
-    caps = [[112, right[0, k], ids[0, k]] for k in range(16)] + [[113, ids[-1, k], right[-1, k]] for k in range(16)]
-    faces = [*quads.tolist(), *caps]
+    caps = [[112, (k + 1) % 16, k] for k in range(16)] + [[113, 96 + k, 96 + (k + 1) % 16] for k in range(16)]
+    faces = [*quads_of(16, 7, closed=True).tolist(), *caps]
     if orientation == "leftHanded":
         faces = [face[::-1] for face in faces]
     mesh = add_mesh(stage, "/World/ball", points, faces)

@@ -1,7 +1,5 @@
 """Alembic by way of Blender: a refined garment out, and a cage in, as docs/handoff.md and the first tutorial say."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Several shots at once: what is left, what goes on, what fails, and one summary of it all."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Refined layers in Blender, and what Blender exports as a shot: both in a process of Blender's own Python."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import os

@@ -1,7 +1,5 @@
 """The add-on in Blender's own Python: what a press of its button brings, and what it says when it cannot."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

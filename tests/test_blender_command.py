@@ -1,7 +1,5 @@
 """The part of Blender's add-on that needs no Blender: its manifest, its command lines, the processes it runs."""
 
-from __future__ import annotations
-
 import sys
 import tomllib
 from pathlib import Path

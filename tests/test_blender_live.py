@@ -1,7 +1,5 @@
 """The part of the add-on's live cloth that needs no Blender: the process that stays, and what it is asked."""
 
-from __future__ import annotations
-
 import json
 import signal
 import sys

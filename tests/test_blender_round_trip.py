@@ -1,7 +1,5 @@
 """A stage through Blender's import, edit and export keeps what it says of cloth."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

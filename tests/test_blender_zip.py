@@ -1,7 +1,5 @@
 """The add-on's zip: Blender installs the file by itself, and says what to do where the solver is missing."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Colliders read from stages: every kind of prim, unit, transform and animation, and which garment feels which."""
 
-from __future__ import annotations
-
 import contextlib
 from pathlib import Path
 

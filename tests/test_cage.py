@@ -1,7 +1,5 @@
 """Topology and points: what no solver could use is refused by name, what can be left out or repaired is told."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The chart: gaps against a reference, times, resuming, and the files that come of it."""
 
-from __future__ import annotations
-
 import csv
 import json
 import math

@@ -1,7 +1,5 @@
 """The console command: what is printed where, which code it leaves with, and that the installed one starts."""
 
-from __future__ import annotations
-
 import json
 import os
 import pickle

@@ -1,7 +1,5 @@
 """The close picture of a place shows that place: the camera turns, and what hides it everywhere is left out."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The rules of size and habit that no linter has; each rule is one function from source to complaints."""
 
-from __future__ import annotations
-
 import ast
 import re
 import tokenize

@@ -1,7 +1,5 @@
 """The side on which cloth belongs, where an artist says so: winding, start, front, back."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import igl

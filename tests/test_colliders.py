@@ -1,7 +1,5 @@
 """Distances, sides and orientation of collider surfaces, against libigl and closed forms."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

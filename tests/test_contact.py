@@ -1,7 +1,5 @@
 """Contact: sheets that rest on bodies."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Samples that are about contact: their cages do not cross, stay out of their bodies, and can be refined."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path

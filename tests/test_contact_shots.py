@@ -1,7 +1,5 @@
 """Samples and real shots with their bodies: nothing left inside, no more crossings than in the input."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

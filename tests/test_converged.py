@@ -1,7 +1,5 @@
 """The judge of rest: a cheap row, kept runs, and what identifies them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -98,4 +96,4 @@ def test_runs_beside_a_converged_run(tmp_path: Path):
 
 
 def test_default_shots_are_samples_or_real():
-    assert all(row.garments or row.source in SAMPLES for row in converged.SHOTS)
+    assert all(row.is_real or row.source in SAMPLES for row in converged.SHOTS)

@@ -1,7 +1,5 @@
 """Edges that pass through faces: every one of them, against numpy and the IPC toolkit, which share no code with it."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The deformable-body proposal of UsdPhysics: moduli on the material, thickness on the mesh, in stage units."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

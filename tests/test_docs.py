@@ -1,7 +1,5 @@
 """The pages: the site builds without a warning, and every block of code runs or says why not."""
 
-from __future__ import annotations
-
 import json
 import re
 import shlex

@@ -1,7 +1,5 @@
 """Without what a machine may lack the same cloth comes out: cholespy (Linux on ARM), POSIX, the extras but usd."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

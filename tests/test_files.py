@@ -1,7 +1,5 @@
 """What a shot is made of is never written, no link is followed, and nothing goes that was not asked for."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 from collections.abc import Callable
@@ -142,18 +140,17 @@ def test_no_result_of_a_batch_is_an_input_of_any_of_its_shots(tmp_path: Path, wo
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("name", ["clip.1.usda", "deep.usda"])
-def test_tag_writes_none_of_them(shot: Path, name: str) -> None:
-    before = contents(shot.parent)
-    result = run("tag", shot, "-o", shot.parent / name, "--garment", "/World/cloth", "--overwrite")
-    assert (result.exit_code, "part of the shot" in result.stderr) == (2, True), result.stderr
-    assert contents(shot.parent) == before
+TAG = ("--garment", "/World/cloth", "--overwrite")
 
 
-def test_preview_draws_over_no_texture(shot: Path) -> None:
+@pytest.mark.parametrize(
+    ("command", "name", "more"),
+    [("tag", "clip.1.usda", TAG), ("tag", "deep.usda", TAG), ("preview", "cloth.png", ())],
+)
+def test_nor_do_tag_and_preview(shot: Path, command: str, name: str, more: tuple[str, ...]) -> None:
     pytest.importorskip("PIL")
     before = contents(shot.parent)
-    result = run("preview", shot, "-o", shot.parent / "cloth.png")
+    result = run(command, shot, "-o", shot.parent / name, *more)
     assert (result.exit_code, "part of the shot" in result.stderr) == (2, True), result.stderr
     assert contents(shot.parent) == before
 

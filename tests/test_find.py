@@ -1,7 +1,5 @@
 """Garments and colliders are found; a survey of a stage never raises on a mesh."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

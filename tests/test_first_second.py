@@ -1,7 +1,5 @@
 """A command loads its libraries late: names, files and folders are checked before, and only a solve takes torch."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The laws that every force keeps; `stability/test_forces_gradients.py` holds them to their energies."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """Kernels made from one formula: that CUDA compiles them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """A frame as a user sees it, of eight scenes: what it may not do, whoever solves it and however."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import pairwise
 

@@ -1,7 +1,5 @@
 """How far frames end from rest, in degrees of the surface: what `inspect --time` says."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A mutant of each kind in this process, and the fuzzer's machinery: `python -m tests.fuzz` runs thousands."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

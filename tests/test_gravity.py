@@ -1,7 +1,5 @@
 """Which way is down: as the stage says, as it was asked for, or as garments author it; and a stage that is wrong."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -87,8 +85,7 @@ def test_garments_author_one_gravity_and_options_go_before(tmp_path: Path):
 
 
 @pytest.mark.parametrize(("values", "message"), [(("down",), "must be one of X, Y"), (("-Y", "-Z"), "has one gravity")])
-def test_gravity_that_is_none_or_two_is_refused(tmp_path: Path, values: tuple[str, ...], message: str):
-    stage = new_stage(tmp_path / "s.usda")
+def test_gravity_that_is_none_or_two_is_refused(stage: Usd.Stage, values: tuple[str, ...], message: str):
     for index, value in enumerate(values):
         mesh = add_mesh(stage, f"/World/cloth{index}", np.eye(3), [[0, 1, 2]])
         author(mesh.GetPrim(), "physgraph:gravity", value, kind="token")

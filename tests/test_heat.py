@@ -1,7 +1,5 @@
 """Heat maps: what is measured, what is written, and that nothing changes in a layer without them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

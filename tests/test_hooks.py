@@ -1,7 +1,5 @@
 """The hooks of `plugins/`: each by its host's own library where there is one, else by a stage in place of the host."""
 
-from __future__ import annotations
-
 import importlib
 import json
 import runpy

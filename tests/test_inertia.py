@@ -1,7 +1,5 @@
 """Inertia: cloth feels the acceleration of its cage beyond gravity, and in slow shots none."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from cloth import frame_of, group_of, refiner_of, sheet
+from meshes import quads_of
 from pxr import Usd, UsdGeom
 from sheets import garment_of
 from stages import add_mesh, author, new_stage, save, vec3
@@ -179,15 +178,12 @@ def spinning(path: Path, turns: float, **authored: float) -> str:
     stage = new_stage(path)
     columns, rows = 24, 4
     angle, height = np.meshgrid(2.0 * np.pi * np.arange(columns) / columns, 0.1 * np.arange(rows))
-    ids = np.arange(columns * rows).reshape(rows, columns)
-    ring = [ids[:-1], np.roll(ids, -1, axis=1)[:-1], np.roll(ids, -1, axis=1)[1:], ids[1:]]
-    faces = np.stack(ring, axis=-1).reshape(-1, 4)
 
     def placed(turn: float) -> np.ndarray:
         at = angle.ravel() + turn
         return np.stack([0.3 * np.sin(at), height.ravel(), 0.3 * np.cos(at)], axis=1)
 
-    mesh = add_mesh(stage, "/World/ring", placed(0.0), faces.tolist())
+    mesh = add_mesh(stage, "/World/ring", placed(0.0), quads_of(columns, rows, closed=True))
     for time in range(1, 9):
         mesh.GetPointsAttr().Set(vec3(placed(2.0 * np.pi * turns * time / 24.0)), time)
     for name, value in authored.items():

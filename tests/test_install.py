@@ -1,7 +1,5 @@
 """README's commands that install, and the image's steps: run as they are printed, in environments that hold nothing."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -1,7 +1,5 @@
 """Integrators against mathematics: quadratics, matrices, preconditioners and reasons to stop."""
 
-from __future__ import annotations
-
 import gc
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Kills, full disks and full file systems: no partial file under the final name, and a rerun finishes (must hold 7)."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

@@ -1,7 +1,5 @@
 """The learned integrators: what holds for any weights, and that files which are not what they say are refused."""
 
-from __future__ import annotations
-
 import copy
 import json
 from collections.abc import Callable

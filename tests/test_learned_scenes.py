@@ -1,7 +1,5 @@
 """One file of weights for every scene: contact, several garments, crossed cloth, skinned input, stiffnesses, levels."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Levels: rest shapes whose parts sum to the whole, and maps between resolutions."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

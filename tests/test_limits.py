@@ -1,7 +1,5 @@
 """Max distance and backstop: cloth stays within them in every frame, in contact too, and others change no bit."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path

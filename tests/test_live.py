@@ -1,7 +1,5 @@
 """The command `live`, as another program uses it: lines of JSON in, lines of JSON out, one process that stays."""
 
-from __future__ import annotations
-
 import json
 import select
 import signal

@@ -1,7 +1,5 @@
 """Who gives a fabric value: --set, the prim, its ancestors, the bound materials, the fallback."""
 
-from __future__ import annotations
-
 import contextlib
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The steps of `make` that install: what they print, and what they ask uv and pip for, with stand-ins for both."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

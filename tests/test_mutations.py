@@ -1,7 +1,5 @@
 """The list of deliberate defects fits the present code; `python -m tests.mutations` sees that each is caught."""
 
-from __future__ import annotations
-
 import ast
 from pathlib import Path
 

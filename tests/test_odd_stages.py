@@ -3,8 +3,6 @@
 Each of these once ended the process, hung, or lost a layer that was already solved.
 """
 
-from __future__ import annotations
-
 import time
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Values of the wrong type or size, as `python -m tests.fuzz` found them: told or refused, never a traceback."""
 
-from __future__ import annotations
-
 from contextlib import closing
 from pathlib import Path
 
@@ -46,8 +44,7 @@ def retype(stage: Usd.Stage, path: str, kind: str, value: object) -> None:
         ("gravityDirection", "vector3f", Gf.Vec3f(float("nan"), 0, 0)),
     ],
 )
-def test_gravity_that_is_none_is_told_and_the_earth_s_taken(tmp_path: Path, name: str, kind: str, value: object):
-    stage = new_stage(tmp_path / "s.usda")
+def test_gravity_that_is_none_is_told_and_the_earth_s_taken(stage: Usd.Stage, name: str, kind: str, value: object):
     UsdPhysics.Scene.Define(stage, "/World/physics")
     retype(stage, f"/World/physics.physics:{name}", kind, value)
     units, notices = read_units(stage)
@@ -68,8 +65,7 @@ def test_a_mistake_in_a_text_file_is_told_in_short_and_without_names_of_code(tmp
 
 @pytest.mark.parametrize("name", ["physics:restShapePoints", "primvars:rest"])
 @pytest.mark.parametrize(("kind", "value"), [("float", 0.5), ("asset", Sdf.AssetPath("x"))])
-def test_a_rest_shape_that_is_no_array_is_refused_by_name(tmp_path: Path, name: str, kind: str, value: object):
-    stage = new_stage(tmp_path / "s.usda")
+def test_a_rest_shape_that_is_no_array_is_refused_by_name(stage: Usd.Stage, name: str, kind: str, value: object):
     add_sheet(stage, CLOTH)
     retype(stage, f"{CLOTH}.{name}", kind, value)
     with pytest.raises(GarmentError, match=f"<{CLOTH}>.*{name}.*not an array of positions"):
@@ -86,8 +82,9 @@ def test_a_rest_shape_that_is_no_array_is_refused_by_name(tmp_path: Path, name: 
         ("points", "matrix4d"),
     ],
 )
-def test_a_body_whose_points_or_faces_are_of_another_type_is_left_out_by_name(tmp_path: Path, name: str, kind: str):
-    stage = new_stage(tmp_path / "s.usda")
+def test_a_body_whose_points_or_faces_are_of_another_type_is_left_out_by_name(
+    stage: Usd.Stage, tmp_path: Path, name: str, kind: str
+):
     add_sheet(stage, CLOTH)
     add_sheet(stage, "/World/floor", tagged=False).GetPrim().AddAppliedSchema(COLLIDER_API)
     retype(stage, f"/World/floor.{name}", kind, VALUES[kind])
@@ -106,8 +103,9 @@ def test_a_body_whose_points_or_faces_are_of_another_type_is_left_out_by_name(tm
         ("axis", "token", "W"),
     ],
 )
-def test_a_body_without_a_size_or_an_axis_is_left_out_with_a_word(tmp_path: Path, name: str, kind: str, value: object):
-    stage = new_stage(tmp_path / "s.usda")
+def test_a_body_without_a_size_or_an_axis_is_left_out_with_a_word(
+    stage: Usd.Stage, name: str, kind: str, value: object
+):
     add_sheet(stage, CLOTH)
     stage.DefinePrim("/World/post", "Capsule").AddAppliedSchema(COLLIDER_API)
     retype(stage, f"/World/post.{name}", kind, value)
@@ -208,8 +206,9 @@ def test_points_of_a_skinned_mesh_that_are_no_positions_are_refused_by_type(tmp_
     ("name", "kind"),
     [("points", "float"), ("points", "string[]"), ("uVertexCount", "string"), ("vVertexCount", "int[]")],
 )
-def test_a_surface_that_is_not_read_may_have_values_of_another_type(tmp_path: Path, name: str, kind: str):
-    stage = new_stage(tmp_path / "s.usda")
+def test_a_surface_that_is_not_read_may_have_values_of_another_type(
+    stage: Usd.Stage, tmp_path: Path, name: str, kind: str
+):
     add_sheet(stage, CLOTH)
     patch = UsdGeom.NurbsPatch.Define(stage, "/World/patch")
     patch.CreatePointsAttr(vec3(sheet_points()))

@@ -3,8 +3,6 @@
 Tests of other files also expect that all of USD's validators run; 25.5.1 lists 22 whose libraries it leaves out.
 """
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Contact alone, without subdivision and wrinkles: cloth inside a body comes out, and all other cloth stays."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The OpenJobDescription template, checked and run by the reference command line: chunks, then the stitch."""
 
-from __future__ import annotations
-
 import json
 import logging
 import os

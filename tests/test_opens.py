@@ -4,8 +4,6 @@ Blender runs in the Python of PHYSGRAPH_BPY_PYTHON, three.js from the folder PHY
 Python of PHYSGRAPH_TINYUSDZ_PYTHON. Readers that are not named are skipped.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

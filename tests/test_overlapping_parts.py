@@ -1,7 +1,5 @@
 """Parts of one body that overlap: what cloth between them sees, where it stays, and that it then lies still."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """How refined garments compose over shots of many kinds."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The package as it is imported and as it is shipped."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import subprocess

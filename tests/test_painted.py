@@ -1,7 +1,5 @@
 """Painted multipliers and pins, as painters and exporters write them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Solvers outside, each in the environment that a variable names: they move, settle, and find about our shape."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

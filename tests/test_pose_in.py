@@ -1,7 +1,5 @@
 """Skinned cloth reaches its first frame from the bind pose, if it would cross itself there or `--pose-in` asks."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Pictures: what is drawn where, in which colour, and in which order."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

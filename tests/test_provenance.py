@@ -1,7 +1,5 @@
 """Where a layer comes from, the root that shows it, and variant selections, recorded and checked."""
 
-from __future__ import annotations
-
 import hashlib
 from pathlib import Path
 

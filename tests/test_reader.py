@@ -1,7 +1,5 @@
 """Reading a shot: what comes out is the stage's cloth, in metres, at the stage's own times."""
 
-from __future__ import annotations
-
 import contextlib
 from pathlib import Path
 
@@ -28,7 +26,6 @@ from stages import (
 
 from physgraph_usd.errors import GarmentError, StageError, UsageError
 from physgraph_usd.usd.read.reader import Shot, open_shot
-from physgraph_usd.usd.times import merge
 
 
 def world(shot: Shot, time: float | None, index: int = 0) -> np.ndarray:
@@ -48,8 +45,7 @@ def test_every_kind_of_face_is_read_as_authored(tmp_path: Path, kind: str) -> No
         np.testing.assert_array_equal(world(shot, time), sheet_points(time).astype(np.float64))
 
 
-def test_holes_are_left_out_and_face_order_kept(tmp_path: Path) -> None:
-    stage = new_stage(tmp_path / "s.usda")
+def test_holes_are_left_out_and_face_order_kept(stage: Usd.Stage) -> None:
     add_sheet(stage, kind="mixed").CreateHoleIndicesAttr([3, 0, 99])
     shot = open_shot(save(stage))
     counts, indices = sheet_faces("mixed")
@@ -68,8 +64,7 @@ PLACES = {"nested": NESTED, "both": [NESTED[0], MIRROR, NESTED[1]]}
 
 @pytest.mark.parametrize("place", PLACES)
 @pytest.mark.parametrize("orientation", ["rightHanded", "leftHanded"])
-def test_s6_transforms_and_handedness_equal_the_baked_cloth(tmp_path: Path, place: str, orientation: str) -> None:
-    stage = new_stage(tmp_path / "s.usda")
+def test_s6_transforms_and_handedness_equal_the_baked_cloth(stage: Usd.Stage, place: str, orientation: str) -> None:
     path, total = "/World", np.eye(4)
     for number, matrix in enumerate(PLACES[place]):
         path += f"/x{number}"
@@ -121,8 +116,7 @@ def test_a_layer_in_other_units_is_told_unless_a_scale_corrects_it(tmp_path: Pat
     assert ("asset.usda@ has 0.01 m per unit" in said(open_shot(save(stage)))) == warned
 
 
-def test_a_reset_transform_stack_ends_the_chain(tmp_path: Path) -> None:
-    stage = new_stage(tmp_path / "s.usda")
+def test_a_reset_transform_stack_ends_the_chain(stage: Usd.Stage) -> None:
     rig = UsdGeom.Xform.Define(stage, "/World/rig").GetPrim()
     set_matrix(rig, affine(np.eye(3), (5, 0, 0)), 9.0)
     UsdGeom.Xformable(add_sheet(stage, "/World/rig/cloth")).SetResetXformStack(True)
@@ -151,8 +145,7 @@ def test_variants_payloads_and_references_are_followed(tmp_path: Path) -> None:
     assert open_shot(save(stage)).scene.garments[0].path == "/World/char/cloth"
 
 
-def test_s32_inactive_and_disabled_garments_do_not_count_and_invisible_ones_do(tmp_path: Path) -> None:
-    stage = new_stage(tmp_path / "s.usda")
+def test_s32_inactive_and_disabled_garments_do_not_count_and_invisible_ones_do(stage: Usd.Stage) -> None:
     for name in ("seen", "hidden", "off", "gone"):
         add_sheet(stage, f"/World/{name}")
     UsdGeom.Imageable(stage.GetPrimAtPath("/World/hidden")).MakeInvisible()
@@ -167,8 +160,7 @@ def test_s32_inactive_and_disabled_garments_do_not_count_and_invisible_ones_do(t
         open_shot(path, garments=["/World/gone"])
 
 
-def test_s32_topology_that_varies_is_refused_with_prim_and_time(tmp_path: Path) -> None:
-    stage = new_stage(tmp_path / "s.usda")
+def test_s32_topology_that_varies_is_refused_with_prim_and_time(stage: Usd.Stage) -> None:
     indices = add_sheet(stage).GetFaceVertexIndicesAttr()
     same = sheet_faces()[1]
     for time in (1.0, 2.0):
@@ -181,8 +173,7 @@ def test_s32_topology_that_varies_is_refused_with_prim_and_time(tmp_path: Path) 
     assert open_shot(path, frames=(1.0, 2.0)).scene.times == (1.0, 2.0)
 
 
-def test_s32_a_number_of_points_that_varies_is_refused_with_prim_and_time(tmp_path: Path) -> None:
-    stage = new_stage(tmp_path / "s.usda")
+def test_s32_a_number_of_points_that_varies_is_refused_with_prim_and_time(stage: Usd.Stage) -> None:
     add_sheet(stage).GetPointsAttr().Set(vec3(sheet_points(2.0)[:-1]), 2.0)
     shot = open_shot(save(stage))
     shot.frame(1.0)
@@ -192,16 +183,14 @@ def test_s32_a_number_of_points_that_varies_is_refused_with_prim_and_time(tmp_pa
         shot.frame(2.0)
 
 
-def test_singular_matrices_are_refused_with_prim_and_time(tmp_path: Path) -> None:
-    stage = new_stage(tmp_path / "s.usda")
+def test_singular_matrices_are_refused_with_prim_and_time(stage: Usd.Stage) -> None:
     add_sheet(stage)
     set_matrix(stage.GetPrimAtPath("/World"), np.diag([1.0, 0.0, 1.0, 1.0]), None)
     with pytest.raises(GarmentError, match=r"</World/cloth> at time code 1: .* singular.*scale other than zero"):
         open_shot(save(stage))
 
 
-def test_level_comes_from_the_option_the_override_and_the_schema(tmp_path: Path) -> None:
-    stage = new_stage(tmp_path / "s.usda")
+def test_level_comes_from_the_option_the_override_and_the_schema(stage: Usd.Stage) -> None:
     author(add_sheet(stage).GetPrim(), "physgraph:refine:level", -1, kind="int")
     path = save(stage)
     assert open_shot(path).scene.garments[0].level == -1
@@ -213,8 +202,7 @@ def test_level_comes_from_the_option_the_override_and_the_schema(tmp_path: Path)
             open_shot(path, level=wrong)
 
 
-def test_values_that_change_are_read_at_each_time(tmp_path: Path) -> None:
-    stage = new_stage(tmp_path / "s.usda")
+def test_values_that_change_are_read_at_each_time(stage: Usd.Stage) -> None:
     prim = add_sheet(stage).GetPrim()
     for time, value in ((1.0, 1e-6), (3.0, 3e-6)):
         author(prim, "physgraph:material:bendStiffness", value, time=time)
@@ -226,8 +214,7 @@ def test_values_that_change_are_read_at_each_time(tmp_path: Path) -> None:
     assert shot.sources[0].animated == {"bendStiffness"}
 
 
-def test_frames_do_not_depend_on_the_order_in_which_they_are_read(tmp_path: Path) -> None:
-    stage = new_stage(tmp_path / "s.usda")
+def test_frames_do_not_depend_on_the_order_in_which_they_are_read(stage: Usd.Stage) -> None:
     points = sheet_points(2.0)
     points[7] = np.nan
     add_sheet(stage).GetPointsAttr().Set(vec3(points), 2.0)
@@ -262,8 +249,7 @@ def test_gravity_of_a_physics_scene(tmp_path: Path) -> None:
     np.testing.assert_allclose(open_shot(save(stage)).scene.gravity, [1.62, 0, 0], rtol=1e-6)
 
 
-def test_s31_times_are_the_union_of_authored_samples_and_nothing_else(tmp_path: Path) -> None:
-    stage = new_stage(tmp_path / "s.usda")
+def test_s31_times_are_the_union_of_authored_samples_and_nothing_else(stage: Usd.Stage) -> None:
     stage.SetStartTimeCode(1)
     stage.SetEndTimeCode(8)
     rig = UsdGeom.Xform.Define(stage, "/World/rig").GetPrim()
@@ -367,8 +353,7 @@ def test_s32_layer_offsets_are_composed(tmp_path: Path, offset: float, scale: fl
     np.testing.assert_allclose(world(shot, shot.scene.times[1]), sheet_points(2.0), atol=1e-6)
 
 
-def test_garments_outside_the_frame_range_are_left_out(tmp_path: Path) -> None:
-    stage = new_stage(tmp_path / "s.usda")
+def test_garments_outside_the_frame_range_are_left_out(stage: Usd.Stage) -> None:
     add_sheet(stage, "/World/early")
     add_sheet(stage, "/World/late", times=(10.0, 11.0))
     path = save(stage)
@@ -385,25 +370,8 @@ def test_a_range_that_is_none_is_refused(tmp_path: Path, frames: tuple[float, fl
         open_shot(sheet_shot(tmp_path / "s.usda"), frames=frames)
 
 
-def test_times_that_differ_by_rounding_are_one_and_the_first_given_stays() -> None:
-    assert merge([1.0, 2.0, 3.0], [1.0 + 1e-9, 2.0 - 9e-4]) == (1.0, 2.0, 3.0)
-    assert merge([1.0 + 1e-9], [1.0]) == (1.0 + 1e-9,)
-    assert merge() == merge([]) == ()
-
-
-@pytest.mark.parametrize("others", [[4.0], [3.9999], [4.0004, 5.0]])
-def test_both_sides_of_a_jump_stay(others: list[float]) -> None:
-    for sources in ([[3.0, 4.0 - 1e-9, 4.0], others], [others, [3.0, 4.0 - 1e-9, 4.0]]):
-        assert merge(*sources)[:3] == (3.0, 4.0 - 1e-9, 4.0)
-
-
-def test_sub_frames_stay_apart() -> None:
-    assert merge([1.0, 1.25], [1.002]) == (1.0, 1.002, 1.25)
-
-
-def test_samples_in_falling_order_are_those_in_rising_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_samples_in_falling_order_are_those_in_rising_order(stage: Usd.Stage, monkeypatch: pytest.MonkeyPatch) -> None:
     """As USD before 26 gives them below a layer offset of negative scale; of equal neighbours none is dropped."""
-    stage = new_stage(tmp_path / "s.usda")
     points = add_sheet(stage, times=(1.0, 5.0, 9.0)).GetPointsAttr()
     points.Set(points.Get(5.0), 9.0)
     rising = Usd.Attribute.GetTimeSamples

@@ -1,7 +1,5 @@
 """Every real shot is read as authored and refined into a valid layer, a broken one ends with a word (must hold 2)."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Work that a card records and replays: checked here on the CPU, where it is called as it is."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path

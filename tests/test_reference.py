@@ -1,7 +1,5 @@
 """Phi*: below what any method finds, the same for all who ask, and lowered where somebody finds less after all."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import replace
 from types import SimpleNamespace

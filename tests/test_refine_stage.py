@@ -1,7 +1,5 @@
 """`refine_stage`: an open stage as it stands in, a layer in memory out, and nothing else changed."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

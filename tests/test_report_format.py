@@ -1,7 +1,5 @@
 """The report's JSON: its format, its schema, and entries of one shape."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

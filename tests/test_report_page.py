@@ -1,7 +1,5 @@
 """The report as a folder: a page with pictures, plots over time and words, beside the JSON."""
 
-from __future__ import annotations
-
 import html
 import json
 import math
@@ -11,13 +9,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from meshes import quads_of
 
 pytest.importorskip("pxr", reason="shots are read with usd-core")
 
 from browser import opened
 from pxr import Gf, Usd, UsdGeom
 from shots import CLOTH, EDGE, TIMES, cloth_shot, refine
-from stages import add_mesh, author, new_stage, save
+from stages import add_mesh, author, save
 
 from physgraph_usd.shot.page.worst import close_up, seconds_as_text, verdict
 from physgraph_usd.shot.report import RefineReport
@@ -100,14 +99,12 @@ def test_the_close_picture_is_of_cloth_in_a_body(tmp_path: Path):
 
 
 @pytest.mark.parametrize("seam", [True, pytest.param(False, marks=pytest.mark.slow)])
-def test_where_nothing_is_wrong_the_close_picture_is_of_the_best_fold(tmp_path: Path, seam: bool):
+def test_where_nothing_is_wrong_the_close_picture_is_of_the_best_fold(stage: Usd.Stage, tmp_path: Path, seam: bool):
     """Two strips, one longer than its cage by ease: where it folds is the best fold, not at a crease of the cage."""
-    stage = new_stage(tmp_path / "s.usda")
     cells, edge = 12, 0.02
     x, y = np.meshgrid(np.arange(cells + 1.0), np.arange(cells + 1.0))
     flat = edge * np.stack([x, y, 0.0 * x], axis=-1).reshape(-1, 3)
-    ids = np.arange(len(flat)).reshape(cells + 1, -1)
-    quads = np.stack([ids[:-1, :-1], ids[:-1, 1:], ids[1:, 1:], ids[1:, :-1]], axis=-1).reshape(-1, 4)
+    quads = quads_of(cells + 1, cells + 1)
     creased = flat * [1.0, 1.0, 0.0] + [0.0, 0.0, 1.0] * np.abs(flat[:, :1] - edge * cells / 2)
     for name, points, ease in (("creased", creased + np.array([1.0, 0.0, 0.0]), 0.0), ("eased", flat, 5.0)):
         apart = points, quads

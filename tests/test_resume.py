@@ -1,7 +1,5 @@
 """``--resume`` where layers are there already: what the same run made is done, nothing else is replaced."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """What training sees of contact: rounds of moving scenes, stepped alone and together."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -3,8 +3,6 @@
 A trial is one pair of random sheets and one move. Many pairs make one mesh, each its own garment, far from the others.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

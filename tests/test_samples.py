@@ -1,7 +1,5 @@
 """Sample shots: valid stages, the same bytes every time, and cloth that leaves something to refine."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The table, the schema files and what USD makes of them agree, in a package of their own too."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Tests of the subdivision surface in a refined layer: scheme, creases and corners by cage, and how it is drawn."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

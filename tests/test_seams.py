@@ -1,7 +1,5 @@
 """Seams: cloth cut along a line whose sides are at one place stays one cloth."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any

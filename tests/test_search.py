@@ -4,8 +4,6 @@ Sheets, tubes and spirals follow random paths, from smooth ones to such on which
 says which parts touch, and each of these must be found.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

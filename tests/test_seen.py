@@ -1,31 +1,21 @@
 """What of a shape is seen: normals, angles between them, and the amount of folds."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
+from bodies import tube
 
 from physgraph_usd.solver.seen import folding, normal_angles, vertex_normals
 
 SQUARE = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 2.0, 0.0], [0.0, 2.0, 0.0]])
 HALVES = np.array([[0, 1, 2], [0, 2, 3]])
+TUBE = tube(0.1, 1.0, around=64, rows=2)
+"""An open tube of unit height, two triangles a side."""
 
 
 def book(angle: float, length: float = 2.0) -> tuple[np.ndarray, np.ndarray]:
     """Two triangles that meet at an edge, turned from flat by an angle [rad]."""
     points = [[0, 0, 0], [length, 0, 0], [0, 1, 0], [0, -np.cos(angle), np.sin(angle)]]
     return np.array(points), np.array([[0, 1, 2], [1, 0, 3]])
-
-
-def tube(points: int = 64, radius: float = 0.1) -> tuple[np.ndarray, np.ndarray]:
-    """An open tube of unit height, two triangles a side."""
-    around = 2.0 * np.pi * np.arange(points) / points
-    ring = np.stack([radius * np.cos(around), radius * np.sin(around), np.zeros(points)], axis=1)
-    k, following = np.arange(points), np.roll(np.arange(points), -1)
-    triangles = np.concatenate(
-        [np.stack([k, following, points + k], 1), np.stack([following, points + following, points + k], 1)]
-    )
-    return np.concatenate([ring, ring + np.array([0.0, 0.0, 1.0])]), triangles
 
 
 def test_normals_are_unit_and_zero_where_there_are_no_triangles():
@@ -35,7 +25,7 @@ def test_normals_are_unit_and_zero_where_there_are_no_triangles():
 
 
 def test_normals_of_a_tube_point_outwards():
-    points, triangles = tube()
+    points, triangles = TUBE
     assert vertex_normals(points, triangles)[:, :2] == pytest.approx(points[:, :2] / 0.1, abs=0.05)
 
 
@@ -47,7 +37,7 @@ def test_turned_cloth_is_apart_by_the_angle_of_the_turn(degrees: float):
 
 
 def test_moved_and_scaled_cloth_is_not_apart():
-    points, triangles = tube()
+    points, triangles = TUBE
     assert normal_angles(points, 3.0 * points + 7.0, triangles) == pytest.approx(0.0, abs=1e-6)
 
 
@@ -63,9 +53,9 @@ def test_folding_is_the_angle_times_the_length_of_the_fold(angle: float):
 
 def test_a_flat_sheet_has_no_folding_and_a_tube_a_full_turn_along_its_height():
     assert folding(SQUARE, HALVES) == 0.0
-    assert folding(*tube()) == pytest.approx(2.0 * np.pi, rel=1e-3)
+    assert folding(*TUBE) == pytest.approx(2.0 * np.pi, rel=1e-3)
 
 
 def test_folding_sees_single_precision_positions_as_well():
-    points, triangles = tube()
+    points, triangles = TUBE
     assert folding(points.astype(np.float32), triangles) == pytest.approx(folding(points, triangles), rel=1e-3)

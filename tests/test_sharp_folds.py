@@ -1,12 +1,11 @@
 """Fine cloth folds sharply only where its cage does, is pressed, or where something is touched."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+from meshes import quads_of
 from scipy.spatial import cKDTree
 from shots import VALID
 from stages import add_mesh, new_stage, save, vec3
@@ -68,8 +67,7 @@ def miura(fold: float) -> np.ndarray:
 def crumpled_shot(path: Path, fold: float) -> Path:
     """A sheet folded in its first frame and its default points, then flat, each frame a little higher."""
     stage = new_stage(path)
-    ids = np.arange((CELLS + 1) ** 2).reshape(CELLS + 1, -1)
-    quads = np.stack([ids[:-1, :-1], ids[1:, :-1], ids[1:, 1:], ids[:-1, 1:]], axis=-1).reshape(-1, 4)
+    quads = quads_of(CELLS + 1, CELLS + 1, turned=True)
     attribute = add_mesh(stage, CLOTH, miura(fold) + np.array([0.0, 0.0, 0.001]), quads).GetPointsAttr()
     for time in (1.0, 2.0, 3.0):
         points = miura(fold if time == 1.0 else 0.0)

@@ -1,7 +1,5 @@
 """A shell written in place of a refined sheet is closed, as thick as asked, and carries the sheet's data."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

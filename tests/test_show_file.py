@@ -1,7 +1,5 @@
 """``physgraph.toml``: a show's defaults, found above the shot, and refused where they are no options."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

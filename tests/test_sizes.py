@@ -1,11 +1,10 @@
 """Sizes: a doll's clothes keep their distance and folds, and units that cannot be a garment's are named."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
 import pytest
+from meshes import quads_of
 from pxr import UsdGeom
 from shots import fine, refine
 from stages import COLLIDER_API, add_mesh, new_stage, said, save
@@ -28,10 +27,7 @@ def coat(scale: float, gap: float = 0.0036, folds: float = 0.003) -> np.ndarray:
 def dressed(path: Path, scale: float, *, metres: float = 1.0, body: bool = True, **folds: float) -> str:
     """A coat on a body at a scale of a person's, in metres unless the stage says otherwise."""
     stage = new_stage(path, up="Z", metres=metres)
-    ids = np.arange(ROWS * AROUND).reshape(ROWS, AROUND)
-    there = np.roll(ids, -1, axis=1)
-    quads = np.stack([ids[:-1], there[:-1], there[1:], ids[1:]], axis=-1).reshape(-1, 4)
-    add_mesh(stage, COAT, coat(scale, **folds), quads)
+    add_mesh(stage, COAT, coat(scale, **folds), quads_of(AROUND, ROWS, closed=True))
     if body:
         shape = UsdGeom.Cylinder.Define(stage, "/World/body")
         shape.CreateRadiusAttr(scale * RADIUS)

@@ -1,7 +1,5 @@
 """UsdSkel skinning, baked without touching the stage: against closed forms and USD's own baselines."""
 
-from __future__ import annotations
-
 import contextlib
 from pathlib import Path
 

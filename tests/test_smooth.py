@@ -1,7 +1,5 @@
 """Linear subdivision and smooth placement: libigl, trimesh, Blender's OpenSubdiv, and values worked out by hand."""
 
-from __future__ import annotations
-
 import igl
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Opening stages: units, axes and every way in which a file or its numbers can be broken."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any
@@ -56,8 +54,7 @@ def test_an_up_axis_that_usd_does_not_know_is_told(tmp_path: Path, axis: str) ->
 
 
 @pytest.mark.parametrize("rate", [float("inf"), float("-inf"), float("nan"), 0.0])
-def test_a_rate_without_end_is_refused(tmp_path: Path, rate: float) -> None:
-    stage = new_stage(tmp_path / "s.usda")
+def test_a_rate_without_end_is_refused(stage: Usd.Stage, rate: float) -> None:
     add_skeleton(stage, "/World/rig", (1.0, 2.0))
     bind_skin(add_sheet(stage, "/World/rig/cloth", times=()), "/World/rig", joints=[0] * 20)
     stage.GetRootLayer().pseudoRoot.SetInfo("timeCodesPerSecond", rate)

@@ -1,7 +1,5 @@
 """What a stopped run left is looked at: drawn, and written as a partial layer; and the picture of a first frame."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

@@ -1,14 +1,13 @@
 """Where the rest shape comes from, when it is refused, who is told that it is not the cloth's, and the fitted one."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 from cloth import sheet
-from pxr import Sdf, UsdGeom
+from meshes import quads_of
+from pxr import Sdf, Usd, UsdGeom
 from sheets import garment_of
 from shots import fine, refine, run, sample_times
 from stages import add_mesh, add_sheet, affine, author, new_stage, save, set_matrix, sheet_points, vec3
@@ -38,10 +37,7 @@ def puffed_shot(
 ) -> str:
     """A sleeve whose default points, if any, are a plain tube and whose animation is puffed; ``odd`` scales samples."""
     stage = new_stage(path)
-    ids = np.arange(AROUND * ROWS).reshape(ROWS, AROUND)
-    across = np.roll(ids, -1, axis=1)
-    quads = np.stack([ids[:-1], ids[1:], across[1:], across[:-1]], axis=-1).reshape(-1, 4)
-    mesh = add_mesh(stage, SLEEVE, tube(1.0), quads)
+    mesh = add_mesh(stage, SLEEVE, tube(1.0), quads_of(AROUND, ROWS, closed=True, turned=True))
     if not default:
         mesh.GetPointsAttr().ClearDefault()
     for time in TIMES:
@@ -122,9 +118,8 @@ def test_a_fitted_shape_is_smooth_where_every_pose_is_folded():
     assert np.quantile(np.abs(folded), 0.95) < np.radians(10.0)  # Rims alone stay free.
 
 
-def test_a_folded_frame_as_rest_shape_is_smooth(tmp_path: Path):
+def test_a_folded_frame_as_rest_shape_is_smooth(stage: Usd.Stage):
     """A sheet folded along its middle at time code 2; its lengths there are the sheet's."""
-    stage = new_stage(tmp_path / "s.usda")
     mesh = add_sheet(stage, default=False)
     folded = np.abs(FLAT - [2.0, 0.0, 0.0]) @ [[0.5, 0.0, np.sqrt(0.75)], [0.0, 1.0, 0.0], [0.0, 0.0, 0.0]]
     folded[:, 0] *= np.sign(FLAT[:, 0] - 2.0)
@@ -161,8 +156,7 @@ def primvar(mesh: UsdGeom.Mesh, name: str, values: np.ndarray) -> UsdGeom.Primva
     return made
 
 
-def test_the_order_of_rest_shapes_from_weakest_to_strongest(tmp_path: Path) -> None:
-    stage = new_stage(tmp_path / "s.usda")
+def test_the_order_of_rest_shapes_from_weakest_to_strongest(stage: Usd.Stage) -> None:
     mesh = add_sheet(stage, default=False, times=(5.0, 6.0))
 
     def rest(**options) -> tuple[str, np.ndarray]:
@@ -201,16 +195,14 @@ def test_the_rest_shape_has_the_size_that_the_cloth_has_in_the_world(tmp_path: P
     np.testing.assert_allclose(open_shot(save(stage)).scene.garments[0].rest, expected, atol=1e-9)
 
 
-def test_s16_a_rest_shape_of_another_topology_is_refused(tmp_path: Path) -> None:
-    stage = new_stage(tmp_path / "s.usda")
+def test_s16_a_rest_shape_of_another_topology_is_refused(stage: Usd.Stage) -> None:
     primvar(add_sheet(stage), "rest", FLAT[:-1])
     with pytest.raises(GarmentError, match=r"</World/cloth>: primvars:rest has 19 values, the mesh has 20 points; "):
         open_shot(save(stage))
 
 
 @pytest.mark.parametrize("where", ["rest", "default"])
-def test_s16_a_rest_edge_without_length_is_told_with_its_indices(tmp_path: Path, where: str) -> None:
-    stage = new_stage(tmp_path / "s.usda")
+def test_s16_a_rest_edge_without_length_is_told_with_its_indices(stage: Usd.Stage, where: str) -> None:
     mesh, points = add_sheet(stage), FLAT.copy()
     points[6] = points[7]
     if where == "rest":
@@ -221,8 +213,7 @@ def test_s16_a_rest_edge_without_length_is_told_with_its_indices(tmp_path: Path,
     assert any("</World/cloth>: 1 edge has no length in" in each and "points[6] and points[7]" in each for each in said)
 
 
-def test_a_rest_shape_that_is_not_finite_is_refused_with_its_index(tmp_path: Path) -> None:
-    stage = new_stage(tmp_path / "s.usda")
+def test_a_rest_shape_that_is_not_finite_is_refused_with_its_index(stage: Usd.Stage) -> None:
     points = FLAT.copy()
     points[4, 1] = np.nan
     primvar(add_sheet(stage), "Pref", points)
@@ -230,8 +221,7 @@ def test_a_rest_shape_that_is_not_finite_is_refused_with_its_index(tmp_path: Pat
         open_shot(save(stage))
 
 
-def test_a_rest_shape_of_another_size_is_told(tmp_path: Path) -> None:
-    stage = new_stage(tmp_path / "s.usda")
+def test_a_rest_shape_of_another_size_is_told(stage: Usd.Stage) -> None:
     primvar(add_sheet(stage), "rest", 100 * FLAT)
     assert any("times as long as the animation's" in notice.message for notice in open_shot(save(stage)).warnings)
 
@@ -240,8 +230,7 @@ def test_a_rest_shape_of_another_size_is_told(tmp_path: Path) -> None:
     ("value", "bent", "renamed"),
     [("restShape", True, None), ("restShapeDefault", True, "restShape"), (None, False, None)],
 )
-def test_hinges_rest_flat_or_bent(tmp_path: Path, value: str | None, bent: bool, renamed: str | None) -> None:
-    stage = new_stage(tmp_path / "s.usda")
+def test_hinges_rest_flat_or_bent(stage: Usd.Stage, value: str | None, bent: bool, renamed: str | None) -> None:
     mesh = add_sheet(stage)
     if value:
         author(mesh.GetPrim(), "physics:restBendAnglesDefault", value, kind="token")

@@ -1,11 +1,10 @@
 """Fabrics of material subsets: their values hold on their faces, in bending, stretch and mass."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
 import pytest
+from meshes import quads_of
 from pxr import Sdf, Usd, UsdGeom
 from shots import fine, refine
 from stages import add_mesh, add_subset, author, new_stage, said, save, vec3
@@ -32,9 +31,7 @@ def grid(*, squeezed: float = 1.0, upright: bool = False) -> np.ndarray:
 def sheet(path: Path, *times: np.ndarray) -> Usd.Stage:
     """A sheet with points at time codes 1, 2 and so on."""
     stage = new_stage(path)
-    ids = np.arange((SIDE + 1) ** 2).reshape(SIDE + 1, -1)
-    quads = np.stack([ids[:-1, :-1], ids[:-1, 1:], ids[1:, 1:], ids[1:, :-1]], axis=-1).reshape(-1, 4)
-    mesh = add_mesh(stage, CLOTH, times[0], quads)
+    mesh = add_mesh(stage, CLOTH, times[0], quads_of(SIDE + 1, SIDE + 1))
     for time, points in enumerate(times):
         mesh.GetPointsAttr().Set(vec3(points), time + 1.0)
     return stage

@@ -1,7 +1,5 @@
 """Tagging a shot in a new layer."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Moves of cloth: nothing newly crosses, whatever is wanted, and what moves together goes together."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

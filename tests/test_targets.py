@@ -1,7 +1,5 @@
 """What hangs on a garment follows its refined cloth: buttons, piping, points, render meshes, and trims of trims."""
 
-from __future__ import annotations
-
 from contextlib import closing
 from pathlib import Path
 

@@ -3,8 +3,6 @@
 # Warp's kernels are typed by values that only Warp reads.
 # pyright: reportInvalidTypeForm=false, reportArgumentType=false
 
-from __future__ import annotations
-
 import errno
 import os
 from collections import defaultdict

@@ -1,7 +1,5 @@
 """Which garments are solved together; what touches nothing is as without contact; work grows with their number."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Meshes, element lists and defects, against definitions spelled out in loops and against geometry."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from meshes import cube, grid, mesh_of, prism, tetrahedron

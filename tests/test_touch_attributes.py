@@ -1,7 +1,5 @@
 """What a garment says of touching itself, other garments and colliders."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

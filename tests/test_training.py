@@ -1,7 +1,5 @@
 """Training: patches, gradients through forces, the record of a run, and going on after an interruption."""
 
-from __future__ import annotations
-
 import json
 import pickle
 from dataclasses import replace

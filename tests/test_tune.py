@@ -1,7 +1,5 @@
 """Tuning: values tried on one frame, soon or as `refine` solves it, and saved as `tag` does."""
 
-from __future__ import annotations
-
 import gc
 import shlex
 import threading

@@ -1,7 +1,5 @@
 """Controls of the page of `tune`: painting, undo, titles and the wipe, in a browser."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The tuning page is open to who has its address, and to no other page, host or user."""
 
-from __future__ import annotations
-
 import http.client
 import socket
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """The page of `tune`, driven in a browser as an artist drives it."""
 
-from __future__ import annotations
-
 import io
 import time
 from base64 import b64decode

@@ -1,7 +1,5 @@
 """The tutorials: their commands and code run in order in an empty folder, and print what the pages show."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import re

@@ -1,7 +1,5 @@
 """Meshes that cloth touches and that nothing names as colliders are named, and taken by ``auto``."""
 
-from __future__ import annotations
-
 import shlex
 from contextlib import closing
 from pathlib import Path

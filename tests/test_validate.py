@@ -1,7 +1,5 @@
 """The validator catches every fault that we know how to make, and finds none in what we write."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

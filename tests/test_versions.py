@@ -1,7 +1,5 @@
 """The judge of versions: figures of a run, and its verdicts."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +9,8 @@ pytest.importorskip("pxr", reason="the judge reads stages with usd-core")
 
 from shots import cloth_shot
 
-from benchmarks.judge_shot import Job, judged
+from benchmarks.judge_shot import RIPPLES, Job, judged
 from benchmarks.verdicts import BETTER, EQUAL, FIGURES, UNKNOWN, WORSE, Band, overall, ratio, verdict
-from benchmarks.versions import RIPPLES
 
 
 def test_a_shot_is_judged_in_every_figure_and_a_ripple_changes_it(tmp_path: Path):

@@ -1,7 +1,5 @@
 """Cloth that walks from where it was: what is apart stays apart, whatever its cage does."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Written layers, opened over their shots: points, normals, extents and velocities, primvars and subsets."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """In place of usdview, which usd-core does not bring: the base class of its plug-ins, and how it loads them."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable
 from pathlib import Path

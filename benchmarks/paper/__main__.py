@@ -17,9 +17,8 @@ import torch
 import physgraph_usd
 from benchmarks import convergence, step, temporal
 from benchmarks.paper import contact, forces, loose, materials, potentials, skinning
-from benchmarks.paper.page import Journal, Part, page, run
-from benchmarks.rows import code_of
-from physgraph_usd import __version__
+from benchmarks.paper.page import Part, page
+from benchmarks.rows import Journal, code_of
 from physgraph_usd.shot.solve import prepare_device
 
 PAGE = Path("benchmarks/results/paper.md")
@@ -51,11 +50,9 @@ def main(short: bool, out: Path, only: tuple[str, ...], fresh: bool) -> None:
     prepare_device("cpu")
     form = "short" if short else "long"
     code = code_of(Path(physgraph_usd.__file__).parent, Path(__file__).parents[1])
-    key = {"version": __version__, "form": form, "code": code}
     parts = [part for part in PARTS if not only or part.name in only]
     with torch.no_grad():
-        known = run(parts, Journal(CACHE / f"results.{form}.jsonl", key, fresh=fresh), short=short)
-    text = page(parts, known, short=short)
+        text = page(parts, Journal(CACHE / f"results.{form}.{code}.jsonl", fresh=fresh), short=short)
     if only:
         click.echo(text)
         return

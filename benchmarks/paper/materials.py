@@ -17,11 +17,12 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw
 
+from benchmarks.drawing import Thing
 from benchmarks.rows import Row
 from benchmarks.shots import frames_of, opened, problem_of
 from benchmarks.waves import lowpass, vertex_area
 from physgraph_usd.lab.chart.problem import COLD, Problem, with_garments
-from physgraph_usd.shot.page.drawing import Surface, View, draw, fit_view
+from physgraph_usd.shot.page.drawing import draw, fit_view
 from physgraph_usd.shot.page.preview import label
 from physgraph_usd.solver.fabric import PRESETS, Fabric
 from physgraph_usd.solver.frame.settings import SolveSettings
@@ -44,7 +45,6 @@ STEPS = {True: 12, False: 100}
 PICTURE = Path("docs/pictures/material_grid.png")
 PANEL, BAND = (300, 280), 40
 """A cell's size and the height of its label [pixels]."""
-COLOR = (0.30, 0.42, 0.50)
 AXES = (20.0, 8.0)
 """Camera's azimuth and elevation [degrees]."""
 
@@ -152,14 +152,10 @@ def paint(grid: list[list[Cell]], triangles: np.ndarray, out: Path) -> None:
     for row, cells in enumerate(grid):
         for column, cell in enumerate(cells):
             corner = column * PANEL[0], row * height
-            sheet.paste(Image.fromarray(drawn(cell.points, triangles, view)), (corner[0], corner[1] + BAND))
+            floor = float(cell.points[:, 1].min()) - 0.02
+            pixels = draw([Thing(cell.points, triangles).surface()], view, size=PANEL, floor=floor)
+            sheet.paste(Image.fromarray(pixels), (corner[0], corner[1] + BAND))
             title = f"stretch {cell.stretch:.3g} N/m, bending {cell.bend:.2g} N m"
             label(pen, corner, 12 * BAND, lines=["", title, f"folds of {1e3 * cell.wave:.0f} mm"])
     out.parent.mkdir(parents=True, exist_ok=True)
     sheet.quantize(96, kmeans=2, dither=Image.Dither.NONE).save(out, optimize=True)
-
-
-def drawn(points: np.ndarray, triangles: np.ndarray, view: View) -> np.ndarray:
-    """One cell's pixels."""
-    surface = Surface(points, triangles, np.tile(COLOR, (len(triangles), 1)))
-    return draw([surface], view, size=PANEL, floor=float(points[:, 1].min()) - 0.02)

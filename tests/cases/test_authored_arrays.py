@@ -1,14 +1,12 @@
 """Arrays that a mesh brings along: rest shapes per corner, numbers of points, those of other schemas, time samples."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
 import pytest
 from layers import COAT, dress_up, errors, make_shot, open_over, write_layer, write_shot
 from pxr import Sdf, Usd, UsdGeom, Vt
-from stages import add_sheet, new_stage, said, save, sheet_points, vec3
+from stages import add_sheet, said, save, sheet_points, vec3
 
 from physgraph_usd.usd.read.reader import open_shot
 
@@ -28,9 +26,8 @@ def per_corner(mesh: UsdGeom.Mesh, *, apart: float) -> None:
     ],
 )
 def test_a_rest_shape_per_corner_is_used_where_corners_of_a_point_agree(
-    tmp_path: Path, apart: float, scale: float, word: str
+    stage: Usd.Stage, apart: float, scale: float, word: str
 ):
-    stage = new_stage(tmp_path / "s.usda")
     per_corner(add_sheet(stage), apart=apart)
     shot = open_shot(save(stage))
     np.testing.assert_allclose(shot.scene.garments[0].rest, scale * sheet_points(), rtol=1e-6)
@@ -84,8 +81,7 @@ def test_a_mesh_with_a_sample_of_every_array_in_every_frame_is_refined(tmp_path:
     assert errors(write_layer(tmp_path / "s.usda", tmp_path / "fine.usdc"), tmp_path / "s.usda") == []
 
 
-def test_negative_time_codes_are_a_range_and_a_prototype_of_instances_is_refined(tmp_path: Path):
-    stage = new_stage(tmp_path / "s.usda")
+def test_negative_time_codes_are_a_range_and_a_prototype_of_instances_is_refined(stage: Usd.Stage, tmp_path: Path):
     crowd = UsdGeom.PointInstancer.Define(stage, "/World/crowd")
     add_sheet(stage, "/World/crowd/protos/coat", times=(-3.0, -2.0, -1.0, 0.0, 1.0))
     crowd.CreatePrototypesRel().SetTargets(["/World/crowd/protos/coat"])

@@ -1,14 +1,12 @@
 """Cloth rests on the bodies that a renderer shows: each kind by its right value on a small stage of its own."""
 
-from __future__ import annotations
-
 from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from meshes import mesh_of
+from meshes import mesh_of, quads_of
 from pxr import Usd, UsdGeom
 from shots import fine, refine
 from stages import COLLIDER_API, add_mesh, author, new_stage, save, vec3
@@ -30,9 +28,7 @@ def tube(radius: float, low: float, high: float, *, around: int = 16, rows: int 
     """An open tube of quads about y."""
     angle, heights = 2.0 * np.pi * np.arange(around) / around, np.linspace(low, high, rows)
     points = np.array([[radius * np.cos(a), y, radius * np.sin(a)] for y in heights for a in angle])
-    ids = np.arange(len(points)).reshape(rows, around)
-    faces = np.stack([ids[:-1], ids[1:], np.roll(ids[1:], -1, axis=1), np.roll(ids[:-1], -1, axis=1)], axis=-1)
-    return points, faces.reshape(-1, 4).tolist()
+    return points, quads_of(around, rows, closed=True, turned=True).tolist()
 
 
 def capped(radius: float, low: float, high: float) -> tuple[np.ndarray, Faces]:
@@ -45,9 +41,7 @@ def floor(height: float, size: float = 1.0, cells: int = 4) -> tuple[np.ndarray,
     """A level grid whose front is up."""
     ticks = np.linspace(-0.5 * size, 0.5 * size, cells + 1)
     points = np.array([[x, height, z] for z in ticks for x in ticks])
-    ids = np.arange(len(points)).reshape(cells + 1, cells + 1)
-    faces = np.stack([ids[:-1, :-1], ids[1:, :-1], ids[1:, 1:], ids[:-1, 1:]], axis=-1)
-    return points, faces.reshape(-1, 4).tolist()
+    return points, quads_of(cells + 1, cells + 1, turned=True).tolist()
 
 
 def spline(count: int, *, parts: int) -> np.ndarray:
@@ -78,13 +72,18 @@ def pressed(points: np.ndarray, by: float) -> np.ndarray:
     return points * np.array([1.0 - by, 1.0, 1.0 + by])
 
 
+def skirt_stage(path: Path, by: float) -> Usd.Stage:
+    """A skirt that is 4 mm off a body of `RADIUS` in its first sample, and pressed in by a fraction in its second."""
+    made = new_stage(path)
+    points, faces = tube(1.04 * RADIUS, 0.0, 0.2, around=24, rows=6)
+    add_moving(made, SKIRT, (points, faces), points, pressed(points, by))
+    return made
+
+
 @pytest.fixture
 def stage(tmp_path: Path) -> Usd.Stage:
-    """A skirt that is 4 mm off a body of `RADIUS` in its first sample and 4 mm inside it in its second."""
-    made = new_stage(tmp_path / "shot.usda")
-    points, faces = tube(1.04 * RADIUS, 0.0, 0.2, around=24, rows=6)
-    add_moving(made, SKIRT, (points, faces), points, pressed(points, 0.08))
-    return made
+    """Pressed in, the skirt is 4 mm inside a body of `RADIUS`."""
+    return skirt_stage(tmp_path / "shot.usda", 0.08)
 
 
 def felt(stage: Usd.Stage, *colliders: str, time: float = 1.0, **options) -> tuple[list[str], list[Pose | None], str]:

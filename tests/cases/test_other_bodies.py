@@ -1,7 +1,5 @@
 """Bodies that are not a mesh in its place, each by its right value on a small stage of its own."""
 
-from __future__ import annotations
-
 from contextlib import closing
 from itertools import pairwise
 from pathlib import Path
@@ -14,7 +12,7 @@ from numpy.typing import ArrayLike
 from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 from shots import fine, refine
 from stages import GARMENT_API, add_mesh, add_sheet, new_stage, said, save, vec3
-from test_bodies_as_drawn import BODY, RADIUS, SKIRT, add, add_moving, capped, floor, pressed, tube
+from test_bodies_as_drawn import BODY, RADIUS, SKIRT, add, add_moving, capped, floor, skirt_stage, tube
 
 from physgraph_usd.shot.refine import inspect_shot
 from physgraph_usd.usd.mesh.bind import closest
@@ -26,11 +24,7 @@ SMALL = 0.05
 
 @pytest.fixture
 def stage(tmp_path: Path) -> Usd.Stage:
-    """A skirt about y, 4 mm off a radius of `RADIUS`."""
-    made = new_stage(tmp_path / "shot.usda")
-    points, faces = tube(1.04 * RADIUS, 0.0, 0.2, around=24, rows=6)
-    add_moving(made, SKIRT, (points, faces), points, pressed(points, 0.02))
-    return made
+    return skirt_stage(tmp_path / "shot.usda", 0.02)
 
 
 def instancer(

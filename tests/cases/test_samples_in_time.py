@@ -1,7 +1,5 @@
 """Frames without a garment, bodies and garments whose samples do not meet, velocities where the cloth jumps."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 
@@ -74,9 +72,8 @@ class TestFramesWithoutTheGarment:
     @pytest.mark.parametrize("time", [1.0, 3.0])
     @pytest.mark.parametrize(("hide", "reason"), HIDES.items())
     def test_are_named_and_left_out(
-        self, tmp_path: Path, hide: Callable[[UsdGeom.Mesh, float], None], reason: str, time: float
+        self, stage: Usd.Stage, hide: Callable[[UsdGeom.Mesh, float], None], reason: str, time: float
     ):
-        stage = new_stage(tmp_path / "s.usda")
         hide(add_sheet(stage, times=TIMES), time)
         path, others = save(stage), tuple(each for each in TIMES if each != time)
         shot = open_shot(path)
@@ -87,16 +84,14 @@ class TestFramesWithoutTheGarment:
         alone = open_shot(path, frames=(others[0], others[0]))
         assert (alone.scene.times, "is not there" in said(alone)) == (others[:1], False)
 
-    def test_of_a_shot_without_others_are_refused(self, tmp_path: Path):
-        stage = new_stage(tmp_path / "s.usda")
+    def test_of_a_shot_without_others_are_refused(self, stage: Usd.Stage):
         add_sheet(stage, times=TIMES[:1])
         block(stage, f"{CLOTH}.points", 1.0)
         with pytest.raises(GarmentError, match="at time code 1: its points have no value; it is there at no time code"):
             open_shot(save(stage))
 
     @pytest.mark.parametrize("hidden", [(1.0, 2.0), (3.0,)])
-    def test_are_blocked_in_the_layer(self, tmp_path: Path, hidden: tuple[float, ...]):
-        stage = new_stage(tmp_path / "s.usda")
+    def test_are_blocked_in_the_layer(self, stage: Usd.Stage, tmp_path: Path, hidden: tuple[float, ...]):
         add_sheet(stage, times=TIMES)
         for time in hidden:
             block(stage, f"{CLOTH}.points", time)
@@ -137,10 +132,9 @@ class TestFramesInWhichItIsInvisible:
     @pytest.mark.parametrize("path", [CLOTH, "/World"])
     @pytest.mark.parametrize(("at", "expected"), [({0: False, 3: True}, (3.0, 4.0)), ({1: True, 3: False}, (1.0, 2.0))])
     def test_are_neither_solved_nor_warned_about(
-        self, tmp_path: Path, path: str, at: dict[float, bool], expected: tuple[float, ...]
+        self, stage: Usd.Stage, tmp_path: Path, path: str, at: dict[float, bool], expected: tuple[float, ...]
     ):
         """There its points lie piled up at one place; it fits no rest shape to them and blocks them in the layer."""
-        stage = new_stage(tmp_path / "s.usda")
         mesh = add_sheet(stage, times=TIMES, default=False)
         for time in {*TIMES} - {*expected}:
             mesh.GetPointsAttr().Set(vec3(1e-4 * sheet_points(time)), time)
@@ -153,23 +147,20 @@ class TestFramesInWhichItIsInvisible:
         assert tuple(time for time, value in values.items() if not isinstance(value, Sdf.ValueBlock)) == expected
         assert errors(tmp_path / "fine.usdc", Path(save(stage))) == []
 
-    def test_are_solved_beside_frames_that_lie_between_samples(self, tmp_path: Path):
+    def test_are_solved_beside_frames_that_lie_between_samples(self, stage: Usd.Stage):
         """Visible from 6 to 7, between samples at 1, 5, 9 and 13: the poses there are those of 5 and of 9."""
-        stage = new_stage(tmp_path / "s.usda")
         add_sheet(stage, times=(1.0, 5.0, 9.0, 13.0))
         show(UsdGeom.Imageable(stage.GetPrimAtPath(CLOTH)), at={0: False, 6: True, 8: False})
         assert open_shot(save(stage)).scene.times == (5.0, 9.0)
 
     @pytest.mark.parametrize("at", [{0: False}, {0: False, 100: True}])
-    def test_are_refined_where_no_other_is_left(self, tmp_path: Path, at: dict[float, bool]):
+    def test_are_refined_where_no_other_is_left(self, stage: Usd.Stage, at: dict[float, bool]):
         """A hidden cage that is named, as those of simulations are, and one that is shown after the shot."""
-        stage = new_stage(tmp_path / "s.usda")
         add_sheet(stage, times=TIMES)
         show(UsdGeom.Imageable(stage.GetPrimAtPath(CLOTH)), at=at)
         assert open_shot(save(stage)).scene.times == TIMES
 
-    def test_leave_it_out_of_a_range_with_a_word(self, tmp_path: Path):
-        stage = new_stage(tmp_path / "s.usda")
+    def test_leave_it_out_of_a_range_with_a_word(self, stage: Usd.Stage):
         add_sheet(stage, times=TIMES)
         add_sheet(stage, "/World/other", times=TIMES)
         show(UsdGeom.Imageable(stage.GetPrimAtPath(CLOTH)), at={0: False, 3: True})
@@ -179,8 +170,7 @@ class TestFramesInWhichItIsInvisible:
 
 class TestValuesOfAnotherTime:
     @pytest.mark.parametrize("name", ["points", "xformOp:translate", "xformOp:scale"])
-    def test_are_no_pose_of_a_body(self, tmp_path: Path, name: str):
-        stage = new_stage(tmp_path / "s.usda")
+    def test_are_no_pose_of_a_body(self, stage: Usd.Stage, name: str):
         add_sheet(stage, times=TIMES)
         body = add_sheet(stage, "/World/floor", times=TIMES, tagged=False, default=False)
         body.GetPrim().AddAppliedSchema(COLLIDER_API)
@@ -193,8 +183,7 @@ class TestValuesOfAnotherTime:
         assert [shot.frame(time).colliders[0] is None for time in TIMES] == [False, False, True, False]
         assert "</World/floor> at time code 3: this collider is left out here: " in said(shot)
 
-    def test_are_no_value_of_an_attribute(self, tmp_path: Path):
-        stage = new_stage(tmp_path / "s.usda")
+    def test_are_no_value_of_an_attribute(self, stage: Usd.Stage):
         mesh = add_sheet(stage, times=TIMES)
         for time in TIMES:
             author(mesh.GetPrim(), "physgraph:guide:stiffness", 1000.0 * time, time=time)
@@ -220,8 +209,7 @@ class TestSamplesOfBodies:
             ((0.0, 1.0, 4.0), ""),
         ],
     )
-    def test_that_miss_the_garments_are_named(self, tmp_path: Path, times: tuple[float, ...], message: str):
-        stage = new_stage(tmp_path / "s.usda")
+    def test_that_miss_the_garments_are_named(self, stage: Usd.Stage, times: tuple[float, ...], message: str):
         add_sheet(stage, times=TIMES)
         body = add_sheet(stage, "/World/floor", times=times, tagged=False)
         body.GetPrim().AddAppliedSchema(COLLIDER_API)
@@ -237,10 +225,9 @@ class TestSamplesOfBodies:
         ],
     )
     def test_a_frame_range_cuts_no_samples_off_in_words(
-        self, tmp_path: Path, frames: tuple[float, float], message: str
+        self, stage: Usd.Stage, frames: tuple[float, float], message: str
     ):
         """Whether a body stands still is asked of the frames refined, and told with all samples of the garment."""
-        stage = new_stage(tmp_path / "s.usda")
         add_sheet(stage, times=range(1, 7))
         add_sheet(stage, "/World/floor", times=range(5), tagged=False).GetPrim().AddAppliedSchema(COLLIDER_API)
         warnings = [
@@ -288,8 +275,7 @@ def velocities(layer: Path) -> dict[float, list[float] | None]:
 class TestVelocities:
     RIGHT = [12.0, 0.0, 0.0]  # noqa: RUF012
 
-    def test_are_never_taken_across_a_cut(self, tmp_path: Path):
-        stage = new_stage(tmp_path / "s.usda")
+    def test_are_never_taken_across_a_cut(self, stage: Usd.Stage, tmp_path: Path):
         mesh = moving(stage, cut=3.0)
         mesh.CreateVelocitiesAttr([self.RIGHT] * len(mesh.GetPointsAttr().Get(1.0)))
         shot, out = Path(save(stage)), tmp_path / "fine.usdc"
@@ -301,8 +287,9 @@ class TestVelocities:
         assert None not in found.values()
 
     @pytest.mark.parametrize("samples", [(None,), (2.0, 4.0)])
-    def test_of_a_frame_alone_are_the_shots_own(self, tmp_path: Path, samples: tuple[float | None, ...]):
-        stage = new_stage(tmp_path / "s.usda")
+    def test_of_a_frame_alone_are_the_shots_own(
+        self, stage: Usd.Stage, tmp_path: Path, samples: tuple[float | None, ...]
+    ):
         mesh = moving(stage)
         own = Vt.Vec3fArray([self.RIGHT] * len(mesh.GetPointsAttr().Get(1.0)))
         for time in samples:
@@ -313,8 +300,7 @@ class TestVelocities:
         refine(tmp_path / "s.usda", tmp_path / "fine.usdc", frames=(3.0, 3.0), level=1)
         assert velocities(tmp_path / "fine.usdc") == {3.0: self.RIGHT}
 
-    def test_of_a_frame_alone_are_blocked_with_a_word_where_the_shot_has_none(self, tmp_path: Path):
-        stage = new_stage(tmp_path / "s.usda")
+    def test_of_a_frame_alone_are_blocked_with_a_word_where_the_shot_has_none(self, stage: Usd.Stage, tmp_path: Path):
         mesh = moving(stage)
         mesh.CreateVelocitiesAttr().Set([self.RIGHT] * len(mesh.GetPointsAttr().Get(1.0)), 4.0)
         shot = Path(save(stage))

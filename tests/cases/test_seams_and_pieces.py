@@ -1,7 +1,5 @@
 """Seams stay closed and buttons stay buttons: each kind by its right value on a small stage of its own."""
 
-from __future__ import annotations
-
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +9,7 @@ import numpy as np
 import pytest
 from cloth import settings_of
 from layers import errors, open_over
-from meshes import mesh_of
+from meshes import mesh_of, quads_of
 from pxr import Sdf, Usd, UsdGeom, Vt
 from scipy.spatial import cKDTree
 from shots import faults, fine, refine
@@ -31,9 +29,7 @@ def panel(x: float, width: float, columns: int, *, rows: int = 8, height: float 
     """A sheet of quads in the plane of x and y, from x to the right [m]."""
     across, up = np.linspace(x, x + width, columns + 1), np.linspace(-height, 0.0, rows + 1)
     points = np.array([[a, b, 0.0] for b in up for a in across])
-    ids = np.arange(len(points)).reshape(rows + 1, columns + 1)
-    faces = np.stack([ids[:-1, :-1], ids[:-1, 1:], ids[1:, 1:], ids[1:, :-1]], axis=-1)
-    return points, faces.reshape(-1, 4).tolist()
+    return points, quads_of(columns + 1, rows + 1).tolist()
 
 
 def together(*shapes: Shape) -> Shape:
@@ -222,9 +218,7 @@ def fringe(time: float) -> Shape:
         top = np.stack([left + part * (right - left) for part in ALONG])
         swing = 0.3 * np.sin(2.0 * time + number)
         rows = [top + 0.02 * row * np.array([0.5 * swing, -1.0, swing]) for row in range(ROWS)]
-        ids = np.arange(2 * ROWS).reshape(ROWS, 2)
-        quads = np.stack([ids[:-1, 0], ids[1:, 0], ids[1:, 1], ids[:-1, 1]], axis=1)
-        shapes.append((np.concatenate(rows), quads.tolist()))
+        shapes.append((np.concatenate(rows), quads_of(2, ROWS, turned=True).tolist()))
     return together(*shapes)
 
 

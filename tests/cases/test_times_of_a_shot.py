@@ -1,7 +1,5 @@
 """Time codes at which cloth is solved: between sparse keys, at the samples of bodies, about jumps, rounded."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -105,8 +103,7 @@ class TestBetweenSparseKeys:
         points = fine(shot, out, 3.0, prim="/World/rig/cloth")
         assert np.linalg.norm(points - EDGE * np.array([3.0, 3.0, 0.7]), axis=1).min() > 0.99 * EDGE * RADIUS
 
-    def test_nothing_is_added_where_nothing_turns_or_a_key_is_a_stray_one(self, tmp_path: Path):
-        stage = new_stage(tmp_path / "s.usda")
+    def test_nothing_is_added_where_nothing_turns_or_a_key_is_a_stray_one(self, stage: Usd.Stage):
         rig = UsdGeom.Xform.Define(stage, "/World/rig").GetPrim()
         turn(rig, "rotate", {-1e6: 10.0, 1.0: 30.0, 5.0: 30.0, 7.0: 40.0})
         add_sheet(stage, "/World/rig/cloth", times=(1.5, 5.0, 5.5, 6.5))
@@ -143,16 +140,14 @@ class TestSamplesOfBodies:
         assert sample_times(out, "/World/far") == ()
         assert sample_times(refine_range(shot, tmp_path, (2.0, 3.0))) == (2.0, 2.5, 3.0)
 
-    def test_of_bodies_apart_from_the_cloth_or_with_one_sample_do_not_count(self, tmp_path: Path):
-        stage = new_stage(tmp_path / "s.usda")
+    def test_of_bodies_apart_from_the_cloth_or_with_one_sample_do_not_count(self, stage: Usd.Stage):
         cloth = flat(stage).GetPrim()
         add_ball(stage, "/World/ball", self.THROUGH)
         add_ball(stage, "/World/still", {3.0: (3.0, 3.0, -4.0)})
         cloth.CreateRelationship("physgraph:contact:exclude").SetTargets(["/World/ball"])
         assert open_shot(save(stage)).scene.times == ()
 
-    def test_that_change_their_size_count(self, tmp_path: Path):
-        stage = new_stage(tmp_path / "s.usda")
+    def test_that_change_their_size_count(self, stage: Usd.Stage):
         flat(stage)
         ball = add_ball(stage, "/World/ball", {1.0: (3.0, 3.0, -4.0)})
         for time in (2.0, 7.0):
@@ -161,8 +156,7 @@ class TestSamplesOfBodies:
 
     FINE = (1.0, 1.25, 2.0, 2.25, 3.0)
 
-    def test_that_are_not_solved_get_one_word(self, tmp_path: Path):
-        stage = new_stage(tmp_path / "s.usda")
+    def test_that_are_not_solved_get_one_word(self, stage: Usd.Stage):
         flat(stage, times=(1.0, 2.0, 3.0))
         add_ball(stage, "/World/ball", {time: (3.0, 3.0, -4.0 - time**2) for time in self.FINE})
         shot = open_shot(save(stage))
@@ -171,8 +165,7 @@ class TestSamplesOfBodies:
         assert said(shot).count(word) == 1
 
     @pytest.mark.parametrize("bend", [0.0, 0.01])
-    def test_that_are_not_solved_get_no_word_where_the_body_moves_straight(self, tmp_path: Path, bend: float):
-        stage = new_stage(tmp_path / "s.usda")
+    def test_that_are_not_solved_get_no_word_where_the_body_moves_straight(self, stage: Usd.Stage, bend: float):
         flat(stage, times=(1.0, 2.0, 3.0))
         add_ball(stage, "/World/ball", {time: (3.0, 3.0, -4.0 - time) for time in self.FINE})
         floor = add_sheet(stage, "/World/floor", times=(), tagged=False)
@@ -233,8 +226,7 @@ class TestJumps:
         assert max(depth(shot, out, time, place) for time, place in places.items()) < 0.01 * EDGE
         assert np.abs(fine(shot, out, 3.0)[:, 2]).max() < 0.2 * EDGE < np.abs(fine(shot, out, 2.9)[:, 2]).max()
 
-    def test_that_are_none_have_one_side(self, tmp_path: Path):
-        stage = new_stage(tmp_path / "s.usda")
+    def test_that_are_none_have_one_side(self, stage: Usd.Stage):
         mesh = add_sheet(stage, times=(1.0, 2.0, 3.0))
         mesh.GetPointsAttr().Set(mesh.GetPointsAttr().Get(2.0), 2.0 - 1e-8)
         assert open_shot(save(stage)).scene.times == (1.0, 2.0, 3.0)

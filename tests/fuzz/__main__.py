@@ -1,7 +1,5 @@
 """``python -m tests.fuzz``: the tests' own folder becomes importable, then the command runs."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Attributes and relationships of any prim, broken: what is authored, and what we read and nobody authored; options."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

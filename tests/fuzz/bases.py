@@ -1,7 +1,5 @@
 """The sound shots that mutants are made from: small, and between them they use all that a shot may have."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

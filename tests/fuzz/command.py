@@ -1,7 +1,5 @@
 """The command: mutants in child processes, a table of outcomes by kind, failing mutants kept in a folder."""
 
-from __future__ import annotations
-
 import sys
 import tempfile
 import time

@@ -1,7 +1,5 @@
 """What is composed into a shot: splines, levels of detail, edits of arrays, parts of skinning, twins, visibility."""
 
-from __future__ import annotations
-
 from importlib import import_module
 from typing import Any
 

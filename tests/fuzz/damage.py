@@ -1,7 +1,5 @@
 """Values that no shot should have, and how to author them where USD's own setters would refuse."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

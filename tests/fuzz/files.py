@@ -1,7 +1,5 @@
 """Files that are damaged as files: cut, flipped bits, missing pieces, words of the text exchanged."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Every kind of mutation; a mutant's number picks one in turn."""
 
-from __future__ import annotations
-
 from . import attributes, composed, files, meshes, odd, poses, records, shown, wholes
 
 KINDS = (

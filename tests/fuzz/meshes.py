@@ -1,7 +1,5 @@
 """Meshes, garments and bodies alike, whose arrays are broken."""
 
-from __future__ import annotations
-
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 

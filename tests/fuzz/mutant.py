@@ -1,7 +1,5 @@
 """One mutant: a sound shot, broken on purpose in a way that its number decides."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """What everyday shots bring now and then: glitches, points at one place, huge faces, variants, cloth of any size."""
 
-from __future__ import annotations
-
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom, Vt
 from stages import vec3

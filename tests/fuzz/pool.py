@@ -1,7 +1,5 @@
 """Child processes that try mutants one by one, with a time limit, and are started again when one dies."""
 
-from __future__ import annotations
-
 import faulthandler
 import json
 import os

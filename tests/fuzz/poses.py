@@ -1,10 +1,9 @@
 """Skinned clothes in two layers over a limb, in random poses: joints turn by up to 120 degrees about any axes."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
+from meshes import quads_of
 from pxr import Gf, Usd, UsdGeom, UsdSkel, Vt
 from stages import COLLIDER_API, author, new_stage, save, vec3
 
@@ -24,9 +23,7 @@ def tube(radius: float, start: float, end: float, rows: int) -> tuple[np.ndarray
     angle = 2.0 * np.pi * np.arange(AROUND) / AROUND
     ring = radius * np.stack([0.0 * angle, np.cos(angle), np.sin(angle)], axis=1)
     points = np.concatenate([ring + np.array([x, 0.0, 0.0]) for x in np.linspace(start, end, rows)])
-    row, column = (grid.ravel() for grid in np.mgrid[: rows - 1, :AROUND])
-    first, second = row * AROUND + column, row * AROUND + (column + 1) % AROUND
-    return points, np.stack([first, second, second + AROUND, first + AROUND], axis=1)
+    return points, quads_of(AROUND, rows, closed=True)
 
 
 def write_limb(folder: Path) -> None:

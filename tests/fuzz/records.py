@@ -1,7 +1,5 @@
 """Records that lie: what says that it is ours and is not."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from pxr import Sdf

@@ -1,7 +1,5 @@
 """What a renderer shows and when: purposes, blocked samples, gaps, holes, rates, open bodies, cuts and loose pieces."""
 
-from __future__ import annotations
-
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom, Vt
 from stages import vec3

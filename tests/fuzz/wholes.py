@@ -1,7 +1,5 @@
 """What concerns a stage as a whole, broken: units, time, arcs between files, bodies, skeletons, relationships."""
 
-from __future__ import annotations
-
 from pxr import Gf, Sdf, Usd, UsdGeom
 
 from .bases import garments_of

@@ -1,7 +1,5 @@
 """``python -m tests.mutations``."""
 
-from __future__ import annotations
-
 from .command import main
 
 if __name__ == "__main__":

@@ -1,7 +1,5 @@
 """The command: each defect is put into a copy of the repository, and its tests run there."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

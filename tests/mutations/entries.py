@@ -1,7 +1,5 @@
 """The list of defects, and how one is put into a copy of the package."""
 
-from __future__ import annotations
-
 import tomllib
 from dataclasses import dataclass
 from pathlib import Path

@@ -3,13 +3,9 @@
 A cell says whether the case passed and what was measured. Cases that no integrator decides have one figure for all.
 """
 
-from __future__ import annotations
-
 import contextlib
-import json
 import platform
 import sys
-import time
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -27,7 +23,7 @@ import warp as wp
 from report_solver import Result
 
 import physgraph_usd
-from benchmarks.rows import code_of, commit
+from benchmarks.rows import Journal, code_of, commit
 from physgraph_usd.errors import PhysGraphError
 from physgraph_usd.lab.methods import METHODS
 
@@ -106,37 +102,6 @@ CASES = (
 )
 
 
-class Cells:
-    """Measured cells in a file that grows: a run that was stopped goes on where it was."""
-
-    def __init__(self, file: Path | None) -> None:
-        """Open it; None keeps nothing."""
-        self._file = file
-        self._known: dict[str, tuple[bool, str, float]] = {}
-        if file is not None and file.exists():
-            for line in file.read_text(encoding="utf-8").splitlines(keepends=True):
-                if line.endswith("\n"):
-                    self._known |= {key: (held, text, spent) for key, held, text, spent in [json.loads(line)]}
-
-    @property
-    def seconds(self) -> float:
-        """Processor time of all that is known [s]."""
-        return sum(spent for *_, spent in self._known.values())
-
-    def get(self, number: int, column: str, measure: Callable[[], Result]) -> tuple[bool, str]:
-        """A cell, measured where it is not known."""
-        key = f"S{number} {column}"
-        if key not in self._known:
-            began = time.process_time()
-            held, text = cell(measure)
-            self._known[key] = held, text, round(time.process_time() - began, 2)
-            if self._file is not None:
-                self._file.parent.mkdir(parents=True, exist_ok=True)
-                with self._file.open("a", encoding="utf-8") as file:
-                    file.write(json.dumps([key, *self._known[key]]) + "\n")
-        return self._known[key][:2]
-
-
 def cell(measure: Callable[[], Result]) -> tuple[bool, str]:
     """Whether a measurement passed, and its cell."""
     try:
@@ -148,16 +113,20 @@ def cell(measure: Callable[[], Result]) -> tuple[bool, str]:
     return bool(result.held), f"pass {result.figure}" if result.held else f"**fail** {result.figure}"
 
 
-def row(case: Case, names: list[str], cells: Cells | None = None) -> tuple[list[bool], str]:
+def row(case: Case, names: list[str], journal: Journal) -> tuple[list[bool], str]:
     """Which cells of a case passed, and its row."""
-    head, known = f"| S{case.number} | {case.title} | {case.bound} |", cells or Cells(None)
+    head = f"| S{case.number} | {case.title} | {case.bound} |"
+
+    def known(column: str, measure: Callable[[], Result]) -> tuple[bool, str]:
+        return tuple(journal.get(f"S{case.number} {column}", partial(cell, measure)))
+
     if case.left_out:
         return [], f"{head} {case.left_out} |" + " |" * len(names)
-    found = [known.get(case.number, "all", case.once)] if case.once else []
+    found = [known("all", case.once)] if case.once else []
     once = found[0][1] if found else "n/a"
     columns = []
     if case.by_method:
-        columns = [known.get(case.number, name, partial(case.by_method, name)) for name in names]
+        columns = [known(name, partial(case.by_method, name)) for name in names]
     shown = [text for _, text in columns] or ["n/a"] * len(names)
     return [held for held, _ in found + columns], f"{head} {once} | {' | '.join(shown)} |"
 
@@ -204,9 +173,7 @@ def main(chosen: tuple[int, ...], short: bool, fresh: bool, out: Path) -> None:
     wp.config.log_level = wp.LOG_WARNING
     wp.init()
     names = [name for name in METHODS if not (short and name == SLOW)]
-    if fresh:
-        CELLS.unlink(missing_ok=True)
-    cells = Cells(None if chosen else CELLS)
+    journal = Journal(None if chosen else CELLS, fresh=fresh)
     lines = [f"| case | what | passes | all | {' | '.join(names)} |", "|---" * (4 + len(names)) + "|"]
     every: list[bool] = []
     own: list[bool] = []
@@ -214,7 +181,7 @@ def main(chosen: tuple[int, ...], short: bool, fresh: bool, out: Path) -> None:
         if chosen and case.number not in chosen:
             continue
         with contextlib.redirect_stdout(sys.stderr):
-            held, line = row(case, names, cells)
+            held, line = row(case, names, journal)
         every += held
         own += held[: bool(case.once) + bool(case.by_method)]
         lines.append(line)
@@ -225,7 +192,7 @@ def main(chosen: tuple[int, ...], short: bool, fresh: bool, out: Path) -> None:
         return
     figures = {"passed": sum(every), "measured": len(every), "own": sum(own), "all_own": len(own)}
     form, long = (" --short", f"With `{SLOW}`, without --short, it takes about {LONG_MINUTES}.") if short else ("", "")
-    words = {"form": form, "long": long, "minutes": cells.seconds / 60.0, "machine": f"{platform.machine()}, CPU"}
+    words = {"form": form, "long": long, "minutes": journal.seconds() / 60.0, "machine": f"{platform.machine()}, CPU"}
     words["commit"] = commit("tests/stability")
     out.write_text(TEXT.format(table=table, **words, **figures), encoding="utf-8")
     click.echo(out)

@@ -3,8 +3,6 @@
 Each takes a method's name. Bodies of the scenes are those of `test_contact_bodies.py` beside it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
@@ -20,7 +18,7 @@ from sheets import garment_of
 from test_contact import MESH as WIDE
 from test_contact import REST as WIDE_REST
 from test_contact import draped
-from test_contact_bodies import KINDS, STEP, STILL, bodies, jaws, needles
+from test_contact_bodies import KINDS, STEP, STILL, bodies, closing, jaws, needles
 from test_tangles import cornered, dented
 
 from physgraph_usd.solver.colliders.pose import Pose
@@ -149,7 +147,7 @@ def s21_pinched(method: str) -> Result:
     The first must be under its thickness, the second under a cage edge, the third under what one sees.
     """
     settles, farthest = 0.0, 0.0
-    restless = max(closing(method)[-8:])
+    restless = max(closing(stays=8, integrator=method)[-8:])
     for kind, kinds in KINDS.items():
         frame = frame_with([REST], *jaws(0.0005, kind))
         runs = [
@@ -161,17 +159,6 @@ def s21_pinched(method: str) -> Result:
         farthest = max(farthest, np.linalg.norm(found - base_of(SHEET[0], REST, 1), axis=1).max())
     held = settles < THICK and farthest < EDGE and restless < 2 * STILL
     return Result(bool(held), ", ".join(f"{1e3 * each:.2g} mm" for each in (settles, farthest, restless)))
-
-
-def closing(method: str) -> list[float]:
-    """Farthest move of a vertex from frame to frame [m] between boxes that close to an overlap of 5 mm and stay."""
-    gaps, kind = [*np.linspace(0.02, -0.005, 6), *[-0.005] * 8], "boxes"
-    one = refiner_with([named(SHEET)], KINDS[kind], times=tuple(range(len(gaps))), integrator=method)
-    points = [
-        one.solve(frame_with([REST + 1e-6 * time], *jaws(float(gap), kind), time=float(time))).points[0]
-        for time, gap in enumerate(gaps)
-    ]
-    return [float(np.linalg.norm(b - a, axis=1).max()) for a, b in pairwise(points)]
 
 
 def s22_swallowed(method: str) -> Result:

@@ -3,8 +3,6 @@
 Faults are crossings of cloth with cloth and with bodies, and vertices inside bodies.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """S38: Cusick's drape test."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -4,8 +4,6 @@ The bounds are those of benchmarks/results/calibration.md: 5% where the mesh can
 cannot.
 """
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

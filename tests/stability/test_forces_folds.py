@@ -1,7 +1,5 @@
 """S14: hinges folded flat and past it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """S3: needle triangles of aspect 1e4, and triangles without area: finite."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

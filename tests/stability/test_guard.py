@@ -1,7 +1,5 @@
 """S37: whatever an integrator proposes, the guard's result is not worse than the input."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from itertools import pairwise
 

@@ -1,7 +1,5 @@
 """S29, S31: teleports, gaps and odd sample times."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

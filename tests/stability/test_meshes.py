@@ -1,7 +1,5 @@
 """S1, S2, S16: meshes of almost nothing by every method, faults in compressed cloth, rest points at one place."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

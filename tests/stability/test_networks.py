@@ -1,7 +1,5 @@
 """S8 to S12 and S37 for the learned integrators, in reduced form: safety does not rest on training."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

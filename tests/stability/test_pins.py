@@ -1,7 +1,5 @@
 """S17: pinned edges and soft pins."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

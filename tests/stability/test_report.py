@@ -1,7 +1,5 @@
 """The stability report: every case has its row, and quasi-Newton passes it."""
 
-from __future__ import annotations
-
 import re
 from functools import partial
 

@@ -1,7 +1,5 @@
 """S13, S15: starts that an integrator could be stuck at or thrown by: the flat saddle, and a crumpled cage."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
