@@ -153,7 +153,7 @@ def test_a_descent_waits_once_for_several_steps(warm: bool, more: int) -> None:
             _, report = descend(system, integrator, x, level=0, budget=Budget(steps, warm=warm))
         finally:
             torch.cuda.set_sync_debug_mode("default")
-    waits = [warning for warning in caught if "synchronizing" in str(warning.message)]
+    waits = [warning for warning in caught if "called a synchronizing" in str(warning.message)]
     assert report.movers == {"physgraph": report.steps}
     assert 0 < len(waits) <= report.steps // SEEN_STEPS + more, [str(wait.message) for wait in waits]
 
