@@ -28,10 +28,10 @@ from physgraph_usd import cli
 
 solve = scene_frame.solve_soundly
 
-def broken(group, given, state):
-    if given.at == {BROKEN}:
+def broken(problem):
+    if problem.at == {BROKEN}:
         raise ValueError("a bug\\n of two lines")
-    return solve(group, given, state)
+    return solve(problem)
 
 scene_frame.solve_soundly = broken  # In worker processes too, which run this file as well.
 if __name__ == "__main__":
