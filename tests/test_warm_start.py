@@ -17,6 +17,7 @@ from shots import refine
 from physgraph_usd.lab.samples import write_sample
 from physgraph_usd.shot.options import RefineOptions
 from physgraph_usd.shot.refine import refine_shot
+from physgraph_usd.solver.collide import search
 from physgraph_usd.solver.contact.settings import ContactSettings
 from physgraph_usd.solver.frame.group import Group
 from physgraph_usd.solver.frame.problem import begin
@@ -183,6 +184,17 @@ def layers() -> tuple[Group, list[GarmentFrame], State]:
 
 def crossings(telemetry: dict[str, Any]) -> int:
     return telemetry["contact"]["cloth"]["after"]["crossings"]
+
+
+def test_a_warm_frame_searches_few_times(
+    layers: tuple[Group, list[GarmentFrame], State], monkeypatch: pytest.MonkeyPatch
+):
+    """Crossings of the cage, and near pairs with what blocks the move: what the last frame left is known to be clean."""
+    group, frames, state = layers
+    searches, search_once = [], search._search
+    monkeypatch.setattr(search, "_search", lambda *args, **options: searches.append(1) or search_once(*args, **options))
+    _, telemetry = solve_frame(begin(group, frames, state))
+    assert len(searches) <= 2 * len(telemetry["levels"])
 
 
 @pytest.mark.parametrize(("twist", "why"), [(3.0, "it kept "), (0.0, "it ended with ")])

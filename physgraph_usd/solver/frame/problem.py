@@ -170,8 +170,13 @@ class Problem:
         warm = warm if limit is None else limit.in_front(warm)
         if view is None or self.last is None:
             return warm
-        inside = self.last.inside if bool(self.last.inside.any()) else None
-        return view.carried(self.last.about(self.cage.origin)[1], warm, inside)
+        return view.carried(self.before, warm, self.last.inside if bool(self.last.inside.any()) else None)
+
+    @cached_property
+    def before(self) -> Placed:
+        """Fine positions after the last frame [m], float64; always the same tensor, by which contact knows them."""
+        assert self.last is not None
+        return self.last.about(self.cage.origin)[1]
 
     @property
     def _first_cage(self) -> Float[Tensor, "coarse 3"]:
@@ -310,9 +315,7 @@ def begin(
         if settings.temporal != "tether":  # Only the tether slows the cloth down.
             moved = np.inf
         start = start_of(last, cage, group.moving_frames, reset=settings.reset, moved=moved)
-        if contact is not None and last.clean:
-            contact.at(group.levels[-1]).remember(last.about(cage.origin)[1])
-    return Problem(
+    problem = Problem(
         began,
         group,
         frames,
@@ -326,3 +329,6 @@ def begin(
         start,
         tether=start.slowed * settings.tether / (elapsed or 1.0 / 24.0) ** 2 if settings.temporal == "tether" else None,
     )
+    if contact is not None and last is not None and last.clean:
+        contact.at(group.levels[-1]).remember(problem.before)
+    return problem
