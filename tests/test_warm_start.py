@@ -189,7 +189,7 @@ def crossings(telemetry: dict[str, Any]) -> int:
 def test_a_warm_frame_searches_few_times(
     layers: tuple[Group, list[GarmentFrame], State], monkeypatch: pytest.MonkeyPatch
 ):
-    """Crossings of the cage, and near pairs with what blocks the move: what the last frame left is known to be clean."""
+    """The cage, and the move with its near pairs: what the last frame left is known to be clean."""
     group, frames, state = layers
     searches, search_once = [], search._search
     monkeypatch.setattr(search, "_search", lambda *args, **options: searches.append(1) or search_once(*args, **options))
