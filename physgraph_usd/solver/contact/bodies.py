@@ -26,11 +26,10 @@ from ..forces.self_contact import PairConstraints
 from ..level import Level
 from ..mesh.topology import joined_by, patches_with
 from .along import ApproachLimits, along
+from .cloth_mesh import Pieces
 from .measure import is_between, pinched
 from .settings import ContactSettings
 
-SIDE_SAMPLES = 8
-"""Largest number of vertices of a piece of cloth that are tested; the majority decides the side."""
 ON_SURFACE = 1e-6
 """Distance below which the direction to the closest point is rounding, and the face's normal is taken [m]."""
 
@@ -151,13 +150,13 @@ class LevelBodies:
     """One level's view of the bodies.
 
     Attributes:
-        pieces: Piece of each vertex of the uncut cloth, shape (V,).
+        pieces: Connected pieces of the uncut cloth.
         buried: For each body, a mask of the cloth between its overlapping parts, shape (V,); None if not computed.
     """
 
     level: Level
     frame: FrameBodies
-    pieces: Int[np.ndarray, " vertices"]
+    pieces: Pieces
     buried: tuple[Bool[Tensor, " vertices"], ...] | None = None
 
     def inside(self, x: Float[Tensor, "vertices 3"], pierced: Pierced) -> Bool[Tensor, "bodies vertices"]:
@@ -174,16 +173,12 @@ class LevelBodies:
         surface, out = self.frame.touching[index].surface, torch.zeros_like(self.level.free[:, 0])
         if not np.isfinite(self.frame.touching[index].offset).any() or not (surface.has_inside or len(cut)):
             return out
-        piece = self.pieces
+        pieces = self.pieces
         if len(cut):
             uncut = np.ones(len(self.level.edges), bool)
             uncut[cut.cpu().numpy()] = False
-            piece = joined_by(self.level.edges.cpu().numpy()[uncut], self.level.vertex_count)
-        samples, owner = _spread(piece)
-        vertices = torch.as_tensor(samples, device=x.device)
-        wrong = self._behind(index, x[vertices], vertices).cpu().numpy()
-        votes = np.bincount(owner, np.where(wrong, 1.0, -1.0), int(piece.max()) + 1)
-        return torch.as_tensor(votes[piece] > 0, device=x.device) & self._feels(index)
+            pieces = Pieces(joined_by(self.level.edges.cpu().numpy()[uncut], self.level.vertex_count), x.device)
+        return pieces.most(self._behind(index, x[pieces.sampled], pieces.sampled)) & self._feels(index)
 
     def _feels(self, index: int) -> Bool[Tensor, " vertices"]:
         """Mask of the vertices of garments that do not ignore a body."""
@@ -364,16 +359,6 @@ def _meet(first: MeshSurface, second: MeshSurface) -> bool:
     """Whether the bounds of two surfaces meet."""
     a, b = first.bounds + first.origin, second.bounds + second.origin
     return bool((a[0] <= b[1]).all() and (b[0] <= a[1]).all())
-
-
-def _spread(piece: Int[np.ndarray, " vertices"]) -> tuple[np.ndarray, np.ndarray]:
-    """Up to `SIDE_SAMPLES` vertices of each piece, evenly spaced in their order, and the piece of each."""
-    order = np.argsort(piece, kind="stable")
-    size = np.bincount(piece)
-    first, step = np.cumsum(size) - size, np.maximum(size // SIDE_SAMPLES, 1)
-    rank = np.arange(len(piece)) - first[piece[order]]
-    taken = (rank % step[piece[order]] == 0) & (rank // step[piece[order]] < SIDE_SAMPLES)
-    return order[taken], piece[order[taken]]
 
 
 def _start_sides(surface: MeshSurface, cage: Float[Tensor, "coarse 3"]) -> Float[Tensor, " coarse"]:

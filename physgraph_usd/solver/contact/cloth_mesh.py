@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sp
@@ -19,6 +20,37 @@ from ..mesh.topology import adjacency, joined_by
 
 RINGS = 2
 """Rings of vertices around a crossing or a piece of cloth that count as part of it."""
+SIDE_SAMPLES = 8
+"""Largest number of vertices of a piece of cloth that are tested; the majority decides the side."""
+
+
+class Pieces:
+    """Pieces of cloth, each judged by a few of its vertices.
+
+    Attributes:
+        sampled: Up to `SIDE_SAMPLES` vertices of each piece, evenly spaced in their order, shape (S,).
+    """
+
+    def __init__(self, piece: Int[np.ndarray, " vertices"], device: torch.device | str) -> None:
+        """Choose the vertices.
+
+        Args:
+            piece: Piece of each vertex, shape (V,).
+        """
+        order, size = np.argsort(piece, kind="stable"), np.bincount(piece)
+        first, step = np.cumsum(size) - size, np.maximum(size // SIDE_SAMPLES, 1)
+        rank = np.arange(len(piece)) - first[piece[order]]
+        chosen = order[(rank % step[piece[order]] == 0) & (rank // step[piece[order]] < SIDE_SAMPLES)]
+        self._count = len(size)
+        self.sampled, self._piece, self._owner = (
+            torch.as_tensor(numbers.astype(np.int64)).to(device) for numbers in (chosen, piece, piece[chosen])
+        )
+
+    def most(self, chosen: Bool[Tensor, " sampled"]) -> Bool[Tensor, " vertices"]:
+        """Mask of the pieces of which most sampled vertices are chosen."""
+        votes = torch.zeros(self._count, dtype=torch.int32, device=chosen.device)
+        votes.index_add_(0, self._owner, 2 * chosen.int() - 1)
+        return (votes > 0)[self._piece]
 
 
 class ClothMesh:
@@ -28,7 +60,6 @@ class ClothMesh:
         edges: Ends of the edges of the cloth, then of the bodies, int64.
         parts: Table of vertex, edge and face pairs that may be in contact.
         triangles: Corners of the faces of the cloth, then of the bodies, int64.
-        pieces: Connected piece of each vertex, shape (V,).
         beside: Adjacency of the vertices, also across seams, shape (V, V).
         free: Mask of the vertices that may move, False for the bodies' corners, shape (V + B, 1).
         opposite: Vertices opposite each edge in the edge's first and last face, -1 without a face, shape (E, 2).
@@ -48,7 +79,6 @@ class ClothMesh:
         self.level, self._garments = level, len(level.spans)
         self.parts = Parts(level, meets, label, solids=solids)
         edges, triangles, sides = self.parts.surface
-        self.pieces = joined_by(cloth, count)
         self.beside = _across(adjacency(cloth, count), label)
         self._body_corners = sum(len(solid.points) for solid in solids)
         self.free = self.padded(level.free[:, 0]).unsqueeze(1)
@@ -59,6 +89,11 @@ class ClothMesh:
         self._first, self._second = (
             torch.as_tensor(vertices.astype(np.int64)).to(level.device) for vertices in self.beside.nonzero()
         )
+
+    @cached_property
+    def pieces(self) -> Pieces:
+        """Connected pieces of the cloth."""
+        return Pieces(joined_by(self.level.edges.cpu().numpy(), self.level.vertex_count), self.level.device)
 
     def padded(self, vertices: Bool[Tensor, " vertices"]) -> Bool[Tensor, " all"]:
         """A mask of vertices, with False for the bodies' corners."""
