@@ -26,7 +26,7 @@ from ..forces.self_contact import PairConstraints
 from ..level import Level
 from ..mesh.topology import joined_by, patches_with
 from .along import ApproachLimits, along
-from .cloth_mesh import Pieces
+from .cloth_mesh import ClothPieces
 from .measure import is_between, pinched
 from .settings import ContactSettings
 
@@ -156,7 +156,7 @@ class LevelBodies:
 
     level: Level
     frame: FrameBodies
-    pieces: Pieces
+    pieces: ClothPieces
     buried: tuple[Bool[Tensor, " vertices"], ...] | None = None
 
     def inside(self, x: Float[Tensor, "vertices 3"], pierced: Pierced) -> Bool[Tensor, "bodies vertices"]:
@@ -177,7 +177,7 @@ class LevelBodies:
         if len(cut):
             uncut = np.ones(len(self.level.edges), bool)
             uncut[cut.cpu().numpy()] = False
-            pieces = Pieces(joined_by(self.level.edges.cpu().numpy()[uncut], self.level.vertex_count), x.device)
+            pieces = ClothPieces(joined_by(self.level.edges.cpu().numpy()[uncut], self.level.vertex_count), x.device)
         return pieces.most(self._behind(index, x[pieces.sampled], pieces.sampled)) & self._feels(index)
 
     def _feels(self, index: int) -> Bool[Tensor, " vertices"]:

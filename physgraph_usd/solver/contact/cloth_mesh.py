@@ -24,7 +24,7 @@ SIDE_SAMPLES = 8
 """Largest number of vertices of a piece of cloth that are tested; the majority decides the side."""
 
 
-class Pieces:
+class ClothPieces:
     """Pieces of cloth, each judged by a few of its vertices.
 
     Attributes:
@@ -91,9 +91,9 @@ class ClothMesh:
         )
 
     @cached_property
-    def pieces(self) -> Pieces:
+    def pieces(self) -> ClothPieces:
         """Connected pieces of the cloth."""
-        return Pieces(joined_by(self.level.edges.cpu().numpy(), self.level.vertex_count), self.level.device)
+        return ClothPieces(joined_by(self.level.edges.cpu().numpy(), self.level.vertex_count), self.level.device)
 
     def padded(self, vertices: Bool[Tensor, " vertices"]) -> Bool[Tensor, " all"]:
         """A mask of vertices, with False for the bodies' corners."""
