@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
 # Tool: Blender 5.0.1 as the Python package bpy (USD import and export); needs Python 3.11
 #
-# Expected: a mesh whose skel:skinningMethod is dualQuaternion is skinned by dual quaternions. Blender has them: they are
-# the armature modifier's "Preserve Volume". The importer switches it on, and the exporter writes the method.
+# Expected: a mesh whose skel:skinningMethod is dualQuaternion is skinned by dual quaternions. Blender has them: they
+# are the armature modifier's "Preserve Volume". The importer switches it on, and the exporter writes the method.
 #
 # Seen: the importer leaves it off, so that the mesh is skinned linearly. With it switched on by hand the exporter
 # writes no method, which means classicLinear. No warning in either direction. A ring of radius 1, half of whose weight
@@ -13,11 +13,11 @@
 #   UsdSkel, dualQuaternion:           radius 1.000
 #   UsdSkel, exported by Blender then: radius 0.087
 #
-# Why it matters: the method is chosen for forearms and thighs that twist. They collapse like a sweet's wrapper, and cloth
-# around the limb is solved against a body that the other program does not show.
+# Why it matters: the method is chosen for forearms and thighs that twist. They collapse where they twist most, and
+# cloth around the limb is solved against a body that the other program does not show.
 #
-# Workaround: set use_deform_preserve_volume after the import and write skel:skinningMethod after the export, or exchange
-# baked points.
+# Workaround: set use_deform_preserve_volume of the armature modifiers after the import and write skel:skinningMethod
+# after the export, or exchange baked points.
 set -euo pipefail
 tmp=$(mktemp -d)
 trap 'rm -rf "$tmp"' EXIT
@@ -87,8 +87,8 @@ coat.modifiers[0].use_deform_preserve_volume = True
 seen.append(by_blender())
 bpy.ops.wm.usd_export(filepath="out.usda", export_animation=True)
 seen += [by_usd("in.usda"), by_usd("out.usda")]
-names = "Blender, after the import:", "Blender, Preserve Volume:", "UsdSkel, dualQuaternion:", "UsdSkel, exported by Blender then:"
-for name, radius in zip(names, seen):
-    print(f"{name:34} radius {radius:.3f}")
+names = ["Blender, after the import", "Blender, Preserve Volume", "UsdSkel, dualQuaternion"]
+for name, radius in zip([*names, "UsdSkel, exported by Blender then"], seen):
+    print(f"{name + ':':34} radius {radius:.3f}")
 sys.exit([round(radius, 3) for radius in seen] != [0.087, 1, 1, 0.087])
 PY

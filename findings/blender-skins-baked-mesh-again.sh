@@ -1,22 +1,22 @@
 #!/usr/bin/env bash
 # Tool: Blender 5.0.1 as the Python package bpy (USD import); needs Python 3.11
 #
-# Expected: UsdSkel.BakeSkinning writes a garment's skinned points and makes its SkelRoot an Xform. UsdSkel's page on its
-# schemas says that bindings without a SkelRoot above them have no meaning and should be ignored, and UsdSkel ignores
-# them. An importer then shows the baked points as they are.
+# Expected: UsdSkel.BakeSkinning writes a garment's skinned points and makes its SkelRoot an Xform. UsdSkel's page on
+# its schemas says that bindings without a SkelRoot above them have no meaning and should be ignored. An importer then
+# shows the baked points as they are.
 #
-# Seen: Blender reads the bindings, which the bake leaves on the mesh, and skins the skinned points once more. A point at 0
-# degrees on a joint that turns by 90:
+# Seen: Blender reads the bindings, which the bake leaves on the mesh, and skins the skinned points once more. A point
+# at 0 degrees on a joint that turns by 90:
 #
 #   Blender, before the bake: type SkelRoot, 90 degrees
 #   USD, after the bake:      type Xform, 90 degrees
 #   Blender, after the bake:  type Xform, 180 degrees
 #
-# Why it matters: baking is how a skinned garment is made safe for tools that do not skin. Blender turns every limb twice,
-# and the first frame, where the pose is often the rest pose, looks right.
+# Why it matters: baking is how a skinned garment is made safe for tools that do not skin. Blender turns every limb
+# twice, and the first frame, where the pose is often the rest pose, looks right.
 #
-# Workaround: after the bake remove SkelBindingAPI and the properties skel:* and primvars:skel:* from the meshes, or make
-# the Skeleton inactive and import with import_skeletons off.
+# Workaround: import with import_skeletons off, or after the bake remove SkelBindingAPI and the properties skel:* and
+# primvars:skel:* from the meshes.
 set -euo pipefail
 tmp=$(mktemp -d)
 trap 'rm -rf "$tmp"' EXIT

@@ -1,21 +1,20 @@
 #!/usr/bin/env bash
 # Tool: Blender 5.0.1 as the Python package bpy (USD import); needs Python 3.11
 #
-# Expected: the transform of a skinned mesh has no effect, says UsdSkel. Its points are put into the space of the
-# skeleton by skel:geomBindTransform, which is the identity where it is not set. So Blender shows a mesh without it where
-# UsdSkel does.
+# Expected: the documentation of UsdSkel says that a skinned mesh's own transform has no effect. Its points are put into
+# the space of the skeleton by skel:geomBindTransform, which is the identity where it is not set. So Blender shows a
+# mesh without it where UsdSkel does.
 #
-# Seen: where it is not set, Blender takes the mesh's own transform for it. A coat with points at x = 1 whose Xform moves
-# it by 5, on a joint that stays in its rest pose:
+# Seen: where it is not set, Blender takes the mesh's own transform for it. A coat with a point at x = 1 and a
+# translation by 5, on a joint that stays in its rest pose:
 #
 #   UsdSkel, geomBindTransform not set:      x = 1
 #   UsdSkel, geomBindTransform the identity: x = 1
 #   Blender, geomBindTransform not set:      x = 6
 #   Blender, geomBindTransform the identity: x = 1
 #
-# Why it matters: garments whose points are in the space of the skeleton need no geomBindTransform, and get an Xform when
-# someone places them. The body and the coat on it stand together in one program and apart in the other, and each looks
-# as if the file were wrong.
+# Why it matters: garments whose points are in the space of the skeleton need no geomBindTransform, and someone who
+# places them gives them a transform. Body and coat stand together in one program and apart in the other.
 #
 # Workaround: write skel:geomBindTransform on every skinned mesh, the identity too.
 set -euo pipefail

@@ -5,15 +5,15 @@
 # class takes its threshold dhat as a distance. Two sheets 0.1 apart have a minimum distance of 0.1.
 #
 # Seen: the value is the square of the distance. The documentation of point_point_distance and its sisters says so of
-# them; that of compute_minimum_distance does not. With dhat a little over the gap:
+# them; that of compute_minimum_distance does not (open since 2023 as issue 40 of ipc-toolkit). With dhat over the gap:
 #
 #   gap  0.1, dhat  0.2: minimum distance 0.01
 #   gap  1.0, dhat  2.0: minimum distance 1.0
 #   gap 10.0, dhat 20.0: minimum distance 100.0
 #
-# Why it matters: the value is printed to show that cloth keeps its thickness, and compared with dhat. In meters the
-# square of a millimeter looks like a crossing that is about to happen; in centimeters near cloth looks far apart. At
-# a gap of one unit, which is what a first test often uses, nothing is to be seen.
+# Why it matters: the value is what shows that cloth keeps its thickness. In meters a gap of a millimeter reads as a
+# micrometer; in centimeters near cloth reads as far apart. At a gap of one unit, which a first test often uses, the
+# two are equal.
 #
 # Workaround: take the square root.
 set -euo pipefail

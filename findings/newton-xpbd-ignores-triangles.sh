@@ -5,20 +5,20 @@
 # lists cloth for SolverXPBD with one limitation, that it does not collide with itself. A strip that is fixed at its
 # upper edge hangs in each solver that takes cloth.
 #
-# Seen: SolverXPBD does not read the triangles. It solves springs, which add_cloth_grid makes only with add_springs, and
-# bending of edges. Without springs all vertices but the fixed ones fall freely; no warning. A strip of 160 mm with
-# tri_ke 100, half a second after it is let go, and how far its lowest vertex hangs below the upper edge:
+# Seen: SolverXPBD does not read the triangles. It solves bending and springs, and add_cloth_grid makes springs with
+# add_springs only. Without them all vertices but the fixed ones fall freely; no warning. A strip of 160 mm with
+# tri_ke 100, half a second after it is let go, and how far its lowest vertex is below the upper edge:
 #
 #   SolverVBD:                   161 mm
 #   SolverSemiImplicit:          160 mm
 #   SolverXPBD:                 1396 mm
 #   SolverXPBD, add_springs:     164 mm
 #
-# Why it matters: solvers share one model so that they can be exchanged and compared. A cloth that is tuned by tri_ke in
-# one of them has no fabric at all in another, and where it lies on a body this shows only as very limp cloth.
+# Why it matters: solvers share one model so that they can be exchanged and compared. Cloth that is tuned by tri_ke in
+# one of them does not hold together in another.
 #
-# Workaround: build cloth for SolverXPBD with add_springs, and tune spring_ke: every edge, and the two vertices opposite
-# of every edge, get a spring; stiff ones on light vertices need short steps.
+# Workaround: build cloth for SolverXPBD with add_springs and tune spring_ke. Every edge gets a spring, and so do the
+# two vertices opposite each inner edge; stiff springs on light vertices need short steps.
 set -euo pipefail
 tmp=$(mktemp -d)
 trap 'rm -rf "$tmp"' EXIT

@@ -1,18 +1,18 @@
 #!/usr/bin/env bash
-# Library: three 0.187.0 (USDLoader), with Node.js
+# Tool: three 0.187.0 (USDLoader, under node 18 or later)
 #
 # Expected: USD says that the front of a mesh whose orientation is leftHanded lies where its points run clockwise. A
 # reader for which counterclockwise is front, as three, turns the faces around.
 #
 # Seen: USDLoader does not read orientation. The faces stay as they are: normals that it makes point to the back, and
-# normals that the file has point away from the side that is drawn. A triangle at z = 0 that faces towards -z by USD; from
-# which side a ray that looks for fronts hits it:
+# normals that the file has point away from the side that is drawn. A triangle at z = 0 that faces -z by USD, and the
+# side from which a ray that looks for fronts hits it:
 #
 #   leftHanded, no normals: normal z  1, seen from +z
 #   leftHanded, normals:    normal z -1, seen from +z
 #
-# Why it matters: leftHanded is how Houdini writes meshes. A one-sided coat vanishes and shows its lining; with the
-# file's own normals it is lit from the wrong side; and a tool that takes inside and outside from it is wrong about both.
+# Why it matters: Houdini writes leftHanded meshes. A coat shows its lining instead of its outside, with the file's own
+# normals it is lit from the wrong side, and what is inside and outside of a body is exchanged.
 #
 # Workaround: before loading, reverse the indices of each face (and of face-varying values) and write rightHanded.
 set -euo pipefail

@@ -15,8 +15,8 @@
 # Why it matters: hand-made animation and compressed motion have few keys. A body that was baked as the collider of a
 # simulation shrinks between them, and the cloth on it is pushed, torn or left in the air.
 #
-# Workaround: before the bake write the animation's translations, rotations and scales at every frame (and substep),
-# each got from the attribute at that time; BakeSkinning then writes a sample of points for each.
+# Workaround: before the bake get the rotations at every frame (and substep), and then set them there; BakeSkinning
+# writes a sample of points for each, and the lengths above are all 1.000.
 set -euo pipefail
 tmp=$(mktemp -d)
 trap 'rm -rf "$tmp"' EXIT

@@ -1,5 +1,6 @@
 #!/usr/bin/env bash
-# Library: bpy 5.0.1 (Blender: usd_import, usd_export), newton 1.8.0 (newton.usd.get_mesh) with usd-core 26.11
+# Tools: Blender 5.0.1 as the Python package bpy (USD import and export; needs Python 3.11) and newton 1.8.0
+# (newton.usd.get_mesh)
 #
 # Expected: faces that a subdivision mesh in USD lists in holeIndices are holes: they shape the surface and are not part
 # of it. A reader leaves them out, or warns, and an exporter writes them back.

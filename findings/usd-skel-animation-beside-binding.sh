@@ -5,17 +5,18 @@
 # skel:skeleton is bound, at the same prim or below. One Skeleton may then be bound twice, with two animations; the page
 # shows such a scene and counts two skeleton instances, each with its own animation.
 #
-# Seen: the animation is looked up at the Skeleton prim and its ancestors alone. Beside the binding it has no effect: the
-# garments stay in the rest pose, no warning is given, and BakeSkinning returns True. With animations that move the only
-# joint by 10 and by 20:
+# Seen: the animation is looked up at the Skeleton prim and its ancestors alone. Beside the binding it has no effect:
+# the garments stay in the rest pose, no warning is given, and BakeSkinning returns True. With animations that move the
+# only joint by 10 and by 20:
 #
 #   one Skeleton bound twice, an animation at each binding: moved by 0 and 0
 #   the same, and the first animation at the Skeleton too:  moved by 10 and 10
 #
-# Why it matters: two actors in one costume, or a garment file that brings its motion and binds to the body's Skeleton, are
-# built by this page. Other readers that follow it move the garments, so that the same stage differs between tools.
+# Why it matters: two actors in one costume, or a garment file that brings its motion and binds to the body's Skeleton,
+# are built by this page. The garments stand in the rest pose in the middle of the shot, and cloth is refined there.
 #
-# Workaround: one Skeleton prim for each animation (an instance will do), and skel:animationSource at the Skeleton or above.
+# Workaround: one Skeleton prim for each animation (an instance will do), and skel:animationSource at the Skeleton or
+# above it.
 set -euo pipefail
 tmp=$(mktemp -d)
 trap 'rm -rf "$tmp"' EXIT
