@@ -76,6 +76,14 @@ class TestFarmFolder:
             next(solve_in_chunks(counting, times, frames, workers=1, start=start, movers=None, warn=print))
         timers[-1].cancel()
 
+    def test_a_run_that_waited_for_one_that_ends_says_so(self, tmp_path: Path):
+        first = FrameFolder(tmp_path / "f", {}).__enter__()
+        ends = threading.Timer(0.3, first.__exit__, (None, None, None))
+        ends.start()
+        with pytest.raises(LayerError, match="was made by another run meanwhile; run again"):
+            FrameFolder(tmp_path / "f", {})
+        ends.join()
+
     def test_a_task_that_outlasts_its_run_writes_nothing_into_another(self, tmp_path: Path):
         with FrameFolder(tmp_path / "f", {"level": 2}) as frames:
             outlasting = pickle.loads(pickle.dumps(frames))

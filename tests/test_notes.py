@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import shlex
 from dataclasses import asdict
 from pathlib import Path
@@ -13,6 +14,7 @@ from shots import run
 from stages import add_sheet, author, new_stage, save
 
 from physgraph_usd.errors import UsageError
+from physgraph_usd.shot.findings.drawn import Shown
 from physgraph_usd.shot.findings.table import Facts, texts
 from physgraph_usd.shot.refine import inspect_shot
 from physgraph_usd.shot.report import RefineReport
@@ -120,3 +122,11 @@ def test_cloth_that_is_not_solved_is_named_with_its_frames():
     assert "</dress>, first at time code 2" in note
     report.frames = frames[:1]
     assert texts("given_up", Facts(report=report)) == []
+
+
+@pytest.mark.parametrize(("offset", "remedy"), [(0.004, "--set /Coat.contact:offset=0.004 hides it"), (math.inf, "")])
+def test_a_body_that_shows_through_has_an_offset_only_if_folds_stay(offset: float, remedy: str):
+    """Far off, the cloth has no folds: a note never asks for what a warning then refuses."""
+    (text,) = texts("shown", Facts(shown=[Shown("/Coat", "/Body", 1.0, 0.0075, offset)]))
+    assert remedy in text
+    assert ("--set" in text) == bool(remedy)

@@ -109,5 +109,7 @@ def test_wrong_requests_are_named(sample: Callable[[str], Path], tmp_path: Path)
         preview(sample("swatch"), tmp_path / "a.tiff")
     with pytest.raises(UsageError, match="one time code, not 2"):
         preview(sample("swatch"), tmp_path / "a.png", times=[1.0, 2.0])
+    with pytest.raises(UsageError, match="has no cloth at time code 999, only at time codes 1 to "):
+        preview(sample("swatch"), tmp_path / "a.png", times=[999.0])
     with pytest.raises(StageError, match=r"no such file: .*absent\.usdc"):
         preview(tmp_path / "absent.usdc", tmp_path / "a.png")

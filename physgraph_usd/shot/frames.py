@@ -217,16 +217,22 @@ class FrameFolder(Finished):
         """Lock the folder; created if missing."""
         self.folder.mkdir(exist_ok=True)
         file, lock = self.folder / LOCK, _lock(self.folder)
+        layer = self.folder.with_name(self.folder.name.removesuffix(FRAMES_SUFFIX))
         check_no_link(file)
         try:
             lock.acquire()
+            if not file.is_file():
+                lock.release()
+                raise FileNotFoundError(file)
             with suppress(OSError):  # Windows refuses to write a locked file.
                 file.write_text(f"process {os.getpid()} on {HOST}", encoding="utf-8")
+        except FileNotFoundError as error:  # The other run was complete, and removed the folder.
+            fault = f"{layer} was made by another run meanwhile; run again, with --resume to keep it"
+            raise LayerError(fault) from error
         except Timeout as timeout:
             owner = "another run"
             with suppress(OSError, ValueError):
                 owner = file.read_text(encoding="utf-8") or owner
-            layer = self.folder.with_name(self.folder.name.removesuffix(FRAMES_SUFFIX))
             raise LayerError(
                 f"{layer} is being made by {owner}; wait for it, end it, or name another layer"
             ) from timeout

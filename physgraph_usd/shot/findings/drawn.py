@@ -41,7 +41,8 @@ class Shown:
         garment: Path of the garment.
         body: Path of the body.
         height: Largest height of a polygon above the cloth [m].
-        offset: The garment's contact offset at which the cloth covers the polygons [m].
+        offset: The garment's contact offset at which the cloth covers the polygons [m]; infinite if it would hide the
+            cloth's folds.
     """
 
     garment: str
@@ -111,7 +112,8 @@ class Compared:
                 height, lift = _height(body, solved.points, kept=shot.offset(index, result.time) + collider.offset)
                 if height > DRAWN_WITHIN:
                     offset = STEP * math.ceil((lift - collider.offset) / STEP)
-                    yield Shown(garment.path, collider.path, result.time, height, offset)
+                    suits = offset <= shot.readers[index].largest_offset
+                    yield Shown(garment.path, collider.path, result.time, height, offset if suits else math.inf)
 
 
 def _height(body: Polygons, cloth: np.ndarray, *, kept: float) -> tuple[float, float]:

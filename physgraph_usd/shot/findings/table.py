@@ -9,6 +9,7 @@ Odd or repaired contents of a stage are reported by the stage's reader, as `usd.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -465,6 +466,10 @@ def _folds(facts: Facts) -> Iterator[Figures]:
         }
 
 
+_NO_OFFSET = "a contact offset that hides it would hide the cloth's folds too; draw the body subdivided"
+"""Remedy where the cloth would have to stand far off."""
+
+
 def _shown(facts: Facts) -> Iterator[Figures]:
     """Bodies shown through garments by viewports without subdivision, with sufficient offsets."""
     if facts.shown:
@@ -473,12 +478,14 @@ def _shown(facts: Facts) -> Iterator[Figures]:
         for surface in facts.shown:
             offsets[surface.garment] = max(offsets.get(surface.garment, 0.0), surface.offset)
         further, name = len(offsets) - 1, GARMENT["contact:offset"].short
+        values = [f"{path}.{name}={offset:.4g}" for path, offset in offsets.items() if offset < math.inf]
+        hides = f"{join(options_of('--set', values))} hides it" if len(values) == len(offsets) else _NO_OFFSET
         yield {
             "body": worst.body,
             "garments": f"<{worst.garment}>" + (f" and {counted(further, 'other garment')}" if further else ""),
             "height": 1e3 * worst.height,
             "when": at_time(worst.time),
-            "options": join(options_of("--set", [f"{path}.{name}={offset:.4g}" for path, offset in offsets.items()])),
+            "hides": hides,
         }
 
 
@@ -716,9 +723,9 @@ FINDINGS = {
         level=NOTE,
         after=_shown,
         advice="renderers that subdivide the body do not; the note has the contact offset that hides the body "
-        "everywhere",
+        "everywhere, if there is one that leaves the cloth its folds",
         sentence="viewports that draw <{body}> unsubdivided show it through {garments} by up to {height:.1f} mm{when}",
-        remedy="{options} hides it",
+        remedy="{hides}",
     ),
     "unsettled": Finding(
         level=STRICT,

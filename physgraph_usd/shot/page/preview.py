@@ -10,7 +10,7 @@ from typing import BinaryIO
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from ...errors import LayerError, StageError, UsageError
+from ...errors import LayerError, StageError, UsageError, named_time
 from ...usd.files import check_targets, files_of
 from ...usd.read.meshes import NEUTRAL, DrawnMesh, DrawnStage, refined_in, shot_of
 from ...usd.write.atomic import check_place, make_file, prepare_target, publish, temporary_path
@@ -83,6 +83,7 @@ def preview(
     prepare_target(out, overwrite=overwrite)
     pictures = Pictures(layer, below, size, codes=times)
     codes = [float(time) for time in times] if times is not None else pictures.times or [None]
+    _refuse_outside(layer, codes, [time for time in pictures.times if time is not None])
     drawn = pictures.draw(codes[-1:] if suffix == STILL else codes, camera or CAMERA)
     temporary = temporary_path(out, suffix=out.suffix)
     try:
@@ -97,6 +98,14 @@ def preview(
     finally:
         temporary.unlink(missing_ok=True)
     return out
+
+
+def _refuse_outside(layer: Path, codes: Sequence[float | None], sampled: Sequence[float]) -> None:
+    """Refuse (UsageError) time codes before the first or after the last sample of the drawn garments."""
+    for code in codes:
+        if code is not None and sampled and not min(sampled) <= code <= max(sampled):
+            within = f"time codes {named_time(min(sampled))} to {named_time(max(sampled))}"
+            raise UsageError(f"{layer} has no cloth at time code {named_time(code)}, only at {within}")
 
 
 def check_picture(out: Path, *, times: Sequence[float] | None, overwrite: bool) -> None:

@@ -157,6 +157,11 @@ class GarmentReader:
         """Diagonal of the rest shape's bounding box [m]."""
         return float(np.linalg.norm(extent(self.garment.rest)))
 
+    @property
+    def largest_offset(self) -> float:
+        """Contact distance beyond which the cloth's folds are hidden [m]."""
+        return _STANDS_OFF * self.fitting
+
     def contact_distance(self, name: str, time: float | None) -> float:
         """Contact offset or thickness at a time code [m], by short name; unless authored, at most `fitting`."""
         value = self.values.number(name, time)
@@ -171,7 +176,7 @@ class GarmentReader:
             )
             if limited < value:
                 notices.append(f"{row.name} is taken as {limited:.2g} mm, not {value:g}; author it for another")
-            elif value > _STANDS_OFF * most:
+            elif value > 1e3 * self.largest_offset:
                 notices.append(f"{row.name} of {value:.3g} mm hides its folds; at most {most:.2g} mm suits it")
         small = f"its edges are of {1e3 * mean_edge(self.garment):.2g} mm: {'; '.join(notices)}"
         return [Notice(self.garment.path, None, small)] if notices else []
