@@ -22,7 +22,7 @@ PER_VERTEX = 6.5e3
 LAYER_ONCE, LAYER_FRAME = 60.0, 24.0
 """Data per fine vertex in a layer: faces, UVs and the default once; points and normals per sample [bytes]."""
 PER_BOUND, BOUND_FRAME = 1e3, 12.0
-"""Memory per point that follows a garment, and its data per sample [bytes]."""
+"""Memory of a point bound to a garment, and data of the point per sample [bytes]."""
 TIMED_FRAMES, LONG_RUN = 3, 60.0
 """Frames before the first forecast, and least remaining time of a forecast [s]."""
 RECENT = 1 / 3

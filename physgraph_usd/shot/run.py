@@ -227,7 +227,7 @@ class Run:
                 yield from solved
 
     def _write_frame(self, writer: LayerWriter | None, result: Result) -> None:
-        """Report the result of one time code and write it; a chunk's frames are already in its folder."""
+        """Add the telemetry of a time code to the report, and its points to the layer; a chunk has no layer."""
         report = self.report
         report.add(result)
         if not result.garments:

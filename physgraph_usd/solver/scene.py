@@ -26,7 +26,7 @@ solver's positions have 24 bits, and with less than that nothing of the cloth is
 FALLS = 4.0
 """Largest distance that a garment may sink, in diameters. Cloth over one diameter off the cage is invalid."""
 SPECK = 0.1
-"""Size under which a garment's units are in doubt before its guide is [m]."""
+"""Least size of a garment in the test for cloth that sinks [m]: smaller garments have wrong units, not a weak guide."""
 OUTGROWN = 1e3
 """Median edges of the rest shape above which those of a cage are not of stretched cloth: it rests as a speck."""
 GIVEN_UP = "given up: the cloth is its subdivided cage"

@@ -103,7 +103,7 @@ class ValuePanel:
             self._write(tunable, number, slider)
 
     def _try(self, session: TuneSession, tunable: Tunable, value: float, *, is_slid: bool = False) -> None:
-        """Try a value [SI], and write it into the control that was not moved."""
+        """Try a value [SI]; the slider's value is copied to the number box, and the box's to the slider."""
         session.set_value(self._desk.garment, tunable.name, value)
         if tunable.group == FABRIC:
             put(self._preset, value=OWN_VALUES)

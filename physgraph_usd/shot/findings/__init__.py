@@ -1,1 +1,1 @@
-"""Findings about a shot and its run: `table` holds every warning and note, the other modules measure what they need."""
+"""Warnings and notes of a run: `table` holds all of them; the other modules measure cloth and bodies for its tests."""

@@ -279,7 +279,7 @@ def _fabrics_of_faces(facts: Facts) -> Iterator[Figures]:
 
 
 def _trims(facts: Facts) -> Iterator[Figures]:
-    """Meshes that lie on a garment and move with it."""
+    """Trims: meshes lying on a garment and moving along."""
     garment_of = {candidate.path: candidate.follows for candidate in facts.candidates if candidate.follows}
     if garment_of:
         stay, them = ("stays as it is", "it") if len(garment_of) == 1 else ("stay as they are", "them")
@@ -743,4 +743,4 @@ FINDINGS = {
         remedy="look at these frames",
     ),
 }
-"""All findings by name, in the order in which a run reports them."""
+"""Findings by id, in reporting order."""

@@ -11,6 +11,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from ...errors import LayerError, StageError, UsageError, named_time
+from ...solver.scene import SAME_TIME
 from ...usd.files import check_targets, files_of
 from ...usd.read.meshes import NEUTRAL, DrawnMesh, DrawnStage, refined_in, shot_of
 from ...usd.write.atomic import check_place, make_file, prepare_target, publish, temporary_path
@@ -103,7 +104,7 @@ def preview(
 def _refuse_outside(layer: Path, codes: Sequence[float | None], sampled: Sequence[float]) -> None:
     """Refuse (UsageError) time codes before the first or after the last sample of the drawn garments."""
     for code in codes:
-        if code is not None and sampled and not min(sampled) <= code <= max(sampled):
+        if code is not None and sampled and not min(sampled) - SAME_TIME <= code <= max(sampled) + SAME_TIME:
             within = f"time codes {named_time(min(sampled))} to {named_time(max(sampled))}"
             raise UsageError(f"{layer} has no cloth at time code {named_time(code)}, only at {within}")
 

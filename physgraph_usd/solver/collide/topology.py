@@ -153,7 +153,7 @@ def halved(points: np.ndarray, group: np.ndarray, size: int) -> np.ndarray:
 
 
 def _sorted(values: np.ndarray) -> np.ndarray:
-    """The order that sorts finite values; equal ones stay in order, by a second sort faster than a stable one."""
+    """Indices that sort finite values, stably: two unstable sorts are faster than numpy's stable sort."""
     order = np.argsort(values)
     values = values[order]
     rank = np.cumsum(np.append(False, values[1:] != values[:-1])[: len(order)])

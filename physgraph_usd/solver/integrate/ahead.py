@@ -29,7 +29,7 @@ STEPS_AHEAD = {"cpu": 1, "cuda": SEEN_STEPS}
 
 @runtime_checkable
 class Ahead(Protocol):
-    """An integrator whose next step needs no number of the last one."""
+    """An integrator able to step on without reading the energy or the remaining move."""
 
     def most_ahead(self, carry: Carry) -> int:
         """Most steps from a carry before the first is checked, at least 1; later ones would lose the carry's memory."""
@@ -45,12 +45,12 @@ class Checked(Ahead, Protocol):
     """An integrator with a check for its steps."""
 
     def checked(self, system: System, carry: Carry, proposed: Carry) -> Carry:
-        """The step proposed after a carry, if it is good; otherwise another one."""
+        """The proposed carry if its energy [J] does not exceed the carry's; a corrected step otherwise."""
         ...
 
 
 def read(carries: Sequence[Carry]) -> list[Carry]:
-    """The carries with their numbers, which are waited for once."""
+    """The carries with energy [J] and remaining move [local edges], copied from the device in a single wait."""
     numbers = torch.stack([carry.unread for carry in carries if carry.unread is not None]).tolist()
     return [
         replace(carry, energy=energy, remaining=remaining, unread=None)

@@ -70,7 +70,7 @@ class Guard:
         return self._ahead.ahead(system, carry)
 
     def checked(self, system: System, carry: Carry, proposed: Carry) -> Carry:
-        """The wrapped integrator's step, unless it raises the energy; then a corrected one."""
+        """The wrapped integrator's step; a corrected step if the energy rises."""
         if math.isfinite(proposed.energy) and proposed.energy <= carry.energy:
             return proposed
         corrected = replace(self._corrected(system, carry, proposed), setbacks=carry.setbacks + 1)

@@ -31,7 +31,7 @@ SLICES, SLICE_SECONDS = 8, 5e-5
 """Slices per thread and their least average work [s]: some items cost a hundred times as much as average, so free
 threads take the next slice, and slices shrink to shorten the wait for the last."""
 _item_seconds: defaultdict[str, float] = defaultdict(float)
-"""By kernel: time of an item in its last launches, on one thread [s]."""
+"""Recent time per item on one thread [s], by kernel."""
 
 
 class Launch:
